@@ -1,0 +1,1 @@
+"""Skeletons, forward kinematics, body surfaces, retargeting."""

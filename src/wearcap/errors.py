@@ -1,0 +1,27 @@
+"""The one exception that users are meant to read."""
+
+from pathlib import Path
+
+
+class WearcapError(Exception):
+    """Something a user can mend: says what was wrong, where, what was expected, and what to do.
+
+    The command line prints it without a traceback and exits with code 2.
+    """
+
+    def __init__(self, what: str, *, where: str | Path | None = None, expected: str = "", fix: str = ""):
+        parts = [f"{where}: {what}" if where is not None else what]
+        if expected:
+            parts.append(f"Expected {expected}.")
+        if fix:
+            parts.append(fix)
+        super().__init__(" ".join(part if part.endswith((".", "!", "?")) else part + "." for part in parts))
+        self.what, self.where, self.expected, self.fix = what, where, expected, fix
+
+    def __reduce__(self):
+        """Survive the trip back from a worker process."""
+        return _rebuild, (type(self), self.what, self.where, self.expected, self.fix)
+
+
+def _rebuild(cls: type[WearcapError], what: str, where, expected: str, fix: str) -> WearcapError:
+    return cls(what, where=where, expected=expected, fix=fix)

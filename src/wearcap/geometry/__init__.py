@@ -1,0 +1,1 @@
+"""Rotations, rigid transforms, cameras, trajectories, distances and the software renderer."""

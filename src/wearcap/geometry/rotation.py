@@ -1,0 +1,83 @@
+"""Rotations: matrices in computation, 6D into networks, quaternions and axis-angle only at the doors.
+
+Every function is batched over leading axes and differentiable, at the identity and near π too (RoMa).
+"""
+
+import math
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def exp(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrix of an axis-angle vector (rad)."""
+    return roma.rotvec_to_rotmat(rotvec)
+
+
+def log(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Axis-angle vector (rad, norm at most π) of a rotation matrix."""
+    return roma.rotmat_to_rotvec(R)
+
+
+def rot6d_from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 6"]:
+    """First two columns of the matrix, one after the other (thesis §6, Zhou et al. 2019)."""
+    return R[..., :2].transpose(-1, -2).flatten(-2)
+
+
+def matrix_from_rot6d(rot6d: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
+    """Gram–Schmidt of two 3-vectors into a rotation matrix; any non-parallel pair is accepted."""
+    x = torch.nn.functional.normalize(rot6d[..., :3], dim=-1)
+    y = rot6d[..., 3:] - (x * rot6d[..., 3:]).sum(-1, keepdim=True) * x
+    y = torch.nn.functional.normalize(y, dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
+
+
+def matrix_from_quat_wxyz(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrix of a quaternion, scalar first; normalised here."""
+    xyzw = torch.nn.functional.normalize(quat_wxyz, dim=-1).roll(-1, dims=-1)
+    return roma.unitquat_to_rotmat(xyzw)
+
+
+def quat_wxyz_from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternion, scalar first and not negative."""
+    wxyz = roma.rotmat_to_unitquat(R).roll(1, dims=-1)
+    return torch.where(wxyz[..., :1] < 0, -wxyz, wxyz)
+
+
+def geodesic(R_a: Float[Tensor, "*batch 3 3"], R_b: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+    """Angle between two rotations (rad, 0…π); its gradient stays finite where they agree."""
+    return roma.rotmat_geodesic_distance(R_a, R_b)
+
+
+def about_axis(axis: str, angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation by `angle` (rad) about the named axis "x", "y" or "z"."""
+    i = "xyz".index(axis)
+    j, k = (i + 1) % 3, (i + 2) % 3
+    cos, sin, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    entries = {(i, i): one, (j, j): cos, (k, k): cos, (k, j): sin, (j, k): -sin}
+    rows = [torch.stack([entries.get((row, column), zero) for column in range(3)], -1) for row in range(3)]
+    return torch.stack(rows, -2)
+
+
+def yaw_of(R_world_body: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+    """Heading (rad) about the vertical: direction in which the body's x axis points.
+
+    Where x is nearly vertical (|x_z| > 0.9: looking straight up or down) the body's z axis, which then
+    points along or against the heading, decides; so a head that bends down keeps its heading.
+    """
+    forward, up = R_world_body[..., 0], R_world_body[..., 2]
+    steep = forward[..., 2:].abs() > 0.9
+    heading = torch.where(steep, -up * forward[..., 2:].sign(), forward)
+    return torch.atan2(heading[..., 1], heading[..., 0])
+
+
+def wrap_angle(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The same angle in [-π, π)."""
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
+def mean_rotation(R: Float[Tensor, "sample 3 3"]) -> Float[Tensor, "3 3"]:
+    """Chordal mean: the rotation nearest to the arithmetic mean of the matrices."""
+    return roma.special_procrustes(R.mean(0))

@@ -1,0 +1,20 @@
+"""The Recording (what was sensed, what is true), the Motion (what was captured), and their store."""
+
+from wearcap.recording.motion import Motion
+from wearcap.recording.recording import (
+    CameraStream,
+    ContactTrack,
+    Cue,
+    FloorTrack,
+    HeadStream,
+    ImuStream,
+    Localization,
+    PointCloud,
+    Recording,
+)
+from wearcap.recording.store import RecordingStore
+
+__all__ = [
+    "CameraStream", "ContactTrack", "Cue", "FloorTrack", "HeadStream", "ImuStream", "Localization",
+    "Motion", "PointCloud", "Recording", "RecordingStore",
+]  # fmt: skip

@@ -1,0 +1,69 @@
+"""The Motion: what a pipeline returns and what truth holds."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.skeleton import Skeleton
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A body's motion: timestamps in s, rotations of each joint in its parent (the root in the world), m."""
+
+    timestamps: Float64[Tensor, "time"]
+    skeleton: Skeleton
+    R_parent_joint: Float[Tensor, "time joint 3 3"]
+    t_world_root: Float[Tensor, "time 3"]
+    contact_prob: Float[Tensor, "time patch"] | None = None
+    """Probability of floor contact of `FOOT_PATCHES`."""
+    object_motion: dict[str, Trajectory] | None = None
+    provenance: dict[str, str] = field(default_factory=dict)
+    """Pipeline, checkpoint, config hash, or the source of a truth."""
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def fps(self) -> float:
+        """Nominal frame rate (Hz): the inverse of the median time step."""
+        if len(self) < 2:
+            raise ValueError("a motion of one frame has no frame rate")
+        return 1.0 / self.timestamps.diff().median().item()
+
+    @cached_property
+    def T_world_joint(self) -> Rigid:
+        """Poses of all joints: R "time joint 3 3", t "time joint 3"."""
+        return forward_kinematics(self.skeleton, self.R_parent_joint, self.t_world_root)
+
+    def joint(self, name: str) -> Rigid:
+        """Pose of one joint over time."""
+        return self.T_world_joint[:, self.skeleton.index(name)]
+
+    def sliced(self, start: int, stop: int) -> "Motion":
+        """Frames start…stop-1; object trajectories keep their own clocks and are cut to the same time span."""
+        times = self.timestamps[start:stop]
+        contact = None if self.contact_prob is None else self.contact_prob[start:stop]
+        objects = self.object_motion
+        if objects is not None and len(times):
+            objects = {
+                name: _within(track, times[0].item(), times[-1].item()) for name, track in objects.items()
+            }
+        return replace(
+            self, timestamps=times, R_parent_joint=self.R_parent_joint[start:stop],
+            t_world_root=self.t_world_root[start:stop], contact_prob=contact, object_motion=objects,
+        )  # fmt: skip
+
+
+def _within(track: Trajectory, start_s: float, stop_s: float) -> Trajectory:
+    first = int(torch.searchsorted(track.timestamps, start_s))
+    last = int(torch.searchsorted(track.timestamps, stop_s, right=True))
+    return Trajectory(
+        track.timestamps[first:last], track.R_world_body[first:last], track.t_world_body[first:last]
+    )

@@ -1,0 +1,158 @@
+"""The Recording: what was sensed and what is true, with only the parts that exist."""
+
+from dataclasses import dataclass, field
+
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording.motion import Motion
+
+
+@dataclass(frozen=True)
+class HeadStream:
+    """Poses of a head-mounted device, and how it sits on the head joint.
+
+    The device frame has the head's axes (x forward, y left, z up); readers turn foreign device axes into these.
+    """
+
+    timestamps: Float64[Tensor, "time"]
+    R_world_device: Float[Tensor, "time 3 3"]
+    t_world_device: Float[Tensor, "time 3"]
+    R_head_device: Float[Tensor, "3 3"]
+    t_head_device: Float[Tensor, "3"]
+
+    @property
+    def T_world_device(self) -> Rigid:
+        return Rigid(self.R_world_device, self.t_world_device)
+
+    @property
+    def T_world_head(self) -> Rigid:
+        """Pose of the head joint: T_world_device @ T_device_head."""
+        return self.T_world_device @ Rigid(self.R_head_device, self.t_head_device).inverse()
+
+
+@dataclass(frozen=True)
+class ImuStream:
+    """One inertial sensor; only what the sensor gave is present."""
+
+    timestamps: Float64[Tensor, "time"]
+    joint: str
+    """Joint that the sensor is worn on, by the skeleton's name."""
+    R_world_imu: Float[Tensor, "time 3 3"] | None = None
+    acc_world: Float[Tensor, "time 3"] | None = None
+    """Free acceleration: gravity removed (m/s²)."""
+    acc_imu: Float[Tensor, "time 3"] | None = None
+    """Specific force in the sensor's axes: at rest +9.81 m/s² upwards."""
+    gyro_imu: Float[Tensor, "time 3"] | None = None
+    """Angular velocity in the sensor's axes (rad/s)."""
+    R_joint_imu: Float[Tensor, "3 3"] | None = None
+    """Mounting, where it is known."""
+
+
+@dataclass(frozen=True)
+class CameraStream:
+    """A camera worn on the head: calibration, and images by file name or as embeddings."""
+
+    timestamps: Float64[Tensor, "time"]
+    camera: Camera
+    R_head_cam: Float[Tensor, "3 3"]
+    t_head_cam: Float[Tensor, "3"]
+    image_files: tuple[str, ...] | None = None
+    embedding: Float[Tensor, "time feature"] | None = None
+    embedding_name: str | None = None
+
+
+@dataclass(frozen=True)
+class Localization:
+    """Camera poses found in a map, frame by frame, with their confidence (0…1; 0 where none was found)."""
+
+    timestamps: Float64[Tensor, "time"]
+    R_world_cam: Float[Tensor, "time 3 3"]
+    t_world_cam: Float[Tensor, "time 3"]
+    confidence: Float[Tensor, "time"]
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points of the surroundings (m)."""
+
+    points_world: Float[Tensor, "point 3"]
+    confidence: Float[Tensor, "point"] | None = None
+    first_seen: Float64[Tensor, "point"] | None = None
+    """When each point was first observed (s); absent for scans."""
+
+
+@dataclass(frozen=True)
+class Cue:
+    """Observed keypoints of one joint: pixels (2) or world positions (3), with confidence."""
+
+    timestamps: Float64[Tensor, "time"]
+    joint: str
+    points: Float[Tensor, "time axis"]
+    confidence: Float[Tensor, "time"]
+
+
+@dataclass(frozen=True)
+class ContactTrack:
+    """True contacts of named parts (`FOOT_PATCHES`, hands) over time."""
+
+    timestamps: Float64[Tensor, "time"]
+    parts: tuple[str, ...]
+    contact: Bool[Tensor, "time part"]
+
+
+@dataclass(frozen=True)
+class FloorTrack:
+    """Height (m) of the floor beneath the wearer over time."""
+
+    timestamps: Float64[Tensor, "time"]
+    height: Float[Tensor, "time"]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Everything one wearer's sensors saw, and what is known to be true. Streams keep their own clocks' rates."""
+
+    name: str
+    # sensed
+    head: HeadStream | None = None
+    imu: dict[str, ImuStream] = field(default_factory=dict)
+    suit: Motion | None = None
+    camera: CameraStream | None = None
+    localization: Localization | None = None
+    points: PointCloud | None = None
+    cues: dict[str, Cue] = field(default_factory=dict)
+    scene: str | None = None
+    """File of the surroundings' geometry (.ply or .glb), relative to the data set's directory."""
+    # true
+    motion: Motion | None = None
+    contacts: ContactTrack | None = None
+    object_motion: dict[str, Trajectory] = field(default_factory=dict)
+    floor: FloorTrack | None = None
+    # about
+    skeleton: Skeleton | None = None
+    shape: dict[str, float] = field(default_factory=dict)
+    """Body shape by named parameter: height (m), weight (kg), or a body model's own coefficients."""
+    subject: str = ""
+    location: str = ""
+    activity: str = ""
+    source: str = ""
+    license: str = ""
+    session: str | None = None
+    """Recordings of several wearers with the same session share clock and world."""
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the earliest to the latest timestamp of all streams."""
+        spans = [
+            s.timestamps for s in (self.head, self.motion, self.suit, self.camera, self.localization) if s
+        ]
+        spans += [s.timestamps for s in self.imu.values()]
+        spans = [s for s in spans if len(s)]
+        return max((s[-1].item() for s in spans), default=0.0) - min(
+            (s[0].item() for s in spans), default=0.0
+        )

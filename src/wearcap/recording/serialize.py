@@ -1,0 +1,70 @@
+"""Recordings to flat tensors plus JSON and back: the content of one `.safetensors` file.
+
+A tree of known dataclasses becomes `{"head.R_world_device": tensor, …}` and a JSON skeleton in which every
+tensor is a reference. Only the classes in `KNOWN` can come back; nothing in a file is ever executed.
+"""
+
+import dataclasses
+import json
+from typing import Any
+
+from torch import Tensor
+
+from wearcap.body.skeleton import Site, Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording import recording as containers
+from wearcap.recording.motion import Motion
+
+KNOWN: dict[str, type] = {
+    cls.__name__: cls
+    for cls in (
+        Motion, Skeleton, Site, Camera, Trajectory, containers.Recording, containers.HeadStream,
+        containers.ImuStream, containers.CameraStream, containers.Localization, containers.PointCloud,
+        containers.Cue, containers.ContactTrack, containers.FloorTrack,
+    )
+}  # fmt: skip
+
+
+def flatten(value: Any, key: str = "") -> tuple[Any, dict[str, Tensor]]:
+    """Return (JSON tree, tensors by dotted key). Parts that are None or empty are left out."""
+    if isinstance(value, Tensor):
+        return {"$tensor": key}, {key: value.detach().cpu().contiguous().clone()}
+    if dataclasses.is_dataclass(value):
+        items = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        tree: dict[str, Any] = {"$type": type(value).__name__}
+    elif isinstance(value, dict):
+        items, tree = value, {}
+    elif isinstance(value, tuple):
+        return {"$tuple": list(value)}, {}
+    else:
+        return value, {}
+    tensors: dict[str, Tensor] = {}
+    for name, item in items.items():
+        if item is None or (isinstance(item, dict | str) and not item):
+            continue
+        tree[name], inner = flatten(item, f"{key}.{name}" if key else name)
+        tensors |= inner
+    return tree, tensors
+
+
+def unflatten(tree: Any, fetch) -> Any:
+    """Rebuild what `flatten` took apart; `fetch(key)` gives a tensor."""
+    if not isinstance(tree, dict):
+        return tree
+    if "$tensor" in tree:
+        return fetch(tree["$tensor"])
+    if "$tuple" in tree:
+        return tuple(tree["$tuple"])
+    items = {name: unflatten(item, fetch) for name, item in tree.items() if name != "$type"}
+    if "$type" not in tree:
+        return items
+    if tree["$type"] not in KNOWN:
+        raise WearcapError(f"unknown part {tree['$type']!r}", expected=f"one of {', '.join(sorted(KNOWN))}")
+    return KNOWN[tree["$type"]](**items)
+
+
+def dumps(tree: Any) -> str:
+    """JSON with sorted keys and no spaces, so that equal content has equal bytes."""
+    return json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False)
