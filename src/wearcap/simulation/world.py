@@ -1,0 +1,216 @@
+"""The surroundings of a simulated wearer: what can be stood on, sat on, reached, bumped into and seen.
+
+World frame: metres, z up, the ground floor at z = 0. Headings are angles (rad) about z, 0 along +x.
+A builder (`flat.build_flat`, `outdoor.build_outdoor`) fills the lists; walking and planning live in
+`navigation`, which sees only surfaces (stood on) and objects (bumped into), so that a new kind of object
+needs no change there.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from wearcap.geometry.mesh import Mesh
+from wearcap.simulation.navigation import NavigationGrid
+
+STEP_UP_M = 0.35
+"""A foot finds no floor higher than this above where it was."""
+
+
+@dataclass(frozen=True)
+class DegreeOfFreedom:
+    """One way in which an object moves: turning about, or sliding along, an axis through a point."""
+
+    name: str
+    kind: str
+    """"hinge" (limits in rad) or "slide" (limits in m)."""
+    axis: tuple[float, float, float]
+    pivot: tuple[float, float, float]
+    limits: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class WorldObject:
+    """A thing with a footprint, which walkers keep off; its faces are those of the world's mesh with its index."""
+
+    name: str
+    kind: str
+    """"wall", "door_frame", "sofa", "chair", "table", "bed", "shelf", "counter", "railing", "tree", …"""
+    footprint: Float[np.ndarray, "corner 2"]
+    """Convex outline from above, counter-clockwise, in the world (m)."""
+    z_range: tuple[float, float]
+    position: tuple[float, float, float]
+    heading: float
+    degrees_of_freedom: tuple[DegreeOfFreedom, ...] = ()
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Something to stand on: a convex polygon seen from above, on the plane z = a x + b y + c."""
+
+    kind: str
+    """"floor", "stairs_step", "ramp" or "kerb"."""
+    polygon: Float[np.ndarray, "corner 2"]
+    plane: tuple[float, float, float]
+    level: int = 0
+    """Storey: surfaces of one level never lie above each other, except steps and kerbs on their ground."""
+
+    def height(self, points_xy: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch"]:
+        a, b, c = self.plane
+        return a * points_xy[..., 0] + b * points_xy[..., 1] + c
+
+
+@dataclass(frozen=True)
+class Seat:
+    """A place to sit: where the middle of the buttocks touches the seat, and where the sitter then looks."""
+
+    position: tuple[float, float, float]
+    heading: float
+    height: float
+    """Of the seat above the floor (m)."""
+    depth: float
+    """From `position` forward to the seat's front edge (m)."""
+
+    @property
+    def floor_z(self) -> float:
+        return self.position[2] - self.height
+
+    def standing_point(self, calf_to_edge: float = 0.12) -> Float[np.ndarray, "3"]:
+        """Floor point beneath the pelvis of one who stands before the seat, ready to sit down (m)."""
+        reach = self.depth + calf_to_edge
+        return np.array(
+            [
+                self.position[0] + reach * np.cos(self.heading),
+                self.position[1] + reach * np.sin(self.heading),
+                self.floor_z,
+            ]
+        )
+
+
+@dataclass(frozen=True)
+class ReachTarget:
+    """A point that a hand reaches for, and where and how to stand for it."""
+
+    position: tuple[float, float, float]
+    stand: tuple[float, float, float]
+    """Floor point to stand on (m)."""
+    heading: float
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Straight stairs: step k = 1 … steps rises to base_z + k · rise; the last step is the upper floor itself.
+
+    Step k < steps covers [(k − 1) · tread, k · tread] along `direction` from `start`.
+    """
+
+    start: tuple[float, float]
+    """Middle of the foot of the first riser (m)."""
+    direction: float
+    """Heading of going up (rad)."""
+    steps: int
+    rise: float
+    tread: float
+    width: float
+    base_z: float
+
+    @property
+    def length(self) -> float:
+        """Horizontal distance from the first riser to the last (m)."""
+        return (self.steps - 1) * self.tread
+
+    @property
+    def top_z(self) -> float:
+        return self.base_z + self.steps * self.rise
+
+
+@dataclass(frozen=True)
+class Room:
+    name: str
+    polygon: Float[np.ndarray, "corner 2"]
+    z: float
+
+
+@dataclass(frozen=True)
+class Door:
+    """A gap in a wall; heading is the direction of walking through it."""
+
+    position: tuple[float, float, float]
+    heading: float
+    width: float
+
+
+@dataclass(frozen=True)
+class World:
+    """Seeded surroundings. `face_object` gives each face of `mesh` its object (index), or -1 for the shell."""
+
+    name: str
+    mesh: Mesh
+    face_object: Int[np.ndarray, "face"]
+    objects: tuple[WorldObject, ...]
+    surfaces: tuple[Surface, ...]
+    seats: tuple[Seat, ...] = ()
+    reach_targets: tuple[ReachTarget, ...] = ()
+    flights: tuple[Flight, ...] = ()
+    rooms: tuple[Room, ...] = ()
+    doors: tuple[Door, ...] = ()
+    cell: float = 0.1
+    """Side of a cell of the planning grid (m)."""
+    attributes: dict[str, float] = field(default_factory=dict)
+
+    def floor_height(
+        self, points_xy: Float[np.ndarray, "*batch 2"], near_z: Float[np.ndarray, "*batch"]
+    ) -> Float[np.ndarray, "*batch"]:
+        """Height (m) of the highest surface not above near_z + 0.35 m; NaN where there is none."""
+        flat_xy = points_xy.reshape(-1, 2).astype(np.float64)
+        limit = near_z.reshape(-1) + STEP_UP_M
+        best = np.full(len(flat_xy), -np.inf)
+        for surface in self.surfaces:
+            inside = np.nonzero(points_in_convex(flat_xy, surface.polygon))[0]
+            height = surface.height(flat_xy[inside])
+            height[height > limit[inside]] = -np.inf
+            best[inside] = np.maximum(best[inside], height)
+        best[np.isinf(best)] = np.nan
+        return best.reshape(near_z.shape)
+
+    @cached_property
+    def navigation(self) -> NavigationGrid:
+        """The planning grid, built at first use."""
+        return NavigationGrid.build(self.surfaces, self.objects, self.cell)
+
+    def clearance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+        """Distance (m, to about a cell) from floor points to the nearest obstacle; 0 inside one."""
+        return self.navigation.clearance_at(points)
+
+    def plan_path(
+        self, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], rng: np.random.Generator
+    ) -> Float[np.ndarray, "waypoint 3"] | None:
+        """A smooth way over the floor from start to goal, both floor points (m), across stairs too.
+
+        Waypoints stand about 0.1 m apart on the floor, the first is `start`, the last `goal`; they keep 0.28 m
+        off obstacles, except on the last steps to a start or goal that is nearer to one itself (a seat).
+        `rng` varies how far from walls this walk likes to be. None when no way leads there.
+        """
+        return self.navigation.plan(start, goal, rng, self.flights)
+
+    def sample_floor(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "count 3"]:
+        """Random floor points (m) in the largest connected walkable part."""
+        return self.navigation.sample(rng, count)
+
+
+def points_in_convex(
+    points_xy: Float[np.ndarray, "point 2"], polygon: Float[np.ndarray, "corner 2"]
+) -> np.ndarray:
+    """Whether points lie in a convex counter-clockwise polygon, its border included: bool "point"."""
+    low, high = polygon.min(0) - 1e-9, polygon.max(0) + 1e-9
+    x, y = points_xy[:, 0], points_xy[:, 1]
+    inside = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
+    candidates = np.nonzero(inside)[0]
+    x, y = x[candidates], y[candidates]
+    for start, end in zip(polygon, np.roll(polygon, -1, axis=0)):
+        edge = end - start
+        cross = edge[0] * (y - start[1]) - edge[1] * (x - start[0])
+        inside[candidates[cross < -1e-9]] = False
+    return inside
