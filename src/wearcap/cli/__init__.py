@@ -1,0 +1,1 @@
+"""The verbs: one module per verb with `HELP` (one line) and `main(arguments)`."""

@@ -1,0 +1,201 @@
+"""Configs: where they lie, how Hydra composes them, and a typo's nearest valid neighbour."""
+
+import difflib
+import functools
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    MissingConfigException,
+    OverrideParseException,
+)
+from hydra.types import RunMode
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from wearcap.errors import WearcapError
+
+
+def _resource(in_checkout: str, in_wheel: str) -> Path:
+    package = Path(__file__).resolve().parents[1]
+    checkout = package.parents[1]
+    if (checkout / "pyproject.toml").is_file() and (checkout / in_checkout).is_dir():
+        return checkout / in_checkout
+    return package / "_resources" / in_wheel
+
+
+def conf_dir() -> Path:
+    """The checkout's `conf/` when the package is imported from one, else the copy that the wheel carries."""
+    return _resource("conf", "conf")
+
+
+def splits_dir() -> Path:
+    """The committed split lists, of the checkout or of the wheel."""
+    return _resource("data_prep/splits", "splits")
+
+
+def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
+    """Compose one config of `conf/` with overrides (no sweep, no run folder).
+
+    Raises WearcapError that names the nearest valid key or choice when an override is mistyped.
+    """
+    overrides = list(overrides)
+    with _explained(config_name, overrides):
+        return _compose(config_name, overrides)
+
+
+def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: list[str]) -> None:
+    """Run `task(config)` as a Hydra application with its command line: overrides, `-m`, `--cfg job`, `--help` …
+
+    A WearcapError of the task comes out as it is; a config error comes out as a WearcapError.
+    """
+    guarded = _Guarded(task)
+    application = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)
+    with _explained(config_name, arguments), _command_line(arguments):
+        application(guarded)()
+    if guarded.refused is not None:
+        raise guarded.refused
+
+
+class _Guarded:
+    """A task that keeps its WearcapError for later, so that Hydra prints nothing of its own about it.
+
+    A class, because the joblib launcher has to pickle it. In a multirun the error goes through Hydra, which
+    says which of the jobs failed.
+    """
+
+    def __init__(self, task: Callable[[DictConfig], Any]):
+        functools.update_wrapper(self, task)
+        self.task = task
+        self.refused: WearcapError | None = None
+
+    def __call__(self, config: DictConfig) -> Any:
+        try:
+            return self.task(config)
+        except WearcapError as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise
+            self.refused = error
+
+
+def nearest(wrong: str, valid: Iterable[str]) -> str:
+    """A sentence that names the valid words nearest to a wrong one, or all of them when none is near."""
+    valid = sorted(valid)
+    near = difflib.get_close_matches(wrong, valid, n=3, cutoff=0.5)
+    if near:
+        return f"Did you mean {' or '.join(repr(word) for word in near)}?"
+    return f"Expected one of {', '.join(valid[:40])}." if valid else ""
+
+
+@contextmanager
+def _command_line(arguments: list[str]) -> Iterator[None]:
+    """Hydra reads sys.argv; with HYDRA_FULL_ERROR it raises its errors instead of printing them and leaving."""
+    before, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv = [sys.argv[0], *arguments]
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    finally:
+        sys.argv = before
+        if full_error is None:
+            os.environ.pop("HYDRA_FULL_ERROR", None)
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = full_error
+
+
+def _compose(config_name: str, overrides: list[str]) -> DictConfig:
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra.compose(config_name, overrides)
+
+
+@contextmanager
+def _explained(config_name: str, arguments: list[str]) -> Iterator[None]:
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException) as error:
+        ours = _cause(error, WearcapError)
+        if ours is not None:
+            raise ours from error
+        raise _explanation(error, config_name, arguments) from error
+
+
+def _cause(error: BaseException | None, kind: type[BaseException]):
+    """The first exception of a kind along the chain of causes."""
+    while error is not None and not isinstance(error, kind):
+        error = error.__cause__
+    return error
+
+
+def _explanation(error: Exception, config_name: str, arguments: list[str]) -> WearcapError:
+    """What a Hydra or OmegaConf error means for the person who typed the command."""
+    for place, argument in enumerate(arguments[:-1]):
+        if argument in ("--config-name", "-cn"):
+            config_name = arguments[place + 1]
+    if isinstance(error, MissingConfigException):
+        return _missing_choice(error)
+    if isinstance(error, OverrideParseException):
+        return WearcapError(f"cannot read the override {error.override!r}", expected="key=value",
+                            fix=f"({str(error).splitlines()[0]})")  # fmt: skip
+    if isinstance(error, MissingMandatoryValue):
+        key = re.search(r"Missing mandatory value: (\S+)", str(error))
+        key = key.group(1) if key else str(error.full_key or "")
+        return WearcapError(f"{key} has no value", fix=f"Give it on the command line: {key}=…")
+    key = re.search(r"(?:Could not override|Could not delete from config\.|Could not append) '([^']+)'", str(error))
+    key = key or re.search(r"key '?([\w./@-]+)'? (?:is not in|not found)", str(error), re.IGNORECASE)
+    if key is None and not isinstance(error, ConfigCompositionException):
+        return WearcapError(str(error).strip().splitlines()[0], where=f"config {config_name!r}",
+                            fix="Run again with --debug for the whole story.")  # fmt: skip
+    if key is None:
+        return WearcapError(" ".join(str(error).split()), where=f"config {config_name!r}")
+    wrong = key.group(1).split("@")[0]
+    return WearcapError(f"config {config_name!r} has no key {wrong!r}",
+                        fix=nearest(wrong, _valid_keys(config_name, arguments, wrong)))  # fmt: skip
+
+
+def _missing_choice(error: MissingConfigException) -> WearcapError:
+    wrong = str(error.missing_cfg_file or "").removesuffix(".yaml")
+    group, _, choice = wrong.rpartition("/")
+    if not group:
+        roots = [path.stem for path in conf_dir().glob("*.yaml")]
+        return WearcapError(f"no config {choice!r}", where=conf_dir(), fix=nearest(choice, roots))
+    options = error.options or [path.stem for path in (conf_dir() / group).glob("*.yaml")]
+    if not options:
+        return WearcapError(f"no config group {group!r}", fix=nearest(group, _groups()))
+    return WearcapError(f"no choice {choice!r} in config group {group!r}", fix=nearest(choice, options))
+
+
+def _groups() -> list[str]:
+    root = conf_dir()
+    return sorted(
+        {path.parent.relative_to(root).as_posix() for path in root.rglob("*.yaml")} - {".", "hydra"}
+    )
+
+
+def _valid_keys(config_name: str, arguments: list[str], wrong: str) -> set[str]:
+    """Config groups and dotted keys of the config without the override that failed."""
+    rest = [a for a in arguments if "=" in a and not a.startswith("-") and wrong not in a and "," not in a]
+    keys = set(_groups())
+    try:
+        return keys | set(_dotted(_compose(config_name, rest)))
+    except (HydraException, OmegaConfBaseException):
+        return keys
+
+
+def _dotted(config: Any, prefix: str = "") -> Iterator[str]:
+    if not isinstance(config, DictConfig) or config._is_missing() or config._is_none():
+        return
+    for key in config:
+        yield f"{prefix}{key}"
+        if not OmegaConf.is_missing(config, key) and not OmegaConf.is_interpolation(config, key):
+            value = config[key]
+            if not isinstance(value, ListConfig):
+                yield from _dotted(value, f"{prefix}{key}.")

@@ -1,0 +1,92 @@
+"""`wearcap VERB …`: finds the verb's module, runs it, and turns what users can mend into one message."""
+
+import errno
+import importlib
+import importlib.util
+import sys
+import traceback
+
+from wearcap import __version__
+from wearcap.errors import WearcapError
+
+VERBS = (
+    "train", "evaluate", "capture", "export", "prepare", "view", "render", "annotate", "scene", "calibrate",
+    "track", "doctor", "demo",
+)  # fmt: skip
+"""In the order of the help; a verb is there when its module is."""
+
+USER_ERROR, INTERRUPTED = 2, 130
+
+
+def available() -> list[str]:
+    """Verbs whose module exists."""
+    return [verb for verb in VERBS if importlib.util.find_spec(f"wearcap.cli.{verb}")]
+
+
+def usage() -> str:
+    """The help text: every verb with its line."""
+    lines = [
+        "wearcap: motion capture from what a person wears.",
+        "",
+        "usage: wearcap [--debug] VERB [arguments]     wearcap VERB --help     wearcap --version",
+        "",
+        *(f"  {verb:10} {importlib.import_module(f'wearcap.cli.{verb}').HELP}" for verb in available()),
+        "",
+        "--debug shows the traceback of an error.",
+    ]
+    return "\n".join(lines)
+
+
+def run_verb(verb: str, arguments: list[str]) -> int:
+    """Run one verb and return the exit code; errors a user can mend become one message on stderr."""
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    try:
+        importlib.import_module(f"wearcap.cli.{verb}").main(arguments)
+        return 0
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # `wearcap … | head`: the reader left
+        sys.stderr.close()
+        return 1
+    except (WearcapError, OSError) as error:
+        if debug:
+            traceback.print_exc()
+        print(f"wearcap {verb}: {explain(error)}", file=sys.stderr)
+        return USER_ERROR
+
+
+def explain(error: WearcapError | OSError) -> str:
+    """One message: a WearcapError's own, or what the operating system refused and where."""
+    if isinstance(error, WearcapError):
+        return str(error)
+    where = f"{error.filename}: " if error.filename else ""
+    if error.errno == errno.ENOSPC:
+        return f"{where}the disk is full. Free some space and run again."
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{where}no permission. Choose another folder."
+    return f"{where}{error.strerror or error}."
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The console command. Exits with 0, 2 (an error a user can mend) or 130 (interrupted)."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    verb = next((argument for argument in arguments if not argument.startswith("-")), None)
+    if arguments[:1] == ["--version"]:
+        print(f"wearcap {__version__}")
+    elif verb is None or arguments[0] in ("--help", "-h"):
+        print(usage())
+        sys.exit(0 if arguments else USER_ERROR)
+    elif verb not in available():
+        from wearcap.cli.conf import nearest
+
+        print(f"wearcap: no verb {verb!r}. {nearest(verb, available())}", file=sys.stderr)
+        sys.exit(USER_ERROR)
+    else:
+        place = arguments.index(verb)
+        sys.exit(run_verb(verb, arguments[:place] + arguments[place + 1 :]))
+
+
+if __name__ == "__main__":
+    main()
