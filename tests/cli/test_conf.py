@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+
 from wearcap.cli import conf
 from wearcap.errors import WearcapError
 
@@ -62,11 +63,13 @@ def test_compose_applies_overrides():
 )
 @pytest.mark.parametrize("through", ["compose", "hydra_main", "multirun"])
 def test_a_typo_names_the_nearest_valid_word(override, named, through):
+    run = {
+        "compose": lambda: conf.compose("train", [override]),
+        "hydra_main": lambda: conf.hydra_main("train", record, [override]),
+        "multirun": lambda: conf.hydra_main("train", record, [override, "-m"]),
+    }
     with pytest.raises(WearcapError) as caught:
-        if through == "compose":
-            conf.compose("train", [override])
-        else:
-            conf.hydra_main("train", record, [override, *(["-m"] if through == "multirun" else [])])
+        run[through]()
     assert "Did you mean" in str(caught.value)
     assert named in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -98,9 +101,7 @@ def test_multirun_visits_every_combination(small_conf):
 @pytest.mark.slow
 def test_multirun_through_the_joblib_launcher(small_conf):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    conf.hydra_main(
-        "train", record, ["-m", "seed=1,2", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
-    )
+    conf.hydra_main("train", record, ["-m", "seed=1,2", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"])
     assert len(list(small_conf.glob("sweep/*/seen.json"))) == 2
 
 

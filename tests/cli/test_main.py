@@ -5,6 +5,7 @@ import sys
 import types
 
 import pytest
+
 from wearcap.cli import main as cli
 from wearcap.errors import WearcapError
 

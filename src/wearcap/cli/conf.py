@@ -149,7 +149,9 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
         key = re.search(r"Missing mandatory value: (\S+)", str(error))
         key = key.group(1) if key else str(error.full_key or "")
         return WearcapError(f"{key} has no value", fix=f"Give it on the command line: {key}=…")
-    key = re.search(r"(?:Could not override|Could not delete from config\.|Could not append) '([^']+)'", str(error))
+    key = re.search(
+        r"(?:Could not override|Could not delete from config\.|Could not append) '([^']+)'", str(error)
+    )
     key = key or re.search(r"key '?([\w./@-]+)'? (?:is not in|not found)", str(error), re.IGNORECASE)
     if key is None and not isinstance(error, ConfigCompositionException):
         return WearcapError(str(error).strip().splitlines()[0], where=f"config {config_name!r}",
