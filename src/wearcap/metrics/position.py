@@ -1,0 +1,74 @@
+"""How far captured joints and rotations are from the true ones. Pure functions on tensors."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.geometry.rotation import geodesic
+
+CM_PER_M = 100.0
+
+
+def joint_error_cm(
+    joints: Float[Tensor, "*batch joint 3"], joints_true: Float[Tensor, "*batch joint 3"]
+) -> Float[Tensor, "*batch joint"]:
+    """Distance (cm) of every joint (m) from its true position, without any alignment."""
+    return (joints - joints_true).norm(dim=-1) * CM_PER_M
+
+
+def mpjpe_cm(
+    joints: Float[Tensor, "*batch joint 3"], joints_true: Float[Tensor, "*batch joint 3"]
+) -> Float[Tensor, ""]:
+    """Mean per joint position error (cm): the mean over frames and joints of the joint errors.
+
+    Systems driven by the head are compared with the body hung from the true head (thesis §6.4); whoever
+    calls does that first.
+    """
+    return joint_error_cm(joints, joints_true).mean()
+
+
+def body_parts(skeleton: Skeleton) -> dict[str, list[int]]:
+    """Joints of the parts whose errors the tables name.
+
+    hand: both wrists. lower: hips, knees, ankles, toes. upper: every joint above the pelvis, so all but the
+    pelvis and the lower ones. Raises WearcapError when the skeleton lacks one of the named joints.
+    """
+    sides = ("left", "right")
+    hand = [skeleton.index(f"{side}_wrist") for side in sides]
+    lower = [skeleton.index(f"{side}_{name}") for side in sides for name in ("hip", "knee", "ankle", "toe")]
+    upper = [joint for joint in range(1, len(skeleton)) if joint not in lower]
+    return {"hand": hand, "lower": lower, "upper": upper}
+
+
+def mpjve_cm_s(
+    joints: Float[Tensor, "time joint 3"], joints_true: Float[Tensor, "time joint 3"], fps: float
+) -> Float[Tensor, ""]:
+    """Mean per joint velocity error (cm/s): the mean over frames and joints of the length of the difference
+    between captured and true velocity, both from successive frames. NaN for fewer than two frames."""
+    return (joints - joints_true).diff(dim=0).norm(dim=-1).mean() * (fps * CM_PER_M)
+
+
+def error_percentile_cm(
+    joints: Float[Tensor, "time joint 3"], joints_true: Float[Tensor, "time joint 3"], percent: float = 95.0
+) -> Float[Tensor, ""]:
+    """Percentile over one sequence's frames of the frame's mean joint error (cm).
+
+    Thesis §6.4.4 takes it within each sequence and averages over sequences, so that hard sequences do not
+    alone decide the tail. Linear interpolation between frames.
+    """
+    return torch.quantile(joint_error_cm(joints, joints_true).mean(-1), percent / 100.0)
+
+
+def root_error_cm(
+    t_world_root: Float[Tensor, "time 3"], t_world_root_true: Float[Tensor, "time 3"]
+) -> Float[Tensor, ""]:
+    """Mean distance (cm) between captured and true root."""
+    return (t_world_root - t_world_root_true).norm(dim=-1).mean() * CM_PER_M
+
+
+def rotation_error_deg(
+    R: Float[Tensor, "*batch joint 3 3"], R_true: Float[Tensor, "*batch joint 3 3"]
+) -> Float[Tensor, ""]:
+    """Mean geodesic distance (degrees) between rotations over frames and joints (MPJRE of local rotations)."""
+    return geodesic(R, R_true).mean().rad2deg()

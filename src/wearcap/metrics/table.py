@@ -1,0 +1,216 @@
+"""Scores of one motion, their mean over recordings and spread over seeds, and the tables that show them."""
+
+import json
+import math
+from collections import defaultdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool
+from rich.table import Table
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.errors import WearcapError
+from wearcap.files import write_text
+from wearcap.geometry.rigid import Rigid
+from wearcap.metrics import physics, position
+from wearcap.recording.motion import Motion
+
+PER_SEQUENCE = ("p95_cm",)
+"""Metrics that the thesis averages over sequences; all others over frames."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Scores of one recording captured with one seed."""
+
+    recording: str
+    seed: int
+    frames: int
+    scores: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Mean and sample standard deviation over seeds (None for a single seed)."""
+
+    mean: float
+    std: float | None
+    seeds: int
+
+    def __str__(self) -> str:
+        return f"{self.mean:.2f}" if self.std is None else f"{self.mean:.2f} ± {self.std:.2f}"
+
+
+def evaluate_motion(
+    prediction: Motion, truth: Motion, contact: Bool[Tensor, "time patch"] | None = None
+) -> dict[str, float]:
+    """All metrics of one captured motion against the truth, by name with unit.
+
+    contact: true contact of `FOOT_PATCHES` at the truth's frames; without it, it is judged from the true
+    motion (`contact_from_motion`). Raises WearcapError unless both motions have the same joints and
+    timestamps and finite values.
+    """
+    _require_comparable(prediction, truth)
+    if contact is not None and len(contact) != len(truth):
+        raise WearcapError(f"{len(contact)} frames of contact for {len(truth)} frames of motion",
+                           expected="true contact at the truth's frames")  # fmt: skip
+    fps = truth.fps
+    pose, pose_true = _double_pose(prediction), _double_pose(truth)
+    joints, joints_true = pose.t, pose_true.t
+    floor = physics.local_floor(joints_true, fps)
+    points = physics.foot_points(prediction.skeleton, pose)
+    if contact is None:
+        points_true = physics.foot_points(truth.skeleton, pose_true)
+        touching = physics.contact_from_motion(points_true, floor, fps)
+    else:
+        touching = physics.foot_contact(contact)
+    jitter, jitter_true = physics.jitter_m_s3(joints, fps), physics.jitter_m_s3(joints_true, fps)
+    parts = {
+        f"{part}_pe_cm": position.mpjpe_cm(joints[:, indices], joints_true[:, indices])
+        for part, indices in position.body_parts(truth.skeleton).items()
+    }
+    scores = {
+        "mpjpe_cm": position.mpjpe_cm(joints, joints_true),
+        **parts,
+        "p95_cm": position.error_percentile_cm(joints, joints_true),
+        "root_cm": position.root_error_cm(joints[:, 0], joints_true[:, 0]),
+        "mpjve_cm_s": position.mpjve_cm_s(joints, joints_true, fps),
+        "rotation_deg": position.rotation_error_deg(prediction.R_parent_joint, truth.R_parent_joint),
+        "jitter_m_s3": jitter,
+        "jitter_ratio": jitter / jitter_true,
+        "foot_skate_cm_s": physics.foot_skate_cm_s(points, touching, fps),
+        "physicality": physics.physicality(joints[:, 0], physics.foot_joints(truth.skeleton, pose), fps),
+        "truth_physicality": physics.physicality(
+            joints_true[:, 0], physics.foot_joints(truth.skeleton, pose_true), fps
+        ),
+        "floor_penetration_cm": physics.floor_penetration_cm(joints, floor),
+    }
+    return {name: float(value) for name, value in scores.items()}
+
+
+def _double_pose(motion: Motion) -> Rigid:
+    """Joint poses in float64: in float32, metres away from the origin, rounding alone is jitter of 1 m/s³."""
+    return forward_kinematics(motion.skeleton, motion.R_parent_joint.double(), motion.t_world_root.double())
+
+
+def _require_comparable(prediction: Motion, truth: Motion) -> None:
+    if prediction.skeleton.joint_names != truth.skeleton.joint_names:
+        raise WearcapError(
+            f"captured on skeleton {prediction.skeleton.name!r}, true on {truth.skeleton.name!r}",
+            expected="the same joints", fix="Retarget one of them first.",
+        )  # fmt: skip
+    if len(truth) < 2:
+        raise WearcapError(
+            f"a motion of {len(truth)} frames cannot be scored", expected="at least two frames"
+        )
+    same_clock = len(prediction) == len(truth) and torch.allclose(
+        prediction.timestamps, truth.timestamps, rtol=0.0, atol=1e-6
+    )
+    if not same_clock:
+        raise WearcapError(
+            f"captured motion has {len(prediction)} frames from {_span(prediction)}, the truth {len(truth)} from "
+            f"{_span(truth)}", expected="the same timestamps", fix="Resample the captured motion first.",
+        )  # fmt: skip
+    for name, motion in (("captured", prediction), ("true", truth)):
+        finite = motion.R_parent_joint.isfinite().all((1, 2, 3)) & motion.t_world_root.isfinite().all(1)
+        if not finite.all():
+            first = int((~finite).nonzero()[0])
+            raise WearcapError(f"the {name} motion is not finite at frame {first}", expected="finite poses")
+
+
+def _span(motion: Motion) -> str:
+    if not len(motion):
+        return "no time"
+    return f"{motion.timestamps[0].item():.3f} to {motion.timestamps[-1].item():.3f} s"
+
+
+def aggregate(rows: list[Row]) -> dict[str, Summary]:
+    """Mean over recordings within each seed, weighted by frames (`PER_SEQUENCE`: equally), then mean and
+    spread over seeds. A score that is NaN (no contact, too few frames) is left out of its mean.
+
+    Raises WearcapError when the seeds did not see the same recordings, once each.
+    """
+    by_seed: dict[int, dict[str, Row]] = defaultdict(dict)
+    for row in rows:
+        if row.recording in by_seed[row.seed]:
+            raise WearcapError(f"recording {row.recording!r} is scored twice for seed {row.seed}")
+        by_seed[row.seed][row.recording] = row
+    seen = {frozenset(recordings) for recordings in by_seed.values()}
+    if len(seen) != 1:
+        raise WearcapError(
+            "the seeds were not scored on the same recordings" if seen else "nothing was scored"
+        )
+    names = list(rows[0].scores)
+    per_seed = {
+        name: [_weighted_mean(name, list(recordings.values())) for recordings in by_seed.values()]
+        for name in names
+    }
+    return {name: _summary(values) for name, values in per_seed.items()}
+
+
+def _weighted_mean(name: str, rows: list[Row]) -> float:
+    known = [(row.scores[name], 1 if name in PER_SEQUENCE else row.frames) for row in rows]
+    known = [(score, weight) for score, weight in known if not math.isnan(score)]
+    total = sum(weight for _, weight in known)
+    return sum(score * weight for score, weight in known) / total if total else math.nan
+
+
+def _summary(values: list[float]) -> Summary:
+    mean = sum(values) / len(values)
+    if len(values) == 1:
+        return Summary(mean, None, 1)
+    spread = math.sqrt(sum((value - mean) ** 2 for value in values) / (len(values) - 1))
+    return Summary(mean, spread, len(values))
+
+
+Scores = dict[str, dict[str, Summary]]
+"""Summaries by method ("ours", "mean pose" …) and metric."""
+
+
+def _grid(methods: Scores, metrics: tuple[str, ...] | None) -> tuple[list[str], list[list[str]]]:
+    columns = list(metrics or next(iter(methods.values())))
+    rows = [
+        [method, *(str(scores[metric]) if metric in scores else "–" for metric in columns)]
+        for method, scores in methods.items()
+    ]
+    return ["method", *columns], rows
+
+
+def markdown_table(methods: Scores, metrics: tuple[str, ...] | None = None) -> str:
+    """A table in Markdown: one line per method, one column per metric (all of the first method's by default)."""
+    header, rows = _grid(methods, metrics)
+    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def rich_table(title: str, methods: Scores, metrics: tuple[str, ...] | None = None) -> Table:
+    """The same table for a terminal."""
+    header, rows = _grid(methods, metrics)
+    table = Table(title=title)
+    for name in header:
+        table.add_column(name, justify="left" if name == "method" else "right")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def write_scores(
+    path: str | Path, methods: Scores, about: dict[str, str | int | float] | None = None
+) -> None:
+    """Write a table as JSON, atomically: {"about", "methods": {method: {metric: {mean, std, seeds}}}}; what is
+    not finite becomes null."""
+    tree = {
+        method: {
+            metric: {key: None if _undefined(value) else value for key, value in asdict(summary).items()}
+            for metric, summary in scores.items()
+        }
+        for method, scores in methods.items()
+    }
+    write_text(path, json.dumps({"about": about or {}, "methods": tree}, indent=1, allow_nan=False) + "\n")
+
+
+def _undefined(value: float | int | None) -> bool:
+    return value is None or not math.isfinite(value)
