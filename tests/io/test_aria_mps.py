@@ -1,0 +1,208 @@
+import gzip
+import lzma
+
+import numpy as np
+import pytest
+import torch
+
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.io.aria_mps import (
+    R_CPF_DEVICE,
+    head_stream,
+    nominal_T_aria_cpf,
+    read_closed_loop,
+    read_mps,
+    read_points,
+    turn_up,
+)
+
+HEADER = (
+    "graph_uid,tracking_timestamp_us,utc_timestamp_ns,tx_world_device,ty_world_device,tz_world_device,"
+    "qx_world_device,qy_world_device,qz_world_device,qw_world_device,device_linear_velocity_x_device,"
+    "device_linear_velocity_y_device,device_linear_velocity_z_device,angular_velocity_x_device,"
+    "angular_velocity_y_device,angular_velocity_z_device,gravity_x_world,gravity_y_world,gravity_z_world,quality_score"
+)
+
+
+def rows(n=50, **changes):
+    """CSV rows of a wearer who walks along +x at 1 m/s, head level, 100 Hz."""
+    T_world_aria = (nominal_T_aria_cpf() @ Rigid(R_CPF_DEVICE, torch.zeros(3))).inverse()
+    w, x, y, z = rotation.quat_wxyz_from_matrix(T_world_aria.R).tolist()
+    table = []
+    for i in range(n):
+        row = dict(
+            zip(
+                HEADER.split(","),
+                [
+                    "g",
+                    10_000_000 + 10_000 * i,
+                    -1,
+                    0.01 * i,
+                    0,
+                    1.6,
+                    x,
+                    y,
+                    z,
+                    w,
+                    0,
+                    0,
+                    0,
+                    0,
+                    0,
+                    0,
+                    0,
+                    0,
+                    -9.81,
+                    1.0,
+                ],
+            )
+        )
+        row |= {key: value(i) if callable(value) else value for key, value in changes.items()}
+        table.append(row)
+    return table
+
+
+def write(path, table, opener=open):
+    with opener(path, "wt") as file:
+        file.write(",".join(table[0]) + "\n")
+        file.writelines(",".join(str(v) for v in row.values()) + "\n" for row in table)
+    return path
+
+
+def test_level_head_faces_along_its_walk(tmp_path):
+    head = head_stream(read_closed_loop(write(tmp_path / "t.csv", rows())).T_world_aria, fps=60.0)
+    assert head.R_world_device == pytest.approx(torch.eye(3).expand(len(head.timestamps), 3, 3), abs=1e-5)
+    assert head.timestamps.diff() == pytest.approx(
+        torch.full((len(head.timestamps) - 1,), 1 / 60, dtype=torch.float64)
+    )
+    assert head.timestamps[0].item() == 10.0
+    speed = (head.t_world_device[-1] - head.t_world_device[0]) / (head.timestamps[-1] - head.timestamps[0])
+    assert speed.tolist() == pytest.approx([1.0, 0.0, 0.0], abs=1e-4)
+
+
+@pytest.mark.parametrize(("suffix", "opener"), [("", open), (".gz", gzip.open), (".xz", lzma.open)])
+def test_compression_changes_nothing(tmp_path, suffix, opener):
+    plain = read_closed_loop(write(tmp_path / "plain.csv", rows()))
+    packed = read_closed_loop(write(tmp_path / f"packed.csv{suffix}", rows(), opener))
+    assert torch.equal(plain.T_world_aria.t_world_body, packed.T_world_aria.t_world_body)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tx_world_device": "nan"}, "row 1: pose is NaN"),
+        ({"quality_score": "inf"}, "quality_score is NaN or infinite"),
+        ({"tracking_timestamp_us": lambda i: 1000 * (20 - i)}, "timestamps that rise"),
+        ({"tracking_timestamp_us": 7}, "timestamps that rise"),
+        ({"qw_world_device": 3.0}, "unit quaternions"),
+        ({"gravity_z_world": 9.81}, "-z is up"),
+        ({"gravity_y_world": -9.81, "gravity_z_world": 0}, "up='y'"),
+        ({"gravity_z_world": -981}, "m/s² long"),
+        ({"graph_uid": lambda i: f"g{i // 30}"}, "2 unconnected world frames"),
+        ({"ty_world_device": "left"}, "not a table of numbers"),
+    ],
+)
+def test_defects_are_named(tmp_path, changes, message):
+    path = write(tmp_path / "t.csv", rows(**changes))
+    with pytest.raises(WearcapError, match=message.replace("+", r"\+")) as error:
+        read_closed_loop(path)
+    assert str(path) in str(error.value)
+
+
+def test_missing_column_names_the_nearest(tmp_path):
+    table = [
+        {("tz_world_devcie" if k == "tz_world_device" else k): v for k, v in row.items()} for row in rows()
+    ]
+    with pytest.raises(WearcapError, match=r"no column 'tz_world_device'.*'tz_world_devcie'"):
+        read_closed_loop(write(tmp_path / "t.csv", table))
+
+
+def test_hostile_files(tmp_path):
+    (tmp_path / "empty.csv").write_text("")
+    (tmp_path / "header.csv").write_text(HEADER + "\n")
+    (tmp_path / "binary.csv").write_bytes(bytes(range(128, 256)) * 40)
+    whole = write(tmp_path / "whole.csv.gz", rows(2000), gzip.open).read_bytes()
+    (tmp_path / "cut.csv.gz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "false.csv.xz").write_bytes(b"no xz at all")
+    expected = {"empty.csv": "empty", "header.csv": "no rows", "binary.csv": "not a text file",
+                "cut.csv.gz": "cut short", "false.csv.xz": "damaged", "absent.csv": "no such file"}  # fmt: skip
+    for name, message in expected.items():
+        with pytest.raises(WearcapError, match=message):
+            read_closed_loop(tmp_path / name)
+
+
+def test_y_up_world_is_turned(tmp_path):
+    table = rows(gravity_y_world=-9.81, gravity_z_world=0, ty_world_device=1.6, tz_world_device=0.25)
+    read = read_closed_loop(write(tmp_path / "t.csv", table), up="y")
+    assert read.T_world_aria.t_world_body[0].tolist() == pytest.approx([0.0, -0.25, 1.6], abs=1e-6)
+    assert torch.linalg.det(turn_up("y")) == pytest.approx(1.0)
+
+
+def test_points_are_kept_by_their_certainty(tmp_path):
+    header = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std\n"
+    lines = [
+        "1,g,1,2,3,0.001,0.002",
+        "2,g,4,5,6,0.006,0.002",
+        "3,g,7,8,9,0.001,0.02",
+        "4,g,0,1,2,0.004,0.009",
+    ]
+    (tmp_path / "p.csv").write_text(header + "\n".join(lines) + "\n")
+    cloud = read_points(tmp_path / "p.csv")
+    assert cloud.points_world.tolist() == [[1, 2, 3], [0, 1, 2]]
+    assert cloud.confidence is not None
+    assert cloud.confidence.tolist() == pytest.approx([0.8, 0.2], abs=1e-6)
+
+
+def test_folder_without_trajectory(tmp_path):
+    with pytest.raises(WearcapError, match=r"no closed_loop_trajectory\.csv"):
+        read_mps(tmp_path)
+
+
+def test_subfolder_slam_is_found(tmp_path):
+    (tmp_path / "slam").mkdir()
+    write(tmp_path / "slam" / "closed_loop_trajectory.csv", rows())
+    recording = read_mps(tmp_path, fps=30.0)
+    assert recording.head is not None
+    assert len(recording.head.timestamps) == 15
+    assert recording.points is None
+
+
+@pytest.mark.real
+def test_real_recording_has_an_upright_head(real_data):
+    recording = read_mps(real_data / "aria_mps")
+    assert recording.head is not None
+    assert recording.points is not None
+    R, t = recording.head.R_world_device, recording.head.t_world_device
+    assert R[:, 2, 2].mean() > 0.95, "the head's z axis points up"
+    assert R[:, 2, 0].abs().mean() < 0.2, "its x axis is roughly level"
+    assert len(recording.head.timestamps) == 684, "11.38 s at 60 Hz"
+    assert t.diff(dim=0).norm(dim=-1).sum() == pytest.approx(7.67, abs=0.3), "MPS's own summary: 7.67 m"
+    assert len(recording.points.points_world) == 27231
+
+
+@pytest.mark.real
+def test_velocity_column_agrees_with_the_poses(real_data):
+    """The file's velocity is in device axes: turned to the world it is the path's derivative."""
+    read = read_closed_loop(real_data / "aria_mps" / "closed_loop_trajectory.csv.xz")
+    track = read.T_world_aria
+    vel_world = (track.R_world_body @ read.vel_aria[..., None])[..., 0]
+    step = 20
+    moved = (track.t_world_body[step:] - track.t_world_body[:-step]).double()
+    vel_path = moved / (track.timestamps[step:] - track.timestamps[:-step])[:, None]
+    assert (vel_path - vel_world[step // 2 : -step // 2]).norm(dim=-1).median() < 0.02
+
+
+@pytest.mark.real
+def test_nominal_head_axes_fit_a_calibrated_device(real_data):
+    """Real extrinsics: left and right SLAM cameras must look forward and to their own side of the head."""
+    import json
+
+    cameras = json.loads((real_data / "aria_adt_sample" / "extracted" / "meta.json").read_text())["cameras"]
+    R_device_aria = R_CPF_DEVICE.T @ nominal_T_aria_cpf().R.T
+    axis = {side: R_device_aria @ torch.tensor(np.array(cameras[f"camera-slam-{side}"]["T_device_camera"])[:3, 2]).float()
+            for side in ("left", "right")}  # fmt: skip
+    assert axis["left"] == pytest.approx(axis["right"] * torch.tensor([1.0, -1.0, 1.0]), abs=0.03)
+    assert axis["left"][0] > 0.75
+    assert axis["left"][1] > 0.55
