@@ -1,0 +1,57 @@
+# Two commands for a new user, `make demo` and `make test`; each makes .venv by itself, once.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.wearcap-installed
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-real lint format lock clean
+
+help:
+	@echo "make demo       prepare simulated data, train, evaluate, capture, export (about 10 minutes on 2 cores)"
+	@echo "make test       ruff, basedpyright, and every test that needs no GPU and no real recordings"
+	@echo "make test-real  the tests on real recordings (../shared/data, or WEARCAP_REAL_DATA)"
+	@echo "make format     let ruff mend what it can"
+	@echo "make lock       write requirements.lock from a clean environment"
+	@echo "make clean      remove $(VENV)"
+	@echo "PYTHON=python3.12 make demo  takes another interpreter (3.11 or 3.12)"
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' || { \
+	  echo "wearcap needs Python 3.11 or 3.12, but '$(PYTHON)' is $$($(PYTHON) --version 2>&1). Try: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { \
+	  echo "Python's venv is missing (Debian: apt install python3-venv)." >&2; rm -rf $(VENV); exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev]'
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/wearcap demo
+
+test: lint
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not real and not gpu" -n 2
+
+test-real: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "real and not gpu" -n 2
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+lock:
+	rm -rf $(VENV)-lock
+	$(PYTHON) -m venv $(VENV)-lock
+	$(VENV)-lock/bin/python -m pip install --quiet -e '.[dev]' torch==2.13.0
+	{ sed -n '/^#/p' requirements.lock; $(VENV)-lock/bin/python -m pip freeze --exclude-editable \
+	  | grep -v -E '^(nvidia-|triton|cuda-)' | sed 's/+cpu$$//' | sort -f; } > requirements.lock.new
+	mv requirements.lock.new requirements.lock
+	rm -rf $(VENV)-lock
+
+clean:
+	rm -rf $(VENV)
