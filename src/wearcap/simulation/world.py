@@ -6,7 +6,7 @@ A builder (`flat.build_flat`, `outdoor.build_outdoor`) fills the lists; walking 
 needs no change there.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,8 @@ from jaxtyping import Float, Int
 
 from wearcap.geometry.mesh import Mesh
 from wearcap.simulation.navigation import NavigationGrid
+from wearcap.simulation.outline import points_in_convex
+from wearcap.simulation.paths import plan_path
 
 STEP_UP_M = 0.35
 """A foot finds no floor higher than this above where it was."""
@@ -149,6 +151,8 @@ class World:
     name: str
     mesh: Mesh
     face_object: Int[np.ndarray, "face"]
+    face_texture: Float[np.ndarray, "face"]
+    """Visual features per m² of each face: near 0 on blank walls, hundreds on book spines."""
     objects: tuple[WorldObject, ...]
     surfaces: tuple[Surface, ...]
     seats: tuple[Seat, ...] = ()
@@ -158,7 +162,6 @@ class World:
     doors: tuple[Door, ...] = ()
     cell: float = 0.1
     """Side of a cell of the planning grid (m)."""
-    attributes: dict[str, float] = field(default_factory=dict)
 
     def floor_height(
         self, points_xy: Float[np.ndarray, "*batch 2"], near_z: Float[np.ndarray, "*batch"]
@@ -193,24 +196,14 @@ class World:
         off obstacles, except on the last steps to a start or goal that is nearer to one itself (a seat).
         `rng` varies how far from walls this walk likes to be. None when no way leads there.
         """
-        return self.navigation.plan(start, goal, rng, self.flights)
+        path = plan_path(self.navigation, self.flights, start, goal, rng)
+        if path is not None:
+            floor = self.floor_height(path[:, :2], path[:, 2])
+            path[:, 2] = np.where(np.isnan(floor), path[:, 2], floor)
+        return path
 
     def sample_floor(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "count 3"]:
         """Random floor points (m) in the largest connected walkable part."""
-        return self.navigation.sample(rng, count)
-
-
-def points_in_convex(
-    points_xy: Float[np.ndarray, "point 2"], polygon: Float[np.ndarray, "corner 2"]
-) -> np.ndarray:
-    """Whether points lie in a convex counter-clockwise polygon, its border included: bool "point"."""
-    low, high = polygon.min(0) - 1e-9, polygon.max(0) + 1e-9
-    x, y = points_xy[:, 0], points_xy[:, 1]
-    inside = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
-    candidates = np.nonzero(inside)[0]
-    x, y = x[candidates], y[candidates]
-    for start, end in zip(polygon, np.roll(polygon, -1, axis=0)):
-        edge = end - start
-        cross = edge[0] * (y - start[1]) - edge[1] * (x - start[0])
-        inside[candidates[cross < -1e-9]] = False
-    return inside
+        points = self.navigation.sample(rng, count)
+        points[:, 2] = self.floor_height(points[:, :2], points[:, 2])
+        return points
