@@ -124,6 +124,10 @@ class Skeleton:
         lowest = min(p[2].item() for p in (*self.rest_joints, *self.rest_sites.values()))
         return -lowest
 
+    def height_of(self, joint: str) -> float:
+        """Height of a joint above the floor in the rest pose (m)."""
+        return self.rest_joints[self.index(joint), 2].item() + self.root_height
+
     def with_offsets(self, t_parent_joint: Float[Tensor, "joint 3"]) -> "Skeleton":
         """The same tree with other bone offsets; sites scale with their joint's own or parent bone."""
         old = self.t_parent_joint.norm(dim=-1).sum()

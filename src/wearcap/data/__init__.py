@@ -1,0 +1,1 @@
+"""Windows, features, DataModules, and the preparation of data sets."""

@@ -1,0 +1,1 @@
+"""LightningModules, loss terms, callbacks, checkpoints."""

@@ -1,0 +1,42 @@
+"""Strided sampling of whole windows, with frames that are already known held fixed."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.diffusion.process import posterior_step
+from wearcap.diffusion.schedule import Schedule
+
+Denoise = Callable[
+    [Float[Tensor, "batch time feature"], Float[Tensor, "batch 1"]], Float[Tensor, "batch time feature"]
+]
+"""x̂0 from x_t and its level."""
+
+
+def sample(
+    denoise: Denoise,
+    noise: Float[Tensor, "draw batch time feature"],
+    schedule: Schedule,
+    *,
+    eta: float = 1.0,
+    known: Float[Tensor, "batch time feature"] | None = None,
+    is_known: Bool[Tensor, "batch time"] | None = None,
+) -> Float[Tensor, "batch time feature"]:
+    """Draw x0 in `draw` evenly strided steps from level 1 to 0; noise[0] is the start, the rest the steps' noise.
+
+    Where `is_known`, every x̂0 is overwritten by `known` (autoregressive inpainting, thesis eq. 6.5).
+    The same noise gives the same sample, so windows of several wearers can share a batch.
+    """
+    steps = len(noise)
+    levels = torch.linspace(1, 0, steps + 1, dtype=noise.dtype, device=noise.device)
+    x = noise[0]
+    for step in range(steps):
+        level, level_next = (levels[step + i].expand(x.shape[0], 1) for i in (0, 1))
+        x0_hat = denoise(x, level)
+        if known is not None and is_known is not None:
+            x0_hat = torch.where(is_known[..., None], known, x0_hat)
+        fresh = noise[step + 1] if step + 1 < steps else torch.zeros_like(x)
+        x = posterior_step(x, x0_hat, level, level_next, fresh, schedule, eta)
+    return x

@@ -1,0 +1,85 @@
+"""Blocks shared by the transformers: rotary attention, adaptive layer norm, level embedding."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+class LevelEmbedding(nn.Module):
+    """Sinusoids of a noise level in [0, 1], then a two-layer MLP."""
+
+    frequencies: Tensor
+
+    def __init__(self, width: int, sinusoids: int = 128):
+        super().__init__()
+        scale = torch.exp(torch.linspace(0, math.log(1000.0), sinusoids // 2))
+        self.register_buffer("frequencies", scale, persistent=False)
+        self.mlp = nn.Sequential(nn.Linear(sinusoids, width), nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, level: Float[Tensor, "batch #token"]) -> Float[Tensor, "batch #token width"]:
+        angle = level[..., None] * self.frequencies
+        return self.mlp(torch.cat([angle.sin(), angle.cos()], -1))
+
+
+class RotaryAttention(nn.Module):
+    """Multi-head self-attention with rotary positions (Su et al. 2021), fused by PyTorch."""
+
+    cos: Tensor
+    sin: Tensor
+
+    def __init__(self, width: int, heads: int, max_tokens: int, dropout: float = 0.0):
+        super().__init__()
+        if width % (2 * heads):
+            raise ValueError(f"width {width} must be a multiple of twice the number of heads ({heads})")
+        self.heads, self.dropout = heads, dropout
+        self.qkv = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        half = width // heads // 2
+        angle = torch.outer(torch.arange(max_tokens), 10000.0 ** (-torch.arange(half) / half))
+        self.register_buffer("cos", angle.cos(), persistent=False)
+        self.register_buffer("sin", angle.sin(), persistent=False)
+
+    def _rotate(self, x: Float[Tensor, "batch head token depth"]) -> Float[Tensor, "batch head token depth"]:
+        first, second = x.chunk(2, -1)
+        cos, sin = self.cos[: x.shape[-2]].to(x.dtype), self.sin[: x.shape[-2]].to(x.dtype)
+        return torch.cat([first * cos - second * sin, first * sin + second * cos], -1)
+
+    def forward(
+        self, x: Float[Tensor, "batch token width"], valid: Bool[Tensor, "batch token"]
+    ) -> Float[Tensor, "batch token width"]:
+        batch, tokens, width = x.shape
+        q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
+        dropout = self.dropout if self.training else 0.0
+        # A row with nothing to attend to would be NaN: padding may always see itself.
+        mask = valid[:, None, None, :] | torch.eye(tokens, dtype=torch.bool, device=x.device)
+        attended = F.scaled_dot_product_attention(self._rotate(q), self._rotate(k), v, mask, dropout)
+        return self.out(attended.transpose(1, 2).reshape(batch, tokens, width))
+
+
+class AdaptiveBlock(nn.Module):
+    """A DiT block (Peebles & Xie 2023): attention and MLP, each scaled, shifted and gated by the level."""
+
+    def __init__(self, width: int, heads: int, feedforward: int, max_tokens: int, dropout: float):
+        super().__init__()
+        self.norm_attention = nn.LayerNorm(width, elementwise_affine=False)
+        self.norm_mlp = nn.LayerNorm(width, elementwise_affine=False)
+        self.attention = RotaryAttention(width, heads, max_tokens, dropout)
+        self.mlp = nn.Sequential(
+            nn.Linear(width, feedforward), nn.GELU(), nn.Dropout(dropout), nn.Linear(feedforward, width)
+        )
+        self.modulation = nn.Linear(width, 6 * width)
+        nn.init.zeros_(self.modulation.weight)
+        nn.init.zeros_(self.modulation.bias)
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch token width"],
+        level: Float[Tensor, "batch #token width"],
+        valid: Bool[Tensor, "batch token"],
+    ) -> Float[Tensor, "batch token width"]:
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = self.modulation(F.silu(level)).chunk(6, -1)
+        x = x + gate_a * self.attention(self.norm_attention(x) * (1 + scale_a) + shift_a, valid)
+        return x + gate_m * self.mlp(self.norm_mlp(x) * (1 + scale_m) + shift_m)

@@ -1,0 +1,77 @@
+"""Callbacks: they watch a training run and never define what is measured."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch import Callback
+
+from wearcap.metrics.table import aggregate
+from wearcap.pipelines.evaluation import score
+from wearcap.pipelines.hmd2 import HMD2
+from wearcap.recording import Recording, RecordingStore
+from wearcap.training.motion_diffusion import MotionDiffusion
+from wearcap.viewer.picture import contact_sheet, save_png
+
+
+class CaptureValidation(Callback):
+    """Captures some validation recordings with the current weights: logs their metrics, draws them beside truth.
+
+    Stands before the weight averaging in the list of callbacks, so that it sees the averaged weights.
+    """
+
+    def __init__(
+        self,
+        pipeline: Callable[..., HMD2],
+        root: str,
+        folder: str,
+        recordings: int = 4,
+        max_seconds: float = 20.0,
+        every_n_epochs: int = 5,
+        picture: bool = True,
+    ):
+        self.pipeline, self.root, self.folder = pipeline, root, Path(folder)
+        self.recordings, self.max_seconds, self.every_n_epochs = recordings, max_seconds, every_n_epochs
+        self.picture = picture
+
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: MotionDiffusion) -> None:
+        last = trainer.max_steps > 0 and trainer.global_step >= trainer.max_steps
+        due = last or (trainer.current_epoch + 1) % self.every_n_epochs == 0
+        if trainer.sanity_checking or not trainer.is_global_zero or not due:
+            return
+        pipeline = self.pipeline(
+            net=pl_module.net, features=pl_module.features, schedule=pl_module.schedule,
+            skeleton=pl_module.skeleton, fps=pl_module.fps, device=str(pl_module.device),
+        )  # fmt: skip
+        recordings = self._recordings()
+        motions = pipeline.capture(recordings, [0] * len(recordings))
+        rows = [score(m, r, r.name, 0) for m, r in zip(motions, recordings)]
+        for key, summary in aggregate(rows).items():
+            pl_module.log(f"capture/{key}", summary.mean, rank_zero_only=True)
+        pl_module.net.train()
+        if self.picture:
+            path = self.folder / f"step_{trainer.global_step:06d}_{recordings[0].name}.png"
+            save_png(path, contact_sheet({"truth": recordings[0].motion, "capture": motions[0]}))
+
+    def _recordings(self) -> list[Recording]:
+        """Validation recordings spread over the list, cut to their first seconds: a look, not the evaluation."""
+        store = RecordingStore.open(self.root)
+        names = store.names("val")
+        chosen = names[:: max(1, len(names) // self.recordings)][: self.recordings]
+        return [first_seconds(store.load(name), self.max_seconds) for name in chosen]
+
+
+def first_seconds(recording: Recording, seconds: float) -> Recording:
+    """The beginning of a recording's head path, motion and contacts."""
+    assert recording.head is not None and recording.motion is not None
+    stop = int(torch.searchsorted(recording.head.timestamps, recording.head.timestamps[0] + seconds))
+    head, contacts = recording.head, recording.contacts
+    head = replace(
+        head, timestamps=head.timestamps[:stop], R_world_device=head.R_world_device[:stop],
+        t_world_device=head.t_world_device[:stop],
+    )  # fmt: skip
+    if contacts is not None:
+        contacts = replace(contacts, timestamps=contacts.timestamps[:stop], contact=contacts.contact[:stop])
+    return replace(recording, head=head, motion=recording.motion.sliced(0, stop), contacts=contacts)

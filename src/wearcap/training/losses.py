@@ -1,0 +1,38 @@
+"""Loss terms: pure functions of predictions and truth, averaged over the frames that exist."""
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def masked_mean(value: Float[Tensor, "batch time"], valid: Bool[Tensor, "batch time"]) -> Float[Tensor, ""]:
+    """Mean over valid frames; zero when there are none."""
+    return (value * valid).sum() / valid.sum().clamp_min(1)
+
+
+def motion_mse(
+    prediction: Float[Tensor, "batch time motion"],
+    target: Float[Tensor, "batch time motion"],
+    valid: Bool[Tensor, "batch time"],
+) -> Float[Tensor, ""]:
+    """Squared error of x̂0 in normalised motion space (thesis eq. 6.4)."""
+    return masked_mean((prediction - target).square().mean(-1), valid)
+
+
+def joint_position(
+    prediction: Float[Tensor, "batch time joint 3"],
+    target: Float[Tensor, "batch time joint 3"],
+    valid: Bool[Tensor, "batch time"],
+) -> Float[Tensor, ""]:
+    """Squared distance of joints, both bodies hung from the same head (m²; ours)."""
+    return masked_mean((prediction - target).square().sum(-1).mean(-1), valid)
+
+
+def joint_velocity(
+    prediction: Float[Tensor, "batch time joint 3"],
+    target: Float[Tensor, "batch time joint 3"],
+    valid: Bool[Tensor, "batch time"],
+    fps: float,
+) -> Float[Tensor, ""]:
+    """Squared difference of joint velocities (m²/s²; ours)."""
+    error = (prediction - target).diff(dim=1) * fps
+    return masked_mean(error.square().sum(-1).mean(-1), valid[:, 1:])

@@ -1,0 +1,59 @@
+"""One training run: its folder, its resumption, its record of what made it."""
+
+import importlib.metadata
+import json
+import platform
+import subprocess
+from pathlib import Path
+
+import lightning
+import torch
+
+from wearcap.data.datamodule import MotionWindows
+from wearcap.errors import WearcapError
+from wearcap.files import write_text
+from wearcap.training.motion_diffusion import MotionDiffusion
+
+
+def fit(
+    system: MotionDiffusion, data: MotionWindows, trainer: lightning.Trainer, resume: Path | None = None
+) -> None:
+    """Train from scratch or go on from a checkpoint; a run that was killed repeats nothing and misses nothing."""
+    if resume is None:
+        system.set_statistics(data.dataset("train"))
+    trainer.fit(system, datamodule=data, ckpt_path=resume, weights_only=True)
+
+
+def resume_path(resume: str | None, runs: Path) -> Path | None:
+    """A checkpoint to go on from: none, a path, or with "auto" the newest `last.ckpt` below `runs`."""
+    if resume is None:
+        return None
+    if resume != "auto":
+        if not Path(resume).is_file():
+            raise WearcapError("no such checkpoint to resume from", where=resume)
+        return Path(resume)
+    found = sorted(runs.glob("**/last.ckpt"), key=lambda path: path.stat().st_mtime)
+    return found[-1] if found else None
+
+
+def record_run(folder: Path, config_yaml: str) -> None:
+    """Write the config, the git commit and the library versions into a run's folder."""
+    names = ("wearcap", "torch", "lightning", "numpy", "hydra-core", "numba", "anny")
+    record = {
+        "commit": _git_commit(),
+        "python": platform.python_version(),
+        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads, "
+        + (torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"),
+        "versions": {name: importlib.metadata.version(name) for name in names},
+    }
+    write_text(folder / "config.yaml", config_yaml)
+    write_text(folder / "run.json", json.dumps(record, indent=1) + "\n")
+
+
+def _git_commit() -> str:
+    here = Path(__file__).parent
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40"]
+    try:
+        return subprocess.run(command, cwd=here, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "not a git checkout"
