@@ -1,6 +1,21 @@
-"""Camera models: points in the camera's axes (OpenCV: x right, y down, z forward) to pixels and back."""
+"""Camera models: points in the camera's axes (OpenCV: x right, y down, z forward) to pixels and back.
 
-from dataclasses import dataclass
+Every model draws a point as `focal * lens(m) + centre`. The plane coordinates m are (x/z, y/z) for "pinhole" and
+"opencv", and the direction's angle θ from the optical axis along (x, y) for the fisheyes.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+
+_COEFFICIENTS = {"pinhole": (0,), "opencv": (4, 5), "fisheye": (4,), "fisheye624": (12,)}
 
 
 @dataclass(frozen=True)
@@ -8,7 +23,8 @@ class Camera:
     """Intrinsics of a camera; lengths in pixels, pixel centres at integers."""
 
     model: str
-    """"pinhole" (no distortion), "opencv" (k1 k2 p1 p2 [k3]) or "fisheye" (equidistant, k1…k4)."""
+    """"pinhole" (no distortion), "opencv" (k1 k2 p1 p2 [k3]), "fisheye" (equidistant, k1…k4) or "fisheye624"
+    (Project Aria: k0…k5, p0 p1, s0…s3)."""
     width: int
     height: int
     fx: float
@@ -16,3 +32,163 @@ class Camera:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
+
+    def __post_init__(self):
+        if self.model not in _COEFFICIENTS:
+            raise WearcapError(
+                f"no camera model {self.model!r}", expected=f"one of {', '.join(_COEFFICIENTS)}"
+            )
+        if len(self.distortion) not in _COEFFICIENTS[self.model]:
+            counts = " or ".join(map(str, _COEFFICIENTS[self.model]))
+            raise WearcapError(
+                f"camera model {self.model!r} with {len(self.distortion)} coefficients", expected=counts
+            )
+        if not (self.width > 0 and self.height > 0 and self.fx > 0 and self.fy > 0):
+            raise WearcapError(
+                f"camera of {self.width}x{self.height} pixels with focal lengths {self.fx}, {self.fy}",
+                expected="positive numbers",
+            )
+
+    @classmethod
+    def pinhole(cls, width: int, height: int, vertical_fov_deg: float) -> "Camera":
+        """A centred pinhole camera with square pixels."""
+        focal = height / 2 / math.tan(math.radians(vertical_fov_deg) / 2)
+        return cls("pinhole", width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+    @property
+    def is_fisheye(self) -> bool:
+        """True where the model draws angles, so that points beside and behind the lens may be seen."""
+        return self.model.startswith("fisheye")
+
+    def scaled(self, width: int, height: int) -> "Camera":
+        """The same camera after its image was resized to width x height pixels."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y,
+            cx=(self.cx + 0.5) * x - 0.5, cy=(self.cy + 0.5) * y - 0.5,
+        )  # fmt: skip
+
+    def project(
+        self, points_cam: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
+        """Pixels (x, y) of points, and where they are valid: before the lens, within its monotone range, in the image.
+
+        Differentiable in the points. Pixels that are not valid are finite, and mean nothing.
+        """
+        plane, seen = self._to_plane(points_cam)
+        distorted, _ = self._lens(plane)
+        pixels = distorted * plane.new_tensor([self.fx, self.fy]) + plane.new_tensor([self.cx, self.cy])
+        x, y = pixels.unbind(-1)
+        inside = (x >= -0.5) & (x < self.width - 0.5) & (y >= -0.5) & (y < self.height - 0.5)
+        return pixels, seen & inside
+
+    def unproject(self, pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+        """Unit rays of pixels in the camera's axes; NaN where the lens maps no direction there.
+
+        Newton's method on the lens; differentiable in the pixels (the derivative is the inverse lens's own).
+        """
+        target = (pixels - pixels.new_tensor([self.cx, self.cy])) / pixels.new_tensor([self.fx, self.fy])
+        plane = target
+        if self.model != "pinhole":
+            with torch.no_grad():
+                root, found = self._invert_lens(target.detach())
+                step = torch.linalg.inv(self._lens(root)[1])
+                rest = self._lens(root)[0]
+            plane = root + (step @ (target - rest)[..., None])[..., 0]
+            plane = torch.where(found[..., None], plane, torch.nan)
+        return self._from_plane(plane)
+
+    def _to_plane(self, points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
+        """Plane coordinates and which points the lens can see at all."""
+        xy, z = points[..., :2], points[..., 2]
+        if not self.is_fisheye:
+            ahead = z > 1e-6
+            plane = xy / torch.where(ahead, z, 1.0)[..., None]
+            return plane, ahead & ((plane**2).sum(-1) < self._fold)
+        square = (xy**2).sum(-1)
+        on_axis = square < 1e-18
+        radius = torch.where(on_axis, 1.0, square).sqrt()
+        theta = torch.atan2(radius, z)
+        scale = torch.where(on_axis, 1 / torch.where(z.abs() < 1e-9, 1.0, z), theta / radius)
+        behind = on_axis & (z <= 0)
+        return xy * scale[..., None], ~behind & (torch.where(on_axis, 0.0, theta) ** 2 < self._fold)
+
+    def _from_plane(self, plane: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+        if not self.is_fisheye:
+            ray = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
+            return torch.nn.functional.normalize(ray, dim=-1)
+        square = (plane**2).sum(-1, keepdim=True)
+        small = square < 1e-12
+        theta = torch.where(small, 1.0, square).sqrt()
+        sinc = torch.where(small, 1 - square / 6, theta.sin() / theta)
+        return torch.cat([plane * sinc, torch.where(small, 1 - square / 2, theta.cos())], -1)
+
+    def _lens(self, plane: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
+        """Distorted plane coordinates "*batch 2" and their Jacobian "*batch 2 2"."""
+        radial, (first, second), prism = self._terms
+        bent, d_bent = _radial(plane, radial)
+        if self.model == "opencv":  # the tangential term sees the undistorted point
+            shift, d_shift = _tangential(plane, (second, first))
+            return bent + shift, d_bent + d_shift
+        shift, d_shift = _tangential(bent, (first, second))
+        tilt, d_tilt = _thin_prism(bent, prism)
+        identity = torch.eye(2, dtype=plane.dtype, device=plane.device)
+        return bent + shift + tilt, (identity + d_shift + d_tilt) @ d_bent
+
+    @cached_property
+    def _terms(self) -> tuple[tuple[float, ...], tuple[float, float], tuple[float, ...]]:
+        """(radial coefficients, the two tangential ones as written in the file, thin-prism ones)."""
+        d = self.distortion
+        if self.model == "opencv":
+            return (*d[:2], *d[4:]), (d[2], d[3]), (0.0,) * 4
+        if self.model == "fisheye624":
+            return d[:6], (d[6], d[7]), d[8:]
+        return d, (0.0, 0.0), (0.0,) * 4
+
+    @cached_property
+    def _fold(self) -> float:
+        """Square of the largest undistorted radius (or angle) up to which the radial polynomial still rises."""
+        slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(self._terms[0]))]
+        roots = np.roots(slope[::-1])
+        rising = [root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0]
+        return min([math.pi**2 if self.is_fisheye else math.inf, *rising])
+
+    def _invert_lens(self, target: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
+        """Plane coordinates that the lens maps onto `target`, and where they were found."""
+        limit = min(0.999 * math.sqrt(self._fold), 1e3)
+        plane = target
+        for _ in range(25):
+            plane = plane * (limit / plane.norm(dim=-1, keepdim=True).clamp(min=limit))
+            value, jacobian = self._lens(plane)
+            plane = plane - torch.linalg.solve_ex(jacobian, value - target)[0]
+        tolerance = 1e4 * torch.finfo(target.dtype).eps
+        close = ((self._lens(plane)[0] - target).abs() < tolerance).all(-1)
+        found = close & ((plane**2).sum(-1) < self._fold)
+        return torch.where(found[..., None], plane, torch.zeros_like(plane)), found
+
+
+def _radial(m: Tensor, coefficients: tuple[float, ...]) -> tuple[Tensor, Tensor]:
+    """m (1 + k1 s + k2 s² + …), s = |m|², and its Jacobian."""
+    s = (m**2).sum(-1, keepdim=True)
+    gain, slope = torch.zeros_like(s), torch.zeros_like(s)
+    for k in reversed((1.0, *coefficients)):
+        slope = slope * s + gain
+        gain = gain * s + k
+    identity = torch.eye(2, dtype=m.dtype, device=m.device)
+    return m * gain, gain[..., None] * identity + 2 * slope[..., None] * m[..., :, None] * m[..., None, :]
+
+
+def _tangential(m: Tensor, coefficients: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """2 (q·m) m + |m|² q, and its Jacobian; OpenCV's q is (p2, p1)."""
+    q = m.new_tensor(coefficients)
+    along = (m * q).sum(-1, keepdim=True)
+    identity = torch.eye(2, dtype=m.dtype, device=m.device)
+    outer = m[..., :, None] * q + q[:, None] * m[..., None, :]
+    return 2 * along * m + (m**2).sum(-1, keepdim=True) * q, 2 * (outer + along[..., None] * identity)
+
+
+def _thin_prism(m: Tensor, coefficients: tuple[float, ...]) -> tuple[Tensor, Tensor]:
+    """(s0 s + s1 s², s2 s + s3 s²), s = |m|², and its Jacobian."""
+    s = (m**2).sum(-1, keepdim=True)
+    first, second = m.new_tensor(coefficients[0::2]), m.new_tensor(coefficients[1::2])
+    return first * s + second * s**2, (2 * first + 4 * second * s)[..., :, None] * m[..., None, :]

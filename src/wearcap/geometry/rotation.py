@@ -47,8 +47,11 @@ def quat_wxyz_from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
 
 
 def geodesic(R_a: Float[Tensor, "*batch 3 3"], R_b: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-    """Angle between two rotations (rad, 0…π); its gradient stays finite where they agree."""
-    return roma.rotmat_geodesic_distance(R_a, R_b)
+    """Angle between two rotations (rad, 0…π): precise, and its gradient finite, where they agree and at π too."""
+    turn = R_a.transpose(-1, -2) @ R_b
+    # sin and cos of the angle; acos or asin of one alone loses half the digits at one end
+    axis = torch.stack([turn[..., i, j] - turn[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
+    return torch.atan2(axis.norm(dim=-1), turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
 
 
 def about_axis(axis: str, angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
@@ -80,4 +83,4 @@ def wrap_angle(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 def mean_rotation(R: Float[Tensor, "sample 3 3"]) -> Float[Tensor, "3 3"]:
     """Chordal mean: the rotation nearest to the arithmetic mean of the matrices."""
-    return roma.special_procrustes(R.mean(0))
+    return roma.special_procrustes(R.mean(0))  # pyright: ignore[reportReturnType]

@@ -1,11 +1,14 @@
-"""Timed poses of one body: resampling, velocities, outliers, smoothing."""
+"""Timed poses of one body: resampling, velocities, outliers, gaps, smoothing."""
 
 from dataclasses import dataclass
 
+import roma
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 
 
@@ -24,6 +27,10 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.timestamps)
 
+    def __getitem__(self, index) -> "Trajectory":
+        """Frames by slice, index tensor or mask."""
+        return Trajectory(self.timestamps[index], self.R_world_body[index], self.t_world_body[index])
+
 
 def finite_difference(
     value: Float[Tensor, "time *rest"], timestamps: Float64[Tensor, "time"]
@@ -34,3 +41,171 @@ def finite_difference(
     dt = timestamps.diff().to(value.dtype).reshape(-1, *[1] * (value.ndim - 1))
     velocity = value.diff(dim=0) / dt
     return torch.cat([velocity[:1], velocity])
+
+
+def require_rising(timestamps: Float64[Tensor, "time"]) -> None:
+    """Raise WearcapError, naming the first bad frame, unless timestamps are finite and strictly rising."""
+    steps = timestamps.diff()
+    for bad, word in (
+        (~timestamps.isfinite(), "is not a number"),
+        (torch.cat([steps.new_ones(1), steps])[: len(timestamps)] == 0, "repeats the one before"),
+        (torch.cat([steps.new_ones(1), steps])[: len(timestamps)] < 0, "lies before its predecessor"),
+    ):
+        if bad.any():
+            frame = int(bad.nonzero()[0])
+            raise WearcapError(
+                f"the timestamp of frame {frame} ({timestamps[frame].item():.6f} s) {word}",
+                expected="strictly rising timestamps in seconds", fix="Sort the frames and drop duplicates.",
+            )  # fmt: skip
+
+
+def interpolate(
+    timestamps: Float64[Tensor, "time"],
+    value: Float[Tensor, "time *rest"],
+    at: Float64[Tensor, "new_time"],
+) -> Float[Tensor, "new_time *rest"]:
+    """Values at other times, linearly between frames. Times outside are refused as in `resample`."""
+    before, after, blend = _brackets(timestamps, at)
+    blend = blend.to(value.dtype).reshape(-1, *[1] * (value.ndim - 1))
+    return torch.lerp(value[before], value[after], blend)
+
+
+def resample(trajectory: Trajectory, timestamps: Float64[Tensor, "new_time"]) -> Trajectory:
+    """Poses at other times: linear in translation, slerp in rotation.
+
+    The end poses are held for up to one median frame step outside the trajectory; times further outside, and
+    timestamps that do not rise, raise WearcapError.
+    """
+    return _resampled(trajectory, timestamps, _brackets(trajectory.timestamps, timestamps))
+
+
+def _resampled(trajectory: Trajectory, timestamps: Tensor, brackets: tuple) -> Trajectory:
+    before, after, blend = brackets
+    R, t = trajectory.R_world_body, trajectory.t_world_body
+    blend = blend.to(t.dtype)[:, None]
+    turn = rotation.log(R[before].mT @ R[after])
+    return Trajectory(
+        timestamps, R[before] @ rotation.exp(blend * turn), torch.lerp(t[before], t[after], blend)
+    )
+
+
+def _brackets(timestamps: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Frames before and after each time, and how far between them it lies (0…1)."""
+    require_rising(timestamps)
+    if not len(timestamps):
+        raise WearcapError("nothing to resample", expected="at least one frame")
+    slack = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
+    outside = ~((at >= timestamps[0] - slack) & (at <= timestamps[-1] + slack))
+    if outside.any():
+        raise WearcapError(
+            f"{int(outside.sum())} of {len(at)} times, first {at[outside][0].item():.3f} s, lie outside the stream",
+            expected=f"times from {timestamps[0].item():.3f} s to {timestamps[-1].item():.3f} s",
+        )
+    return _clamped_brackets(timestamps, at)
+
+
+def _clamped_brackets(timestamps: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    after = torch.searchsorted(timestamps, at.contiguous(), right=True).clamp(max=len(timestamps) - 1)
+    before = (after - 1).clamp(min=0)
+    span = timestamps[after] - timestamps[before]
+    blend = (at - timestamps[before]) / torch.where(span > 0, span, 1.0)
+    return before, after, blend.clamp(0, 1)
+
+
+def linear_velocity(trajectory: Trajectory) -> Float[Tensor, "time 3"]:
+    """Velocity in the world (m/s) by central differences, one-sided at the ends (one frame: zero)."""
+    first, last, dt = _central(trajectory)
+    return (trajectory.t_world_body[last] - trajectory.t_world_body[first]) / dt
+
+
+def angular_velocity(trajectory: Trajectory) -> Float[Tensor, "time 3"]:
+    """Angular velocity in the world's axes (rad/s) by central differences; turns under π per two frames."""
+    first, last, dt = _central(trajectory)
+    R = trajectory.R_world_body
+    return rotation.log(R[last] @ R[first].mT) / dt
+
+
+def _central(trajectory: Trajectory) -> tuple[Tensor, Tensor, Tensor]:
+    require_rising(trajectory.timestamps)
+    frame = torch.arange(len(trajectory), device=trajectory.timestamps.device)
+    first, last = (frame - 1).clamp(min=0), (frame + 1).clamp(max=max(len(trajectory) - 1, 0))
+    span = trajectory.timestamps[last] - trajectory.timestamps[first]
+    return first, last, torch.where(span > 0, span, 1.0).to(trajectory.t_world_body.dtype)[:, None]
+
+
+def outlier_mask(trajectory: Trajectory, max_speed: float) -> Bool[Tensor, "time"]:
+    """Valid frames: no two neighbouring valid frames are further apart than `max_speed` (m/s) allows.
+
+    Where the speed is exceeded the track is cut; a piece not longer than the pieces beside it is dropped, its
+    neighbours are joined, and so on until no cut is left; then dropped frames that agree with their valid
+    neighbours come back (thesis §4, initialisation, 3 m/s). A block of wrong positions thus falls as a whole
+    and takes no good neighbour along. Frames with positions that are not finite are never valid.
+    """
+    require_rising(trajectory.timestamps)
+    position, time = trajectory.t_world_body.double(), trajectory.timestamps
+    finite = position.isfinite().all(-1)
+    kept = finite.nonzero()[:, 0]
+    while len(kept) > 1:
+        cut = position[kept].diff(dim=0).norm(dim=-1) > max_speed * time[kept].diff()
+        if not cut.any():
+            break
+        piece = torch.cat([cut.new_zeros(1), cut]).cumsum(0)
+        length = torch.bincount(piece)
+        wall = length.new_full((1,), len(kept) + 1)
+        left, right = torch.cat([wall, length[:-1]]), torch.cat([length[1:], wall])
+        dropped = ((length <= left) & (length <= right)).index_fill(0, length.argmax(), False)
+        kept = kept[~dropped[piece]]
+    valid = torch.zeros_like(finite)
+    valid[kept] = True
+    while len(back := _agreeing(position, time, valid, finite & ~valid, max_speed)):
+        valid[back] = True
+    return valid
+
+
+def _agreeing(position: Tensor, time: Tensor, valid: Tensor, candidate: Tensor, max_speed: float) -> Tensor:
+    """In each stretch between valid frames the first candidate that is near enough to both of them."""
+    kept, frame = valid.nonzero()[:, 0], candidate.nonzero()[:, 0]
+    if not len(kept):
+        return frame[:0]
+    stretch = torch.searchsorted(kept, frame)
+    near = torch.ones_like(frame, dtype=torch.bool)
+    for neighbour, exists in ((stretch - 1, stretch > 0), (stretch, stretch < len(kept))):
+        other = kept[neighbour.clamp(0, len(kept) - 1)]
+        reach = max_speed * (time[frame] - time[other]).abs()
+        near &= ~exists | ((position[frame] - position[other]).norm(dim=-1) <= reach)
+    frame, stretch = frame[near], stretch[near]
+    first = torch.cat([stretch.new_ones(1, dtype=torch.bool), stretch.diff() > 0])[: len(frame)]
+    return frame[first]
+
+
+def filled(trajectory: Trajectory, valid: Bool[Tensor, "time"]) -> Trajectory:
+    """The same timestamps with invalid frames interpolated from valid ones (held at the ends)."""
+    if not valid.any():
+        raise WearcapError("no valid pose to interpolate from", expected="at least one valid frame")
+    good = trajectory[valid]
+    return _resampled(good, trajectory.timestamps, _clamped_brackets(good.timestamps, trajectory.timestamps))
+
+
+def find_gaps(timestamps: Float64[Tensor, "time"], max_step_s: float) -> Int64[Tensor, "gap"]:
+    """Frames after which the next one comes later than `max_step_s`."""
+    require_rising(timestamps)
+    return (timestamps.diff() > max_step_s).nonzero()[:, 0]
+
+
+def smooth(trajectory: Trajectory, sigma_s: float) -> Trajectory:
+    """Gaussian-weighted mean over time (standard deviation in s): arithmetic for t, chordal for R."""
+    require_rising(trajectory.timestamps)
+    if len(trajectory) < 2 or sigma_s <= 0:
+        return trajectory
+    reach = int(3 * sigma_s / trajectory.timestamps.diff().median().item()) + 1
+    reach = min(reach, len(trajectory) - 1)
+    frame = torch.arange(len(trajectory), device=trajectory.timestamps.device)
+    near = frame[:, None] + torch.arange(-reach, reach + 1, device=frame.device)
+    exists = (near >= 0) & (near < len(trajectory))
+    near = near.clamp(0, len(trajectory) - 1)
+    distance = (trajectory.timestamps[near] - trajectory.timestamps[:, None]) / sigma_s
+    weight = (exists * torch.exp(-0.5 * distance**2)).to(trajectory.t_world_body.dtype)
+    weight = weight / weight.sum(1, keepdim=True)
+    t = torch.einsum("fk,fki->fi", weight, trajectory.t_world_body[near])
+    R = torch.einsum("fk,fkij->fij", weight, trajectory.R_world_body[near])
+    return Trajectory(trajectory.timestamps, roma.special_procrustes(R), t)
