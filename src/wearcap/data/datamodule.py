@@ -12,7 +12,7 @@ class MotionWindows(lightning.LightningDataModule):
 
     def __init__(
         self,
-        sources: dict[str, dict],
+        sources: dict[str, dict | None],
         window: int,
         stride: int,
         fps: float,
@@ -22,15 +22,15 @@ class MotionWindows(lightning.LightningDataModule):
         workers: int = 1,
         seed: int = 0,
         augment: bool = True,
-        val_sources: dict[str, dict] | None = None,
+        val_sources: dict[str, dict | None] | None = None,
     ):
         """`sources` maps a name to {root, weight}; `val_sources` (default: the same) are validated on.
 
         An epoch has `steps_per_epoch` steps of `batch_size` windows, however many windows there are.
         """
         super().__init__()
-        self.sources = [Source(**source) for source in sources.values()]
-        self.val_sources = [Source(**source) for source in (val_sources or sources).values()]
+        self.sources = [Source(**source) for source in sources.values() if source]
+        self.val_sources = [Source(**source) for source in (val_sources or sources).values() if source]
         self.window, self.stride, self.fps = window, stride, fps
         self.batch_size, self.steps_per_epoch, self.val_windows = batch_size, steps_per_epoch, val_windows
         self.workers, self.seed, self.augment = workers, seed, augment

@@ -25,14 +25,13 @@ class CaptureValidation(Callback):
     def __init__(
         self,
         pipeline: Callable[..., HMD2],
-        root: str,
         folder: str,
         recordings: int = 4,
         max_seconds: float = 20.0,
         every_n_epochs: int = 5,
         picture: bool = True,
     ):
-        self.pipeline, self.root, self.folder = pipeline, root, Path(folder)
+        self.pipeline, self.folder = pipeline, Path(folder)
         self.recordings, self.max_seconds, self.every_n_epochs = recordings, max_seconds, every_n_epochs
         self.picture = picture
 
@@ -45,7 +44,7 @@ class CaptureValidation(Callback):
             net=pl_module.net, features=pl_module.features, schedule=pl_module.schedule,
             skeleton=pl_module.skeleton, fps=pl_module.fps, device=str(pl_module.device),
         )  # fmt: skip
-        recordings = self._recordings()
+        recordings = self._recordings(trainer.datamodule.val_sources[0].root)
         motions = pipeline.capture(recordings, [0] * len(recordings))
         rows = [score(m, r, r.name, 0) for m, r in zip(motions, recordings)]
         for key, summary in aggregate(rows).items():
@@ -55,9 +54,9 @@ class CaptureValidation(Callback):
             path = self.folder / f"step_{trainer.global_step:06d}_{recordings[0].name}.png"
             save_png(path, contact_sheet({"truth": recordings[0].motion, "capture": motions[0]}))
 
-    def _recordings(self) -> list[Recording]:
+    def _recordings(self, root: str) -> list[Recording]:
         """Validation recordings spread over the list, cut to their first seconds: a look, not the evaluation."""
-        store = RecordingStore.open(self.root)
+        store = RecordingStore.open(root)
         names = store.names("val")
         chosen = names[:: max(1, len(names) // self.recordings)][: self.recordings]
         return [first_seconds(store.load(name), self.max_seconds) for name in chosen]
@@ -65,7 +64,8 @@ class CaptureValidation(Callback):
 
 def first_seconds(recording: Recording, seconds: float) -> Recording:
     """The beginning of a recording's head path, motion and contacts."""
-    assert recording.head is not None and recording.motion is not None
+    assert recording.head is not None
+    assert recording.motion is not None
     stop = int(torch.searchsorted(recording.head.timestamps, recording.head.timestamps[0] + seconds))
     head, contacts = recording.head, recording.contacts
     head = replace(

@@ -1,0 +1,39 @@
+"""`wearcap train`: compose a config, build what it names, fit."""
+
+from pathlib import Path
+
+import lightning
+from hydra.utils import instantiate
+from lightning.pytorch.callbacks import EarlyStopping
+from omegaconf import DictConfig, OmegaConf
+from rich import print as show
+
+from wearcap.cli.conf import hydra_main
+from wearcap.training.checkpoint import ConfigInCheckpoint
+from wearcap.training.run import fit, record_run, resume_path
+
+HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
+
+
+def train(config: DictConfig) -> float:
+    """Train what the config describes; returns the last validation loss (what a sweep minimises)."""
+    lightning.seed_everything(config.seed, workers=True, verbose=False)
+    run = Path(config.paths.run)
+    record_run(run, OmegaConf.to_yaml(config, resolve=True))
+    resume = resume_path(config.resume, Path(config.paths.outputs) / "train" / config.name)
+    data, system = instantiate(config.data), instantiate(config.model)
+    callbacks = [instantiate(callback) for callback in config.callbacks.values() if callback]
+    callbacks.insert(0, ConfigInCheckpoint(OmegaConf.to_container(config, resolve=True)))
+    if config.early_stop:
+        callbacks.append(EarlyStopping("val/loss", patience=config.early_stop))
+    loggers = [instantiate(logger) for logger in (config.logger or {}).values() if logger]
+    trainer: lightning.Trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers or False)
+    show(f"[bold]{config.name}[/bold] in {run}" + (f", going on from {resume}" if resume else ""))
+    fit(system, data, trainer, resume)
+    if trainer.is_global_zero:
+        show(f"checkpoint: {run / 'checkpoints' / 'last.ckpt'}")
+    return float(trainer.callback_metrics.get("val/loss", float("nan")))
+
+
+def main(arguments: list[str]) -> None:
+    hydra_main("train", train, arguments)
