@@ -73,6 +73,9 @@ class WorldBuilder:
         out[..., :2] = out[..., :2] @ turn(self.heading).T + np.array(self.shift)
         return out
 
+    def from_world(self, points_xy: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        return (points_xy - np.array(self.shift)) @ turn(self.heading)
+
     def add_triangles(
         self, vertices: np.ndarray, faces: np.ndarray, color, texture: float, item: int = -1
     ) -> None:
