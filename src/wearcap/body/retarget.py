@@ -1,0 +1,298 @@
+"""Motion of one skeleton worn by another, and a skeleton given another's bone lengths.
+
+Every skeleton is first brought into one T-pose (legs down, arms sideways; the least swing of each limb bone).
+A joint's *turn* is its rotation from that pose to the moment's, in world axes; turns mean the same in every
+skeleton, whatever its bind pose, and are what is carried across.
+"""
+
+from dataclasses import dataclass, replace
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics, local_rotations
+from wearcap.body.landmarks import Landmarks, landmarks
+from wearcap.body.limb_ik import reach, swing_between
+from wearcap.body.skeleton import Site, Skeleton
+from wearcap.geometry.rigid import Rigid
+
+_SPLAY = 0.17
+"""Lateral angle (rad) of a bind pose's shins above which its feet are taken to be rolled with them."""
+_SIDES = ("left", "right")
+
+
+@dataclass(frozen=True)
+class _TPose:
+    """A skeleton brought to the T-pose, root at the origin: what its parts are and where they then stand."""
+
+    marks: Landmarks
+    R: Float[Tensor, "joint 3 3"]
+    t: Float[Tensor, "joint 3"]
+
+    @property
+    def hip_centre(self) -> Float[Tensor, "3"]:
+        return (self.t[self.marks.limb["left_leg"][0]] + self.t[self.marks.limb["right_leg"][0]]) / 2
+
+
+def _t_pose(skeleton: Skeleton) -> _TPose:
+    marks = landmarks(skeleton)
+    rest = skeleton.rest_joints.double()
+    aim: dict[int, tuple[Tensor, Tensor]] = {}
+    feet = {}
+    for name, (first, second, third) in marks.limb.items():
+        y = 1.0 if name.startswith("left") else -1.0
+        direction = torch.tensor(
+            [0.0, 0.0, -1.0] if name.endswith("leg") else [0.0, y, 0.0], dtype=rest.dtype
+        )
+        aim[first] = (rest[second] - rest[first], direction)
+        aim[second] = (rest[third] - rest[second], direction)
+        if name.endswith("leg"):
+            feet[third] = aim[second]
+    R = [torch.eye(3, dtype=rest.dtype)] * len(skeleton)
+    for joint in range(1, len(skeleton)):
+        R[joint] = R[skeleton.parents[joint]]
+        if joint in aim:
+            R[joint] = swing_between(*aim[joint])
+        elif joint in feet:
+            bone, down = feet[joint]
+            splayed = bone[1].abs() > _SPLAY * bone.norm()
+            R[joint] = swing_between(bone, down) if splayed else torch.eye(3, dtype=rest.dtype)
+    R_t = torch.stack(R)
+    local = local_rotations(skeleton, R_t)
+    t = forward_kinematics(skeleton, local, torch.zeros(3, dtype=rest.dtype)).t
+    return _TPose(marks, R_t, t)
+
+
+# ------------------------------------------------------------------------------------------------ rotations
+
+
+def _overlaps(
+    source: Float[Tensor, "knot_s"], target: Float[Tensor, "knot_t"]
+) -> Float[Tensor, "seg_t seg_s"]:
+    """Share of each target segment that lies in each source segment, both chains stretched to length 1."""
+    source, target = source / source[-1].clamp_min(1e-9), target / target[-1].clamp_min(1e-9)
+    low = torch.maximum(target[:-1, None], source[None, :-1])
+    high = torch.minimum(target[1:, None], source[None, 1:])
+    share = (high - low).clamp_min(0) + 1e-9
+    return share / share.sum(1, keepdim=True)
+
+
+def _knots(pose: _TPose, joints: tuple[int, ...], end: int) -> Float[Tensor, "knot"]:
+    """Arc length at each joint of a chain and at its end."""
+    points = pose.t[[*joints, end]]
+    steps = (points[1:] - points[:-1]).norm(dim=-1)
+    return torch.cat([steps.new_zeros(1), steps.cumsum(0)])
+
+
+def _spread(
+    turn: Float[Tensor, "*batch joint 3 3"], share: Float[Tensor, "seg_t seg_s"]
+) -> Float[Tensor, "*batch seg_t 3 3"]:
+    """Mean turn of each target segment, weighted by its share of the source's segments."""
+    quat = roma.rotmat_to_unitquat(turn)
+    quat = torch.where((quat * quat[..., :1, :]).sum(-1, keepdim=True) < 0, -quat, quat)
+    mean = torch.einsum("ts,...sq->...tq", share.to(quat), quat)
+    return roma.unitquat_to_rotmat(torch.nn.functional.normalize(mean, dim=-1))
+
+
+def _carry(
+    turn: Float[Tensor, "*batch joint 3 3"], source: _TPose, target: _TPose, parents: tuple[int, ...]
+) -> Float[Tensor, "*batch joint_t 3 3"]:
+    """Turns of the target's joints from the source's; joints without a counterpart follow their parent."""
+    from_s, to = source.marks, target.marks
+    given: dict[int, Tensor] = {to.root: turn[..., from_s.root, :, :], to.head: turn[..., from_s.head, :, :]}
+
+    def chain(joints_s: tuple[int, ...], end_s: int, joints_t: tuple[int, ...], end_t: int) -> None:
+        if joints_s and joints_t:
+            share = _overlaps(_knots(source, joints_s, end_s), _knots(target, joints_t, end_t))
+            given.update(zip(joints_t, _spread(turn[..., list(joints_s), :, :], share).unbind(-3)))
+
+    top_s, top_t = from_s.spine[-1], to.spine[-1]
+    chain(
+        from_s.spine[:-1] or (top_s,), top_s if len(from_s.spine) > 1 else from_s.head, to.spine[:-1], top_t
+    )
+    given[top_t] = turn[..., top_s, :, :]
+    chain(from_s.neck or (top_s,), from_s.head, to.neck, to.head)
+    for side in _SIDES:
+        for part in ("leg", "arm"):
+            joints = zip(to.limb[f"{side}_{part}"], from_s.limb[f"{side}_{part}"])
+            given |= {t: turn[..., s, :, :] for t, s in joints}
+        given[to.limb[f"{side}_arm"][1]] = turn[..., from_s.forearm[side], :, :]
+        for pair_s, pair_t in ((from_s.collar, to.collar), (from_s.toe, to.toe)):
+            if pair_s[side] is not None and pair_t[side] is not None:
+                given[pair_t[side]] = turn[..., pair_s[side], :, :]
+    turns: list[Tensor] = []
+    for joint, parent in enumerate(parents):
+        turns.append(given[joint] if joint in given else turns[parent])
+    return torch.stack(turns, -3)
+
+
+def retarget(
+    source: Skeleton,
+    target: Skeleton,
+    R_parent_joint: Float[Tensor, "*batch joint 3 3"],
+    t_world_root: Float[Tensor, "*batch 3"],
+) -> tuple[Float[Tensor, "*batch joint_t 3 3"], Float[Tensor, "*batch 3"]]:
+    """Rotations and root translation (m) of `target` that repeat the motion of `source`.
+
+    The hips' centre is kept, bones point where the source's point, spine and neck share their bend by arc
+    length, and elbows and knees then give way a little so that wrists and ankles land on the source's (or as
+    near as the target's bones reach). Nothing is scaled: for a wearer of another size use `fit_offsets` first.
+    Raises WearcapError where a skeleton's limbs are not recognised.
+    """
+    pose_s, pose_t = _t_pose(source), _t_pose(target)
+    T_world_source = forward_kinematics(source, R_parent_joint, t_world_root)
+    turn = T_world_source.R @ pose_s.R.to(T_world_source.R).transpose(-1, -2)
+    R_world = _carry(turn, pose_s, pose_t, target.parents) @ pose_t.R.to(turn)
+    hips = [pose_s.marks.limb[f"{side}_leg"][0] for side in _SIDES]
+    centre = T_world_source.t[..., hips, :].mean(-2)
+    t_root = centre - (R_world[..., 0, :, :] @ pose_t.hip_centre.to(centre)[:, None])[..., 0]
+    T_world = forward_kinematics(target, local_rotations(target, R_world), t_root)
+    R_world = _landed(T_world, T_world_source.t, pose_s.marks, pose_t.marks)
+    return local_rotations(target, R_world), t_root
+
+
+def _landed(
+    T_world: Rigid, t_source: Float[Tensor, "*batch joint_s 3"], source: Landmarks, target: Landmarks
+) -> Float[Tensor, "*batch joint 3 3"]:
+    """World rotations with limbs bent so that ankles and wrists meet the source's; hands and feet keep theirs."""
+    R = T_world.R.clone()
+    for name, (first, second, third) in target.limb.items():
+        # In double precision: a nearly straight limb's bend is the root of a difference of squares.
+        a, b, c = (T_world.t[..., joint, :].double() for joint in (first, second, third))
+        turns = reach(a, b, c, t_source[..., source.limb[name][2], :].double())
+        upper, lower = (turn.to(R) for turn in turns)
+        R[..., first, :, :] = upper @ R[..., first, :, :]
+        R[..., second, :, :] = lower @ R[..., second, :, :]
+        if name.endswith("arm"):
+            for joint in _between(target, name):
+                R[..., joint, :, :] = lower @ R[..., joint, :, :]
+    return R
+
+
+def _between(marks: Landmarks, name: str) -> list[int]:
+    """Twist joints between elbow and wrist, which turn with the forearm."""
+    _, elbow, _ = marks.limb[name]
+    forearm = marks.forearm[name.split("_")[0]]
+    return [] if forearm == elbow else [forearm]
+
+
+# ---------------------------------------------------------------------------------------------- proportions
+
+
+def fit_offsets(source: Skeleton, target: Skeleton) -> Skeleton:
+    """The target's tree with the size of the source's wearer: hips, spine, collars, neck, arms, legs, feet.
+
+    Limb bones keep the target's directions and take the source's lengths; the trunk takes the source's shape.
+    Heels and toe tips are copied where the source has them, other sites scaled.
+    """
+    pose_s, pose_t = _t_pose(source), _t_pose(target)
+    scale = _size(pose_s) / _size(pose_t)
+    places = _places(pose_s, pose_t, float(scale))
+    t = pose_t.t.clone()
+    for joint, parent in enumerate(target.parents):
+        if joint in places:
+            t[joint] = places[joint]
+        elif parent >= 0:
+            t[joint] = t[parent] + scale * (pose_t.t[joint] - pose_t.t[parent])
+    offsets = torch.zeros_like(t)
+    above = list(target.parents[1:])
+    offsets[1:] = (pose_t.R[above].transpose(-1, -2) @ (t[1:] - t[above])[..., None])[..., 0]
+    fitted = replace(target, t_parent_joint=offsets.to(target.t_parent_joint), sites={})
+    return replace(fitted, sites=_fitted_sites(source, target, pose_s, replace(pose_t, t=t), float(scale)))
+
+
+def _size(pose: _TPose) -> Tensor:
+    """Height of the head joint above the ankles (m)."""
+    ankles = pose.t[[pose.marks.limb[f"{side}_leg"][2] for side in _SIDES], 2]
+    return pose.t[pose.marks.head, 2] - ankles.mean()
+
+
+def _resampled(points: Float[Tensor, "point 3"], fractions: Float[Tensor, "knot"]) -> Float[Tensor, "knot 3"]:
+    """Points of a polyline at fractions of its length."""
+    steps = (points[1:] - points[:-1]).norm(dim=-1)
+    arc = torch.cat([steps.new_zeros(1), steps.cumsum(0)])
+    wanted = (fractions * arc[-1]).contiguous()
+    after = torch.searchsorted(arc, wanted).clamp(1, len(points) - 1)
+    weight = ((wanted - arc[after - 1]) / steps[after - 1].clamp_min(1e-9))[:, None]
+    return points[after - 1] * (1 - weight) + points[after] * weight
+
+
+def _places(source: _TPose, target: _TPose, scale: float) -> dict[int, Tensor]:
+    """T-pose positions of the target's landmark joints, its root at the origin."""
+    from_s, to = source.marks, target.marks
+    shift = target.hip_centre * scale - source.hip_centre
+    at_s = source.t + shift
+    neck_s = from_s.neck[0] if from_s.neck else from_s.head
+    column = at_s[list(from_s.spine)]
+    if len(column) == 1:  # one joint for the whole spine: its upper part is rigid, so any point of it will do
+        column = torch.stack([column[0], column[0] + 0.6 * (at_s[neck_s] - column[0])])
+    places = {to.root: target.t[to.root], to.head: at_s[from_s.head]}
+
+    def chain(points: Tensor, joints: tuple[int, ...], end: int) -> None:
+        arc = _knots(target, joints, end)[:-1]
+        fractions = arc / _knots(target, joints, end)[-1].clamp_min(1e-9)
+        places.update(zip(joints, _resampled(points, fractions).unbind(0)))
+
+    if len(to.spine) > 1:
+        chain(column, to.spine[:-1], to.spine[-1])
+    top = to.spine[len(to.spine) - 1]
+    places[top] = column[-1] if len(to.spine) > 1 else column[0]
+    if to.neck:
+        chain(at_s[[neck_s, *from_s.neck[1:], from_s.head]], to.neck, to.head)
+    for side in _SIDES:
+        shoulder_s, shoulder_t = from_s.limb[f"{side}_arm"][0], to.limb[f"{side}_arm"][0]
+        collar_s, collar_t = from_s.collar[side], to.collar[side]
+        if collar_t is not None:
+            places[collar_t] = at_s[collar_s if collar_s is not None else neck_s]
+        places[shoulder_t] = at_s[shoulder_s]
+        places[to.limb[f"{side}_leg"][0]] = at_s[from_s.limb[f"{side}_leg"][0]]
+        for part in ("leg", "arm"):
+            joints_s, joints_t = from_s.limb[f"{side}_{part}"], to.limb[f"{side}_{part}"]
+            for k in (1, 2):
+                length = (source.t[joints_s[k]] - source.t[joints_s[k - 1]]).norm()
+                bone = target.t[joints_t[k]] - target.t[joints_t[k - 1]]
+                places[joints_t[k]] = places[joints_t[k - 1]] + bone / bone.norm() * length
+        toe_s, toe_t, ankle_s = from_s.toe[side], to.toe[side], from_s.limb[f"{side}_leg"][2]
+        if toe_s is not None and toe_t is not None:
+            places[toe_t] = places[to.limb[f"{side}_leg"][2]] + source.t[toe_s] - source.t[ankle_s]
+    return places
+
+
+def _fitted_sites(
+    source: Skeleton, target: Skeleton, pose_s: _TPose, pose_t: _TPose, scale: float
+) -> dict[str, Site]:
+    """The target's sites on the fitted body: scaled, the feet's copied where the source has them.
+
+    Crowns and fingertips are never copied: files end those bones anywhere (CMU's head at its markers).
+    """
+    at = {
+        name: pose_t.t[target.index(site.joint)]
+        + scale * (pose_t.R[target.index(site.joint)] @ torch.tensor(site.t_joint_site, dtype=torch.float64))
+        for name, site in target.sites.items()
+    }
+    for side in _SIDES:
+        heel, tip = f"{side}_heel", f"{side}_toe_tip"
+        if not {heel, tip} <= set(at):
+            continue
+        if {heel, tip} <= set(source.sites):
+            at |= {name: _on_foot(source, pose_s, pose_t, side, name) for name in (heel, tip)}
+        # One flat sole: toe joints and the ends of toe bones lie at different heights in every file.
+        sole = at[heel][2] if heel not in source.sites else torch.minimum(at[heel][2], at[tip][2])
+        at |= {name: torch.cat([at[name][:2], sole[None]]) for name in (heel, tip)}
+    sites = {}
+    for name, site in target.sites.items():
+        joint = target.index(site.joint)
+        x, y, z = (pose_t.R[joint].T @ (at[name] - pose_t.t[joint])).tolist()
+        sites[name] = Site(site.joint, (x, y, z))
+    return sites
+
+
+def _on_foot(source: Skeleton, pose_s: _TPose, pose_t: _TPose, side: str, name: str) -> Float[Tensor, "3"]:
+    """T-pose position on the target of a foot site of the source: the same offset from the ankle."""
+    site = source.sites[name]
+    joint = source.index(site.joint)
+    offset = pose_s.R[joint] @ torch.tensor(site.t_joint_site, dtype=torch.float64)
+    ankle_s, ankle_t = (pose.marks.limb[f"{side}_leg"][2] for pose in (pose_s, pose_t))
+    return pose_s.t[joint] + offset - pose_s.t[ankle_s] + pose_t.t[ankle_t]
