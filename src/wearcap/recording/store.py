@@ -57,10 +57,15 @@ class RecordingFile:
         if "wearcap" not in metadata:
             raise WearcapError("a .safetensors file, but not a recording", where=path,
                                expected="one that `wearcap prepare` wrote")  # fmt: skip
-        if metadata.get("schema") != str(SCHEMA_VERSION):
-            raise WearcapError(f"schema version {metadata.get('schema')}", where=path,
+        try:
+            content = json.loads(metadata["wearcap"])
+            version, self._tree = content["schema_version"], content["recording"]
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise WearcapError("its description is unreadable", where=path,
+                               fix="Prepare this recording again.") from error  # fmt: skip
+        if version != SCHEMA_VERSION:
+            raise WearcapError(f"schema version {version}", where=path,
                                expected=f"version {SCHEMA_VERSION}", fix="Prepare it again.")  # fmt: skip
-        self._tree = json.loads(metadata["wearcap"])
 
     @cached_property
     def keys(self) -> frozenset[str]:
@@ -96,7 +101,8 @@ class RecordingFile:
 def save_recording(recording: Recording, path: str | Path) -> None:
     """Write one recording atomically; equal recordings give equal bytes."""
     tree, tensors = flatten(recording)
-    metadata = {"wearcap": dumps(tree), "schema": str(SCHEMA_VERSION)}
+    # One entry only: safetensors writes several in an order that changes from process to process.
+    metadata = {"wearcap": dumps({"schema_version": SCHEMA_VERSION, "recording": tree})}
     with atomic_path(path) as temporary:
         temporary.write_bytes(save(dict(sorted(tensors.items())), metadata))
 
@@ -141,19 +147,17 @@ class RecordingStore:
     def add(self, recording: Recording, *, split: str, config_hash: str) -> None:
         """Write a recording and its manifest entry."""
         save_recording(recording, self.path_of(recording.name))
-        self.register(recording.name, entry_for(recording, self.root, split, config_hash))
+        self.register({recording.name: entry_for(recording, self.root, split, config_hash)})
 
-    def register(self, name: str, entry: Entry) -> None:
-        """Enter a recording whose file is already in place (written by a worker)."""
-        self.entries[name] = entry
+    def register(self, entries: dict[str, Entry]) -> None:
+        """Enter recordings by name whose files are already in place (written by workers)."""
+        self.entries |= entries
         recordings = {key: dataclasses.asdict(value) for key, value in sorted(self.entries.items())}
         text = json.dumps({"schema_version": SCHEMA_VERSION, "recordings": recordings}, indent=1)
         write_text(self.manifest_path, text + "\n")
 
     def path_of(self, name: str) -> Path:
-        if not name or Path(name).name != name or name.startswith("."):
-            raise WearcapError(f"{name!r} cannot name a recording", expected="a plain file name")
-        return self.root / "recordings" / f"{name}.safetensors"
+        return recording_path(self.root, name)
 
     def open_file(self, name: str) -> RecordingFile:
         """Open one recording for slicing. Raises WearcapError when it is missing, truncated or foreign."""
@@ -182,11 +186,18 @@ class RecordingStore:
                 yield name, error
 
 
+def recording_path(root: Path, name: str) -> Path:
+    """Where a data set keeps a recording. Raises WearcapError when the name is no plain file name."""
+    if not name or Path(name).name != name or name.startswith("."):
+        raise WearcapError(f"{name!r} cannot name a recording", expected="a plain file name")
+    return Path(root) / "recordings" / f"{name}.safetensors"
+
+
 def entry_for(recording: Recording, root: Path, split: str, config_hash: str) -> Entry:
     """The manifest entry of a recording whose file has been written."""
     if split not in SPLITS:
         raise WearcapError(f"no split {split!r}", expected=f"one of {', '.join(SPLITS)}")
-    path = Path(root) / "recordings" / f"{recording.name}.safetensors"
+    path = recording_path(root, recording.name)
     stream = recording.motion or recording.head
     frames = len(stream.timestamps) if stream else 0
     fps = round(1 / stream.timestamps.diff().median().item(), 4) if stream and frames > 1 else 0.0
