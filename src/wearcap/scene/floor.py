@@ -21,9 +21,11 @@ _NEAR_M = 0.25
 """Standard deviation of their weight over that distance: on stairs the nearest step counts."""
 _KEY_STEP_M = 0.15
 """The head's path is examined once in so many metres."""
+_FAINT = 0.3
+"""Layers of fewer points per bin than this say little."""
 _CLEARANCE_M = (0.3, 2.3)
 """The head is never nearer to the floor, nor further from it."""
-_CHANGE_COST = 8.0
+_CHANGE_COST = 20.0
 """Cost of a metre up or down, in the units of `_evidence` (ours, as all weights here)."""
 
 
@@ -119,10 +121,10 @@ def _cell_key(cell: np.ndarray) -> np.ndarray:
 def _evidence(votes: np.ndarray) -> np.ndarray:
     """Cost of each height: how weak its layer is beside the strongest there, and how much lies beneath it."""
     layer = gaussian_filter1d(votes, 1.5, axis=1)
-    strength = (layer + 0.05) / (layer.max(1, keepdims=True) + 0.05)
+    strength = (layer + _FAINT) / (layer.max(1, keepdims=True) + _FAINT)
     margin = int(0.08 / _BIN_M)
     beneath = np.pad(votes.cumsum(1), ((0, 0), (margin, 0)))[:, : votes.shape[1]]
-    share = beneath / np.maximum(votes.sum(1, keepdims=True), 1)
+    share = beneath / np.maximum(votes.sum(1, keepdims=True), 1)  # a lone point beneath is no evidence
     return -np.log(strength) + 6.0 * share
 
 
@@ -154,5 +156,5 @@ def _centre_of_layer(votes: np.ndarray, chosen: np.ndarray, heights: np.ndarray)
     around = around.clip(0, votes.shape[1] - 1)
     weight = np.take_along_axis(votes, around, 1) * exists
     total = weight.sum(1)
-    mean = (weight * heights[around]).sum(1) / np.maximum(total, 1)
+    mean = (weight * heights[around]).sum(1) / np.where(total > 0, total, 1)
     return np.where(total > 0, mean, heights[chosen])
