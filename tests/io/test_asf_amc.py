@@ -7,7 +7,8 @@ import time
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hostile import fuzz, mutated
+from hypothesis import given
 from hypothesis import strategies as st
 
 from wearcap.errors import WearcapError
@@ -253,18 +254,7 @@ def test_binary_missing_and_folder_are_refused(tmp_path):
             read_asf(path)
 
 
-def mutated(text: str):
-    """Strategy: the text with one cut, one overwritten stretch, or one line repeated."""
-    position = st.integers(0, len(text))
-    junk = st.text(max_size=6) | st.sampled_from(
-        ["nan", "-1e400", "\n", "9" * 30, "\0", "{", "}", ":", "#", "begin\n"]
-    )
-    return st.builds(
-        lambda a, b, new: text[: min(a, b)] + new + text[max(a, b) :], position, position, junk
-    ) | st.builds(lambda a, new: text[:a] + new + text[a + len(new) :], position, junk)
-
-
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@fuzz
 @given(asf=mutated(ASF), amc=mutated(amc_text(3)), which=st.booleans())
 def test_fuzz_gives_a_motion_or_one_clear_error(tmp_path, asf, amc, which):
     for file, text in (("t.asf", asf if which else ASF), ("t.amc", amc_text(3) if which else amc)):
