@@ -1,0 +1,75 @@
+"""Opening exported networks: each becomes a function from named tensors to a tensor."""
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+
+Run = Callable[..., Tensor]
+"""Called with the network's arguments by name."""
+
+
+def open_onnx(path: str | Path) -> Run:
+    """An ONNX file in ONNX Runtime on the CPU. Raises WearcapError when it is missing or not readable."""
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise WearcapError("running ONNX files needs onnxruntime",
+                           fix='Run: pip install "wearcap[export]"') from error  # fmt: skip
+    _require_file(path)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions share no base of their own
+        raise WearcapError(f"not a readable ONNX file ({_first_line(error)})", where=path) from error
+
+    def run(**inputs: Tensor) -> Tensor:
+        arrays = {name: value.contiguous().numpy() for name, value in inputs.items()}
+        return torch.from_numpy(session.run(None, arrays)[0])
+
+    return run
+
+
+def open_pt2(path: str | Path) -> Run:
+    """A torch.export archive on the CPU. Raises WearcapError when it is missing, not readable or holds pickles.
+
+    PyTorch parses the archive's symbolic sizes with SymPy, so open only archives from people you trust.
+    """
+    _require_file(path)
+    try:
+        _refuse_pickles(path)
+        module = torch.export.load(str(path)).module()
+    except (RuntimeError, ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
+        raise WearcapError(f"not a readable .pt2 archive ({_first_line(error)})", where=path) from error
+    return lambda **inputs: module(**inputs)
+
+
+def _refuse_pickles(path: str | Path) -> None:
+    """torch.export.load would unpickle example inputs, tensor subclasses and script objects; ours has none."""
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            pickled = "/sample_inputs/" in entry.filename and entry.file_size > 0
+            if entry.filename.endswith("_config.json"):
+                config = json.loads(archive.read(entry))["config"]
+                pickled = any(payload.get("use_pickle") for payload in config.values())
+            if pickled:
+                raise WearcapError("the archive holds pickled objects", where=path,
+                                   expected="one that `wearcap export` wrote")  # fmt: skip
+
+
+def _require_file(path: str | Path) -> None:
+    if not Path(path).is_file():
+        raise WearcapError("no such exported model", where=path, fix="Make one with `wearcap export`.")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]
+
+
+RUN_BY_FORMAT: dict[str, Callable[[str | Path], Run]] = {"onnx": open_onnx, "pt2": open_pt2}

@@ -1,0 +1,189 @@
+"""Exported denoisers agree with eager ones, as networks and as whole pipelines."""
+
+import json
+import math
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import nn
+
+from wearcap.body.skeleton import xsens23
+from wearcap.data.features import HeadFeatures
+from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.errors import WearcapError
+from wearcap.export import denoiser, exported, runner, sidecar
+from wearcap.geometry import rotation
+from wearcap.models.denoiser import MotionDenoiser
+from wearcap.pipelines.hmd2 import HMD2
+from wearcap.recording import FloorTrack, HeadStream, Recording
+from wearcap.recording.store import RecordingFile, save_recording
+
+WINDOW = 24
+FORMATS = ("onnx", "pt2")
+
+
+class Toy(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.linear = nn.Linear(3, 3)
+
+    def forward(self, x, valid):
+        return self.linear(x) * valid[..., None]
+
+
+def toy_example() -> dict[str, torch.Tensor]:
+    return {"x": torch.randn(2, 5, 3), "valid": torch.ones(2, 5, dtype=torch.bool)}
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> HMD2:
+    """A small pipeline with random weights that do say something."""
+    torch.manual_seed(0)
+    features = HeadFeatures()
+    net = MotionDenoiser(
+        features.motion_size, features.condition_size, WINDOW, width=32, layers=1, heads=2, feedforward=64,
+        frames_per_token=2,
+    )  # fmt: skip
+    for parameter in net.parameters():
+        nn.init.normal_(parameter, std=0.05)
+    net.motion_normalizer.set(torch.randn(138) * 0.1, torch.rand(138) + 0.5)
+    net.condition_normalizer.set(torch.randn(13) * 0.1, torch.rand(13) + 0.5)
+    return HMD2(net, features, CosineSchedule(), xsens23(), fps=60.0, steps=3, stride=16)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    frames = 50
+    t = torch.arange(frames, dtype=torch.float64) / 60
+    position = torch.stack([t, 0.1 * torch.sin(t), 1.6 + 0 * t], -1).float()
+    R = rotation.about_axis("z", torch.linspace(0, 1, frames))
+    head = HeadStream(t, R, position, torch.eye(3), torch.zeros(3))
+    return Recording("walk", head=head, floor=FloorTrack(t, torch.zeros(frames)), skeleton=xsens23())
+
+
+@pytest.fixture(scope="module")
+def exports(pipeline, tmp_path_factory):
+    """The pipeline in both formats, each with its report."""
+    folder = tmp_path_factory.mktemp("export")
+    return {
+        format: (
+            folder / format / f"model.{format}",
+            sidecar.export_hmd2(pipeline, folder / format / f"model.{format}", format),
+        )
+        for format in FORMATS
+    }
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_toy_network_agrees_at_other_batch_sizes(tmp_path, format):
+    net = Toy().train()
+    report = denoiser.export_denoiser(net, toy_example(), tmp_path / f"toy.{format}", format)
+    assert report.max_abs_error < 1e-6
+    assert report.latency_ms > 0
+    assert report.bytes == (tmp_path / f"toy.{format}").stat().st_size
+    assert net.training  # the caller's network is left as it was
+    run = exported.RUN_BY_FORMAT[format](tmp_path / f"toy.{format}")
+    inputs = {"x": torch.randn(7, 5, 3), "valid": torch.rand(7, 5) > 0.5}
+    torch.testing.assert_close(run(**inputs), net(**inputs))
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_pipeline_reports_small_error(exports, format):
+    path, report = exports[format]
+    assert 0 <= report.max_abs_error < 1e-4
+    about = json.loads(path.with_suffix(".json").read_text())
+    assert about["window"] == WINDOW
+    assert len(about["condition_channels"]) == 13
+    assert len(about["motion_channels"]) == 138
+    assert about["motion_channels"][6] == "l5.xx"
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_runner_equals_the_eager_pipeline(pipeline, recording, exports, format):
+    eager = pipeline(recording, seed=5)
+    motion = runner.load_exported(exports[format][0])(recording, seed=5)
+    torch.testing.assert_close(motion.R_parent_joint, eager.R_parent_joint, atol=1e-4, rtol=0)
+    torch.testing.assert_close(motion.t_world_root, eager.t_world_root, atol=1e-4, rtol=0)
+    other = runner.load_exported(exports[format][0])(recording, seed=6)
+    assert (other.R_parent_joint - eager.R_parent_joint).abs().max() > 1e-2
+
+
+def test_runner_restores_settings(pipeline, exports):
+    loaded = runner.load_exported(exports["onnx"][0])
+    assert loaded.skeleton == pipeline.skeleton
+    assert loaded.features == pipeline.features
+    assert (loaded.fps, loaded.steps, loaded.stride, loaded.eta) == (60.0, 3, 16, 1.0)
+    assert loaded.schedule.offset == pipeline.schedule.offset
+
+
+@pytest.mark.slow
+def test_runner_command_needs_neither_lightning_nor_hydra(recording, exports, tmp_path):
+    save_recording(recording, tmp_path / "in.safetensors")
+    program = (
+        "import sys; from wearcap.export.runner import main; main(sys.argv[1:]); "
+        "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
+    )
+    model, source, target = exports["onnx"][0], tmp_path / "in.safetensors", tmp_path / "out.safetensors"
+    subprocess.run([sys.executable, "-c", program, model, source, target], check=True)
+    assert len(RecordingFile(target).load().motion) == 50
+
+
+class Moody(nn.Module):
+    """Says something else when it is traced."""
+
+    def forward(self, x, valid):
+        return x + (1 if torch.compiler.is_compiling() else 0)
+
+
+def test_a_deviating_export_is_refused_and_leaves_nothing(tmp_path):
+    with pytest.raises(WearcapError, match="differs from the eager one"):
+        denoiser.export_denoiser(Moody(), toy_example(), tmp_path / "toy.pt2", "pt2")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_not_a_number_is_refused(tmp_path):
+    net = Toy()
+    nn.init.constant_(net.linear.weight, math.nan)
+    with pytest.raises(WearcapError, match="nan"):
+        denoiser.export_denoiser(net, toy_example(), tmp_path / "toy.pt2", "pt2")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_library_and_wrong_names_are_told(tmp_path, monkeypatch):
+    with pytest.raises(WearcapError, match="one of onnx, pt2"):
+        denoiser.export_denoiser(Toy(), toy_example(), tmp_path / "toy.tflite", "tflite")
+    with pytest.raises(WearcapError, match=r"ends in \.pt2"):
+        denoiser.export_denoiser(Toy(), toy_example(), tmp_path / "toy.onnx", "pt2")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(WearcapError, match=r'onnxscript.*pip install "wearcap\[export\]"'):
+        denoiser.export_denoiser(Toy(), toy_example(), tmp_path / "toy.onnx", "onnx")
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_hostile_model_files_are_named(tmp_path, exports, format):
+    path = tmp_path / f"model.{format}"
+    with pytest.raises(WearcapError, match="no such exported model"):
+        runner.load_exported(path)
+    path.write_bytes(exports[format][0].read_bytes()[:1000])
+    with pytest.raises(WearcapError, match="not a readable"):
+        runner.load_exported(path)
+    path.write_bytes(exports[format][0].read_bytes())
+    with pytest.raises(WearcapError, match="no such sidecar"):
+        runner.load_exported(path)
+    path.with_suffix(".json").write_text("{")
+    with pytest.raises(WearcapError, match="not a readable sidecar"):
+        runner.load_exported(path)
+    about = json.loads(exports[format][0].with_suffix(".json").read_text())
+    about["model"]["sha256"] = "0" * 64
+    path.with_suffix(".json").write_text(json.dumps(about))
+    with pytest.raises(WearcapError, match="belongs to another model"):
+        runner.load_exported(path)
+
+
+def test_archives_with_pickles_are_refused(tmp_path):
+    program = torch.export.export(Toy(), (), toy_example())
+    torch.export.save(program, tmp_path / "toy.pt2")  # PyTorch pickles the example inputs
+    with pytest.raises(WearcapError, match="pickled"):
+        exported.open_pt2(tmp_path / "toy.pt2")
