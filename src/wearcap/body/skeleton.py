@@ -20,6 +20,7 @@ FOOT_PATCHES = ("left_heel", "left_toe_tip", "right_heel", "right_toe_tip")
 
 _ALIASES = {
     "left_toe": "left_foot", "right_toe": "right_foot",
+    "left_foot": "left_toe", "right_foot": "right_toe",
     "left_collar": "left_clavicle", "right_collar": "right_clavicle",
 }  # fmt: skip
 """Names that answer to another skeleton's word for the same joint, where the first is absent."""
@@ -143,17 +144,18 @@ class Skeleton:
         return self.with_offsets(self.t_parent_joint * scale)
 
 
-def _mirrored(rows: list[tuple[str, str, tuple[float, float, float]]]) -> list:
+def mirrored(rows: list[tuple[str, str, tuple[float, float, float]]]) -> list:
     """The right-hand twins (y negated, left→right) of rows that describe the left side."""
     swap = lambda name: name.replace("left", "right")  # noqa: E731
     return [(swap(name), swap(parent), (x, -y, z)) for name, parent, (x, y, z) in rows]
 
 
-def _build(name: str, rows: list, sites: list) -> Skeleton:
+def build_skeleton(name: str, rows: list, sites: list) -> Skeleton:
+    """A skeleton from rows (joint, parent, offset); left-hand sites (name, joint, offset) get right-hand twins."""
     names = tuple(row[0] for row in rows)
     parents = tuple(names.index(row[1]) if row[1] else -1 for row in rows)
     offsets = torch.tensor([row[2] for row in rows])
-    table = {site: Site(joint, offset) for site, joint, offset in [*sites, *_mirrored(sites)]}
+    table = {site: Site(joint, offset) for site, joint, offset in [*sites, *mirrored(sites)]}
     table["crown"] = Site("head", (0.02, 0.0, 0.185))
     return Skeleton(name, names, parents, offsets, table)
 
@@ -187,4 +189,4 @@ def xsens23() -> Skeleton:
         ("left_fingertip", "left_wrist", (0.0, 0.185, 0.0)),
         ("left_palm", "left_wrist", (0.0, 0.080, -0.015)),
     ]
-    return _build("xsens23", [*spine, *_mirrored(arm), *arm, *_mirrored(leg), *leg], sites)
+    return build_skeleton("xsens23", [*spine, *mirrored(arm), *arm, *mirrored(leg), *leg], sites)
