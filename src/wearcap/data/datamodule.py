@@ -61,7 +61,9 @@ class MotionWindows(lightning.LightningDataModule):
     def _loader(self, dataset: WindowDataset, sampler) -> DataLoader:
         return DataLoader(
             dataset, self.batch_size, sampler=sampler, num_workers=self.workers, collate_fn=collate,
-            persistent_workers=self.workers > 0, pin_memory=self.trainer is not None and self._on_gpu(),
+            persistent_workers=self.workers > 0,
+            # A forked worker can inherit a held lock of the main process's threads and hang.
+            multiprocessing_context="forkserver" if self.workers else None, pin_memory=self.trainer is not None and self._on_gpu(),
         )  # fmt: skip
 
     def _on_gpu(self) -> bool:

@@ -1,7 +1,6 @@
 """What the head-driven networks see and say: head paths to conditions, poses to vectors and back."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -22,8 +21,8 @@ class HeadFeatures:
     floor, as a share of the head's height in the rest pose.
     """
 
-    frame: Literal["heading", "window"] = "heading"
-    height: Literal["stature", "floor", "relative"] = "stature"
+    frame: str = "heading"
+    height: str = "stature"
     joints: int = 23
 
     def __post_init__(self):

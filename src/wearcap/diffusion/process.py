@@ -40,4 +40,5 @@ def posterior_step(
     x_next = (
         after.sqrt() * x0_hat + (noise_left - spread**2).clamp_min(0).sqrt() * epsilon_hat + spread * noise
     )
+    x_next = torch.where((level_next == 0)[..., None], x0_hat, x_next)
     return torch.where((level == level_next)[..., None], x_t, x_next)

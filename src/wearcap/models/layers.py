@@ -30,11 +30,11 @@ class RotaryAttention(nn.Module):
     cos: Tensor
     sin: Tensor
 
-    def __init__(self, width: int, heads: int, max_tokens: int, dropout: float = 0.0):
+    def __init__(self, width: int, heads: int, max_tokens: int):
         super().__init__()
         if width % (2 * heads):
             raise ValueError(f"width {width} must be a multiple of twice the number of heads ({heads})")
-        self.heads, self.dropout = heads, dropout
+        self.heads = heads
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
         half = width // heads // 2
@@ -52,10 +52,9 @@ class RotaryAttention(nn.Module):
     ) -> Float[Tensor, "batch token width"]:
         batch, tokens, width = x.shape
         q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
-        dropout = self.dropout if self.training else 0.0
         # A row with nothing to attend to would be NaN: padding may always see itself.
         mask = valid[:, None, None, :] | torch.eye(tokens, dtype=torch.bool, device=x.device)
-        attended = F.scaled_dot_product_attention(self._rotate(q), self._rotate(k), v, mask, dropout)
+        attended = F.scaled_dot_product_attention(self._rotate(q), self._rotate(k), v, mask)
         return self.out(attended.transpose(1, 2).reshape(batch, tokens, width))
 
 
@@ -66,7 +65,7 @@ class AdaptiveBlock(nn.Module):
         super().__init__()
         self.norm_attention = nn.LayerNorm(width, elementwise_affine=False)
         self.norm_mlp = nn.LayerNorm(width, elementwise_affine=False)
-        self.attention = RotaryAttention(width, heads, max_tokens, dropout)
+        self.attention = RotaryAttention(width, heads, max_tokens)
         self.mlp = nn.Sequential(
             nn.Linear(width, feedforward), nn.GELU(), nn.Dropout(dropout), nn.Linear(feedforward, width)
         )

@@ -1,7 +1,7 @@
 """Score a pipeline on whole recordings, never cut, over several seeds."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from wearcap.errors import WearcapError
 from wearcap.metrics.table import Row, evaluate_motion
@@ -9,6 +9,7 @@ from wearcap.pipelines.hmd2 import hang_from_head
 from wearcap.recording import Motion, Recording, RecordingStore
 
 
+@runtime_checkable
 class Pipeline(Protocol):
     """What every capture system looks like from outside."""
 

@@ -5,7 +5,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.recording import Recording
-from wearcap.scene.floor import estimate_floor
+from wearcap.scene.floor import estimate_floor, floor_from_head
 
 MIN_POINTS = 500
 """Fewer points than this say nothing about a floor."""
@@ -24,10 +24,9 @@ def floor_beneath(
     """
     if recording.floor is not None:
         return interpolate(recording.floor.timestamps, recording.floor.height, timestamps)
-    points = recording.points.points_world if recording.points is not None else torch.zeros(0, 3)
-    if len(points) < MIN_POINTS:
-        points = points[:0]
-    return estimate_floor(points, t_world_head, stature)
+    if recording.points is not None and len(recording.points.points_world) >= MIN_POINTS:
+        return estimate_floor(recording.points.points_world, t_world_head, stature).height
+    return floor_from_head(t_world_head, stature).height
 
 
 def interpolate(

@@ -1,0 +1,23 @@
+"""`wearcap export`: a checkpoint's network as ONNX or torch.export, checked against eager."""
+
+from omegaconf import DictConfig
+from rich import print as show
+
+from wearcap.cli.conf import hydra_main
+from wearcap.cli.load import load_pipeline
+from wearcap.export.denoiser import ExportReport
+from wearcap.export.sidecar import export_hmd2
+
+HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2"
+
+
+def run(config: DictConfig) -> ExportReport:
+    """Export the denoiser with its sidecar; prints the error against eager and both latencies."""
+    pipeline = load_pipeline(config.checkpoint, config.pipeline, "cpu")
+    report = export_hmd2(pipeline, config.output, config.format)
+    show(f"exported: {config.output}\n{report}")
+    return report
+
+
+def main(arguments: list[str]) -> None:
+    hydra_main("export", run, arguments)

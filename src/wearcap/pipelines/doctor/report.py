@@ -1,0 +1,54 @@
+"""What the doctor found: findings by recording, the worst first."""
+
+from dataclasses import asdict, dataclass
+
+SEVERITIES = ("ok", "note", "warning", "error")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One statement about a recording."""
+
+    severity: str
+    """"ok" (looked at and sound), "note" (worth knowing), "warning" (looks wrong) or "error" (is wrong)."""
+    check: str
+    """What was looked at, in two or three words."""
+    what: str
+    evidence: str = ""
+    fix: str = ""
+    """How to mend it; empty where there is nothing to mend."""
+
+    def __post_init__(self):
+        if self.severity not in SEVERITIES:
+            raise ValueError(f"severity {self.severity!r} is none of {SEVERITIES}")
+
+
+@dataclass(frozen=True)
+class Report:
+    """Findings of every recording that was looked at."""
+
+    source: str
+    findings: dict[str, tuple[Finding, ...]]
+
+    def of_severity(self, *severities: str) -> list[tuple[str, Finding]]:
+        """(recording, finding) of these severities."""
+        return [(name, f) for name, found in self.findings.items() for f in found if f.severity in severities]
+
+    @property
+    def sound(self) -> bool:
+        """Whether no error was found."""
+        return not self.of_severity("error")
+
+    def grouped(self) -> list[tuple[Finding, list[str]]]:
+        """Findings that say the same of several recordings, put together: (the first, all recordings), worst first."""
+        groups: dict[tuple, tuple[Finding, list[str]]] = {}
+        for name, found in self.findings.items():
+            for finding in found:
+                key = (finding.severity, finding.check, finding.what)
+                groups.setdefault(key, (finding, []))[1].append(name)
+        return sorted(groups.values(), key=lambda group: -SEVERITIES.index(group[0].severity))
+
+    def as_json(self) -> dict:
+        """Plain dicts and lists."""
+        findings = {name: [asdict(f) for f in found] for name, found in self.findings.items()}
+        return {"source": self.source, "sound": self.sound, "findings": findings}

@@ -1,0 +1,76 @@
+"""Small measurements that several checks share."""
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from wearcap.geometry import rotation
+from wearcap.geometry.trajectory import Trajectory, interpolate
+
+LAG_RATE_HZ = 200.0
+
+
+def quantile(value: Float[Tensor, "*any"], q: float) -> float:
+    """Quantile of all entries (0 where there are none); long signals are thinned to a million entries."""
+    flat = value.flatten().double()
+    return torch.quantile(flat[:: len(flat) // 1_000_000 + 1], q).item() if len(flat) else 0.0
+
+
+def spin_of(track: Trajectory) -> Float[Tensor, "time 3"]:
+    """Angular velocity (rad/s) in the body's own axes, by central differences over two frames."""
+    R, times = track.R_world_body.double(), track.timestamps
+    if len(R) < 3:
+        return torch.zeros(len(R), 3, dtype=torch.float64)
+    turn = rotation.log(R[:-2].mT @ R[2:]) / (times[2:] - times[:-2])[:, None]
+    return torch.cat([turn[:1], turn, turn[-1:]])
+
+
+def acceleration_of(track: Trajectory, span_s: float = 0.067) -> Float[Tensor, "time 3"]:
+    """Acceleration (m/s²) in the world by second differences over ±n frames (MocapEvery eq. 8, about 4 at 60 Hz)."""
+    count = len(track)
+    n = max(1, round(span_s / track.timestamps.diff().median().item())) if count > 1 else 1
+    if count < 2 * n + 1:
+        return torch.zeros(count, 3, dtype=torch.float64)
+    p, dt = track.t_world_body.double(), (track.timestamps[2 * n :] - track.timestamps[: -2 * n])[:, None] / 2
+    inner = (p[: -2 * n] + p[2 * n :] - 2 * p[n:-n]) / dt**2
+    return torch.cat([inner[:1].expand(n, 3), inner, inner[-1:].expand(n, 3)])
+
+
+def lag_between(
+    reference_times: Float64[Tensor, "time"],
+    reference: Float[Tensor, "time"],
+    other_times: Float64[Tensor, "sample"],
+    other: Float[Tensor, "sample"],
+    max_lag_s: float = 1.0,
+) -> tuple[float, float, float] | None:
+    """(lag in s, correlation at that lag, correlation without a shift) of two signals of the same quantity.
+
+    A positive lag says that `other` shows things late. None where the streams share less than 4 s or a signal is still.
+    """
+    start = max(reference_times[0].item(), other_times[0].item())
+    stop = min(reference_times[-1].item(), other_times[-1].item())
+    if stop - start < 4.0:
+        return None
+    grid = torch.arange(start, stop, 1 / LAG_RATE_HZ, dtype=torch.float64)[: int(600 * LAG_RATE_HZ)]
+    a, b = (
+        interpolate(reference_times, reference.double(), grid),
+        interpolate(other_times, other.double(), grid),
+    )
+    a, b = a - a.mean(), b - b.mean()
+    if a.std() < 1e-6 or b.std() < 1e-6:
+        return None
+    reach = int(min(max_lag_s, (stop - start) / 4) * LAG_RATE_HZ)
+    score = _cross_correlation(a, b, reach)
+    best = int(score.argmax())
+    shift = 0.0
+    if 0 < best < 2 * reach:
+        left, middle, right = score[best - 1 : best + 2].tolist()
+        shift = 0.5 * (left - right) / (left - 2 * middle + right) if left - 2 * middle + right < 0 else 0.0
+    return (best - reach + shift) / LAG_RATE_HZ, score[best].item(), score[reach].item()
+
+
+def _cross_correlation(a: Tensor, b: Tensor, reach: int) -> Tensor:
+    """Normalised correlation of a(t) with b(t + lag) for lags -reach … reach (samples)."""
+    size = 1 << (len(a) + reach).bit_length()
+    product = torch.fft.irfft(torch.fft.rfft(a, size).conj() * torch.fft.rfft(b, size), size)
+    return torch.cat([product[-reach:], product[: reach + 1]]) / (a.norm() * b.norm())

@@ -1,0 +1,73 @@
+"""The denoiser: shapes, padding, levels, normalisation."""
+
+import pytest
+import torch
+
+from wearcap.models.denoiser import MotionDenoiser, Normalizer
+
+
+def small(**changes) -> MotionDenoiser:
+    settings = {"motion_size": 12, "condition_size": 5, "window": 16, "width": 32, "layers": 2, "heads": 4}
+    net = MotionDenoiser(**settings | {"feedforward": 64, "dropout": 0.0} | changes)
+    for parameter in net.parameters():  # zero-initialised gates would hide what the blocks do
+        torch.nn.init.normal_(parameter, std=0.1)
+    return net.eval()
+
+
+def inputs(time: int = 16):
+    torch.manual_seed(0)
+    return (
+        torch.randn(2, time, 12),
+        torch.rand(2, 1),
+        torch.randn(2, time, 5),
+        torch.ones(2, time, dtype=torch.bool),
+    )
+
+
+@pytest.mark.parametrize("frames_per_token", [1, 4])
+def test_padding_changes_nothing_on_the_frames_that_exist(frames_per_token):
+    net = small(frames_per_token=frames_per_token)
+    x_t, level, condition, valid = inputs()
+    valid[:, 8:] = False
+    out = net(x_t, level, condition, valid)
+    x_t[:, 8:], condition[:, 8:] = 99.0, -99.0
+    assert torch.allclose(net(x_t, level, condition, valid)[:, :8], out[:, :8], atol=1e-5)
+
+
+def test_a_window_without_any_frame_is_finite():
+    x_t, level, condition, valid = inputs()
+    assert small()(x_t, level, condition, valid & False).isfinite().all()
+
+
+def test_level_per_frame_equals_level_per_window_when_all_are_the_same():
+    net = small(frames_per_token=4)
+    x_t, level, condition, valid = inputs()
+    assert torch.allclose(
+        net(x_t, level, condition, valid),
+        net(x_t, level.expand(2, 16).contiguous(), condition, valid),
+        atol=1e-5,
+    )
+
+
+def test_level_condition_and_order_of_frames_matter():
+    net = small()
+    x_t, level, condition, valid = inputs()
+    out = net(x_t, level, condition, valid)
+    assert not torch.allclose(net(x_t, 1 - level, condition, valid), out, atol=1e-3)
+    assert not torch.allclose(net(x_t, level, condition + 1, valid), out, atol=1e-3)
+    assert not torch.allclose(net(x_t.flip(1), level, condition.flip(1), valid).flip(1), out, atol=1e-3)
+
+
+def test_window_must_split_into_tokens():
+    with pytest.raises(ValueError, match="does not split"):
+        small(frames_per_token=5)
+
+
+def test_normalizer_inverts_and_travels_with_the_weights():
+    normalizer = Normalizer(3)
+    normalizer.set(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.5, 1.0, 2.0]))
+    x = torch.randn(4, 3)
+    assert torch.allclose(normalizer.inverse(normalizer(x)), x, atol=1e-6)
+    other = Normalizer(3)
+    other.load_state_dict(normalizer.state_dict())
+    assert torch.equal(other(x), normalizer(x))

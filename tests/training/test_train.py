@@ -1,0 +1,180 @@
+"""Training end to end on a small data set: every experiment runs, kill and resume changes nothing."""
+
+import csv
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from wearcap.cli import capture, evaluate, export, train
+from wearcap.cli.conf import compose, conf_dir
+from wearcap.cli.load import load_system
+from wearcap.errors import WearcapError
+from wearcap.training.checkpoint import read_checkpoint
+from wearcap_testing import small_dataset
+
+EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("*.yaml"))
+SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return small_dataset(tmp_path_factory.mktemp("data")).root
+
+
+def arguments(data: Path, run: Path, *more: str) -> list[str]:
+    return [
+        "experiment=motion_diffusion_head", f"data.sources.simulated.root={data}", "debug=fast", f"hydra.run.dir={run}",
+        f"paths.outputs={run.parent}", "data.window=60", "trainer.accelerator=cpu", "logger.csv.flush_logs_every_n_steps=1",
+        "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "callbacks.progress=null", *SMALL, *more,
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def checkpoint(data, tmp_path_factory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "run"
+    train.main(arguments(data, run))
+    return run / "checkpoints" / "last.ckpt"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_takes_a_step(experiment, data, tmp_path):
+    run = tmp_path / "run"
+    changed = arguments(data, run, "trainer.precision=32-true", "data.workers=0", "data.batch_size=2")
+    train.main([f"experiment={experiment}", *changed[1:]])
+    assert (run / "checkpoints" / "last.ckpt").is_file()
+
+
+def test_a_run_leaves_its_record(checkpoint):
+    run = checkpoint.parents[1]
+    assert "max_steps: 4" in (run / "config.yaml").read_text()
+    record = json.loads((run / "run.json").read_text())
+    assert record["versions"]["torch"] == torch.__version__.split("+")[0] or torch.__version__
+    assert list((run / "pictures").glob("*.png"))
+
+
+def test_the_checkpoint_rebuilds_the_system(checkpoint):
+    system, config = load_system(checkpoint)
+    assert config["name"] == "debug_fast"
+    assert not torch.equal(
+        system.net.motion_normalizer.scale, torch.ones_like(system.net.motion_normalizer.scale)
+    )
+
+
+def losses(run: Path) -> dict[int, str]:
+    with open(run / "metrics.csv") as file:
+        return {int(row["step"]): row["train/loss"] for row in csv.DictReader(file) if row.get("train/loss")}
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_equals_straight_through(data, tmp_path):
+    """A process killed in its third epoch goes on from the second's checkpoint with exactly the same losses."""
+    more = ["trainer.max_steps=12", "data.steps_per_epoch=3", "callbacks.capture=null", "name=kill"]
+    train.main(arguments(data, tmp_path / "straight/run", *more))
+    killed = tmp_path / "killed/train/kill/first"
+    command = arguments(
+        data, killed, *more, f"paths.outputs={tmp_path / 'killed'}", "trainer.max_steps=100000"
+    )
+    command = [a for a in command if a != "trainer.max_steps=12"] + ["optimizer.scheduler.total=12"]
+    process = subprocess.Popen([sys.executable, "-m", "wearcap.cli.main", "train", *command])
+    deadline = time.monotonic() + 120
+    while not (len(rows := _safe_losses(killed)) >= 7 and (killed / "checkpoints/last.ckpt").is_file()):
+        assert time.monotonic() < deadline, f"no seven steps within two minutes: {rows}"
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    saved = torch.load(killed / "checkpoints/last.ckpt", weights_only=True)["global_step"]
+    resumed = tmp_path / "killed/train/kill/second"
+    train.main(
+        arguments(
+            data,
+            resumed,
+            *more,
+            f"paths.outputs={tmp_path / 'killed'}",
+            f"resume={killed}/checkpoints/last.ckpt",
+        )
+    )
+    straight, after = losses(tmp_path / "straight/run"), losses(resumed)
+    assert after
+    assert min(after) == saved
+    assert after == {step: loss for step, loss in straight.items() if step >= saved}
+
+
+def _safe_losses(run: Path) -> dict[int, str]:
+    return losses(run) if (run / "metrics.csv").is_file() else {}
+
+
+def test_overfits_one_batch(data, tmp_path):
+    run = tmp_path / "run"
+    more = ["debug=overfit", "trainer.max_steps=60", "model.net.dropout=0", "data.batch_size=2", "data.steps_per_epoch=1",
+            "optimizer.optimizer.lr=0.01", "optimizer.scheduler.warmup=5", "data.workers=0", "callbacks.capture=null"]  # fmt: skip
+    train.main([a for a in arguments(data, run, *more) if a != "debug=fast"])
+    values = [float(loss) for loss in losses(run).values()]
+    assert values[-1] < 0.5 * values[0]
+
+
+def test_evaluate_capture_and_export(checkpoint, data, tmp_path):
+    common = [f"checkpoint={checkpoint}", "pipeline.steps=2"]
+    evaluate.main([*common, f"hydra.run.dir={tmp_path}/e", f"output={tmp_path}/table.json", "seeds=[0,1]"])
+    table = json.loads((tmp_path / "table.json").read_text())
+    assert set(table["methods"]) == {"wearcap", "mean pose", "nearest window"}
+    assert table["methods"]["wearcap"]["mpjpe_cm"]["seeds"] == 2
+    capture.main(
+        [*common, f"recording={data}/r4", f"hydra.run.dir={tmp_path}/c", "video=false", "body=false"]
+    )
+    assert {p.name for p in (tmp_path / "c").iterdir()} >= {"motion.npz", "motion.bvh", "motion.glb"}
+    export.main([*common, f"hydra.run.dir={tmp_path}/x", f"output={tmp_path}/d.pt2", "format=pt2"])
+    assert (tmp_path / "d.pt2").is_file()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "not a readable checkpoint"),
+        (b"garbage" * 100, "not a readable checkpoint"),
+        (None, "no such checkpoint"),
+    ],
+)
+def test_broken_checkpoints_are_named(content, message, tmp_path):
+    path = tmp_path / "bad.ckpt"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(WearcapError, match=f"bad.ckpt: {message}"):
+        read_checkpoint(path)
+
+
+def test_a_truncated_and_a_foreign_checkpoint_are_named(checkpoint, tmp_path):
+    short = tmp_path / "short.ckpt"
+    short.write_bytes(checkpoint.read_bytes()[:-5000])
+    with pytest.raises(WearcapError, match="not a readable checkpoint"):
+        read_checkpoint(short)
+    torch.save({"state_dict": {}}, tmp_path / "foreign.ckpt")
+    with pytest.raises(WearcapError, match="not of wearcap"):
+        read_checkpoint(tmp_path / "foreign.ckpt")
+
+
+def test_a_checkpoint_with_code_in_it_is_refused(tmp_path):
+    torch.save({"wearcap": Path("x")}, tmp_path / "code.ckpt")
+    with pytest.raises(WearcapError, match="tensors and plain values only"):
+        read_checkpoint(tmp_path / "code.ckpt")
+
+
+def test_a_checkpoint_of_another_model_is_named(checkpoint, tmp_path):
+    saved = torch.load(checkpoint, weights_only=True)
+    saved["state_dict"].pop("net.head.weight")
+    torch.save(saved, tmp_path / "other.ckpt")
+    with pytest.raises(WearcapError, match="do not fit this model, such as 'net.head.weight'"):
+        load_system(tmp_path / "other.ckpt")
+
+
+@pytest.mark.parametrize(
+    "group", ["data", "features", "model", "optimizer", "trainer", "callbacks", "logger", "debug"]
+)
+def test_every_choice_of_every_group_composes(group):
+    for path in sorted((conf_dir() / group).glob("*.yaml")):
+        assert compose("train", [f"{group}={path.stem}", "paths.run=x"])

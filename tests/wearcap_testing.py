@@ -1,0 +1,43 @@
+"""Small recordings for tests, made in milliseconds: a body that sways while it wanders in a circle."""
+
+from pathlib import Path
+
+import torch
+
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
+from wearcap.geometry import rotation
+from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Motion, Recording, RecordingStore
+
+
+def swaying_motion(frames: int, seed: int = 0, fps: float = 60.0, skeleton: Skeleton | None = None) -> Motion:
+    """Every joint swings with its own phase; the root goes round a circle."""
+    skeleton = skeleton or xsens23()
+    random = torch.Generator().manual_seed(seed)
+    time = torch.arange(frames, dtype=torch.float64) / fps
+    phase = 6.3 * torch.rand(len(skeleton), 3, generator=random)
+    R = rotation.exp(0.25 * torch.sin(2.0 * time.float()[:, None, None] + phase))
+    angle = 0.5 * time.float()
+    R[:, 0] = rotation.about_axis("z", angle) @ R[:, 0]
+    root = torch.stack([angle.sin(), -angle.cos(), 0 * angle + skeleton.root_height], -1)
+    return Motion(time, skeleton, R, root)
+
+
+def recording_of(motion: Motion, name: str, **about: str) -> Recording:
+    """A recording whose device sits exactly 9 cm in front of and above the head joint."""
+    offset = torch.tensor([0.09, 0.0, 0.09])
+    head = motion.joint("head")
+    device = HeadStream(motion.timestamps, head.R, head @ offset, torch.eye(3), offset)
+    none = torch.zeros(len(motion), len(FOOT_PATCHES), dtype=torch.bool)
+    return Recording(
+        name, head=device, motion=motion, contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, none),
+        floor=FloorTrack(motion.timestamps, torch.zeros(len(motion))), skeleton=motion.skeleton,
+        **{"subject": f"subject_{name}", "location": "nowhere", "license": "MIT"} | about,
+    )  # fmt: skip
+
+
+def small_dataset(root: Path, frames: tuple[int, ...] = (400, 300, 90, 300, 260, 300)) -> RecordingStore:
+    """Recordings r0, r1 … dealt to train, train, train, val, test, test; one is shorter than a window."""
+    store = RecordingStore(root)
+    for index, (count, split) in enumerate(zip(frames, ("train", "train", "train", "val", "test", "test"))):
+        store.add(recording_of(swaying_motion(count, index), f"r{index}"), split=split, config_hash="test")
+    return store
