@@ -1,0 +1,68 @@
+"""`wearcap doctor`: examine recordings and say what is wrong with them and how to mend it."""
+
+import argparse
+import json
+import sys
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from rich.text import Text
+
+from wearcap.pipelines.doctor import Report, examine
+
+HELP = "say what a recording holds, what looks wrong in it, and how to mend it"
+_COLOR = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
+
+
+def main(arguments: list[str]) -> None:
+    """Exit code 1 when errors were found, else 0."""
+    parser = argparse.ArgumentParser(prog="wearcap doctor", description=HELP)
+    parser.add_argument(
+        "path", help="data set folder, recording file, Aria MPS folder, motion capture file or folder"
+    )
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    parser.add_argument("--quiet", action="store_true", help="leave out what is sound")
+    options = parser.parse_args(arguments)
+    if options.json:
+        report = examine(options.path)
+        print(json.dumps(report.as_json(), indent=1, ensure_ascii=False))
+    else:
+        console = Console()
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            task = progress.add_task("examining", total=None)
+            report = examine(
+                options.path, lambda done, total: progress.update(task, completed=done, total=total)
+            )
+        console.print(_table(report, options.quiet))
+        console.print(_summary(report))
+    if not report.sound:
+        sys.exit(1)
+
+
+def _table(report: Report, quiet: bool) -> Table:
+    """One row per finding: what was looked at; what was found, the evidence, how to mend it, and in which recordings."""
+    table = Table(title=report.source, title_justify="left")
+    for column in ("", "check", "finding"):
+        table.add_column(column, no_wrap=column == "")
+    several = len(report.findings) > 1
+    for finding, names in report.grouped():
+        if quiet and finding.severity == "ok":
+            continue
+        color = _COLOR[finding.severity]
+        cell = Text(finding.what, style=color if finding.severity != "ok" else "")
+        cell.append(f"\n{finding.evidence}" if finding.evidence else "", style="dim")
+        cell.append(f"\n→ {finding.fix}" if finding.fix else "", style="bold")
+        if several:
+            cell.append(
+                f"\n{len(names)}: {', '.join(names[:3])}{' …' if len(names) > 3 else ''}", style="italic"
+            )
+        table.add_row(Text(finding.severity, style=color), Text(finding.check), cell)
+    return table
+
+
+def _summary(report: Report) -> str:
+    counts = {severity: len(report.of_severity(severity)) for severity in ("error", "warning", "note")}
+    listed = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items())
+    verdict = "[green]sound[/]" if report.sound else "[bold red]not sound[/]"
+    return f"{len(report.findings)} recording{'s' if len(report.findings) != 1 else ''}: {verdict} ({listed})"
