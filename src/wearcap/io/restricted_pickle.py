@@ -195,7 +195,7 @@ class _Unpickler(_PythonUnpickler):
             raise _RefusedError("it holds an array of structures")
         # Sizes count for text alone; numbers know theirs.
         sizes = (dtype.itemsize, dtype.alignment) if dtype.kind in "SU" else (-1, -1)
-        dtype.__setstate__((3, order, None, None, None, *sizes, 0))
+        dtype.__setstate__((3, order, None, None, None, *sizes, 0))  # pyright: ignore[reportAttributeAccessIssue]
 
     def _joblib_array(self, state: dict[str, Any]) -> np.ndarray:
         dtype, shape = state["dtype"], tuple(state["shape"])
