@@ -49,7 +49,7 @@ def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
     Raises WearcapError that names the nearest valid key or choice when an override is mistyped.
     """
     overrides = list(overrides)
-    with _explained(config_name, overrides):
+    with explained(config_name, overrides):
         return _compose(config_name, overrides)
 
 
@@ -60,7 +60,7 @@ def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: l
     """
     guarded = _Guarded(task)
     application = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)
-    with _explained(config_name, arguments), _command_line(arguments):
+    with explained(config_name, arguments), _command_line(arguments):
         application(guarded)()
     if guarded.refused is not None:
         raise guarded.refused
@@ -118,7 +118,8 @@ def _compose(config_name: str, overrides: list[str]) -> DictConfig:
 
 
 @contextmanager
-def _explained(config_name: str, arguments: list[str]) -> Iterator[None]:
+def explained(config_name: str, arguments: list[str]) -> Iterator[None]:
+    """Turn errors of composing or using a config into a WearcapError that says what to type instead."""
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:

@@ -165,7 +165,8 @@ def _outcomes(
         )
         for start in range(0, len(todo), chunk_size):
             chunk = todo[start : start + chunk_size]
-            yield from parallel(joblib.delayed(_run)(task, root) for task in chunk) or ()
+            results: Any = parallel(joblib.delayed(_run)(task, root) for task in chunk)
+            yield from results
 
 
 @contextmanager

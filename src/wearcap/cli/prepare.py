@@ -1,0 +1,86 @@
+"""`wearcap prepare SOURCE`: make a data set of recordings."""
+
+import sys
+from pathlib import Path
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from wearcap.cli.conf import compose, conf_dir, explained, nearest, splits_dir
+from wearcap.data.prepare.engine import Report, prepare
+from wearcap.data.prepare.splits import read_splits
+from wearcap.errors import WearcapError
+from wearcap.recording.store import SPLITS, RecordingStore
+
+HELP = "make a data set: wearcap prepare simulated, wearcap prepare cmu source=DIR"
+
+
+def run(config: DictConfig) -> Report:
+    """Prepare what the config describes."""
+    listed = splits_dir() / config.splits
+    splits = read_splits(listed if listed.is_file() else Path(config.splits))
+    tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits)
+    report = prepare(
+        tasks, config.output, jobs=config.jobs, backend=config.backend, scheduler=config.scheduler,
+        overwrite=config.overwrite,
+    )  # fmt: skip
+    _tell(report, RecordingStore.open(config.output))
+    return report
+
+
+def _tell(report: Report, store: RecordingStore) -> None:
+    for name, note in sorted(report.notes.items()):
+        print(f"{name}: {note}")
+    for name, reason in sorted(report.failed.items()):
+        print(f"failed: {name}: {reason}", file=sys.stderr)
+    ours = {*report.written, *report.current}
+    if others := [name for name in store.names() if name not in ours]:
+        print(f"{len(others)} recordings of earlier runs lie here too, {others[0]} among them")
+    print(
+        f"{store.root}: {len(report.written)} written, {len(report.current)} current, {len(report.failed)} failed"
+    )
+    for split in SPLITS:
+        entries = [store.entries[name] for name in store.names(split)]
+        minutes = sum(entry.duration_s for entry in entries) / 60
+        subjects = len({entry.subject for entry in entries})
+        print(f"  {split:5} {len(entries):4} recordings, {subjects:3} subjects, {minutes:7.1f} min")
+
+
+def sources() -> dict[str, Path]:
+    """Sources by name: the configs of `conf/prepare/`."""
+    return {path.stem: path for path in sorted((conf_dir() / "prepare").glob("*.yaml"))}
+
+
+def usage() -> str:
+    """What can be prepared."""
+    lines = ["usage: wearcap prepare SOURCE [key=value …]     wearcap prepare SOURCE --help", ""]
+    for name, path in sources().items():
+        about = next(line[2:] for line in path.read_text(encoding="utf-8").splitlines()
+                     if line.startswith("# ") and not line.startswith("# @"))  # fmt: skip
+        lines.append(f"  {name:10} {about}")
+    return "\n".join([*lines, "", (conf_dir() / "prepare.yaml").read_text(encoding="utf-8").split("\n\n")[1]])
+
+
+def main(arguments: list[str]) -> None:
+    """Exits with 1 when a recording could not be made."""
+    source = next((argument for argument in arguments if "=" not in argument and argument[0] != "-"), None)
+    if source is None:
+        print(usage())
+        if not {"--help", "-h"} & set(arguments):
+            raise WearcapError("no source given", expected=f"one of {', '.join(sources())}")
+    elif source not in sources():
+        raise WearcapError(f"no source {source!r}", fix=nearest(source, sources()))
+    elif {"--help", "-h"} & set(arguments):
+        print(sources()[source].read_text(encoding="utf-8"))
+        print((conf_dir() / "prepare.yaml").read_text(encoding="utf-8").split("\n\n")[1])
+    else:
+        overrides = [f"prepare={source}", *(argument for argument in arguments if argument != source)]
+        with explained("prepare", overrides):
+            config = compose("prepare", overrides)
+            if missing := sorted(OmegaConf.missing_keys(config)):
+                raise WearcapError(
+                    f"{missing[0]} has no value", fix=f"Give it: wearcap prepare {source} {missing[0]}=…"
+                )
+            report = run(config)
+        if report.failed:
+            sys.exit(1)
