@@ -20,7 +20,7 @@ from hydra.errors import (
 )
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 from wearcap.errors import WearcapError
 
@@ -146,9 +146,8 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
     if isinstance(error, OverrideParseException):
         return WearcapError(f"cannot read the override {error.override!r}", expected="key=value",
                             fix=f"({str(error).splitlines()[0]})")  # fmt: skip
-    if isinstance(error, MissingMandatoryValue):
-        key = re.search(r"Missing mandatory value: (\S+)", str(error))
-        key = key.group(1) if key else str(error.full_key or "")
+    if missing := re.search(r"Missing mandatory value: (\S+)", str(error)):
+        key = missing.group(1).rstrip(".")
         return WearcapError(f"{key} has no value", fix=f"Give it on the command line: {key}=…")
     key = re.search(
         r"(?:Could not override|Could not delete from config\.|Could not append) '([^']+)'", str(error)

@@ -77,10 +77,9 @@ def main(arguments: list[str]) -> None:
         overrides = [f"prepare={source}", *(argument for argument in arguments if argument != source)]
         with explained("prepare", overrides):
             config = compose("prepare", overrides)
-            if missing := sorted(OmegaConf.missing_keys(config)):
-                raise WearcapError(
-                    f"{missing[0]} has no value", fix=f"Give it: wearcap prepare {source} {missing[0]}=…"
-                )
+            OmegaConf.to_container(
+                config, resolve=True, throw_on_missing=True
+            )  # what lacks a value is said here
             report = run(config)
         if report.failed:
             sys.exit(1)
