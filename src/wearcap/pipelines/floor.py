@@ -5,7 +5,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.recording import Recording
-from wearcap.scene.floor import estimate_floor, floor_from_head
+from wearcap.scene.floor import EYE_HEIGHT_OF_STATURE, estimate_floor, floor_from_head
 
 MIN_POINTS = 500
 """Fewer points than this say nothing about a floor."""
@@ -26,7 +26,7 @@ def floor_beneath(
         return interpolate(recording.floor.timestamps, recording.floor.height, timestamps)
     if recording.points is not None and len(recording.points.points_world) >= MIN_POINTS:
         return estimate_floor(recording.points.points_world, t_world_head, stature).height
-    return floor_from_head(t_world_head, stature).height
+    return floor_from_head(t_world_head, stature / EYE_HEIGHT_OF_STATURE).height
 
 
 def interpolate(

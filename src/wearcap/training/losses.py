@@ -1,12 +1,16 @@
-"""Loss terms: pure functions of predictions and truth, averaged over the frames that exist."""
+"""Loss terms: pure functions of predictions and truth, averaged over frames, padding left out."""
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 
 def masked_mean(value: Float[Tensor, "batch time"], valid: Bool[Tensor, "batch time"]) -> Float[Tensor, ""]:
-    """Mean over valid frames; zero when there are none."""
-    return (value * valid).sum() / valid.sum().clamp_min(1)
+    """Mean over all frames, padding counting as zero.
+
+    Divided by the number of valid frames instead, the gradient would depend on how a batch is shared out among
+    processes: each would weigh its own padding.
+    """
+    return (value * valid).mean()
 
 
 def motion_mse(

@@ -7,14 +7,13 @@ import lightning
 import torch
 from torch import Tensor
 
-from wearcap.body.hang import hang
+from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import HeadFeatures
 from wearcap.data.statistics import feature_statistics
 from wearcap.data.windows import Window, WindowDataset
 from wearcap.diffusion.process import add_noise
 from wearcap.diffusion.schedule import Schedule
-from wearcap.geometry.rigid import Rigid
 from wearcap.models.denoiser import MotionDenoiser
 from wearcap.training import losses
 
@@ -66,21 +65,17 @@ class MotionDiffusion(lightning.LightningModule):
         x0_hat = self._denoise(x_t, batch.level, condition, batch.valid)
         terms = {"motion": losses.motion_mse(x0_hat, x0, batch.valid)}
         if self.loss_weights.get("joints") or self.loss_weights.get("velocity"):
-            predicted, true = self._joints(x0_hat.float(), batch), self._true_joints(batch)
+            R_hat = self.features.decode(self.net.motion_normalizer.inverse(x0_hat.float()), batch.R_world_head)
+            predicted, true = self._from_head(R_hat, batch), self._from_head(batch.R_parent_joint, batch)
             terms["joints"] = losses.joint_position(predicted, true, batch.valid)
             terms["velocity"] = losses.joint_velocity(predicted, true, batch.valid, self.fps)
         return terms
 
-    def _joints(self, x0_hat: Tensor, batch: Window) -> Tensor:
-        R = self.features.decode(self.net.motion_normalizer.inverse(x0_hat), batch.R_world_head)
-        return self._hung(R, batch)
-
-    def _true_joints(self, batch: Window) -> Tensor:
-        return self._hung(batch.R_parent_joint, batch)
-
-    def _hung(self, R_parent_joint: Tensor, batch: Window) -> Tensor:
-        T_world_head = Rigid(batch.R_world_head, batch.t_world_head)
-        return hang(self.skeleton, R_parent_joint, T_world_head, batch.t_parent_joint[:, None])[1].t
+    def _from_head(self, R_parent_joint: Tensor, batch: Window) -> Tensor:
+        """Joint positions seen from the head joint: where hanging the body from the true head puts them."""
+        origin = torch.zeros_like(batch.t_world_head)
+        joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
+        return joints - joints[:, :, self.skeleton.index("head"), None]
 
     def _loss(self, batch: Window, stage: str) -> Tensor:
         terms = self.terms(batch)
