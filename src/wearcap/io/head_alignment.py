@@ -1,0 +1,180 @@
+"""Align a motion capture suit with the head device worn on it: clocks, seat of the device, and the suit's drifting world."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, interpolate, resample
+
+_RATE_HZ = 60.0
+_STEP_S = 0.5
+"""Span of the relative motions that are compared: long against noise, short against the suit's drift."""
+_SEAT_PRIOR_M = 0.05
+"""Standard deviation of the device's place on the head about the assumed one (ours)."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How suit and device hang together."""
+
+    T_head_device: Rigid
+    """The device on the suit's head joint (constant)."""
+    T_world_suit: Rigid
+    """The suit's world in the device's, per suit frame: a turn about the vertical and a shift."""
+    residual_m: float
+    residual_rad: float
+    """Median distance and angle between the aligned head and the device."""
+
+
+def clock_offset(suit: Trajectory, device: Trajectory) -> float:
+    """Seconds to add to the suit's timestamps to bring them to the device's clock, from angular speed alone.
+
+    Clocks may differ by any amount; the whole recordings are correlated. Raises WearcapError when no shift makes the
+    head's and the device's turns alike (correlation below 0.5).
+    """
+    grids, speeds = [], []
+    for track in (suit, device):
+        span = (track.timestamps[-1] - track.timestamps[0]).item()
+        grid = track.timestamps[0] + torch.arange(int(span * _RATE_HZ) + 1, dtype=torch.float64) / _RATE_HZ
+        R = resample(track, grid).R_world_body.double()
+        speeds.append(rotation.geodesic(R[:-1], R[1:]) * _RATE_HZ)
+        grids.append(grid)
+    a, b = (speed.clamp(max=10.0).numpy() for speed in speeds)
+    lag, score = _best_shift(a, b)
+    if score < 0.5:
+        raise WearcapError(f"head and device do not move alike at any shift of their clocks (correlation {score:.2f})",
+                           expected="a recording of the same head")  # fmt: skip
+    return grids[1][0].item() - grids[0][0].item() + lag / _RATE_HZ
+
+
+def _best_shift(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """Shift in samples with a[i] ≈ b[i + shift], and the correlation there; at least a third must overlap."""
+    size = 1 << (len(a) + len(b)).bit_length()
+    shifts = np.arange(-len(a) + 1, len(b))
+
+    def correlate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        product = np.fft.irfft(np.fft.rfft(x, size).conj() * np.fft.rfft(y, size), size)
+        return product[shifts]
+
+    one_a, one_b = np.ones_like(a), np.ones_like(b)
+    count = np.maximum(correlate(one_a, one_b), 1.0)
+    mean_a, mean_b = correlate(a, one_b) / count, correlate(one_a, b) / count
+    covariance = correlate(a, b) / count - mean_a * mean_b
+    spread = (correlate(a * a, one_b) / count - mean_a**2) * (correlate(one_a, b * b) / count - mean_b**2)
+    score = covariance / np.sqrt(np.maximum(spread, 1e-9))
+    score[count < min(len(a), len(b)) / 3] = -1
+    best = int(score.argmax())
+    shift = 0.0
+    if 0 < best < len(score) - 1 and score[best - 1] > -1 and score[best + 1] > -1:
+        left, middle, right = score[best - 1 : best + 2]
+        shift = 0.5 * (left - right) / min(left - 2 * middle + right, -1e-12)
+    return float(shifts[best] + shift), float(score[best])
+
+
+def align_head(
+    suit: Trajectory, device: Trajectory, t_head_device: Float[Tensor, "3"], window_s: float = 8.0
+) -> Alignment:
+    """Solve device = T_world_suit(t) · suit head · T_head_device, both streams on one clock, both worlds z up.
+
+    The seat's rotation comes from relative turns and from both streams' sense of up (Wahba's problem), its place from
+    head turns with `t_head_device` (m) as a weak prior; the suit's world then is the median turn and shift in windows
+    of `window_s`, interpolated. Raises WearcapError where the streams share less than 10 s or the head hardly turns.
+    """
+    shared = (suit.timestamps >= device.timestamps[0]) & (suit.timestamps <= device.timestamps[-1])
+    if shared.sum() < 2 or suit.timestamps[shared][-1] - suit.timestamps[shared][0] < 10:
+        raise WearcapError(
+            "suit and device share less than 10 s", expected="overlapping recordings on one clock"
+        )
+    start, stop = suit.timestamps[shared][0].item(), suit.timestamps[shared][-1].item()
+    grid = start + torch.arange(int((stop - start) * _RATE_HZ), dtype=torch.float64) / _RATE_HZ
+    head, seen = (_double(resample(track, grid)) for track in (suit, device))
+    R_head_device = _seat_rotation(head.R, seen.R)
+    R_apart = seen.R @ R_head_device.mT @ head.R.mT
+    yaw, knots = _windowed_yaw(R_apart, grid, window_s)
+    R_world_suit = rotation.about_axis("z", _between(knots, yaw, grid))
+    t_seat = _seat_place(
+        Rigid(R_world_suit @ head.R, (R_world_suit @ head.t[..., None])[..., 0]), seen, t_head_device.double()
+    )
+    t_apart = seen.t - (R_world_suit @ (head.t + (head.R @ t_seat))[..., None])[..., 0]
+    shift = _windowed_median(t_apart, grid, knots, window_s)
+    error = t_apart - _between(knots, shift, grid)
+    at = suit.timestamps
+    T_world_suit = Rigid(rotation.about_axis("z", _between(knots, yaw, at)), _between(knots, shift, at))
+    turn = rotation.geodesic(R_world_suit @ head.R @ R_head_device, seen.R)
+    T_head_device = Rigid(R_head_device, t_seat).to(torch.float32)
+    return Alignment(T_head_device, T_world_suit, error.norm(dim=-1).median().item(), turn.median().item())
+
+
+def _double(track: Trajectory) -> Rigid:
+    return Rigid(track.R_world_body.double(), track.t_world_body.double())
+
+
+def _seat_rotation(R_head: Tensor, R_device: Tensor) -> Float64[Tensor, "3 3"]:
+    """R_head_device with turn_head = R_head_device · turn_device and up_head = R_head_device · up_device, robustly."""
+    step = int(_STEP_S * _RATE_HZ)
+    turn_head = rotation.log(R_head[:-step].mT @ R_head[step:])
+    turn_device = rotation.log(R_device[:-step].mT @ R_device[step:])
+    if turn_head.norm(dim=-1).quantile(0.9) < 0.1:
+        raise WearcapError(
+            "the head hardly turns", expected="turns of more than 6° in half a second, now and then"
+        )
+    a = torch.cat([turn_head, R_head[:, 2, :]])
+    b = torch.cat([turn_device, R_device[:, 2, :]])
+    weight = torch.ones(len(a), dtype=torch.float64)
+    R = torch.eye(3, dtype=torch.float64)
+    for _ in range(8):
+        R = rotation.mean_rotation(torch.einsum("n,ni,nj->ij", weight, a, b)[None])
+        residual = (a - b @ R.mT).norm(dim=-1)
+        weight = 1 / (residual / residual.median().clamp(min=1e-6)).clamp(min=1.0)
+    return R
+
+
+def _seat_place(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) -> Float64[Tensor, "3"]:
+    """t_head_device from how the device moves against the head joint while the head turns (least squares, Huber)."""
+    step = int(_STEP_S * _RATE_HZ)
+    A = head.R[step:] - head.R[:-step]
+    b = (seen.t[step:] - seen.t[:-step]) - (head.t[step:] - head.t[:-step])
+    t = t_prior
+    for _ in range(8):
+        residual = (b - A @ t).norm(dim=-1)
+        scale = residual.median().clamp(min=1e-4)
+        # Half-second differences overlap thirtyfold, so the samples count for so much less.
+        weight = 1 / (residual / scale).clamp(min=1.0) / (scale**2 * step)
+        normal = (
+            torch.einsum("n,nki,nkj->ij", weight, A, A) + torch.eye(3, dtype=torch.float64) / _SEAT_PRIOR_M**2
+        )
+        right = torch.einsum("n,nki,nk->i", weight, A, b) + t_prior / _SEAT_PRIOR_M**2
+        t = torch.linalg.solve(normal, right)
+    return t
+
+
+def _windowed_yaw(R_apart: Tensor, grid: Tensor, window_s: float) -> tuple[Tensor, Tensor]:
+    """Turn about the vertical (rad, unwrapped) by window, and the windows' middles."""
+    cos, sin = R_apart[:, 0, 0] + R_apart[:, 1, 1], R_apart[:, 1, 0] - R_apart[:, 0, 1]
+    length = torch.hypot(cos, sin).clamp(min=1e-9)
+    count = max(2, round((grid[-1] - grid[0]).item() / (window_s / 2)) + 1)
+    knots = torch.linspace(grid[0].item(), grid[-1].item(), count, dtype=torch.float64)
+    mean = _windowed_median(torch.stack([cos / length, sin / length], 1), grid, knots, window_s)
+    return torch.from_numpy(np.unwrap(torch.atan2(mean[:, 1], mean[:, 0]).numpy())), knots
+
+
+def _windowed_median(value: Tensor, grid: Tensor, knots: Tensor, window_s: float) -> Tensor:
+    """Median of the values within half a window of each knot; windows at the ends shrink to stay symmetric."""
+    first = torch.searchsorted(grid, knots - window_s / 2)
+    last = torch.searchsorted(grid, knots + window_s / 2, right=True)
+    middle = torch.searchsorted(grid, knots).clamp(max=len(grid) - 1)
+    reach = torch.minimum(middle - first, last - 1 - middle).clamp(min=int(0.5 * _RATE_HZ))
+    return torch.stack([
+        value[max(m - r, 0) : m + r + 1].median(0).values for m, r in zip(middle.tolist(), reach.tolist())
+    ])  # fmt: skip
+
+
+def _between(knots: Tensor, value: Tensor, at: Tensor) -> Tensor:
+    """Linear interpolation between knots, held outside them."""
+    return interpolate(knots, value, at.clamp(knots[0].item(), knots[-1].item()))
