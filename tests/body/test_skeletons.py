@@ -54,7 +54,7 @@ def test_round_trip_through_xsens(name):
     back = forward_kinematics(source, *retarget(target, source, *retarget(source, target, R, t))).t
     wrist, ankle = ("lhand", "lfoot") if name == "cmu31" else ("left_wrist", "left_ankle")
     for theirs, ours in ((wrist, "left_wrist"), (ankle, "left_ankle")):
-        assert (truth[:, source.index(theirs)] - there[:, target.index(ours)]).norm(dim=-1).max() < 0.002
+        assert (truth[:, source.index(theirs)] - there[:, target.index(ours)]).norm(dim=-1).max() < 0.005
     body = [j for j in range(len(source)) if not _is_finger(source.joint_names[j])]
     assert (back - truth)[:, body].norm(dim=-1).mean() < 0.004
     assert (back - truth)[:, body].norm(dim=-1).max() < 0.030

@@ -1,11 +1,10 @@
 """Motion of one skeleton worn by another, and a skeleton given another's bone lengths.
 
-Every skeleton is first brought into one T-pose (legs down, arms sideways; the least swing of each limb bone).
-A joint's *turn* is its rotation from that pose to the moment's, in world axes; turns mean the same in every
+A joint's *turn* is its rotation from the T-pose to the moment's, in world axes; turns mean the same in every
 skeleton, whatever its bind pose, and are what is carried across.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import roma
 import torch
@@ -13,56 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics, local_rotations
-from wearcap.body.landmarks import Landmarks, landmarks
-from wearcap.body.limb_ik import reach, swing_between
+from wearcap.body.landmarks import Landmarks
+from wearcap.body.limb_ik import reach
 from wearcap.body.skeleton import Site, Skeleton
+from wearcap.body.t_pose import TPose, t_pose
 from wearcap.geometry.rigid import Rigid
 
-_SPLAY = 0.17
-"""Lateral angle (rad) of a bind pose's shins above which its feet are taken to be rolled with them."""
 _SIDES = ("left", "right")
-
-
-@dataclass(frozen=True)
-class _TPose:
-    """A skeleton brought to the T-pose, root at the origin: what its parts are and where they then stand."""
-
-    marks: Landmarks
-    R: Float[Tensor, "joint 3 3"]
-    t: Float[Tensor, "joint 3"]
-
-    @property
-    def hip_centre(self) -> Float[Tensor, "3"]:
-        return (self.t[self.marks.limb["left_leg"][0]] + self.t[self.marks.limb["right_leg"][0]]) / 2
-
-
-def _t_pose(skeleton: Skeleton) -> _TPose:
-    marks = landmarks(skeleton)
-    rest = skeleton.rest_joints.double()
-    aim: dict[int, tuple[Tensor, Tensor]] = {}
-    feet = {}
-    for name, (first, second, third) in marks.limb.items():
-        y = 1.0 if name.startswith("left") else -1.0
-        direction = torch.tensor(
-            [0.0, 0.0, -1.0] if name.endswith("leg") else [0.0, y, 0.0], dtype=rest.dtype
-        )
-        aim[first] = (rest[second] - rest[first], direction)
-        aim[second] = (rest[third] - rest[second], direction)
-        if name.endswith("leg"):
-            feet[third] = aim[second]
-    R = [torch.eye(3, dtype=rest.dtype)] * len(skeleton)
-    for joint in range(1, len(skeleton)):
-        R[joint] = R[skeleton.parents[joint]]
-        if joint in aim:
-            R[joint] = swing_between(*aim[joint])
-        elif joint in feet:
-            bone, down = feet[joint]
-            splayed = bone[1].abs() > _SPLAY * bone.norm()
-            R[joint] = swing_between(bone, down) if splayed else torch.eye(3, dtype=rest.dtype)
-    R_t = torch.stack(R)
-    local = local_rotations(skeleton, R_t)
-    t = forward_kinematics(skeleton, local, torch.zeros(3, dtype=rest.dtype)).t
-    return _TPose(marks, R_t, t)
 
 
 # ------------------------------------------------------------------------------------------------ rotations
@@ -79,7 +35,7 @@ def _overlaps(
     return share / share.sum(1, keepdim=True)
 
 
-def _knots(pose: _TPose, joints: tuple[int, ...], end: int) -> Float[Tensor, "knot"]:
+def _knots(pose: TPose, joints: tuple[int, ...], end: int) -> Float[Tensor, "knot"]:
     """Arc length at each joint of a chain and at its end."""
     points = pose.t[[*joints, end]]
     steps = (points[1:] - points[:-1]).norm(dim=-1)
@@ -97,7 +53,7 @@ def _spread(
 
 
 def _carry(
-    turn: Float[Tensor, "*batch joint 3 3"], source: _TPose, target: _TPose, parents: tuple[int, ...]
+    turn: Float[Tensor, "*batch joint 3 3"], source: TPose, target: TPose, parents: tuple[int, ...]
 ) -> Float[Tensor, "*batch joint_t 3 3"]:
     """Turns of the target's joints from the source's; joints without a counterpart follow their parent."""
     from_s, to = source.marks, target.marks
@@ -141,7 +97,7 @@ def retarget(
     near as the target's bones reach). Nothing is scaled: for a wearer of another size use `fit_offsets` first.
     Raises WearcapError where a skeleton's limbs are not recognised.
     """
-    pose_s, pose_t = _t_pose(source), _t_pose(target)
+    pose_s, pose_t = t_pose(source), t_pose(target)
     T_world_source = forward_kinematics(source, R_parent_joint, t_world_root)
     turn = T_world_source.R @ pose_s.R.to(T_world_source.R).transpose(-1, -2)
     R_world = _carry(turn, pose_s, pose_t, target.parents) @ pose_t.R.to(turn)
@@ -187,7 +143,7 @@ def fit_offsets(source: Skeleton, target: Skeleton) -> Skeleton:
     Limb bones keep the target's directions and take the source's lengths; the trunk takes the source's shape.
     Heels and toe tips are copied where the source has them, other sites scaled.
     """
-    pose_s, pose_t = _t_pose(source), _t_pose(target)
+    pose_s, pose_t = t_pose(source), t_pose(target)
     scale = _size(pose_s) / _size(pose_t)
     places = _places(pose_s, pose_t, float(scale))
     t = pose_t.t.clone()
@@ -203,7 +159,7 @@ def fit_offsets(source: Skeleton, target: Skeleton) -> Skeleton:
     return replace(fitted, sites=_fitted_sites(source, target, pose_s, replace(pose_t, t=t), float(scale)))
 
 
-def _size(pose: _TPose) -> Tensor:
+def _size(pose: TPose) -> Tensor:
     """Height of the head joint above the ankles (m)."""
     ankles = pose.t[[pose.marks.limb[f"{side}_leg"][2] for side in _SIDES], 2]
     return pose.t[pose.marks.head, 2] - ankles.mean()
@@ -219,7 +175,7 @@ def _resampled(points: Float[Tensor, "point 3"], fractions: Float[Tensor, "knot"
     return points[after - 1] * (1 - weight) + points[after] * weight
 
 
-def _places(source: _TPose, target: _TPose, scale: float) -> dict[int, Tensor]:
+def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
     """T-pose positions of the target's landmark joints, its root at the origin."""
     from_s, to = source.marks, target.marks
     shift = target.hip_centre * scale - source.hip_centre
@@ -261,7 +217,7 @@ def _places(source: _TPose, target: _TPose, scale: float) -> dict[int, Tensor]:
 
 
 def _fitted_sites(
-    source: Skeleton, target: Skeleton, pose_s: _TPose, pose_t: _TPose, scale: float
+    source: Skeleton, target: Skeleton, pose_s: TPose, pose_t: TPose, scale: float
 ) -> dict[str, Site]:
     """The target's sites on the fitted body: scaled, the feet's copied where the source has them.
 
@@ -289,7 +245,7 @@ def _fitted_sites(
     return sites
 
 
-def _on_foot(source: Skeleton, pose_s: _TPose, pose_t: _TPose, side: str, name: str) -> Float[Tensor, "3"]:
+def _on_foot(source: Skeleton, pose_s: TPose, pose_t: TPose, side: str, name: str) -> Float[Tensor, "3"]:
     """T-pose position on the target of a foot site of the source: the same offset from the ankle."""
     site = source.sites[name]
     joint = source.index(site.joint)

@@ -1,0 +1,64 @@
+"""A body surface on a skeleton: what every parametric human is once its shape is chosen."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+
+
+@dataclass(frozen=True, eq=False)
+class BodyModel:
+    """A mesh in its skeleton's rest pose (root at the origin, m) and how it follows the joints."""
+
+    skeleton: Skeleton
+    rest_vertices: Float[Tensor, "vertex 3"]
+    faces: Int64[Tensor, "face 3"]
+    skin_joints: Int64[Tensor, "vertex 4"]
+    skin_weights: Float[Tensor, "vertex 4"]
+    """Of `skin_joints`; rows sum to 1."""
+    regions: dict[str, Int64[Tensor, "_"]] = field(default_factory=dict)
+    """Vertices of {left,right}_{toes,heel,sole,palm}."""
+
+    def vertices(self, T_world_joint: Rigid, region: str | None = None) -> Float[Tensor, "*batch vertex 3"]:
+        """World positions (m) by linear blend skinning, of all vertices or of one region's.
+
+        T_world_joint: R "*batch joint 3 3", t "*batch joint 3", as forward kinematics gives them.
+        Raises WearcapError for an unknown region.
+        """
+        if region is not None and region not in self.regions:
+            raise WearcapError(
+                f"the body has no region {region!r}", expected=f"one of {', '.join(self.regions)}"
+            )
+        rows = slice(None) if region is None else self.regions[region].to(self.rest_vertices.device)
+        rest, weight = self.rest_vertices[rows].to(T_world_joint.t), self._weights[rows].to(T_world_joint.t)
+        joints = self.skeleton.rest_joints.to(T_world_joint.t)
+        # Each joint's affine map of rest points, blended per vertex: one matrix product for all joints.
+        shift = T_world_joint.t - (T_world_joint.R @ joints[..., None])[..., 0]
+        affine = torch.cat([T_world_joint.R, shift[..., None]], -1).flatten(-2)
+        blended = (weight @ affine).unflatten(-1, (3, 4))
+        return (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
+
+    @cached_property
+    def _weights(self) -> Float[Tensor, "vertex joint"]:
+        dense = self.skin_weights.new_zeros(len(self.rest_vertices), len(self.skeleton))
+        return dense.scatter_add(1, self.skin_joints, self.skin_weights)
+
+    @cached_property
+    def volume(self) -> float:
+        """Volume (m³) of the resting body."""
+        a, b, c = (self.rest_vertices[self.faces[:, corner]].double() for corner in range(3))
+        return float((torch.linalg.cross(a, b) * c).sum() / 6)
+
+
+def four_weights(
+    weights: Float[Tensor, "vertex joint"],
+) -> tuple[Int64[Tensor, "vertex 4"], Float[Tensor, "vertex 4"]]:
+    """The four joints that hold each vertex most, and their weights, summing to 1."""
+    top = weights.topk(4, dim=1)
+    return top.indices, top.values / top.values.sum(1, keepdim=True).clamp_min(1e-12)
