@@ -21,19 +21,19 @@ TRUNK = ("pelvis", "l5", "l3", "t12", "t8", "neck", "head", "left_hip", "right_h
 class CleaningLimits:
     """When a motion is taken for a glitch, a foot for planted, a floor for level."""
 
-    max_trunk_speed: float
+    max_trunk_speed: float | int
     """Of `TRUNK`'s joints (m/s); sprinters reach 12, CMU's runners 5."""
-    max_limb_speed: float
+    max_limb_speed: float | int
     """Of all other joints (m/s); a kicking foot reaches 14 in CMU."""
-    contact_speed: float
+    contact_speed: float | int
     """A foot patch slower than this (m/s) and …"""
-    contact_height: float
+    contact_height: float | int
     """… lower than this above the floor (m) touches it."""
-    level_within: float
+    level_within: float | int
     """Spread (m, 5th to 95th percentile) of the lowest planted patch's height up to which the floor is level."""
 
 
-def resampled(motion: Motion, fps: float) -> Motion:
+def resampled(motion: Motion, fps: float | int) -> Motion:
     """The motion at `fps`: every n-th frame where the rates divide, else slerp (rotations) and lerp (root)."""
     ratio = motion.fps / fps
     steps = motion.timestamps.diff()

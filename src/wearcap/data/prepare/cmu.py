@@ -26,7 +26,7 @@ CGSPEED_JOINT = "LHipJoint"
 class BvhSettings:
     """Units and axes of BVH files other than CMU's (those are known)."""
 
-    unit_m: float
+    unit_m: float | int
     up: str
     forward: str
 
@@ -38,7 +38,7 @@ class Trial:
     file: Path
     asf: Path | None
     about: About
-    amc_fps: float
+    amc_fps: float | int
     bvh: BvhSettings
     settings: MocapSettings
 
@@ -59,7 +59,7 @@ class Trial:
 
 def cmu_tasks(
     source: str | Path, splits: Splits, settings: MocapSettings, bvh: BvhSettings,
-    amc_fps: float, license: str,
+    amc_fps: float | int, license: str,
 ) -> list[Task]:  # fmt: skip
     """One task per trial found anywhere below `source`.
 

@@ -25,7 +25,7 @@ from wearcap.recording.recording import ContactTrack, FloorTrack, HeadStream, Re
 class MocapSettings:
     """How motion capture without sensors becomes a recording."""
 
-    fps: float
+    fps: float | int
     t_head_device: Sequence[float]
     """Nominal place of a head-mounted device on the head joint (m)."""
     limits: CleaningLimits

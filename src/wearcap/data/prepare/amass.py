@@ -1,0 +1,52 @@
+"""AMASS: the user's own download, SMPL-H or SMPL-X files."""
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from wearcap.data.prepare.engine import Task, content_hash
+from wearcap.data.prepare.mocap import About, MocapSettings, mocap_recording
+from wearcap.data.prepare.splits import Splits
+from wearcap.errors import WearcapError
+from wearcap.io.amass import read_amass
+from wearcap.recording.recording import Recording
+
+VERSION = 1
+"""Raised when the same source and settings would give another recording."""
+
+NO_MOTION = ("shape.npz", "stagei.npz")
+"""Ends of the names of files that hold no motion."""
+
+
+@dataclass(frozen=True)
+class AmassFile:
+    """One motion file; picklable, callable as a task."""
+
+    file: Path
+    about: About
+    settings: MocapSettings
+
+    def __call__(self) -> Recording:
+        source = read_amass(self.file)
+        assert source.motion is not None
+        return replace(mocap_recording(source.motion, self.about, self.settings), shape=source.shape)
+
+
+def amass_tasks(source: str | Path, splits: Splits, settings: MocapSettings, license: str) -> list[Task]:
+    """One task per motion file below `source`, laid out DATASET/SUBJECT/MOTION.npz."""
+    source = Path(source)
+    if not source.is_dir():
+        raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
+    files = sorted(path for path in source.rglob("*.npz") if not path.name.endswith(NO_MOTION))
+    tasks = []
+    for path in files:
+        parts = path.relative_to(source).with_suffix("").parts
+        if len(parts) < 3:
+            raise WearcapError("not below a data set's and a subject's folder", where=path,
+                               expected=f"{source}/DATASET/SUBJECT/{path.name}")  # fmt: skip
+        name, subject = "__".join(parts).replace(" ", "_"), "/".join(parts[:2])
+        about = About(name, subject, "amass", license)
+        settings_hash = content_hash(asdict(about), asdict(settings), VERSION, path)
+        tasks.append(Task(name, AmassFile(path, about, settings), splits.of(subject), settings_hash))
+    if not tasks:
+        raise WearcapError("no motion files (.npz)", where=source, expected="AMASS as it unpacks")
+    return tasks
