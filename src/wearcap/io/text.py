@@ -3,7 +3,8 @@
 import gzip
 import lzma
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +15,18 @@ MAX_BYTES = 1 << 29
 """Largest unpacked size that is read (512 MiB: over an hour of 120 Hz motion as text)."""
 
 
-def read_bytes(path: str | Path, max_bytes: int = MAX_BYTES) -> bytes:
-    """Content of a file, unpacked when its name ends in .gz or .xz.
+@contextmanager
+def open_bytes(path: str | Path, max_bytes: int = MAX_BYTES) -> Iterator["BoundedReader"]:
+    """Open a file for reading bytes, unpacked when its name ends in .gz or .xz.
 
-    Raises WearcapError when it is missing, empty, larger than `max_bytes` once unpacked, or not what its name says.
+    Raises WearcapError, while opening or while reading inside the `with` block, when the file is missing, larger than
+    `max_bytes` once unpacked, or not what its name says.
     """
     path = Path(path)
     opener = {".gz": gzip.open, ".xz": lzma.open}.get(path.suffix, open)
     try:
         with opener(path, "rb") as file:
-            content = file.read(max_bytes + 1)
+            yield BoundedReader(file, path, max_bytes)
     except FileNotFoundError as error:
         raise WearcapError("no such file", where=path) from error
     except (lzma.LZMAError, gzip.BadGzipFile, zlib.error, EOFError) as error:
@@ -32,8 +35,28 @@ def read_bytes(path: str | Path, max_bytes: int = MAX_BYTES) -> bytes:
         ) from error
     except OSError as error:
         raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
-    if len(content) > max_bytes:
-        raise WearcapError(f"unpacks to more than {max_bytes} bytes", where=path, expected="a smaller file")
+
+
+class BoundedReader:
+    """A file's `read` that stops where a small packed file would fill the memory."""
+
+    def __init__(self, file, path: Path, max_bytes: int):
+        self._file, self._path, self._left, self._max = file, path, max_bytes, max_bytes
+
+    def read(self, size: int = -1) -> bytes:
+        content = self._file.read(self._left + 1 if size < 0 else size)
+        self._left -= len(content)
+        if self._left < 0:
+            raise WearcapError(
+                f"unpacks to more than {self._max} bytes", where=self._path, expected="a smaller file"
+            )
+        return content
+
+
+def read_bytes(path: str | Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """Content of a file. Raises WearcapError as `open_bytes` does, and when it is empty."""
+    with open_bytes(path, max_bytes) as file:
+        content = file.read()
     if not content:
         raise WearcapError("the file is empty", where=path)
     return content

@@ -1,0 +1,208 @@
+"""MVNX files, written here as MVN Analyze exports them: values, bones, contacts, sensors; hostile files; fuzz."""
+
+import gzip
+import re
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hostile import fuzz, mutated
+from hypothesis import given
+
+from wearcap.body.skeleton import xsens23
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.io.mvnx import read_mvnx
+from wearcap.recording import Motion
+
+SEGMENTS = {
+    "Pelvis": "pelvis", "L5": "l5", "L3": "l3", "T12": "t12", "T8": "t8", "Neck": "neck", "Head": "head",
+    **{side + segment: f"{side.lower()}_{joint}" for side, segments in (
+        ("Right", ("Shoulder", "UpperArm", "ForeArm", "Hand")), ("Left", ("Shoulder", "UpperArm", "ForeArm", "Hand")),
+        ("Right", ("UpperLeg", "LowerLeg", "Foot", "Toe")), ("Left", ("UpperLeg", "LowerLeg", "Foot", "Toe")),
+    ) for segment, joint in zip(segments, ("collar", "shoulder", "elbow", "wrist") if "Hand" in segments else ("hip", "knee", "ankle", "toe"))},
+}  # fmt: skip
+SENSORS = ["Pelvis", "T8", "Head", "LeftForeArm", "RightForeArm", "LeftLowerLeg", "Prop1"]
+CONTACTS = ["LeftFoot_Heel", "LeftFoot_Toe", "RightFoot_Heel", "RightFoot_Toe"]
+POINTS = {
+    "LeftFoot": ("pLeftHeelFoot", "-0.06 0 -0.05"),
+    "Head": ("pTopOfHead", "0 0 0.2"),
+    "LeftToe": ("pLeftToe", "0.05 0 0"),
+}
+IDENTITY = "1 0 0 0 "
+
+
+def numbers(values) -> str:
+    return " ".join(f"{v:.9f}" for v in np.asarray(values).reshape(-1))
+
+
+def sample(frames: int = 6) -> Motion:
+    generator = torch.Generator().manual_seed(8)
+    skeleton = xsens23().scaled(1.04)
+    R = rotation.exp(0.5 * torch.randn(frames, 23, 3, generator=generator))
+    contact = (torch.rand(frames, 4, generator=generator) > 0.5).float()
+    return Motion(
+        torch.arange(frames, dtype=torch.float64) / 240,
+        skeleton,
+        R,
+        torch.randn(frames, 3, generator=generator),
+        contact,
+    )
+
+
+def sensors(frames: int) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(9)
+    acc = torch.randn(frames, len(SENSORS), 3, generator=generator)
+    return acc, rotation.exp(torch.randn(frames, len(SENSORS), 3, generator=generator))
+
+
+def mvnx(motion: Motion, rest: str = "identity", contacts: list[str] = CONTACTS) -> str:
+    order = motion.skeleton.indices(*SEGMENTS.values())
+    poses, (acc, R_sensor) = motion.T_world_joint, sensors(len(motion))
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<mvnx version="4" xmlns="http://www.xsens.com/mvn/mvnx">',
+             '<mvn version="2022.0.0" build="x"/><comment/>',
+             f'<subject label="Suit" frameRate="240" segmentCount="{len(SEGMENTS)}" configuration="FullBody"><segments>']  # fmt: skip
+    for k, label in enumerate(SEGMENTS, 1):
+        point = (
+            f'<point label="{POINTS[label][0]}"><pos_b>{POINTS[label][1]}</pos_b></point>'
+            if label in POINTS
+            else ""
+        )
+        lines.append(f'<segment label="{label}" id="{k}"><points>{point}</points></segment>')
+    lines += ["</segments><sensors>", *(f'<sensor label="{label}"/>' for label in SENSORS), "</sensors>",
+              '<joints><joint label="jL5S1"><connector1>Pelvis/jL5S1</connector1></joint></joints><footContactDefinition>',
+              *(f'<contactDefinition label="{label}" index="{k}"/>' for k, label in enumerate(contacts)),
+              '</footContactDefinition><frames segmentCount="23" sensorCount="7" jointCount="22">']  # fmt: skip
+    rest_joints = motion.skeleton.rest_joints[order]
+    if rest:
+        lines.append(f'<frame time="0" index="" tc="00:00:00:00" ms="0" type="{rest}"><orientation>{IDENTITY * 23}</orientation>'
+                     f"<position>{numbers(rest_joints)}</position></frame>")  # fmt: skip
+        lines.append('<frame type="tpose-isb"><orientation>what else</orientation></frame>')
+    patches = ["LeftFoot_Heel", "LeftFoot_Toe", "RightFoot_Heel", "RightFoot_Toe"]
+    for k in range(len(motion)):
+        contact = motion.contact_prob[k, [patches.index(label) for label in contacts or patches]]
+        lines.append(
+            f'<frame time="{round(1000 * k / 240)}" index="{k}" tc="" ms="1" type="normal">'
+            f"<orientation>{numbers(rotation.quat_wxyz_from_matrix(poses.R[k, order].double()))}</orientation>"
+            f"<position>{numbers(poses.t[k, order])}</position><velocity>0 0 0</velocity>"
+            f"<footContacts>{' '.join(str(int(c)) for c in contact)}</footContacts>"
+            f"<sensorFreeAcceleration>{numbers(acc[k])}</sensorFreeAcceleration>"
+            f"<sensorOrientation>{numbers(rotation.quat_wxyz_from_matrix(R_sensor[k].double()))}</sensorOrientation></frame>"
+        )  # fmt: skip
+    return "\n".join([*lines, "</frames></subject></mvnx>"])
+
+
+def save(tmp_path, text: str):
+    (tmp_path / "t.mvnx").write_bytes(text.encode("utf-8", "replace"))
+    return tmp_path / "t.mvnx"
+
+
+@pytest.mark.parametrize("rest", ["identity", "tpose", ""])
+def test_pose_bones_contacts_and_sensors_come_back(tmp_path, rest):
+    motion = sample()
+    recording = read_mvnx(save(tmp_path, mvnx(motion, rest)))
+    back = recording.motion
+    assert back.skeleton.name == "xsens23"
+    assert back.fps == pytest.approx(240)
+    torch.testing.assert_close(
+        back.skeleton.t_parent_joint, motion.skeleton.t_parent_joint, atol=2e-6, rtol=0
+    )
+    torch.testing.assert_close(back.R_parent_joint, motion.R_parent_joint, atol=1e-5, rtol=0)
+    torch.testing.assert_close(back.T_world_joint.t, motion.T_world_joint.t, atol=1e-5, rtol=0)
+    torch.testing.assert_close(back.contact_prob, motion.contact_prob)
+    assert back.skeleton.sites["left_heel"].t_joint_site == pytest.approx((-0.06, 0, -0.05))
+    assert back.skeleton.sites["crown"].t_joint_site == pytest.approx((0, 0, 0.2))
+    acc, R_sensor = sensors(len(motion))
+    assert set(recording.imu) == {
+        "pelvis",
+        "t8",
+        "head",
+        "left_elbow",
+        "right_elbow",
+        "left_knee",
+        "right_knee",
+    } - {"right_knee"}
+    torch.testing.assert_close(recording.imu["left_elbow"].acc_world, acc[:, 3], atol=1e-6, rtol=0)
+    torch.testing.assert_close(recording.imu["left_elbow"].R_world_imu, R_sensor[:, 3], atol=1e-6, rtol=0)
+
+
+def test_contacts_are_sorted_by_their_labels(tmp_path):
+    motion = sample()
+    turned = read_mvnx(save(tmp_path, mvnx(motion, contacts=CONTACTS[::-1]))).motion
+    torch.testing.assert_close(turned.contact_prob, motion.contact_prob)
+    unnamed = read_mvnx(save(tmp_path, mvnx(motion, contacts=[]))).motion
+    torch.testing.assert_close(unnamed.contact_prob, motion.contact_prob)
+
+
+def test_dropped_frames_and_packed_files(tmp_path):
+    text = mvnx(sample()).replace('time="21" index="5"', 'time="38" index="9"')
+    (tmp_path / "t.mvnx.gz").write_bytes(gzip.compress(text.encode()))
+    recording = read_mvnx(tmp_path / "t.mvnx.gz")
+    assert recording.name == "t"
+    assert recording.motion.timestamps[-1].item() == pytest.approx(9 / 240)
+    (tmp_path / "t.mvnx.gz").write_bytes(gzip.compress(text.encode())[:2000])
+    with pytest.raises(WearcapError, match="not a complete"):
+        read_mvnx(tmp_path / "t.mvnx.gz")
+
+
+def test_doubtful_files_warn(tmp_path):
+    long = sample(200)
+    with pytest.warns(UserWarning, match="frame rate is believed"):
+        read_mvnx(save(tmp_path, mvnx(long).replace('frameRate="240"', 'frameRate="60"')))
+    text = mvnx(sample())
+    position = text.index("<position>", text.index('index="3"')) + len("<position>")
+    stretched = text[:position] + "9 " + text[text.index(" ", position) + 1 :]
+    with pytest.warns(UserWarning, match="away from where"):
+        read_mvnx(save(tmp_path, stretched))
+
+
+TEXT = mvnx(sample(2))
+BOMB = """<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">
+<!ENTITY c "&b;&b;&b;&b;&b;&b;&b;&b;&b;&b;">]><mvnx>&c;</mvnx>"""
+FILE_READ = '<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]><mvnx>&a;</mvnx>'
+FAULTS = {
+    "empty": ("", "broken XML"),
+    "garbage": ("\x01\x02", "broken XML"),
+    "truncated": (TEXT[: len(TEXT) * 2 // 3], "broken XML.*line"),
+    "entity bomb": (BOMB, "entities"),
+    "outside entity": (FILE_READ, "entities"),
+    "other xml": ("<html></html>", "segments"),
+    "no frames": (TEXT.replace('type="normal"', 'type="other"'), "no frames"),
+    "missing segment": (TEXT.replace('label="LeftFoot" id', 'label="Tail" id'), "leftfoot"),
+    "wrong count": (TEXT.replace("<position>", "<position>1 ", 2), "identity frame: position with 70"),
+    "nan": (re.sub(r"(<sensorFreeAcceleration>)\S+", r"\1nan", TEXT), "normal frame 0: not finite"),
+    "nan at rest": (TEXT.replace(IDENTITY, "nan 0 0 0 ", 1), "identity frame: not finite"),
+    "missing field": (re.sub(r"(?s)(.*)<footContacts>.*?</footContacts>", r"\1", TEXT), "frame 1: a frame with"),
+    "no quaternion": (TEXT.replace("<sensorOrientation>", "<sensorOrientation>7").replace("7-", "-7"), "unit quaternion"),
+    "rate 0": (TEXT.replace('frameRate="240"', 'frameRate="0"'), "frame rate"),
+    "rate text": (TEXT.replace('frameRate="240"', 'frameRate="fast"'), "cannot be understood"),
+    "no rate": (TEXT.replace('frameRate="240"', ""), "cannot be understood"),
+    "frames backwards": (TEXT.replace('index="1" tc', 'index="0" tc'), "repeat or fall"),
+    "huge count": (TEXT.replace('segmentCount="23"', 'segmentCount="99999999999"').replace('index="1" tc', 'index="x" tc'), "normal frame x"),
+    "segment without label": (TEXT.replace('<segment label="L5"', "<segment"), "cannot be understood"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_hostile_mvnx_is_named(tmp_path, fault):
+    text, message = FAULTS[fault]
+    with pytest.raises(WearcapError, match=message) as caught:
+        read_mvnx(save(tmp_path, text))
+    assert "t.mvnx" in str(caught.value)
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(WearcapError, match="no such file"):
+        read_mvnx(tmp_path / "none.mvnx")
+
+
+@fuzz
+@given(text=mutated(TEXT))
+def test_fuzz_gives_a_recording_or_one_clear_error(tmp_path, text):
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            recording = read_mvnx(save(tmp_path, text))
+    except WearcapError:
+        return
+    assert recording.motion.R_parent_joint.isfinite().all()
