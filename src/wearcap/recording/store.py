@@ -48,7 +48,7 @@ class RecordingFile:
             self._file = safetensors.safe_open(str(self.path), framework="pt")
         except FileNotFoundError as error:
             raise WearcapError("no such recording", where=path) from error
-        except (safetensors.SafetensorError, OSError) as error:
+        except (safetensors.SafetensorError, OSError, RuntimeError) as error:
             raise WearcapError(
                 f"not a readable recording ({error})", where=path, expected="a complete .safetensors file",
                 fix="Prepare this recording again.",
@@ -61,8 +61,7 @@ class RecordingFile:
             content = json.loads(metadata["wearcap"])
             version, self._tree = content["schema_version"], content["recording"]
         except (json.JSONDecodeError, KeyError, TypeError) as error:
-            raise WearcapError("its description is unreadable", where=path,
-                               fix="Prepare this recording again.") from error  # fmt: skip
+            raise self._unreadable(error) from error
         if version != SCHEMA_VERSION:
             raise WearcapError(f"schema version {version}", where=path,
                                expected=f"version {SCHEMA_VERSION}", fix="Prepare it again.")  # fmt: skip
@@ -87,10 +86,23 @@ class RecordingFile:
 
     def part(self, name: str):
         """One top-level part ("skeleton", "head", "motion" …), or None where the recording lacks it."""
-        return unflatten(self._tree.get(name), self.tensor)
+        return self._built(self._tree.get(name))
 
     def load(self) -> Recording:
-        return unflatten(self._tree, self.tensor)
+        recording = self._built(self._tree)
+        if not isinstance(recording, Recording):
+            raise self._unreadable(TypeError("not a Recording"))
+        return recording
+
+    def _built(self, tree):
+        try:
+            return unflatten(tree, self.tensor)
+        except (WearcapError, TypeError, ValueError, KeyError, AttributeError) as error:
+            raise self._unreadable(error) from error
+
+    def _unreadable(self, error: Exception) -> WearcapError:
+        return WearcapError(f"its description is unreadable ({error})", where=self.path,
+                            fix="Prepare this recording again.")  # fmt: skip
 
     def _require(self, key: str) -> None:
         if key not in self.keys:
@@ -131,8 +143,17 @@ class RecordingStore:
             manifest = json.loads(self.manifest_path.read_text(encoding="utf-8"))
             version = manifest["schema_version"]
             if version == SCHEMA_VERSION:
-                return {name: Entry(**entry) for name, entry in manifest["recordings"].items()}
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+                entries = {name: Entry(**entry) for name, entry in manifest["recordings"].items()}
+                for name, entry in entries.items():
+                    if self.root / entry.file != recording_path(self.root, name):
+                        raise ValueError(f"{name!r} lies at {entry.file!r}, outside this data set")
+                return entries
+        except (
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+        ) as error:  # JSON's and UTF-8's errors are ValueErrors
             raise WearcapError(f"not a readable manifest ({error})", where=self.manifest_path,
                                fix="Delete it and prepare the data set again.") from error  # fmt: skip
         raise WearcapError(f"schema version {version}", where=self.manifest_path,
