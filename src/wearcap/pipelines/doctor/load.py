@@ -10,10 +10,16 @@ import torch
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.adt import is_adt, read_adt
+from wearcap.io.amass import read_amass
 from wearcap.io.aria_mps import find_mps_file, head_stream, is_mps_folder, read_closed_loop, read_mps
 from wearcap.io.asf_amc import read_amc, read_asf
 from wearcap.io.bvh import read_bvh
 from wearcap.io.euroc import read_euroc
+from wearcap.io.motion_npz import read_motion
+from wearcap.io.mvnx import read_mvnx
+from wearcap.io.npz import read_npz
+from wearcap.io.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.pcd import read_pcd
 from wearcap.io.ply import read_ply
 from wearcap.io.tum import read_tum
@@ -46,12 +52,13 @@ def patients(path: Path) -> list[Patient]:
     if (path / "manifest.json").is_file():
         store = RecordingStore.open(path)
         return [Patient(name, partial(_read_stored, store, name)) for name in store.names()]
-    if is_mps_folder(path):
-        return [Patient(path.resolve().name, partial(_read_mps, path))]
+    for is_kind, read in _FOLDERS:
+        if is_kind(path):
+            return [Patient(path.resolve().name, partial(read, path))]
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) in _MOTIONS]
     if not files:
         raise WearcapError("nothing to examine here", where=path,
-                           expected=f"a data set (manifest.json), an MPS folder, or files like {', '.join(_MOTIONS)}")  # fmt: skip
+                           expected=f"a data set (manifest.json), an MPS, Nymeria or ADT folder, or files like {', '.join(_MOTIONS)}")  # fmt: skip
     return [Patient(file.relative_to(path).as_posix(), partial(_read_file, file)) for file in files]
 
 
@@ -144,7 +151,19 @@ def _read_csv(path: Path) -> Recording | Trajectory:
     return read_euroc(path)
 
 
-_MOTIONS = {".amc": _read_amc, ".bvh": read_bvh}
+def _read_npz(path: Path) -> Recording | Motion:
+    """A motion of ours, Nymeria's suit data, or an AMASS file, by the arrays it holds."""
+    if path.name == "xdata.npz":
+        return read_xdata(path)[0]
+    return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)
+
+
+_FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Loaded]], ...] = (
+    (is_nymeria, lambda folder: (read_nymeria(folder), [])),
+    (is_mps_folder, _read_mps),
+    (is_adt, lambda folder: (read_adt(folder), [])),
+)
+_MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _read_npz}
 _READERS: dict[str, Callable] = {
     **_MOTIONS, ".safetensors": _read_recording, ".csv": _read_csv, ".txt": read_tum, ".tum": read_tum,
     ".ply": read_ply, ".pcd": read_pcd,
