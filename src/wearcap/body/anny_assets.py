@@ -77,7 +77,7 @@ def joint_positions(
 
 
 @lru_cache(maxsize=2)
-def load_assets(keep: int | None = 4000) -> AnnyAssets:
+def load_assets(keep: int | None) -> AnnyAssets:
     """Read the files (a few seconds). `keep`: vertices of the cut-down surface, None for all 14,000."""
     root = _data_root()
     template, groups = _read_obj(root / "3dobjs" / "base.obj")

@@ -49,8 +49,8 @@ def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np
     """For each vertex the neighbour it may fall onto, and the cost (infinite where it may not)."""
     count = len(vertices)
     edges = _half_edges(faces)
-    adjacent = sparse.csr_matrix((np.ones(len(edges), dtype=np.int32), edges.T), shape=(count, count))
-    common = (adjacent @ adjacent).multiply(adjacent).tocoo()  # neighbours shared by the ends of each edge
+    adjacent = sparse.csr_array((np.ones(len(edges), dtype=np.int32), edges.T), shape=(count, count))
+    common = sparse.coo_array(adjacent @ adjacent * adjacent)  # neighbours that an edge's two ends share
     fit = (common.data == 2) & ~rim[common.row]
     edges = np.stack([common.row[fit], common.col[fit]], -1).astype(np.int64)
     points = np.concatenate([vertices[edges[:, 1]], np.ones((len(edges), 1))], 1)
