@@ -156,7 +156,7 @@ def read_nymeria(folder: str | Path, *, fps: float = 60.0, clock_offset_s: float
     except WearcapError as error:
         raise WearcapError(error.what, where=folder, expected=error.expected, fix=error.fix) from error
     points = find_mps_file(slam, ("semidense_points.csv",))
-    about = _metadata(folder)
+    about = read_metadata(folder)
     return Recording(
         name=folder.resolve().name, head=head, motion=motion, contacts=contact, skeleton=motion.skeleton,
         points=read_points(points) if points else None, source="Nymeria", license="Nymeria dataset licence", **about,
@@ -222,7 +222,7 @@ def _nearest(
     return value[torch.searchsorted((timestamps[1:] + timestamps[:-1]) / 2, at)]
 
 
-def _metadata(folder: Path) -> dict:
+def read_metadata(folder: Path) -> dict:
     """Subject, location, activity and size from metadata.json where it is there, else subject from the folder's name."""
     parts = folder.resolve().name.split("_")
     about: dict = {"subject": "_".join(parts[2:4]) if len(parts) > 4 else "", "location": "", "activity": ""}

@@ -1,0 +1,45 @@
+"""Nymeria and NymeriaPlus: the user's own download, one folder per sequence."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from wearcap.data.prepare.engine import Task, content_hash
+from wearcap.data.prepare.splits import Splits
+from wearcap.errors import WearcapError
+from wearcap.io.nymeria import is_nymeria, read_metadata, read_nymeria
+from wearcap.recording.recording import Recording
+
+VERSION = 1
+"""Raised when the same source and settings would give another recording."""
+
+
+@dataclass(frozen=True)
+class NymeriaSequence:
+    """One sequence's folder; picklable, callable as a task."""
+
+    folder: Path
+    name: str
+    fps: float | int
+    license: str
+
+    def __call__(self) -> Recording:
+        return replace(read_nymeria(self.folder, fps=float(self.fps)), name=self.name, license=self.license)
+
+
+def nymeria_tasks(source: str | Path, splits: Splits, fps: float | int, license: str) -> list[Task]:
+    """One task per sequence folder (with `body/xdata.npz`) below `source`; hashed by its motion and head path."""
+    source = Path(source)
+    if not source.is_dir():
+        raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
+    folders = sorted(path.parents[1] for path in source.rglob("xdata.npz") if is_nymeria(path.parents[1]))
+    if not folders:
+        raise WearcapError("no sequences", where=source, expected="folders with body/xdata.npz")
+    tasks = []
+    for folder in folders:
+        name = folder.resolve().name
+        about = read_metadata(folder)
+        paths = sorted((folder / "recording_head" / "mps" / "slam").glob("closed_loop_trajectory.csv*"))
+        sequence = NymeriaSequence(folder, name, fps, license)
+        settings_hash = content_hash(name, float(fps), VERSION, about, folder / "body" / "xdata.npz", *paths)
+        tasks.append(Task(name, sequence, splits.of(about["subject"]), settings_hash))
+    return tasks
