@@ -132,6 +132,14 @@ def test_an_array_larger_than_its_file_is_refused_without_allocating(tmp_path):
         read_npz(tmp_path / "m.npz")
 
 
+def test_a_broken_array_header_is_named(tmp_path):
+    for header in (b"{'descr': '<f8', 'shape': (", b"{'descr': '<f8', 'shape': [3]", b"\xff\xfe", b"7"):
+        with zipfile.ZipFile(tmp_path / "m.npz", "w") as archive:
+            archive.writestr("poses.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+        with pytest.raises(WearcapError, match="poses"):
+            read_npz(tmp_path / "m.npz")
+
+
 def test_fortran_order_and_missing_keys(tmp_path):
     array = np.asfortranarray(np.arange(12.0).reshape(3, 4))
     np.savez(tmp_path / "m.npz", a=array)

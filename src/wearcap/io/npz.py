@@ -1,6 +1,9 @@
 """Arrays from .npz files of strangers: no pickles, no sizes that the file cannot hold."""
 
+import lzma
 import math
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -15,8 +18,9 @@ MAX_BYTES = 1 << 32
 """Largest array that is read (4 GiB)."""
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, OSError, NotImplementedError, RuntimeError,
-           SyntaxError, KeyError, TypeError, OverflowError)  # fmt: skip
+_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, ValueError, OSError,
+           NotImplementedError, RuntimeError, SyntaxError, tokenize.TokenError, KeyError, TypeError,
+           OverflowError)  # fmt: skip
 """What zipfile and numpy raise on files that are cut short or tampered with."""
 
 
