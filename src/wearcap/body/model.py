@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -24,6 +25,8 @@ class BodyModel:
     """Of `skin_joints`; rows sum to 1."""
     regions: dict[str, Int64[Tensor, "_"]] = field(default_factory=dict)
     """Vertices of {left,right}_{toes,heel,sole,palm}."""
+    pose_blend: Float[Tensor, "feature vertex 3"] | None = None
+    """Offsets of the resting surface per entry of (R_parent_joint - I), the root left out (SMPL's)."""
 
     def vertices(self, T_world_joint: Rigid, region: str | None = None) -> Float[Tensor, "*batch vertex 3"]:
         """World positions (m) by linear blend skinning, of all vertices or of one region's.
@@ -42,6 +45,10 @@ class BodyModel:
         shift = T_world_joint.t - (T_world_joint.R @ joints[..., None])[..., 0]
         affine = torch.cat([T_world_joint.R, shift[..., None]], -1).flatten(-2)
         blended = (weight @ affine).unflatten(-1, (3, 4))
+        if self.pose_blend is not None:
+            local = local_rotations(self.skeleton, T_world_joint.R)[..., 1:, :, :]
+            entries = (local - torch.eye(3, dtype=local.dtype, device=local.device)).flatten(-3)
+            rest = rest + torch.einsum("...f,fvc->...vc", entries, self.pose_blend[:, rows].to(local))
         return (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
 
     @cached_property

@@ -1,0 +1,105 @@
+"""SMPL, SMPL+H and SMPL-X surfaces from the arrays of the user's own model files (see `io/smpl_files.py`)."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from wearcap.body.model import BodyModel, four_weights
+from wearcap.body.regions import contact_regions
+from wearcap.body.skeleton import Site, Skeleton
+from wearcap.body.skeletons import skeleton_by_name
+from wearcap.errors import WearcapError
+
+_WORLD_MODEL = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""The files' axes (x left, y up, z forward) into ours."""
+_SKELETON_OF = {24: "smpl24", 52: "smplh52", 55: "smplx22"}
+
+
+@dataclass(frozen=True, eq=False)
+class SmplArrays:
+    """A model file's arrays, in the file's axes (m)."""
+
+    template: Float[Tensor, "vertex 3"]
+    shape_directions: Float[Tensor, "vertex 3 beta"]
+    pose_directions: Float[Tensor, "vertex 3 feature"] | None
+    """Offsets per entry of (R_parent_joint - I) of all joints but the root."""
+    joint_regressor: Float[Tensor, "joint vertex"]
+    weights: Float[Tensor, "vertex joint"]
+    parents: tuple[int, ...]
+    faces: Int64[Tensor, "face 3"]
+
+
+def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) -> BodyModel:
+    """The body of one shape, its root at the origin; fewer betas than the file has are filled with zeros.
+
+    The skeleton is smpl24, smplh52 or, for SMPL-X, smplx22 (hands move with the wrists, jaw and eyes with the
+    head), with the model's own joints. Raises WearcapError for another number of joints or too many betas.
+    """
+    count = len(arrays.parents)
+    if count not in _SKELETON_OF:
+        raise WearcapError(
+            f"a body model of {count} joints", expected="24 (SMPL), 52 (SMPL+H) or 55 (SMPL-X)"
+        )
+    known = arrays.shape_directions.shape[-1]
+    if betas is not None and len(betas) > known:
+        raise WearcapError(f"{len(betas)} shape coefficients", expected=f"at most this file's {known}")
+    vertices = arrays.template
+    if betas is not None:
+        vertices = vertices + arrays.shape_directions[..., : len(betas)] @ betas.to(vertices)
+    joints = arrays.joint_regressor @ vertices
+    vertices, joints = ((points - joints[0]) @ _WORLD_MODEL.to(points).T for points in (vertices, joints))
+    named = skeleton_by_name(_SKELETON_OF[count])
+    carrier = _carriers(arrays.parents, len(named))
+    weights = arrays.weights.new_zeros(len(vertices), len(named)).index_add_(
+        1, torch.tensor(carrier), arrays.weights
+    )
+    if arrays.parents[: len(named)] != named.parents:
+        raise WearcapError(f"joints that hang otherwise than {named.name}'s", expected="an SMPL family file")
+    offsets = joints[: len(named)] - joints[[max(parent, 0) for parent in named.parents]]
+    skeleton = named.with_offsets(offsets.float())
+    skin_joints, skin_weights = four_weights(weights)
+    regions = contact_regions(skeleton, skeleton.rest_joints, vertices.float(), arrays.faces, weights.float())
+    skeleton = replace(skeleton, sites=skeleton.sites | _surface_sites(skeleton, vertices, regions))
+    blend = None
+    if arrays.pose_directions is not None:
+        blend = _pose_blend(arrays.pose_directions, len(named)).float()
+    return BodyModel(
+        skeleton, vertices.float(), arrays.faces, skin_joints, skin_weights.float(), regions, blend
+    )
+
+
+def _carriers(parents: tuple[int, ...], kept: int) -> list[int]:
+    """For each joint of the file the nearest one above it that the skeleton keeps."""
+    carrier = list(range(len(parents)))
+    for joint in range(kept, len(parents)):
+        carrier[joint] = carrier[parents[joint]]
+    return carrier
+
+
+def _surface_sites(
+    skeleton: Skeleton, vertices: Float[Tensor, "vertex 3"], regions: dict[str, Tensor]
+) -> dict[str, Site]:
+    """Heels, toe tips and crown on the surface itself."""
+    at = {"crown": ("head", vertices[vertices[:, 2].argmax()])}
+    for side in ("left", "right"):
+        heel, toes = (vertices[regions[f"{side}_{part}"]] for part in ("heel", "toes"))
+        sole = torch.minimum(heel[:, 2].min(), toes[:, 2].min())
+        at[f"{side}_heel"] = (f"{side}_ankle", torch.stack([heel[:, 0].min(), heel[:, 1].mean(), sole]))
+        at[f"{side}_toe_tip"] = (f"{side}_foot", torch.stack([toes[:, 0].max(), toes[:, 1].mean(), sole]))
+    sites = {}
+    for name, (joint, place) in at.items():
+        x, y, z = (place - skeleton.rest_joints[skeleton.index(joint)]).tolist()
+        sites[name] = Site(joint, (x, y, z))
+    return sites
+
+
+def _pose_blend(
+    directions: Float[Tensor, "vertex 3 feature"], kept: int
+) -> Float[Tensor, "feature_kept vertex 3"]:
+    """Pose offsets in our axes, per entry of our (R_parent_joint - I), of the joints that the skeleton keeps."""
+    P = _WORLD_MODEL.to(directions)
+    entries = directions.unflatten(-1, (-1, 3, 3))[..., : kept - 1, :, :]
+    turned = torch.einsum("dc,vcjab,ka,lb->jklvd", P, entries, P, P)
+    return turned.flatten(0, 2)
