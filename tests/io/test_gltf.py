@@ -206,7 +206,7 @@ def test_sticks_reach_from_joint_to_joint(tmp_path):
     vertices = glb.vertices_at(2 / 30)
     for name in ("left_knee", "right_wrist", "head"):
         joint = to_y_up(motion.joint(name).t[2].numpy())
-        assert np.linalg.norm(vertices - joint, axis=-1).min() < 1e-4
+        assert np.linalg.norm(vertices - joint, axis=-1).min() < 0.03  # a stick is 2.2 cm thick
 
 
 def test_trimesh_opens_it(tmp_path):

@@ -47,7 +47,7 @@ def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -
     if not all((clock.diff() > 0).all() for clock in clocks):
         raise WearcapError("timestamps repeat or fall", where=path, expected="rising timestamps")
     joints = len(motion.skeleton)
-    mesh = sticks(motion.skeleton) if body is None else skin_of(body, motion.skeleton)
+    shown = sticks(motion.skeleton) if body is None else skin_of(body, motion.skeleton)
     figure = _Figure(start_s=min(clock[0].item() for clock in clocks))
     figure.nodes = _joint_nodes(motion)
     figure.animate(
@@ -62,13 +62,13 @@ def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -
     skin = {
         "joints": list(range(1, 1 + joints)),
         "skeleton": 1,
-        "inverseBindMatrices": figure.inverse_bind(mesh),
+        "inverseBindMatrices": figure.inverse_bind(shown),
     }
     figure.nodes.append({"name": "body", "mesh": 0, "skin": 0})
     document = {
         "asset": {"version": "2.0", "generator": "wearcap", "extras": dict(motion.provenance)},
         "scene": 0, "scenes": [{"nodes": [0, len(figure.nodes) - 1]}], "nodes": figure.nodes,
-        "meshes": [{"name": "body", "primitives": [figure.primitive(mesh)]}], "materials": [_MATERIAL],
+        "meshes": [{"name": "body", "primitives": [figure.primitive(shown)]}], "materials": [_MATERIAL],
         "skins": [skin], "animations": [{"name": "motion", "samplers": figure.samplers, "channels": figure.channels}],
     }  # fmt: skip
     _write(path, document, figure)
@@ -138,20 +138,20 @@ class _Figure:
             self.channels.append({"sampler": len(self.samplers), "target": {"node": node, "path": path}})
             self.samplers.append({"input": time, "output": self.add(values), "interpolation": "LINEAR"})
 
-    def inverse_bind(self, mesh: SkinnedMesh) -> int:
+    def inverse_bind(self, skin: SkinnedMesh) -> int:
         """Accessor of the matrices that bring rest vertices into each joint's frame (column-major)."""
-        matrices = np.tile(np.eye(4, dtype=np.float32), (len(mesh.rest_joints), 1, 1))
-        matrices[:, 3, :3] = -mesh.rest_joints.float().numpy()
+        matrices = np.tile(np.eye(4, dtype=np.float32), (len(skin.rest_joints), 1, 1))
+        matrices[:, 3, :3] = -skin.rest_joints.float().numpy()
         return self.add(matrices)
 
-    def primitive(self, mesh: SkinnedMesh) -> dict[str, Any]:
+    def primitive(self, skin: SkinnedMesh) -> dict[str, Any]:
         attributes = {
-            "POSITION": self.add(mesh.vertices, _VERTICES, bounds=True),
-            "NORMAL": self.add(mesh.normals, _VERTICES),
-            "JOINTS_0": self.add(mesh.joints.astype(np.uint16), _VERTICES),
-            "WEIGHTS_0": self.add(mesh.weights, _VERTICES),
+            "POSITION": self.add(skin.mesh.vertices, _VERTICES, bounds=True),
+            "NORMAL": self.add(skin.normals, _VERTICES),
+            "JOINTS_0": self.add(skin.joints.astype(np.uint16), _VERTICES),
+            "WEIGHTS_0": self.add(skin.weights, _VERTICES),
         }
-        indices = self.add(mesh.faces.astype(np.uint32).reshape(-1), _INDICES)
+        indices = self.add(skin.mesh.faces.astype(np.uint32).reshape(-1), _INDICES)
         return {"attributes": attributes, "indices": indices, "material": 0}
 
 

@@ -10,35 +10,29 @@ from torch import Tensor
 from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import Mesh, capsules
 
-_STICK_M = 0.018
-"""Half the thickness of a stick."""
+_THICK_M, _THIN_M = 0.022, 0.012
+"""Radius of a stick where it begins and where it ends."""
 
-_OCTAHEDRON = np.array(
-    [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [5, 2, 1], [5, 3, 2], [5, 4, 3], [5, 1, 4]]
-)
+_GREY = np.full(3, 0.7, np.float32)
 
 
 @dataclass(frozen=True)
 class SkinnedMesh:
-    """Vertices (m, our axes, root at the origin) at rest, and up to four joints with weights per vertex."""
+    """A mesh at rest (m, our axes, root at the origin), and up to four joints with weights per vertex."""
 
-    vertices: Float32[np.ndarray, "vertex 3"]
-    faces: Int[np.ndarray, "face 3"]
+    mesh: Mesh
     joints: Int[np.ndarray, "vertex 4"]
     weights: Float32[np.ndarray, "vertex 4"]
     rest_joints: Float[Tensor, "joint 3"]
 
     @property
     def normals(self) -> Float32[np.ndarray, "vertex 3"]:
-        """Unit normals, each the mean of its faces' by area; upwards where a vertex has no face."""
-        corners = self.vertices[self.faces].astype(np.float64)
-        area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        total = np.zeros((len(self.vertices), 3))
-        for corner in range(3):
-            np.add.at(total, self.faces[:, corner], area)
-        length = np.linalg.norm(total, axis=-1, keepdims=True)
-        return np.where(length > 1e-12, total / np.maximum(length, 1e-12), [0.0, 0.0, 1.0]).astype(np.float32)
+        """Unit normals; upwards at vertices without a face, for glTF wants every one of unit length."""
+        normals = self.mesh.vertex_normals
+        loose = np.linalg.norm(normals, axis=-1, keepdims=True) < 0.5
+        return np.where(loose, np.float32([0, 0, 1]), normals).astype(np.float32)
 
 
 def skin_of(body: BodyModel, skeleton: Skeleton) -> SkinnedMesh:
@@ -46,39 +40,35 @@ def skin_of(body: BodyModel, skeleton: Skeleton) -> SkinnedMesh:
     if body.skeleton.joint_names != skeleton.joint_names:
         raise WearcapError(f"the motion has skeleton {skeleton.name!r}, the body {body.skeleton.name!r}",
                            expected="the same joints", fix="Make the body for the motion's skeleton, or retarget.")  # fmt: skip
+    mesh = Mesh(body.rest_vertices.float().numpy(), body.faces.int().numpy(), _GREY, smooth=True)
     weights = body.skin_weights.float().numpy()
-    weights = weights / weights.sum(-1, keepdims=True)
-    return SkinnedMesh(
-        body.rest_vertices.float().numpy(), body.faces.numpy(), np.where(weights > 0, body.skin_joints.numpy(), 0),
-        weights, body.skeleton.rest_joints,
-    )  # fmt: skip
+    # Joints without weight must be named as joint 0.
+    joints = np.where(weights > 0, body.skin_joints.numpy(), 0)
+    return SkinnedMesh(mesh, joints, weights / weights.sum(-1, keepdims=True), body.skeleton.rest_joints)
 
 
 def sticks(skeleton: Skeleton) -> SkinnedMesh:
-    """A slim octahedron along every bone and out to every site; each moves with the joint it starts from."""
+    """A rounded stick along every bone and out to every site; each moves with the joint it starts from."""
     bones = [
         (parent, skeleton.t_parent_joint[joint]) for joint, parent in enumerate(skeleton.parents) if joint
     ]
     bones += [
         (skeleton.index(site.joint), torch.tensor(site.t_joint_site)) for site in skeleton.sites.values()
     ]
-    bones = [(joint, way.double().numpy()) for joint, way in bones if way.norm() > 1e-4]
-    bones = bones or [(0, np.array([0.0, 0.0, 0.1]))]
-    starts = skeleton.rest_joints.double().numpy()
-    vertices = np.concatenate([starts[joint] + _stick(way) for joint, way in bones]).astype(np.float32)
-    faces = np.concatenate([_OCTAHEDRON + 6 * k for k in range(len(bones))])
-    joints = np.zeros((len(vertices), 4), dtype=np.int64)
-    joints[:, 0] = np.repeat([joint for joint, _ in bones], 6)
-    weights = np.zeros((len(vertices), 4), dtype=np.float32)
+    bones.append((0, torch.zeros(3)))
+    owners = np.array([joint for joint, _ in bones])
+    start = skeleton.rest_joints.double().numpy()[owners]
+    end = start + torch.stack([way for _, way in bones]).double().numpy()
+    mesh = capsules(
+        start,
+        end,
+        np.full(len(bones), _THICK_M),
+        np.full(len(bones), _THIN_M),
+        np.tile(_GREY, (len(bones), 1)),
+        8,
+    )
+    joints = np.zeros((len(mesh.vertices), 4), dtype=np.int64)
+    joints[:, 0] = np.repeat(owners, len(mesh.vertices) // len(bones))
+    weights = np.zeros((len(mesh.vertices), 4), dtype=np.float32)
     weights[:, 0] = 1
-    return SkinnedMesh(vertices, faces, joints, weights, skeleton.rest_joints)
-
-
-def _stick(way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6 3"]:
-    """Tail, a ring of four a seventh of the way along, tip."""
-    along = way / np.linalg.norm(way)
-    across = np.cross(along, np.eye(3)[np.abs(along).argmin()])
-    across /= np.linalg.norm(across)
-    other = np.cross(along, across)
-    ring = [way / 7 + _STICK_M * side for side in (across, other, -across, -other)]
-    return np.stack([0 * way, *ring, way])
+    return SkinnedMesh(mesh, joints, weights, skeleton.rest_joints)
