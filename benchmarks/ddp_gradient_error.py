@@ -67,7 +67,9 @@ def gradients(folder: str, rank: int, world: int) -> dict[str, Tensor]:
     random = torch.Generator().manual_seed(0)
     for parameter in loss.parameters():  # the network starts as zero, which would hide most of it
         nn.init.normal_(parameter, std=0.05, generator=random)
-    batch = collate([dataset[item] for item in SeededSampler(dataset.weights, JOINT_BATCH, SEED, rank, world)])
+    batch = collate(
+        [dataset[item] for item in SeededSampler(dataset.weights, JOINT_BATCH, SEED, rank, world)]
+    )
     distributed = DistributedDataParallel(loss) if world > 1 else loss  # it must outlive the backward pass
     distributed(batch).backward()
     return {name: parameter.grad for name, parameter in loss.named_parameters() if parameter.grad is not None}

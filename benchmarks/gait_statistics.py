@@ -1,0 +1,170 @@
+"""Statistics of walking that do not depend on a skeleton's conventions: they use joint positions alone.
+
+Everything is brought to 30 Hz first, so that rates and marker noise above 15 Hz do not decide.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.recording import Recording
+
+FPS = 30
+WINDOW = 2 * FPS
+HOP = FPS
+JOINTS = ("pelvis", "head", *(
+    f"{side}_{name}" for side in ("left", "right")
+    for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
+))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Clip:
+    """What is compared of one recording, at 30 Hz."""
+
+    person: str
+    joints: dict[str, Float[Tensor, "time 3"]]
+    R_world_head: Float[Tensor, "time 3 3"]
+    floor: Float[Tensor, "time"]
+    stature: float
+
+
+def clip_of(recording: Recording) -> Clip:
+    """True joints of a recording, every pair of frames (at 60 Hz) averaged into one."""
+    motion = recording.motion
+    assert motion is not None
+    step = round(motion.fps / FPS)
+    count = len(motion) // step * step
+    average = lambda value: value[:count].unflatten(0, (-1, step)).mean(1)  # noqa: E731
+    pose: Rigid = motion.T_world_joint
+    floor = recording.floor.height if recording.floor is not None else torch.zeros(len(motion))
+    return Clip(
+        recording.subject,
+        {name: average(pose.t[:, motion.skeleton.index(name)]) for name in JOINTS},
+        motion.joint("head").R[:count:step],
+        average(floor),
+        motion.skeleton.height_of("head"),
+    )
+
+
+def windows_of(value: Float[Tensor, "time *rest"]) -> Float[Tensor, "window frame *rest"]:
+    """Overlapping windows of 2 s."""
+    if len(value) < WINDOW:
+        return value.new_zeros(0, WINDOW, *value.shape[1:])
+    return value.unfold(0, WINDOW, HOP).movedim(-1, 1)
+
+
+def walking_windows(clips: list[Clip]) -> dict[str, Float[Tensor, "window"]]:
+    """Statistics of all windows of straight walking, by name with unit."""
+    parts = [statistics(clip) for clip in clips]
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def is_walking(clip: Clip) -> Bool[Tensor, "window"]:
+    """Windows in which the pelvis goes straight on, upright, at a walking speed that never stops."""
+    pelvis = windows_of(clip.joints["pelvis"])
+    step = pelvis[:, 1:, :2] - pelvis[:, :-1, :2]
+    net = (pelvis[:, -1, :2] - pelvis[:, 0, :2]).norm(dim=-1)
+    speed, arc = net * FPS / (WINDOW - 1), step.norm(dim=-1).sum(1)
+    height = pelvis[..., 2].amax(1) - pelvis[..., 2].amin(1)
+    slowest = step.norm(dim=-1).amin(1) * FPS
+    return (speed > 0.6) & (speed < 1.9) & (net > 0.97 * arc) & (height < 0.12) & (slowest > 0.3)
+
+
+def statistics(clip: Clip) -> dict[str, Float[Tensor, "window"]]:
+    """Gait statistics of a clip's walking windows."""
+    chosen = is_walking(clip)
+    joint = {name: windows_of(value)[chosen] for name, value in clip.joints.items()}
+    pelvis = joint["pelvis"]
+    forward = torch.nn.functional.normalize(
+        (pelvis[:, -1] - pelvis[:, 0]) * torch.tensor([1.0, 1.0, 0.0]), dim=-1
+    )
+    left = torch.stack([-forward[:, 1], forward[:, 0], 0 * forward[:, 0]], -1)
+    along = lambda value, axis: (value * axis[:, None]).sum(-1)  # noqa: E731
+    speed = along(pelvis[:, -1:] - pelvis[:, :1], forward)[:, 0] * FPS / (WINDOW - 1)
+    stride_hz = dominant_frequency(along(joint["left_ankle"] - joint["right_ankle"], forward))
+    head_above_floor = joint["head"][..., 2] - windows_of(clip.floor)[chosen]
+    R_head = windows_of(clip.R_world_head)[chosen]
+    found = {
+        "speed_m_s": speed,
+        "cadence_steps_min": 120 * stride_hz,
+        "step_length_m": speed / (2 * stride_hz),
+        "pelvis_vertical_cm": 100 * peak_to_peak(pelvis[..., 2]),
+        "pelvis_lateral_cm": 100 * peak_to_peak(along(pelvis, left)),
+        "head_vertical_cm": 100 * peak_to_peak(joint["head"][..., 2]),
+        "head_height_share": head_above_floor.mean(1) / clip.stature,
+        "head_pitch_down_deg": R_head[..., 2, 0].clamp(-1, 1).asin().mean(1).neg().rad2deg(),
+        "head_yaw_spread_deg": _yaw_spread(R_head),
+        "head_jerk_m_s3": jerk(joint["head"]),
+        "pelvis_jerk_m_s3": jerk(pelvis),
+    }  # fmt: skip
+    for name in ("wrist", "ankle"):
+        found[f"{name}_jerk_m_s3"] = 0.5 * (jerk(joint[f"left_{name}"]) + jerk(joint[f"right_{name}"]))
+    for name, angles in _limb_angles(joint, along, forward).items():
+        found[f"{name}_range_deg"] = (angles.amax(-1) - angles.amin(-1)).rad2deg().mean(0)
+    return found
+
+
+def _limb_angles(
+    joint: dict[str, Tensor], along, forward: Tensor
+) -> dict[str, Float[Tensor, "side window frame"]]:
+    """Thigh and upper arm against the vertical in the plane of walking; knee, ankle and elbow between bones."""
+    bones = {
+        "hip": ("hip", "knee"), "shoulder": ("shoulder", "elbow"),
+    }  # fmt: skip
+    hinges = {
+        "knee": ("hip", "knee", "ankle"), "ankle": ("knee", "ankle", "toe"), "elbow": ("shoulder", "elbow", "wrist"),
+    }  # fmt: skip
+    found: dict[str, list[Tensor]] = {name: [] for name in (*bones, *hinges)}
+    for side in ("left", "right"):
+        at = lambda name, side=side: joint[f"{side}_{name}"]  # noqa: E731
+        for name, (top, bottom) in bones.items():
+            bone = at(bottom) - at(top)
+            found[name].append(torch.atan2(along(bone, forward), -bone[..., 2]))
+        for name, (a, b, c) in hinges.items():
+            found[name].append(_between(at(a) - at(b), at(c) - at(b)))
+    return {name: torch.stack(sides) for name, sides in found.items()}
+
+
+def _between(a: Float[Tensor, "*batch 3"], b: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    return torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(-1))
+
+
+def _yaw_spread(R_head: Float[Tensor, "window frame 3 3"]) -> Float[Tensor, "window"]:
+    """Standard deviation of the head's heading in each window (degrees)."""
+    yaw = rotation.yaw_of(R_head)
+    turned = rotation.wrap_angle(yaw - yaw[:, :1])
+    return (turned - turned.mean(1, keepdim=True)).square().mean(1).sqrt().rad2deg()
+
+
+def peak_to_peak(value: Float[Tensor, "window frame"]) -> Float[Tensor, "window"]:
+    """Range around each window's own straight line."""
+    line = torch.linspace(-1, 1, value.shape[1])
+    centred = value - value.mean(1, keepdim=True)
+    centred = centred - (centred @ line / line.square().sum())[:, None] * line
+    return centred.amax(1) - centred.amin(1)
+
+
+def jerk(position: Float[Tensor, "window frame 3"]) -> Float[Tensor, "window"]:
+    """Mean length of the third difference of position (m/s³)."""
+    return position.double().diff(n=3, dim=1).norm(dim=-1).mean(1).float() * FPS**3
+
+
+def dominant_frequency(
+    value: Float[Tensor, "window frame"], lowest: float = 0.5, highest: float = 1.5
+) -> Float[Tensor, "window"]:
+    """Frequency (Hz) of the sinusoid that leaves the least of each window after least squares."""
+    t = torch.arange(value.shape[1]) / FPS
+    candidates = torch.arange(lowest, highest, 0.01)
+    left = []
+    for frequency in candidates.tolist():
+        phase = 2 * math.pi * frequency * t
+        basis = torch.stack([phase.cos(), phase.sin(), torch.ones_like(t)], -1)
+        Q = torch.linalg.qr(basis).Q
+        left.append((value - value @ Q @ Q.T).square().sum(1))
+    return candidates[torch.stack(left).argmin(0)]

@@ -1,0 +1,85 @@
+"""HMD2 on the head path alone: the document's row "without points, without images", on the data at hand.
+
+Without --checkpoint the rows are trained first, once per seed, with the configuration of their experiment.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+from rich import print as show
+
+from wearcap.cli import evaluate, train
+from wearcap.cli.conf import compose
+from wearcap.metrics.table import Scores, Summary, rich_table, write_scores
+
+OURS = "motion_diffusion_head"
+ABLATIONS = {"document's window frame, plain MSE": "motion_diffusion_head_document"}
+DOCUMENT: Scores = {
+    "HMD2's document, on Nymeria": {"mpjpe_cm": Summary(9.28, None, 1), "hand_pe_cm": Summary(19.47, None, 1)}
+}
+COLUMNS = (
+    "mpjpe_cm", "hand_pe_cm", "lower_pe_cm", "upper_pe_cm", "p95_cm", "jitter_ratio", "foot_skate_cm_s",
+    "physicality", "truth_physicality", "floor_penetration_cm",
+)  # fmt: skip
+QUICK = (
+    "trainer.max_steps=300",
+    "data.steps_per_epoch=100",
+    "data.batch_size=16",
+    "callbacks.average.decay=0.98",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", default="cmu", help="config of the data: cmu, simulated, cmu_simulated")
+    parser.add_argument("--datasets", default="datasets", help="folder of the prepared data sets")
+    parser.add_argument("--checkpoint", nargs="+", help="our checkpoints, one per seed, instead of training")
+    parser.add_argument("--seeds", type=int, default=3, help="trainings per row (1 when quick)")
+    parser.add_argument("--device", default="cpu", help="device that captures")
+    parser.add_argument("--no-ablations", action="store_true", help="ours and the baselines alone")
+
+
+def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
+    """Print and write the table; returns its path."""
+    checkpoints = options.checkpoint or _trained(OURS, options)
+    scores = {**_evaluated(checkpoints, options, "hmd2", baselines=True)}
+    if not options.no_ablations:
+        for row, experiment in ABLATIONS.items():
+            scores[row] = _evaluated(_trained(experiment, options), options, "hmd2")["wearcap"]
+        if not options.quick:
+            scores["wearcap, latency 0.17 s"] = _evaluated(checkpoints, options, "hmd2_online")["wearcap"]
+    path = options.output / "hmd2_head.json"
+    show(rich_table(f"HMD2, head path alone ({options.data})", {**scores, **DOCUMENT}, COLUMNS))
+    facts = {
+        "data": options.data,
+        "quick": str(options.quick),
+        "checkpoints": " ".join(map(str, checkpoints)),
+    }
+    write_scores(path, {**scores, **DOCUMENT}, {**about, **facts})
+    return path
+
+
+def _trained(experiment: str, options: argparse.Namespace) -> list[str]:
+    """Checkpoints of one experiment, one per seed."""
+    found = []
+    for seed in range(1 if options.quick else options.seeds):
+        run = options.output / "runs" / f"{experiment}_{options.data}_{seed}"
+        overrides = [
+            f"experiment={experiment}", f"data={options.data}", f"seed={seed}", f"paths.datasets={options.datasets}",
+            f"paths.run={run}", "callbacks.capture=null", *(QUICK if options.quick else ()),
+        ]  # fmt: skip
+        train.train(compose("train", overrides))
+        found.append(str(run / "checkpoints" / "last.ckpt"))
+    return found
+
+
+def _evaluated(
+    checkpoints: list[str], options: argparse.Namespace, pipeline: str, baselines: bool = False
+) -> Scores:
+    """Scores of whole recordings of the test split, over trainings and sampling seeds."""
+    overrides = [
+        f"checkpoint={json.dumps(checkpoints)}", f"pipeline={pipeline}", f"baselines={baselines}",
+        f"seeds={[0] if options.quick else [0, 1, 2]}", f"device={options.device}",
+        f"output={options.output / 'runs' / 'last_evaluation.json'}",
+    ]  # fmt: skip
+    return evaluate.run(compose("evaluate", overrides))

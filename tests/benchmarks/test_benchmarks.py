@@ -1,0 +1,149 @@
+"""Benchmarks and tables run, say what DESIGN asks for, and measure what they claim."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+GOALS = {"windows_vs_npz", "lightning_step_vs_loop", "ddp_gradient_error"}
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+
+
+def test_list_names_every_benchmark():
+    command = [sys.executable, str(FOLDER / "run.py"), "--list"]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert {line.split()[0] for line in lines} >= GOALS
+    assert all(len(line.split()) > 3 for line in lines)
+
+
+def test_unknown_names_are_refused():
+    command = [sys.executable, str(FOLDER / "run.py"), "windows_vs_zip"]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert "windows_vs_npz" in ended.stderr
+    ended = subprocess.run(
+        [sys.executable, str(FOLDER / "tables.py"), "hmd3"], capture_output=True, text=True
+    )
+    assert ended.returncode == 2
+    assert "hmd2_head" in ended.stderr
+
+
+def test_a_figure_with_other_keys_is_refused(monkeypatch, tmp_path):
+    import run
+
+    (tmp_path / "askew.py").write_text("def measure():\n    return [{'name': 'askew', 'value': 1}]\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert list(run.discover(tmp_path)) == ["askew"]
+    with pytest.raises(SystemExit, match="Expected name, value, unit"):
+        run.run("askew")
+
+
+def test_windows_from_the_store_are_faster_than_npz():
+    import run
+    import windows_vs_npz
+
+    figure = windows_vs_npz.measure(minutes=0.5, windows=20, npz_windows=3)[0]
+    assert tuple(json.loads(json.dumps(figure))) == run.KEYS
+    assert figure["ratio"] == pytest.approx(figure["baseline"] / figure["value"])
+    assert figure["ratio"] > 2  # half a minute instead of fifteen
+
+
+def figure_of(program: str) -> dict:
+    """The first figure that a program prints, in a process of its own as users run it."""
+    program = f"import json, sys; sys.path.insert(0, {str(FOLDER)!r}); {program}"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    return json.loads(ended.stdout.splitlines()[0])
+
+
+@pytest.mark.slow
+def test_lightning_and_the_loop_take_turns():
+    figure = figure_of(
+        "import lightning_step_vs_loop as b; "
+        "print(json.dumps(b.measure(steps=4, overrides=('data.batch_size=2',))[0]))"
+    )
+    assert 0.3 < figure["ratio"] < 3
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_joint_gradient():
+    ended = subprocess.run(
+        [sys.executable, str(FOLDER / "run.py"), "ddp_gradient_error"], capture_output=True, text=True
+    )
+    figure = json.loads(ended.stdout)
+    assert figure["baseline"] > 0.1
+    assert figure["ratio"] <= figure["goal"]
+
+
+def test_dominant_frequency_finds_a_planted_one():
+    import gait_statistics as gait
+
+    t = torch.arange(gait.WINDOW) / gait.FPS
+    waves = torch.stack([3 + torch.sin(2 * math.pi * f * t + f) for f in (0.7, 0.95, 1.2)])
+    assert gait.dominant_frequency(waves).tolist() == pytest.approx([0.7, 0.95, 1.2], abs=0.015)
+    assert gait.peak_to_peak(waves[:1] + 5 * t).item() == pytest.approx(2.0, abs=0.3)
+
+
+def walker(speed: float, person: str, seconds: int = 6, bob: float = 0.03, swing: float = 0.2):
+    """A clip of someone whose pelvis bobs and whose legs swing in antiphase."""
+    import gait_statistics as gait
+
+    t = torch.arange(seconds * gait.FPS) / gait.FPS
+    phase = 2 * math.pi * 0.9 * t
+    pelvis = torch.stack([speed * t, 0.02 * phase.sin(), 0.95 + bob / 2 * (2 * phase).cos()], -1)
+    joints = {}
+    for name in gait.JOINTS:
+        side = {"left": 1.0, "right": -1.0}.get(name.split("_")[0], 0.0)
+        drop = {"head": -0.6, "knee": 0.45, "ankle": 0.9, "toe": 0.95, "shoulder": -0.45, "wrist": 0.1}
+        down = drop.get(name.split("_")[-1], 0.0)
+        offset = torch.stack(
+            [side * swing * max(down, 0.0) * phase.sin(), 0 * t + 0.1 * side, 0 * t - down], -1
+        )
+        joints[name] = pelvis + offset
+    return gait.Clip(person, joints, torch.eye(3).expand(len(t), 3, 3), torch.zeros(len(t)), 1.55)
+
+
+def test_gait_statistics_of_a_planted_walk():
+    import gait_statistics as gait
+
+    found = gait.statistics(walker(1.25, "a"))
+    assert len(found["speed_m_s"]) == 5
+    assert found["speed_m_s"].mean().item() == pytest.approx(1.25, abs=0.01)
+    assert found["cadence_steps_min"].mean().item() == pytest.approx(108, abs=2)
+    assert found["pelvis_vertical_cm"].mean().item() == pytest.approx(3.0, abs=0.15)
+    assert found["pelvis_lateral_cm"].mean().item() == pytest.approx(4.0, abs=0.4)
+    assert found["head_height_share"].mean().item() == pytest.approx(1.0, abs=0.01)
+    assert not gait.is_walking(walker(0.2, "b")).any()
+    assert not gait.is_walking(walker(1.2, "b", bob=0.2)).any()
+
+
+def test_discriminator_tells_what_can_be_told_and_no_more():
+    from discriminator import held_out_accuracy
+
+    random = torch.Generator().manual_seed(0)
+    speeds = 0.9 + 0.6 * torch.rand(2, 12, generator=random)
+    some, alike = (
+        [walker(v, f"{i}_{k}") for k, v in enumerate(row.tolist())] for i, row in enumerate(speeds)
+    )
+    other = [walker(1.1, f"f{k}", swing=0.35) for k in range(12)]
+    assert held_out_accuracy(some, other, True, range(2), 100)["mean"] > 0.9
+    assert 0.2 < held_out_accuracy(some, alike, True, range(3), 100)["mean"] < 0.8
+
+
+def test_discriminator_needs_people_to_hold_out():
+    from discriminator import held_out_accuracy
+
+    from wearcap.errors import WearcapError
+
+    one = [walker(1.0, "only")]
+    with pytest.raises(WearcapError, match="1 and 1 people"):
+        held_out_accuracy(one, one, True, range(1), 1)
