@@ -112,6 +112,14 @@ def test_a_kill_in_the_middle_is_resumed(alone, tmp_path):
     assert digests(tmp_path) == digests(alone)
 
 
+def test_a_killed_worker_is_said_and_the_next_run_goes_on(alone, tmp_path):
+    with pytest.raises(WearcapError, match=r"a worker process was killed.*fewer jobs"):
+        prepare(tasks(8, r05="killed"), tmp_path, jobs=2, progress=False)
+    assert all(wrong is None for _, wrong in RecordingStore.open(tmp_path).verify())
+    prepare(tasks(8), tmp_path, jobs=1, progress=False)
+    assert digests(tmp_path) == digests(alone)
+
+
 def test_a_full_disk_stops_the_run_with_one_message(tmp_path, monkeypatch):
     prepare(tasks(1), tmp_path, jobs=1, progress=False)
     write = Path.write_bytes
@@ -150,6 +158,8 @@ def test_wrong_requests_are_refused(tmp_path):
         prepare([], tmp_path)
     with pytest.raises(WearcapError, match="two sources give a recording the name 'r00'"):
         prepare([*tasks(1), *tasks(1)], tmp_path)
+    with pytest.raises(WearcapError, match="0 jobs"):
+        prepare(tasks(1), tmp_path, jobs=0)
     with pytest.raises(WearcapError, match="no backend 'lokky'"):
         prepare(tasks(1), tmp_path, backend="lokky", progress=False)
 

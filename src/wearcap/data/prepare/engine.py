@@ -8,7 +8,9 @@ import hashlib
 import json
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -77,14 +79,17 @@ def prepare(
     """
     if not tasks:
         raise WearcapError("nothing to prepare", fix="Check the source folder and its settings.")
-    names = [task.name for task in tasks]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise WearcapError(f"two sources give a recording the name {twice[0]!r}", expected="unique names")
+    names = {task.name for task in tasks}
+    if len(names) < len(tasks):
+        twice = Counter(task.name for task in tasks).most_common(1)[0][0]
+        raise WearcapError(f"two sources give a recording the name {twice!r}", expected="unique names")
+    if jobs == 0:
+        raise WearcapError("0 jobs", expected="a number of jobs, or -1 for one per core")
     store = RecordingStore(output)
     store.register({})  # no permission or no space is better known now than after the first hour
     _remove_leftovers(store.root)
     todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
-    report = Report(current=sorted(set(names) - {task.name for task in todo}))
+    report = Report(current=sorted(names - {task.name for task in todo}))
     waiting: dict[str, Entry] = {}
     written_at = time.monotonic()
     try:
@@ -102,6 +107,9 @@ def prepare(
                     store.register(waiting)
                     waiting, written_at = {}, time.monotonic()
                 advance()
+    except BrokenExecutor as error:
+        raise WearcapError("a worker process was killed (out of memory?)", where=store.root,
+                           fix="What is finished is kept: run again with fewer jobs.") from error  # fmt: skip
     finally:
         store.register(waiting)
     report.written.sort()
