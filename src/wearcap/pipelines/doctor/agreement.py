@@ -121,7 +121,11 @@ def _floor_beneath(points: PointCloud, head: HeadStream) -> Finding:
     evidence = f"the head is {usual:.2f} m above it (80 % of the time less), confidence {floor.confidence.median():.2f}"
     if floor.confidence.median() < 0.1:
         return Finding(
-            "note", check, "no clear floor", evidence, "Give the floor's height or the wearer's stature."
+            "note",
+            check,
+            "no clear floor",
+            evidence,
+            "Check that points and head share a world with z up; else give the floor's height or the wearer's stature.",
         )
     if not 0.9 < usual < 2.1:
         return Finding(

@@ -61,7 +61,7 @@ def check_gravity(stream: str, imu: ImuStream) -> list[Finding]:
 
 def _specific_force(check: str, acc_imu: Tensor, R_world_imu: Tensor | None) -> Finding:
     usual = quantile(acc_imu.norm(dim=-1), 0.5)
-    evidence = f"median length {usual:.3g} m/s²"
+    evidence = f"median length {usual:.4g} m/s²"
     if not 0.8 * GRAVITY < usual < 1.25 * GRAVITY:
         unit = min(_ACC_UNITS, key=lambda name: abs(math.log(max(usual, 1e-9) * _ACC_UNITS[name] / GRAVITY)))
         if abs(math.log(max(usual, 1e-9) * _ACC_UNITS[unit] / GRAVITY)) < 0.25:
@@ -220,7 +220,7 @@ def offset_finding(lag: tuple[float, float, float] | None, who: str = "the senso
             evidence,
             "Another joint, another recording, or a clock more than a second off.",
         )
-    if abs(seconds) > 0.02 and best - unshifted > 0.01:
+    if abs(seconds) > 0.02 and 1 - unshifted > 2 * (1 - best) + 0.001:
         severity = "error" if abs(seconds) > 0.05 else "warning"
         late = "late" if seconds > 0 else "early"
         return Finding(

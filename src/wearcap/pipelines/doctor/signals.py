@@ -1,11 +1,13 @@
 """Small measurements that several checks share."""
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, interpolate
+from wearcap.io.head_alignment import best_shift, correlate_shifts
 
 LAG_RATE_HZ = 200.0
 
@@ -56,21 +58,16 @@ def lag_between(
         interpolate(reference_times, reference.double(), grid),
         interpolate(other_times, other.double(), grid),
     )
-    a, b = a - a.mean(), b - b.mean()
     if a.std() < 1e-6 or b.std() < 1e-6:
         return None
-    reach = int(min(max_lag_s, (stop - start) / 4) * LAG_RATE_HZ)
-    score = _cross_correlation(a, b, reach)
-    best = int(score.argmax())
-    shift = 0.0
-    if 0 < best < 2 * reach:
-        left, middle, right = score[best - 1 : best + 2].tolist()
-        shift = 0.5 * (left - right) / (left - 2 * middle + right) if left - 2 * middle + right < 0 else 0.0
-    return (best - reach + shift) / LAG_RATE_HZ, score[best].item(), score[reach].item()
-
-
-def _cross_correlation(a: Tensor, b: Tensor, reach: int) -> Tensor:
-    """Normalised correlation of a(t) with b(t + lag) for lags -reach … reach (samples)."""
-    size = 1 << (len(a) + reach).bit_length()
-    product = torch.fft.irfft(torch.fft.rfft(a, size).conj() * torch.fft.rfft(b, size), size)
-    return torch.cat([product[-reach:], product[: reach + 1]]) / (a.norm() * b.norm())
+    shifts, score = correlate_shifts(a.numpy(), b.numpy(), 0.7)
+    near = abs(shifts) <= max_lag_s * LAG_RATE_HZ
+    shifts, score = shifts[near], score[near]
+    # Walking repeats itself: of peaks as good as the highest, the least shift is meant.
+    rising = np.diff(score, prepend=-np.inf) > 0
+    falling = np.diff(score, append=-np.inf) <= 0
+    peaks = (rising & falling & (score >= score.max() - 0.02)).nonzero()[0]
+    peak = int(peaks[abs(shifts[peaks]).argmin()])
+    beside = slice(max(peak - 1, 0), peak + 2)
+    shift, best = best_shift(shifts[beside], score[beside])
+    return shift / LAG_RATE_HZ, best, float(score[shifts == 0][0])
