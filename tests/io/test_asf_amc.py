@@ -203,6 +203,7 @@ def test_dropped_frames_show_in_the_timestamps(tmp_path):
 AMC_FAULTS = {
     "empty": (lambda t: "", "empty"),
     "no frames": (lambda t: "#!OML:ASF\n:DEGREES\n", "lacks"),
+    "radians": (lambda t: t.replace(":DEGREES", ":RADIANS"), "another unit"),
     "truncated": (lambda t: t[: int(len(t) * 0.8)], "line|cut short"),
     "nan": (lambda t: t.replace("ltibia ", "ltibia nan #", 1), "line 8"),
     "nan later": (lambda t: t[:400] + t[400:].replace("ltibia ", "ltibia nan", 1), "line"),
@@ -285,7 +286,7 @@ def test_cmu_positions_equal_the_documented_formula(real_data):
 def test_every_cmu_trial_is_read_as_a_person(real_data):
     trials = sorted((real_data / "cmu_mocap" / "trials").glob("*/*.amc.xz"))
     assert len(trials) == 235
-    frames, started = 0, time.perf_counter()
+    frames, started = 0, time.process_time()
     for trial in trials:
         motion = read_amc(read_asf(next(trial.parent.glob("*.asf"))), trial)
         frames += len(motion)
@@ -294,4 +295,4 @@ def test_every_cmu_trial_is_read_as_a_person(real_data):
         assert 1.3 < height < 2.0, trial
         assert motion.t_world_root[:, 2].median() > 0.25, trial
     assert frames > 200_000
-    assert time.perf_counter() - started < 120
+    assert time.process_time() - started < 120

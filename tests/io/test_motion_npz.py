@@ -66,6 +66,13 @@ def test_a_bare_motion_comes_back_bare(tmp_path):
     assert torch.equal(back.R_parent_joint, motion.R_parent_joint)
 
 
+def test_nan_is_not_written(tmp_path):
+    motion = dataclasses.replace(sample(), t_world_root=torch.full((6, 3), float("nan")))
+    with pytest.raises(WearcapError, match="t_world_root"):
+        write_motion(motion, tmp_path / "a.npz")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_numpy_alone_reads_the_amass_like_keys(tmp_path):
     motion = sample()
     write_motion(motion, tmp_path / "a.npz")

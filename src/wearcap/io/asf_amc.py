@@ -302,6 +302,10 @@ def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Flo
     start = next(
         (i for i, line in enumerate(lines) if line.strip() and line.strip()[0] not in "#:"), len(lines)
     )
+    if (":DEGREES" if asf.radians else ":RADIANS") in {line.strip().upper() for line in lines[:start]}:
+        raise WearcapError(
+            "its angles are in another unit than the ASF's", where=path, expected="one unit in both"
+        )
     first: list[tuple[int, list[str]]] = []
     for number, line in enumerate(lines[start + 1 :], start + 2):
         words = line.split()

@@ -24,8 +24,13 @@ SCHEMA = 1
 
 
 def write_motion(motion: Motion, path: str | Path) -> None:
-    """Write a motion atomically; equal motions give equal bytes. Raises WearcapError when it cannot be written."""
+    """Write a motion atomically; equal motions give equal bytes.
+
+    Raises WearcapError when it cannot be written, or holds NaN or infinite values.
+    """
     tree, tensors = flatten(motion)
+    if bad := [key for key, tensor in tensors.items() if not tensor.isfinite().all()]:
+        raise WearcapError(f"{bad[0]!r} holds NaN or infinite values", where=path, expected="a finite motion")
     arrays = {key: tensor.numpy() for key, tensor in sorted(tensors.items())}
     arrays["wearcap"] = np.array(dumps({"schema": SCHEMA, "motion": tree}))
     arrays["trans"] = arrays["t_world_root"]
