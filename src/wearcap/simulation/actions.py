@@ -1,0 +1,108 @@
+"""What a wearer can do. Each activity is a function that writes footsteps and channels onto the plan.
+
+A new one (a door, a sofa to push, a box to carry) is a function `(plan, world, rng) -> bool` under `@activity`;
+it returns False, without having written anything, where the world gives no occasion for it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from wearcap.simulation.gaze import look_about
+from wearcap.simulation.plan import Plan
+from wearcap.simulation.walking import turn_to, walk_along
+from wearcap.simulation.world import World
+
+Act = Callable[[Plan, World, np.random.Generator], bool]
+
+
+@dataclass(frozen=True)
+class Activity:
+    """`weight` is how often it is drawn among all."""
+
+    act: Act
+    weight: float
+
+
+ACTIVITIES: dict[str, Activity] = {}
+
+
+def activity(name: str, weight: float) -> Callable[[Act], Act]:
+    """Enter a function into `ACTIVITIES`."""
+
+    def enter(act: Act) -> Act:
+        ACTIVITIES[name] = Activity(act, weight)
+        return act
+
+    return enter
+
+
+def start_place(world: World, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """A free floor point (m), off the stairs, and a heading (rad) to start from."""
+    return _free_point(world, rng), float(rng.uniform(-np.pi, np.pi))
+
+
+def _free_point(world: World, rng: np.random.Generator, clearance: float = 0.45) -> np.ndarray:
+    points = world.sample_floor(rng, 24)
+    free = (world.clearance(points) > clearance) & ~_on_stairs(world, points)
+    return points[np.flatnonzero(free)[0]] if free.any() else points[0]
+
+
+def _on_stairs(world: World, points: np.ndarray) -> np.ndarray:
+    """Whether floor points lie on a flight or within a step of its ends."""
+    near = np.zeros(len(points), bool)
+    for flight in world.flights:
+        along = np.array([np.cos(flight.direction), np.sin(flight.direction)])
+        offset = points[:, :2] - np.array(flight.start)
+        run, side = offset @ along, offset @ np.array([-along[1], along[0]])
+        near |= (run > -0.8) & (run < flight.length + 0.8) & (np.abs(side) < flight.width / 2 + 0.1)
+    return near
+
+
+@activity("stand", weight=2.0)
+def stand(plan: Plan, world: World, rng: np.random.Generator) -> bool:
+    """Stand for some seconds, looking about a little."""
+    stop = plan.time + rng.uniform(1.5, 6.0)
+    look_about(plan, plan.time, stop, rng, spread=0.35)
+    plan.time = stop
+    return True
+
+
+@activity("look_around", weight=1.0)
+def look_around(plan: Plan, world: World, rng: np.random.Generator) -> bool:
+    """Stand and look far about, the trunk turning with the head."""
+    start, stop = plan.time, plan.time + rng.uniform(4.0, 9.0)
+    look_about(plan, start, stop, rng, spread=0.75, rest=1.2)
+    time = start + 0.4
+    while time < stop - 2.0:
+        plan.lean.move(time, time + 0.9, (0.0, 0.0, np.clip(rng.normal(0.0, 0.22), -0.5, 0.5)))
+        time += rng.uniform(1.2, 3.0)
+    plan.lean.move(stop - 0.9, stop, 0.0)
+    plan.time = stop
+    return True
+
+
+@activity("turn", weight=1.0)
+def turn(plan: Plan, world: World, rng: np.random.Generator) -> bool:
+    """Turn on the spot."""
+    turn_to(plan, plan.heading + rng.choice([-1, 1]) * rng.uniform(0.7, 3.1), rng)
+    plan.time += rng.uniform(0.4, 1.2)
+    return True
+
+
+@activity("walk", weight=6.0)
+def walk(plan: Plan, world: World, rng: np.random.Generator) -> bool:
+    """Walk to another place, over stairs where the way leads there."""
+    return _go(plan, world, rng, _free_point(world, rng), plan.style.speed * float(np.exp(rng.normal(0.0, 0.13))))
+
+
+def _go(plan: Plan, world: World, rng: np.random.Generator, goal: np.ndarray, speed: float) -> bool:
+    path = world.plan_path(plan.position, goal, rng)
+    if path is None or np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum() < 1.2:
+        return False
+    start = plan.time
+    walk_along(plan, path, rng, speed, world.flights)
+    look_about(plan, start + 1.0, plan.time, rng, spread=0.28, rest=2.2)
+    plan.time += rng.uniform(0.25, 0.6)
+    return True

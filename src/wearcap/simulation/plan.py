@@ -1,0 +1,138 @@
+"""The score of a simulated motion: footprints and keyed channels, written by activities and read by the generator."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.simulation.style import Style
+from wearcap.simulation.track import Track
+
+SIDES = ("left", "right")
+LEFT_SIGN = {"left": 1.0, "right": -1.0}
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Where and when a foot stands; pitches are of the sole against the floor, toe down positive (rad)."""
+
+    ground: Float[np.ndarray, "3"]
+    """Floor point beneath the ankle of the flat foot (m)."""
+    heading: float
+    """Of the foot (rad), unwrapped."""
+    tilt: float = 0.0
+    """Of the floor along the foot, falling forwards positive (rad)."""
+    land_s: float = -1e3
+    lift_s: float = 1e6
+    land_pitch: float = 0.0
+    lift_pitch: float = 0.0
+    clearance: float = 0.02
+    """Of the sole above the floor in the middle of the swing that ends here (m)."""
+    bow: float = 0.0
+    """Outward deviation of that swing from the straight line (m)."""
+    running: bool = False
+
+
+@dataclass
+class HandScore:
+    """What one hand does beyond swinging: a held posture against the chest, and a goal in the world."""
+
+    pose_weight: Track = field(default_factory=lambda: Track(np.zeros(1)))
+    pose: Track = field(default_factory=lambda: Track(np.zeros(6)))
+    """Wrist from the shoulder in the chest's axes as a share of the arm's length (left hand's mirror image for
+    the right), elbow swivel (rad, 0 hangs down, positive lifts outwards), hand roll and hand bend (rad)."""
+    goal_weight: Track = field(default_factory=lambda: Track(np.zeros(1)))
+    goal: Track = field(default_factory=lambda: Track(np.zeros(3)))
+    """Wrist in the world (m)."""
+
+
+@dataclass(frozen=True)
+class Label:
+    start_s: float
+    stop_s: float
+    name: str
+
+
+class Plan:
+    """Everything that was decided so far. Activities append to it; `time` is when the next may start."""
+
+    def __init__(self, skeleton: Skeleton, style: Style, position: np.ndarray, heading: float, floor_height):
+        self.skeleton, self.style, self.floor_height = skeleton, style, floor_height
+        self.time = 0.0
+        self.labels: list[Label] = []
+        self.hands = {side: HandScore() for side in SIDES}
+        self.lean = Track(np.zeros(3))
+        """Trunk beyond its habit: forward lean, bend to the right, twist to the left (rad)."""
+        self.crouch = Track(np.zeros(1))
+        """Lowering of the pelvis (m)."""
+        self.heel_lift = {side: Track(np.zeros(1)) for side in SIDES}
+        """Pitch of a standing foot on its ball (rad)."""
+        self.seat_weight = Track(np.zeros(2))
+        """How far the pelvis is led by `seat` rather than by the feet: in the plane, and in height."""
+        self.seat = Track(np.array([*position[:2], 0.9]))
+        """Hip middle when sitting, in the world (m)."""
+        self.gaze = Track(np.array([0.0, 0.0]))
+        """Head against the walking direction: yaw to the left, pitch downwards (rad)."""
+        self.gaze_weight = Track(np.zeros(1))
+        self.gaze_point = Track(np.array([*position[:2], 1.5]))
+        """A point in the world that is looked at while its weight is 1 (m)."""
+        self.prints: dict[str, list[Footprint]] = {
+            side: [self.footprint(side, position, heading, style.stance_width / 2)] for side in SIDES
+        }
+
+    def footprint(self, side: str, center: np.ndarray, heading: float, half_width: float, **how) -> Footprint:
+        """A print beside a floor point, turned out by the wearer's habit, on the floor near the point's height."""
+        sign = LEFT_SIGN[side]
+        ground = np.array(center, np.float64)
+        ground[:2] += sign * half_width * np.array([-np.sin(heading), np.cos(heading)])
+        foot_heading = heading + sign * self.style.toe_out
+        ahead = 0.10 * np.array([np.cos(foot_heading), np.sin(foot_heading)])
+        under = np.stack([ground[:2], ground[:2] + ahead, ground[:2] - 0.4 * ahead])
+        heights = self.floor_height(under, np.full(3, ground[2]))
+        tilt = 0.0
+        if np.isfinite(heights[0]):
+            ground[2] = heights[0]
+            fall = (heights[2] - heights[1]) / 0.14
+            tilt = float(np.arctan(fall)) if abs(fall) < 0.2 else 0.0
+        return Footprint(ground, foot_heading, tilt, **how)
+
+    def step(self, side: str, lift_s: float, land_s: float, lift_pitch: float, print_: Footprint) -> None:
+        """Lift a foot and put it down on a new print; `time` becomes the moment of landing."""
+        prints = self.prints[side]
+        prints[-1] = replace(prints[-1], lift_s=lift_s, lift_pitch=lift_pitch)
+        heading = prints[-1].heading + wrap(print_.heading - prints[-1].heading)
+        prints.append(replace(print_, land_s=land_s, heading=heading))
+        self.time = land_s
+
+    @property
+    def position(self) -> Float[np.ndarray, "3"]:
+        """Floor point between the feet as they stand at the end of the plan (m)."""
+        return (self.prints["left"][-1].ground + self.prints["right"][-1].ground) / 2
+
+    @property
+    def heading(self) -> float:
+        """Of the body at the end of the plan (rad)."""
+        left, right = (self.prints[side][-1].heading for side in SIDES)
+        return right + wrap(left - right) / 2
+
+    @property
+    def hip_height(self) -> float:
+        """Of the hips above the floor when standing upright (m)."""
+        skeleton = self.skeleton
+        legs = skeleton.indices("left_knee", "left_ankle")
+        return float(-skeleton.t_parent_joint[legs, 2].sum()) - skeleton.sites["left_heel"].t_joint_site[2]
+
+    @property
+    def arm_length(self) -> float:
+        """From shoulder to wrist (m)."""
+        joints = self.skeleton.indices("left_elbow", "left_wrist")
+        return float(self.skeleton.t_parent_joint[joints].norm(dim=-1).sum())
+
+    def label(self, start_s: float, name: str) -> None:
+        self.labels.append(Label(start_s, self.time, name))
+
+
+def wrap(angle: float) -> float:
+    """The same angle in [-π, π)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -1,0 +1,113 @@
+"""The trunk over the feet: a pendulum's centre of mass, a pelvis that the legs can carry, a counter-turning chest."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.geometry import rotation
+from wearcap.simulation.gait import FootMotion, load_on_left
+from wearcap.simulation.plan import SIDES, Plan
+from wearcap.simulation.track import blur, lower_envelope, pendulum, wander
+
+GRAVITY = 9.81
+ENVELOPE_S = 0.09
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """Pelvis and chest over time; angles are yaw, forward pitch and roll to the right in the world (rad)."""
+
+    pelvis: Float[np.ndarray, "time 3"]
+    pelvis_angles: Float[np.ndarray, "time 3"]
+    chest_angles: Float[np.ndarray, "time 3"]
+    heading: Float[np.ndarray, "time"]
+    stride: Float[np.ndarray, "time"]
+    """Left foot ahead of the right one (m), smooth."""
+    speed: Float[np.ndarray, "time"]
+
+
+def rotation_of(angles: Float[np.ndarray, "time 3"]) -> Float[Tensor, "time 3 3"]:
+    """Matrix of yaw, pitch and roll: Rz Ry Rx."""
+    yaw, pitch, roll = torch.from_numpy(np.ascontiguousarray(angles)).unbind(-1)
+    about = rotation.about_axis
+    return about("z", yaw) @ about("y", pitch) @ about("x", roll)
+
+
+def trunk_motion(
+    plan: Plan, feet: dict[str, FootMotion], times: Float[np.ndarray, "time"], fps: float, rng: np.random.Generator
+) -> Trunk:
+    """Pelvis and chest that follow from the feet, the plan's channels and the wearer's habits."""
+    left, right = (feet[side] for side in SIDES)
+    style, count = plan.style, len(times)
+    heading = blur((left.heading + right.heading) / 2, 0.13, fps)
+    forward = np.stack([np.cos(heading), np.sin(heading)], 1)
+    load = load_on_left(np.stack([left.planted, right.planted], 1), times, rng)
+    pressure = load[:, None] * left.pressure + (1 - load[:, None]) * right.pressure
+    pressure = pressure[:, :2] + wander(rng, count, 2, 2.2, style.sway, fps)
+    rate = float(np.sqrt(GRAVITY / (1.06 * plan.hip_height)))
+    mass = pendulum(pressure, rate, fps)
+    velocity = np.gradient(mass, axis=0) * fps
+    speed = blur((velocity * forward).sum(1), 0.3, fps)
+    acceleration = blur(rate**2 * (mass - pressure), 0.1, fps)
+    stride = blur(((left.ankle - right.ankle)[:, :2] * forward).sum(1), 0.06, fps)
+    seated = plan.seat_weight.sample(times)
+    moving = np.clip(np.abs(speed) / 0.8, 0.0, 1.0)
+    lean = plan.lean.sample(times)
+    drift = wander(rng, count, 6, 2.5, 0.010, fps)
+
+    pelvis_angles = np.stack(
+        [
+            heading - style.pelvis_yaw * stride * (1 - seated[:, 0]) + 0.3 * lean[:, 2],
+            style.pelvis_tilt * (0.4 + 0.6 * moving) + 0.45 * lean[:, 0] + drift[:, 0],
+            _list(style.pelvis_list, blur(load, 0.05, fps), moving) + 0.15 * lean[:, 1],
+        ],
+        1,
+    )
+    sideways = (acceleration * np.stack([-forward[:, 1], forward[:, 0]], 1)).sum(1)
+    chest_angles = np.stack(
+        [
+            heading + style.trunk_counter * style.pelvis_yaw * blur(stride, 0.05, fps) + lean[:, 2] + drift[:, 1],
+            style.slouch
+            + 0.035 * speed
+            + 0.03 * blur((acceleration * forward).sum(1), 0.12, fps)
+            + lean[:, 0]
+            + drift[:, 2],
+            -0.35 * pelvis_angles[:, 2] - 0.025 * sideways + lean[:, 1] + drift[:, 3],
+        ],
+        1,
+    )
+    back = 0.26 * plan.hip_height * np.sin(np.clip(lean[:, 0], -0.5, 1.5)) + 0.012
+    place = mass - back[:, None] * forward
+    seat = plan.seat.sample(times)
+    place += seated[:, :1] * (seat[:, :2] - place)
+    height = _height(plan, feet, place, rotation_of(pelvis_angles), fps) - plan.crouch.sample(times)[:, 0]
+    height += seated[:, 1] * (seat[:, 2] - height)
+    pelvis = np.concatenate([place, height[:, None]], 1)
+    return Trunk(pelvis, pelvis_angles, chest_angles, heading, stride, speed)
+
+
+def _list(amount: float, load: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """The pelvis drops on the side that swings: roll to the right while the left leg stands."""
+    return amount * (0.35 + 0.65 * moving) * np.sin(np.pi * (load - 0.5))
+
+
+def _height(
+    plan: Plan, feet: dict[str, FootMotion], place: np.ndarray, R_world_pelvis: Tensor, fps: float
+) -> Float[np.ndarray, "time"]:
+    """Height of the pelvis (m): as high as both legs let it, with soft knees, and smooth."""
+    skeleton = plan.skeleton
+    limits = []
+    for side in SIDES:
+        hip, knee, ankle = (
+            skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double() for joint in ("hip", "knee", "ankle")
+        )
+        soft = torch.tensor([0.0, plan.style.knee_soft, 0.0], dtype=torch.float64)
+        leg = float((knee + rotation.exp(soft) @ ankle).norm())
+        offset = (R_world_pelvis @ hip).numpy()
+        away = np.linalg.norm(feet[side].ankle[:, :2] - place - offset[:, :2], axis=1)
+        up = np.sqrt(np.maximum(leg**2 - away**2, (0.35 * leg) ** 2))
+        limits.append(feet[side].ankle[:, 2] + up - offset[:, 2])
+    return lower_envelope(np.minimum(*limits), ENVELOPE_S, fps)

@@ -1,0 +1,176 @@
+"""The simulated wearer: activities are planned one after the other, then the whole body's motion follows at once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.body.kinematics import local_rotations
+from wearcap.body.skeleton import Skeleton
+from wearcap.geometry import rotation
+from wearcap.recording.motion import Motion
+from wearcap.simulation.actions import ACTIVITIES, start_place
+from wearcap.simulation.arms import ArmMotion, arm_motion
+from wearcap.simulation.gait import FootMotion, FootShape, foot_motion
+from wearcap.simulation.gaze import head_angles
+from wearcap.simulation.ik import two_bone
+from wearcap.simulation.plan import SIDES, Label, Plan
+from wearcap.simulation.posture import Trunk, rotation_of, trunk_motion
+from wearcap.simulation.style import Style
+from wearcap.simulation.track import blur
+from wearcap.simulation.world import World
+
+SPINE = ("l5", "l3", "t12", "t8")
+NECK_SHARE = 0.45
+
+
+class Wearer(Protocol):
+    """Who is simulated: a skeleton with the person's own bones (xsens23's joints), and habits of moving."""
+
+    @property
+    def skeleton(self) -> Skeleton: ...
+    @property
+    def style(self) -> Style: ...
+
+
+@dataclass(frozen=True)
+class SimulatedMotion:
+    """A motion with what is true beside it."""
+
+    motion: Motion
+    contact: Bool[Tensor, "time patch"]
+    """Of `FOOT_PATCHES`."""
+    floor_height: Float[Tensor, "time"]
+    """Of the floor beneath the wearer (m)."""
+    labels: tuple[Label, ...]
+    """What was done when, in order."""
+
+
+def simulate_motion(
+    world: World,
+    person: Wearer,
+    rng: np.random.Generator,
+    duration_s: float,
+    fps: float = 60.0,
+    activities: Sequence[str] | None = None,
+) -> SimulatedMotion:
+    """A person's whole-body motion in a world, deterministic for a given state of `rng`.
+
+    `activities` names entries of `actions.ACTIVITIES` to be done in turn, over and over until the time is full;
+    None draws them at random by their weights.
+    """
+    plan = _plan(world, person, rng, duration_s, activities)
+    times = np.arange(int(round(duration_s * fps))) / fps
+    feet = {
+        side: foot_motion(plan.prints[side], FootShape.of(person.skeleton, side), plan.heel_lift[side], times)
+        for side in SIDES
+    }
+    trunk = trunk_motion(plan, feet, times, fps, rng)
+    R_world_joint = _body(plan, feet, trunk, times, fps, rng)
+    contact = torch.from_numpy(np.concatenate([feet[side].contact for side in SIDES], 1))
+    motion = Motion(
+        timestamps=torch.from_numpy(times),
+        skeleton=person.skeleton,
+        R_parent_joint=local_rotations(person.skeleton, R_world_joint).float(),
+        t_world_root=torch.from_numpy(trunk.pelvis).float(),
+        contact_prob=contact.float(),
+        provenance={"source": "simulated wearer"},
+    )
+    floor = np.mean([blur(feet[side].ground[:, 2], 0.1, fps) for side in SIDES], 0)
+    labels = tuple(label for label in plan.labels if label.start_s < duration_s)
+    return SimulatedMotion(motion, contact, torch.from_numpy(floor).float(), labels)
+
+
+def _plan(
+    world: World, person: Wearer, rng: np.random.Generator, duration_s: float, activities: Sequence[str] | None
+) -> Plan:
+    position, heading = start_place(world, rng)
+    plan = Plan(person.skeleton, person.style, position, heading, world.floor_height)
+    weights = np.array([activity.weight for activity in ACTIVITIES.values()])
+    names, turn = list(ACTIVITIES), 0
+    while plan.time < duration_s:
+        if activities is not None:
+            name = activities[turn % len(activities)]
+        else:
+            name = names[rng.choice(len(names), p=weights / weights.sum())]
+        start = plan.time
+        if turn == 0:
+            plan.time += 0.3
+        done = ACTIVITIES[name].act(plan, world, rng)
+        if not done:
+            ACTIVITIES["stand"].act(plan, world, rng)
+        plan.label(start, name if done else "stand")
+        turn += 1
+    return plan
+
+
+def _body(
+    plan: Plan,
+    feet: dict[str, FootMotion],
+    trunk: Trunk,
+    times: Float[np.ndarray, "time"],
+    fps: float,
+    rng: np.random.Generator,
+) -> Float[Tensor, "time joint 3 3"]:
+    """World rotations of all joints."""
+    skeleton = plan.skeleton
+    R = torch.eye(3, dtype=torch.float64).repeat(len(times), len(skeleton), 1, 1)
+    R_pelvis, R_chest = rotation_of(trunk.pelvis_angles), rotation_of(trunk.chest_angles)
+    R[:, skeleton.index("pelvis")] = R_pelvis
+    t_chest = _spine(skeleton, R, R_pelvis, R_chest, torch.from_numpy(trunk.pelvis))
+
+    neck, head = skeleton.t_parent_joint[skeleton.indices("neck", "head")].double()
+    eyes = t_chest + R_chest @ (neck + head) + torch.tensor([0.0, 0.0, 0.1])
+    angles = head_angles(plan, times, fps, trunk.heading, trunk.chest_angles, eyes.numpy(), rng)
+    R_head = rotation_of(angles)
+    R[:, skeleton.index("head")] = R_head
+    between = rotation.log(R_chest.transpose(-1, -2) @ R_head)
+    R[:, skeleton.index("neck")] = R_chest @ rotation.exp(NECK_SHARE * between)
+
+    running = blur(np.mean([feet[side].running for side in SIDES], 0), 0.15, fps)
+    for side in SIDES:
+        arm = arm_motion(plan, side, trunk, R_chest, t_chest, running, times, fps, rng)
+        _set_arm(skeleton, R, side, arm)
+        _leg(skeleton, R, side, feet[side], trunk)
+    return R
+
+
+def _spine(skeleton: Skeleton, R: Tensor, R_pelvis: Tensor, R_chest: Tensor, t_pelvis: Tensor) -> Tensor:
+    """Share the turn between pelvis and chest evenly among the spine's joints; returns where the chest is."""
+    between = rotation.log(R_pelvis.transpose(-1, -2) @ R_chest)
+    position, above = t_pelvis, R_pelvis
+    for number, name in enumerate(SPINE, start=1):
+        position = position + above @ skeleton.t_parent_joint[skeleton.index(name)].double()
+        above = R_pelvis @ rotation.exp(number / len(SPINE) * between)
+        R[:, skeleton.index(name)] = above
+    return position
+
+
+def _set_arm(skeleton: Skeleton, R: Tensor, side: str, arm: ArmMotion) -> None:
+    for joint in ("collar", "shoulder", "elbow", "wrist"):
+        R[:, skeleton.index(f"{side}_{joint}")] = getattr(arm, joint)
+
+
+def _leg(skeleton: Skeleton, R: Tensor, side: str, foot: FootMotion, trunk: Trunk) -> None:
+    """Hip and knee that carry the pelvis over the ankle; foot and toes as the step says."""
+    hip, knee, ankle = (
+        skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double() for joint in ("hip", "knee", "ankle")
+    )
+    heading, body = torch.from_numpy(foot.heading), torch.from_numpy(trunk.pelvis_angles[:, 0].copy())
+    zero = torch.zeros_like(heading)
+    pole = 0.65 * torch.stack([heading.cos(), heading.sin(), zero + 0.35], -1)
+    pole = pole + 0.35 * torch.stack([body.cos(), body.sin(), zero + 0.35], -1)
+    R_pelvis = R[:, skeleton.index("pelvis")]
+    target = torch.from_numpy(foot.ankle - trunk.pelvis) - R_pelvis @ hip
+    hinge = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    R_hip, bend = two_bone(knee, ankle, hinge, target, pole)
+    angles = np.stack([foot.heading, foot.pitch, np.zeros_like(foot.pitch)], 1)
+    toes = np.stack([foot.heading, foot.pitch - foot.toe_bend, np.zeros_like(foot.pitch)], 1)
+    R[:, skeleton.index(f"{side}_hip")] = R_hip
+    R[:, skeleton.index(f"{side}_knee")] = R_hip @ rotation.exp(bend[:, None] * hinge)
+    R[:, skeleton.index(f"{side}_ankle")] = rotation_of(angles)
+    R[:, skeleton.index(f"{side}_toe")] = rotation_of(toes)
