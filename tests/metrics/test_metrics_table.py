@@ -121,7 +121,9 @@ def test_tables_are_written(tmp_path):
     assert lines[0] == "| method | mpjpe_cm | skate |"
     assert lines[2].startswith("| ours | 8.36 ± 0.02 |")
     assert lines[3] == "| mean pose | 20.00 | – |"
-    assert table.rich_table("t", methods).row_count == 2
+    shown = table.rich_table("t", methods, ("mpjpe_cm",))
+    assert [column.header for column in shown.columns] == ["", "ours", "mean pose"]
+    assert [list(column.cells) for column in shown.columns] == [["mpjpe_cm"], ["8.36 ± 0.02"], ["20.00"]]
     table.write_scores(tmp_path / "t.json", methods, {"frames": 3})
     written = json.loads((tmp_path / "t.json").read_text())
     assert written["methods"]["ours"]["mpjpe_cm"] == {"mean": 8.361, "std": 0.02, "seeds": 3}

@@ -107,13 +107,12 @@ def _milliseconds(run: Callable[..., Tensor], inputs: dict[str, Tensor]) -> floa
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """The exporters speak at length of optional libraries and of their own deprecations."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
+    """The exporters speak at length of optional libraries and of what they fold together."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(None):
             warnings.simplefilter("ignore")
             yield
     finally:
-        logger.setLevel(level)
+        logging.disable(before)

@@ -170,29 +170,31 @@ Scores = dict[str, dict[str, Summary]]
 """Summaries by method ("ours", "mean pose" …) and metric."""
 
 
-def _grid(methods: Scores, metrics: tuple[str, ...] | None) -> tuple[list[str], list[list[str]]]:
+def _cells(methods: Scores, metrics: tuple[str, ...] | None) -> list[list[str]]:
+    """One line per method: its name, then its metrics (by default all that the first method has)."""
     columns = list(metrics or next(iter(methods.values())))
-    rows = [
+    lines = [
         [method, *(str(scores[metric]) if metric in scores else "–" for metric in columns)]
         for method, scores in methods.items()
     ]
-    return ["method", *columns], rows
+    return [["method", *columns], *lines]
 
 
 def markdown_table(methods: Scores, metrics: tuple[str, ...] | None = None) -> str:
-    """A table in Markdown: one line per method, one column per metric (all of the first method's by default)."""
-    header, rows = _grid(methods, metrics)
-    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    """A table in Markdown: one line per method, one column per metric."""
+    header, *lines = _cells(methods, metrics)
+    rule = ["---", *["---:"] * (len(header) - 1)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (header, rule, *lines))
 
 
 def rich_table(title: str, methods: Scores, metrics: tuple[str, ...] | None = None) -> Table:
-    """The same table for a terminal."""
-    header, rows = _grid(methods, metrics)
+    """A table for a terminal, where many metrics need lines: one line per metric, one column per method."""
     table = Table(title=title)
-    for name in header:
-        table.add_column(name, justify="left" if name == "method" else "right")
-    for row in rows:
+    header, *lines = _cells(methods, metrics)
+    table.add_column("", no_wrap=True)
+    for line in lines:
+        table.add_column(line[0], justify="right")
+    for row in zip(header[1:], *(line[1:] for line in lines)):
         table.add_row(*row)
     return table
 

@@ -1,0 +1,73 @@
+"""Forward kinematics, fused with its own backward, against one torch step per joint.
+
+24 joints, batch 4096, CPU, 2 threads, single precision; both sides take turns in one run. value and baseline:
+median ms. ratio = baseline / value, to be at least `goal`.
+"""
+
+import statistics
+import time
+
+import torch
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeletons import smpl24
+from wearcap.geometry import rotation
+
+BATCH = 4096
+
+
+def joint_loop(skeleton: Skeleton, R_parent_joint: Tensor, t_world_root: Tensor) -> tuple[Tensor, Tensor]:
+    """The baseline: one joint after the other."""
+    R, t = [R_parent_joint[:, 0]], [t_world_root]
+    for joint in range(1, len(skeleton)):
+        parent = skeleton.parents[joint]
+        R.append(R[parent] @ R_parent_joint[:, joint])
+        t.append(t[parent] + R[parent] @ skeleton.t_parent_joint[joint])
+    return torch.stack(R, 1), torch.stack(t, 1)
+
+
+def fused(skeleton: Skeleton, R_parent_joint: Tensor, t_world_root: Tensor) -> tuple[Tensor, Tensor]:
+    T_world_joint = forward_kinematics(skeleton, R_parent_joint, t_world_root)
+    return T_world_joint.R, T_world_joint.t
+
+
+def measure(batch: int = BATCH, repeats: int = 40) -> list[dict]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        torch.manual_seed(0)
+        skeleton = smpl24()
+        R = rotation.exp(0.5 * torch.randn(batch, len(skeleton), 3))
+        t = torch.randn(batch, 3)
+        for ours, theirs in zip(fused(skeleton, R, t), joint_loop(skeleton, R, t)):
+            torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
+        forward = _medians_ms([lambda: fused(skeleton, R, t), lambda: joint_loop(skeleton, R, t)], repeats)
+        leaves = [R.clone().requires_grad_(), t.clone().requires_grad_()]
+        seeds = [torch.randn(batch, len(skeleton), 3, 3), torch.randn(batch, len(skeleton), 3)]
+        both = _medians_ms(
+            [
+                lambda: torch.autograd.grad(fused(skeleton, *leaves), leaves, seeds),
+                lambda: torch.autograd.grad(joint_loop(skeleton, *leaves), leaves, seeds),
+            ],
+            repeats,
+        )
+    finally:
+        torch.set_num_threads(threads)
+    return [
+        {"name": "fk_vs_joint_loop", "value": value, "unit": unit, "baseline": baseline,
+         "ratio": baseline / value, "goal": goal}
+        for (value, baseline), unit, goal in ((forward, "ms forward", 10.0), (both, "ms forward + backward", 5.0))
+    ]  # fmt: skip
+
+
+def _medians_ms(sides: list, repeats: int) -> list[float]:
+    times: list[list[float]] = [[] for _ in sides]
+    for repeat in range(repeats + 3):
+        for side, own in zip(sides, times):
+            begin = time.perf_counter()
+            side()
+            if repeat >= 3:
+                own.append(time.perf_counter() - begin)
+    return [1000 * statistics.median(own) for own in times]
