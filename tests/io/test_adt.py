@@ -3,6 +3,8 @@ import shutil
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from wearcap.errors import WearcapError
 from wearcap.io.adt import is_adt, read_adt, read_objects, read_skeleton
@@ -68,6 +70,24 @@ def test_other_folders_are_refused(tmp_path):
     assert not is_adt(tmp_path)
     with pytest.raises(WearcapError, match="aria_trajectory"):
         read_adt(tmp_path)
+
+
+JUNK = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.text(max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(["frames", "joints", "timestamp_ns"]), inner, max_size=3)
+    ),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(JUNK)
+def test_any_json_is_read_or_refused(tmp_path_factory, content):
+    path = tmp_path_factory.mktemp("fuzz") / "s.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(WearcapError):
+        read_skeleton(path)
 
 
 @pytest.mark.real

@@ -4,6 +4,8 @@ import lzma
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -206,3 +208,34 @@ def test_nominal_head_axes_fit_a_calibrated_device(real_data):
     assert axis["left"] == pytest.approx(axis["right"] * torch.tensor([1.0, -1.0, 1.0]), abs=0.03)
     assert axis["left"][0] > 0.75
     assert axis["left"][1] > 0.55
+
+
+@pytest.mark.real
+def test_real_head_looks_where_it_goes_at_first(real_data):
+    """Before the wearer walks round the table looking at it, the walk's first two seconds are straight ahead."""
+    head = read_mps(real_data / "aria_mps").head
+    assert head is not None
+    velocity = (head.t_world_device[150] - head.t_world_device[30])[:2]
+    forward = head.R_world_device[30:150, :2, 0].mean(0)
+    cos = torch.nn.functional.cosine_similarity(velocity, forward, dim=0)
+    assert cos > 0.9
+
+
+@settings(max_examples=120, deadline=None)
+@given(st.data())
+def test_damaged_files_are_read_or_refused(tmp_path_factory, data):
+    """Any bytes may be changed, dropped or doubled, before or after compression."""
+    folder = tmp_path_factory.mktemp("fuzz")
+    packed = data.draw(st.booleans())
+    path = write(folder / ("t.csv.gz" if packed else "t.csv"), rows(12), gzip.open if packed else open)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        start = data.draw(st.integers(0, len(content) - 1))
+        content[start : start + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=4))
+    path.write_bytes(bytes(content))
+    try:
+        read = read_closed_loop(path)
+        assert read.T_world_aria.t_world_body.isfinite().all()
+        head_stream(read.T_world_aria, fps=None)
+    except WearcapError:
+        pass

@@ -54,6 +54,7 @@ def test_euroc_scalar_comes_first(tmp_path):
         ("1 2 3\n", "line 1 has 3 fields"),
         ("1 0 0 0 0 0 0 one\n", "one"),
         ("1 0 0 0 0 0 0 nan\n", "quaternion is NaN"),
+        ("1 1e300 0 0 0 0 0 1\n", "translation is NaN or infinite"),
         ("1 0 0 0 0 0 0 0\n", "unit quaternions"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "timestamps that rise"),
     ],

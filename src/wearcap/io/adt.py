@@ -17,7 +17,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.aria_mps import head_stream, read_closed_loop, turn_up
 from wearcap.io.csv_table import open_text, read_columns
-from wearcap.io.poses import check_finite, checked_trajectory
+from wearcap.io.poses import check_finite, check_rising, checked_trajectory
 from wearcap.recording import Cue, Recording
 
 _BODY = {
@@ -82,6 +82,7 @@ def read_skeleton(path: str | Path) -> dict[str, Cue]:
     if joints.ndim != 3 or joints.shape[1:] != (_JOINTS, 3):
         raise WearcapError(f"joints of shape {joints.shape}", where=path, expected=f"(frames, {_JOINTS}, 3)")
     check_finite({"joints": joints}, path)
+    check_rising(times, path)
     world = torch.tensor(joints, dtype=torch.float32) @ turn_up("y").T
     timestamps, sure = torch.from_numpy(times), torch.ones(len(times))
     return {name: Cue(timestamps, name, world[:, row], sure) for name, row in _BODY.items()}

@@ -36,9 +36,9 @@ def checked_trajectory(
 
 
 def check_finite(columns: dict[str, np.ndarray], where: str | Path) -> None:
-    """Raise WearcapError naming the first row and column that is NaN or infinite."""
+    """Raise WearcapError naming the first row and column that is NaN, infinite, or beyond single precision."""
     for name, values in columns.items():
-        bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
+        bad = ~(np.abs(values.reshape(len(values), -1)) < np.finfo(np.float32).max).all(1)
         if bad.any():
             raise WearcapError(f"row {int(bad.argmax()) + 1}: {name} is NaN or infinite ({int(bad.sum())} such rows)",
                                where=where, expected="finite numbers")  # fmt: skip
