@@ -1,0 +1,240 @@
+"""Pixel loops of the renderer: which triangle or splat is nearest in each pixel, and its shaded colour.
+
+The z-buffer holds nearness, which grows towards the camera: 1/depth for perspective (linear on the screen for
+a plane, so that interpolating it is exact), the height towards the light for orthographic maps.
+"""
+
+import math
+
+from wearcap.geometry.compiled import compiled
+
+
+@compiled
+def fill_triangle(x0, y0, w0, x1, y1, w1, x2, y2, w2, number, nearness, index):
+    """Draw one triangle given in pixels with the nearness w of its corners."""
+    height, width = nearness.shape
+    area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+    if not abs(area) > 1e-12:
+        return
+    dw_dx = ((w1 - w0) * (y2 - y0) - (w2 - w0) * (y1 - y0)) / area
+    dw_dy = ((w2 - w0) * (x1 - x0) - (w1 - w0) * (x2 - x0)) / area
+    highest = max(w0, w1, w2)
+    lowest = min(w0, w1, w2)
+    sign = 1.0 if area > 0 else -1.0
+    top = max(0, math.ceil(min(y0, y1, y2)))
+    bottom = min(height - 1, math.floor(max(y0, y1, y2)))
+    for y in range(top, bottom + 1):
+        low, high = 0.0, width - 1.0
+        for xa, ya, xb, yb in ((x0, y0, x1, y1), (x1, y1, x2, y2), (x2, y2, x0, y0)):
+            # the pixel is inside this edge where slope * x + rest >= 0
+            slope = -sign * (yb - ya)
+            rest = sign * ((xb - xa) * y + (xa * yb - xb * ya))
+            if slope > 0:
+                low = max(low, -rest / slope)
+            elif slope < 0:
+                high = min(high, -rest / slope)
+            elif rest < 0:
+                high = -1.0
+        for x in range(math.ceil(low), math.floor(high) + 1):
+            w = min(highest, max(lowest, w0 + (x - x0) * dw_dx + (y - y0) * dw_dy))
+            if w > nearness[y, x]:
+                nearness[y, x] = w
+                index[y, x] = number
+
+
+@compiled
+def draw_pinhole(vertices, faces, fx, fy, cx, cy, near, nearness, index):
+    """Triangles with corners in the camera's axes, clipped at the plane z = near."""
+    px, py, pw = [0.0] * 4, [0.0] * 4, [0.0] * 4
+    for number in range(len(faces)):
+        count = 0
+        for corner in range(3):
+            a, b = faces[number, corner], faces[number, (corner + 1) % 3]
+            za, zb = vertices[a, 2], vertices[b, 2]
+            if za >= near:
+                px[count] = fx * vertices[a, 0] / za + cx
+                py[count] = fy * vertices[a, 1] / za + cy
+                pw[count] = 1.0 / za
+                count += 1
+            if (za >= near) != (zb >= near):
+                blend = (near - za) / (zb - za)
+                px[count] = fx * (vertices[a, 0] + blend * (vertices[b, 0] - vertices[a, 0])) / near + cx
+                py[count] = fy * (vertices[a, 1] + blend * (vertices[b, 1] - vertices[a, 1])) / near + cy
+                pw[count] = 1.0 / near
+                count += 1
+        for last in range(2, count):
+            fill_triangle(
+                px[0], py[0], pw[0], px[last - 1], py[last - 1], pw[last - 1], px[last], py[last], pw[last],
+                number, nearness, index,
+            )  # fmt: skip
+
+
+@compiled
+def draw_projected(pixels, vertex_nearness, valid, faces, nearness, index):
+    """Triangles whose corners are already pixels; those with a corner that is not valid are left out."""
+    for number in range(len(faces)):
+        a, b, c = faces[number, 0], faces[number, 1], faces[number, 2]
+        if valid[a] and valid[b] and valid[c]:
+            fill_triangle(
+                pixels[a, 0], pixels[a, 1], vertex_nearness[a], pixels[b, 0], pixels[b, 1], vertex_nearness[b],
+                pixels[c, 0], pixels[c, 1], vertex_nearness[c], number, nearness, index,
+            )  # fmt: skip
+
+
+@compiled
+def draw_splats(pixels, point_nearness, radius, valid, offset, nearness, index):
+    """Discs of `radius` pixels that face the camera; one always covers the pixel nearest to its centre."""
+    height, width = nearness.shape
+    for number in range(len(pixels)):
+        if not valid[number]:
+            continue
+        x, y, r, w = pixels[number, 0], pixels[number, 1], radius[number], point_nearness[number]
+        column, row = math.floor(x + 0.5), math.floor(y + 0.5)
+        for v in range(max(0, min(row, math.ceil(y - r))), min(height - 1, max(row, math.floor(y + r))) + 1):
+            for u in range(
+                max(0, min(column, math.ceil(x - r))), min(width - 1, max(column, math.floor(x + r))) + 1
+            ):
+                inside = (u - x) ** 2 + (v - y) ** 2 <= r * r or (u == column and v == row)
+                if inside and w > nearness[v, u]:
+                    nearness[v, u] = w
+                    index[v, u] = offset + number
+
+
+@compiled
+def _hit(rx, ry, rz, vertices, a, b, c):
+    """Barycentric weights of corners b and c where the ray through the camera's centre meets the triangle."""
+    ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+    ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+    vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
+    px, py, pz = ry * vz - rz * vy, rz * vx - rx * vz, rx * vy - ry * vx
+    det = ux * px + uy * py + uz * pz
+    if abs(det) < 1e-20:
+        return 0.0, 0.0
+    qx, qy, qz = -ay * uz + az * uy, -az * ux + ax * uz, -ax * uy + ay * ux
+    second = min(1.0, max(0.0, -(ax * px + ay * py + az * pz) / det))
+    third = min(1.0 - second, max(0.0, (rx * qx + ry * qy + rz * qz) / det))
+    return second, third
+
+
+@compiled
+def _key_visibility(x, y, z, axes, scale, shadow, shadow_high, shadow_low):
+    """Part (0…1) of the key light that reaches a point: percentage-closer filtering over 4 x 4 texels.
+
+    `axes` are the map's rows: right, up, towards the light, each with its offset. `shadow_high/low` are the
+    map's extremes over that neighbourhood, which decide most pixels at once.
+    """
+    size = len(shadow)
+    u = (axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z + axes[0, 3]) * scale
+    v = (axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z + axes[1, 3]) * scale
+    d = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z + axes[2, 3] + 0.004
+    column, row = math.floor(u), math.floor(v)
+    if column < 2 or row < 2 or column > size - 4 or row > size - 4:
+        return 1.0
+    if shadow_high[row, column] <= d:
+        return 1.0
+    if shadow_low[row, column] > d:
+        return 0.0
+    du, dv, lit = u - column, v - row, 0.0
+    for i in range(-1, 3):
+        wi = (1 - dv) if i == -1 else (dv if i == 2 else 1.0)
+        for j in range(-1, 3):
+            wj = (1 - du) if j == -1 else (du if j == 2 else 1.0)
+            if shadow[row + i, column + j] <= d:
+                lit += wi * wj
+    return lit / 9.0
+
+
+@compiled
+def _contact_shade(x, y, z, axes, scale, contact, fade):
+    """Part (0…1) of the sky that a thing close above an upward surface hides: darkest where they touch.
+
+    `contact` holds exp(height / fade) of the surfaces seen from beneath, blurred; rows 3-5 of `axes` place it.
+    """
+    u = (axes[3, 0] * x + axes[3, 1] * y + axes[3, 2] * z + axes[3, 3]) * scale
+    v = (axes[4, 0] * x + axes[4, 1] * y + axes[4, 2] * z + axes[4, 3]) * scale
+    height = axes[5, 0] * x + axes[5, 1] * y + axes[5, 2] * z + axes[5, 3]
+    column, row = math.floor(u), math.floor(v)
+    if column < 0 or row < 0 or column > len(contact) - 2 or row > len(contact) - 2:
+        return 0.0
+    du, dv = u - column, v - row
+    value = (1 - dv) * ((1 - du) * contact[row, column] + du * contact[row, column + 1])
+    value += dv * ((1 - du) * contact[row + 1, column] + du * contact[row + 1, column + 1])
+    return min(1.0, value * math.exp(min(80.0, -height / fade)))
+
+
+@compiled
+def resolve(nearness, index, rays, samples, pose, vertices, faces, normals, smooth, casts, colors, color_rows,
+            point_colors, light, axes, scale, shadow, shadow_high, shadow_low, contact, fade,
+            background, color, depth, number):  # fmt: skip
+    """Shade the visible samples and average `samples` x `samples` of them into each pixel of the picture.
+
+    `light`: direction to the key light (3), its strength, the ambient light from below and from above. A
+    pixel's depth and number are those of its nearest sample.
+    """
+    shadows = len(shadow) > 0
+    for row in range(color.shape[0]):
+        for column in range(color.shape[1]):
+            red, green, blue, best, best_number = 0.0, 0.0, 0.0, 0.0, -1
+            for sample in range(samples * samples):
+                v, u = row * samples + sample // samples, column * samples + sample % samples
+                face, w = index[v, u], nearness[v, u]
+                if face >= 0 and w > best:
+                    best, best_number = w, face
+                if face < 0:
+                    red += background[row, 0]
+                    green += background[row, 1]
+                    blue += background[row, 2]
+                    continue
+                if face >= len(faces):
+                    red += point_colors[face - len(faces), 0]
+                    green += point_colors[face - len(faces), 1]
+                    blue += point_colors[face - len(faces), 2]
+                    continue
+                rx, ry, rz = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2]
+                a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+                second, third = _hit(rx, ry, rz, vertices, a, b, c)
+                first = 1.0 - second - third
+                if smooth[face]:
+                    nx = first * normals[a, 0] + second * normals[b, 0] + third * normals[c, 0]
+                    ny = first * normals[a, 1] + second * normals[b, 1] + third * normals[c, 1]
+                    nz = first * normals[a, 2] + second * normals[b, 2] + third * normals[c, 2]
+                else:
+                    ux, uy, uz = (vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1],
+                                  vertices[b, 2] - vertices[a, 2])  # fmt: skip
+                    vx, vy, vz = (vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1],
+                                  vertices[c, 2] - vertices[a, 2])  # fmt: skip
+                    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+                length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-30
+                facing = nx * rx + ny * ry + nz * rz
+                if facing > 0:  # two-sided: the side that is seen is the side that is lit
+                    length = -length
+                nx, ny, nz = nx / length, ny / length, nz / length
+                # world's normal and point
+                wx = pose[0, 0] * nx + pose[0, 1] * ny + pose[0, 2] * nz
+                wy = pose[1, 0] * nx + pose[1, 1] * ny + pose[1, 2] * nz
+                wz = pose[2, 0] * nx + pose[2, 1] * ny + pose[2, 2] * nz
+                key = light[3] * max(0.0, wx * light[0] + wy * light[1] + wz * light[2])
+                ambient = light[4] + (light[5] - light[4]) * (0.5 + 0.5 * wz)
+                if shadows:
+                    z = 1.0 / w
+                    x = pose[0, 0] * rx * z + pose[0, 1] * ry * z + pose[0, 2] * rz * z + pose[0, 3]
+                    y = pose[1, 0] * rx * z + pose[1, 1] * ry * z + pose[1, 2] * rz * z + pose[1, 3]
+                    z = pose[2, 0] * rx * z + pose[2, 1] * ry * z + pose[2, 2] * rz * z + pose[2, 3]
+                    if key > 0:
+                        key *= _key_visibility(x + 0.015 * wx, y + 0.015 * wy, z + 0.015 * wz, axes, scale,
+                                               shadow, shadow_high, shadow_low)  # fmt: skip
+                    if wz > 0.3 and not casts[face]:
+                        hidden = _contact_shade(x, y, z, axes, scale, contact, fade)
+                        ambient *= 1.0 - 0.75 * hidden
+                        key *= 1.0 - 0.5 * hidden
+                ra, rb, rc = color_rows[face, 0], color_rows[face, 1], color_rows[face, 2]
+                shade = ambient + key
+                red += shade * (first * colors[ra, 0] + second * colors[rb, 0] + third * colors[rc, 0])
+                green += shade * (first * colors[ra, 1] + second * colors[rb, 1] + third * colors[rc, 1])
+                blue += shade * (first * colors[ra, 2] + second * colors[rb, 2] + third * colors[rc, 2])
+            total = samples * samples
+            color[row, column, 0] = min(255.0, red / total + 0.5)
+            color[row, column, 1] = min(255.0, green / total + 0.5)
+            color[row, column, 2] = min(255.0, blue / total + 0.5)
+            depth[row, column] = 1.0 / best if best_number >= 0 else math.inf
+            number[row, column] = best_number
