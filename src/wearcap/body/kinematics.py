@@ -1,9 +1,13 @@
-"""Forward kinematics, vectorised over the levels of the skeleton's tree."""
+"""Forward kinematics: fused kernels on the CPU, elsewhere vectorised over the levels of the skeleton's tree."""
+
+import itertools
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.fused_kinematics import can_fuse, fused_forward_kinematics
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
 
@@ -17,20 +21,48 @@ def forward_kinematics(
     """Poses of all joints in the world: Rigid with R "*batch joint 3 3", t "*batch joint 3" (m).
 
     R_parent_joint's root entry is R_world_root. `t_parent_joint` replaces the skeleton's own offsets where
-    a batch mixes subjects (its root row is not read).
+    a batch mixes subjects (its root row is not read). Second derivatives need `level_forward_kinematics`.
     """
     offsets = skeleton.t_parent_joint if t_parent_joint is None else t_parent_joint
-    offsets = offsets.to(R_parent_joint).expand(*R_parent_joint.shape[:-3], len(skeleton), 3)
-    R_levels, t_levels, order = [R_parent_joint[..., :1, :, :]], [t_world_root[..., None, :]], [0]
-    for above, level in zip(skeleton.levels[:-1], skeleton.levels[1:]):
-        parent = [above.index(skeleton.parents[joint]) for joint in level]
+    offsets = offsets.to(R_parent_joint)
+    if can_fuse(R_parent_joint, t_world_root, offsets):
+        return Rigid(*fused_forward_kinematics(skeleton, R_parent_joint, t_world_root, offsets))
+    return level_forward_kinematics(skeleton, R_parent_joint, t_world_root, offsets)
+
+
+def level_forward_kinematics(
+    skeleton: Skeleton,
+    R_parent_joint: Float[Tensor, "*batch joint 3 3"],
+    t_world_root: Float[Tensor, "*batch 3"],
+    offsets: Float[Tensor, "*#batch joint 3"],
+) -> Rigid:
+    """The same in plain tensor operations, one step per level of the tree: any device, transform or compiler."""
+    # What a compiler traces must not be kept: its tensors are stand-ins.
+    plan = _plan if torch.compiler.is_compiling() else _kept_plan
+    levels, back = plan(skeleton.levels, skeleton.parents, R_parent_joint.device)
+    offsets = offsets.expand(*R_parent_joint.shape[:-3], len(skeleton), 3)
+    R_levels, t_levels = [R_parent_joint[..., :1, :, :]], [t_world_root[..., None, :]]
+    for joints, parent in levels:
         R_parent, t_parent = R_levels[-1][..., parent, :, :], t_levels[-1][..., parent, :]
-        joints = list(level)
         R_levels.append(R_parent @ R_parent_joint[..., joints, :, :])
         t_levels.append(t_parent + (R_parent @ offsets[..., joints, :, None])[..., 0])
-        order += joints
-    back = torch.tensor(order).argsort().to(R_parent_joint.device)
     return Rigid(torch.cat(R_levels, -3)[..., back, :, :], torch.cat(t_levels, -2)[..., back, :])
+
+
+def _plan(
+    levels: tuple[tuple[int, ...], ...], parents: tuple[int, ...], device: torch.device
+) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
+    """Per level below the root: its joints and their parents' places in the level above; then the way back."""
+    steps = []
+    for above, joints in itertools.pairwise(levels):
+        places = [above.index(parents[joint]) for joint in joints]
+        steps.append((torch.tensor(joints, device=device), torch.tensor(places, device=device)))
+    order = torch.tensor([joint for level in levels for joint in level])
+    return steps, order.argsort().to(device)
+
+
+_kept_plan = lru_cache(maxsize=64)(_plan)
+"""Copying indices to a GPU anew would wait for it at every call."""
 
 
 def site_positions(

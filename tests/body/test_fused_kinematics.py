@@ -1,0 +1,106 @@
+"""Fused forward kinematics: equal to the level version, its gradient to finite differences."""
+
+import pytest
+import torch
+
+from wearcap.body.fused_kinematics import can_fuse, fused_forward_kinematics
+from wearcap.body.kinematics import forward_kinematics, level_forward_kinematics, local_rotations
+from wearcap.body.skeletons import skeleton_by_name
+from wearcap.geometry import rotation
+
+
+def sample(skeleton, batch, dtype, per_sample_offsets=False):
+    torch.manual_seed(len(batch))
+    R = rotation.exp(torch.randn(*batch, len(skeleton), 3, dtype=dtype))
+    offsets = skeleton.t_parent_joint.to(dtype)
+    if per_sample_offsets:
+        offsets = offsets * (0.8 + 0.4 * torch.rand(*batch, 1, 1, dtype=dtype))
+    return R, torch.randn(*batch, 3, dtype=dtype), offsets
+
+
+@pytest.mark.parametrize("name", ["xsens23", "smplh52"])
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3), (0,)])
+@pytest.mark.parametrize("per_sample", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_equals_the_level_version(name, batch, per_sample, dtype):
+    skeleton = skeleton_by_name(name)
+    R, t, offsets = sample(skeleton, batch, dtype, per_sample)
+    fused = fused_forward_kinematics(skeleton, R, t, offsets)
+    level = level_forward_kinematics(skeleton, R, t, offsets)
+    torch.testing.assert_close(fused[0], level.R)
+    torch.testing.assert_close(fused[1], level.t)
+    torch.testing.assert_close(local_rotations(skeleton, fused[0]), R, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("per_sample", [False, True])
+def test_gradient_is_that_of_finite_differences(per_sample):
+    skeleton = skeleton_by_name("xsens23")
+    inputs = [x.requires_grad_() for x in sample(skeleton, (2,), torch.float64, per_sample)]
+    assert torch.autograd.gradcheck(lambda *x: fused_forward_kinematics(skeleton, *x), inputs)
+
+
+def test_gradient_equals_the_level_versions_for_strided_inputs():
+    skeleton = skeleton_by_name("smpl24")
+    R, t, offsets = sample(skeleton, (6,), torch.float64, True)
+    seeds = torch.randn(6, 24, 3, 3, dtype=torch.float64), torch.randn(6, 24, 3, dtype=torch.float64)
+    gradients = []
+    for version in (fused_forward_kinematics, lambda *x: vars(level_forward_kinematics(*x)).values()):
+        leaves = [x.transpose(0, -1).contiguous().transpose(0, -1).requires_grad_() for x in (R, t, offsets)]
+        gradients.append(torch.autograd.grad(tuple(version(skeleton, *leaves)), leaves, seeds))
+    for fused, level in zip(*gradients):
+        torch.testing.assert_close(fused, level)
+
+
+def test_unused_outputs_and_repeated_backward():
+    """Only positions are used, the expanded gradient of a sum comes in, and a second backward gives the same."""
+    skeleton = skeleton_by_name("xsens23")
+    R, t, _ = sample(skeleton, (4,), torch.float32)
+    R.requires_grad_()
+    loss = forward_kinematics(skeleton, R, t).t.sum()
+    first = torch.autograd.grad(loss, R, retain_graph=True)[0]
+    torch.testing.assert_close(torch.autograd.grad(loss, R)[0], first)
+    level = level_forward_kinematics(skeleton, R, t, skeleton.t_parent_joint).t.sum()
+    torch.testing.assert_close(first, torch.autograd.grad(level, R)[0], atol=1e-5, rtol=1e-5)
+
+
+def test_transforms_and_compilers_take_the_level_version():
+    skeleton = skeleton_by_name("xsens23")
+    R, t, _ = sample(skeleton, (3,), torch.float64)
+    positions = lambda R, t: forward_kinematics(skeleton, R, t).t  # noqa: E731
+    jacobian = torch.func.vmap(torch.func.jacrev(positions))(R, t)
+    assert jacobian.shape == (3, 23, 3, 23, 3, 3)
+    assert torch.func.jacfwd(positions)(R[0], t[0]).shape == (23, 3, 23, 3, 3)
+    assert can_fuse(R, t)
+    assert not can_fuse(R, t.float())
+    assert not can_fuse(R.to("meta"), t.to("meta"))
+
+    class Positions(torch.nn.Module):
+        def forward(self, R, t):
+            return positions(R, t)
+
+    exported = torch.export.export(Positions(), (R, t), strict=False)
+    torch.testing.assert_close(exported.module()(R, t), positions(R, t))
+    torch.testing.assert_close(positions(R, t), forward_kinematics(skeleton, R, t).t)
+
+
+@pytest.mark.gpu
+def test_cuda_agrees_with_the_cpu():
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    skeleton = skeleton_by_name("xsens23")
+    R, t, _ = sample(skeleton, (7,), torch.float32)
+    device = forward_kinematics(skeleton, R.cuda(), t.cuda())
+    torch.testing.assert_close(device.t.cpu(), forward_kinematics(skeleton, R, t).t, atol=1e-5, rtol=1e-5)
+
+
+def test_benchmark_has_its_two_figures():
+    import importlib.util
+    from pathlib import Path
+
+    path = Path(__file__).parents[2] / "benchmarks" / "fk_vs_joint_loop.py"
+    spec = importlib.util.spec_from_file_location("fk_vs_joint_loop", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    figures = module.measure(batch=64, repeats=3)
+    assert [figure["goal"] for figure in figures] == [10.0, 5.0]
+    assert all(figure["ratio"] == figure["baseline"] / figure["value"] for figure in figures)
