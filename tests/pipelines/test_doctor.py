@@ -5,6 +5,7 @@ import json
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from walking_person import MOUNT, sound_recording
@@ -19,6 +20,7 @@ from wearcap.io.tum import write_tum
 from wearcap.pipelines.doctor import Finding, Report, examine
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import save_recording
+from wearcap.sensors.imu import ImuNoise, synthesize_imu
 
 Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 """Turns a z-up world into a y-up one."""
@@ -195,6 +197,18 @@ def test_planted_defect_is_found(sound, name):
     assert severity in {f.severity for f in hits}
     assert all(f.fix for f in hits)
     assert report.sound == (severity != "error" and not report.of_severity("error"))
+
+
+def test_a_real_sensors_errors_are_no_defect(sound):
+    """Attitude error, bias, noise and a loose strap of a watch-like sensor: nothing to mend."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        imu = {
+            joint: synthesize_imu(sound.motion, joint, R_joint_imu=MOUNT, noise=ImuNoise(), rng=rng)
+            for joint in ("left_wrist", "head", "pelvis")
+        }
+        report = examine(replace(sound, imu=imu))
+        assert not [(f.check, f.what, f.evidence) for _, f in report.of_severity("error", "warning")]
 
 
 def test_measured_lag_is_the_planted_one(sound):

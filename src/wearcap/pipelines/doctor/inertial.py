@@ -3,7 +3,6 @@
 import math
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.geometry import rotation
@@ -12,8 +11,8 @@ from wearcap.pipelines.doctor.poses import check_rotations
 from wearcap.pipelines.doctor.report import Finding
 from wearcap.pipelines.doctor.signals import acceleration_of, lag_between, quantile, spin_of
 from wearcap.recording import ImuStream
+from wearcap.sensors.imu import GRAVITY, mean_filter
 
-GRAVITY = 9.81
 _ACC_UNITS = {"g": GRAVITY, "milli-g": GRAVITY / 1000, "cm/s²": 0.01}
 
 
@@ -264,7 +263,10 @@ def _mounting(check: str, imu: ImuStream, R_world_imu: Tensor, R_world_joint: Te
 def _acceleration(check: str, acc_world: Tensor, joint: Trajectory, timestamps: Tensor) -> Finding:
     """Free acceleration against the second difference of the joint's path (MocapEvery eq. 8)."""
     expected = interpolate(joint.timestamps, acceleration_of(joint), timestamps)
-    scale, agreement = _fit(expected.flatten(), _smoothed(acc_world, timestamps).flatten())
+    window = (
+        2 * round(0.033 / timestamps.diff().median().item()) + 1
+    )  # about the span that eq. 8 averages over
+    scale, agreement = _fit(expected.flatten(), mean_filter(acc_world, window).flatten())
     evidence = f"{scale:.2g} × the motion's, correlation {agreement:.2f}"
     if quantile(expected.norm(dim=-1), 0.9) < 0.5:
         return Finding("ok", check, "hardly any to compare", evidence)
@@ -285,17 +287,6 @@ def _acceleration(check: str, acc_world: Tensor, joint: Trajectory, timestamps: 
             "warning", check, "has another scale than the motion's", evidence, "Check units and frame rates."
         )
     return Finding("ok", check, "agrees with the motion", evidence)
-
-
-def _smoothed(
-    acc: Float[Tensor, "time 3"], timestamps: Tensor, span_s: float = 0.13
-) -> Float[Tensor, "time 3"]:
-    """Mean over the time that the second difference spans."""
-    n = max(1, round(span_s / timestamps.diff().median().item())) | 1
-    if len(acc) <= n:
-        return acc
-    padded = torch.nn.functional.pad(acc.T[None], (n // 2, n // 2), mode="replicate")
-    return torch.nn.functional.avg_pool1d(padded, n, 1)[0].T
 
 
 def _fit(reference: Tensor, measured: Tensor) -> tuple[float, float]:

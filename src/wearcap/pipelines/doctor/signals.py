@@ -8,6 +8,7 @@ from torch import Tensor
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, interpolate
 from wearcap.io.head_alignment import best_shift, correlate_shifts
+from wearcap.sensors.imu import acceleration
 
 LAG_RATE_HZ = 200.0
 
@@ -27,15 +28,12 @@ def spin_of(track: Trajectory) -> Float[Tensor, "time 3"]:
     return torch.cat([turn[:1], turn, turn[-1:]])
 
 
-def acceleration_of(track: Trajectory, span_s: float = 0.067) -> Float[Tensor, "time 3"]:
-    """Acceleration (m/s²) in the world by second differences over ±n frames (MocapEvery eq. 8, about 4 at 60 Hz)."""
-    count = len(track)
-    n = max(1, round(span_s / track.timestamps.diff().median().item())) if count > 1 else 1
-    if count < 2 * n + 1:
-        return torch.zeros(count, 3, dtype=torch.float64)
-    p, dt = track.t_world_body.double(), (track.timestamps[2 * n :] - track.timestamps[: -2 * n])[:, None] / 2
-    inner = (p[: -2 * n] + p[2 * n :] - 2 * p[n:-n]) / dt**2
-    return torch.cat([inner[:1].expand(n, 3), inner, inner[-1:].expand(n, 3)])
+def acceleration_of(track: Trajectory) -> Float[Tensor, "time 3"]:
+    """Acceleration (m/s²) in the world, as synthetic IMUs have it: MocapEvery eq. 8 over the span of 4 frames at 60 Hz."""
+    if len(track) < 2:
+        return torch.zeros(len(track), 3, dtype=torch.float64)
+    fps = 1 / track.timestamps.diff().median().item()
+    return acceleration(track.t_world_body.double(), fps, max(1, round(fps / 15)))
 
 
 def lag_between(
