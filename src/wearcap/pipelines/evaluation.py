@@ -3,6 +3,10 @@
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Protocol, runtime_checkable
 
+from jaxtyping import Bool
+from torch import Tensor
+
+from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.metrics.table import Row, evaluate_motion
 from wearcap.pipelines.hmd2 import hang_from_head
@@ -39,5 +43,12 @@ def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
     if truth is None:
         raise WearcapError("no true motion to compare with", where=name, expected="a recording with `motion`")
     hung = hang_from_head(motion, truth.joint("head"))
-    contact = recording.contacts.contact if recording.contacts is not None else None
-    return Row(name, seed, len(truth), evaluate_motion(hung, truth, contact))
+    return Row(name, seed, len(truth), evaluate_motion(hung, truth, _foot_contact(recording)))
+
+
+def _foot_contact(recording: Recording) -> Bool[Tensor, "time patch"] | None:
+    """True contact of the foot patches among the parts that a recording tracks (hands may be others)."""
+    track = recording.contacts
+    if track is None or not set(FOOT_PATCHES) <= set(track.parts):
+        return None
+    return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]
