@@ -94,7 +94,9 @@ def turn(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 @activity("walk", weight=6.0)
 def walk(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Walk to another place, over stairs where the way leads there."""
-    return _go(plan, world, rng, _free_point(world, rng), plan.style.speed * float(np.exp(rng.normal(0.0, 0.13))))
+    return _go(
+        plan, world, rng, _free_point(world, rng), plan.style.speed * float(np.exp(rng.normal(0.0, 0.13)))
+    )
 
 
 def _go(plan: Plan, world: World, rng: np.random.Generator, goal: np.ndarray, speed: float) -> bool:

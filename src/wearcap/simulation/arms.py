@@ -44,7 +44,8 @@ def arm_motion(
     """
     skeleton, sign, hand = plan.skeleton, LEFT_SIGN[side], plan.hands[side]
     collar, upper, lower = (
-        skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double() for joint in ("collar", "shoulder", "elbow")
+        skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double()
+        for joint in ("collar", "shoulder", "elbow")
     )
     forearm = skeleton.t_parent_joint[skeleton.index(f"{side}_wrist")].double()
     length = float(lower.norm() + forearm.norm())
@@ -61,7 +62,9 @@ def arm_motion(
 
     hinge = torch.tensor([0.0, 0.0, -sign], dtype=torch.float64)
     R_upper = R_world_chest @ R_swing
-    wrist = _rotate(R_upper, lower + _rotate(rotation.exp(bend[:, None] * hinge), forearm.expand(len(times), 3)))
+    wrist = _rotate(
+        R_upper, lower + _rotate(rotation.exp(bend[:, None] * hinge), forearm.expand(len(times), 3))
+    )
     mirror = torch.tensor([1.0, sign, 1.0], dtype=torch.float64)
     held = torch.from_numpy(pose[:, :3].copy()) * mirror * length
     swivel = torch.from_numpy(pose[:, 3].copy())
@@ -77,7 +80,9 @@ def arm_motion(
     turn = pose_weight[:, 0] * torch.from_numpy(pose[:, 4].copy()) + torch.from_numpy(relaxed[:, 0])
     fold = pose_weight[:, 0] * torch.from_numpy(pose[:, 5].copy()) + torch.from_numpy(relaxed[:, 1] + 0.06)
     axis = forearm / forearm.norm()
-    R_elbow = R_shoulder @ rotation.exp(flexion[:, None] * hinge) @ rotation.exp(0.7 * sign * turn[:, None] * axis)
+    R_elbow = (
+        R_shoulder @ rotation.exp(flexion[:, None] * hinge) @ rotation.exp(0.7 * sign * turn[:, None] * axis)
+    )
     R_hand = rotation.exp(0.3 * sign * turn[:, None] * axis) @ rotation.about_axis("x", -sign * fold)
     return ArmMotion(R_collar, R_shoulder, R_elbow, R_elbow @ R_hand)
 
@@ -87,12 +92,18 @@ def _rotate(R: Tensor, vector: Tensor) -> Tensor:
 
 
 def _swing(
-    plan: Plan, sign: float, trunk: Trunk, running: np.ndarray, times: np.ndarray, fps: float, rng: np.random.Generator
+    plan: Plan,
+    sign: float,
+    trunk: Trunk,
+    running: np.ndarray,
+    times: np.ndarray,
+    fps: float,
+    rng: np.random.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Rotation of the hanging upper arm in the chest, and the elbow's bend (rad)."""
     style = plan.style
     gain = style.arm_swing * (1.0 + sign * style.arm_symmetry)
-    lag = int(round(0.04 * fps))
+    lag = round(0.04 * fps)
     ahead = -sign * blur(np.roll(trunk.stride, lag), 0.07, fps)
     ahead[:lag] = ahead[lag] if len(ahead) > lag else 0.0
     slow = wander(rng, len(times), 4, 4.0, 0.03, fps)

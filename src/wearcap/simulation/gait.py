@@ -96,7 +96,16 @@ class _Timeline:
     def __init__(self, prints: list[Footprint], times: np.ndarray):
         columns = {
             name: np.array([getattr(p, name) for p in prints], np.float64)
-            for name in ("land_s", "lift_s", "land_pitch", "lift_pitch", "clearance", "bow", "tilt", "heading")
+            for name in (
+                "land_s",
+                "lift_s",
+                "land_pitch",
+                "lift_pitch",
+                "clearance",
+                "bow",
+                "tilt",
+                "heading",
+            )
         }
         columns["ground"] = np.stack([p.ground for p in prints])
         columns["height"] = columns["ground"][:, 2]

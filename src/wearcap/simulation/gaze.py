@@ -13,7 +13,12 @@ PITCH_LIMITS = (-0.75, 0.95)
 
 
 def look_about(
-    plan: Plan, start_s: float, stop_s: float, rng: np.random.Generator, spread: float = 0.5, rest: float = 1.6
+    plan: Plan,
+    start_s: float,
+    stop_s: float,
+    rng: np.random.Generator,
+    spread: float = 0.5,
+    rest: float = 1.6,
 ) -> None:
     """Head turns of 10 to 60 degrees every 1 to 4 s between two times, back to the front at the end.
 
@@ -53,7 +58,7 @@ def head_angles(
     keeps still against the trunk's swing but for a small share, and pitches against its own bob as eyes fixed on a
     point some metres ahead do.
     """
-    lead = int(round(LEAD_S * fps))
+    lead = round(LEAD_S * fps)
     ahead = np.concatenate([heading[lead:], np.full(min(lead, len(heading)), heading[-1])])[: len(heading)]
     offset = plan.gaze.sample(times)
     bob = eyes[:, 2] - blur(eyes[:, 2], 0.6, fps)

@@ -37,7 +37,11 @@ def rotation_of(angles: Float[np.ndarray, "time 3"]) -> Float[Tensor, "time 3 3"
 
 
 def trunk_motion(
-    plan: Plan, feet: dict[str, FootMotion], times: Float[np.ndarray, "time"], fps: float, rng: np.random.Generator
+    plan: Plan,
+    feet: dict[str, FootMotion],
+    times: Float[np.ndarray, "time"],
+    fps: float,
+    rng: np.random.Generator,
 ) -> Trunk:
     """Pelvis and chest that follow from the feet, the plan's channels and the wearer's habits."""
     left, right = (feet[side] for side in SIDES)
@@ -69,7 +73,10 @@ def trunk_motion(
     sideways = (acceleration * np.stack([-forward[:, 1], forward[:, 0]], 1)).sum(1)
     chest_angles = np.stack(
         [
-            heading + style.trunk_counter * style.pelvis_yaw * blur(stride, 0.05, fps) + lean[:, 2] + drift[:, 1],
+            heading
+            + style.trunk_counter * style.pelvis_yaw * blur(stride, 0.05, fps)
+            + lean[:, 2]
+            + drift[:, 1],
             style.slouch
             + 0.035 * speed
             + 0.03 * blur((acceleration * forward).sum(1), 0.12, fps)
@@ -102,7 +109,8 @@ def _height(
     limits = []
     for side in SIDES:
         hip, knee, ankle = (
-            skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double() for joint in ("hip", "knee", "ankle")
+            skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double()
+            for joint in ("hip", "knee", "ankle")
         )
         soft = torch.tensor([0.0, plan.style.knee_soft, 0.0], dtype=torch.float64)
         leg = float((knee + rotation.exp(soft) @ ankle).norm())

@@ -72,7 +72,7 @@ def lower_envelope(
     signal: Float[np.ndarray, "time"], half_width_s: float, fps: float
 ) -> Float[np.ndarray, "time"]:
     """A smooth curve that nowhere exceeds the signal: minimum over a window, then a mean over the same window."""
-    half = max(int(round(half_width_s * fps)), 1)
+    half = max(round(half_width_s * fps), 1)
     lowest = scipy.ndimage.minimum_filter1d(signal, 2 * half + 1, mode="nearest")
     kernel = np.convolve(np.hanning(half + 3)[1:-1], np.hanning(half + 3)[1:-1])
     return scipy.ndimage.convolve1d(lowest, kernel / kernel.sum(), mode="nearest")

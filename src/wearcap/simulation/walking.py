@@ -43,14 +43,18 @@ class Course:
 
 
 def walk_along(
-    plan: Plan, path: Float[np.ndarray, "waypoint 3"], rng: np.random.Generator, speed: float, flights: tuple = ()
+    plan: Plan,
+    path: Float[np.ndarray, "waypoint 3"],
+    rng: np.random.Generator,
+    speed: float,
+    flights: tuple = (),
 ) -> None:
     """Turn towards a path's start, walk (or run, above 2.1 m/s) along it and stop at its end, feet together."""
     course = plan_course(plan, path, speed, flights)
     ahead = float(np.interp(0.35, np.arange(len(course.heading)) * SPACING_M, course.heading))
     if abs(wrap(ahead - plan.heading)) > np.deg2rad(50):
         turn_to(plan, ahead - np.sign(wrap(ahead - plan.heading)) * np.deg2rad(15), rng)
-    steps = int(round(course.phase[-1]))
+    steps = round(course.phase[-1])
     first = _first_foot(plan, course, rng)
     sides = [first if k % 2 else _other(first) for k in range(1, steps + 2)]
     lands = np.array([course.at_phase("time", k - 0.5) for k in range(1, steps + 1)])
@@ -105,7 +109,11 @@ def _course_print(
     style = plan.style
     point, heading = course.at_phase("points", k), float(course.at_phase("heading", k))
     stairs = abs(course.at_phase("on_stairs", k)) > 0.5
-    width = style.step_width * (0.6 if speed > RUN_SPEED else 1.0) * (1 + 3 * style.variability * rng.standard_normal())
+    width = (
+        style.step_width
+        * (0.6 if speed > RUN_SPEED else 1.0)
+        * (1 + 3 * style.variability * rng.standard_normal())
+    )
     if last:
         width = style.stance_width * (1 + 0.1 * rng.standard_normal())
     length = style.variability * rng.standard_normal() * 0.6 * (0.0 if stairs else 1.0)
@@ -124,7 +132,7 @@ def plan_course(plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float,
     anchors = [anchor for flight in flights for anchor in _tread_anchors(points, flight)]
     anchors = sorted(anchors, key=lambda anchor: anchor[0])
     stairs = np.zeros(len(points))
-    for at, way, tread, rise in anchors:
+    for at, way, tread, _rise in anchors:
         near = np.abs(length - at) < 0.55 * tread
         stairs[near] = way
         beat = (0.58 if way > 0 else 0.54) / plan.style.briskness**0.5
@@ -193,7 +201,7 @@ def _anchored(raw: np.ndarray, length: np.ndarray, anchors: list[float]) -> np.n
     for end in ends:
         steps = np.interp(end, length, raw) - np.interp(previous, length, raw)
         knots.append(float(np.interp(end, length, raw)))
-        whole.append(whole[-1] + max(int(round(steps)), 1))
+        whole.append(whole[-1] + max(round(steps), 1))
         previous = end
     return np.interp(raw, knots, whole)
 

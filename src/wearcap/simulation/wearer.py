@@ -64,7 +64,7 @@ def simulate_motion(
     None draws them at random by their weights.
     """
     plan = _plan(world, person, rng, duration_s, activities)
-    times = np.arange(int(round(duration_s * fps))) / fps
+    times = np.arange(round(duration_s * fps)) / fps
     feet = {
         side: foot_motion(plan.prints[side], FootShape.of(person.skeleton, side), plan.heel_lift[side], times)
         for side in SIDES
@@ -86,7 +86,11 @@ def simulate_motion(
 
 
 def _plan(
-    world: World, person: Wearer, rng: np.random.Generator, duration_s: float, activities: Sequence[str] | None
+    world: World,
+    person: Wearer,
+    rng: np.random.Generator,
+    duration_s: float,
+    activities: Sequence[str] | None,
 ) -> Plan:
     position, heading = start_place(world, rng)
     plan = Plan(person.skeleton, person.style, position, heading, world.floor_height)
@@ -158,7 +162,8 @@ def _set_arm(skeleton: Skeleton, R: Tensor, side: str, arm: ArmMotion) -> None:
 def _leg(skeleton: Skeleton, R: Tensor, side: str, foot: FootMotion, trunk: Trunk) -> None:
     """Hip and knee that carry the pelvis over the ankle; foot and toes as the step says."""
     hip, knee, ankle = (
-        skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double() for joint in ("hip", "knee", "ankle")
+        skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double()
+        for joint in ("hip", "knee", "ankle")
     )
     heading, body = torch.from_numpy(foot.heading), torch.from_numpy(trunk.pelvis_angles[:, 0].copy())
     zero = torch.zeros_like(heading)
