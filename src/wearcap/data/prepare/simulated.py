@@ -1,0 +1,61 @@
+"""The simulated wearer's recordings: nothing to download, the same bytes for the same seed."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import wearcap.sensors
+import wearcap.simulation
+from wearcap.data.prepare.engine import Task, content_hash
+from wearcap.data.prepare.splits import Splits
+from wearcap.errors import WearcapError
+from wearcap.recording.recording import Recording
+from wearcap.recording.store import SPLITS
+from wearcap.simulation.simulate import SimulationConfig, simulate_recording
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """One recording by seed; picklable, callable as a task."""
+
+    config: SimulationConfig
+    name: str
+    split: str
+    seed: int
+
+    def __call__(self) -> Recording:
+        return simulate_recording(self.config, self.name, self.split, self.seed)
+
+
+def simulated_tasks(
+    splits: Splits, recordings: dict[str, int], duration_s: float | int, fps: float | int, points: bool,
+    activities: list[str] | None, seed: int,
+) -> list[Task]:  # fmt: skip
+    """`recordings[split]` recordings of `duration_s` each; people and places of the splits never meet.
+
+    The hash covers the simulator's own source, so that a better simulator makes its recordings again.
+    Raises WearcapError for an unknown split, or when a simulated person's name belongs to another split's list.
+    """
+    config = SimulationConfig(duration_s=float(duration_s), fps=float(fps), points=points,
+                              activities=tuple(activities) if activities else None)  # fmt: skip
+    if not config.duration_s > 0 or not config.fps > 0:
+        raise WearcapError(f"recordings of {duration_s} s at {fps} Hz", expected="positive numbers")
+    if unknown := set(recordings) - set(SPLITS):
+        raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
+    simulator = _source_files()
+    tasks = []
+    for split, count in recordings.items():
+        if splits.of(f"sim-{split}-person-000") != split:
+            raise WearcapError(
+                f"people of the simulated {split} split are listed elsewhere", where=splits.path
+            )
+        for index in range(count):
+            name = f"sim-{split}-{seed}-{index:04d}"
+            make = Simulated(config, name, split, seed * 1_000_000 + index)
+            tasks.append(Task(name, make, split, content_hash(asdict(config), make.seed, split, simulator)))
+    return tasks
+
+
+def _source_files() -> str:
+    """Digest of the code that simulates."""
+    folders = [Path(package.__file__ or "").parent for package in (wearcap.simulation, wearcap.sensors)]
+    return content_hash(*(path for folder in folders for path in sorted(folder.glob("*.py"))))
