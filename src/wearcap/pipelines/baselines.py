@@ -181,7 +181,7 @@ def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPa
     first: tuple[tuple[str, ...], float] | None = None
     for store in stores:
         for name in store.names("train"):
-            recording, fps = store.load(name), store.entries[name].fps
+            recording, fps = _read(store, name), store.entries[name].fps
             if recording.head is None or recording.motion is None or len(recording.motion) < 2:
                 continue
             path = head_path(recording, recording.motion.skeleton, fps)
@@ -197,6 +197,14 @@ def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPa
     if first is None:
         raise WearcapError("no training recordings with head and motion",
                            where=", ".join(str(store.root) for store in stores))  # fmt: skip
+
+
+def _read(store: RecordingStore, name: str) -> Recording:
+    """The parts that a baseline learns from; clouds and images stay on the disk."""
+    file = store.open_file(name)
+    floor = file.part("floor")
+    points = file.part("points") if floor is None else None
+    return Recording(name, head=file.part("head"), motion=file.part("motion"), floor=floor, points=points)
 
 
 def _fps_of(path: HeadPath) -> float:
