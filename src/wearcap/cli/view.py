@@ -1,0 +1,49 @@
+"""`wearcap view`: a recording, and what was captured from it, in the browser."""
+
+import argparse
+from pathlib import Path
+
+from wearcap.errors import WearcapError
+
+HELP = "show a recording in the browser: wearcap view DATASET/NAME [--motion motion.npz]"
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="wearcap view", description="Show a recording in the browser.")
+    parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
+    parser.add_argument(
+        "--motion", help="captured motion (.npz that `wearcap capture` wrote) to show with it"
+    )
+    parser.add_argument(
+        "--port", type=int, default=8080, help="port of the page (default 8080, else the next free)"
+    )
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to serve on (default: this machine only)"
+    )
+    options = parser.parse_args(arguments)
+    if not 0 < options.port < 65536:
+        raise WearcapError(f"port {options.port}", expected="1 to 65535")
+
+    from wearcap.io.motion_npz import read_motion
+    from wearcap.recording.locate import load_recording
+    from wearcap.viewer.page import Page
+
+    recording = load_recording(options.recording)
+    motion = read_motion(options.motion) if options.motion else None
+    page = Page(
+        recording, motion, folder=dataset_folder(options.recording), host=options.host, port=options.port
+    )
+    print(f"{recording.name}: open {page.url} (Ctrl+C ends; space plays, J and L jump by a second)")
+    try:
+        page.run()
+    finally:
+        page.stop()
+
+
+def dataset_folder(where: str | Path) -> Path:
+    """The data set's directory of what a user typed for a recording: files of the recording lie relative to it."""
+    path = Path(where)
+    for folder in (path, *path.parents):
+        if (folder / "manifest.json").is_file():
+            return folder
+    return path.parent

@@ -1,0 +1,196 @@
+"""What the page shows, layer by layer; each moves to a time by sending poses, never meshes anew."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+import trimesh
+import viser
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from wearcap.body.anny_body import anny_body
+from wearcap.body.kinematics import site_positions
+from wearcap.body.model import BodyModel
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import capsules
+from wearcap.geometry.rotation import quat_wxyz_from_matrix
+from wearcap.recording import HeadStream, Motion, PointCloud
+
+MAX_POINTS = 200_000
+CONTACT_COLOR, AIR_COLOR = (230, 60, 40), (190, 190, 190)
+_R_DEVICE_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""A camera (x right, y down, z forward) that looks the way the head does."""
+
+
+class Layer(Protocol):
+    def show(self, time: float) -> None: ...
+
+
+def nearest_frame(timestamps: Float64[Tensor, "time"], time: float) -> int:
+    """Index of the frame nearest in time."""
+    after = int(torch.searchsorted(timestamps, time).clamp(1, max(len(timestamps) - 1, 1)))
+    if len(timestamps) == 1:
+        return 0
+    return after if timestamps[after] - time < time - timestamps[after - 1] else after - 1
+
+
+def stick_body(skeleton: Skeleton) -> BodyModel:
+    """Capsules along the bones and a ball for the head: a body for any skeleton."""
+    rest = skeleton.rest_joints.double().numpy()
+    joints = [
+        joint for joint in range(1, len(skeleton)) if np.linalg.norm(skeleton.t_parent_joint[joint]) > 1e-4
+    ]
+    bones = [skeleton.parents[joint] for joint in joints]
+    radius = np.clip([0.12 * float(skeleton.t_parent_joint[j].norm()) for j in joints], 0.012, 0.05)
+    start, end = rest[bones], rest[joints]
+    if "head" in skeleton:
+        head = skeleton.index("head")
+        start, end = (np.concatenate([points, rest[[head]] + [0.02, 0.0, 0.09]]) for points in (start, end))
+        radius, bones = np.append(radius, 0.10), [*bones, head]
+    mesh = capsules(start, end, radius, radius, np.zeros((len(bones), 3)), segments=12)
+    held = torch.tensor(bones).repeat_interleave(len(mesh.vertices) // len(bones))
+    weights = torch.zeros(len(held), 4)
+    weights[:, 0] = 1
+    return BodyModel(
+        skeleton, torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces).long(),
+        held[:, None].repeat(1, 4), weights,
+    )  # fmt: skip
+
+
+def surface_or_sticks(skeleton: Skeleton, shape: dict[str, float]) -> BodyModel:
+    """The default human, or sticks where the skeleton is no human's."""
+    try:
+        return anny_body(skeleton, shape)
+    except WearcapError:
+        return stick_body(skeleton)
+
+
+class BodyLayer:
+    """One motion as a skinned mesh. The browser does the skinning: a frame is one pose per joint."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        name: str,
+        motion: Motion,
+        body: BodyModel,
+        color: tuple[int, int, int],
+    ):
+        self.motion, self.offset = motion, np.zeros(3)
+        joints = len(motion.skeleton)
+        weights = np.zeros((len(body.rest_vertices), joints), dtype=np.float32)
+        rows = np.arange(len(weights))[:, None]
+        np.add.at(weights, (rows, body.skin_joints.numpy()), body.skin_weights.numpy())
+        self.handle = server.scene.add_mesh_skinned(
+            f"/{name}", body.rest_vertices.numpy(), body.faces.numpy().astype(np.uint32),
+            bone_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1)), bone_positions=motion.skeleton.rest_joints.numpy(),
+            skin_weights=weights, color=color,
+        )  # fmt: skip
+
+    def show(self, time: float) -> None:
+        frame = nearest_frame(self.motion.timestamps, time)
+        pose = self.motion.T_world_joint[frame]
+        # Bones hang on the mesh's node at the root, so that the browser's culling looks where the body is.
+        root = pose.t[0]
+        self.handle.position = root.double().numpy() + self.offset
+        quaternions = quat_wxyz_from_matrix(pose.R.double()).numpy()
+        for bone, wxyz, position in zip(self.handle.bones, quaternions, (pose.t - root).double().numpy()):
+            bone.wxyz, bone.position = wxyz, position
+
+
+class FeetLayer:
+    """Balls at heels and toe tips, coloured by contact."""
+
+    def __init__(
+        self, server: viser.ViserServer, name: str, motion: Motion,
+        contact: Bool[Tensor, "frame patch"], clock: Float64[Tensor, "frame"],
+    ):  # fmt: skip
+        self.motion, self.contact, self.clock, self.offset = motion, contact, clock, np.zeros(3)
+        self.balls = [
+            server.scene.add_icosphere(f"/{name}/{patch}", 0.028, AIR_COLOR, subdivisions=2)
+            for patch in FOOT_PATCHES
+        ]
+
+    def show(self, time: float) -> None:
+        frame = nearest_frame(self.motion.timestamps, time)
+        places = site_positions(self.motion.skeleton, self.motion.T_world_joint[frame], FOOT_PATCHES)
+        touching = self.contact[nearest_frame(self.clock, time)]
+        for ball, place, touch in zip(self.balls, places.double().numpy(), touching.tolist()):
+            ball.position = place + self.offset
+            color = CONTACT_COLOR if touch else AIR_COLOR
+            if ball.color != color:
+                ball.color = color
+
+
+class HeadLayer:
+    """The head's path and a frustum that looks where the head looks."""
+
+    def __init__(self, server: viser.ViserServer, head: HeadStream):
+        self.head = head
+        path = head.t_world_device[:: max(1, len(head.timestamps) // 2000)].double().numpy()
+        if len(path) > 1:
+            segments = np.stack([path[:-1], path[1:]], 1)
+            server.scene.add_line_segments("/head/path", segments, (70, 110, 200), thickness=0.006)
+        self.frustum = server.scene.add_camera_frustum(
+            "/head/frustum", 1.2, 1.33, scale=0.15, color=(30, 60, 160)
+        )
+
+    def show(self, time: float) -> None:
+        frame = nearest_frame(self.head.timestamps, time)
+        R = self.head.R_world_device[frame] @ _R_DEVICE_CAM.to(self.head.R_world_device)
+        self.frustum.wxyz = quat_wxyz_from_matrix(R.double()).numpy()
+        self.frustum.position = self.head.t_world_device[frame].double().numpy()
+
+
+def add_points(server: viser.ViserServer, cloud: PointCloud) -> None:
+    """A point cloud coloured by height; a large one is thinned evenly."""
+    points = cloud.points_world[:: max(1, -(-len(cloud.points_world) // MAX_POINTS))].double().numpy()
+    if not len(points):
+        return
+    low, high = np.quantile(points[:, 2], [0.02, 0.98])
+    share = np.clip((points[:, 2:] - low) / max(high - low, 1e-6), 0, 1)
+    colors = (1 - share) * np.array([60, 90, 130]) + share * np.array([220, 170, 90])
+    # Half precision is exact to a millimetre only near the node, so the node stands in their middle.
+    centre = points.mean(0)
+    server.scene.add_point_cloud(
+        "/points", (points - centre).astype(np.float32), colors.astype(np.uint8), point_size=0.012,
+        position=centre, precision="float32",
+    )  # fmt: skip
+
+
+def add_scene_mesh(server: viser.ViserServer, path: Path) -> None:
+    """The recording's surroundings. Raises WearcapError when the file cannot be read."""
+    try:
+        mesh = trimesh.load(path, force="mesh")
+    except Exception as error:  # trimesh's loaders raise whatever their parsers do
+        raise WearcapError(
+            f"not a readable scene ({error})", where=path, expected="a .ply or .glb mesh"
+        ) from error
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise WearcapError("a scene without triangles", where=path, expected="a .ply or .glb mesh")
+    server.scene.add_mesh_trimesh("/scene", mesh)
+
+
+@dataclass
+class Placed:
+    """Layers of one motion, shown or hidden and set aside together."""
+
+    body: BodyLayer
+    feet: FeetLayer | None
+
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
+        self.body.offset = offset
+        self.body.handle.visible = visible
+        if self.feet is not None:
+            self.feet.offset = offset
+            for ball in self.feet.balls:
+                ball.visible = visible
+
+    def show(self, time: float) -> None:
+        self.body.show(time)
+        if self.feet is not None:
+            self.feet.show(time)

@@ -1,0 +1,242 @@
+"""The viewer's page: its clock, what it sends, and what a real browser draws of it."""
+
+import base64
+import io
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from websockets.sync.client import connect
+
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
+from wearcap.cli.view import dataset_folder
+from wearcap.cli.view import main as view
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.recording import ContactTrack, HeadStream, Motion, PointCloud, Recording
+from wearcap.viewer.page import CAPTURE_COLOR, Page
+from wearcap.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
+from wearcap.viewer.page_timeline import Timeline
+
+
+def a_walk(frames: int = 60, sideways: float = 0.0) -> Motion:
+    """Legs and arms that swing while the body moves forward at 1 m/s."""
+    skeleton = xsens23()
+    times = torch.arange(frames, dtype=torch.float64) / 30
+    R = torch.eye(3).repeat(frames, len(skeleton), 1, 1)
+    swing = 0.5 * torch.sin(6 * times).float()
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        R[:, skeleton.index(f"{side}_hip")] = rotation.about_axis("y", sign * swing)
+        down = rotation.about_axis("x", torch.tensor(-1.3 * sign))
+        R[:, skeleton.index(f"{side}_shoulder")] = rotation.about_axis("y", -sign * swing) @ down
+    root = torch.stack([times, sideways + 0 * times, skeleton.root_height + 0 * times], -1).float()
+    return Motion(times, skeleton, R, root)
+
+
+def a_recording(**parts) -> Recording:
+    motion = a_walk()
+    contact = torch.zeros(60, 4, dtype=torch.bool)
+    contact[:30, 0] = True
+    head = motion.joint("head")
+    return Recording(
+        name="walk", motion=motion, activity="walking",
+        head=HeadStream(motion.timestamps, head.R, head.t, torch.eye(3), torch.zeros(3)),
+        contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, contact),
+        points=PointCloud(torch.rand(500, 3) * 4 - 2),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def page():
+    page = Page(a_recording(), a_walk(sideways=0.3), port=18080)
+    yield page
+    page.stop()
+
+
+def test_timeline_plays_loops_and_stays_inside():
+    clock = Timeline(2.0, 5.0, 2.0)
+    assert not clock.advance(1.0)
+    clock.playing, clock.speed = True, 2.0
+    assert clock.advance(1.0)
+    assert clock.time == 4.0
+    clock.advance(1.0)
+    assert clock.time == 2.0
+    clock.step(-9.0)
+    assert clock.time == 2.0
+    clock.seek(99.0)
+    assert clock.time == 5.0
+
+
+def test_nearest_frame():
+    times = torch.tensor([0.0, 1.0, 3.0], dtype=torch.float64)
+    assert [nearest_frame(times, t) for t in (-5.0, 0.4, 0.6, 1.9, 2.1, 9.0)] == [0, 0, 1, 1, 2, 2]
+    assert nearest_frame(times[:1], 7.0) == 0
+
+
+def test_bones_of_the_page_are_the_motions_joints(page):
+    page.timeline.seek(1.0)
+    page.show()
+    layer = page.bodies["capture"].body
+    truth = layer.motion.T_world_joint[30]
+    placed = np.stack([bone.position for bone in layer.handle.bones]) + layer.handle.position
+    np.testing.assert_allclose(placed, truth.t.numpy(), atol=1e-5)
+    turned = torch.tensor(np.stack([bone.wxyz for bone in layer.handle.bones]))
+    torch.testing.assert_close(rotation.matrix_from_quat_wxyz(turned).float(), truth.R, atol=1e-5, rtol=0)
+
+
+def test_feet_are_coloured_by_contact(page):
+    feet = page.bodies["truth"].feet
+    assert page.bodies["capture"].feet is None
+    page.timeline.seek(0.5)
+    page.show()
+    assert tuple(feet.balls[0].color) == CONTACT_COLOR
+    page.timeline.seek(1.5)
+    page.show()
+    assert tuple(feet.balls[0].color) == AIR_COLOR
+
+
+def test_layouts_and_keys(page):
+    page.arrange("beside")
+    truth, capture = (page.bodies[name].body.handle for name in ("truth", "capture"))
+    assert truth.position[1] - capture.position[1] == pytest.approx(1.2 - 0.3, abs=1e-6)
+    page.arrange("capture")
+    assert capture.visible
+    assert not truth.visible
+    with pytest.raises(WearcapError, match="over, beside"):
+        page.arrange("inside")
+    page.jump(1.0)
+    assert page.timeline.time == pytest.approx(1.0)
+    page.toggle()
+    page.run(0.4)
+    assert 1.2 < page.timeline.time < 2.0
+
+
+def test_a_frame_is_cheap_to_send(page):
+    """Poses, not vertices: what the server queues for a frame stays below 100 short messages."""
+    queued = []
+    original = page.server.scene._queue_scene_message
+    page.server.scene._queue_scene_message = lambda message: (queued.append(message), original(message))[1]
+    page.timeline.seek(0.7)
+    page.show()
+    assert 46 < len(queued) < 120
+    assert all(np.size(getattr(message, "vertices", ())) == 0 for message in queued)
+
+
+def test_recordings_without_motion_and_without_anything():
+    full = a_recording()
+    bare = Page(Recording(name="aria", head=full.head, points=full.points), port=18090)
+    assert bare.bodies == {}
+    bare.jump(1.0)
+    np.testing.assert_allclose(bare.layers[0].frustum.position, full.head.t_world_device[30], atol=1e-6)
+    bare.stop()
+    with pytest.raises(WearcapError, match="nothing to show"):
+        Page(Recording(name="empty"), port=18090)
+
+
+def test_any_skeleton_gets_a_body():
+    worm = Skeleton("worm", ("a", "b", "c"), (-1, 0, 1), torch.tensor([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]))
+    body = surface_or_sticks(worm, {})
+    assert set(body.skin_joints[:, 0].tolist()) == {0, 1}
+    sticks = stick_body(xsens23())
+    assert sticks.rest_vertices[:, 2].max() > xsens23().rest_joints[:, 2].max()
+
+
+def test_the_verb_refuses_what_is_not_there(tmp_path):
+    with pytest.raises(WearcapError, match="no recording"):
+        view([str(tmp_path / "missing")])
+    with pytest.raises(WearcapError, match="port"):
+        view([str(tmp_path), "--port", "0"])
+    (tmp_path / "manifest.json").write_text("{}")
+    assert dataset_folder(tmp_path / "recordings" / "a.safetensors") == tmp_path
+    assert dataset_folder(tmp_path / "a") == tmp_path
+
+
+class Chromium:
+    """A headless browser on one page, spoken to over its debugging socket."""
+
+    def __init__(self, binary: str, folder: Path, url: str):
+        command = [
+            binary, "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+            "--hide-scrollbars", "--window-size=1100,700", f"--user-data-dir={folder}",
+            "--remote-debugging-port=0", "--remote-allow-origins=*", url,
+        ]  # fmt: skip
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        port = self.poll(lambda: (folder / "DevToolsActivePort").read_text().split()[0])
+        targets = self.poll(lambda: [t for t in self.targets(port) if t["type"] == "page"])
+        self.socket = connect(targets[0]["webSocketDebuggerUrl"], max_size=2**26)
+        self.count = 0
+
+    @staticmethod
+    def targets(port: str) -> list[dict]:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=10) as reply:
+            return json.load(reply)
+
+    @staticmethod
+    def poll(ask, seconds: float = 60.0):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            try:
+                if answer := ask():
+                    return answer
+            except (OSError, IndexError):
+                pass
+            time.sleep(0.3)
+        pytest.fail("the browser did not get there in time")
+
+    def call(self, method: str, **parameters) -> dict:
+        self.count += 1
+        self.socket.send(json.dumps({"id": self.count, "method": method, "params": parameters}))
+        while (reply := json.loads(self.socket.recv(timeout=60))).get("id") != self.count:
+            pass
+        return reply["result"]
+
+    def evaluate(self, script: str):
+        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+
+    def screenshot(self) -> np.ndarray:
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+    def close(self) -> None:
+        self.process.terminate()
+        self.process.wait(20)
+
+
+def like(picture: np.ndarray, color: tuple[int, int, int]) -> int:
+    """Pixels whose hue is the colour's, in whatever light."""
+    total = picture.astype(float).sum(-1, keepdims=True)
+    share = picture / total.clip(1)
+    return int(((np.abs(share - np.array(color) / sum(color)) < 0.035).all(-1) & (total[..., 0] > 90)).sum())
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_chromium_draws_the_page(page, tmp_path):
+    """Canvas, controls and the body in a real browser; it plays, and hides what is put away."""
+    binary = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if binary is None:
+        pytest.skip("no Chromium found: apt-get install chromium")
+    browser = Chromium(binary, tmp_path / "profile", page.url)
+    try:
+        browser.poll(lambda: "Truth and capture" in (browser.evaluate("document.body.innerText") or ""))
+        text = browser.evaluate("document.body.innerText")
+        for label in ("walk", "Play", "Time (s)", "Speed", "Follow with the camera"):
+            assert label in text, label
+        assert browser.evaluate("document.querySelectorAll('canvas').length") >= 1
+        browser.poll(lambda: like(browser.screenshot(), CAPTURE_COLOR) > 1000)
+        Image.fromarray(browser.screenshot()).save(tmp_path / "page.png")
+        page.jump(1.5)
+        browser.poll(
+            lambda: browser.evaluate("[...document.querySelectorAll('input')].some(i => i.value == '1.5')")
+        )
+        page.arrange("truth")
+        browser.poll(lambda: like(browser.screenshot(), CAPTURE_COLOR) < 100)
+    finally:
+        browser.close()
