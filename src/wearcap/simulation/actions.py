@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wearcap.simulation.gaze import look_about
-from wearcap.simulation.plan import Plan
+from wearcap.simulation.plan import Plan, wrap
 from wearcap.simulation.walking import turn_to, walk_along
 from wearcap.simulation.world import World
 
@@ -94,17 +94,40 @@ def turn(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 @activity("walk", weight=6.0)
 def walk(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Walk to another place, over stairs where the way leads there."""
-    return _go(
-        plan, world, rng, _free_point(world, rng), plan.style.speed * float(np.exp(rng.normal(0.0, 0.13)))
-    )
+    return approach(plan, world, rng, None)
 
 
-def _go(plan: Plan, world: World, rng: np.random.Generator, goal: np.ndarray, speed: float) -> bool:
-    path = world.plan_path(plan.position, goal, rng)
-    if path is None or np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum() < 1.2:
+@activity("run", weight=1.0)
+def run(plan: Plan, world: World, rng: np.random.Generator) -> bool:
+    """Run a way of at least 5 m on one level; False where there is none."""
+    path = world.plan_path(plan.position, _free_point(world, rng), rng)
+    if path is None or _length(path) < 5.0 or np.ptp(path[:, 2]) > 0.02:
         return False
     start = plan.time
-    walk_along(plan, path, rng, speed, world.flights)
-    look_about(plan, start + 1.0, plan.time, rng, spread=0.28, rest=2.2)
+    walk_along(plan, path, rng, float(rng.uniform(2.2, 3.2)), ())
+    look_about(plan, start + 1.0, plan.time, rng, spread=0.12, rest=2.2)
     plan.time += rng.uniform(0.25, 0.6)
     return True
+
+
+def approach(
+    plan: Plan, world: World, rng: np.random.Generator, goal: np.ndarray | None, heading: float | None = None
+) -> bool:
+    """Walk to a floor point (m; a free one when None) and turn to a heading (rad) there; False if no way leads there."""
+    goal = _free_point(world, rng) if goal is None else goal
+    path = world.plan_path(plan.position, goal, rng)
+    if path is None or (heading is None and _length(path) < 1.2):
+        return False
+    start = plan.time
+    if _length(path) > 0.25:
+        speed = plan.style.speed * float(np.exp(rng.normal(0.0, 0.13)))
+        walk_along(plan, path, rng, speed, world.flights)
+        look_about(plan, start + 1.0, plan.time, rng, spread=0.28, rest=2.2)
+    if heading is not None and abs(wrap(heading - plan.heading)) > 0.2:
+        turn_to(plan, heading, rng)
+    plan.time += rng.uniform(0.25, 0.6)
+    return True
+
+
+def _length(path: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())

@@ -109,7 +109,7 @@ def _swing(
     slow = wander(rng, len(times), 4, 4.0, 0.03, fps)
     walk, run = 1.0 - running, running
     swing = gain * ahead * (walk + 0.75 * run) + 0.05 - 0.30 * run + slow[:, 0]
-    swing -= 0.55 * (trunk.chest_angles[:, 1] - style.slouch)
+    swing += 0.9 * (trunk.chest_angles[:, 1] - style.slouch)  # gravity pulls them down when the trunk leans
     spread = style.arm_spread + 0.05 * run + slow[:, 1]
     turn = style.arm_turn + 0.25 * run + slow[:, 2]
     elbow = style.elbow + walk * 0.07 * np.clip(trunk.speed, 0.0, 2.0) + 1.15 * run + slow[:, 3]
@@ -117,7 +117,7 @@ def _swing(
     angles = [torch.from_numpy(np.ascontiguousarray(a)) for a in (swing, spread, turn, elbow)]
     about = rotation.about_axis
     hang = about("x", -sign * (np.pi / 2 - angles[1]))
-    R = about("y", -angles[0]) @ hang @ about("y", sign * angles[2])
+    R = about("y", -angles[0]) @ hang @ about("y", angles[2])
     return R, angles[3].clamp(min=0.06)
 
 

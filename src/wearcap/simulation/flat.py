@@ -95,10 +95,10 @@ def _walls(layout: Layout, z: float, rng: np.random.Generator) -> list[Wall]:
     """Outer walls with windows, walls between rooms, and the hallway's walls with a door to every room."""
     width, depth = layout.width, layout.depth
     window = lambda box: ((box[0] + box[2]) / 2, float(rng.uniform(0.9, 1.5)))  # noqa: E731
-    south = Wall((0, 0), (width, 0), z, windows=[window(box) for box in layout.side_a])
-    north = Wall((0, depth), (width, depth), z, windows=[window(box) for box in layout.side_b])
-    west = Wall((0, 0), (0, depth), z)
-    east = Wall((width, 0), (width, depth), z, windows=[(sum(layout.hall) / 2, 0.7)])
+    south = Wall((0.0, 0.0), (width, 0.0), z, windows=[window(box) for box in layout.side_a])
+    north = Wall((0.0, depth), (width, depth), z, windows=[window(box) for box in layout.side_b])
+    west = Wall((0.0, 0.0), (0.0, depth), z)
+    east = Wall((width, 0.0), (width, depth), z, windows=[(sum(layout.hall) / 2, 0.7)])
     walls = [south, north, west, east]
     for side, y in ((layout.side_a, layout.hall[0]), (layout.side_b, layout.hall[1])):
         if not side:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
 from wearcap.recording.motion import Motion
+from wearcap.simulation import hands, settle
 from wearcap.simulation.actions import ACTIVITIES, start_place
 from wearcap.simulation.arms import ArmMotion, arm_motion
 from wearcap.simulation.gait import FootMotion, FootShape, foot_motion
@@ -24,10 +25,14 @@ from wearcap.simulation.style import Style
 from wearcap.simulation.track import blur
 from wearcap.simulation.world import World
 
+__all__ = ["SimulatedMotion", "hands", "settle", "simulate_motion"]
+"""`hands` and `settle` are imported because that enters their activities."""
+
 SPINE = ("l5", "l3", "t12", "t8")
 NECK_SHARE = 0.45
 
 
+@runtime_checkable
 class Wearer(Protocol):
     """Who is simulated: a skeleton with the person's own bones (xsens23's joints), and habits of moving."""
 
