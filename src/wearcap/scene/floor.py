@@ -14,15 +14,28 @@ from wearcap.errors import WearcapError
 EYE_HEIGHT_OF_STATURE = 0.936
 """Eyes above the floor as a share of stature, standing (Drillis and Contini 1966)."""
 
-_CELL_M, _BIN_M = 0.2, 0.02
-_RADIUS_M = 0.8
-"""Points no further than this from the head, seen from above, speak about the floor beneath it."""
-_NEAR_M = 0.25
-"""Standard deviation of their weight over that distance: on stairs the nearest step counts."""
+_BIN_M = 0.02
+
+
+@dataclass(frozen=True)
+class _Reach:
+    """Points within `radius_m` of the head, seen from above, speak about the floor beneath it, near ones most."""
+
+    cell_m: float
+    radius_m: float
+    sigma_m: float
+
+
+_NEAR = _Reach(0.2, 0.8, 0.25)
+"""On stairs the nearest step counts …"""
+_WIDE = _Reach(0.4, 2.4, 1.0)
+"""… where hardly any points are near, those further off."""
+_ENOUGH = 30.0
+"""Weighted number of near points that makes those further off unnecessary."""
 _KEY_STEP_M = 0.15
 """The head's path is examined once in so many metres."""
-_FAINT = 0.3
-"""Layers of fewer points per bin than this say little."""
+_FAINT = 0.1
+"""Layers of fewer (weighted) points per bin than this say little."""
 _CLEARANCE_M = (0.3, 2.3)
 """The head is never nearer to the floor, nor further from it."""
 _CHANGE_COST = 20.0
@@ -46,10 +59,10 @@ def estimate_floor(
 ) -> FloorEstimate:
     """Floor beneath a moving head: at each place the lowest strong horizontal layer, changing no more than it must.
 
-    The path is cut into steps of 0.15 m; each step votes for heights with the points within 0.8 m, and dynamic
-    programming picks the sequence of heights with the best votes and the least change, so stairs are followed
-    (within two steps, a step low on average) and tables are not. `standing_m` is the head's height above the floor
-    when standing, where it is known.
+    The path is cut into steps of 0.15 m; each step votes for heights with the points within 0.8 m (2.4 m
+    where they are few), and dynamic programming picks the sequence of heights with the best votes and the least
+    change, so stairs are followed (within a step) and tables are not. `standing_m` is the
+    head's height above the floor when upright; by default it is read off a first pass.
     Raises WearcapError without a head path or when no point lies below it.
     """
     head = t_world_head.detach().cpu().double().numpy()
@@ -59,13 +72,20 @@ def estimate_floor(
     keys, key_of_frame = _key_positions(head)
     bottom = keys[:, 2].min() - _CLEARANCE_M[1]
     bins = int(np.ceil((keys[:, 2].max() - _CLEARANCE_M[0] - bottom) / _BIN_M)) + 1
-    votes = _votes(points, keys, bottom, bins)
+    near, wide = (_votes(points, keys, bottom, bins, reach) for reach in (_NEAR, _WIDE))
+    votes = near + wide * (1 - near.sum(1, keepdims=True) / _ENOUGH).clip(0.02, 1)
     if not votes.any():
         raise WearcapError("no points beneath the head's path", expected="a cloud in the head's world, z up",
                            fix="Give the wearer's stature instead: floor_from_head.")  # fmt: skip
     heights = bottom + (np.arange(bins) + 0.5) * _BIN_M
-    cost = _evidence(votes) + _posture_cost(keys[:, 2:] - heights, standing_m)
-    chosen = _cheapest_path(cost, _CHANGE_COST * _BIN_M)
+    clearance, evidence = keys[:, 2:] - heights, _evidence(votes)
+    if standing_m is None:
+        first = _cheapest_path(evidence + _posture_cost(clearance, 1.9, 20.0), _CHANGE_COST * _BIN_M)
+        standing_m = _usual_clearance(np.take_along_axis(clearance, first[:, None], 1)[:, 0])
+    # Once the wearer's height is known, a ceiling below an upper floor is no longer taken for that floor.
+    chosen = _cheapest_path(
+        evidence + _posture_cost(clearance, standing_m + 0.03, 40.0), _CHANGE_COST * _BIN_M
+    )
     support = gaussian_filter1d(votes, 1.5, axis=1)[np.arange(len(keys)), chosen] * (1.5 * np.sqrt(2 * np.pi))
     refined = _centre_of_layer(votes, chosen, heights)
     return FloorEstimate(
@@ -94,22 +114,23 @@ def _key_positions(head: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return head[first], key_of_frame
 
 
-def _votes(points: np.ndarray, keys: np.ndarray, bottom: float, bins: int) -> np.ndarray:
-    """Points near each key by height: (key, bin) weighted counts. Points are put into columns of 0.2 m once."""
-    reach = int(np.ceil(_RADIUS_M / _CELL_M))
-    grid = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij"), -1).reshape(-1, 2)
-    disc = grid[np.linalg.norm(grid * _CELL_M, axis=1) <= _RADIUS_M]
-    near = np.floor(keys[:, None, :2] / _CELL_M).astype(np.int64) + disc
+def _votes(points: np.ndarray, keys: np.ndarray, bottom: float, bins: int, reach: _Reach) -> np.ndarray:
+    """Points near each key by height: (key, bin) weighted counts. Points are put into columns of the floor once."""
+    cells = int(np.ceil(reach.radius_m / reach.cell_m))
+    grid = np.stack(np.meshgrid(*[np.arange(-cells, cells + 1)] * 2, indexing="ij"), -1).reshape(-1, 2)
+    distance = np.linalg.norm(grid * reach.cell_m, axis=1)
+    disc, distance = grid[distance <= reach.radius_m], distance[distance <= reach.radius_m]
+    near = np.floor(keys[:, None, :2] / reach.cell_m).astype(np.int64) + disc
     columns, column_of = np.unique(_cell_key(near).reshape(-1), return_inverse=True)
     level = np.floor((points[:, 2] - bottom) / _BIN_M)
     usable = np.isfinite(points).all(1) & (level >= 0) & (level < bins)
-    key = _cell_key(np.floor(points[usable, :2] / _CELL_M).astype(np.int64))
+    key = _cell_key(np.floor(points[usable, :2] / reach.cell_m).astype(np.int64))
     place = np.searchsorted(columns, key).clip(max=len(columns) - 1)
     inside = columns[place] == key
     flat = place[inside] * bins + level[usable][inside].astype(np.int64)
     counts = np.bincount(flat, minlength=len(columns) * bins).reshape(len(columns), bins)
     rows = np.repeat(np.arange(len(keys)), len(disc))
-    weight = np.tile(np.exp(-0.5 * (np.linalg.norm(disc * _CELL_M, axis=1) / _NEAR_M) ** 2), len(keys))
+    weight = np.tile(np.exp(-0.5 * (distance / reach.sigma_m) ** 2), len(keys))
     gather = csr_matrix((weight, (rows, column_of.reshape(-1))), shape=(len(keys), len(columns)))
     return gather @ counts
 
@@ -125,14 +146,25 @@ def _evidence(votes: np.ndarray) -> np.ndarray:
     margin = int(0.08 / _BIN_M)
     beneath = np.pad(votes.cumsum(1), ((0, 0), (margin, 0)))[:, : votes.shape[1]]
     share = beneath / np.maximum(votes.sum(1, keepdims=True), 1)  # a lone point beneath is no evidence
-    return -np.log(strength) + 6.0 * share
+    return -np.log(strength) + 6.0 * share.clip(max=0.4)
 
 
-def _posture_cost(clearance: np.ndarray, standing_m: float | None) -> np.ndarray:
-    """Cost of the head's height above a floor: free from sitting to standing, dear above, impossible far off."""
-    tallest = 1.9 if standing_m is None else standing_m + 0.08
-    cost = 3.0 * np.maximum(1.1 - clearance, 0) + 20.0 * np.maximum(clearance - tallest, 0)
+def _posture_cost(clearance: np.ndarray, tallest: float, slope: float) -> np.ndarray:
+    """Cost of the head's height above a floor: free from sitting to `tallest`, rising by `slope` per metre above."""
+    cost = 3.0 * np.maximum(1.1 - clearance, 0) + slope * np.maximum(clearance - tallest, 0)
     return np.where((clearance < _CLEARANCE_M[0]) | (clearance > _CLEARANCE_M[1]), 1e3, cost)
+
+
+def _usual_clearance(clearance: np.ndarray) -> float:
+    """Height of the head above the floor while walking: the lowest of its common values near the commonest."""
+    counts = gaussian_filter1d(np.histogram(clearance, np.arange(0.0, 2.6, 0.01))[0].astype(float), 2.0)
+    peak = int(counts.argmax())
+    near = np.arange(max(peak - 25, 0), peak + 1)
+    inner = counts[near]
+    summit = (
+        (inner >= np.r_[0.0, inner[:-1]]) & (inner >= np.r_[inner[1:], 0.0]) & (inner > 0.3 * counts[peak])
+    )
+    return float(0.01 * (near[summit][0] + 0.5))
 
 
 def _cheapest_path(cost: np.ndarray, change_cost: float) -> np.ndarray:

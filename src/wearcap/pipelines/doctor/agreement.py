@@ -9,7 +9,7 @@ from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.pipelines.doctor.inertial import offset_finding
 from wearcap.pipelines.doctor.report import Finding
 from wearcap.pipelines.doctor.signals import lag_between, quantile, spin_of
-from wearcap.recording import CameraStream, HeadStream, Motion, PointCloud
+from wearcap.recording import CameraStream, FloorTrack, HeadStream, Motion, PointCloud
 from wearcap.scene.floor import estimate_floor
 
 
@@ -84,14 +84,14 @@ def check_points(points: PointCloud, head: HeadStream | None) -> list[Finding]:
                 "Drop them.",
             )
         ]
-    if not len(cloud):
+    if len(cloud) < 50:
         return [
             Finding(
                 "warning",
                 "points",
-                "no points",
-                "",
-                "Nothing was sure enough to keep: loosen the thresholds.",
+                "hardly any points",
+                f"{len(cloud)} points",
+                "If few were sure enough to keep, loosen the thresholds.",
             )
         ]
     spread = quantile((cloud - cloud.median(0).values).norm(dim=-1), 0.5)
@@ -136,6 +136,15 @@ def _floor_beneath(points: PointCloud, head: HeadStream) -> Finding:
             "Check unit and up axis of both.",
         )
     return Finding("ok", check, "a floor beneath the head", evidence)
+
+
+def floor_beneath(points: PointCloud, head: HeadStream) -> FloorTrack | None:
+    """The floor that the points show along the head's path; None where they show none."""
+    try:
+        floor = estimate_floor(points.points_world, head.t_world_device)
+    except WearcapError:
+        return None
+    return FloorTrack(head.timestamps, floor.height) if floor.confidence.median() > 0.3 else None
 
 
 def check_camera(stream: CameraStream) -> list[Finding]:

@@ -181,12 +181,10 @@ def check_feet(stream: str, motion: Motion, parts: Landmarks, floor: FloorTrack 
     feet = _foot_points(motion, parts)
     height = feet[..., 2] - _floor_at(floor, motion)[:, None]
     check, lowest = f"{stream}: feet on the floor", height.amin(1)
-    low, usual = quantile(lowest, 0.02), quantile(lowest, 0.5)
-    evidence = (
-        f"the lowest foot point is at {100 * low:+.1f} cm at its lowest, {100 * usual:+.1f} cm in the median"
-    )
+    low, usual = quantile(lowest, 0.1), quantile(lowest, 0.5)
+    evidence = f"the lowest foot point is at {100 * low:+.1f} cm in its lowest tenth, {100 * usual:+.1f} cm in the median"
     findings = []
-    if floor is None and abs(usual) > 0.3:
+    if floor is None and (abs(usual) > 0.1 or low < -0.1):
         findings.append(
             Finding(
                 "note",

@@ -8,7 +8,12 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.pipelines.doctor.agreement import check_camera, check_head_against_body, check_points
+from wearcap.pipelines.doctor.agreement import (
+    check_camera,
+    check_head_against_body,
+    check_points,
+    floor_beneath,
+)
 from wearcap.pipelines.doctor.body import check_motion
 from wearcap.pipelines.doctor.inertial import check_imu
 from wearcap.pipelines.doctor.load import Patient, patients
@@ -87,10 +92,13 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
         found = _track("head", track)
         findings += found
         head = head if _sound(found) else None
+    floor = recording.floor
+    if floor is None and recording.points is not None and head is not None:
+        floor = floor_beneath(recording.points, head)
     bodies = {}
     for name, motion in (("motion", recording.motion), ("suit", recording.suit)):
         if motion is not None and name in usable:
-            found = check_motion(name, motion, recording.floor)
+            found = check_motion(name, motion, floor)
             findings += found
             if _sound(found):
                 bodies[name] = motion
