@@ -1,10 +1,11 @@
 """`wearcap prepare simulated`: splits that never meet, the same bytes for the same seed."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from wearcap.cli import prepare as verb
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.data.prepare import read_splits
 from wearcap.data.prepare.simulated import simulated_tasks
@@ -14,19 +15,23 @@ from wearcap.recording import RecordingStore
 
 
 def prepare(output: Path, *more: str) -> RecordingStore:
-    verb.main(
-        [
-            "simulated",
-            f"output={output}",
-            "recordings={train:2,val:1,test:1}",
-            "duration_s=3",
-            "points=false",
-            *more,
-        ]
-    )
+    """As a user would, in a process of its own."""
+    settings = ["recordings={train:2,val:1,test:1}", "duration_s=3", "points=false", *more]
+    command = [
+        sys.executable,
+        "-m",
+        "wearcap.cli.main",
+        "prepare",
+        "simulated",
+        f"output={output}",
+        *settings,
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
     return RecordingStore.open(output)
 
 
+@pytest.mark.slow
 def test_a_small_set(tmp_path):
     store = prepare(tmp_path / "a", "jobs=1")
     assert [len(store.names(split)) for split in ("train", "val", "test")] == [2, 1, 1]

@@ -25,7 +25,8 @@ HAS_TABLE = ("living room", "kitchen")
 
 
 def overlaps(a: Box, b: Box, margin: float = 0.0) -> bool:
-    return a[0] < b[2] + margin and b[0] < a[2] + margin and a[1] < b[3] + margin and b[1] < a[3] + margin
+    apart = a[0] >= b[2] + margin or b[0] >= a[2] + margin or a[1] >= b[3] + margin or b[1] >= a[3] + margin
+    return not apart
 
 
 @dataclass
@@ -136,4 +137,4 @@ def _outline(size: tuple[float, float], x: float, y: float, heading: float) -> B
 
 
 def _inside(inner: Box, outer: Box) -> bool:
-    return inner[0] >= outer[0] and inner[1] >= outer[1] and inner[2] <= outer[2] and inner[3] <= outer[3]
+    return bool(inner[0] >= outer[0] and inner[1] >= outer[1] and inner[2] <= outer[2] and inner[3] <= outer[3])

@@ -35,6 +35,9 @@ REGISTER_EVERY_S = 1.0
 NOTE = "note"
 """Key of a motion's provenance that the report repeats: what was cut, dropped or guessed."""
 
+MAX_REASON = 500
+"""Longest reason (characters) that is told of a recording that failed."""
+
 _LEFTOVER = re.compile(r"\..+\.tmp-[0-9a-f]{8}(\..+)?")
 
 
@@ -141,8 +144,8 @@ def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
                 raise WearcapError(f"the source made a recording {recording.name!r}", expected=task.name)
             check_recording(recording)
         except Exception as error:
-            known = isinstance(error, WearcapError)
-            return task.name, str(error) if known else f"{type(error).__name__}: {error}", ""
+            reason = str(error) if isinstance(error, WearcapError) else f"{type(error).__name__}: {error}"
+            return task.name, " ".join(reason.split())[:MAX_REASON], ""
         save_recording(recording, recording_path(root, task.name))
         note = recording.motion.provenance.get(NOTE, "") if recording.motion else ""
         return task.name, entry_for(recording, root, task.split, task.hash), note
