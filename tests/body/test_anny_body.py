@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from wearcap.body.anny_assets import coefficients, joint_positions, load_assets, shaped
+from wearcap.body import anny_cache
+from wearcap.body.anny_assets import coefficients, joint_positions, shaped
 from wearcap.body.anny_body import anny_body
+from wearcap.body.anny_cache import load_assets
 from wearcap.body.decimate import decimate
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.retarget import fit_offsets
@@ -152,3 +154,24 @@ def test_joints_are_means_of_their_corners():
     positions = joint_positions(assets, assets.template)
     assert positions["l-knee"][1] > 0 > positions["r-knee"][1]
     assert positions["l-toe-3-1"][0] > positions["l-ankle"][0]
+
+
+def test_cache_gives_the_same_and_survives_damage(tmp_path, monkeypatch):
+    reads = []
+    kept = load_assets(4000)
+    monkeypatch.setattr(anny_cache, "read_assets", lambda keep: reads.append(keep) or kept)
+    monkeypatch.setenv("WEARCAP_CACHE", str(tmp_path))
+    load = load_assets.__wrapped__
+    first, second = load(4000), load(4000)
+    assert reads == [4000]
+    assert (second.components, second.bones, set(second.joints)) == (
+        first.components,
+        first.bones,
+        set(first.joints),
+    )
+    for name in ("template", "targets", "faces", "surface", "weights"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    file = next(tmp_path.iterdir())
+    file.write_bytes(file.read_bytes()[:-100])
+    load(4000)
+    assert reads == [4000, 4000]

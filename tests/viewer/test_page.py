@@ -140,6 +140,18 @@ def test_recordings_without_motion_and_without_anything():
         Page(Recording(name="empty"), port=18090)
 
 
+@pytest.mark.real
+def test_aria_recording_is_shown(real_data):
+    from wearcap.io.aria_mps import read_mps
+
+    recording = read_mps(real_data / "aria_mps")
+    page = Page(recording, port=18095)
+    page.jump(5.0)
+    place = recording.head.t_world_device[nearest_frame(recording.head.timestamps, page.timeline.time)]
+    np.testing.assert_allclose(page.layers[0].frustum.position, place, atol=1e-6)
+    page.stop()
+
+
 def test_any_skeleton_gets_a_body():
     worm = Skeleton("worm", ("a", "b", "c"), (-1, 0, 1), torch.tensor([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]))
     body = surface_or_sticks(worm, {})

@@ -9,7 +9,6 @@ import importlib.util
 import itertools
 import json
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -76,8 +75,7 @@ def joint_positions(
     return {name: vertices[corners].mean(0) for name, corners in assets.joints.items()}
 
 
-@lru_cache(maxsize=2)
-def load_assets(keep: int | None) -> AnnyAssets:
+def read_assets(keep: int | None) -> AnnyAssets:
     """Read the files (a few seconds). `keep`: vertices of the cut-down surface, None for all 14,000."""
     root = _data_root()
     template, groups = _read_obj(root / "3dobjs" / "base.obj")

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from wearcap.body.anny_assets import AnnyAssets, joint_positions, load_assets, shaped
+from wearcap.body.anny_assets import AnnyAssets, joint_positions, shaped
+from wearcap.body.anny_cache import load_assets
 from wearcap.body.anny_rig import skin_weights
 from wearcap.body.anny_warp import Fit, fit_to
 from wearcap.body.model import BodyModel, four_weights

@@ -1,6 +1,7 @@
 """`wearcap view`: a recording, and what was captured from it, in the browser."""
 
 import argparse
+import logging
 from pathlib import Path
 
 from wearcap.errors import WearcapError
@@ -28,6 +29,8 @@ def main(arguments: list[str]) -> None:
     from wearcap.recording.locate import load_recording
     from wearcap.viewer.page import Page
 
+    # Browsers open connections in advance and drop them; the server's log of that is no news to a user.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     recording = load_recording(options.recording)
     motion = read_motion(options.motion) if options.motion else None
     page = Page(
