@@ -7,11 +7,13 @@ import shutil
 import subprocess
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 from websockets.sync.client import connect
 
@@ -20,7 +22,8 @@ from wearcap.cli.view import dataset_folder
 from wearcap.cli.view import main as view
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.recording import ContactTrack, HeadStream, Motion, PointCloud, Recording
+from wearcap.io.motion_npz import write_motion
+from wearcap.recording import ContactTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.viewer.page import CAPTURE_COLOR, Page
 from wearcap.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
 from wearcap.viewer.page_timeline import Timeline
@@ -138,6 +141,21 @@ def test_recordings_without_motion_and_without_anything():
     bare.stop()
     with pytest.raises(WearcapError, match="nothing to show"):
         Page(Recording(name="empty"), port=18090)
+
+
+def test_the_verb_shows_a_stored_recording_with_its_scene(tmp_path, monkeypatch, capsys):
+    store = RecordingStore(tmp_path)
+    trimesh.creation.box((4, 4, 0.1)).export(tmp_path / "room.ply")
+    store.add(replace(a_recording(), scene="room.ply"), split="test", config_hash="x")
+    write_motion(a_walk(sideways=0.2), tmp_path / "motion.npz")
+    pages = []
+    monkeypatch.setattr(Page, "run", lambda self: pages.append(self))
+    view([str(tmp_path / "walk"), "--motion", str(tmp_path / "motion.npz"), "--port", "18099"])
+    assert set(pages[0].bodies) == {"truth", "capture"}
+    assert "walk: open http://127.0.0.1:" in capsys.readouterr().out
+    (tmp_path / "room.ply").write_text("ply")
+    with pytest.raises(WearcapError, match=r"room.ply"):
+        view([str(tmp_path / "walk"), "--port", "18099"])
 
 
 @pytest.mark.real

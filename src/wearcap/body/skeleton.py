@@ -1,8 +1,8 @@
-"""Skeletons by joint name, one rest convention for all.
+"""Skeletons by joint name.
 
-In every skeleton the rest pose (all `R_parent_joint` identity) is a T-pose that faces +x, with +y to its left
-and +z up, and all joint frames are parallel to the world. Readers bring foreign rest poses to this one, so a
-joint's rotation means the same thing in every skeleton. Offsets are in metres.
+In the named skeletons (xsens23 and SMPL's) the rest pose (all `R_parent_joint` identity) is a T-pose that faces
++x, with +y to its left and +z up, and all joint frames are parallel to the world. Skeletons read from files keep
+their bind pose as rest, in the same axes; `retarget` reconciles the two. Offsets are in metres.
 """
 
 import difflib

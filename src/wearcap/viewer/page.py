@@ -19,7 +19,7 @@ from wearcap.viewer.page_layers import (
     Layer,
     Placed,
     add_points,
-    add_scene_mesh,
+    read_scene,
     surface_or_sticks,
 )
 from wearcap.viewer.page_timeline import SPEEDS, Timeline
@@ -40,6 +40,7 @@ class Page:
         """`motion`: what was captured; `folder`: the data set's, where `recording.scene` lies."""
         self.timeline = _timeline(recording, motion)
         self._stopped = False
+        scene = read_scene(folder / recording.scene) if recording.scene and folder is not None else None
         self.server = viser.ViserServer(host=host, port=port, label="wearcap", verbose=False)
         self.server.scene.set_up_direction("+z")
         self.server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
@@ -50,8 +51,8 @@ class Page:
             self.layers.append(HeadLayer(self.server, recording.head))
         if recording.points is not None:
             add_points(self.server, recording.points)
-        if recording.scene and folder is not None:
-            add_scene_mesh(self.server, folder / recording.scene)
+        if scene is not None:
+            self.server.scene.add_mesh_trimesh("/scene", scene)
         self._add_floor(recording)
         self._add_controls(recording)
         self._followed = self._focus()

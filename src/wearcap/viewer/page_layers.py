@@ -162,7 +162,7 @@ def add_points(server: viser.ViserServer, cloud: PointCloud) -> None:
     )  # fmt: skip
 
 
-def add_scene_mesh(server: viser.ViserServer, path: Path) -> None:
+def read_scene(path: Path) -> trimesh.Trimesh:
     """The recording's surroundings. Raises WearcapError when the file cannot be read."""
     try:
         mesh = trimesh.load(path, force="mesh")
@@ -172,7 +172,7 @@ def add_scene_mesh(server: viser.ViserServer, path: Path) -> None:
         ) from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise WearcapError("a scene without triangles", where=path, expected="a .ply or .glb mesh")
-    server.scene.add_mesh_trimesh("/scene", mesh)
+    return mesh
 
 
 @dataclass
