@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
 from wearcap.body.skeleton import Skeleton
+from wearcap.data.floor import floor_beneath
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.store import RecordingFile, RecordingStore
@@ -123,6 +124,16 @@ def _constants(path: Path) -> tuple[Tensor, Tensor, Rigid]:
     return skeleton.t_parent_joint, stature, mount.inverse()
 
 
+@cache
+def _floor(path: Path) -> Tensor:
+    """Floor height beneath every frame, as the pipelines find it."""
+    recording = _open(path).load()
+    assert recording.head is not None
+    return floor_beneath(
+        recording, recording.head.timestamps, recording.head.T_world_head.t, _part(path).height_of("head")
+    )
+
+
 def read_window(file: RecordingFile, start: int, length: int, random: torch.Generator) -> Window:
     """Frames start…start+length-1 of a recording, the last frame repeated as padding behind its end."""
     offsets, stature, T_device_head = _constants(file.path)
@@ -132,10 +143,7 @@ def read_window(file: RecordingFile, start: int, length: int, random: torch.Gene
         file.window("head.R_world_device", start, stop), file.window("head.t_world_device", start, stop)
     )
     T_world_head = (T_world_device @ T_device_head)[take]
-    if "floor.height" in file.keys:
-        floor = file.window("floor.height", start, stop)[take]
-    else:
-        floor = torch.zeros(length)
+    floor = _floor(file.path)[start:stop][take]
     R_parent_joint = file.window("motion.R_parent_joint", start, stop)[take]
     return Window(
         R_parent_joint=R_parent_joint,

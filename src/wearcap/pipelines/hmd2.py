@@ -13,13 +13,13 @@ from torch import Tensor
 from wearcap.body.hang import hang
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import HeadFeatures
+from wearcap.data.floor import floor_beneath
 from wearcap.diffusion.sampler import sample
 from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.models.denoiser import MotionDenoiser
-from wearcap.pipelines.floor import floor_beneath
 from wearcap.recording import Motion, Recording
 
 
