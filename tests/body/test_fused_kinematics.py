@@ -51,6 +51,23 @@ def test_gradient_equals_the_level_versions_for_strided_inputs():
         torch.testing.assert_close(fused, level)
 
 
+@pytest.mark.parametrize("per_sample", [False, True])
+def test_threads_share_the_work_exactly(per_sample):
+    skeleton = skeleton_by_name("xsens23")
+    inputs = sample(skeleton, (1501,), torch.float32, per_sample)
+    threads, results = torch.get_num_threads(), []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            leaves = [x.clone().requires_grad_() for x in inputs]
+            R, t = fused_forward_kinematics(skeleton, *leaves)
+            results.append((R, t, *torch.autograd.grad((R.square().sum() + t.square().sum()), leaves)))
+    finally:
+        torch.set_num_threads(threads)
+    for one, three in zip(*results):
+        torch.testing.assert_close(one, three, atol=0, rtol=1e-5)
+
+
 def test_unused_outputs_and_repeated_backward():
     """Only positions are used, the expanded gradient of a sum comes in, and a second backward gives the same."""
     skeleton = skeleton_by_name("xsens23")
