@@ -1,0 +1,92 @@
+"""`wearcap render`: a recording as a contact sheet or a video, on a machine without a screen."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from rich import print as show
+
+from wearcap.body.anny_body import anny_body
+from wearcap.errors import WearcapError
+from wearcap.io.motion_npz import read_motion
+from wearcap.recording.locate import load_recording
+from wearcap.recording.motion import Motion
+from wearcap.recording.recording import Recording
+from wearcap.viewer.head_path import draw_head_path
+from wearcap.viewer.picture import contact_sheet, save_png
+from wearcap.viewer.video import write_video
+
+HELP = "pictures without a screen: wearcap render DATASET/NAME --out sheet.png|motion.mp4"
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(
+        prog="wearcap render", description="Draw a recording to a PNG or an MP4."
+    )
+    parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
+    parser.add_argument(
+        "--motion", help="captured motion (.npz that `wearcap capture` wrote) to draw with it"
+    )
+    parser.add_argument(
+        "--out", type=Path, help=".png for a contact sheet, .mp4 for a video (default: NAME.png)"
+    )
+    parser.add_argument("--start", type=float, default=0.0, help="from this second of the recording on")
+    parser.add_argument("--stop", type=float, help="up to this second")
+    parser.add_argument("--frames", type=int, default=12, help="pictures in a contact sheet (default 12)")
+    parser.add_argument("--fps", type=float, default=30.0, help="frame rate of a video (default 30)")
+    parser.add_argument("--size", default="", help="WIDTHxHEIGHT of a panel in pixels, such as 480x400")
+    parser.add_argument("--sticks", action="store_true", help="bones instead of a body surface")
+    options = parser.parse_args(arguments)
+    recording = load_recording(options.recording)
+    out = options.out or Path(f"{recording.name}.png")
+    if out.suffix not in (".png", ".mp4"):
+        raise WearcapError(
+            f"cannot draw a {out.suffix or 'file without an ending'}", where=out, expected=".png or .mp4"
+        )
+    motions = _motions(recording, options.motion, options.start, options.stop)
+    size = {"size": _size(options.size)} if options.size else {}
+    if not motions:
+        if out.suffix == ".mp4":
+            raise WearcapError("no motion to film", where=recording.name, expected="a .png of its head path")
+        save_png(out, draw_head_path(recording, **size))
+    else:
+        skeleton = next(iter(motions.values())).skeleton
+        body = None if options.sticks else anny_body(skeleton, recording.shape or None)
+        if out.suffix == ".mp4":
+            write_video(out, motions, fps=options.fps, body=body, **size)
+        else:
+            last = min(map(len, motions.values())) - 1
+            frames = np.linspace(0, last, min(options.frames, last + 1)).round().astype(int).tolist()
+            save_png(out, contact_sheet(motions, frames, body=body, **size))
+    show(f"wrote {out}")
+
+
+def _motions(
+    recording: Recording, captured: str | None, start_s: float, stop_s: float | None
+) -> dict[str, Motion]:
+    motions = {"truth": recording.motion} if recording.motion is not None else {}
+    if captured:
+        motions["capture"] = read_motion(captured)
+    return {label: _between(motion, start_s, stop_s) for label, motion in motions.items()}
+
+
+def _between(motion: Motion, start_s: float, stop_s: float | None) -> Motion:
+    """The frames from one second to another, counted from the motion's first frame."""
+    since = (motion.timestamps - motion.timestamps[0]).numpy()
+    first = int(np.searchsorted(since, start_s))
+    stop = len(since) if stop_s is None else int(np.searchsorted(since, stop_s, side="right"))
+    if stop <= first:
+        raise WearcapError(
+            f"no frames from {start_s} s to {stop_s} s", expected=f"times from 0 to {since[-1]:.1f} s"
+        )
+    return motion.sliced(first, stop)
+
+
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(part) for part in text.lower().split("x"))
+    except ValueError as error:
+        raise WearcapError(f"size {text!r}", expected="WIDTHxHEIGHT, such as 480x400") from error
+    if not (16 <= width <= 8192 and 16 <= height <= 8192):
+        raise WearcapError(f"size {text!r}", expected="16 to 8192 pixels each way")
+    return width, height

@@ -1,0 +1,162 @@
+"""Pictures of motion without a screen: truth and captures beside each other, shaded, with feet one can judge."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from wearcap.body.kinematics import site_positions
+from wearcap.body.model import BodyModel
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.mesh import Mesh, capsules, checker_floor
+from wearcap.geometry.render import Light, Splats, render
+from wearcap.geometry.rigid import Rigid
+from wearcap.recording.motion import Motion
+from wearcap.viewer.page_layers import stick_body
+
+PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], [0.62, 0.45, 0.62]])
+"""Colours of the motions, in order."""
+
+CONTACT_COLOR = np.array([0.80, 0.18, 0.12])
+TILES = np.array([[0.90, 0.90, 0.89], [0.80, 0.81, 0.82]])
+SKY = (0.965, 0.97, 0.975)
+VIEW = (-0.62, 0.78)
+"""Direction in which the camera looks at someone facing +x: from the front left."""
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A motion with the surface that shows it."""
+
+    label: str
+    motion: Motion
+    body: BodyModel
+    color: Float[np.ndarray, "3"]
+    floor_z: float
+
+    def meshes(self, frame: int) -> list[Mesh]:
+        """Body and contact marks of one frame."""
+        T = self.motion.T_world_joint[frame]
+        vertices = self.body.vertices(T).detach().numpy().astype(np.float32)
+        body = Mesh(
+            vertices, self.body.faces.numpy().astype(np.int32), self.color.astype(np.float32), smooth=True
+        )
+        prob = self.motion.contact_prob
+        skeleton = self.motion.skeleton
+        if prob is None or not set(FOOT_PATCHES) <= set(skeleton.sites):
+            return [body]
+        feet = site_positions(skeleton, T, FOOT_PATCHES).double().numpy()[(prob[frame] > 0.5).numpy()]
+        if not len(feet):
+            return [body]
+        size = np.full(len(feet), 0.028)
+        return [body, capsules(feet, feet, size, size, np.tile(CONTACT_COLOR, (len(feet), 1)), 8)]
+
+
+def actors(motions: dict[str, Motion], body: BodyModel | None = None) -> list[Actor]:
+    """One actor per motion, in sticks unless a body is given for them all. Raises WearcapError for none."""
+    if not motions:
+        raise WearcapError("no motion to draw", expected="at least one")
+    shown = []
+    for number, (label, motion) in enumerate(motions.items()):
+        lowest = motion.T_world_joint.t[..., 2].amin(1)
+        floor_z = float(torch.quantile(lowest[:: max(1, len(lowest) // 5000)], 0.05)) - 0.02
+        color = PALETTE[number % len(PALETTE)]
+        shown.append(Actor(label, motion, body or stick_body(motion.skeleton), color, floor_z))
+    return shown
+
+
+def follow_camera(
+    target: Float[np.ndarray, "3"], size: tuple[int, int], distance: float = 4.2
+) -> tuple[Camera, Rigid]:
+    """A camera of `size` (width, height) that looks down at a point (m) from the front left of the world."""
+    width, height = size
+    focal = 1.75 * min(height, width * 1.3)
+    camera = Camera("pinhole", width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    forward = np.array([*VIEW, -0.30])
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    R = np.stack([right, np.cross(forward, right), forward], 1)
+    return camera, Rigid(torch.from_numpy(R).float(), torch.from_numpy(target - distance * forward).float())
+
+
+def panel(
+    actor: Actor,
+    frame: int,
+    target: Float[np.ndarray, "3"],
+    size: tuple[int, int],
+    *,
+    world: Mesh | None = None,
+    splats: Sequence[Splats] = (),
+    supersample: int = 2,
+    distance: float = 4.2,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """One actor at one frame, on a chequered floor or in a world."""
+    camera, T_world_cam = follow_camera(target, size, distance)
+    ground = np.array([target[0], target[1], actor.floor_z])
+    stage = world or checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
+    below = (float(target[0]), float(target[1]), float(ground[2]))
+    light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
+    return render(
+        camera, T_world_cam, [*actor.meshes(frame), stage], list(splats), light=light, background=SKY,
+        supersample=supersample,
+    ).color  # fmt: skip
+
+
+def contact_sheet(
+    motions: dict[str, Motion],
+    frames: Sequence[int] | None = None,
+    *,
+    columns: int = 6,
+    size: tuple[int, int] = (200, 240),
+    body: BodyModel | None = None,
+    world: Mesh | None = None,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Frames of motions on a shared clock, one row per motion, the camera following the first motion's root.
+
+    `size` is a panel's (width, height). Without `frames`, `columns` frames spread over the shortest motion are
+    drawn; with more frames than columns, the rows repeat below. Raises WearcapError for frames that are not there.
+    """
+    shown = actors(motions, body)
+    length = min(len(motion) for motion in motions.values())
+    if frames is None:
+        frames = np.linspace(0, length - 1, columns).round().astype(int).tolist()
+    if not len(frames) or max(frames) >= length or min(frames) < 0:
+        raise WearcapError(f"frames {list(frames)}", expected=f"some from 0 to {length - 1}")
+    bands = [frames[start : start + columns] for start in range(0, len(frames), columns)]
+    width, height = size
+    sheet = Image.new("RGB", (width * min(columns, len(frames)), height * len(shown) * len(bands)), "white")
+    for band, chosen in enumerate(bands):
+        for column, frame in enumerate(chosen):
+            target = focus(shown[0].motion, frame)
+            for row, actor in enumerate(shown):
+                image = panel(actor, frame, target, size, world=world)
+                seconds = (actor.motion.timestamps[frame] - actor.motion.timestamps[0]).item()
+                text = f"{actor.label}  {seconds:.2f} s" if column == 0 else f"{seconds:.2f} s"
+                sheet.paste(captioned(image, text), (column * width, (band * len(shown) + row) * height))
+    return np.asarray(sheet)
+
+
+def focus(motion: Motion, frame: int) -> Float[np.ndarray, "3"]:
+    """Where the camera looks: the root, a little below it (m)."""
+    return motion.t_world_root[frame].double().numpy() - np.array([0.0, 0.0, 0.08])
+
+
+def captioned(image: UInt8[np.ndarray, "height width 3"], text: str) -> Image.Image:
+    """The picture with a line of text in its upper left corner."""
+    picture = Image.fromarray(image)
+    ImageDraw.Draw(picture).text((6, 4), text, fill=(50, 50, 55), font=ImageFont.load_default(size=13))
+    return picture
+
+
+def save_png(path: str | Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    """Write a PNG atomically."""
+    with atomic_path(path) as temporary:
+        Image.fromarray(image).save(temporary, format="PNG")

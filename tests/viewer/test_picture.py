@@ -1,0 +1,103 @@
+"""Pictures and videos show what they should, where they should."""
+
+from dataclasses import replace
+
+import av
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from wearcap.cli import render as render_verb
+from wearcap.errors import WearcapError
+from wearcap.recording import PointCloud, Recording
+from wearcap.viewer.head_path import draw_head_path
+from wearcap.viewer.picture import SKY, contact_sheet, save_png
+from wearcap.viewer.video import write_video
+from wearcap_testing import recording_of, small_dataset, swaying_motion
+
+SKY_8BIT = np.round(255 * np.array(SKY))
+
+
+def ink(image: np.ndarray) -> np.ndarray:
+    """Pixels that are much darker than floor and sky."""
+    return image.astype(int).sum(-1) < 330
+
+
+def test_sheet_has_a_row_per_motion_and_a_body_in_every_panel():
+    motion = swaying_motion(60)
+    sheet = contact_sheet({"truth": motion, "capture": motion}, columns=4, size=(80, 100))
+    assert sheet.shape == (200, 320, 3)
+    panels = sheet.reshape(2, 100, 4, 80, 3).transpose(0, 2, 1, 3, 4).reshape(8, 100, 80, 3)
+    for panel in panels:
+        rows, columns = np.nonzero(ink(panel))
+        assert rows.min() < 35
+        assert rows.max() > 75
+        assert abs(columns.mean() - 40) < 12
+    assert not np.array_equal(panels[0], panels[1])
+
+
+def test_frames_beyond_the_columns_continue_below():
+    assert contact_sheet({"a": swaying_motion(30)}, [0, 5, 10, 15, 20], columns=2, size=(40, 50)).shape == (
+        150,
+        80,
+        3,
+    )
+
+
+def test_frames_that_are_not_there_are_named():
+    with pytest.raises(WearcapError, match="expected some from 0 to 29|Expected some from 0 to 29"):
+        contact_sheet({"a": swaying_motion(30)}, [31])
+
+
+def test_contacts_colour_the_feet():
+    motion = swaying_motion(10)
+    touching = torch.ones(10, 4)
+    plain = contact_sheet({"a": motion}, [3], size=(120, 160)).astype(int)
+    marked = contact_sheet({"a": replace(motion, contact_prob=touching)}, [3], size=(120, 160)).astype(int)
+    red = (marked[..., 0] - marked[..., 2] > 70) & (np.abs(marked - plain).sum(-1) > 60)
+    assert red.sum() > 10
+    assert np.nonzero(red)[0].mean() > 110
+
+
+def test_video_has_the_frames_and_both_panels(tmp_path):
+    motion = swaying_motion(60)
+    write_video(tmp_path / "v.mp4", {"a": motion, "b": motion}, fps=10, size=(96, 80), progress=False)
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(frames) == 10
+    assert frames[0].shape == (80, 192, 3)
+    assert ink(frames[5][:, :96]).sum() > 100
+    assert ink(frames[5][:, 96:]).sum() > 100
+
+
+def test_a_video_of_odd_size_is_refused_and_leaves_nothing(tmp_path):
+    with pytest.raises(WearcapError, match="even sizes"):
+        write_video(tmp_path / "v.mp4", {"a": swaying_motion(10)}, size=(97, 80))
+    assert not list(tmp_path.iterdir())
+
+
+def test_head_path_is_drawn_where_there_is_no_motion():
+    recording = recording_of(swaying_motion(60), "a")
+    alone = Recording("a", head=recording.head, points=PointCloud(torch.rand(500, 3) * 3))
+    image = draw_head_path(alone, (160, 120))
+    assert image.shape == (120, 320, 3)
+    assert (np.abs(image.astype(int) - SKY_8BIT).sum(-1) > 120).sum() > 200
+
+
+def test_render_verb(tmp_path):
+    store = small_dataset(tmp_path / "data")
+    render_verb.main(
+        [f"{store.root}/r5", "--out", str(tmp_path / "s.png"), "--frames", "3", "--size", "60x80", "--sticks"]
+    )
+    assert Image.open(tmp_path / "s.png").size == (180, 80)
+    with pytest.raises(WearcapError, match="cannot draw a .gif"):
+        render_verb.main([f"{store.root}/r5", "--out", str(tmp_path / "s.gif")])
+    with pytest.raises(WearcapError, match="no frames from 100"):
+        render_verb.main([f"{store.root}/r5", "--start", "100"])
+
+
+def test_png_is_written_whole(tmp_path):
+    image = np.zeros((4, 5, 3), np.uint8)
+    save_png(tmp_path / "a.png", image)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), image)
