@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.training.checkpoint import load_weights, read_checkpoint
@@ -14,7 +14,7 @@ from wearcap.training.motion_diffusion import MotionDiffusion
 def load_system(checkpoint: str | Path) -> tuple[MotionDiffusion, dict[str, Any]]:
     """The trained system (averaged weights, evaluation mode) and the config it was trained with."""
     config, state = read_checkpoint(checkpoint)
-    system = instantiate(OmegaConf.create(config["model"]))
+    system = instantiate(config["model"], _convert_="all")
     load_weights(system, state, checkpoint)
     return system.eval(), config
 
@@ -22,7 +22,7 @@ def load_system(checkpoint: str | Path) -> tuple[MotionDiffusion, dict[str, Any]
 def load_pipeline(checkpoint: str | Path, pipeline: DictConfig, device: str) -> HMD2:
     """The pipeline of a config group around a checkpoint's network."""
     system, _ = load_system(checkpoint)
-    return instantiate(pipeline)(
+    return instantiate(pipeline, _convert_="all")(
         net=system.net, features=system.features, schedule=system.schedule, skeleton=system.skeleton,
         fps=system.fps, device=device,
     )  # fmt: skip

@@ -21,12 +21,12 @@ def train(config: DictConfig) -> float:
     run = Path(config.paths.run)
     record_run(run, OmegaConf.to_yaml(config, resolve=True))
     resume = resume_path(config.resume, Path(config.paths.outputs) / "train" / config.name)
-    data, system = instantiate(config.data), instantiate(config.model)
-    callbacks = [instantiate(callback) for callback in config.callbacks.values() if callback]
+    data, system = instantiate(config.data, _convert_="all"), instantiate(config.model, _convert_="all")
+    callbacks = [instantiate(callback, _convert_="all") for callback in config.callbacks.values() if callback]
     callbacks.insert(0, ConfigInCheckpoint(OmegaConf.to_container(config, resolve=True)))
     if config.early_stop:
         callbacks.append(EarlyStopping("val/loss", patience=config.early_stop))
-    loggers = [instantiate(logger) for logger in (config.logger or {}).values() if logger]
+    loggers = [instantiate(logger, _convert_="all") for logger in (config.logger or {}).values() if logger]
     trainer: lightning.Trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers or False)
     show(f"[bold]{config.name}[/bold] in {run}" + (f", going on from {resume}" if resume else ""))
     fit(system, data, trainer, resume)

@@ -163,6 +163,25 @@ def _contact_shade(x, y, z, axes, scale, contact, fade):
 
 
 @compiled
+def _seen_normal(face, a, b, c, second, third, rx, ry, rz, vertices, normals, smooth):
+    """Unit normal of a face, or between its corners' normals, on the side that the ray meets: that side is lit."""
+    if smooth[face]:
+        first = 1.0 - second - third
+        nx = first * normals[a, 0] + second * normals[b, 0] + third * normals[c, 0]
+        ny = first * normals[a, 1] + second * normals[b, 1] + third * normals[c, 1]
+        nz = first * normals[a, 2] + second * normals[b, 2] + third * normals[c, 2]
+    else:
+        ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+        ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+        vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-30
+    if nx * rx + ny * ry + nz * rz > 0:
+        length = -length
+    return nx / length, ny / length, nz / length
+
+
+@compiled
 def resolve(nearness, index, rays, samples, pose, vertices, faces, normals, smooth, casts, colors, color_rows,
             point_colors, light, axes, scale, shadow, shadow_high, shadow_low, contact, fade,
             background, color, depth, number):  # fmt: skip
@@ -194,22 +213,7 @@ def resolve(nearness, index, rays, samples, pose, vertices, faces, normals, smoo
                 a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
                 second, third = _hit(rx, ry, rz, vertices, a, b, c)
                 first = 1.0 - second - third
-                if smooth[face]:
-                    nx = first * normals[a, 0] + second * normals[b, 0] + third * normals[c, 0]
-                    ny = first * normals[a, 1] + second * normals[b, 1] + third * normals[c, 1]
-                    nz = first * normals[a, 2] + second * normals[b, 2] + third * normals[c, 2]
-                else:
-                    ux, uy, uz = (vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1],
-                                  vertices[b, 2] - vertices[a, 2])  # fmt: skip
-                    vx, vy, vz = (vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1],
-                                  vertices[c, 2] - vertices[a, 2])  # fmt: skip
-                    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-                length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-30
-                facing = nx * rx + ny * ry + nz * rz
-                if facing > 0:  # two-sided: the side that is seen is the side that is lit
-                    length = -length
-                nx, ny, nz = nx / length, ny / length, nz / length
-                # world's normal and point
+                nx, ny, nz = _seen_normal(face, a, b, c, second, third, rx, ry, rz, vertices, normals, smooth)
                 wx = pose[0, 0] * nx + pose[0, 1] * ny + pose[0, 2] * nz
                 wy = pose[1, 0] * nx + pose[1, 1] * ny + pose[1, 2] * nz
                 wz = pose[2, 0] * nx + pose[2, 1] * ny + pose[2, 2] * nz
