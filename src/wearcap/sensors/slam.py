@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
@@ -41,17 +41,19 @@ def semidense_points(
     rng: np.random.Generator,
     settings: SlamPoints = SlamPoints(),
 ) -> PointCloud:
-    """Points on `mesh` (features per m² by face) that the device saw, each from where it was seen first.
+    """Points on `mesh` (features per m² by face, seen from the side of its normal) that the device saw, each from
+    where it was seen first.
 
     Confidence falls with the deviation of depth: 1 at zero, 0.5 at 2 cm.
     """
-    points = textured_points(mesh, face_texture, rng, settings.max_candidates)
+    points, normals = textured_points(mesh, face_texture, rng, settings.max_candidates)
     first = np.full(len(points), -1)
     frames = keyframes(head, settings)
     for frame in frames:
         T_world_cam = Rigid(head.R_world_device[frame] @ R_DEVICE_CAM, head.t_world_device[frame])
         unseen = np.flatnonzero(first < 0)
-        first[unseen[_visible(points[unseen], mesh, T_world_cam, settings.range_m)]] = frame
+        seen = _visible(points[unseen], normals[unseen], mesh, T_world_cam, settings.range_m)
+        first[unseen[seen]] = frame
     seen = first >= 0
     points, first = points[seen], first[seen]
     eyes = head.t_world_device.numpy()[first]
@@ -72,17 +74,18 @@ def semidense_points(
 
 def textured_points(
     mesh: Mesh, face_texture: Float[np.ndarray, "face"], rng: np.random.Generator, limit: int
-) -> Float[np.ndarray, "point 3"]:
-    """Points on the surface, as dense as its texture, at most about `limit`."""
+) -> tuple[Float[np.ndarray, "point 3"], Float[np.ndarray, "point 3"]]:
+    """Points on the surface, as dense as its texture, at most about `limit`; and the surface's unit normals there."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    normal = np.cross(b - a, c - a)
+    area = 0.5 * np.linalg.norm(normal, axis=1)
     expected = area * face_texture
     expected *= min(1.0, limit / max(expected.sum(), 1e-9))
     face = np.repeat(np.arange(len(area)), rng.poisson(expected))
     u, v = rng.random((2, len(face), 1))
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face]
+    return a[face] + u * (b - a)[face] + v * (c - a)[face], normal[face] / (2 * area[face, None])
 
 
 def keyframes(head: HeadStream, settings: SlamPoints) -> list[int]:
@@ -95,9 +98,13 @@ def keyframes(head: HeadStream, settings: SlamPoints) -> list[int]:
 
 
 def _visible(
-    points: Float[np.ndarray, "point 3"], mesh: Mesh, T_world_cam: Rigid, range_m: float
-) -> np.ndarray:
-    """Which points the camera sees: inside the picture, in range, and not behind what is nearer."""
+    points: Float[np.ndarray, "point 3"],
+    normals: Float[np.ndarray, "point 3"],
+    mesh: Mesh,
+    T_world_cam: Rigid,
+    range_m: float,
+) -> Bool[np.ndarray, "point"]:
+    """Which points the camera sees: inside the picture, in range, from the front, and not behind what is nearer."""
     in_cam = T_world_cam.inverse()[None] @ torch.from_numpy(points).float()
     pixels, valid = CAMERA.project(in_cam)
     depth = render(CAMERA, T_world_cam, [mesh]).depth
@@ -105,6 +112,7 @@ def _visible(
     column, row = pixels.nan_to_num(-1.0).round().long().unbind(-1)
     inside = valid.numpy() & (z > 0.2) & (z < range_m)
     inside &= ((column >= 0) & (column < CAMERA.width) & (row >= 0) & (row < CAMERA.height)).numpy()
+    inside &= ((T_world_cam.t.numpy() - points) * normals).sum(1) > 0
     surface = np.full(len(points), -np.inf)
     surface[inside] = depth[row.numpy()[inside], column.numpy()[inside]]
     return inside & (z < surface * 1.03 + 0.05)

@@ -9,6 +9,7 @@ from wearcap.recording.recording import ContactTrack, FloorTrack, PointCloud, Re
 from wearcap.sensors.head import SlamNoise, head_stream
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.slam import semidense_points
+from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.flat import build_flat
 from wearcap.simulation.person import Person, draw_person
 from wearcap.simulation.wearer import SimulatedMotion, simulate_motion
@@ -29,6 +30,8 @@ class SimulationConfig:
     activities: tuple[str, ...] | None = None
     head_noise: SlamNoise | None = field(default_factory=SlamNoise)
     imu_noise: ImuNoise | None = field(default_factory=ImuNoise)
+    suit: SuitNoise | None = field(default_factory=SuitNoise)
+    """None: no suit is worn."""
 
 
 def simulate_recording(config: SimulationConfig, name: str, split: str, seed: int) -> Recording:
@@ -72,11 +75,12 @@ def sense(
     points: PointCloud | None = (
         semidense_points(world.mesh, world.face_texture, head, rng) if config.points else None
     )
+    suit = suit_motion(motion, simulated.contact, config.suit, rng) if config.suit else None
     seconds: dict[str, float] = {}
     for label in simulated.labels:
         seconds[label.name] = seconds.get(label.name, 0.0) + float(label.stop_s - label.start_s)
     return Recording(
-        name, head=head, imu=imu, points=points, motion=motion,
+        name, head=head, imu=imu, suit=suit, points=points, motion=motion,
         contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, simulated.contact),
         floor=FloorTrack(motion.timestamps, simulated.floor_height), skeleton=person.skeleton, shape=person.shape,
         subject=person.name, location=world.name,
