@@ -66,9 +66,9 @@ def test_the_checkpoint_rebuilds_the_system(checkpoint):
     )
 
 
-def losses(run: Path) -> dict[int, str]:
+def losses(run: Path, name: str = "train/loss") -> dict[int, str]:
     with open(run / "metrics.csv") as file:
-        return {int(row["step"]): row["train/loss"] for row in csv.DictReader(file) if row.get("train/loss")}
+        return {int(row["step"]): row[name] for row in csv.DictReader(file) if row.get(name)}
 
 
 @pytest.mark.slow
@@ -103,6 +103,9 @@ def test_killed_and_resumed_equals_straight_through(data, tmp_path):
     assert after
     assert min(after) == saved
     assert after == {step: loss for step, loss in straight.items() if step >= saved}
+    # The averaged weights, which validation sees, go on too.
+    validated = losses(tmp_path / "straight/run", "val/loss")
+    assert losses(resumed, "val/loss") == {step: loss for step, loss in validated.items() if step >= saved}
 
 
 def _safe_losses(run: Path) -> dict[int, str]:

@@ -43,7 +43,7 @@ class Source:
 
 
 class WindowDataset(Dataset):
-    """Windows of one split of one or more data sets. An item is asked for by (window, seed)."""
+    """Windows of one split of one or more data sets. An item is asked for by (window, seed), or by its window alone."""
 
     def __init__(
         self,
@@ -88,8 +88,9 @@ class WindowDataset(Dataset):
     def __len__(self) -> int:
         return len(self.starts)
 
-    def __getitem__(self, item: tuple[int, int]) -> Window:
-        index, seed = item
+    def __getitem__(self, item: tuple[int, int] | int) -> Window:
+        # A number alone comes from Lightning's overfit_batches, which puts its own sampler in: same noise each time.
+        index, seed = item if isinstance(item, tuple) else (item, item)
         random = torch.Generator().manual_seed(seed)
         recording, start, frames = self.starts[index].tolist()
         shift, mirrored = torch.rand(2, generator=random).tolist()

@@ -54,7 +54,7 @@ def describe(pipeline: HMD2, report: ExportReport) -> dict:
         "model": {"file": Path(report.path).name, "sha256": sha256_of(report.path), **asdict(report)},
         "window": net.window,
         "fps": pipeline.fps,
-        "sampler": {"steps": pipeline.steps, "stride": pipeline.stride, "eta": pipeline.eta},
+        "sampler": {"steps": pipeline.steps, "stride": pipeline.advance, "eta": pipeline.eta},
         "schedule": {"name": type(schedule).__name__, **vars(schedule)},
         "features": asdict(features),
         "condition_channels": condition_channels(features),

@@ -32,7 +32,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
     except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
         raise WearcapError("not a readable checkpoint", where=path,
                            expected="a complete .ckpt file of `wearcap train`, with tensors and plain values only",
-                           fix=f"({str(error).splitlines()[0][:120]})") from error  # fmt: skip
+                           ) from error  # fmt: skip
     if not isinstance(checkpoint, dict) or "wearcap" not in checkpoint:
         raise WearcapError("a checkpoint, but not of wearcap", where=path,
                            expected="a .ckpt file that `wearcap train` wrote")  # fmt: skip

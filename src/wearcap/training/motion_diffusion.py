@@ -65,7 +65,9 @@ class MotionDiffusion(lightning.LightningModule):
         x0_hat = self._denoise(x_t, batch.level, condition, batch.valid)
         terms = {"motion": losses.motion_mse(x0_hat, x0, batch.valid)}
         if self.loss_weights.get("joints") or self.loss_weights.get("velocity"):
-            R_hat = self.features.decode(self.net.motion_normalizer.inverse(x0_hat.float()), batch.R_world_head)
+            R_hat = self.features.decode(
+                self.net.motion_normalizer.inverse(x0_hat.float()), batch.R_world_head
+            )
             predicted, true = self._from_head(R_hat, batch), self._from_head(batch.R_parent_joint, batch)
             terms["joints"] = losses.joint_position(predicted, true, batch.valid)
             terms["velocity"] = losses.joint_velocity(predicted, true, batch.valid, self.fps)
