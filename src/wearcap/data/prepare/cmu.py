@@ -1,11 +1,17 @@
 """CMU's motion capture (ASF/AMC and BVH), and any folder of BVH files."""
 
 import csv
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.head_level import head_level, with_head_face
 from wearcap.data.prepare.engine import Task, content_hash
-from wearcap.data.prepare.mocap import About, MocapSettings, mocap_recording
+from wearcap.data.prepare.mocap import About, MocapSettings, mocap_recording, on_xsens23
 from wearcap.data.prepare.splits import Splits
 from wearcap.errors import WearcapError
 from wearcap.io.asf_amc import read_amc, read_asf
@@ -14,10 +20,13 @@ from wearcap.io.text import read_text
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 
-VERSION = 1
+VERSION = 2
 """Raised when the same source and settings would give another recording."""
 
 MOTION_SUFFIXES = (".amc", ".amc.xz", ".amc.gz", ".bvh", ".bvh.xz", ".bvh.gz")
+HEAD_TRIALS, HEAD_FRAME_STEP = 6, 12
+"""So many trials of a subject, and every twelfth frame of them, show how the head's markers sit."""
+
 CGSPEED_JOINT = "LHipJoint"
 """A joint that only cgspeed's conversions of CMU have."""
 
@@ -41,9 +50,17 @@ class Trial:
     amc_fps: float | int
     bvh: BvhSettings
     settings: MocapSettings
+    same_subject: tuple[Path, ...] = ()
+    """Trials of the same subject and skeleton file that tell how the head's markers sit."""
 
     def __call__(self) -> Recording:
-        return mocap_recording(self.read(), self.about, self.settings)
+        motion = on_xsens23(self.read())
+        if self.asf is not None:
+            face = _head_face(self.asf, self.same_subject, self.amc_fps)
+            if face is not None:
+                R = with_head_face(motion.skeleton, motion.R_parent_joint, face)
+                motion = replace(motion, R_parent_joint=R)
+        return mocap_recording(motion, self.about, self.settings)
 
     def read(self) -> Motion:
         """The motion in the file's own skeleton."""
@@ -55,6 +72,24 @@ class Trial:
         if _is_cgspeed(self.file):
             return read_cmu_bvh(self.file)
         return read_bvh(self.file, unit_m=self.bvh.unit_m, up=self.bvh.up, forward=self.bvh.forward)
+
+
+@cache
+def _head_face(asf: Path, files: tuple[Path, ...], fps: float | int) -> Float[Tensor, "3 3"] | None:
+    """Tilt of a subject's face in the captured head frame: CMU's head markers sit 5…45° off, by subject."""
+    skeleton, poses = read_asf(asf), []
+    for file in files:
+        try:
+            motion = read_amc(skeleton, file, fps)
+        except WearcapError:  # said when its own turn comes
+            continue
+        thin = slice(None, None, HEAD_FRAME_STEP)
+        motion = on_xsens23(replace(
+            motion, timestamps=motion.timestamps[thin], R_parent_joint=motion.R_parent_joint[thin],
+            t_world_root=motion.t_world_root[thin], contact_prob=None,
+        ))  # fmt: skip
+        poses.append(motion.R_parent_joint)
+    return head_level(motion.skeleton, torch.cat(poses)) if poses else None
 
 
 def cmu_tasks(
@@ -70,14 +105,22 @@ def cmu_tasks(
     if not source.is_dir():
         raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
     activities = _activities(source / "index.csv")
+    trials = {
+        name: (path, _asf_for(path) if ".amc" in path.name.lower() else None)
+        for name, path in _trials(source).items()
+    }
+    same: dict[tuple[str, Path | None], list[Path]] = {}
+    for name, (path, asf) in trials.items():
+        same.setdefault((_subject(name), asf), []).append(path)
     tasks = []
-    for name, path in _trials(source).items():
+    for name, (path, asf) in trials.items():
         subject = _subject(name)
         about = About(name, subject, "cmu", license, activities.get(name, ""))
-        asf = _asf_for(path) if ".amc" in path.name.lower() else None
-        trial = Trial(path, asf, about, amc_fps, bvh, settings)
+        others = same[subject, asf]
+        spread = tuple(others[:: -(-len(others) // HEAD_TRIALS)]) if asf is not None else ()
+        trial = Trial(path, asf, about, amc_fps, bvh, settings, spread)
         described = [asdict(about), asdict(settings), asdict(bvh), amc_fps, VERSION]
-        sources = [path] if asf is None else [path, asf]
+        sources = [path] if asf is None else [path, asf, *spread]
         tasks.append(Task(name, trial, splits.of(subject), content_hash(*described, *sources)))
     return tasks
 
