@@ -1,12 +1,19 @@
-"""Shape checks for the whole suite: jaxtyping annotations are enforced by beartype, in tests only."""
+"""Shape checks for the whole suite: jaxtyping annotations are enforced by beartype, in tests only.
+
+WEARCAP_EXAMPLES=1000 makes the property tests and the fuzzing of the readers search longer.
+"""
 
 import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from jaxtyping import install_import_hook
 
 install_import_hook("wearcap", "shapes.checker")
+
+settings.register_profile("suite", max_examples=int(os.environ.get("WEARCAP_EXAMPLES", "25")), deadline=None)
+settings.load_profile("suite")
 
 
 @pytest.fixture(scope="session")

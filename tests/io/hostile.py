@@ -3,7 +3,9 @@
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-fuzz = settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+fuzz = settings(
+    max_examples=4 * settings().max_examples, deadline=None, suppress_health_check=list(HealthCheck)
+)
 
 JUNK = [
     "nan",

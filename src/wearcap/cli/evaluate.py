@@ -1,6 +1,6 @@
 """`wearcap evaluate`: whole recordings of a split, over seeds, beside the trivial baselines."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 from omegaconf import DictConfig, ListConfig
@@ -53,7 +53,7 @@ def _rows(
     config: DictConfig,
     progress: Progress,
     title: str,
-) -> Iterator[Row]:
+) -> Iterable[Row]:
     names = store.names(config.split)
     return progress.track(
         evaluate(pipeline, store, names, seeds, config.lanes),

@@ -44,7 +44,7 @@ class CaptureValidation(Callback):
             net=pl_module.net, features=pl_module.features, schedule=pl_module.schedule,
             skeleton=pl_module.skeleton, fps=pl_module.fps, device=str(pl_module.device),
         )  # fmt: skip
-        recordings = self._recordings(trainer.datamodule.val_sources[0].root)
+        recordings = self._recordings(trainer.datamodule.val_sources[0].root)  # pyright: ignore[reportAttributeAccessIssue]
         motions = pipeline.capture(recordings, [0] * len(recordings))
         rows = [score(m, r, r.name, 0) for m, r in zip(motions, recordings)]
         for key, summary in aggregate(rows).items():
