@@ -71,3 +71,18 @@ def test_normalizer_inverts_and_travels_with_the_weights():
     other = Normalizer(3)
     other.load_state_dict(normalizer.state_dict())
     assert torch.equal(other(x), normalizer(x))
+
+
+def test_blending_is_smoother_and_never_mixes_in_padding():
+    x_t, level, condition, valid = inputs()
+    valid[:, 10:] = False
+    blended = small(blend=5)
+    out = blended(x_t, level, condition, valid)
+    x_t[:, 10:] = 50.0
+    assert torch.allclose(blended(x_t, level, condition, valid)[:, :10], out[:, :10], atol=1e-5)
+    plain = blended.blend
+    blended.blend = None
+    rough = blended(x_t, level, condition, valid)[:, :10]
+    assert out[:, :10].diff(dim=1).square().mean() < 0.5 * rough.diff(dim=1).square().mean()
+    constant = torch.ones(2, 16, 12)
+    assert torch.allclose(plain(constant, valid)[:, :10], constant[:, :10])

@@ -3,6 +3,7 @@
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from wearcap.models.layers import AdaptiveBlock, LevelEmbedding
 
@@ -29,12 +30,35 @@ class Normalizer(nn.Module):
         return x * self.scale + self.mean
 
 
+class TemporalBlend(nn.Module):
+    """A learned weighted mean of neighbouring frames, the same for all features; it never looks at padding."""
+
+    def __init__(self, frames: int, spread: float = 1.5):
+        """`frames` (odd) are blended; the weights start as a Gaussian of `spread` frames."""
+        super().__init__()
+        offset = torch.arange(frames) - frames // 2
+        self.weight = nn.Parameter(-0.5 * (offset / spread) ** 2)
+
+    def forward(
+        self, x: Float[Tensor, "batch time feature"], valid: Bool[Tensor, "batch time"]
+    ) -> Float[Tensor, "batch time feature"]:
+        kernel = self.weight.softmax(0)
+        half = len(kernel) // 2
+        mask = valid.to(x.dtype)[..., None]
+
+        def mixed(value: Tensor) -> Tensor:
+            return F.pad(value, (0, 0, half, half)).unfold(1, len(kernel), 1) @ kernel
+
+        return mixed(x * mask) / mixed(mask).clamp_min(1e-3)
+
+
 class MotionDenoiser(nn.Module):
     """x̂0 = D(x_t, c, level): one token per frame (or per few frames) through adaptive transformer blocks.
 
     x_t and the condition of every frame are concatenated and narrowed by an MLP to one token (thesis §6.2);
     where x_t joins the conditions the document leaves open. `frames_per_token` > 1 is ours: neighbouring frames
-    share a token, which cuts the cost of a window about as many times.
+    share a token, which cuts the cost of a window about as many times; `blend` > 0 (ours too) mixes that many
+    neighbouring frames of x̂0, which removes the seams between tokens and most of an unfinished network's jitter.
     """
 
     def __init__(
@@ -48,6 +72,7 @@ class MotionDenoiser(nn.Module):
         feedforward: int = 1024,
         dropout: float = 0.1,
         frames_per_token: int = 1,
+        blend: int = 0,
     ):
         super().__init__()
         if window % frames_per_token:
@@ -67,6 +92,7 @@ class MotionDenoiser(nn.Module):
         self.head = nn.Linear(width, frames_per_token * motion_size)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
+        self.blend = TemporalBlend(blend) if blend else None
 
     def forward(
         self,
@@ -85,4 +111,5 @@ class MotionDenoiser(nn.Module):
         embedded = self.level(token_level)
         for block in self.blocks:
             token = block(token, embedded, token_valid)
-        return self.head(self.norm(token)).reshape(batch, time, -1)
+        x0_hat = self.head(self.norm(token)).reshape(batch, time, -1)
+        return x0_hat if self.blend is None else self.blend(x0_hat, valid)
