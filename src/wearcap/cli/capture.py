@@ -31,7 +31,7 @@ def run(config: DictConfig) -> Motion:
     write_glb(motion, folder / "motion.glb", body=body)
     if config.video:
         shown = {"truth": recording.motion} if recording.motion is not None else {}
-        write_video(folder / "motion.mp4", shown | {"capture": motion})
+        write_video(folder / "motion.mp4", shown | {"capture": motion}, max_seconds=config.video_seconds)
     show(f"motion: {folder}")
     return motion
 

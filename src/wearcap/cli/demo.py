@@ -16,7 +16,7 @@ HELP = "prepare simulated data, train, evaluate, capture and export in minutes"
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser("wearcap demo", description=HELP)
     parser.add_argument("--output", type=Path, default=Path("outputs/demo"), help="folder for everything")
-    parser.add_argument("--steps", type=int, default=300, help="training steps")
+    parser.add_argument("--steps", type=int, default=240, help="training steps")
     options = parser.parse_args(arguments)
     out, data, checkpoint = (
         options.output,
@@ -26,7 +26,7 @@ def main(arguments: list[str]) -> None:
     started = time.monotonic()
     _step("Simulated wearers", prepare.main, ["simulated", "preset=demo", f"output={data}"])
     _step("Training", train.main, [
-        "experiment=motion_diffusion_head", f"data.sources.simulated.root={data}", "data.steps_per_epoch=100",
+        "experiment=motion_diffusion_head", f"data.sources.simulated.root={data}", f"data.steps_per_epoch={max(1, options.steps // 2)}",
         f"trainer.max_steps={options.steps}", f"hydra.run.dir={out}/train", "callbacks.capture.every_n_epochs=100",
         "callbacks.average.decay=0.98", "data.batch_size=16",
     ])  # fmt: skip
@@ -34,7 +34,7 @@ def main(arguments: list[str]) -> None:
         f"checkpoint={checkpoint}", f"hydra.run.dir={out}/evaluate", "seeds=[0]", f"output={out}/table.json"])  # fmt: skip
     name = RecordingStore.open(data).names("test")[0]
     _step("Capture", capture.main, [
-        f"checkpoint={checkpoint}", f"recording={data}/{name}", f"hydra.run.dir={out}/capture"])  # fmt: skip
+        f"checkpoint={checkpoint}", f"recording={data}/{name}", f"hydra.run.dir={out}/capture", "video_seconds=10"])  # fmt: skip
     _step("Export", export.main, [
         f"checkpoint={checkpoint}", f"hydra.run.dir={out}/export", f"output={out}/denoiser.onnx"])  # fmt: skip
     show(
