@@ -1,0 +1,49 @@
+"""Project Aria recordings after Meta's machine perception services (MPS): head path and points, no body."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from wearcap.data.prepare.engine import Task, content_hash
+from wearcap.data.prepare.splits import Splits
+from wearcap.errors import WearcapError
+from wearcap.io.aria_mps import is_mps_folder, read_mps
+from wearcap.recording.recording import Recording
+
+VERSION = 1
+"""Raised when the same source and settings would give another recording."""
+
+
+@dataclass(frozen=True)
+class AriaRecording:
+    """One MPS output folder; picklable, callable as a task."""
+
+    folder: Path
+    name: str
+    subject: str
+    fps: float
+    license: str
+
+    def __call__(self) -> Recording:
+        recording = read_mps(self.folder, fps=self.fps)
+        return replace(recording, name=self.name, subject=self.subject, license=self.license)
+
+
+def aria_tasks(
+    source: str | Path, splits: Splits, subject: str, fps: float | int, license: str
+) -> list[Task]:
+    """One task per folder with a closed-loop trajectory, at or below `source`, named after the folder."""
+    source = Path(source)
+    if not source.is_dir():
+        raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
+    folders = sorted(path for path in [source, *source.rglob("*")] if path.is_dir() and is_mps_folder(path))
+    if not folders:
+        raise WearcapError("no MPS output", where=source, expected="folders with closed_loop_trajectory.csv")
+    tasks = []
+    for folder in folders:
+        name = folder.resolve().name
+        files = sorted(path for path in folder.glob("*.csv*") if path.is_file())
+        digest = content_hash(name, subject, float(fps), VERSION, *files)
+        tasks.append(
+            Task(name, AriaRecording(folder, name, subject, float(fps), license), splits.of(subject), digest)
+        )
+    return tasks
