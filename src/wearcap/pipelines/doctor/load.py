@@ -41,6 +41,10 @@ class Patient:
 
 def patients(path: Path) -> list[Patient]:
     """All recordings in a path, in order of name. Raises WearcapError when there is none."""
+    if not path.exists() and (path.parent / "manifest.json").is_file():
+        store = RecordingStore.open(path.parent)
+        store.open_file(path.name)
+        return [Patient(path.name, partial(_read_stored, store, path.name))]
     if not path.exists():
         raise WearcapError("no such file or folder", where=path)
     if path.is_file():
