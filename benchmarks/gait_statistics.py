@@ -66,14 +66,22 @@ def walking_windows(clips: list[Clip]) -> dict[str, Float[Tensor, "window"]]:
 
 
 def is_walking(clip: Clip) -> Bool[Tensor, "window"]:
-    """Windows in which the pelvis goes straight on, upright, at a walking speed that never stops."""
+    """Windows in which the pelvis goes straight on (its halves within 4°), upright, at a walking speed, never stopping."""
     pelvis = windows_of(clip.joints["pelvis"])
     step = pelvis[:, 1:, :2] - pelvis[:, :-1, :2]
     net = (pelvis[:, -1, :2] - pelvis[:, 0, :2]).norm(dim=-1)
     speed, arc = net * FPS / (WINDOW - 1), step.norm(dim=-1).sum(1)
     height = pelvis[..., 2].amax(1) - pelvis[..., 2].amin(1)
     slowest = step.norm(dim=-1).amin(1) * FPS
-    return (speed > 0.6) & (speed < 1.9) & (net > 0.97 * arc) & (height < 0.12) & (slowest > 0.3)
+    middle = pelvis[:, WINDOW // 2, :2]
+    turned = _between(
+        *(
+            torch.nn.functional.pad(half, (0, 1))
+            for half in (middle - pelvis[:, 0, :2], pelvis[:, -1, :2] - middle)
+        )
+    )
+    straight = (net > 0.97 * arc) & (turned.rad2deg() < 4)
+    return (speed > 0.6) & (speed < 1.9) & straight & (height < 0.12) & (slowest > 0.3)
 
 
 def statistics(clip: Clip) -> dict[str, Float[Tensor, "window"]]:

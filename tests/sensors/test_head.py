@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from wearcap_testing import swaying_motion
 
 from wearcap.geometry import rotation
 from wearcap.sensors.head import SlamNoise, head_stream
 from wearcap.sensors.noise import random_walk, smooth_noise
+from wearcap_testing import swaying_motion
 
 SEAT = torch.tensor([0.09, 0.0, 0.08])
 

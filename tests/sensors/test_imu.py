@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from wearcap_testing import swaying_motion
 
 from wearcap.body.skeleton import xsens23
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
 from wearcap.sensors.imu import GRAVITY, ImuNoise, acceleration, angular_rate, mean_filter, synthesize_imu
+from wearcap_testing import swaying_motion
 
 FPS = 60.0
 NONE = ImuNoise(0.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0)

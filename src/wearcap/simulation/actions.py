@@ -122,7 +122,7 @@ def approach(
     if _length(path) > 0.25:
         speed = plan.style.speed * float(np.exp(rng.normal(0.0, 0.13)))
         walk_along(plan, path, rng, speed, world.flights)
-        look_about(plan, start + 1.0, plan.time, rng, spread=0.28, rest=2.2)
+        look_about(plan, start + 1.0, plan.time, rng, spread=0.22, rest=3.0)
     if heading is not None and abs(wrap(heading - plan.heading)) > 0.2:
         turn_to(plan, heading, rng)
     plan.time += rng.uniform(0.25, 0.6)

@@ -113,7 +113,7 @@ def _swing(
     spread = style.arm_spread + 0.05 * run + slow[:, 1]
     turn = style.arm_turn + 0.25 * run + slow[:, 2]
     elbow = style.elbow + walk * 0.07 * np.clip(trunk.speed, 0.0, 2.0) + 1.15 * run + slow[:, 3]
-    elbow = elbow + (0.45 * walk + 0.25 * run) * _forward_part(swing)
+    elbow = elbow + (1.15 * walk + 0.25 * run) * _forward_part(swing)
     angles = [torch.from_numpy(np.ascontiguousarray(a)) for a in (swing, spread, turn, elbow)]
     about = rotation.about_axis
     hang = about("x", -sign * (np.pi / 2 - angles[1]))

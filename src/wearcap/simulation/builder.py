@@ -198,7 +198,9 @@ class WorldBuilder:
 
 def _reachable(world: w.World, point: np.ndarray, within_m: float) -> bool:
     node = world.navigation.nearest_node(point)
-    return node is not None and bool(np.linalg.norm(world.navigation.node_points[node][:2] - point[:2]) < within_m)
+    return node is not None and bool(
+        np.linalg.norm(world.navigation.node_points[node][:2] - point[:2]) < within_m
+    )
 
 
 def _prism_faces(sides: int) -> np.ndarray:

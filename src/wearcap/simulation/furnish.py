@@ -137,4 +137,6 @@ def _outline(size: tuple[float, float], x: float, y: float, heading: float) -> B
 
 
 def _inside(inner: Box, outer: Box) -> bool:
-    return bool(inner[0] >= outer[0] and inner[1] >= outer[1] and inner[2] <= outer[2] and inner[3] <= outer[3])
+    return bool(
+        inner[0] >= outer[0] and inner[1] >= outer[1] and inner[2] <= outer[2] and inner[3] <= outer[3]
+    )

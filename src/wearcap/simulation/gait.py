@@ -11,11 +11,15 @@ from wearcap.simulation.track import Track, ease, hermite
 
 ROLL_DOWN_S = 0.13
 """From landing to the flat foot."""
-ROLL_UP_S = 0.34
+ROLL_UP_S = 0.42
 """From the flat foot to toe-off."""
 SOFT_M = 0.008
 """Width over which the lowest point of a swinging sole changes from ball to heel."""
 LONG_STAND_S = 0.9
+LATE_LIFT = 0.06
+"""Height of the heel shortly before it lands, by how far the toes are up then (m/rad)."""
+STAIR_WAIT = 0.16
+"""Share of a swing up a stair during which the foot only rises, and of one down during which it only sinks."""
 
 
 @dataclass(frozen=True)
@@ -66,16 +70,20 @@ def foot_motion(
     at = _Timeline(prints, times)
     roll, bend = _roll(at, heel_lift.sample(times)[:, 0])
     share = at.swing_share
-    moved, turned = glide(share), ease(share)
+    rise = at.mix("height", np.ones_like(share)) - at["height"]
+    moved = advance(share, rise)
+    turned = ease(share)
     pivot_x, pivot_z = _pivot(at, roll, turned, shape)
-    depth = _depth(shape, roll, bend, SOFT_M * _bump(share))
+    depth = _depth(shape, roll, bend, SOFT_M * bump(share))
     rolled = pivot_x - (np.cos(roll) * pivot_x + np.sin(roll) * pivot_z)
-    raised = at.clearance * _bump(share) + depth
+    raised = (
+        at.clearance * bump(share) + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * _late(share) + depth
+    )
     tilt = at.mix("tilt", turned)
     heading = at.mix("heading", turned)
     ground = at.mix("ground", moved[:, None])
-    ground[:, 2] = at.mix("height", _climb(at, share))
-    outward = at.bow * _bump(share)
+    ground[:, 2] = at.mix("height", climb(rise, share))
+    outward = at.bow * bump(share)
     cos, sin = np.cos(heading), np.sin(heading)
     ground[:, 0] -= outward * sin
     ground[:, 1] += outward * cos
@@ -131,26 +139,43 @@ class _Timeline:
         return here + share * (self._columns[name][self.next] - here)
 
 
-def glide(share: Float[np.ndarray, "*batch"], ramp: float = 0.36) -> Float[np.ndarray, "*batch"]:
-    """Course of a swing from 0 to 1: speeds up over the first `ramp` of it, slows down over the last."""
+def glide(
+    share: Float[np.ndarray, "*batch"], ramps: tuple[float, float] = (0.36, 0.30)
+) -> Float[np.ndarray, "*batch"]:
+    """Course of a swing from 0 to 1: speeds up over the first of `ramps` (shares of it), slows down over the last."""
 
     def integral(u):
         return u**3 * (1.0 - 0.5 * u)
 
-    rise = ramp * integral(np.clip(share / ramp, 0.0, 1.0))
-    flat = np.clip(share - ramp, 0.0, 1.0 - 2 * ramp)
-    fall = ramp * (0.5 - integral(np.clip((1.0 - share) / ramp, 0.0, 1.0)))
-    return (rise + flat + fall) / (1.0 - ramp)
+    first, last = ramps
+    rise = first * integral(np.clip(share / first, 0.0, 1.0))
+    flat = np.clip(share - first, 0.0, 1.0 - first - last)
+    fall = last * (0.5 - integral(np.clip((1.0 - share) / last, 0.0, 1.0)))
+    return (rise + flat + fall) / (1.0 - (first + last) / 2)
 
 
-def _bump(share: np.ndarray) -> np.ndarray:
+def advance(
+    share: Float[np.ndarray, "*batch"], rise: Float[np.ndarray, "*#batch"]
+) -> Float[np.ndarray, "*batch"]:
+    """Way over the floor of a swing that rises by `rise` (m) in all, from 0 to 1."""
+    up, down = np.clip(rise / 0.12, 0.0, 1.0), np.clip(-rise / 0.12, 0.0, 1.0)
+    return glide(np.clip((share - STAIR_WAIT * up) / (1.0 - STAIR_WAIT * (up + down)), 0.0, 1.0))
+
+
+def bump(share: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """Course of a swing's lift: 0 at both ends, 1 in the middle."""
     return 64.0 * (share * (1.0 - share)) ** 3
+
+
+def _late(share: np.ndarray) -> np.ndarray:
+    """A bump with its top at 0.75."""
+    return (share / 0.75) ** 9 * ((1.0 - share) / 0.25) ** 3
 
 
 def _roll(at: _Timeline, heel_lift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pitch of the sole against the floor and bend of the toes (rad)."""
     down = np.minimum(ROLL_DOWN_S, 0.35 * at.stance_s)
-    up = np.minimum(ROLL_UP_S, 0.55 * at.stance_s)
+    up = np.minimum(ROLL_UP_S, 0.58 * at.stance_s)
     rate = 1.7 * at["lift_pitch"] / up
     zero = np.zeros_like(rate)
     landing = hermite(at.since_land / down, (at["land_pitch"], zero), (zero, zero))
@@ -190,11 +215,12 @@ def _depth(shape: FootShape, roll: np.ndarray, bend: np.ndarray, soft: np.ndarra
     return top + width * np.log(np.exp((points - top) / width).sum(0)) * (soft > 1e-5)
 
 
-def _climb(at: _Timeline, share: np.ndarray) -> np.ndarray:
+def climb(
+    rise: Float[np.ndarray, "*#batch"], share: Float[np.ndarray, "*batch"]
+) -> Float[np.ndarray, "*batch"]:
     """Course of the floor beneath a swing: up early and down late, so that the foot clears the stair's edge."""
-    height = at.mix("height", np.ones_like(share)) - at["height"]
-    early, late = ease(share / 0.62), ease((share - 0.38) / 0.62)
-    up = np.clip(0.5 + height / 0.12, 0.0, 1.0)
+    early, late = ease(share / 0.58), ease((share - 0.45) / 0.55)
+    up = np.clip(0.5 + rise / 0.12, 0.0, 1.0)
     return up * early + (1.0 - up) * late
 
 

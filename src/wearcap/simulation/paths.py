@@ -7,7 +7,7 @@ from wearcap.simulation.navigation import CLEARANCE_M, NavigationGrid
 
 WAYPOINT_M = 0.1
 SMOOTHING_PASSES = 80
-STAIR_APPROACH_M = 0.35
+STAIR_APPROACH_M = 0.5
 """Stairs are entered and left straight, from this far off."""
 
 

@@ -13,7 +13,15 @@ from wearcap.simulation.plan import SIDES, Plan
 from wearcap.simulation.track import blur, lower_envelope, pendulum, wander
 
 GRAVITY = 9.81
-ENVELOPE_S = 0.09
+ENVELOPE_S = 0.06
+STEP_ENVELOPE_S, LEVELLED = 0.26, 0.12
+"""In walking the pelvis stays this share nearer to the height that it can keep over a whole step."""
+STAIR_APART_M, STAIRS_LEVELLED = 0.15, 0.5
+"""On stairs (feet so far apart in height) knees bend more, which evens out the pelvis' way."""
+HIPS_AHEAD_M = 0.042
+"""How much further forward than in standing the hips are carried in walking."""
+STANCE_BEND = 0.9
+"""More bend of a bearing knee in walking than in standing, as a share of the knee's softness."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +94,13 @@ def trunk_motion(
         ],
         1,
     )
-    back = 0.26 * plan.hip_height * np.sin(np.clip(lean[:, 0], -0.5, 1.5)) + 0.012
+    back = 0.26 * plan.hip_height * np.sin(np.clip(lean[:, 0], -0.5, 1.5)) + 0.012 - HIPS_AHEAD_M * moving
     place = mass - back[:, None] * forward
     seat = plan.seat.sample(times)
     place += seated[:, :1] * (seat[:, :2] - place)
-    height = _height(plan, feet, place, rotation_of(pelvis_angles), fps) - plan.crouch.sample(times)[:, 0]
+    height = (
+        _height(plan, feet, place, moving, rotation_of(pelvis_angles), fps) - plan.crouch.sample(times)[:, 0]
+    )
     height += seated[:, 1] * (seat[:, 2] - height)
     pelvis = np.concatenate([place, height[:, None]], 1)
     return Trunk(pelvis, pelvis_angles, chest_angles, heading, stride, speed)
@@ -102,7 +112,12 @@ def _list(amount: float, load: np.ndarray, moving: np.ndarray) -> np.ndarray:
 
 
 def _height(
-    plan: Plan, feet: dict[str, FootMotion], place: np.ndarray, R_world_pelvis: Tensor, fps: float
+    plan: Plan,
+    feet: dict[str, FootMotion],
+    place: Float[np.ndarray, "time 2"],
+    moving: Float[np.ndarray, "time"],
+    R_world_pelvis: Float[Tensor, "time 3 3"],
+    fps: float,
 ) -> Float[np.ndarray, "time"]:
     """Height of the pelvis (m): as high as both legs let it, with soft knees, and smooth."""
     skeleton = plan.skeleton
@@ -112,10 +127,17 @@ def _height(
             skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double()
             for joint in ("hip", "knee", "ankle")
         )
-        soft = torch.tensor([0.0, plan.style.knee_soft, 0.0], dtype=torch.float64)
-        leg = float((knee + rotation.exp(soft) @ ankle).norm())
+        bears = blur(feet[side].planted.astype(np.float64), 0.08, fps)
+        soft = np.zeros_like(place[:, :1]).repeat(3, 1)
+        soft[:, 1] = plan.style.knee_soft * (0.5 + (0.5 + STANCE_BEND * moving) * bears)
+        lower = rotation.exp(torch.from_numpy(soft)) @ ankle[:, None]
+        leg = (knee + lower[..., 0]).norm(dim=-1).numpy()
         offset = (R_world_pelvis @ hip).numpy()
         away = np.linalg.norm(feet[side].ankle[:, :2] - place - offset[:, :2], axis=1)
         up = np.sqrt(np.maximum(leg**2 - away**2, (0.35 * leg) ** 2))
         limits.append(feet[side].ankle[:, 2] + up - offset[:, 2])
-    return lower_envelope(np.minimum(*limits), ENVELOPE_S, fps)
+    limit = np.minimum(*limits)
+    high, level = lower_envelope(limit, ENVELOPE_S, fps), lower_envelope(limit, STEP_ENVELOPE_S, fps)
+    apart = np.abs(feet["left"].ground[:, 2] - feet["right"].ground[:, 2])
+    stairs = blur(np.clip(apart / STAIR_APART_M, 0.0, 1.0), 0.25, fps)
+    return high + (LEVELLED * moving + (STAIRS_LEVELLED - LEVELLED * moving) * stairs) * (level - high)

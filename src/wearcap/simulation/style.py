@@ -22,13 +22,13 @@ class Style:
     """Knee flexion at which the standing leg counts as straight."""
     heel_rise: float = 1.0
     """Scales how far feet roll at push-off and landing."""
-    arm_swing: float = 0.55
+    arm_swing: float = 0.46
     """Shoulder angle per metre between the feet (rad/m)."""
     arm_symmetry: float = 0.0
     """More swing left than right, as a share."""
     elbow: float = 0.30
     arm_spread: float = 0.14
-    arm_turn: float = 0.45
+    arm_turn: float = 0.32
     """Inward turn of the hanging arm: palms face back."""
     slouch: float = 0.05
     """Forward lean of the chest."""
@@ -61,6 +61,7 @@ class Style:
         }
         for name in (f.name for f in fields(cls) if f.name not in draw):
             draw[name] = getattr(base, name) * float(np.exp(rng.normal(0.0, 0.22)))
+        draw["heel_rise"] = float(np.clip(rng.normal(1.0, 0.1), 0.8, 1.2))
         draw["knee_soft"] = float(np.clip(draw["knee_soft"], 0.08, 0.25))
         draw["step_width"] = float(np.clip(draw["step_width"], 0.05, 0.16))
         draw["stance_width"] = float(np.clip(draw["stance_width"], 0.12, 0.30))

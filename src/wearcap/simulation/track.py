@@ -11,7 +11,7 @@ from jaxtyping import Float
 def ease(share: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
     """Minimum-jerk course from 0 to 1 while `share` runs from 0 to 1 (Flash and Hogan 1985); constant outside."""
     u = np.clip(share, 0.0, 1.0)
-    return u**3 * (10.0 + u * (6.0 * u - 15.0))
+    return np.asarray(u**3 * (10.0 + u * (6.0 * u - 15.0)))
 
 
 def hermite(

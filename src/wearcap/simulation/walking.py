@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from wearcap.simulation.gait import advance, bump, climb
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Footprint, Plan, wrap
 from wearcap.simulation.track import blur
 
@@ -17,7 +18,8 @@ READY_S = 0.42
 """Between the decision to walk and the first foot's lift the weight moves to the other leg."""
 CURVE_SPEED = 0.95
 """Speed (m/s) in a curve of radius 1 m, for a wearer whose own speed is 1.3 m/s (two-thirds power law)."""
-TREAD_OVERHANG_M, EDGE_M = 0.02, 0.08
+HEEL_ROOM_M, TOE_ROOM_M, EDGE_M = 0.055, 0.015, 0.08
+"""On treads: heel behind the ankle, toes before the next riser, and, going down, the ankle past the edge."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +36,13 @@ class Course:
     on_stairs: Float[np.ndarray, "point"]
     """+1 going up, -1 going down, else 0."""
 
-    def at_phase(self, name: str, phase: float) -> np.ndarray:
-        """Points, heading, speed or time where the phase has a value; ends held."""
-        values = getattr(self, name)
-        if values.ndim == 1:
-            return np.interp(phase, self.phase, values)
-        return np.array([np.interp(phase, self.phase, column) for column in values.T])
+    def at_phase(self, name: str, phase: float) -> float:
+        """Heading, speed, time or on_stairs where the phase has a value; ends held."""
+        return float(np.interp(phase, self.phase, getattr(self, name)))
+
+    def point_at(self, phase: float) -> Float[np.ndarray, "3"]:
+        """Floor point where the phase has a value (m); ends held."""
+        return np.array([np.interp(phase, self.phase, column) for column in self.points.T])
 
 
 def walk_along(
@@ -64,11 +67,11 @@ def walk_along(
     lands = np.append(lands, lands[-1] + max(tempo[-1], 0.55))
     for k, (side, land) in enumerate(zip(sides, lands), start=1):
         last = k > steps
-        how = float(course.at_phase("speed", min(k, steps) - 0.5))
+        how = course.at_phase("speed", min(k, steps) - 0.5)
         print_ = _course_print(plan, course, side, min(k, steps), last, how, rng)
         beat = land - lands[k - 2] if k > 1 else 0.62
         lift = land - beat * (1.0 - double_support(how)) if k > 1 else land - 0.5
-        _walk_step(plan, side, lift, land, print_, float(course.at_phase("on_stairs", min(k, steps))), how)
+        _walk_step(plan, side, lift, land, print_, course.at_phase("on_stairs", min(k, steps)), how)
 
 
 def double_support(speed: float) -> float:
@@ -87,7 +90,7 @@ def _walk_step(
     stride = float(np.linalg.norm((print_.ground - old.ground)[:2]))
     size = min(stride / 1.35, 1.15) * plan.style.heel_rise
     rise = print_.ground[2] - old.ground[2]
-    lift_pitch, land_pitch, clearance = 0.82 * size, -0.34 * size, 0.02
+    lift_pitch, land_pitch, clearance = 0.95 * size, -0.44 * size, 0.02
     if speed > RUN_SPEED:
         lift_pitch, land_pitch, clearance = 0.85, -0.10, 0.10
     if rise > 0.05:
@@ -96,6 +99,7 @@ def _walk_step(
         lift_pitch, land_pitch, clearance = 0.60, 0.22, 0.03
     elif stride < 0.45:
         clearance = 0.03
+    clearance = max(clearance, _over_corner(plan, old, print_))
     new = Footprint(
         print_.ground, print_.heading, print_.tilt, land_pitch=land_pitch, clearance=clearance,
         bow=LEFT_SIGN[side] * 0.012, running=speed > RUN_SPEED,
@@ -103,11 +107,32 @@ def _walk_step(
     plan.step(side, lift, land, lift_pitch, new)
 
 
+def _over_corner(plan: Plan, old: Footprint, new: Footprint) -> float:
+    """Height (m) to which a swing must lift the foot to clear a step whose corner it cuts; 0 going down."""
+    rise = new.ground[2] - old.ground[2]
+    if rise < -0.05:
+        return 0.0
+    share = np.linspace(0.15, 0.8, 14)
+    ankle = old.ground + advance(share, np.array(rise))[:, None] * (new.ground - old.ground)
+    heading = old.heading + share * wrap(new.heading - old.heading)
+    toes = ankle[:, :2] + foot_length(plan) * np.stack([np.cos(heading), np.sin(heading)], 1)
+    floor = plan.floor_height(toes, np.full(len(share), max(old.ground[2], new.ground[2])))
+    need = np.nan_to_num(floor - old.ground[2] - rise * climb(np.array(rise), share), nan=0.0)
+    need = np.where(need > 0.05, (need + 0.02) / bump(share), 0.0)
+    return float(min(need.max(), 0.35))
+
+
+def foot_length(plan: Plan) -> float:
+    """How far the toes are ahead of the ankle (m)."""
+    toe, tip = plan.skeleton.index("left_toe"), plan.skeleton.sites["left_toe_tip"].t_joint_site
+    return float(plan.skeleton.t_parent_joint[toe, 0]) + tip[0]
+
+
 def _course_print(
     plan: Plan, course: Course, side: str, k: int, last: bool, speed: float, rng: np.random.Generator
 ) -> Footprint:
     style = plan.style
-    point, heading = course.at_phase("points", k), float(course.at_phase("heading", k))
+    point, heading = course.point_at(k), course.at_phase("heading", k)
     stairs = abs(course.at_phase("on_stairs", k)) > 0.5
     width = (
         style.step_width
@@ -129,7 +154,8 @@ def plan_course(plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float,
     curvature = blur(np.abs(np.gradient(heading, SPACING_M)), 0.15, 1 / SPACING_M)
     pace = speed / 1.3 if speed < RUN_SPEED else 1.5
     limit = np.minimum(speed, CURVE_SPEED * pace * np.maximum(curvature, 0.05) ** (-1 / 3))
-    anchors = [anchor for flight in flights for anchor in _tread_anchors(points, flight)]
+    foot = foot_length(plan)
+    anchors = [anchor for flight in flights for anchor in _tread_anchors(points, flight, foot)]
     anchors = sorted(anchors, key=lambda anchor: anchor[0])
     stairs = np.zeros(len(points))
     for at, way, tread, _rise in anchors:
@@ -170,20 +196,24 @@ def _ramped(limit: np.ndarray) -> np.ndarray:
     return np.sqrt(np.minimum.accumulate((squared + fall)[::-1])[::-1] - fall)
 
 
-def _tread_anchors(points: np.ndarray, flight) -> list[tuple[float, int, float, float]]:
-    """(arc length, way up or down, tread, rise) of the places on a path where a foot must stand on a flight."""
+def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float, int, float, float]]:
+    """(arc length, way up or down, tread, rise) of the places on a path where a foot must stand on a flight.
+
+    `foot` is how far the toes are ahead of the ankle (m).
+    """
     along = np.array([np.cos(flight.direction), np.sin(flight.direction)])
     offset = points[:, :2] - np.array(flight.start)
     run, side = offset @ along, offset @ np.array([-along[1], along[0]])
     inside = (np.abs(side) < flight.width / 2 + 0.1) & (run > -0.6) & (run < flight.length + 0.6)
-    inside &= (points[:, 2] > flight.base_z - 0.1) & (points[:, 2] < flight.top_z + 0.1)
+    climbed = flight.base_z + flight.rise * np.clip(run / flight.tread + 0.5, 0, flight.steps)
+    inside &= np.abs(points[:, 2] - climbed) < 0.35  # the floors above and below the flight are not on it
     if inside.sum() < 3:
         return []
     first, last = np.flatnonzero(inside)[[0, -1]]
     up = run[last] > run[first]
     treads = np.arange(flight.steps + 1) * flight.tread
     if up:
-        wanted = np.concatenate([[-0.29], treads[:-1] + TREAD_OVERHANG_M])
+        wanted = np.concatenate([[-0.29], treads[:-1] + min(HEEL_ROOM_M, flight.tread - foot - TOE_ROOM_M)])
     else:
         wanted = np.concatenate([[treads[-2] + 0.20], treads[-2::-1] - EDGE_M])
     crossing = run[first : last + 1] * (1 if up else -1)
@@ -235,7 +265,7 @@ def _first_foot(plan: Plan, course: Course, rng: np.random.Generator) -> str:
     ahead = (plan.prints["left"][-1].ground - plan.prints["right"][-1].ground)[:2] @ along
     if abs(ahead) > 0.1:
         return "right" if ahead > 0 else "left"
-    turn = wrap(float(course.at_phase("heading", 1.0)) - plan.heading)
+    turn = wrap(course.at_phase("heading", 1.0) - plan.heading)
     if abs(turn) > 0.2:
         return "left" if turn > 0 else "right"
     return SIDES[int(rng.random() < 0.5)]

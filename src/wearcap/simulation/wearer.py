@@ -1,7 +1,7 @@
 """The simulated wearer: activities are planned one after the other, then the whole body's motion follows at once."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
 from wearcap.geometry import rotation
 from wearcap.recording.motion import Motion
 from wearcap.simulation import hands, settle
@@ -30,6 +30,7 @@ __all__ = ["SimulatedMotion", "hands", "settle", "simulate_motion"]
 
 SPINE = ("l5", "l3", "t12", "t8")
 NECK_SHARE = 0.45
+TOUCH_M = 0.02
 
 
 @runtime_checkable
@@ -76,18 +77,27 @@ def simulate_motion(
     }
     trunk = trunk_motion(plan, feet, times, fps, rng)
     R_world_joint = _body(plan, feet, trunk, times, fps, rng)
-    contact = torch.from_numpy(np.concatenate([feet[side].contact for side in SIDES], 1))
     motion = Motion(
         timestamps=torch.from_numpy(times),
         skeleton=person.skeleton,
         R_parent_joint=local_rotations(person.skeleton, R_world_joint).float(),
         t_world_root=torch.from_numpy(trunk.pelvis).float(),
-        contact_prob=contact.float(),
         provenance={"source": "simulated wearer"},
     )
+    planted = torch.from_numpy(np.concatenate([feet[side].contact for side in SIDES], 1))
+    contact = planted & _over_floor(world, motion)
+    motion = replace(motion, contact_prob=contact.float())
     floor = np.mean([blur(feet[side].ground[:, 2], 0.1, fps) for side in SIDES], 0)
     labels = tuple(label for label in plan.labels if label.start_s < duration_s)
     return SimulatedMotion(motion, contact, torch.from_numpy(floor).float(), labels)
+
+
+def _over_floor(world: World, motion: Motion) -> Bool[Tensor, "time patch"]:
+    """Whether the floor is close beneath each patch: a heel or toes may stand over a stair's edge."""
+    sites = [motion.skeleton.sites[name] for name in FOOT_PATCHES]
+    patches = torch.stack([motion.joint(site.joint) @ torch.tensor(site.t_joint_site) for site in sites], 1)
+    points = patches.double().numpy()
+    return torch.from_numpy(points[..., 2] - world.floor_height(points[..., :2], points[..., 2]) < TOUCH_M)
 
 
 def _plan(
