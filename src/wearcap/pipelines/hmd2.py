@@ -14,6 +14,7 @@ from wearcap.body.hang import hang
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import HeadFeatures
 from wearcap.data.floor import floor_beneath
+from wearcap.data.prepare.check import MIN_DURATION_S
 from wearcap.diffusion.sampler import sample
 from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
@@ -141,13 +142,16 @@ class HMD2:
 def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
     """Step 1: the head joint's path at `fps`, and the floor beneath it.
 
-    Raises WearcapError when the recording has no head stream.
+    Raises WearcapError when the recording has no head stream, or hardly one.
     """
     if recording.head is None:
         raise WearcapError("no head poses in this recording", where=recording.name,
                            expected="a recording with a `head` stream")  # fmt: skip
-    skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
     head = recording.head
+    if head.timestamps[-1] - head.timestamps[0] < MIN_DURATION_S:
+        raise WearcapError(f"head poses of {len(head.timestamps)} frames", where=recording.name,
+                           expected=f"at least {MIN_DURATION_S} s")  # fmt: skip
+    skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
     T_world_head = head.T_world_head
     trajectory = Trajectory(head.timestamps, T_world_head.R, T_world_head.t)
     count = int((head.timestamps[-1] - head.timestamps[0]).item() * fps + 1e-3) + 1

@@ -50,7 +50,7 @@ class RecordingFile:
             raise WearcapError("no such recording", where=path) from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
             raise WearcapError(
-                f"not a readable recording ({error})", where=path, expected="a complete .safetensors file",
+                "not a readable recording", where=path, expected="a complete .safetensors file",
                 fix="Prepare this recording again.",
             ) from error  # fmt: skip
         metadata = self._file.metadata() or {}
