@@ -113,12 +113,12 @@ def test_deterministic_for_a_generator(stairs_flat, person):
 
 @pytest.mark.parametrize("activity", sorted(ACTIVITIES))
 def test_every_activity_finds_an_occasion_in_a_flat(activity, person):
-    done = 0
     for seed in range(4):
         world = build_flat(np.random.default_rng(seed), "flat", stairs=False)
-        simulated = simulate_motion(world, person, np.random.default_rng(seed), 20.0, 30.0, [activity])
-        assert len(simulated.motion) == 600
+        simulated = simulate_motion(world, person, np.random.default_rng(seed), 12.0, 30.0, [activity])
+        assert len(simulated.motion) == 360
         assert simulated.motion.T_world_joint.t.isfinite().all()
         assert below_floor(world, simulated.motion).max() < 0.005
-        done += activity in {label.name for label in simulated.labels}
-    assert done
+        if activity in {label.name for label in simulated.labels}:
+            return
+    pytest.fail("no occasion in four flats")

@@ -108,11 +108,11 @@ def _visible(
     in_cam = T_world_cam.inverse()[None] @ torch.from_numpy(points).float()
     pixels, valid = CAMERA.project(in_cam)
     depth = render(CAMERA, T_world_cam, [mesh]).depth
-    z = in_cam[:, 2].numpy()
+    z = np.asarray(in_cam[:, 2])
     column, row = pixels.nan_to_num(-1.0).round().long().unbind(-1)
     inside = valid.numpy() & (z > 0.2) & (z < range_m)
     inside &= ((column >= 0) & (column < CAMERA.width) & (row >= 0) & (row < CAMERA.height)).numpy()
-    inside &= ((T_world_cam.t.numpy() - points) * normals).sum(1) > 0
+    inside &= ((np.asarray(T_world_cam.t) - points) * normals).sum(1) > 0
     surface = np.full(len(points), -np.inf)
     surface[inside] = depth[row.numpy()[inside], column.numpy()[inside]]
     return inside & (z < surface * 1.03 + 0.05)

@@ -17,7 +17,8 @@ WOOD = (0.55, 0.40, 0.26)
 
 def wood(rng: np.random.Generator) -> tuple[float, float, float]:
     shade = rng.uniform(0.6, 1.35)
-    return tuple(min(shade * c, 1.0) for c in WOOD)
+    red, green, blue = (min(shade * c, 1.0) for c in WOOD)
+    return red, green, blue
 
 
 def chair(rng: np.random.Generator) -> Piece:

@@ -174,7 +174,8 @@ def _drop_distance(height: np.ndarray, cell: float) -> np.ndarray:
         gap = np.abs(height - floor[tuple(nearest)])
         deep = void & ~(np.nan_to_num(gap, nan=np.inf).min(0) < DROP_M)
         deep = np.pad(deep, 1, constant_values=True)
-        distance[layer] = (scipy.ndimage.distance_transform_edt(~deep)[1:-1, 1:-1] - 0.5) * cell
+        away = np.asarray(scipy.ndimage.distance_transform_edt(~deep))
+        distance[layer] = (away[1:-1, 1:-1] - 0.5) * cell
     return np.maximum(distance, 0.0)
 
 

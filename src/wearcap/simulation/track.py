@@ -112,4 +112,4 @@ def _cubic(coarse: np.ndarray, place: np.ndarray) -> np.ndarray:
     u = (place - low)[:, None]
     low = np.clip(low, 1, len(coarse) - 3)
     weights = ((1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3)
-    return sum(w * coarse[low + k - 1] for k, w in enumerate(weights)) / 6.0
+    return np.sum([w * coarse[low + k - 1] for k, w in enumerate(weights)], 0) / 6.0
