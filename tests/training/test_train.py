@@ -108,6 +108,22 @@ def test_killed_and_resumed_equals_straight_through(data, tmp_path):
     assert losses(resumed, "val/loss") == {step: loss for step, loss in validated.items() if step >= saved}
 
 
+@pytest.mark.slow
+def test_a_sweep_of_two_jobs_runs(data, tmp_path):
+    """The documented multirun through the joblib launcher: each job trains in a process and a folder of its own."""
+    command = [
+        argument for argument in arguments(data, tmp_path / "run") if not argument.startswith("hydra.run")
+    ]
+    script = Path(__file__).parents[2] / "train.py"
+    subprocess.run(
+        [sys.executable, script, "-m", *command, f"hydra.sweep.dir={tmp_path}/sweep", "seed=0,1",
+         "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], check=True, cwd=tmp_path,
+    )  # fmt: skip
+    trained = [losses(tmp_path / "sweep" / job) for job in ("0", "1")]
+    assert len(trained[0]) == len(trained[1]) == 4
+    assert trained[0] != trained[1]
+
+
 def _safe_losses(run: Path) -> dict[int, str]:
     return losses(run) if (run / "metrics.csv").is_file() else {}
 
