@@ -241,13 +241,7 @@ def test_a_full_disk_and_a_locked_folder(verb, fault, message, trained, tmp_path
         "evaluate": lambda: with_checkpoint("evaluate", checkpoint, out, "seeds=[0]", "baselines=false"),
         "capture": lambda: with_checkpoint("capture", checkpoint, out, f"recording={data}/r4", "body=false"),
         "export": lambda: with_checkpoint("export", checkpoint, out, "format=pt2", f"output={out}/d.pt2"),
-        "prepare": lambda: [
-            "prepare",
-            f"source={tmp_path}/source",
-            f"output={out}",
-            "jobs=1",
-            "bvh.up=z",
-        ],
+        "prepare": lambda: ["prepare", "cmu", f"source={tmp_path}/source", f"output={out}", "jobs=1"],
         "render": lambda: ["render", f"{data}/r4", "--out", f"{out}/a.png", "--sticks"],
     }[verb]()
 
