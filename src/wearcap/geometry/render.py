@@ -69,7 +69,7 @@ def render(
     meshes: Sequence[Mesh] = (),
     splats: Sequence[Splats] = (),
     *,
-    light: Light = Light(),  # noqa: B008 - frozen
+    light: Light = Light(),
     background: Float32[np.ndarray, "height 3"] | tuple[float, float, float] = (1.0, 1.0, 1.0),
     supersample: int = 1,
 ) -> Frame:

@@ -126,10 +126,10 @@ def contact_sheet(
     """
     shown = actors(motions, body)
     length = min(len(motion) for motion in motions.values())
-    if frames is None:
-        frames = np.linspace(0, length - 1, columns).round().astype(int).tolist()
-    if not len(frames) or max(frames) >= length or min(frames) < 0:
-        raise WearcapError(f"frames {list(frames)}", expected=f"some from 0 to {length - 1}")
+    spread = np.linspace(0, length - 1, columns).round().astype(int).tolist()
+    frames = spread if frames is None else list(frames)
+    if not frames or max(frames) >= length or min(frames) < 0:
+        raise WearcapError(f"frames {frames}", expected=f"some from 0 to {length - 1}")
     bands = [frames[start : start + columns] for start in range(0, len(frames), columns)]
     width, height = size
     sheet = Image.new("RGB", (width * min(columns, len(frames)), height * len(shown) * len(bands)), "white")

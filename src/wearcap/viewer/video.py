@@ -45,6 +45,7 @@ def write_video(
     clocks = [actor.motion.timestamps.numpy() for actor in shown]
     with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
         stream = container.add_stream(_codec(), rate=round(fps))
+        assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = size[0] * len(shown), size[1], "yuv420p"
         for time in track(
             times, f"video {Path(path).name}", console=Console(stderr=True), disable=not progress
