@@ -44,7 +44,7 @@ def pipeline() -> HMD2:
     features = HeadFeatures()
     net = MotionDenoiser(
         features.motion_size, features.condition_size, WINDOW, width=32, layers=1, heads=2, feedforward=64,
-        frames_per_token=2,
+        frames_per_token=2, blend=5,
     )  # fmt: skip
     for parameter in net.parameters():
         nn.init.normal_(parameter, std=0.05)

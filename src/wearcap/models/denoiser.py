@@ -43,11 +43,12 @@ class TemporalBlend(nn.Module):
         self, x: Float[Tensor, "batch time feature"], valid: Bool[Tensor, "batch time"]
     ) -> Float[Tensor, "batch time feature"]:
         kernel = self.weight.softmax(0)
-        half = len(kernel) // 2
         mask = valid.to(x.dtype)[..., None]
 
         def mixed(value: Tensor) -> Tensor:
-            return F.pad(value, (0, 0, half, half)).unfold(1, len(kernel), 1) @ kernel
+            rows = value.transpose(1, 2).flatten(0, 1)[:, None]
+            blended = F.conv1d(rows, kernel.to(rows.dtype)[None, None], padding=len(kernel) // 2)
+            return blended.view(x.shape[0], -1, x.shape[1]).transpose(1, 2)
 
         return mixed(x * mask) / mixed(mask).clamp_min(1e-3)
 
