@@ -19,20 +19,24 @@ Act = Callable[[Plan, World, np.random.Generator], bool]
 
 @dataclass(frozen=True)
 class Activity:
-    """`weight` is how often it is drawn among all."""
+    """`weight` is how often it is drawn among all, `outdoors` by how much more often in the open."""
 
     act: Act
     weight: float
+    outdoors: float = 1.0
 
+
+RUN_RISE_M = 0.02
+"""Between waypoints 0.1 m apart: one runs up a ramp, but over no step."""
 
 ACTIVITIES: dict[str, Activity] = {}
 
 
-def activity(name: str, weight: float) -> Callable[[Act], Act]:
+def activity(name: str, weight: float, outdoors: float = 1.0) -> Callable[[Act], Act]:
     """Enter a function into `ACTIVITIES`."""
 
     def enter(act: Act) -> Act:
-        ACTIVITIES[name] = Activity(act, weight)
+        ACTIVITIES[name] = Activity(act, weight, outdoors)
         return act
 
     return enter
@@ -97,17 +101,28 @@ def walk(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return approach(plan, world, rng, None)
 
 
-@activity("run", weight=1.0)
+@activity("run", weight=1.0, outdoors=3.0)
 def run(plan: Plan, world: World, rng: np.random.Generator) -> bool:
-    """Run a way of at least 5 m on one level; False where there is none."""
-    path = world.plan_path(plan.position, _free_point(world, rng), rng)
-    if path is None or _length(path) < 5.0 or np.ptp(path[:, 2]) > 0.02:
+    """Run a way of at least 5 m without a step; False where none is found."""
+    path = _way_to_run(plan, world, rng)
+    if path is None:
         return False
     start = plan.time
     walk_along(plan, path, rng, float(rng.uniform(2.2, 3.2)), ())
     look_about(plan, start + 1.0, plan.time, rng, spread=0.12, rest=2.2)
     plan.time += rng.uniform(0.25, 0.6)
     return True
+
+
+def _way_to_run(plan: Plan, world: World, rng: np.random.Generator, tries: int = 4) -> np.ndarray | None:
+    for _ in range(tries):
+        goal = _free_point(world, rng)
+        if np.linalg.norm(goal[:2] - plan.position[:2]) < 3.0:
+            continue
+        path = world.plan_path(plan.position, goal, rng)
+        if path is not None and _length(path) > 5.0 and np.abs(np.diff(path[:, 2])).max() < RUN_RISE_M:
+            return path
+    return None
 
 
 def approach(

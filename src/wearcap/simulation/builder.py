@@ -58,6 +58,7 @@ class WorldBuilder:
     name: str
     heading: float = 0.0
     shift: tuple[float, float] = (0.0, 0.0)
+    outdoors: bool = False
     objects: list[w.WorldObject] = field(default_factory=list)
     surfaces: list[w.Surface] = field(default_factory=list)
     seats: list[w.Seat] = field(default_factory=list)
@@ -93,6 +94,12 @@ class WorldBuilder:
         low, high = (np.full((sides, 1), center[2] + side * size[2] / 2) for side in (-1, 1))
         vertices = np.concatenate([np.concatenate([ring, low], 1), np.concatenate([ring, high], 1)])
         self.add_triangles(vertices, _BOX_FACES if sides == 4 else _prism_faces(sides), color, texture, item)
+
+    def add_prism(
+        self, vertices: Float[np.ndarray, "corner 3"], color, texture: float, item: int = -1
+    ) -> None:
+        """A solid between a lower ring of corners and the upper one that follows it, both counter-clockwise."""
+        self.add_triangles(vertices, _prism_faces(len(vertices) // 2), color, texture, item)
 
     def add_surface(
         self,
@@ -192,7 +199,7 @@ class WorldBuilder:
             self.name, mesh, np.repeat([t[4] for t in self._triangles], face_counts),
             np.repeat(np.array([t[3] for t in self._triangles], np.float64), face_counts),
             tuple(self.objects), tuple(self.surfaces), seats, reaches, tuple(self.flights), tuple(self.rooms),
-            tuple(self.doors), cell,
+            tuple(self.doors), cell, self.outdoors,
         )  # fmt: skip
 
 

@@ -248,6 +248,76 @@ def bin_(rng: np.random.Generator) -> Piece:
     return Piece("bin", (size, size), (0.0, height), (part,), reaches=((size / 2 - 0.05, 0.0, height),))
 
 
+def low_wall(rng: np.random.Generator) -> Piece:
+    """To sit on or walk around; its front is a long side."""
+    depth, width, height = rng.uniform(0.36, 0.45), rng.uniform(1.4, 2.6), rng.uniform(0.42, 0.47)
+    parts = (
+        Part(
+            (0, 0, height / 2 - 0.03), (depth - 0.06, width - 0.06, height - 0.06), (0.55, 0.42, 0.36), 20.0
+        ),
+        Part((0, 0, height - 0.03), (depth, width, 0.06), (0.70, 0.69, 0.66), 12.0),
+    )
+    seat = (depth / 2 - 0.22, float(rng.uniform(-0.25, 0.25)) * width, height, 0.0, 0.22)
+    return Piece("low_wall", (depth, width), (0.0, height), parts, seats=(seat,))
+
+
+def planter(rng: np.random.Generator) -> Piece:
+    depth, width, height = rng.uniform(0.5, 0.8), rng.uniform(0.8, 1.6), rng.uniform(0.45, 0.7)
+    green, tall = (0.2, rng.uniform(0.4, 0.6), 0.2), rng.uniform(0.25, 0.6)
+    parts = (
+        Part((0, 0, height / 2), (depth, width, height), (0.62, 0.60, 0.57), 10.0),
+        Part((0, 0, height + tall / 2), (depth - 0.1, width - 0.1, tall), green, PATTERNED),
+    )
+    return Piece("planter", (depth, width), (0.0, height + tall), parts)
+
+
+def bollard(rng: np.random.Generator) -> Piece:
+    thick, height = rng.uniform(0.10, 0.18), rng.uniform(0.85, 1.05)
+    parts = (
+        Part((0, 0, height / 2), (thick, 0, height), (0.22, 0.24, 0.26), 10.0, 8),
+        Part((0, 0, height - 0.12), (thick + 0.01, 0, 0.08), (0.85, 0.85, 0.8), PATTERNED, 8),
+    )
+    return Piece("bollard", (thick, thick), (0.0, height), parts)
+
+
+def board(rng: np.random.Generator) -> Piece:
+    """A notice or map on two posts, pointed at from the front."""
+    width, low, tall = rng.uniform(0.9, 1.4), rng.uniform(0.85, 1.0), rng.uniform(0.7, 1.0)
+    posts = [
+        Part((-0.03, side * (width / 2 - 0.06), (low + tall) / 2), (0.06, 0.06, low + tall), (0.3, 0.3, 0.32), 8.0)
+        for side in (-1, 1)
+    ]  # fmt: skip
+    sheet = Part((0.02, 0, low + tall / 2), (0.04, width, tall), hue(rng, (0.05, 0.4)), 3 * PATTERNED)
+    reaches = tuple((0.04, float(y), low + rng.uniform(0.15, 0.9) * tall) for y in (-0.2, 0.1, 0.3))
+    return Piece("board", (0.12, width), (0.0, low + tall), (*posts, sheet), reaches=reaches)
+
+
+def letter_box(rng: np.random.Generator) -> Piece:
+    color, slot = hue(rng, (0.7, 0.9)), rng.uniform(1.15, 1.35)
+    parts = (
+        Part((0, 0, 0.4), (0.12, 0.12, 0.8), (0.3, 0.3, 0.3), PLAIN),
+        Part((0, 0, 1.15), (0.32, 0.42, 0.75), color, 12.0),
+        Part((0.165, 0, slot), (0.02, 0.28, 0.05), (0.1, 0.1, 0.1), 3 * PATTERNED),
+    )
+    return Piece("letter_box", (0.34, 0.42), (0.0, 1.53), parts, reaches=((0.17, 0.0, slot),))
+
+
+def car(rng: np.random.Generator) -> Piece:
+    """Parked; its front is the bonnet."""
+    length, width, color = rng.uniform(3.8, 4.5), rng.uniform(1.68, 1.80), hue(rng, (0.0, 0.8))
+    cabin = 0.52 * length
+    parts = [
+        Part((0, 0, 0.52), (length, width, 0.55), color, 5.0),
+        Part((-0.06 * length, 0, 1.10), (cabin, width - 0.22, 0.60), (0.12, 0.14, 0.17), 8.0),
+        Part((-0.06 * length, 0, 1.43), (cabin - 0.1, width - 0.26, 0.06), color, PLAIN),
+        *(Part((x * 0.32 * length, y * (width / 2 - 0.1), 0.31), (0.60, 0.21, 0.60), (0.08, 0.08, 0.08), 20.0)
+          for x in (-1, 1) for y in (-1, 1)),
+        *(Part((length / 2, y * (width / 2 - 0.25), 0.65), (0.04, 0.35, 0.14), (0.9, 0.9, 0.85), 60.0)
+          for y in (-1, 1)),
+    ]  # fmt: skip
+    return Piece("car", (length, width), (0.0, 1.46), tuple(parts))
+
+
 def _legs(depth: float, width: float, height: float, thick: float, color) -> list[Part]:
     return [
         Part((x * (depth - thick) / 2, y * (width - thick) / 2, height / 2), (thick, thick, height), color, 8.0)
@@ -273,5 +343,6 @@ MAKERS: dict[str, Callable[[np.random.Generator], Piece]] = {
     "chair": chair, "armchair": armchair, "sofa": sofa, "bed": bed, "table": table, "desk": desk,
     "coffee_table": coffee_table, "shelf": shelf, "wardrobe": wardrobe, "cabinet": cabinet, "counter": counter,
     "plant": plant, "lamp": lamp, "bench": bench, "tree": tree, "bush": bush, "street_lamp": street_lamp,
-    "bin": bin_,
+    "bin": bin_, "low_wall": low_wall, "planter": planter, "bollard": bollard, "board": board,
+    "letter_box": letter_box, "car": car,
 }  # fmt: skip

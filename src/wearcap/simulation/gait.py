@@ -1,12 +1,13 @@
 """Feet from footprints: planted soles that roll about heel and ball, swings between them, and who bears the load."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from wearcap.body.skeleton import Skeleton
-from wearcap.simulation.plan import Footprint
+from wearcap.simulation.plan import Footprint, step_rise
 from wearcap.simulation.track import Track, ease, hermite
 
 ROLL_DOWN_S = 0.13
@@ -70,7 +71,8 @@ def foot_motion(
     at = _Timeline(prints, times)
     roll, bend = _roll(at, heel_lift.sample(times)[:, 0])
     share = at.swing_share
-    rise = at.mix("height", np.ones_like(share)) - at["height"]
+    rise = at["step"]
+    slope = at.mix("height", np.ones_like(share)) - at["height"] - rise
     moved = advance(share, rise)
     turned = ease(share)
     pivot_x, pivot_z = _pivot(at, roll, turned, shape)
@@ -82,7 +84,7 @@ def foot_motion(
     tilt = at.mix("tilt", turned)
     heading = at.mix("heading", turned)
     ground = at.mix("ground", moved[:, None])
-    ground[:, 2] = at.mix("height", climb(rise, share))
+    ground[:, 2] = at["height"] + slope * moved + rise * climb(rise, share)
     outward = at.bow * bump(share)
     cos, sin = np.cos(heading), np.sin(heading)
     ground[:, 0] -= outward * sin
@@ -117,6 +119,7 @@ class _Timeline:
         }
         columns["ground"] = np.stack([p.ground for p in prints])
         columns["height"] = columns["ground"][:, 2]
+        columns["step"] = np.array([step_rise(a, b) for a, b in pairwise(prints)] + [0.0])
         self._columns = columns
         self.now = np.clip(np.searchsorted(columns["land_s"], times, side="right") - 1, 0, None)
         self.next = np.minimum(self.now + 1, len(prints) - 1)

@@ -11,6 +11,10 @@ from wearcap.simulation.track import Track
 
 SIDES = ("left", "right")
 LEFT_SIGN = {"left": 1.0, "right": -1.0}
+STEEPEST = 0.2
+"""A foot adapts to slopes below this, and stands level on what is steeper (a step's edge)."""
+STEP_M = 0.05
+"""Rises from print to print beyond what their slopes say count as steps from this on."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,19 @@ class Footprint:
     bow: float = 0.0
     """Outward deviation of that swing from the straight line (m)."""
     running: bool = False
+
+
+def step_rise(old: Footprint, new: Footprint) -> float:
+    """How much a new print lies above an old one (m) beyond the slope on which both stand: a step, kerb or stair."""
+    rise = float(new.ground[2] - old.ground[2])
+    if old.tilt == new.tilt == 0.0:
+        return rise
+    way = (new.ground - old.ground)[:2]
+    slopes = (
+        -np.tan(p.tilt) * (way @ np.array([np.cos(p.heading), np.sin(p.heading)])) / 2 for p in (old, new)
+    )
+    rest = rise - sum(slopes)
+    return rest if abs(rest) > STEP_M else 0.0
 
 
 @dataclass
@@ -87,15 +104,25 @@ class Plan:
         ground = np.array(center, np.float64)
         ground[:2] += sign * half_width * np.array([-np.sin(heading), np.cos(heading)])
         foot_heading = heading + sign * self.style.toe_out
-        ahead = 0.10 * np.array([np.cos(foot_heading), np.sin(foot_heading)])
-        under = np.stack([ground[:2], ground[:2] + ahead, ground[:2] - 0.4 * ahead])
+        ahead = np.array([np.cos(foot_heading), np.sin(foot_heading)])
+        heel, tip = self.sole
+        under = ground[:2] + np.array([0.0, heel, tip])[:, None] * ahead
         heights = self.floor_height(under, np.full(3, ground[2]))
         tilt = 0.0
         if np.isfinite(heights[0]):
             ground[2] = heights[0]
-            fall = (heights[2] - heights[1]) / 0.14
-            tilt = float(np.arctan(fall)) if abs(fall) < 0.2 else 0.0
+            slope = (heights[2] - heights[1]) / (tip - heel)
+            if abs(slope) < STEEPEST:  # a slope, not an edge; on its bend the sole bridges heel and toes
+                tilt = float(-np.arctan(slope))
+                ground[2] = heights[1] - heel * slope
         return Footprint(ground, foot_heading, tilt, **how)
+
+    @property
+    def sole(self) -> tuple[float, float]:
+        """How far heel and tip of the toes are ahead of the ankle (m)."""
+        toe, sites = self.skeleton.index("left_toe"), self.skeleton.sites
+        ball = float(self.skeleton.t_parent_joint[toe, 0])
+        return sites["left_heel"].t_joint_site[0], ball + sites["left_toe_tip"].t_joint_site[0]
 
     def step(self, side: str, lift_s: float, land_s: float, lift_pitch: float, print_: Footprint) -> None:
         """Lift a foot and put it down on a new print; `time` becomes the moment of landing."""

@@ -5,23 +5,34 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.errors import WearcapError
 from wearcap.recording.recording import ContactTrack, FloorTrack, PointCloud, Recording
 from wearcap.sensors.head import SlamNoise, head_stream
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.slam import semidense_points
 from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.flat import build_flat
+from wearcap.simulation.outdoor import build_outdoor
 from wearcap.simulation.person import Person, draw_person
 from wearcap.simulation.wearer import SimulatedMotion, simulate_motion
 from wearcap.simulation.world import World
 
 POOLS = {"train": (200, 150), "val": (20, 15), "test": (40, 30)}
-"""People and places of each split: (subjects, locations); no split shares any with another."""
+"""People and places of each split: (subjects, locations of each kind); no split shares any with another."""
+
+WORLDS = {"flat": (2, build_flat), "outdoor": (3, build_outdoor)}
+"""Kinds of surroundings: a number for their seeds, and their builder."""
+
+OUTDOOR_SHARE = 0.3
 
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """What to simulate. `activities` names entries of `simulation.actions.ACTIVITIES`; None draws from all."""
+    """What to simulate. `activities` names entries of `simulation.actions.ACTIVITIES`; None draws from all.
+
+    `world` is "flat", "outdoor" or None: drawn for each recording, three in ten outdoors. Raises WearcapError for
+    another.
+    """
 
     duration_s: float = 120.0
     fps: float = 60.0
@@ -32,6 +43,13 @@ class SimulationConfig:
     imu_noise: ImuNoise | None = field(default_factory=ImuNoise)
     suit: SuitNoise | None = field(default_factory=SuitNoise)
     """None: no suit is worn."""
+    world: str | None = None
+
+    def __post_init__(self):
+        if self.world is not None and self.world not in WORLDS:
+            raise WearcapError(
+                f"no world {self.world!r}", expected=f"{' or '.join(WORLDS)}, or null to draw one"
+            )
 
 
 def simulate_recording(config: SimulationConfig, name: str, split: str, seed: int) -> Recording:
@@ -39,7 +57,8 @@ def simulate_recording(config: SimulationConfig, name: str, split: str, seed: in
     rng = np.random.default_rng([seed, sum(map(ord, split))])
     subjects, locations = POOLS[split]
     person = person_of(split, int(rng.integers(subjects)))
-    world = world_of(split, int(rng.integers(locations)))
+    number, kind = int(rng.integers(locations)), "outdoor" if rng.uniform() < OUTDOOR_SHARE else "flat"
+    world = world_of(split, number, config.world or kind)
     activities = list(config.activities) if config.activities else None
     simulated = simulate_motion(world, person, rng, config.duration_s, config.fps, activities)
     return sense(config, name, world, person, simulated, rng)
@@ -52,10 +71,11 @@ def person_of(split: str, number: int) -> Person:
     )
 
 
-def world_of(split: str, number: int) -> World:
-    """A split's place by number, always the same."""
-    rng = np.random.default_rng([2, sum(map(ord, split)), number])
-    return build_flat(rng, f"sim-{split}-flat-{number:03d}")
+def world_of(split: str, number: int, kind: str = "flat") -> World:
+    """A split's place of a kind (`WORLDS`) by number, always the same."""
+    salt, build = WORLDS[kind]
+    rng = np.random.default_rng([salt, sum(map(ord, split)), number])
+    return build(rng, f"sim-{split}-{kind}-{number:03d}")
 
 
 def sense(

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from wearcap.simulation.gait import advance, bump, climb
-from wearcap.simulation.plan import LEFT_SIGN, SIDES, Footprint, Plan, wrap
+from wearcap.simulation.plan import LEFT_SIGN, SIDES, STEP_M, Footprint, Plan, step_rise, wrap
 from wearcap.simulation.track import blur
 
 SPACING_M = 0.02
@@ -20,6 +20,9 @@ CURVE_SPEED = 0.95
 """Speed (m/s) in a curve of radius 1 m, for a wearer whose own speed is 1.3 m/s (two-thirds power law)."""
 HEEL_ROOM_M, TOE_ROOM_M, EDGE_M = 0.055, 0.015, 0.08
 """On treads: heel behind the ankle, toes before the next riser, and, going down, the ankle past the edge."""
+
+PAST_KERB_M = 0.16
+"""Where the ankle of the foot that steps over a kerb's edge stands beyond it."""
 
 
 @dataclass(frozen=True)
@@ -89,13 +92,13 @@ def _walk_step(
     lift = max(lift, old.land_s + 0.16)
     stride = float(np.linalg.norm((print_.ground - old.ground)[:2]))
     size = min(stride / 1.35, 1.15) * plan.style.heel_rise
-    rise = print_.ground[2] - old.ground[2]
+    rise = step_rise(old, print_)
     lift_pitch, land_pitch, clearance = 0.95 * size, -0.44 * size, 0.02
     if speed > RUN_SPEED:
         lift_pitch, land_pitch, clearance = 0.85, -0.10, 0.10
-    if rise > 0.05:
+    if rise > STEP_M:
         lift_pitch, land_pitch, clearance = 0.55, 0.06, 0.05
-    elif rise < -0.05:
+    elif rise < -STEP_M:
         lift_pitch, land_pitch, clearance = 0.60, 0.22, 0.03
     elif stride < 0.45:
         clearance = 0.03
@@ -108,24 +111,23 @@ def _walk_step(
 
 
 def _over_corner(plan: Plan, old: Footprint, new: Footprint) -> float:
-    """Height (m) to which a swing must lift the foot to clear a step whose corner it cuts; 0 going down."""
-    rise = new.ground[2] - old.ground[2]
-    if rise < -0.05:
+    """Height (m) to which a swing must lift the foot to clear a step or crest whose corner it cuts; 0 going down."""
+    rise = step_rise(old, new)
+    if rise < -STEP_M:
         return 0.0
     share = np.linspace(0.15, 0.8, 14)
-    ankle = old.ground + advance(share, np.array(rise))[:, None] * (new.ground - old.ground)
+    moved = advance(share, np.array(rise))
+    ankle = old.ground + moved[:, None] * (new.ground - old.ground)
     heading = old.heading + share * wrap(new.heading - old.heading)
-    toes = ankle[:, :2] + foot_length(plan) * np.stack([np.cos(heading), np.sin(heading)], 1)
+    toes = ankle[:, :2] + plan.sole[1] * np.stack([np.cos(heading), np.sin(heading)], 1)
     floor = plan.floor_height(toes, np.full(len(share), max(old.ground[2], new.ground[2])))
-    need = np.nan_to_num(floor - old.ground[2] - rise * climb(np.array(rise), share), nan=0.0)
-    need = np.where(need > 0.05, (need + 0.02) / bump(share), 0.0)
+    line = (
+        old.ground[2] + (new.ground[2] - old.ground[2] - rise) * moved + rise * climb(np.array(rise), share)
+    )
+    need = np.nan_to_num(floor - line, nan=0.0)
+    least = STEP_M if rise > STEP_M else 0.002
+    need = np.where(need > least, (need + 0.02) / bump(share), 0.0)
     return float(min(need.max(), 0.35))
-
-
-def foot_length(plan: Plan) -> float:
-    """How far the toes are ahead of the ankle (m)."""
-    toe, tip = plan.skeleton.index("left_toe"), plan.skeleton.sites["left_toe_tip"].t_joint_site
-    return float(plan.skeleton.t_parent_joint[toe, 0]) + tip[0]
 
 
 def _course_print(
@@ -154,7 +156,7 @@ def plan_course(plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float,
     curvature = blur(np.abs(np.gradient(heading, SPACING_M)), 0.15, 1 / SPACING_M)
     pace = speed / 1.3 if speed < RUN_SPEED else 1.5
     limit = np.minimum(speed, CURVE_SPEED * pace * np.maximum(curvature, 0.05) ** (-1 / 3))
-    foot = foot_length(plan)
+    foot = plan.sole[1]
     anchors = [anchor for flight in flights for anchor in _tread_anchors(points, flight, foot)]
     anchors = sorted(anchors, key=lambda anchor: anchor[0])
     stairs = np.zeros(len(points))
@@ -212,7 +214,9 @@ def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float,
     first, last = np.flatnonzero(inside)[[0, -1]]
     up = run[last] > run[first]
     treads = np.arange(flight.steps + 1) * flight.tread
-    if up:
+    if flight.steps == 1:
+        wanted = np.array([PAST_KERB_M if up else -PAST_KERB_M])
+    elif up:
         wanted = np.concatenate([[-0.29], treads[:-1] + min(HEEL_ROOM_M, flight.tread - foot - TOE_ROOM_M)])
     else:
         wanted = np.concatenate([[treads[-2] + 0.20], treads[-2::-1] - EDGE_M])

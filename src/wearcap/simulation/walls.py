@@ -118,7 +118,7 @@ def _pictures(builder: WorldBuilder, wall: Wall, openings: list, side: int, rng:
 
 def build_flight(
     builder: WorldBuilder, start: tuple[float, float], direction: float, steps: int, rise: float, tread: float,
-    width: float, base_z: float, railings: tuple[int, ...],
+    width: float, base_z: float, railings: tuple[int, ...], color: tuple = (0.5, 0.425, 0.35),
 ) -> w.Flight:  # fmt: skip
     """Steps as surfaces and solid boxes; a railing on each side named (+1 left of going up, -1 right)."""
     cos, sin = np.cos(direction), np.sin(direction)
@@ -126,8 +126,8 @@ def build_flight(
     for step in range(1, steps):
         middle, top = on_line((step - 0.5) * tread, 0.0), base_z + step * rise
         outline = rectangle(middle, (tread, width), direction)
-        shade = 0.5 + 0.08 * (step % 2)
-        builder.add_surface("stairs_step", outline, (shade, shade * 0.85, shade * 0.7), plane=(0.0, 0.0, top),
+        shade = 1.0 + 0.16 * (step % 2)
+        builder.add_surface("stairs_step", outline, tuple(shade * c for c in color), plane=(0.0, 0.0, top),
                             texture=8.0, thickness=step * rise)  # fmt: skip
         for side in railings:
             _rail(

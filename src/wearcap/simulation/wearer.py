@@ -109,7 +109,9 @@ def _plan(
 ) -> Plan:
     position, heading = start_place(world, rng)
     plan = Plan(person.skeleton, person.style, position, heading, world.floor_height)
-    weights = np.array([activity.weight for activity in ACTIVITIES.values()])
+    weights = np.array(
+        [activity.weight * (activity.outdoors if world.outdoors else 1.0) for activity in ACTIVITIES.values()]
+    )
     names, turn = list(ACTIVITIES), 0
     while plan.time < duration_s:
         if activities is not None:

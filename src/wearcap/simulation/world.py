@@ -105,7 +105,7 @@ class ReachTarget:
 class Flight:
     """Straight stairs: step k = 1 … steps rises to base_z + k · rise; the last step is the upper floor itself.
 
-    Step k < steps covers [(k − 1) · tread, k · tread] along `direction` from `start`.
+    With a single step it is a place at which a kerb is crossed. Step k < steps covers [(k − 1) · tread, k · tread] along `direction` from `start`.
     """
 
     start: tuple[float, float]
@@ -162,6 +162,7 @@ class World:
     doors: tuple[Door, ...] = ()
     cell: float = 0.1
     """Side of a cell of the planning grid (m)."""
+    outdoors: bool = False
 
     def floor_height(
         self, points_xy: Float[np.ndarray, "*batch 2"], near_z: Float[np.ndarray, "*batch"]

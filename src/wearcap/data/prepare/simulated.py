@@ -28,15 +28,15 @@ class Simulated:
 
 def simulated_tasks(
     splits: Splits, recordings: dict[str, int], duration_s: float | int, fps: float | int, points: bool,
-    activities: list[str] | None, seed: int,
+    activities: list[str] | None, seed: int, world: str | None = None,
 ) -> list[Task]:  # fmt: skip
     """`recordings[split]` recordings of `duration_s` each; people and places of the splits never meet.
 
     The hash covers the simulator's own source, so that a better simulator makes its recordings again.
-    Raises WearcapError for an unknown split, or when a simulated person's name belongs to another split's list.
+    `world` is "flat", "outdoor" or None (drawn). Raises WearcapError for an unknown split or world, or when a simulated person's name belongs to another split's list.
     """
     config = SimulationConfig(duration_s=float(duration_s), fps=float(fps), points=points,
-                              activities=tuple(activities) if activities else None)  # fmt: skip
+                              activities=tuple(activities) if activities else None, world=world)  # fmt: skip
     if not config.duration_s > 0 or not config.fps > 0:
         raise WearcapError(f"recordings of {duration_s} s at {fps} Hz", expected="positive numbers")
     if unknown := set(recordings) - set(SPLITS):
