@@ -134,7 +134,7 @@ def _build_ground(builder: WorldBuilder, layout: Layout, rng: np.random.Generato
         slab(builder, "kerb", (a, street, b, street + KERB_STONE_M), kerb, kerb, STONE, 12.0)
     slab(builder, "floor", (0.0, inner, width, layout.pavement), kerb, kerb, paving, 6.0)
     square = (0.0, layout.pavement, width, layout.depth)
-    slab(builder, "floor", square, kerb, kerb, hue(rng, (0.05, 0.25)), 5.0)
+    slab(builder, "floor", square, kerb, kerb, _earthy(rng), 5.0)
     center = (width / 2, layout.depth / 2, -0.11)
     builder.add_box(center, (width + 24.0, layout.depth + 24.0, 0.1), (0.42, 0.52, 0.32), 1.0)
     for name, low, high, z in (
@@ -143,6 +143,12 @@ def _build_ground(builder: WorldBuilder, layout: Layout, rng: np.random.Generato
     ):  # fmt: skip
         corners = np.array([[0.0, low], [width, low], [width, high], [0.0, high]])
         builder.rooms.append(Room(name, builder.to_world(corners), z))
+
+
+def _earthy(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Gravel, clinker or flagstones."""
+    warm, light = rng.uniform(0.0, 0.16), rng.uniform(0.45, 0.75)
+    return light * (1.0 + warm), light, light * (1.0 - warm)
 
 
 def _build_terrace(builder: WorldBuilder, layout: Layout) -> None:

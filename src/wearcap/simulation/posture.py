@@ -10,7 +10,7 @@ from torch import Tensor
 from wearcap.geometry import rotation
 from wearcap.simulation.gait import FootMotion, load_on_left
 from wearcap.simulation.plan import SIDES, Plan
-from wearcap.simulation.track import blur, lower_envelope, pendulum, wander
+from wearcap.simulation.track import blur, falling_at_most, lower_envelope, pendulum, wander
 
 GRAVITY = 9.81
 ENVELOPE_S = 0.06
@@ -140,4 +140,5 @@ def _height(
     high, level = lower_envelope(limit, ENVELOPE_S, fps), lower_envelope(limit, STEP_ENVELOPE_S, fps)
     apart = np.abs(feet["left"].ground[:, 2] - feet["right"].ground[:, 2])
     stairs = blur(np.clip(apart / STAIR_APART_M, 0.0, 1.0), 0.25, fps)
-    return high + (LEVELLED * moving + (STAIRS_LEVELLED - LEVELLED * moving) * stairs) * (level - high)
+    share = LEVELLED * moving + (STAIRS_LEVELLED - LEVELLED * moving) * stairs
+    return blur(falling_at_most(high + share * (level - high), GRAVITY, fps), 0.02, fps)

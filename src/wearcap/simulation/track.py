@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.ndimage
 import scipy.signal
+import scipy.spatial
 from jaxtyping import Float
 
 
@@ -76,6 +77,23 @@ def lower_envelope(
     lowest = scipy.ndimage.minimum_filter1d(signal, 2 * half + 1, mode="nearest")
     kernel = np.convolve(np.hanning(half + 3)[1:-1], np.hanning(half + 3)[1:-1])
     return scipy.ndimage.convolve1d(lowest, kernel / kernel.sum(), mode="nearest")
+
+
+def falling_at_most(
+    signal: Float[np.ndarray, "time"], acceleration: float, fps: float
+) -> Float[np.ndarray, "time"]:
+    """The highest curve that nowhere exceeds the signal and never curves down by more than `acceleration` (per s²).
+
+    With acceleration · t² / 2 added, such a curve is convex: it is the lower convex hull of the signal so raised.
+    """
+    if len(signal) < 3:
+        return signal
+    time = (np.arange(len(signal)) - len(signal) / 2) / fps
+    raised = signal + 0.5 * acceleration * time**2
+    corners = scipy.spatial.ConvexHull(np.stack([time, raised], 1)).vertices  # counter-clockwise
+    below = np.roll(corners, -int(corners.argmin()))
+    below = below[: int(below.argmax()) + 1]
+    return np.interp(time, time[below], raised[below]) - 0.5 * acceleration * time**2
 
 
 def pendulum(
