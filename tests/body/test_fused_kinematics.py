@@ -1,8 +1,12 @@
 """Fused forward kinematics: equal to the level version, its gradient to finite differences."""
 
+import multiprocessing
+import sys
+
 import pytest
 import torch
 
+from wearcap.body import fused_kinematics
 from wearcap.body.fused_kinematics import can_fuse, fused_forward_kinematics
 from wearcap.body.kinematics import forward_kinematics, level_forward_kinematics, local_rotations
 from wearcap.body.skeletons import skeleton_by_name
@@ -19,7 +23,7 @@ def sample(skeleton, batch, dtype, per_sample_offsets=False):
 
 
 @pytest.mark.parametrize("name", ["xsens23", "smplh52"])
-@pytest.mark.parametrize("batch", [(), (5,), (2, 3), (0,)])
+@pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3), (0,)])
 @pytest.mark.parametrize("per_sample", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_equals_the_level_version(name, batch, per_sample, dtype):
@@ -52,7 +56,8 @@ def test_gradient_equals_the_level_versions_for_strided_inputs():
 
 
 @pytest.mark.parametrize("per_sample", [False, True])
-def test_threads_share_the_work_exactly(per_sample):
+def test_threads_share_the_work_exactly(per_sample, monkeypatch):
+    monkeypatch.setattr(fused_kinematics, "_WORTH_THREADS", 1)
     skeleton = skeleton_by_name("xsens23")
     inputs = sample(skeleton, (1501,), torch.float32, per_sample)
     threads, results = torch.get_num_threads(), []
@@ -66,6 +71,35 @@ def test_threads_share_the_work_exactly(per_sample):
         torch.set_num_threads(threads)
     for one, three in zip(*results):
         torch.testing.assert_close(one, three, atol=0, rtol=1e-5)
+
+
+def joints_in_threads(inputs, results):
+    results.put(fused_forward_kinematics(*inputs)[1].sum().item())
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs fork")
+def test_a_forked_process_has_threads_of_its_own(monkeypatch):
+    """Loader workers are forked after the parent has used its threads."""
+    monkeypatch.setattr(fused_kinematics, "_WORTH_THREADS", 1)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    skeleton = skeleton_by_name("xsens23")
+    inputs = skeleton, *sample(skeleton, (9,), torch.float64)
+    expected = fused_forward_kinematics(*inputs)[1].sum().item()
+    context = multiprocessing.get_context("fork")
+    results = context.SimpleQueue()
+    child = context.Process(target=joints_in_threads, args=(inputs, results))
+    child.start()
+    child.join(60)
+    assert child.exitcode == 0
+    assert results.get() == pytest.approx(expected)
+
+
+def test_what_does_not_fit_is_refused():
+    skeleton = skeleton_by_name("xsens23")
+    R, t, offsets = sample(skeleton, (4,), torch.float32)
+    for wrong in ((R[:, 1:], t, offsets), (R, t[:3], offsets), (R, t, offsets[1:])):
+        with pytest.raises((RuntimeError, TypeError)):
+            fused_forward_kinematics(skeleton, *wrong)
 
 
 def test_unused_outputs_and_repeated_backward():

@@ -18,7 +18,7 @@ from torch import Tensor
 from wearcap.body import kinematics_kernels
 from wearcap.body.skeleton import Skeleton
 
-_WORTH_THREADS = 1 << 14
+_WORTH_THREADS = 1 << 16
 """Joints of all samples together from which another thread saves more than it costs."""
 
 
