@@ -44,7 +44,7 @@ def _address(context, builder, array_type, array, index, vector=True):
 
 @intrinsic
 def load(typingctx, array, index):
-    """Array[index : index + 4]."""
+    """The four numbers array[index : index + 4]."""
 
     def codegen(context, builder, signature, args):
         address = _address(context, builder, signature.args[0], *args)
@@ -55,7 +55,7 @@ def load(typingctx, array, index):
 
 @intrinsic
 def store(typingctx, array, index, lanes):
-    """array[index : index + 4] = lanes."""
+    """Put the lanes to array[index : index + 4]."""
 
     def codegen(context, builder, signature, args):
         address = _address(context, builder, signature.args[0], *args[:2])
@@ -67,7 +67,7 @@ def store(typingctx, array, index, lanes):
 
 @intrinsic
 def spread(typingctx, array, index):
-    """array[index] in all four lanes."""
+    """The number array[index] in all four lanes."""
 
     def codegen(context, builder, signature, args):
         number = builder.load(_address(context, builder, signature.args[0], *args, vector=False))
@@ -91,7 +91,7 @@ def shuffle(typingctx, low, high, a, b, c, d):
 
 @intrinsic(prefer_literal=True)
 def store_lane(typingctx, array, index, lanes, which):
-    """array[index] = the lane of that literal number."""
+    """Put the lane of that literal number to array[index]."""
 
     def codegen(context, builder, signature, args):
         address = _address(context, builder, signature.args[0], *args[:2], vector=False)
@@ -136,48 +136,49 @@ def plus_times(typingctx, total, a, b):
 
 @compiled
 def load_rows(array, index):
-    """Rows of the 3x3 matrix at array[index:]; lane 3 is whatever."""
+    """Rows of the 3x3 matrix at array[index]; lane 3 is whatever stands there."""
     last = load(array, index + 5)
     return load(array, index), load(array, index + 3), shuffle(last, last, 1, 2, 3, 3)
 
 
 @compiled
-def store_rows(array, index, x, y, z):
-    """Lanes 0..2 of three rows to the 3x3 matrix at array[index:]; each row's lane 3 gives way to the next row."""
-    store(array, index, x)
-    store(array, index + 3, y)
-    store(array, index + 5, shuffle(y, z, 2, 4, 5, 6))
+def store_rows(array, index, rows):
+    """Put lanes 0..2 of three rows to the 3x3 matrix at array[index]; a row's lane 3 gives way to the next row."""
+    store(array, index, rows[0])
+    store(array, index + 3, rows[1])
+    store(array, index + 5, shuffle(rows[1], rows[2], 2, 4, 5, 6))
 
 
 @compiled
 def with_last(rows, array, index):
-    """The rows with array[index : index + 3] in lane 3."""
-    x, y, z = rows
+    """The rows with the vector at array[index] in lane 3."""
     return (
-        shuffle(x, spread(array, index), 0, 1, 2, 7),
-        shuffle(y, spread(array, index + 1), 0, 1, 2, 7),
-        shuffle(z, spread(array, index + 2), 0, 1, 2, 7),
+        shuffle(rows[0], spread(array, index), 0, 1, 2, 7),
+        shuffle(rows[1], spread(array, index + 1), 0, 1, 2, 7),
+        shuffle(rows[2], spread(array, index + 2), 0, 1, 2, 7),
     )
 
 
 @compiled
 def store_last(array, index, rows):
-    """array[index : index + 3] = the rows' lanes 3."""
+    """Put the rows' lanes 3 to the vector at array[index]."""
     store_lane(array, index, rows[0], 3)
     store_lane(array, index + 1, rows[1], 3)
     store_lane(array, index + 2, rows[2], 3)
 
 
 @compiled
-def store_last_added(array, index, rows, base, at):
-    """array[index : index + 3] = base[at : at + 3] + the rows' lanes 3."""
-    store_lane(array, index, plus(rows[0], spread(base, at)), 3)
-    store_lane(array, index + 1, plus(rows[1], spread(base, at + 1)), 3)
-    store_lane(array, index + 2, plus(rows[2], spread(base, at + 2)), 3)
+def plus_vector(rows, array, index):
+    """The rows, to each of them the number of the vector at array[index] added: lane 3 is what counts."""
+    return (
+        plus(rows[0], spread(array, index)),
+        plus(rows[1], spread(array, index + 1)),
+        plus(rows[2], spread(array, index + 2)),
+    )
 
 
 @compiled
-def mix(array, index, step, rows):
+def mixed(array, index, step, rows):
     """Sum over k of array[index + k * step] rows[k]."""
     total = times(spread(array, index), rows[0])
     total = plus_times(total, spread(array, index + step), rows[1])
@@ -191,20 +192,17 @@ def forward(start, stop, parents, R_local, t_root, offsets, R, t):
     stride = 3 * joints if len(offsets) > 3 * joints else 0
     for sample in range(start, stop):
         first = sample * joints
-        x, y, z = load_rows(R_local, 9 * first)
-        store_rows(R, 9 * first, x, y, z)
+        store_rows(R, 9 * first, load_rows(R_local, 9 * first))
         for axis in range(3):
             store_lane(t, 3 * first + axis, spread(t_root, 3 * sample + axis), 0)
         for joint in range(1, joints):
-            own, parent = first + joint, first + parents[joint]
-            rows = with_last(load_rows(R_local, 9 * own), offsets, stride * sample + 3 * joint)
-            x, y, z = (
-                mix(R, 9 * parent, 1, rows),
-                mix(R, 9 * parent + 3, 1, rows),
-                mix(R, 9 * parent + 6, 1, rows),
-            )
-            store_rows(R, 9 * own, x, y, z)
-            store_last_added(t, 3 * own, (x, y, z), t, 3 * parent)
+            own, above = first + joint, first + parents[joint]
+            L = with_last(load_rows(R_local, 9 * own), offsets, stride * sample + 3 * joint)
+            # R_p [L | o]
+            at = 9 * above
+            rows = mixed(R, at, 1, L), mixed(R, at + 3, 1, L), mixed(R, at + 6, 1, L)
+            store_rows(R, 9 * own, rows)
+            store_last(t, 3 * own, plus_vector(rows, t, 3 * above))
 
 
 @compiled
@@ -217,40 +215,34 @@ def backward(start, stop, parents, R_local, offsets, R, grad_R, grad_t, grad_loc
     last = load(unit, 0)
     # One sample's gradients [g_R | g_t], to which the children add on the way to the root; they stay in the cache.
     g = np.empty(12 * joints, R.dtype)
+    # From the last sample, as from the last joint: what is read in one direction is fetched ahead.
     for sample in range(stop - 1, start - 1, -1):
         first = sample * joints
         for joint in range(joints):
-            x, y, z = with_last(load_rows(grad_R, 9 * (first + joint)), grad_t, 3 * (first + joint))
-            store(g, 12 * joint, x)
-            store(g, 12 * joint + 4, y)
-            store(g, 12 * joint + 8, z)
-        for joint in range(joints - 1, 0, -1):
-            own, parent, offset = first + joint, first + parents[joint], stride * sample + 3 * joint
-            rows = load(g, 12 * joint), load(g, 12 * joint + 4), load(g, 12 * joint + 8)
-            x, y, z = (
-                mix(R, 9 * parent, 3, rows),
-                mix(R, 9 * parent + 1, 3, rows),
-                mix(R, 9 * parent + 2, 3, rows),
-            )
-            store_rows(grad_local, 9 * own, x, y, z)
-            if len(grad_offsets) > 0:
-                store_last_added(grad_offsets, offset, (x, y, z), grad_offsets, offset)
-            # Columns of the local rotation over 0, and its offset over 1.
-            x, y, z = load_rows(R_local, 9 * own)
-            low, z = shuffle(x, y, 0, 4, 1, 5), shuffle(z, last, 0, 1, 2, 4)
-            columns = (
-                shuffle(low, z, 0, 1, 4, 7),
-                shuffle(low, z, 2, 3, 5, 7),
-                shuffle(shuffle(x, y, 2, 6, 2, 6), z, 0, 1, 6, 7),
-            )
-            before = load(offsets, offset - 1)
-            moved = shuffle(before, last, 1, 2, 3, 7)
+            rows = with_last(load_rows(grad_R, 9 * (first + joint)), grad_t, 3 * (first + joint))
             for row in range(3):
-                mine, above = 12 * joint + 4 * row, 12 * parents[joint] + 4 * row
-                total = plus_times(load(g, above), spread(g, mine), columns[0])
-                total = plus_times(total, spread(g, mine + 1), columns[1])
-                total = plus_times(total, spread(g, mine + 2), columns[2])
-                store(g, above, plus_times(total, spread(g, mine + 3), moved))
-        rows = load(g, 0), load(g, 4), load(g, 8)
-        store_rows(grad_local, 9 * first, rows[0], rows[1], rows[2])
-        store_last(grad_root, 3 * sample, rows)
+                store(g, 12 * joint + 4 * row, rows[row])
+        for joint in range(joints - 1, 0, -1):
+            own, offset, mine = first + joint, stride * sample + 3 * joint, 12 * joint
+            G = load(g, mine), load(g, mine + 4), load(g, mine + 8)
+            # R_pᵀ [g_R | g_t]
+            at = 9 * (first + parents[joint])
+            rows = mixed(R, at, 3, G), mixed(R, at + 1, 3, G), mixed(R, at + 2, 3, G)
+            store_rows(grad_local, 9 * own, rows)
+            if len(grad_offsets) > 0:
+                store_last(grad_offsets, offset, plus_vector(rows, grad_offsets, offset))
+            # Columns of L over 0, and o over 1: the parent receives [g_R Lᵀ + g_t oᵀ | g_t].
+            x, y, z = load_rows(R_local, 9 * own)
+            xy, z = shuffle(x, y, 0, 4, 1, 5), shuffle(z, last, 0, 1, 2, 4)
+            L_0, L_1 = shuffle(xy, z, 0, 1, 4, 7), shuffle(xy, z, 2, 3, 5, 7)
+            L_2 = shuffle(shuffle(x, y, 2, 6, 2, 6), z, 0, 1, 6, 7)
+            o = shuffle(load(offsets, offset - 1), last, 1, 2, 3, 7)
+            above = 12 * parents[joint]
+            for row in range(0, 12, 4):
+                total = plus_times(load(g, above + row), spread(g, mine + row), L_0)
+                total = plus_times(total, spread(g, mine + row + 1), L_1)
+                total = plus_times(total, spread(g, mine + row + 2), L_2)
+                store(g, above + row, plus_times(total, spread(g, mine + row + 3), o))
+        G = load(g, 0), load(g, 4), load(g, 8)
+        store_rows(grad_local, 9 * first, G)
+        store_last(grad_root, 3 * sample, G)
