@@ -6,7 +6,10 @@ import pytest
 import torch
 
 from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.errors import WearcapError
+from wearcap.recording.recording import Recording
 from wearcap.recording.serialize import flatten
+from wearcap.simulation import simulate
 from wearcap.simulation.simulate import POOLS, SimulationConfig, person_of, simulate_recording, world_of
 
 SHORT = SimulationConfig(duration_s=20.0)
@@ -60,6 +63,19 @@ def test_parts_can_be_left_out():
     torch.testing.assert_close(
         recording.head.T_world_head.t, recording.motion.joint("head").t, atol=2e-6, rtol=0
     )
+
+
+def test_three_in_ten_recordings_are_outdoors_unless_a_world_is_asked_for(monkeypatch):
+    monkeypatch.setattr(simulate, "simulate_motion", lambda *_: None)
+    monkeypatch.setattr(simulate, "person_of", lambda *_: None)
+    monkeypatch.setattr(simulate, "world_of", lambda split, number, kind: kind)
+    monkeypatch.setattr(simulate, "sense", lambda config, name, world, *_: Recording(name, location=world))
+    drawn = [simulate_recording(SHORT, "one", "train", seed).location for seed in range(300)]
+    assert 0.22 < drawn.count("outdoor") / 300 < 0.38
+    for kind in simulate.WORLDS:
+        assert simulate_recording(replace(SHORT, world=kind), "one", "train", 7).location == kind
+    with pytest.raises(WearcapError, match="flat or outdoor"):
+        replace(SHORT, world="moon")
 
 
 def test_splits_share_neither_people_nor_places():

@@ -28,6 +28,9 @@ class Activity:
 
 RUN_RISE_M = 0.02
 """Between waypoints 0.1 m apart: one runs up a ramp, but over no step."""
+FREE_M = 0.45
+ELSEWHERE = 0.4
+"""Share of walks outdoors that lead up or down if they can: the terrace is small beside the street."""
 
 ACTIVITIES: dict[str, Activity] = {}
 
@@ -47,9 +50,13 @@ def start_place(world: World, rng: np.random.Generator) -> tuple[np.ndarray, flo
     return _free_point(world, rng), float(rng.uniform(-np.pi, np.pi))
 
 
-def _free_point(world: World, rng: np.random.Generator, clearance: float = 0.45) -> np.ndarray:
+def _free_point(world: World, rng: np.random.Generator, beside_z: float | None = None) -> np.ndarray:
+    """A random place to stand freely; in the open, often one that is higher or lower than `beside_z` (m)."""
     points = world.sample_floor(rng, 24)
-    free = (world.clearance(points) > clearance) & ~_on_stairs(world, points)
+    free = (world.clearance(points) > FREE_M) & ~_on_stairs(world, points)
+    if world.outdoors and beside_z is not None and rng.random() < ELSEWHERE:
+        other = free & (np.abs(points[:, 2] - beside_z) > 0.3)
+        free = other if other.any() else free
     return points[np.flatnonzero(free)[0]] if free.any() else points[0]
 
 
@@ -129,7 +136,7 @@ def approach(
     plan: Plan, world: World, rng: np.random.Generator, goal: np.ndarray | None, heading: float | None = None
 ) -> bool:
     """Walk to a floor point (m; a free one when None) and turn to a heading (rad) there; False if no way leads there."""
-    goal = _free_point(world, rng) if goal is None else goal
+    goal = _free_point(world, rng, float(plan.position[2])) if goal is None else goal
     path = world.plan_path(plan.position, goal, rng)
     if path is None or (heading is None and _length(path) < 1.2):
         return False

@@ -104,8 +104,8 @@ def _swing(
     style = plan.style
     gain = style.arm_swing * (1.0 + sign * style.arm_symmetry)
     lag = round(0.04 * fps)
-    ahead = -sign * blur(np.roll(trunk.stride, lag), 0.07, fps)
-    ahead[:lag] = ahead[lag] if len(ahead) > lag else 0.0
+    delayed = np.concatenate([np.full(lag, trunk.stride[0]), trunk.stride])[: len(times)]
+    ahead = -sign * blur(delayed, 0.07, fps)
     slow = wander(rng, len(times), 4, 4.0, 0.03, fps)
     walk, run = 1.0 - running, running
     swing = gain * ahead * (walk + 0.75 * run) + 0.05 - 0.30 * run + slow[:, 0]

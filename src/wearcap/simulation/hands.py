@@ -17,6 +17,8 @@ POSTURES: dict[str, tuple[tuple[str, ...], tuple[float, ...]]] = {
 }
 """Hands, and their pose channel (`HandScore.pose`), by name."""
 
+FINGERS_USED = 0.9
+"""How far along its fingers a hand touches what it reaches for."""
 ON_THIGHS = (0.46, -0.02, -0.66, 0.35, 0.5, 0.1)
 
 
@@ -102,13 +104,17 @@ def reach(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 
 def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
     """One reach with the nearer hand: minimum-jerk out, a pause, and back (0.4–1.2 s each way)."""
-    point = np.array(target.position) + np.append(0.08 * rng.standard_normal(2), 0.04 * rng.standard_normal())
     ahead = np.array([np.cos(plan.heading), np.sin(plan.heading)])
-    offset = point[:2] - plan.position[:2]
-    aside = float(offset @ np.array([-ahead[1], ahead[0]])) + 0.1 * rng.standard_normal()
+    across = np.array([-ahead[1], ahead[0]])
+    point = np.array(target.position) + np.append(
+        0.08 * rng.standard_normal() * across, 0.04 * rng.standard_normal()
+    )
+    aside = float((point[:2] - plan.position[:2]) @ across) + 0.1 * rng.standard_normal()
     side = "left" if aside > 0 else "right"
     hand, arm = plan.hands[side], plan.arm_length
     shoulder = 1.52 * plan.hip_height
+    thing, point = point, _wrist_before(plan, point, shoulder, LEFT_SIGN[side] * 0.17 * across)
+    offset = point[:2] - plan.position[:2]
     low = shoulder - (point[2] - plan.position[2])
     far = float(offset @ ahead)
     crouch = float(np.clip(low - 1.05 * arm, 0.0, 0.42 * plan.hip_height))
@@ -122,7 +128,7 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
     plan.crouch.move(start, start + out, crouch)
     hand.goal.move(start, start, point)
     hand.goal_weight.move(start, start + out, 1.0)
-    plan.gaze_point.move(start, start, point)
+    plan.gaze_point.move(start, start, thing)
     plan.gaze_weight.move(start, start + 0.45, 1.0)
     leave = start + out + hold_s
     plan.lean.move(leave, leave + back, 0.0)
@@ -130,3 +136,10 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
     hand.goal_weight.move(leave, leave + back, 0.0)
     plan.gaze_weight.move(leave, leave + 0.5, 0.0)
     plan.time = leave + back + rng.uniform(0.05, 0.6)
+
+
+def _wrist_before(plan: Plan, point: np.ndarray, shoulder: float, aside: np.ndarray) -> np.ndarray:
+    """Where the wrist is when the fingers of a straight hand touch a point (m)."""
+    fingers = float(np.linalg.norm(plan.skeleton.sites["left_fingertip"].t_joint_site))
+    way = point - plan.position - np.append(aside, shoulder)
+    return point - FINGERS_USED * fingers * way / np.linalg.norm(way)

@@ -18,6 +18,8 @@ STEP_ENVELOPE_S, LEVELLED = 0.26, 0.12
 """In walking the pelvis stays this share nearer to the height that it can keep over a whole step."""
 STAIR_APART_M, STAIRS_LEVELLED = 0.15, 0.5
 """On stairs (feet so far apart in height) knees bend more, which evens out the pelvis' way."""
+BOUNCE_M, BOUNCE_MIDDLE = 0.12, 0.68
+"""In running the pelvis is lowest over the bent standing leg and rises in flight: by how much, about which load."""
 HIPS_AHEAD_M = 0.042
 """How much further forward than in standing the hips are carried in walking."""
 STANCE_BEND = 0.9
@@ -141,4 +143,9 @@ def _height(
     apart = np.abs(feet["left"].ground[:, 2] - feet["right"].ground[:, 2])
     stairs = blur(np.clip(apart / STAIR_APART_M, 0.0, 1.0), 0.25, fps)
     share = LEVELLED * moving + (STAIRS_LEVELLED - LEVELLED * moving) * stairs
-    return blur(falling_at_most(high + share * (level - high), GRAVITY, fps), 0.02, fps)
+    running = blur(np.maximum(feet["left"].running, feet["right"].running).astype(np.float64), 0.15, fps)
+    share += running * (1.0 - share)
+    stands = blur((feet["left"].planted | feet["right"].planted).astype(np.float64), 0.045, fps)
+    bounce = BOUNCE_M * running * (BOUNCE_MIDDLE - stands)
+    wanted = np.minimum(high + share * (level - high) + bounce, high)
+    return blur(falling_at_most(wanted, GRAVITY, fps), 0.02, fps)

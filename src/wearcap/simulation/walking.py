@@ -11,6 +11,8 @@ from wearcap.simulation.track import blur
 
 SPACING_M = 0.02
 RUN_SPEED = 2.1
+JOG_SPEED = 1.4
+"""One who means to run does so from this speed on (m/s): at its start, its end and in curves."""
 ACCELERATION, BRAKING = 1.0, 0.85
 END_SPEED = 0.32
 MIN_CADENCE = 80.0
@@ -38,6 +40,8 @@ class Course:
     """Steps since the start; the foot of step k stands where phase is k."""
     on_stairs: Float[np.ndarray, "point"]
     """+1 going up, -1 going down, else 0."""
+    run_from: float
+    """Speed (m/s) from which on it is run."""
 
     def at_phase(self, name: str, phase: float) -> float:
         """Heading, speed, time or on_stairs where the phase has a value; ends held."""
@@ -73,20 +77,19 @@ def walk_along(
         how = course.at_phase("speed", min(k, steps) - 0.5)
         print_ = _course_print(plan, course, side, min(k, steps), last, how, rng)
         beat = land - lands[k - 2] if k > 1 else 0.62
-        lift = land - beat * (1.0 - double_support(how)) if k > 1 else land - 0.5
-        _walk_step(plan, side, lift, land, print_, course.at_phase("on_stairs", min(k, steps)), how)
+        running = how > course.run_from and not last
+        lift = land - beat * (1.0 - double_support(how, running)) if k > 1 else land - 0.5
+        _walk_step(plan, side, lift, land, print_, running)
 
 
-def double_support(speed: float) -> float:
+def double_support(speed: float, running: bool) -> float:
     """Share of a step's time that both feet stand; negative in running, where neither does."""
-    if speed > RUN_SPEED:
-        return float(np.clip(-0.22 - 0.08 * (speed - RUN_SPEED), -0.38, -0.22))
+    if running:
+        return float(np.clip(-0.22 - 0.08 * (speed - RUN_SPEED), -0.38, -0.12))
     return float(np.clip(0.24 + 0.16 * (1.3 - speed), 0.14, 0.42))
 
 
-def _walk_step(
-    plan: Plan, side: str, lift: float, land: float, print_: Footprint, stairs: float, speed: float
-) -> None:
+def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprint, running: bool) -> None:
     """Add one step; the longer the stride, the more the foot rolls at its ends."""
     old = plan.prints[side][-1]
     lift = max(lift, old.land_s + 0.16)
@@ -94,7 +97,7 @@ def _walk_step(
     size = min(stride / 1.35, 1.15) * plan.style.heel_rise
     rise = step_rise(old, print_)
     lift_pitch, land_pitch, clearance = 0.95 * size, -0.44 * size, 0.02
-    if speed > RUN_SPEED:
+    if running:
         lift_pitch, land_pitch, clearance = 0.85, -0.10, 0.10
     if rise > STEP_M:
         lift_pitch, land_pitch, clearance = 0.55, 0.06, 0.05
@@ -105,7 +108,7 @@ def _walk_step(
     clearance = max(clearance, _over_corner(plan, old, print_))
     new = Footprint(
         print_.ground, print_.heading, print_.tilt, land_pitch=land_pitch, clearance=clearance,
-        bow=LEFT_SIGN[side] * 0.012, running=speed > RUN_SPEED,
+        bow=LEFT_SIGN[side] * 0.012, running=running,
     )  # fmt: skip
     plan.step(side, lift, land, lift_pitch, new)
 
@@ -138,7 +141,7 @@ def _course_print(
     stairs = abs(course.at_phase("on_stairs", k)) > 0.5
     width = (
         style.step_width
-        * (0.6 if speed > RUN_SPEED else 1.0)
+        * (0.6 if speed > course.run_from else 1.0)
         * (1 + 3 * style.variability * rng.standard_normal())
     )
     if last:
@@ -167,10 +170,12 @@ def plan_course(plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float,
         limit[near] = np.minimum(limit[near], tread / beat)
     limit = blur(_ramped(limit), 0.10, 1 / SPACING_M)
     stride = np.minimum(np.sqrt(60 * plan.style.walk_ratio * limit), limit * 60 / MIN_CADENCE)
-    stride = np.where(limit > RUN_SPEED, limit * 60 / (158 + 6 * limit), stride)
+    run_from = JOG_SPEED if speed > RUN_SPEED else np.inf
+    stride = np.where(limit > run_from, limit * 60 / (158 + 6 * limit), stride)
     raw = np.concatenate([[0.0], np.cumsum(SPACING_M / stride[:-1])])
     time = np.concatenate([[0.0], np.cumsum(SPACING_M / limit[:-1])])
-    return Course(points, heading, limit, time, _anchored(raw, length, [a[0] for a in anchors]), stairs)
+    phase = _anchored(raw, length, [a[0] for a in anchors])
+    return Course(points, heading, limit, time, phase, stairs, run_from)
 
 
 def _smooth(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -31,6 +31,8 @@ __all__ = ["SimulatedMotion", "hands", "settle", "simulate_motion"]
 SPINE = ("l5", "l3", "t12", "t8")
 NECK_SHARE = 0.45
 TOUCH_M = 0.02
+TAIL_S = 1.5
+"""Simulated beyond the end and cut off: a body in motion looks this far ahead."""
 
 
 @runtime_checkable
@@ -69,8 +71,9 @@ def simulate_motion(
     `activities` names entries of `actions.ACTIVITIES` to be done in turn, over and over until the time is full;
     None draws them at random by their weights.
     """
-    plan = _plan(world, person, rng, duration_s, activities)
-    times = np.arange(round(duration_s * fps)) / fps
+    plan = _plan(world, person, rng, duration_s + TAIL_S, activities)
+    count = round(duration_s * fps)
+    times = np.arange(count + round(TAIL_S * fps)) / fps
     feet = {
         side: foot_motion(plan.prints[side], FootShape.of(person.skeleton, side), plan.heel_lift[side], times)
         for side in SIDES
@@ -83,11 +86,11 @@ def simulate_motion(
         R_parent_joint=local_rotations(person.skeleton, R_world_joint).float(),
         t_world_root=torch.from_numpy(trunk.pelvis).float(),
         provenance={"source": "simulated wearer"},
-    )
-    planted = torch.from_numpy(np.concatenate([feet[side].contact for side in SIDES], 1))
+    ).sliced(0, count)
+    planted = torch.from_numpy(np.concatenate([feet[side].contact[:count] for side in SIDES], 1))
     contact = planted & _over_floor(world, motion)
     motion = replace(motion, contact_prob=contact.float())
-    floor = np.mean([blur(feet[side].ground[:, 2], 0.1, fps) for side in SIDES], 0)
+    floor = np.mean([blur(feet[side].ground[:, 2], 0.1, fps)[:count] for side in SIDES], 0)
     labels = tuple(label for label in plan.labels if label.start_s < duration_s)
     return SimulatedMotion(motion, contact, torch.from_numpy(floor).float(), labels)
 
