@@ -8,7 +8,7 @@ from wearcap.simulation.furnish import Box
 from wearcap.simulation.furniture import MAKERS
 from wearcap.simulation.outline import rectangle
 
-KERB_TREAD_M = 0.75
+KERB_TREAD_M = 0.60
 """A kerb is a flight of one step; its tread sets how fast it is stepped over."""
 STONE, METAL = (0.62, 0.60, 0.56), (0.28, 0.30, 0.31)
 BRICK_TEXTURE = 9.0
