@@ -43,6 +43,20 @@ def test_a_clip_shorter_than_a_window_is_padded_with_its_last_frame(store):
     assert torch.equal(window.R_parent_joint[90:], window.R_parent_joint[89:90].expand(30, -1, -1, -1))
 
 
+def test_balance_shares_the_draws_among_recordings(store):
+    def shares(balance: float) -> torch.Tensor:
+        windows = dataset(store, balance=balance, stride=10)
+        return torch.zeros(len(windows.paths), dtype=torch.float64).index_add(
+            0, windows.starts[:, 0], windows.weights
+        )
+
+    counts = torch.bincount(dataset(store, stride=10).starts[:, 0]).double()
+    assert len(counts.unique()) > 1
+    assert torch.allclose(shares(1.0), counts / counts.sum())
+    assert torch.allclose(shares(0.0), torch.full_like(counts, 1 / len(counts)))
+    assert torch.allclose(shares(0.5), counts.sqrt() / counts.sqrt().sum())
+
+
 def test_hanging_the_truth_from_the_head_gives_the_truth(store):
     window = dataset(store)[(0, 0)]
     true = forward_kinematics(xsens23(), window.R_parent_joint, torch.zeros(120, 3)).t

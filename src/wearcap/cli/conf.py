@@ -15,6 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import (
     ConfigCompositionException,
     HydraException,
+    InstantiationException,
     MissingConfigException,
     OverrideParseException,
 )
@@ -153,6 +154,8 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
         r"(?:Could not override|Could not delete from config\.|Could not append) '([^']+)'", str(error)
     )
     key = key or re.search(r"key '?([\w./@-]+)'? (?:is not in|not found)", str(error), re.IGNORECASE)
+    if isinstance(error, InstantiationException):
+        return _refused(error)
     if key is None and not isinstance(error, ConfigCompositionException):
         return WearcapError(str(error).strip().splitlines()[0], where=f"config {config_name!r}",
                             fix="Run again with --debug for the whole story.")  # fmt: skip
@@ -161,6 +164,16 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
     wrong = key.group(1).split("@")[0]
     return WearcapError(f"config {config_name!r} has no key {wrong!r}",
                         fix=nearest(wrong, _valid_keys(config_name, arguments, wrong)))  # fmt: skip
+
+
+def _refused(error: InstantiationException) -> WearcapError:
+    """What the object that a config names had to say against its values."""
+    cause: BaseException = error
+    while cause.__cause__ is not None:
+        cause = cause.__cause__
+    place = re.search(r"full_key: (\S+)", str(error))
+    return WearcapError(f"cannot build {place.group(1) if place else 'what the config names'}: "
+                        + " ".join(str(cause).split()[:60]), fix="--debug shows where.")  # fmt: skip
 
 
 def _missing_choice(error: MissingConfigException) -> WearcapError:

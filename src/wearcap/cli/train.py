@@ -1,5 +1,6 @@
 """`wearcap train`: compose a config, build what it names, fit."""
 
+import warnings
 from pathlib import Path
 
 import lightning
@@ -10,7 +11,7 @@ from rich import print as show
 
 from wearcap.cli.conf import hydra_main
 from wearcap.training.checkpoint import ConfigInCheckpoint
-from wearcap.training.run import fit, record_run, resume_path
+from wearcap.training.run import fit, keep_freed_memory, record_run, resume_path
 
 HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
 
@@ -18,6 +19,10 @@ HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
 def train(config: DictConfig) -> float:
     """Train what the config describes; returns the last validation loss (what a sweep minimises)."""
     lightning.seed_everything(config.seed, workers=True, verbose=False)
+    keep_freed_memory()
+    # A run's folder is its own; what Lightning deprecates within itself is not the user's to mend.
+    warnings.filterwarnings("ignore", "Experiment logs directory")
+    warnings.filterwarnings("ignore", ".*LeafSpec")
     run = Path(config.paths.run)
     record_run(run, OmegaConf.to_yaml(config, resolve=True))
     resume = resume_path(config.resume, Path(config.paths.outputs) / "train" / config.name)

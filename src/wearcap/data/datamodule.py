@@ -22,24 +22,27 @@ class MotionWindows(lightning.LightningDataModule):
         workers: int = 1,
         seed: int = 0,
         augment: bool = True,
+        balance: float = 1.0,
         val_sources: dict[str, dict | None] | None = None,
     ):
         """`sources` maps a name to {root, weight}; `val_sources` (default: the same) are validated on.
 
-        An epoch has `steps_per_epoch` steps of `batch_size` windows, however many windows there are.
+        An epoch has `steps_per_epoch` steps of `batch_size` windows, however many windows there are. `balance`: see
+        `WindowDataset`; it is for training alone.
         """
         super().__init__()
         self.sources = [Source(**source) for source in sources.values() if source]
         self.val_sources = [Source(**source) for source in (val_sources or sources).values() if source]
         self.window, self.stride, self.fps = window, stride, fps
         self.batch_size, self.steps_per_epoch, self.val_windows = batch_size, steps_per_epoch, val_windows
-        self.workers, self.seed, self.augment = workers, seed, augment
+        self.workers, self.seed, self.augment, self.balance = workers, seed, augment, balance
 
     def dataset(self, split: str) -> WindowDataset:
         """Windows of a split; the training split is jittered and mirrored."""
+        train = split == "train"
         return WindowDataset(
-            self.sources if split == "train" else self.val_sources, split, window=self.window, stride=self.stride,
-            fps=self.fps, mirror=self.augment and split == "train",
+            self.sources if train else self.val_sources, split, window=self.window, stride=self.stride, fps=self.fps,
+            mirror=self.augment and train, balance=self.balance if train else 1.0,
         )  # fmt: skip
 
     def setup(self, stage: str) -> None:

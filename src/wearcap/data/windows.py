@@ -54,8 +54,13 @@ class WindowDataset(Dataset):
         stride: int,
         fps: float,
         mirror: bool = False,
+        balance: float = 1.0,
         min_frames: int = 30,
     ):
+        """A recording's share of the draws grows with its number of windows to the power of `balance`.
+
+        1 draws all windows alike, 0 all recordings.
+        """
         self.window, self.stride, self.fps, self.mirror = window, stride, fps, mirror
         self.paths: list[Path] = []
         starts, weights = [], []
@@ -66,9 +71,10 @@ class WindowDataset(Dataset):
                 for name in self._usable(store, split, min_frames)
             ]
             counts = [max(0, frames - window) // stride + 1 for _, frames in rows]
+            total = sum(count**balance for count in counts)
             for (path, frames), count in zip(rows, counts):
                 starts += [(len(self.paths), k * stride, frames) for k in range(count)]
-                weights += [source.weight / sum(counts)] * count
+                weights += [source.weight * count ** (balance - 1) / total] * count
                 self.paths.append(path)
         if not starts:
             raise WearcapError(f"no windows in split {split!r}", where=", ".join(s.root for s in sources),

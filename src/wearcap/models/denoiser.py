@@ -43,23 +43,70 @@ class TemporalBlend(nn.Module):
         self, x: Float[Tensor, "batch time feature"], valid: Bool[Tensor, "batch time"]
     ) -> Float[Tensor, "batch time feature"]:
         kernel = self.weight.softmax(0)
+        # As a matrix over frames: on the CPU much faster than a convolution of so many channels one by one.
+        frame = torch.arange(x.shape[1], device=x.device)
+        place = frame - frame[:, None] + len(kernel) // 2
+        near = (place >= 0) & (place < len(kernel))
+        band = (kernel[place.clamp(0, len(kernel) - 1)] * near).to(x.dtype)
         mask = valid.to(x.dtype)[..., None]
+        return band @ (x * mask) / (band @ mask).clamp_min(1e-3)
 
-        def mixed(value: Tensor) -> Tensor:
-            rows = value.transpose(1, 2).flatten(0, 1)[:, None]
-            blended = F.conv1d(rows, kernel.to(rows.dtype)[None, None], padding=len(kernel) // 2)
-            return blended.view(x.shape[0], -1, x.shape[1]).transpose(1, 2)
 
-        return mixed(x * mask) / mixed(mask).clamp_min(1e-3)
+class ConditionEncoder(nn.Module):
+    """Narrows the conditions to one vector per token by an MLP (thesis §6.2).
+
+    It sees `context` frames before the token's own and as many behind them (ours): a stride shows in half a second of
+    a head's sway, not in one frame.
+    """
+
+    def __init__(self, size: int, width: int, frames_per_token: int, context: int):
+        super().__init__()
+        # One more channel says which frames exist: padding would else look like the mean condition.
+        span = frames_per_token + 2 * context
+        self.widen = nn.Conv1d(size + 1, 2 * width, span, frames_per_token, context)
+        self.narrow = nn.Linear(2 * width, width)
+
+    def forward(
+        self, condition: Float[Tensor, "batch time condition"], valid: Bool[Tensor, "batch time"]
+    ) -> Float[Tensor, "batch token width"]:
+        mask = valid[..., None].to(condition.dtype)
+        frames = torch.cat([condition * mask, mask], -1)
+        return self.narrow(F.gelu(self.widen(frames.transpose(1, 2))).transpose(1, 2))
+
+
+class MotionEncoder(nn.Module):
+    """x_t as one vector per token, scaled by what its noise level makes it worth (ours).
+
+    Concatenated with the conditions instead, the noise of high levels drowns them: the network then needs several
+    times the steps to read the gait from the head.
+    """
+
+    def __init__(self, size: int, width: int, frames_per_token: int):
+        super().__init__()
+        self.frames_per_token = frames_per_token
+        self.linear = nn.Linear(frames_per_token * size, width)
+        self.worth = nn.Linear(width, width)
+        nn.init.zeros_(self.worth.weight)
+        nn.init.zeros_(self.worth.bias)
+
+    def forward(
+        self,
+        x_t: Float[Tensor, "batch time motion"],
+        level: Float[Tensor, "batch #token width"],
+        valid: Bool[Tensor, "batch time"],
+    ) -> Float[Tensor, "batch token width"]:
+        batch, time, _ = x_t.shape
+        tokens = (x_t * valid[..., None]).reshape(batch, time // self.frames_per_token, -1)
+        return self.linear(tokens) * (1 + self.worth(F.silu(level)))
 
 
 class MotionDenoiser(nn.Module):
     """x̂0 = D(x_t, c, level): one token per frame (or per few frames) through adaptive transformer blocks.
 
-    x_t and the condition of every frame are concatenated and narrowed by an MLP to one token (thesis §6.2);
-    where x_t joins the conditions the document leaves open. `frames_per_token` > 1 is ours: neighbouring frames
-    share a token, which cuts the cost of a window about as many times; `blend` > 0 (ours too) mixes that many
-    neighbouring frames of x̂0, which removes the seams between tokens and most of an unfinished network's jitter.
+    A token is the sum of what the condition and x_t say about its frames; where x_t joins the conditions the document
+    leaves open. `frames_per_token` > 1 is ours: neighbouring frames share a token, which cuts the cost of a window
+    about as many times; `blend` > 0 (ours too) mixes that many neighbouring frames of x̂0, which removes the seams
+    between tokens and most of an unfinished network's jitter.
     """
 
     def __init__(
@@ -74,6 +121,7 @@ class MotionDenoiser(nn.Module):
         dropout: float = 0.1,
         frames_per_token: int = 1,
         blend: int = 0,
+        context: int = 14,
     ):
         super().__init__()
         if window % frames_per_token:
@@ -82,8 +130,8 @@ class MotionDenoiser(nn.Module):
         self.motion_size, self.condition_size = motion_size, condition_size
         self.motion_normalizer = Normalizer(motion_size)
         self.condition_normalizer = Normalizer(condition_size)
-        token_input = frames_per_token * (motion_size + condition_size)
-        self.narrow = nn.Sequential(nn.Linear(token_input, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+        self.condition_encoder = ConditionEncoder(condition_size, width, frames_per_token, context)
+        self.motion_encoder = MotionEncoder(motion_size, width, frames_per_token)
         self.level = LevelEmbedding(width)
         self.blocks = nn.ModuleList(
             AdaptiveBlock(width, heads, feedforward, window // frames_per_token, dropout)
@@ -105,11 +153,11 @@ class MotionDenoiser(nn.Module):
         """x̂0 in normalised motion space; `condition` is raw, `valid` is False on padding."""
         batch, time, _ = x_t.shape
         k = self.frames_per_token
-        frames = torch.cat([x_t, self.condition_normalizer(condition)], -1) * valid[..., None]
-        token = self.narrow(frames.reshape(batch, time // k, -1))
         token_valid = valid.view(batch, time // k, k).any(-1)
         token_level = level if level.shape[1] == 1 else level.view(batch, time // k, k).mean(-1)
         embedded = self.level(token_level)
+        token = self.condition_encoder(self.condition_normalizer(condition), valid)
+        token = token + self.motion_encoder(x_t, embedded, valid)
         for block in self.blocks:
             token = block(token, embedded, token_valid)
         x0_hat = self.head(self.norm(token)).reshape(batch, time, -1)

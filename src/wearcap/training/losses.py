@@ -3,6 +3,9 @@
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+EPSILON_M2 = 1e-6
+"""Keeps the gradient of a distance finite where prediction and target meet."""
+
 
 def masked_mean(value: Float[Tensor, "batch time"], valid: Bool[Tensor, "batch time"]) -> Float[Tensor, ""]:
     """Mean over all frames, padding counting as zero.
@@ -27,8 +30,9 @@ def joint_position(
     target: Float[Tensor, "batch time joint 3"],
     valid: Bool[Tensor, "batch time"],
 ) -> Float[Tensor, ""]:
-    """Squared distance of joints, both bodies hung from the same head (m²; ours)."""
-    return masked_mean((prediction - target).square().sum(-1).mean(-1), valid)
+    """Distance of joints, both bodies hung from the same head (m; ours)."""
+    distance = ((prediction - target).square().sum(-1) + EPSILON_M2).sqrt()
+    return masked_mean(distance.mean(-1), valid)
 
 
 def joint_velocity(

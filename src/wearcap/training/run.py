@@ -1,5 +1,6 @@
 """One training run: its folder, its resumption, its record of what made it."""
 
+import ctypes
 import importlib.metadata
 import json
 import platform
@@ -22,6 +23,20 @@ def fit(
     if resume is None:
         system.set_statistics(data.dataset("train"))
     trainer.fit(system, datamodule=data, ckpt_path=resume, weights_only=True)
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep what a training step frees for the next one, instead of handing it back page by page.
+
+    On the CPU a step frees and takes hundreds of megabytes; taking them anew costs about a fifth of its time. Elsewhere
+    than with glibc nothing happens.
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return
+    trim_threshold, mmap_threshold = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h
+    libc = ctypes.CDLL(None)
+    libc.mallopt(mmap_threshold, 32 << 20)  # the most that glibc accepts
+    libc.mallopt(trim_threshold, 2**31 - 1)
 
 
 def resume_path(resume: str | None, runs: Path) -> Path | None:
