@@ -5,6 +5,7 @@ Without --checkpoint the rows are trained first, once per seed, with the configu
 
 import argparse
 import json
+import re
 from pathlib import Path
 
 from rich import print as show
@@ -13,8 +14,13 @@ from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
 from wearcap.metrics.table import Scores, Summary, rich_table, write_scores
 
-OURS = "motion_diffusion_head"
-ABLATIONS = {"document's window frame, plain MSE": "motion_diffusion_head_document"}
+OURS = ("experiment=motion_diffusion_head",)
+ABLATIONS = {
+    "document's frame, losses and draws": ("experiment=motion_diffusion_head_document",),
+    "noise levels drawn uniformly": (*OURS, "model.level_tilt=0"),
+    "all windows drawn alike": (*OURS, "data.balance=1"),
+    "condition without context": (*OURS, "model.net.context=0"),
+}
 DOCUMENT: Scores = {
     "HMD2's document, on Nymeria": {"mpjpe_cm": Summary(9.28, None, 1), "hand_pe_cm": Summary(19.47, None, 1)}
 }
@@ -41,11 +47,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write the table; returns its path."""
-    checkpoints = options.checkpoint or _trained(OURS, options)
+    checkpoints = options.checkpoint or _trained("ours", OURS, options)
     scores = {**_evaluated(checkpoints, options, "hmd2", baselines=True)}
+    scores["wearcap, one step to the mean"] = _evaluated(checkpoints, options, "hmd2_mean")["wearcap"]
     if not options.no_ablations:
-        for row, experiment in ABLATIONS.items():
-            scores[row] = _evaluated(_trained(experiment, options), options, "hmd2")["wearcap"]
+        for row, overrides in ABLATIONS.items():
+            scores[row] = _evaluated(_trained(row, overrides, options), options, "hmd2")["wearcap"]
         if not options.quick:
             scores["wearcap, latency 0.17 s"] = _evaluated(checkpoints, options, "hmd2_online")["wearcap"]
     path = options.output / "hmd2_head.json"
@@ -59,13 +66,13 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     return path
 
 
-def _trained(experiment: str, options: argparse.Namespace) -> list[str]:
-    """Checkpoints of one experiment, one per seed."""
+def _trained(row: str, changes: tuple[str, ...], options: argparse.Namespace) -> list[str]:
+    """Checkpoints of one row, one per seed."""
     found = []
     for seed in range(1 if options.quick else options.seeds):
-        run = options.output / "runs" / f"{experiment}_{options.data}_{seed}"
+        run = options.output / "runs" / f"{re.sub(r'[^a-z]+', '_', row)}_{options.data}_{seed}"
         overrides = [
-            f"experiment={experiment}", f"data={options.data}", f"seed={seed}", f"paths.datasets={options.datasets}",
+            *changes, f"data={options.data}", f"seed={seed}", f"paths.datasets={options.datasets}",
             f"paths.run={run}", "callbacks.capture=null", *(QUICK if options.quick else ()),
         ]  # fmt: skip
         train.train(compose("train", overrides))
