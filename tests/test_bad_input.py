@@ -170,6 +170,8 @@ ROWS = {
     "train: fps 0": (lambda data, ckpt, tmp, out: training(still_dataset(tmp / "still"), out), "0.0 frames per second"),
     "train: typo": (
         lambda data, ckpt, tmp, out: training(data, out, "trainer.max_step=3"), "Did you mean 'trainer.max_steps'"),
+    "train: a value the model refuses": (
+        lambda data, ckpt, tmp, out: training(data, out, "model.net.width=191"), "cannot build model: width 191 must be"),
     "train: resume": (
         lambda data, ckpt, tmp, out: training(data, out, "resume=none.ckpt"), "no such checkpoint to resume from"),
     "evaluate: other model": (

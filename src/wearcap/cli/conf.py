@@ -61,14 +61,15 @@ def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: l
     """
     guarded = _Guarded(task)
     application = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)
-    with explained(config_name, arguments), _command_line(arguments):
-        application(guarded)()
-    if guarded.refused is not None:
-        raise guarded.refused
+    with explained(config_name, arguments):
+        with _command_line(arguments):
+            application(guarded)()
+        if guarded.refused is not None:
+            raise guarded.refused
 
 
 class _Guarded:
-    """A task that keeps its WearcapError for later, so that Hydra prints nothing of its own about it.
+    """A task that keeps for later what it refuses, so that Hydra prints nothing of its own about it.
 
     A class, because the joblib launcher has to pickle it. In a multirun the error goes through Hydra, which
     says which of the jobs failed.
@@ -77,12 +78,12 @@ class _Guarded:
     def __init__(self, task: Callable[[DictConfig], Any]):
         functools.update_wrapper(self, task)
         self.task = task
-        self.refused: WearcapError | None = None
+        self.refused: Exception | None = None
 
     def __call__(self, config: DictConfig) -> Any:
         try:
             return self.task(config)
-        except WearcapError as error:
+        except (WearcapError, HydraException, OmegaConfBaseException) as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
             self.refused = error

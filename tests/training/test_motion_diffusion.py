@@ -1,0 +1,53 @@
+"""The training module: which noise levels the network sees, and what its losses compare."""
+
+import torch
+from torch import nn
+
+from wearcap.body.skeleton import xsens23
+from wearcap.data.features import HeadFeatures
+from wearcap.data.statistics import collate
+from wearcap.data.windows import Source, WindowDataset
+from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.models.denoiser import MotionDenoiser
+from wearcap.training.motion_diffusion import MotionDiffusion
+from wearcap_testing import small_dataset
+
+
+class Spy(nn.Module):
+    """A denoiser that answers with the truth it was given, and remembers the levels."""
+
+    def __init__(self, net: MotionDenoiser, answer: torch.Tensor):
+        super().__init__()
+        self.motion_normalizer, self.condition_normalizer = net.motion_normalizer, net.condition_normalizer
+        self.answer = answer
+
+    def forward(self, x_t, level, condition, valid):
+        self.level = level
+        return self.answer
+
+
+def system(batch, level_tilt: float) -> MotionDiffusion:
+    features = HeadFeatures()
+
+    def net(motion_size, condition_size):
+        plain = MotionDenoiser(motion_size, condition_size, 60, 32, 1, 4, 32, 0.0, 4)
+        return Spy(plain, features.encode(batch.R_parent_joint, batch.R_world_head))
+
+    weights = {"motion": 1.0, "joints": 1.0, "velocity": 1.0}
+    return MotionDiffusion(net, features, CosineSchedule(), xsens23(), 60.0, weights, torch.optim.AdamW,
+                           level_tilt=level_tilt)  # fmt: skip
+
+
+def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_path):
+    store = small_dataset(tmp_path)
+    windows = WindowDataset([Source(str(store.root))], "train", window=60, stride=30, fps=60.0)
+    batch = collate([windows[(i % len(windows), i)] for i in range(400)])
+    for tilt in (0.0, 2.0):
+        module = system(batch, tilt)
+        terms = module.terms(batch)
+        seen = module.net.level
+        # A density of (1 + tilt) l^tilt has this mean.
+        assert abs(seen.mean().item() - (1 + tilt) / (2 + tilt)) < 0.04
+        assert terms["motion"] < 1e-9
+        assert terms["velocity"] < 1e-6
+        assert terms["joints"] < 2e-3  # the distance's own smallest value
