@@ -33,7 +33,8 @@ def simulated_tasks(
     """`recordings[split]` recordings of `duration_s` each; people and places of the splits never meet.
 
     The hash covers the simulator's own source, so that a better simulator makes its recordings again.
-    `world` is "flat", "outdoor" or None (drawn). Raises WearcapError for an unknown split or world, or when a simulated person's name belongs to another split's list.
+    `world` is "flat", "outdoor" or None (drawn). Raises WearcapError for an unknown split or world, or when a
+    simulated person's name belongs to another split's list.
     """
     config = SimulationConfig(duration_s=float(duration_s), fps=float(fps), points=points,
                               activities=tuple(activities) if activities else None, world=world)  # fmt: skip
