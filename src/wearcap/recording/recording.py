@@ -62,6 +62,9 @@ class CameraStream:
     R_head_cam: Float[Tensor, "3 3"]
     t_head_cam: Float[Tensor, "3"]
     image_files: tuple[str, ...] | None = None
+    """One per timestamp, relative to the data set's directory."""
+    video: str | None = None
+    """Video file, relative to the data set's directory, whose n-th frame belongs to the n-th timestamp."""
     embedding: Float[Tensor, "time feature"] | None = None
     embedding_name: str | None = None
 
@@ -74,6 +77,8 @@ class Localization:
     R_world_cam: Float[Tensor, "time 3 3"]
     t_world_cam: Float[Tensor, "time 3"]
     confidence: Float[Tensor, "time"]
+    covariance: Float[Tensor, "time 6 6"] | None = None
+    """Of the pose's error in the world: rotation vector (rad), then position (m)."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,16 @@
+"""A picture taken in the scene with a known camera: what a visual map is built from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An image file, its calibrated camera, and the camera's pose in the scene (no batch axes, m)."""
+
+    file: Path
+    camera: Camera
+    T_world_cam: Rigid
