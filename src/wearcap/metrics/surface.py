@@ -1,0 +1,80 @@
+"""How feet meet the scanned surface: distance to it and sliding along it during contact (thesis Table 4.3)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.body.model import BodyModel
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.surface import SurfaceIndex
+
+PATCH_REGIONS = {
+    "left_heel": "left_heel",
+    "left_toe_tip": "left_toes",
+    "right_heel": "right_heel",
+    "right_toe_tip": "right_toes",
+}
+"""The body's region behind each of `FOOT_PATCHES`."""
+
+
+@dataclass(frozen=True)
+class FootSurface:
+    """Feet in contact against the scan; NaN where nothing was in contact near it."""
+
+    distance_cm: float
+    """Mean signed point-to-plane distance, positive above the surface (FACTS: the table's distance to surface)."""
+    absolute_distance_cm: float
+    """Mean of its absolute value: sinking here and floating there do not cancel."""
+    sliding_cm: float
+    """Mean way along the surface plane from one frame to the next, per frame."""
+    contacts: int
+    """Pairs of frame and vertex in contact."""
+    off_scan: int
+    """Those of them with no surface within the index's reach: left out."""
+
+
+def foot_surface(
+    points: Float[Tensor, "time vertex 3"], contact: Bool[Tensor, "time vertex"], surface: SurfaceIndex
+) -> FootSurface:
+    """Signed distance to the local scan plane and foot sliding, over vertices in contact (world, m).
+
+    A step from one frame to the next counts where a vertex is in contact in both; it is projected onto the plane
+    beneath its start. Far from the scan (a drifted tracker) there is no plane: such contacts count as `off_scan`.
+    """
+    points = points.detach().cpu().double()
+    contact = contact.cpu()
+    origin, normal = torch.full_like(points, torch.nan), torch.full_like(points, torch.nan)
+    touching = points[contact]
+    planes = surface.plane(touching.numpy())
+    origin[contact], normal[contact] = (torch.from_numpy(part) for part in planes)
+    distance = ((points - origin) * normal).sum(-1)[contact]
+    known = distance.isfinite()
+    step = points.diff(dim=0)
+    along = step - (step * normal[:-1]).sum(-1, keepdim=True) * normal[:-1]
+    slide = along.norm(dim=-1)[contact[1:] & contact[:-1]]
+    return FootSurface(
+        100 * float(distance[known].mean()),
+        100 * float(distance[known].abs().mean()),
+        100 * float(slide[slide.isfinite()].mean()),
+        int(contact.sum()),
+        int((~known).sum()),
+    )
+
+
+def foot_vertices(
+    body: BodyModel, T_world_joint: Rigid, contact: Bool[Tensor, "time patch"]
+) -> tuple[Float[Tensor, "time vertex 3"], Bool[Tensor, "time vertex"]]:
+    """The foot patches' vertices (m) and which of them touch; patches in the order of `FOOT_PATCHES`.
+
+    Raises WearcapError when contacts and poses differ in length.
+    """
+    if len(contact) != len(T_world_joint.t):
+        raise WearcapError(f"contacts of {len(contact)} frames for poses of {len(T_world_joint.t)}",
+                           expected="as many of either")  # fmt: skip
+    vertices = [body.vertices(T_world_joint, PATCH_REGIONS[patch]) for patch in FOOT_PATCHES]
+    touching = [contact[:, i, None].expand(-1, part.shape[1]) for i, part in enumerate(vertices)]
+    return torch.cat(vertices, 1), torch.cat(touching, 1)
