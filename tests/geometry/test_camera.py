@@ -9,6 +9,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 
 ARIA = (-0.0257, 0.1005, -0.0711, 0.0176, 0.0018, -0.0007, 0.0008, -0.0002, 0.0006, -0.0001, -0.0009, 0.0002)
+OCAM = (1.0005, -0.0014, 0.0015, 0.001, -0.12, 0.02, -0.01, 0.002, 0.0, 0.001, 0.0, 0.0, 0.0)
 CAMERAS = {
     "pinhole": Camera("pinhole", 640, 480, 500.0, 510.0, 320.0, 240.0),
     # the head camera of the HPS data set
@@ -16,6 +17,7 @@ CAMERAS = {
     "opencv5": Camera("opencv", 640, 480, 450.0, 450.0, 318.0, 243.0, (-0.3, 0.12, 1e-3, -2e-3, -0.02)),
     "fisheye": Camera("fisheye", 640, 480, 190.0, 191.0, 317.0, 239.0, (0.02, -0.01, 0.004, -0.0005)),
     "fisheye624": Camera("fisheye624", 640, 480, 241.0, 241.0, 317.0, 236.0, ARIA),
+    "ocam": Camera("ocam", 640, 480, 276.0, 276.0, 318.6, 242.9, OCAM),
 }  # fmt: skip
 
 
@@ -110,6 +112,20 @@ def test_fisheye624_formula():
         camera.fy * (v + p1 * (2 * v * v + r2) + 2 * p0 * u * v + s2 * r2 + s3 * r2**2) + camera.cy,
     )
     assert camera.project(torch.tensor([x, y, z], dtype=torch.float64))[0].tolist() == pytest.approx(expected)
+
+
+def test_ocam_formula():
+    camera = CAMERAS["ocam"]
+    theta, phi = 0.9, 2.1
+    bent = theta + sum(k * theta ** (i + 2) for i, k in enumerate(OCAM[3:]))
+    down, right = bent * math.sin(phi), bent * math.cos(phi)
+    c, d, e = OCAM[:3]
+    expected = (276.0 * (e * down + right) + camera.cx, 276.0 * (c * down + d * right) + camera.cy)
+    point = torch.tensor(
+        [math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)],
+        dtype=torch.float64,
+    )
+    assert camera.project(5 * point)[0].tolist() == pytest.approx(expected, abs=1e-9)
 
 
 def test_what_cannot_be_seen_is_not_valid():

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 
-_COEFFICIENTS = {"pinhole": (0,), "opencv": (4, 5), "fisheye": (4,), "fisheye624": (12,)}
+_COEFFICIENTS = {"pinhole": (0,), "opencv": (4, 5), "fisheye": (4,), "fisheye624": (12,), "ocam": (13,)}
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,9 @@ class Camera:
     """Intrinsics of a camera; lengths in pixels, pixel centres at integers."""
 
     model: str
-    """"pinhole" (no distortion), "opencv" (k1 k2 p1 p2 [k3]), "fisheye" (equidistant, k1…k4) or "fisheye624"
-    (Project Aria: k0…k5, p0 p1, s0…s3)."""
+    """"pinhole" (no distortion), "opencv" (k1 k2 p1 p2 [k3]), "fisheye" (equidistant, k1…k4), "fisheye624"
+    (Project Aria: k0…k5, p0 p1, s0…s3) or "ocam" (Scaramuzza's fisheye: affine c d e, then k1…k10 of
+    θ + k1 θ² + … + k10 θ¹¹; io/ocamcalib.py makes them from OCamCalib's polynomials)."""
     width: int
     height: int
     fx: float
@@ -58,7 +59,7 @@ class Camera:
     @property
     def is_fisheye(self) -> bool:
         """True where the model draws angles, so that points beside and behind the lens may be seen."""
-        return self.model.startswith("fisheye")
+        return self.model == "ocam" or self.model.startswith("fisheye")
 
     def scaled(self, width: int, height: int) -> "Camera":
         """The same camera after its image was resized to width x height pixels."""
@@ -125,6 +126,13 @@ class Camera:
 
     def _lens(self, plane: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
         """Distorted plane coordinates "*batch 2" and their Jacobian "*batch 2 2"."""
+        if self.model == "ocam":
+            (c, d, e), powers = self.distortion[:3], self.distortion[3:]
+            bent, d_bent = _radial_odd_and_even(plane, powers)
+            affine = plane.new_tensor(
+                [[1.0, e], [d, c]]
+            )  # OCamCalib counts rows first, we count columns first
+            return bent @ affine.T, affine @ d_bent
         radial, (first, second), prism = self._terms
         bent, d_bent = _radial(plane, radial)
         if self.model == "opencv":  # the tangential term sees the undistorted point
@@ -148,9 +156,14 @@ class Camera:
     @cached_property
     def _fold(self) -> float:
         """Square of the largest undistorted radius (or angle) up to which the radial polynomial still rises."""
-        slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(self._terms[0]))]
+        if self.model == "ocam":
+            slope = [1.0, *((i + 2) * k for i, k in enumerate(self.distortion[3:]))]
+        else:
+            slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(self._terms[0]))]
         roots = np.roots(slope[::-1])
         rising = [root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0]
+        if self.model == "ocam":  # a polynomial of the radius, not of its square
+            rising = [root**2 for root in rising]
         return min([math.pi**2 if self.is_fisheye else math.inf, *rising])
 
     def _invert_lens(self, target: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
@@ -176,6 +189,18 @@ def _radial(m: Tensor, coefficients: tuple[float, ...]) -> tuple[Tensor, Tensor]
         gain = gain * s + k
     identity = torch.eye(2, dtype=m.dtype, device=m.device)
     return m * gain, gain[..., None] * identity + 2 * slope[..., None] * m[..., :, None] * m[..., None, :]
+
+
+def _radial_odd_and_even(m: Tensor, coefficients: tuple[float, ...]) -> tuple[Tensor, Tensor]:
+    """m (1 + k1 r + k2 r² + …), r = |m|, and its Jacobian."""
+    r = m.norm(dim=-1, keepdim=True)
+    gain, slope = torch.zeros_like(r), torch.zeros_like(r)
+    for k in reversed((1.0, *coefficients)):
+        slope = slope * r + gain
+        gain = gain * r + k
+    identity = torch.eye(2, dtype=m.dtype, device=m.device)
+    along = slope / r.clamp(min=torch.finfo(m.dtype).tiny)
+    return m * gain, gain[..., None] * identity + along[..., None] * m[..., :, None] * m[..., None, :]
 
 
 def _tangential(m: Tensor, coefficients: tuple[float, float]) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,196 @@
+"""OCamCalib's text and NavVis' XML: against the direct polynomial, row and column kept apart, damage named."""
+
+import contextlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hostile import fuzz, mutated
+from hypothesis import given
+
+from wearcap.errors import WearcapError
+from wearcap.io.ocamcalib import OCamModel, read_ocamcalib, read_sensor_frame
+
+
+def lens(scale: float = 1.0) -> OCamModel:
+    """A lens like those on NavVis' trolleys; its inverse polynomial is fitted here as OCamCalib fits it."""
+    pol = np.array([-1983.0, 0.0, 2.17e-4, -4.0e-8, 1.62e-11]) * scale / scale ** np.arange(5)
+    rho = np.linspace(0, 2900 * scale, 500)
+    angle = np.arctan(np.polynomial.polynomial.polyval(rho, pol) / np.maximum(rho, 1e-9))
+    invpol = np.polynomial.polynomial.polyfit(angle, rho, 14)
+    width, height = round(4592 * scale), round(3448 * scale)
+    return OCamModel(
+        tuple(pol.tolist()), tuple(invpol.tolist()), 1745.64 * scale, 2289.58 * scale, (1.0005, -0.0014, 0.0015),
+        width, height,
+    )  # fmt: skip
+
+
+def text_of(model: OCamModel) -> str:
+    rows = ["#polynomial coefficients for the DIRECT mapping function", ""]
+    rows += [
+        f"{len(model.pol)} " + " ".join(f"{a:.9e}" for a in model.pol),
+        "",
+        "#inverse mapping function",
+        "",
+    ]
+    rows += [
+        f"{len(model.invpol)} " + " ".join(f"{a:.6f}" for a in model.invpol),
+        "",
+        '#center: "row" and "column"',
+    ]
+    rows += [f"{model.row} {model.column}", "", '#affine parameters "c", "d", "e"', ""]
+    rows += [
+        " ".join(map(str, model.affine)),
+        "",
+        '#image size: "height" and "width"',
+        "",
+        f"{model.height} {model.width}",
+    ]
+    return "\n".join(rows) + "\n"
+
+
+def xml_of(models: dict[str, OCamModel]) -> str:
+    def coefficients(values) -> str:
+        return "".join(f"<coeff>{value!r}</coeff>" for value in values)
+
+    cameras = "".join(
+        f"<CameraModel><SensorName>{name}</SensorName><Pose><position><x>0</x></position></Pose>"
+        f"<ImageSize><Width>{m.width}</Width><Height>{m.height}</Height></ImageSize>"
+        f"<OCamModel><c>{m.affine[0]}</c><d>{m.affine[1]}</d><e>{m.affine[2]}</e><cx>{m.row}</cx><cy>{m.column}</cy>"
+        f"<cam2world>{coefficients(m.pol)}</cam2world><world2cam>{coefficients(m.invpol)}</world2cam></OCamModel></CameraModel>"
+        for name, m in models.items()
+    )
+    return (
+        '<?xml version="1.0" ?><SensorFrame><Hardware><Model>M6</Model></Hardware><CameraHead>'
+        f"<SensorName>cam_head</SensorName>{cameras}</CameraHead><LaserModel/></SensorFrame>"
+    )
+
+
+def direct_rays(model: OCamModel, pixels: np.ndarray) -> np.ndarray:
+    """Scaramuzza's image-to-world map, in OpenCV's axes."""
+    c, d, e = model.affine
+    offset = np.stack([pixels[:, 1] - model.row, pixels[:, 0] - model.column])
+    u, v = np.linalg.inv([[c, d], [e, 1.0]]) @ offset
+    w = np.polynomial.polynomial.polyval(np.hypot(u, v), model.pol)
+    rays = np.stack([v, u, -w], 1)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def pixel_grid(model: OCamModel) -> np.ndarray:
+    x, y = np.meshgrid(np.linspace(0, model.width - 1, 25), np.linspace(0, model.height - 1, 19))
+    return np.stack([x.ravel(), y.ravel()], 1)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.2])
+def test_the_camera_sees_along_the_direct_polynomial(scale):
+    model = lens(scale)
+    camera, pixels = model.camera(), pixel_grid(model)
+    rays = camera.unproject(torch.from_numpy(pixels)).numpy()
+    off_px = np.linalg.norm(rays - direct_rays(model, pixels), axis=1) * camera.fx
+    assert off_px.max() < 0.01
+    again, valid = camera.project(torch.from_numpy(direct_rays(model, pixels)))
+    assert valid.all()
+    assert np.abs(again.numpy() - pixels).max() < 0.01
+
+
+def test_its_inverse_polynomial_agrees(tmp_path):
+    """world2cam as OCamCalib evaluates it, against `project`."""
+    model = lens()
+    points = np.random.default_rng(0).normal(size=(200, 3)) * (1, 1, 0.3) + (0, 0, 0.5)
+    u, v, w = points[:, 1], points[:, 0], -points[:, 2]
+    across = np.hypot(u, v)
+    rho = np.polynomial.polynomial.polyval(np.arctan(w / across), model.invpol)
+    c, d, e = model.affine
+    row = (c * u + d * v) / across * rho + model.row
+    column = (e * u + v) / across * rho + model.column
+    pixels, valid = model.camera().project(torch.from_numpy(points))
+    assert valid.sum() > 50
+    error = np.abs(pixels.numpy() - np.stack([column, row], 1))[valid.numpy()]
+    assert error.max() < 0.1
+
+
+def test_text_and_xml_hold_the_same_lens(tmp_path):
+    models = {"cam0": lens(), "cam1": replace(lens(), row=1709.98)}
+    (tmp_path / "calib_results.txt").write_text(text_of(models["cam0"]))
+    (tmp_path / "sensor_frame.xml").write_text(xml_of(models))
+    assert read_sensor_frame(tmp_path / "sensor_frame.xml") == models
+    read = read_ocamcalib(tmp_path / "calib_results.txt")
+    assert (read.width, read.height, read.row, read.column) == (4592, 3448, 1745.64, 2289.58)
+    assert read.camera().distortion == pytest.approx(models["cam0"].camera().distortion, abs=1e-4)
+
+
+def test_a_smaller_picture_of_the_same_lens():
+    small, large = lens(0.25).camera(), lens().camera()
+    ray = torch.tensor([0.4, -0.3, 0.8], dtype=torch.float64)
+    scaled = large.scaled(small.width, small.height)
+    assert torch.allclose(scaled.project(ray)[0], small.project(ray)[0], atol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"row": 2289.0, "column": 4600.0}, "lies outside the image"),
+        ({"pol": (1983.0, 0.0, 2e-4)}, "begins with 1983"),
+        ({"pol": (-1983.0, 0.0, -2e-2)}, "turns back"),
+        ({"invpol": tuple(reversed(lens().invpol))}, "two polynomials differ"),
+        ({"affine": (0.0, 0.0, 0.0)}, "affine parameters"),
+        ({"width": 0}, "image of 0x"),
+    ],
+)
+def test_a_model_of_no_lens_is_refused(change, message):
+    with pytest.raises(WearcapError, match=message):
+        replace(lens(), **change).camera()
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda text: text[: len(text) // 2], "the inverse polynomial"),
+        (lambda text: text[:300], "lacks|announced"),
+        (lambda text: text.replace("5 -", "6 -", 1), "6 are announced"),
+        (lambda text: text.replace("3448 4592", "3448"), "the image size with 1 numbers"),
+        (lambda text: text.replace("1.0005", "nan"), "the affine parameters cannot be read"),
+        (lambda text: "", "empty"),
+    ],
+)
+def test_damaged_text_is_named(damage, message, tmp_path):
+    (tmp_path / "calib_results.txt").write_text(damage(text_of(lens())))
+    with pytest.raises(WearcapError, match=message):
+        read_ocamcalib(tmp_path / "calib_results.txt")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda text: text[: len(text) // 2], "broken XML"),
+        (lambda text: text.replace("<cx>", "<cz>").replace("</cx>", "</cz>"), "no cx"),
+        (lambda text: text.replace("<Width>4592", "<Width>wide"), "Width is 'wide'"),
+        (lambda text: text.replace("cam2world", "camtoworld"), "cam2world with 0"),
+        (lambda text: text.replace("CameraModel", "Camera"), "no cameras"),
+        (lambda text: text.replace("<SensorFrame>", '<!DOCTYPE x [<!ENTITY a "b">]><SensorFrame>'), "document type"),
+        (lambda text: text.replace("cam1", "cam0"), "twice"),
+    ],
+)  # fmt: skip
+def test_damaged_xml_is_named(damage, message, tmp_path):
+    (tmp_path / "sensor_frame.xml").write_text(damage(xml_of({"cam0": lens(), "cam1": lens()})))
+    with pytest.raises(WearcapError, match=message):
+        read_sensor_frame(tmp_path / "sensor_frame.xml")
+
+
+@fuzz
+@given(damaged=mutated(text_of(lens())))
+def test_fuzzed_text(damaged, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "calib_results.txt"
+    path.write_text(damaged)
+    with contextlib.suppress(WearcapError):
+        read_ocamcalib(path).camera()
+
+
+@fuzz
+@given(damaged=mutated(xml_of({"cam0": lens()})))
+def test_fuzzed_xml(damaged, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "sensor_frame.xml"
+    path.write_text(damaged)
+    with contextlib.suppress(WearcapError):
+        [model.camera() for model in read_sensor_frame(path).values()]
