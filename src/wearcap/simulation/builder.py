@@ -66,6 +66,7 @@ class WorldBuilder:
     flights: list[w.Flight] = field(default_factory=list)
     rooms: list[w.Room] = field(default_factory=list)
     doors: list[w.Door] = field(default_factory=list)
+    spots: list[w.CaptureSpot] = field(default_factory=list)
     _triangles: list[tuple] = field(default_factory=list)
 
     def to_world(self, points: Float[np.ndarray, "*batch axis"]) -> Float[np.ndarray, "*batch axis"]:
@@ -199,7 +200,7 @@ class WorldBuilder:
             self.name, mesh, np.repeat([t[4] for t in self._triangles], face_counts),
             np.repeat(np.array([t[3] for t in self._triangles], np.float64), face_counts),
             tuple(self.objects), tuple(self.surfaces), seats, reaches, tuple(self.flights), tuple(self.rooms),
-            tuple(self.doors), cell, self.outdoors,
+            tuple(self.doors), cell, self.outdoors, tuple(self.spots),
         )  # fmt: skip
 
 

@@ -78,7 +78,7 @@ def _build_storey(
     for wall in _walls(layout, z, rng):
         build_wall(builder, wall, wall_color, rng)
     doors = [door for door in builder.doors if abs(door.position[2] - z) < 0.1]
-    kept_free = [_before_door(builder, door) for door in doors]
+    kept_free = [before_door(builder, door) for door in doors]
     kinds = rng.permutation([*ROOM_KINDS, *ROOM_KINDS])[: len(layout.rooms)]
     for number, (outline, kind) in enumerate(zip(layout.rooms, kinds)):
         _floor(builder, outline, z, level, slab, wood(rng))
@@ -152,7 +152,7 @@ def _floor(builder: WorldBuilder, outline: Box, z: float, level: int, slab: floa
     )
 
 
-def _before_door(builder: WorldBuilder, door) -> Box:
+def before_door(builder: WorldBuilder, door) -> Box:
     """The floor on both sides of a door, in the builder's frame."""
     x, y = builder.from_world(np.array(door.position[:2]))
     along = abs(np.cos(door.heading - builder.heading)) > 0.5

@@ -241,10 +241,10 @@ def _furnish(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) ->
         plan = Plan(builder, room, z, [*free, stairs_head, ramp_head])
         for kind in kinds:
             if rng.uniform() < 0.85:
-                _somewhere(plan, kind, rng)
+                put_somewhere(plan, kind, rng)
 
 
-def _somewhere(plan: Plan, kind: str, rng: np.random.Generator, tries: int = 12) -> None:
+def put_somewhere(plan: Plan, kind: str, rng: np.random.Generator, tries: int = 12) -> None:
     """Put a thing at a random place, squarely, with room to use it from its front."""
     piece = MAKERS[kind](rng)
     x_low, y_low, x_high, y_high = plan.room

@@ -14,13 +14,14 @@ from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.flat import build_flat
 from wearcap.simulation.outdoor import build_outdoor
 from wearcap.simulation.person import Person, draw_person
+from wearcap.simulation.site import build_site
 from wearcap.simulation.wearer import SimulatedMotion, simulate_motion
 from wearcap.simulation.world import World
 
 POOLS = {"train": (200, 150), "val": (20, 15), "test": (40, 30)}
 """People and places of each split: (subjects, locations of each kind); no split shares any with another."""
 
-WORLDS = {"flat": (2, build_flat), "outdoor": (3, build_outdoor)}
+WORLDS = {"flat": (2, build_flat), "outdoor": (3, build_outdoor), "site": (4, build_site)}
 """Kinds of surroundings: a number for their seeds, and their builder."""
 
 OUTDOOR_SHARE = 0.3
@@ -30,8 +31,8 @@ OUTDOOR_SHARE = 0.3
 class SimulationConfig:
     """What to simulate. `activities` names entries of `simulation.actions.ACTIVITIES`; None draws from all.
 
-    `world` is "flat", "outdoor" or None: drawn for each recording, three in ten outdoors. Raises WearcapError for
-    another.
+    `world` is "flat", "outdoor", "site", or None: one of the first two, drawn for each recording, three in ten
+    outdoors. Raises WearcapError for another.
     """
 
     duration_s: float = 120.0

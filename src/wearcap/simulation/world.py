@@ -1,7 +1,7 @@
 """The surroundings of a simulated wearer: what can be stood on, sat on, reached, bumped into and seen.
 
 World frame: metres, z up, the ground floor at z = 0. Headings are angles (rad) about z, 0 along +x.
-A builder (`flat.build_flat`, `outdoor.build_outdoor`) fills the lists; walking and planning live in
+A builder (`flat.build_flat`, `outdoor.build_outdoor`, `site.build_site`) fills the lists; walking and planning live in
 `navigation`, which sees only surfaces (stood on) and objects (bumped into), so that a new kind of object
 needs no change there.
 """
@@ -133,6 +133,23 @@ class Room:
     name: str
     polygon: Float[np.ndarray, "corner 2"]
     z: float
+    open_air: bool = False
+
+
+@dataclass(frozen=True)
+class CaptureSpot:
+    """A free square of floor beside a table, to which a recording comes back again and again."""
+
+    position: tuple[float, float, float]
+    """Its middle on the floor (m)."""
+    heading: float
+    """Towards the table (rad)."""
+    size: float
+    """Side of the square (m)."""
+    table_m: float
+    """From the middle to the table's edge."""
+    table_z: float
+    """Height of the table's top above the floor (m)."""
 
 
 @dataclass(frozen=True)
@@ -163,6 +180,7 @@ class World:
     cell: float = 0.1
     """Side of a cell of the planning grid (m)."""
     outdoors: bool = False
+    spots: tuple[CaptureSpot, ...] = ()
 
     def floor_height(
         self, points_xy: Float[np.ndarray, "*batch 2"], near_z: Float[np.ndarray, "*batch"]
