@@ -82,22 +82,99 @@ def draw_projected(pixels, vertex_nearness, valid, faces, nearness, index):
 
 
 @compiled
-def draw_splats(pixels, point_nearness, radius, valid, offset, nearness, index):
-    """Discs of `radius` pixels that face the camera; one always covers the pixel nearest to its centre."""
+def project_point(x, y, z, lens):
+    """Pixel of a point in the camera's axes, and its nearness: 1/z, for angle-drawing lenses 1/distance; 0 if unseen.
+
+    `lens` is laid out as `geometry.splats.lens_numbers` says. Pixels may lie outside the picture.
+    """
+    square = x * x + y * y
+    if lens[0] == 0.0:  # plane coordinates x/z, y/z
+        if z < lens[5]:
+            return 0.0, 0.0, 0.0
+        scale = nearness = 1.0 / z
+        s = square * nearness * nearness
+    else:  # the angle from the axis, along (x, y)
+        distance = math.sqrt(square + z * z)
+        if distance < lens[5]:
+            return 0.0, 0.0, 0.0
+        nearness = 1.0 / distance
+        radius = math.sqrt(square)
+        if radius < 1e-9 * distance:
+            if z < 0:
+                return 0.0, 0.0, 0.0
+            scale, s = 1.0 / z, 0.0
+        else:
+            theta = math.atan2(radius, z)
+            scale, s = theta / radius, theta * theta
+    if s >= lens[6]:
+        return 0.0, 0.0, 0.0
+    u, v = x * scale, y * scale
+    count = int(lens[7])
+    if count > 0:
+        argument = s if lens[8] == 0.0 else math.sqrt(s)
+        gain = 0.0
+        for k in range(count, 0, -1):
+            gain = (gain + lens[18 + k]) * argument
+        bent_u, bent_v = u * (1.0 + gain), v * (1.0 + gain)
+        base_u, base_v = (bent_u, bent_v) if lens[9] == 0.0 else (u, v)
+        base = base_u * base_u + base_v * base_v
+        along = 2.0 * (base_u * lens[10] + base_v * lens[11])
+        bent = bent_u * bent_u + bent_v * bent_v
+        u = bent_u + along * base_u + base * lens[10] + (lens[12] + lens[13] * bent) * bent
+        v = bent_v + along * base_v + base * lens[11] + (lens[14] + lens[15] * bent) * bent
+        u, v = u + lens[16] * v, lens[17] * u + lens[18] * v
+    return lens[1] * u + lens[3], lens[2] * v + lens[4], nearness
+
+
+@compiled
+def _disc(x, y, r, w, number, nearness, index):
+    """One disc of r pixels that faces the camera; it always covers the pixel nearest to its centre."""
     height, width = nearness.shape
-    for number in range(len(pixels)):
-        if not valid[number]:
+    column, row = math.floor(x + 0.5), math.floor(y + 0.5)
+    if 0 <= column < width and 0 <= row < height and w > nearness[row, column]:
+        nearness[row, column] = w
+        index[row, column] = number
+    for v in range(max(0, math.ceil(y - r)), min(height - 1, math.floor(y + r)) + 1):
+        reach = math.sqrt(max(0.0, r * r - (v - y) ** 2))
+        for u in range(max(0, math.ceil(x - reach)), min(width - 1, math.floor(x + reach)) + 1):
+            if w > nearness[v, u]:
+                nearness[v, u] = w
+                index[v, u] = number
+
+
+@compiled
+def draw_splats(points, first, centers, radii, pose, planes, lens, radius, metric, offset, nearness, index):
+    """Project points, block by block, and draw those that the camera sees as discs.
+
+    Block b holds points first[b] … first[b + 1] - 1 within `radii[b]` of `centers[b]`; a block that lies beyond one
+    of `planes` (inward normal in the camera's axes) is passed over. `pose`: [R_cam_world | t_cam_world].
+    `radius`: in metres where `metric`, else in pixels. Returns the number of points that were projected.
+    """
+    height, width = nearness.shape
+    focal = 0.5 * (lens[1] + lens[2])
+    projected = 0
+    for block in range(len(first) - 1):
+        outside = False
+        for plane in range(len(planes)):
+            depth = 0.0
+            for row in range(3):
+                depth += planes[plane, row] * (
+                    pose[row, 0] * centers[block, 0] + pose[row, 1] * centers[block, 1]
+                    + pose[row, 2] * centers[block, 2] + pose[row, 3]
+                )  # fmt: skip
+            outside = outside or depth < -radii[block]
+        if outside:
             continue
-        x, y, r, w = pixels[number, 0], pixels[number, 1], radius[number], point_nearness[number]
-        column, row = math.floor(x + 0.5), math.floor(y + 0.5)
-        for v in range(max(0, min(row, math.ceil(y - r))), min(height - 1, max(row, math.floor(y + r))) + 1):
-            for u in range(
-                max(0, min(column, math.ceil(x - r))), min(width - 1, max(column, math.floor(x + r))) + 1
-            ):
-                inside = (u - x) ** 2 + (v - y) ** 2 <= r * r or (u == column and v == row)
-                if inside and w > nearness[v, u]:
-                    nearness[v, u] = w
-                    index[v, u] = offset + number
+        projected += first[block + 1] - first[block]
+        for number in range(first[block], first[block + 1]):
+            px, py, pz = float(points[number, 0]), float(points[number, 1]), float(points[number, 2])
+            x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
+            y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
+            z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+            u, v, w = project_point(x, y, z, lens)
+            if w > 0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
+                _disc(u, v, radius * focal * w if metric else radius, w, offset + number, nearness, index)
+    return projected
 
 
 @compiled

@@ -17,9 +17,7 @@ from wearcap.geometry import raster
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
-
-_NEAR = 0.02
-"""Nothing closer to the camera than this (m) is drawn."""
+from wearcap.geometry.splats import NEAR_M, camera_from_world, lens_numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +77,7 @@ def render(
     then those of the nearest sample.
     """
     fine = camera.scaled(camera.width * supersample, camera.height * supersample)
-    scene, points = _joined(meshes), _joined_points(splats)
+    scene = _joined(meshes)
     R = T_world_cam.R.detach().double().cpu().numpy()
     t = T_world_cam.t.detach().double().cpu().numpy()
     vertices_cam = (scene.vertices - t) @ R
@@ -87,16 +85,21 @@ def render(
     index = np.full((fine.height, fine.width), -1, np.int32)
     if fine.model == "pinhole":
         raster.draw_pinhole(
-            vertices_cam, scene.faces, fine.fx, fine.fy, fine.cx, fine.cy, _NEAR, nearness, index
+            vertices_cam, scene.faces, fine.fx, fine.fy, fine.cx, fine.cy, NEAR_M, nearness, index
         )
     else:
-        pixels, near, valid = _project(fine, vertices_cam, margin=True)
+        pixels, near, valid = _project(fine, vertices_cam)
         raster.draw_projected(pixels, near, valid, scene.faces, nearness, index)
-    pixels, near, valid = _project(fine, (points.points - t) @ R, margin=False)
-    focal = 0.5 * (fine.fx + fine.fy)
-    radius = np.where(points.metric, points.radius * focal * near, points.radius * supersample)
-    raster.draw_splats(pixels, near, radius, valid, len(scene.faces), nearness, index)
-    return _resolve(camera, fine, R, t, vertices_cam, scene, points, light, background, nearness, index)
+    offset = len(scene.faces)
+    for cloud in splats:
+        one_block = np.array([0, len(cloud.points)]), np.zeros((1, 3)), np.full(1, np.inf)
+        raster.draw_splats(
+            cloud.points, *one_block, camera_from_world(T_world_cam), np.zeros((0, 3)), lens_numbers(fine),
+            cloud.radius * (1.0 if cloud.metric else supersample), cloud.metric, offset, nearness, index,
+        )  # fmt: skip
+        offset += len(cloud.points)
+    colors = _point_colors(splats)
+    return _resolve(camera, fine, R, t, vertices_cam, scene, colors, light, background, nearness, index)
 
 
 def orthographic_map(
@@ -158,39 +161,22 @@ def _joined(meshes: Sequence[Mesh]) -> _Scene:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Points:
-    points: np.ndarray
-    colors: np.ndarray
-    radius: np.ndarray
-    metric: np.ndarray
+def _point_colors(splats: Sequence[Splats]) -> np.ndarray:
+    """RGB 0…255 of the points of all splats."""
+    colors = [np.broadcast_to(255 * cloud.color, cloud.points.shape) for cloud in splats]
+    return np.concatenate([np.zeros((0, 3)), *colors]).astype(np.float32)
 
 
-def _joined_points(splats: Sequence[Splats]) -> _Points:
-    counts = [len(s.points) for s in splats]
-    return _Points(
-        np.concatenate([np.zeros((0, 3)), *(s.points for s in splats)]),
-        np.concatenate(
-            [np.zeros((0, 3), np.float32), *(np.broadcast_to(255 * s.color, s.points.shape) for s in splats)]
-        ).astype(np.float32),
-        np.repeat(np.array([s.radius for s in splats], float), counts),
-        np.repeat(np.array([s.metric for s in splats], bool), counts),
-    )
-
-
-def _project(
-    camera: Camera, points_cam: np.ndarray, margin: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels, nearness and which points may be drawn; with `margin` also those outside the picture."""
+def _project(camera: Camera, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels, nearness and which points may be drawn, some way outside the picture too."""
     wide = Camera(
         camera.model, 3 * camera.width, 3 * camera.height, camera.fx, camera.fy,
         camera.cx + camera.width, camera.cy + camera.height, camera.distortion,
     )  # fmt: skip
-    pixels, valid = (wide if margin else camera).project(torch.from_numpy(points_cam))
-    if margin:
-        pixels = pixels - torch.tensor([camera.width, camera.height])
+    pixels, valid = wide.project(torch.from_numpy(points_cam))
+    pixels = pixels - torch.tensor([camera.width, camera.height])
     depth = np.linalg.norm(points_cam, axis=-1) if camera.is_fisheye else points_cam[:, 2]
-    valid = valid.numpy() & (depth >= _NEAR)
+    valid = valid.numpy() & (depth >= NEAR_M)
     return pixels.numpy(), 1 / np.where(valid, depth, 1.0), valid
 
 
@@ -230,7 +216,9 @@ def _shadow_maps(scene: _Scene, light: Light) -> tuple:
     return np.concatenate([key_axes, down_axes]), scale, shadow, high, low, contact
 
 
-def _resolve(camera, fine, R, t, vertices_cam, scene, points, light, background, nearness, index) -> Frame:
+def _resolve(
+    camera, fine, R, t, vertices_cam, scene, point_colors, light, background, nearness, index
+) -> Frame:
     """Shade what the z-buffer holds, at the picture's own size."""
     to_light = np.asarray(light.to_light, float) / np.linalg.norm(light.to_light)
     shine = np.array([*to_light, light.key, light.ambient_below, light.ambient_above])
@@ -243,6 +231,6 @@ def _resolve(camera, fine, R, t, vertices_cam, scene, points, light, background,
     raster.resolve(
         nearness, index, _pixel_rays(fine), fine.width // camera.width, pose, vertices_cam, scene.faces,
         (scene.normals @ R).astype(np.float32), scene.smooth, scene.casts, scene.colors, scene.color_rows,
-        points.colors, shine, axes, scale, *maps, _CONTACT_FADE, np.ascontiguousarray(back), color, depth, number,
+        point_colors, shine, axes, scale, *maps, _CONTACT_FADE, np.ascontiguousarray(back), color, depth, number,
     )  # fmt: skip
     return Frame(color, depth, number, len(scene.faces))
