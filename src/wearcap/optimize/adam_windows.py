@@ -1,0 +1,82 @@
+"""The document's solver (thesis §4.3.1): Adam over windows of 100 frames that share one frame."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.geometry import rotation
+from wearcap.optimize.hps import HpsData, HpsEnergy, HpsState, energy_terms
+from wearcap.optimize.solution import Solution
+
+
+@dataclass(frozen=True)
+class AdamSettings:
+    """The document's window and step, the released code's rate and number of steps."""
+
+    window: int = 100
+    advance: int = 99
+    steps: int = 500
+    learning_rate: float = 1e-3
+    full_mesh: bool = True
+    """Skin the whole body at each step, as the document does; False: the patches alone, with the same result."""
+
+
+def solve_adam_windows(
+    energy: HpsEnergy,
+    data: HpsData,
+    settings: AdamSettings = AdamSettings(),
+    progress: Callable[[int], None] = lambda frames: None,
+) -> Solution:
+    """Minimise window after window; a window's first frame keeps the previous window's last (all but the first).
+
+    `progress` is told the number of frames after each window.
+    """
+    state = data.start
+    theta, R, t = state.theta.clone(), state.R_world_root.clone(), state.t_world_root.clone()
+    histories, begin = [], 0
+    while True:
+        stop = min(begin + settings.window, len(data))
+        window = slice(begin, stop)
+        known = HpsState(theta[window], R[window], t[window])
+        solved, history = _solve_window(energy, data[window], known, begin > 0, settings)
+        theta[window], R[window], t[window] = solved.theta, solved.R_world_root, solved.t_world_root
+        histories.append(history)
+        progress(stop)
+        if stop == len(data):
+            break
+        begin += settings.advance
+    mean = [{name: sum(step[name] for step in steps) / len(steps) for name in steps[0]} for steps in zip(*histories)]
+    return Solution(HpsState(theta, R, t), mean, f"{settings.steps} steps per window")
+
+
+def _solve_window(
+    energy: HpsEnergy, data: HpsData, start: HpsState, fixed_first: bool, settings: AdamSettings
+) -> tuple[HpsState, list[dict[str, float]]]:
+    theta = start.theta.clone().requires_grad_()
+    turn = torch.zeros_like(start.t_world_root).requires_grad_()
+    t = start.t_world_root.clone().requires_grad_()
+    adam = torch.optim.Adam([theta, turn, t], lr=settings.learning_rate)
+    free = torch.ones(len(data), 1, dtype=t.dtype)
+    if fixed_first:
+        free[0] = 0.0
+
+    def state() -> HpsState:
+        return HpsState(
+            start.theta + free[..., None] * (theta - start.theta),
+            start.R_world_root @ rotation.exp(free * turn),
+            start.t_world_root + free * (t - start.t_world_root),
+        )
+
+    history = []
+    for _ in range(settings.steps):
+        adam.zero_grad()
+        terms = energy_terms(energy, data, state(), full_mesh=settings.full_mesh)
+        total: Float[Tensor, ""] = torch.stack(list(terms.values())).sum()
+        total.backward()
+        adam.step()
+        history.append({name: value.item() for name, value in terms.items()} | {"total": total.item()})
+    with torch.no_grad():
+        return HpsState(*(part.clone() for part in vars(state()).values())), history

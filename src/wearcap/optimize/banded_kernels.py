@@ -1,0 +1,217 @@
+"""Compiled assembly of HPS' normal equations: time is banded, and only head, root and feet enter.
+
+Unknowns of a frame, in this order: translation (3), root rotation (3, right perturbation), axis-angles of the
+active joints (3 each). Derivatives go through world axes: a perturbation of joint i turns all below it about the
+columns of `axes[i]`. The two joints that hold a foot's vertices move as twists, so that a foot's twenty vertices
+cost one 12 x 12 form.
+
+Weights are of iteratively reweighted least squares: an element's ρ(s) is met by ½ w s², w = ρ'(s) / s.
+"""
+
+import numpy as np
+
+from wearcap.geometry.compiled import compiled
+
+NORM, SQUARE, HUBER, CAUCHY = 0, 1, 2, 3
+
+
+@compiled
+def reweight(square, kind, delta, smooth):
+    """(ρ, ρ'(s) / s) of an element whose squared norm is given; the weight of a norm is that of its
+    tip rounded by `smooth`."""
+    if kind == SQUARE:
+        return square, 2.0
+    if kind == CAUCHY:
+        return 0.5 * delta * np.log1p(square / delta**2), 1.0 / (delta * (1.0 + square / delta**2))
+    norm = np.sqrt(square)
+    if kind == HUBER and norm < delta:
+        return square / (2 * delta), 1.0 / delta
+    if kind == HUBER:
+        return norm - delta / 2, 1.0 / norm
+    return norm, 1.0 / np.sqrt(square + smooth * smooth)
+
+
+@compiled
+def exp_and_jacobian(v, R, J):
+    """Rotation matrix of a rotation vector, and its right Jacobian: exp(v + d) ≈ exp(v) exp(J d)."""
+    square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if square < 1e-8:
+        a, b, c = 1.0 - square / 6, 0.5 - square / 24, 1.0 / 6 - square / 120
+    else:
+        angle = np.sqrt(square)
+        a, b, c = np.sin(angle) / angle, (1 - np.cos(angle)) / square, (angle - np.sin(angle)) / (square * angle)
+    for i in range(3):
+        for k in range(3):
+            outer = v[i] * v[k]
+            R[i, k] = b * outer
+            J[i, k] = c * outer
+        R[i, i] += 1.0 - b * square
+        J[i, i] += 1.0 - c * square
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        R[j, i] += a * v[k]
+        R[i, j] -= a * v[k]
+        J[j, i] -= b * v[k]
+        J[i, j] += b * v[k]
+
+
+@compiled
+def log_of(R, v):
+    """Rotation vector of a rotation matrix (angles up to π)."""
+    v[0], v[1], v[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    sine = 0.5 * np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+    cosine = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    angle = np.arctan2(sine, cosine)
+    if sine > 1e-7:
+        v *= 0.5 * angle / sine
+    elif cosine > 0:
+        v *= 0.5
+    else:  # half a turn: the axis from the symmetric part
+        k = np.argmax(np.array([R[0, 0], R[1, 1], R[2, 2]]))
+        for i in range(3):
+            v[i] = 0.5 * (R[i, k] + R[k, i]) + (1.0 if i == k else 0.0)
+        v *= angle / np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+
+
+@compiled
+def turn_between(A, B, v):
+    """Rotation vector (world axes) that turns A into B: log(B Aᵀ)."""
+    M = np.zeros((3, 3))
+    for i in range(3):
+        for k in range(3):
+            for m in range(3):
+                M[i, k] += B[i, m] * A[k, m]
+    log_of(M, v)
+
+
+@compiled
+def pose_all(theta, R_root, t, parents, offsets, R, c, axes):
+    """Forward kinematics of the active joints, entry 0 the root: rotations, origins, perturbation axes (world)."""
+    R_local, J = np.empty((3, 3)), np.empty((3, 3))
+    for j in range(len(t)):
+        R[j, 0], c[j, 0], axes[j, 0] = R_root[j], t[j], R_root[j]
+        for a in range(theta.shape[1]):
+            exp_and_jacobian(theta[j, a], R_local, J)
+            above = parents[a]
+            for i in range(3):
+                c[j, a + 1, i] = c[j, above, i]
+                for k in range(3):
+                    c[j, a + 1, i] += R[j, above, i, k] * offsets[a, k]
+                    R[j, a + 1, i, k] = 0.0
+                    for m in range(3):
+                        R[j, a + 1, i, k] += R[j, above, i, m] * R_local[m, k]
+            for i in range(3):
+                for k in range(3):
+                    axes[j, a + 1, i, k] = 0.0
+                    for m in range(3):
+                        axes[j, a + 1, i, k] += R[j, a + 1, i, m] * J[m, k]
+
+
+@compiled
+def patch_points(R, c, holders, arms, weights, points):
+    """Positions of patch vertices held by two joints each."""
+    for j in range(len(R)):
+        for n in range(len(holders)):
+            for i in range(3):
+                points[j, n, i] = 0.0
+                for h in range(2):
+                    joint, share = holders[n, h], weights[n, h]
+                    if share > 0:
+                        points[j, n, i] += share * c[j, joint, i]
+                        for k in range(3):
+                            points[j, n, i] += share * R[j, joint, i, k] * arms[n, h, k]
+
+
+@compiled
+def vertex_twist(R, holders, arms, weights, n, A):
+    """Motion of vertex n (3) by the twists (v, ω) of its foot's two holders: a 3 x 12 matrix."""
+    for h in range(2):
+        share, joint = weights[n, h], holders[n, h]
+        arm = np.zeros(3)
+        for i in range(3):
+            for k in range(3):
+                arm[i] += R[joint, i, k] * arms[n, h, k]
+        for i in range(3):
+            for k in range(6):
+                A[i, 6 * h + k] = 0.0
+            A[i, 6 * h + i] = share
+        A[0, 6 * h + 4], A[0, 6 * h + 5] = share * arm[2], -share * arm[1]
+        A[1, 6 * h + 5], A[1, 6 * h + 3] = share * arm[0], -share * arm[2]
+        A[2, 6 * h + 3], A[2, 6 * h + 4] = share * arm[1], -share * arm[0]
+
+
+@compiled
+def foot_map(c, axes, chain, holders, T):
+    """Twists of a foot's two holders by the unknowns t, root and the joints of the leg: a 12 x (6 + 3 legs) matrix."""
+    T[:] = 0.0
+    for h in range(2):
+        top = c[holders[h]]
+        for i in range(3):
+            T[6 * h + i, i] = 1.0
+        for column in range(len(chain) + 1):
+            joint = 0 if column == 0 else chain[column - 1]
+            if joint > holders[h]:
+                continue
+            x, y, z = top[0] - c[joint, 0], top[1] - c[joint, 1], top[2] - c[joint, 2]
+            for a in range(3):
+                u = axes[joint, :, a]
+                at = 3 + 3 * column + a
+                T[6 * h, at] = u[1] * z - u[2] * y
+                T[6 * h + 1, at] = u[2] * x - u[0] * z
+                T[6 * h + 2, at] = u[0] * y - u[1] * x
+                for i in range(3):
+                    T[6 * h + 3 + i, at] = u[i]
+
+
+@compiled
+def add_block(target, rows, columns, block):
+    """Add a block to rows and columns of a matrix."""
+    for a in range(len(rows)):
+        for b in range(len(columns)):
+            target[rows[a], columns[b]] += block[a, b]
+
+
+@compiled
+def factor_and_solve(diagonal, below, right, damping):
+    """Solve the block tridiagonal system in place: Cholesky forwards, substitution forwards and backwards.
+
+    diagonal (time, n, n) and below (time - 1, n, n; rows of the next frame) are overwritten by the factors, right
+    (time, n) by the solution. Diagonals are raised by their share `damping`. Returns False where the matrix is
+    not positive definite.
+    """
+    count, n = right.shape
+    for j in range(count):
+        D = diagonal[j]
+        for i in range(n):
+            D[i, i] += damping * D[i, i] + 1e-12
+        for i in range(n):  # D = L Lᵀ, row by row
+            for k in range(i + 1):
+                total = D[i, k]
+                for m in range(k):
+                    total -= D[i, m] * D[k, m]
+                if k < i:
+                    D[i, k] = total / D[k, k]
+                elif total > 0:
+                    D[i, i] = np.sqrt(total)
+                else:
+                    return False
+        for i in range(n):
+            for k in range(i):
+                right[j, i] -= D[i, k] * right[j, k]
+            right[j, i] /= D[i, i]
+        if j + 1 < count:
+            X = np.ascontiguousarray(below[j].T)  # Lᵀ-1 of the coupling, column of the next frame by column
+            for i in range(n):
+                for k in range(i):
+                    X[i] -= D[i, k] * X[k]
+                X[i] /= D[i, i]
+            below[j] = X.T
+            diagonal[j + 1] -= np.dot(below[j], X)
+            right[j + 1] -= np.dot(below[j], right[j])
+    for j in range(count - 1, -1, -1):
+        if j + 1 < count:
+            right[j] -= np.dot(below[j].T, right[j + 1])
+        for i in range(n - 1, -1, -1):
+            for k in range(i + 1, n):
+                right[j, i] -= diagonal[j, k, i] * right[j, k]
+            right[j, i] /= diagonal[j, i, i]
+    return True

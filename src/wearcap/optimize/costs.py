@@ -1,0 +1,109 @@
+"""The terms of HPS as pure functions of what they see; each returns residuals, and `Loss` turns those into energy.
+
+A residual is a vector per element: per frame, pair of frames, or patch vertex. The documents' energies are means
+of its norms (`Loss("norm")`); other losses are ours. Frames at 30 Hz, rotations as matrices, metres, radians.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+
+LOSSES = ("norm", "square", "huber", "cauchy")
+
+
+@dataclass(frozen=True)
+class Loss:
+    """ρ of a residual's norm s: s, s², s²/2δ up to δ and s − δ/2 beyond, or δ/2 · log(1 + (s/δ)²)."""
+
+    kind: str = "norm"
+    delta: float = 1.0
+    """Where "huber" and "cauchy" turn from square to robust, in the residual's unit."""
+
+    def __post_init__(self):
+        if self.kind not in LOSSES:
+            raise WearcapError(f"no loss {self.kind!r}", expected=f"one of {', '.join(LOSSES)}")
+        if not self.delta > 0:
+            raise WearcapError(f"a loss with delta {self.delta}", expected="a positive number")
+
+    def __call__(self, residual: Float[Tensor, "*batch component"]) -> Float[Tensor, "*batch"]:
+        """ρ of each element; the gradient is finite at zero."""
+        square = (residual**2).sum(-1)
+        if self.kind == "square":
+            return square
+        if self.kind == "cauchy":
+            return 0.5 * self.delta * torch.log1p(square / self.delta**2)
+        norm = torch.where(square > 0, square, 1.0).sqrt() * (square > 0)
+        if self.kind == "norm":
+            return norm
+        return torch.where(norm < self.delta, square / (2 * self.delta), norm - self.delta / 2)
+
+
+def head_orientation(
+    R_world_head: Float[Tensor, "time 3 3"],
+    R_head_cam: Float[Tensor, "3 3"],
+    R_world_cam: Float[Tensor, "time 3 3"],
+) -> Float[Tensor, "time 3"]:
+    """Turn (rad) from the body's camera R^H(θ) R_HC to the localised one (thesis eq. 4.2–4.4), in the world."""
+    return _turn(R_world_head @ R_head_cam, R_world_cam)
+
+
+def foot_contact(
+    points: Float[Tensor, "time vertex 3"], surface: Float[Tensor, "time vertex 3"]
+) -> Float[Tensor, "time vertex 3"]:
+    """Offset (m) of patch vertices M_n from their nearest scene points v(n) (thesis eq. 4.6)."""
+    return points - surface
+
+
+def foot_plane(
+    points: Float[Tensor, "time vertex 3"],
+    origin: Float[Tensor, "time vertex 3"],
+    normal: Float[Tensor, "time vertex 3"],
+) -> Float[Tensor, "time vertex 1"]:
+    """Signed distance (m) of patch vertices from the scan's local plane: eq. 4.6 without the cloud's grain (ours)."""
+    return ((points - origin) * normal).sum(-1, keepdim=True)
+
+
+def foot_slide(points: Float[Tensor, "time vertex 3"]) -> Float[Tensor, "pair vertex 3"]:
+    """Way (m) of patch vertices from frame to frame (thesis eq. 4.7)."""
+    return points.diff(dim=0)
+
+
+def translation_step(
+    t_world_root: Float[Tensor, "time 3"], expected: Float[Tensor, "pair 3"]
+) -> Float[Tensor, "pair 3"]:
+    """Step of the root (m) beyond what is expected: nothing (thesis eq. 4.9) or the suit's step (released code)."""
+    return t_world_root.diff(dim=0) - expected
+
+
+def rotation_step(
+    R_world_body: Float[Tensor, "time 3 3"], expected: Float[Tensor, "pair 3 3"]
+) -> Float[Tensor, "pair 3"]:
+    """Turn (rad) from frame to frame beyond the expected one: none (thesis eq. 4.10, 4.11) or the suit's (ours).
+
+    The expected turn is R_world_body[j + 1] R_world_body[j]ᵀ.
+    """
+    return _turn(expected @ R_world_body[:-1], R_world_body[1:])
+
+
+def pose_prior(
+    theta: Float[Tensor, "time joint 3"], theta_imu: Float[Tensor, "time joint 3"]
+) -> Float[Tensor, "time component"]:
+    """All joints' axis-angles but the root's against the suit's, one vector per frame (thesis eq. 4.12)."""
+    return (theta - theta_imu).flatten(1)
+
+
+def translation_hold(
+    t_world_root: Float[Tensor, "time 3"], held: Float[Tensor, "time 3"]
+) -> Float[Tensor, "time 3"]:
+    """Offset (m) of the root from where the camera's localisation puts it (released code; no equation)."""
+    return t_world_root - held
+
+
+def _turn(R_a: Float[Tensor, "*batch 3 3"], R_b: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Rotation vector (world axes, rad) that turns a into b."""
+    return rotation.log(R_b @ R_a.transpose(-1, -2))

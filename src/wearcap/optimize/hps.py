@@ -1,0 +1,191 @@
+"""HPS as an energy (thesis eq. 4.1–4.12): what is known of a recording, the unknowns, and the terms between them."""
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.surface import SurfaceIndex
+from wearcap.optimize import costs
+from wearcap.optimize.costs import Loss
+from wearcap.optimize.feet import FootPatches
+
+TERMS = (
+    "self", "contact", "contact_plane", "slide", "translation_smooth", "root_smooth", "head_smooth", "pose",
+    "hold", "translation_step", "root_step", "head_step",
+)  # fmt: skip
+"""`costs` by the names under which a config weighs them."""
+
+SURFACE_REACH_M = 0.5
+"""A foot further than this from every scanned point has no scene beneath it."""
+
+
+@dataclass(frozen=True)
+class HpsEnergy:
+    """E = Σ weight · mean of ρ(residual), by term; terms without an entry are left out.
+
+    Raises WearcapError for a term that does not exist or a negative weight.
+    """
+
+    weights: dict[str, float]
+    losses: dict[str, Loss] = field(default_factory=dict)
+    """The document's norms where a term is not named."""
+
+    def __post_init__(self):
+        for name in (*self.weights, *self.losses):
+            if name not in TERMS:
+                raise WearcapError(f"HPS has no term {name!r}", expected=f"one of {', '.join(TERMS)}")
+        if any(not weight >= 0 for weight in self.weights.values()):
+            raise WearcapError("a negative weight of a term", expected="zero or more")
+
+    def weight(self, name: str) -> float:
+        return self.weights.get(name, 0.0)
+
+    def loss(self, name: str) -> Loss:
+        return self.losses.get(name, Loss())
+
+
+@dataclass(frozen=True, eq=False)
+class HpsState:
+    """The unknowns: axis-angles of all joints but the root, and the root's pose in the world (float64)."""
+
+    theta: Float[Tensor, "time joint 3"]
+    R_world_root: Float[Tensor, "time 3 3"]
+    t_world_root: Float[Tensor, "time 3"]
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def __getitem__(self, frames: slice) -> "HpsState":
+        return HpsState(self.theta[frames], self.R_world_root[frames], self.t_world_root[frames])
+
+    @property
+    def R_parent_joint(self) -> Float[Tensor, "time joint 3 3"]:
+        return torch.cat([self.R_world_root[:, None], rotation.exp(self.theta)], 1)
+
+
+@dataclass(frozen=True, eq=False)
+class HpsData:
+    """What sensors and initialisation say, frame by frame at one rate (float64; m, rad)."""
+
+    patches: FootPatches
+    start: HpsState
+    """Initialisation (thesis §4.2.5); its theta is the suit's, θ^I."""
+    R_head_cam: Float[Tensor, "3 3"]
+    R_world_cam: Float[Tensor, "time 3 3"]
+    """Localised orientations."""
+    cam_confidence: Float[Tensor, "time"]
+    """Weighs each frame's `self` term: 0 where the camera was not localised."""
+    hold_confidence: Float[Tensor, "time"]
+    """Weighs each frame's `hold` on the initial translation."""
+    contact: Float[Tensor, "time patch"]
+    t_step: Float[Tensor, "pair 3"]
+    """Steps of the root by the suit, turned into the scene (m)."""
+    R_root_step: Float[Tensor, "pair 3 3"]
+    R_head_step: Float[Tensor, "pair 3 3"]
+    surface: SurfaceIndex | None = None
+    """None: without scene."""
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def __getitem__(self, frames: slice) -> "HpsData":
+        """Frames start…stop-1 (no step)."""
+        begin, stop, _ = frames.indices(len(self))
+        pairs = slice(begin, max(stop - 1, begin))
+        return replace(
+            self, start=self.start[frames], R_world_cam=self.R_world_cam[frames],
+            cam_confidence=self.cam_confidence[frames], hold_confidence=self.hold_confidence[frames],
+            contact=self.contact[frames], t_step=self.t_step[pairs], R_root_step=self.R_root_step[pairs],
+            R_head_step=self.R_head_step[pairs],
+        )  # fmt: skip
+
+    def pose(self, state: HpsState) -> Rigid:
+        """Poses of all joints."""
+        return forward_kinematics(self.patches.body.skeleton, state.R_parent_joint, state.t_world_root)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Nearest scene point v(n) of each patch vertex (eq. 4.6), and the plane there; `found` where there is one."""
+
+    point: Float[Tensor, "time vertex 3"]
+    origin: Float[Tensor, "time vertex 3"]
+    normal: Float[Tensor, "time vertex 3"]
+    found: Float[Tensor, "time vertex"]
+
+
+def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"]) -> Ground | None:
+    """Look up the scene beneath patch vertices (m, world) in contact; None without a scene.
+
+    A patch has one plane: that beneath its middle.
+    """
+    if data.surface is None:
+        return None
+    middles = data.patches.middles(points.detach().double())
+    stands = data.contact > 0
+    origin, normal = torch.zeros_like(middles), torch.zeros_like(middles)
+    queries = middles[stands].numpy()
+    found = torch.zeros_like(data.contact)
+    where, up = (torch.from_numpy(part) for part in data.surface.plane(queries, reach_m=SURFACE_REACH_M))
+    found[stands] = up.isfinite().all(-1).double()
+    origin[stands], normal[stands] = where.nan_to_num(), up.nan_to_num()
+    of_vertex, point = found[:, data.patches.patch], points.detach().double().clone()
+    seek = of_vertex > 0
+    nearest = data.surface.nearest_points(point[seek].numpy(), 2 * SURFACE_REACH_M)
+    point[seek] = torch.from_numpy(nearest)
+    by_vertex = data.patches.patch
+    return Ground(point, origin[:, by_vertex], normal[:, by_vertex], of_vertex)
+
+
+def energy_terms(
+    energy: HpsEnergy, data: HpsData, state: HpsState, ground: Ground | None = None, full_mesh: bool = False
+) -> dict[str, Float[Tensor, ""]]:
+    """Each weighed term of eq. 4.1, differentiable in the state.
+
+    `ground` None: looked up for this state. `full_mesh` skins the whole body and takes the patches from it, as
+    the document does; the result is the same.
+    """
+    T_world_joint = data.pose(state)
+    head = data.patches.body.skeleton.index("head")
+    points = _patch_points(data, T_world_joint, full_mesh)
+    if ground is None:
+        ground = find_ground(data, points)
+    stands = data.patches.share(data.contact) / 4
+    stays = data.patches.share(data.contact[1:] * data.contact[:-1]) / 4
+    R_head, R_root, t = T_world_joint.R[:, head], state.R_world_root, state.t_world_root
+    same = torch.eye(3).to(R_root).expand(len(data) - 1, 3, 3)
+    elements = {
+        "self": lambda: (costs.head_orientation(R_head, data.R_head_cam, data.R_world_cam), data.cam_confidence),
+        "contact": lambda: (costs.foot_contact(points, ground.point), stands * ground.found),
+        "contact_plane": lambda: (costs.foot_plane(points, ground.origin, ground.normal), stands * ground.found),
+        "slide": lambda: (costs.foot_slide(points), stays),
+        "translation_smooth": lambda: (costs.translation_step(t, torch.zeros_like(t[1:])), None),
+        "root_smooth": lambda: (costs.rotation_step(R_root, same), None),
+        "head_smooth": lambda: (costs.rotation_step(R_head, same), None),
+        "pose": lambda: (costs.pose_prior(state.theta, data.start.theta), None),
+        "hold": lambda: (costs.translation_hold(t, data.start.t_world_root), data.hold_confidence),
+        "translation_step": lambda: (costs.translation_step(t, data.t_step), None),
+        "root_step": lambda: (costs.rotation_step(R_root, data.R_root_step), None),
+        "head_step": lambda: (costs.rotation_step(R_head, data.R_head_step), None),
+    }  # fmt: skip
+    terms = {}
+    for name, weight in energy.weights.items():
+        if weight == 0 or (name.startswith("contact") and ground is None):
+            continue
+        residual, share_of = elements[name]()
+        value = energy.loss(name)(residual)
+        value = value if share_of is None else value * share_of
+        terms[name] = weight * value.sum() / max(len(residual), 1)
+    return terms
+
+
+def _patch_points(data: HpsData, T_world_joint: Rigid, full_mesh: bool) -> Float[Tensor, "time vertex 3"]:
+    if full_mesh:
+        return data.patches.body.vertices(T_world_joint)[:, data.patches.vertex]
+    return data.patches.points(T_world_joint)
