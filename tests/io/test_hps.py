@@ -1,0 +1,411 @@
+"""The HPS data set: what was written in its layout comes back in our axes; damage is named."""
+
+import json
+import math
+import pickle
+import shutil
+import warnings
+from contextlib import suppress
+from pathlib import Path
+
+import av
+import hps_files
+import numpy as np
+import pytest
+import torch
+from hostile import fuzz, mutated, mutated_bytes
+from hps_files import CAM_START, FRAMES, IMU_START, NAME, SCAN, write_hps, write_scan, write_smpl, write_unity
+from hypothesis import given
+from test_mvnx import mvnx, sample
+
+from wearcap.body.skeletons import smpl24
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.io.hps import (
+    read_hps_cameras,
+    read_hps_localization,
+    read_hps_motion,
+    read_hps_starts,
+    read_hps_subject,
+    resampled_localization,
+)
+from wearcap.io.hps_scene import is_hps_scene, read_hps_scene
+from wearcap.io.hps_sequence import hps_names, is_hps, read_hps_sequence, scan_name, subject_of
+from wearcap.io.hps_unity import read_unity_motion, rotations_from_unity
+
+
+def same_motion(a, b, atol: float = 1e-5) -> None:
+    assert a.skeleton.name == b.skeleton.name == "smpl24"
+    torch.testing.assert_close(a.R_parent_joint, b.R_parent_joint, atol=atol, rtol=0)
+    torch.testing.assert_close(a.t_world_root, b.t_world_root, atol=atol, rtol=0)
+
+
+# Single files ------------------------------------------------------------------------------------------------------
+
+
+def test_published_motion(tmp_path):
+    truth = hps_files.motion()
+    write_smpl(truth, tmp_path / "a.pkl")
+    read = read_hps_motion(tmp_path / "a.pkl")
+    same_motion(read, truth)
+    assert read.fps == pytest.approx(30.0)
+
+
+def test_a_pose_of_zeros_stands_up_facing_x(tmp_path):
+    """SMPL's own axes of a person that was turned to z up: x left, y up, z forward before the turn."""
+    upright = np.zeros((2, 72))
+    upright[:, 0] = math.pi / 2  # about x: y up becomes z up, and z forward becomes -y
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps({"poses": upright, "transes": np.zeros((2, 3))}))
+    read = read_hps_motion(tmp_path / "a.pkl")
+    head = read.joint("head").t - read.joint("pelvis").t
+    assert head[0, 2] > 0.5
+    forward = read.R_parent_joint[0, 0] @ torch.tensor([1.0, 0, 0])
+    assert torch.allclose(forward, torch.tensor([0.0, -1, 0]), atol=1e-6)
+
+
+@pytest.mark.parametrize("inner_root", [True, False])
+def test_unity_text_round_trip(inner_root, tmp_path):
+    truth = hps_files.motion(40)
+    write_unity(truth, tmp_path, inner_root=inner_root)
+    same_motion(read_unity_motion(tmp_path / f"{NAME}_pose.txt", tmp_path / f"{NAME}_trans.txt"), truth)
+
+
+def test_unitys_turns_in_a_left_handed_world():
+    """Unity: a positive turn about y (up) takes forward (z) to the right (x): in our axes the person turns right."""
+    forward, up = torch.tensor([0.0, 0, 1]).double(), torch.tensor([0.0, 1, 0]).double()
+    right_turn = rotations_from_unity(torch.tensor([0.0, 90, 0], dtype=torch.float64))
+    assert torch.allclose(
+        right_turn @ forward, torch.tensor([-1.0, 0, 0]).double(), atol=1e-9
+    )  # SMPL's x is left
+    nod = rotations_from_unity(torch.tensor([30.0, 0, 0], dtype=torch.float64))
+    assert (nod @ forward)[1] < -0.4  # a positive turn about x looks down
+    roll = rotations_from_unity(torch.tensor([0.0, 0, 30.0], dtype=torch.float64))
+    assert (roll @ up)[0] > 0.4  # a positive turn about z leans to the left
+    both = rotations_from_unity(torch.tensor([30.0, 90, 0], dtype=torch.float64))
+    torch.testing.assert_close(both, right_turn @ nod)  # x before y, about fixed axes
+
+
+def test_a_line_cut_short_at_the_end_is_left_out(tmp_path):
+    write_unity(hps_files.motion(10), tmp_path)
+    path = tmp_path / f"{NAME}_pose.txt"
+    path.write_text(path.read_text()[:-20])
+    assert len(read_unity_motion(path, tmp_path / f"{NAME}_trans.txt")) == 9
+
+
+def lines(path: Path, change) -> None:
+    path.write_text("\n".join(change(path.read_text().splitlines())))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "change", "message"),
+    [
+        ("pose", lambda rows: [*rows[:4], rows[4][:60], *rows[5:]], "line 5: .* numbers. Expected 75 or 72"),
+        ("pose", lambda rows: [*rows[:4], rows[4].replace(" ", " nan ", 1), *rows[5:]], "line 5"),
+        ("pose", lambda rows: [row.rsplit(" ", 1)[0] + " nan" for row in rows], "line 1"),
+        ("trans", lambda rows: rows[:-4], "6 positions for 10 poses"),
+        ("trans", lambda rows: [row + " 1.0" for row in rows], "4 numbers. Expected 3"),
+        ("pose", lambda rows: [], "empty"),
+    ],
+)
+def test_damaged_unity_text(suffix, change, message, tmp_path):
+    write_unity(hps_files.motion(10), tmp_path)
+    lines(tmp_path / f"{NAME}_{suffix}.txt", change)
+    with pytest.raises(WearcapError, match=message):
+        read_unity_motion(tmp_path / f"{NAME}_pose.txt", tmp_path / f"{NAME}_trans.txt")
+
+
+class Bomb:
+    def __reduce__(self):
+        return print, ("this ran",)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"poses": np.zeros((3, 72)), "transes": np.zeros((4, 3))}, "'transes' has shape"),
+        ({"poses": np.zeros((3, 75)), "transes": np.zeros((3, 3))}, "'poses' has shape"),
+        ({"poses": np.full((3, 72), np.nan), "transes": np.zeros((3, 3))}, "NaN"),
+        ({"poses": np.zeros((3, 72))}, "no array 'transes'"),
+        ({"poses": np.zeros((0, 72)), "transes": np.zeros((0, 3))}, "no frames"),
+        ({"poses": "text", "transes": np.zeros((3, 3))}, "'poses'"),
+        ([1, 2], "holds a list"),
+        ({"poses": Bomb(), "transes": np.zeros((3, 3))}, "builtins.print"),
+    ],
+)
+def test_hostile_motion(content, message, tmp_path, capsys):
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(content))
+    with pytest.raises(WearcapError, match=message):
+        read_hps_motion(tmp_path / "a.pkl")
+    assert "this ran" not in capsys.readouterr().out
+
+
+def test_localization(tmp_path):
+    truth = hps_files.motion()
+    hps_files.write_localization(truth, tmp_path / "a.json", cam_start=0, lost=(4, 5))
+    read = read_hps_localization(tmp_path / "a.json")
+    assert len(read.timestamps) == FRAMES
+    assert (read.confidence == 0).nonzero()[:, 0].tolist() == [4, 5]
+    head = truth.joint("head")
+    found = read.confidence > 0
+    view = read.R_world_cam[..., 2]  # an OpenCV camera looks along z
+    torch.testing.assert_close(view[found], head.R[found][..., 0], atol=1e-5, rtol=0)
+    assert torch.isfinite(read.t_world_cam).all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ({"0": None, "1": None}, "no frame has a pose"),
+        ({}, "no frame has a pose"),
+        ({"0": {"position": [0, 0, 0]}}, "frame 0: no pose"),
+        ({"0": {"position": [0, 0], "quaternion": [1, 0, 0, 0]}}, "frame 0"),
+        ({"0": {"position": [0, 0, 0], "quaternion": [2, 0, 0, 0]}}, "length 1"),
+        ({"0": {"position": [0, float("nan"), 0], "quaternion": [1, 0, 0, 0]}}, "frame 0"),
+        ({"first": None}, "frame 'first'"),
+        ({"99999999999": None}, "frame '99999999999'"),
+        ({"0": None, "00": None}, "twice"),
+        ([], "holds a list"),
+    ],
+)
+def test_hostile_localization(rows, message, tmp_path):
+    (tmp_path / "a.json").write_text(json.dumps(rows))
+    with pytest.raises(WearcapError, match=message):
+        read_hps_localization(tmp_path / "a.json")
+
+
+def test_localization_at_30_hz(tmp_path):
+    """Recorded at 29.97: a steady walk and turn stays steady, lost frames stay lost."""
+    count, fps = 400, 30000 / 1001
+    times = np.arange(count) / fps
+    rows = {
+        str(k): {"position": [1.2 * t, 0, 1.7], "quaternion": [math.cos(0.1 * t), 0, 0, math.sin(0.1 * t)]}
+        for k, t in enumerate(times)
+    }
+    rows |= {str(k): None for k in range(100, 110)}
+    (tmp_path / "a.json").write_text(json.dumps(rows))
+    slow = read_hps_localization(tmp_path / "a.json", fps)
+    read = resampled_localization(slow, 30.0)
+    assert read.timestamps.diff().max() == pytest.approx(1 / 30)
+    assert read.timestamps[-1] <= slow.timestamps[-1] + 1e-9
+    found = read.confidence > 0
+    gap = (read.timestamps > times[99] + 1e-3) & (read.timestamps < times[110] - 1e-3)
+    assert torch.equal(~found, gap)
+    t = read.timestamps[found]
+    torch.testing.assert_close(read.t_world_cam[found, 0], (1.2 * t).float(), atol=1e-4, rtol=0)
+    expected = rotation.about_axis("z", 0.2 * t).float()
+    assert rotation.geodesic(read.R_world_cam[found], expected).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        '{"cam_start": 3}',
+        '{"cam_start": -1, "imu_start": 2}',
+        "[]",
+        "{",
+        '{"cam_start": "a", "imu_start": 0}',
+    ],
+)
+def test_hostile_starts(content, tmp_path):
+    (tmp_path / "a.json").write_text(content)
+    with pytest.raises(WearcapError, match=r"a\.json"):
+        read_hps_starts(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [{}, {"betas": []}, {"betas": ["a"]}, {"betas": [float("inf")]}, {"betas": [0.1], "root_to_heel": "x"}],
+)
+def test_hostile_betas(content, tmp_path):
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.raises(WearcapError, match=r"a\.json"):
+        read_hps_subject(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"parameters": {}}, {"captured_videos": None}, {"parameters": {"focal_dist_xy": [871.8], "center_xy": [1, 2], "dist_coeffs": []}},
+     {"parameters": {"focal_dist_xy": [0, 0], "center_xy": [1, 2], "dist_coeffs": []}},
+     {"parameters": {"focal_dist_xy": [9, 9], "center_xy": [1, 2], "dist_coeffs": [0.1] * 14}}],
+)  # fmt: skip
+def test_missing_intrinsics(change, tmp_path):
+    (tmp_path / "cameras.json").write_text(json.dumps({"029756": hps_files.CAMERA["029756"] | change}))
+    with pytest.raises(WearcapError, match="camera '029756'"):
+        read_hps_cameras(tmp_path / "cameras.json")
+
+
+# Scans -------------------------------------------------------------------------------------------------------------
+
+
+def test_scan(tmp_path):
+    write_scan(tmp_path)
+    assert is_hps_scene(tmp_path)
+    cloud, photos = read_hps_scene(tmp_path)
+    assert cloud == tmp_path / "pointcloud.ply"
+    assert [photo.file.name for photo in photos] == [f"0000{f}-cam{k}.jpg" for f in (0, 1) for k in (0, 1)]
+    assert photos[0].camera.model == "ocam"
+    assert photos[2].T_world_cam.t.tolist() == pytest.approx([1.5, 2.0, 1.7])
+    view = photos[0].T_world_cam.R @ torch.tensor([0.0, 0, 1])
+    assert view.tolist() == pytest.approx([1.0, 0.0, 0.0], abs=1e-6) or view.norm() == pytest.approx(1.0)
+
+
+def rewritten(path: Path, change) -> None:
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda scan: (scan / "pointcloud.ply").unlink(), "no pointcloud.ply"),
+        (lambda scan: (scan / "sensor_frame.xml").unlink(), "no sensor_frame.xml"),
+        (lambda scan: shutil.rmtree(scan / "info"), "no info"),
+        (lambda scan: (scan / "info/00001-info.json").unlink(), "no such file"),
+        (lambda scan: [path.unlink() for path in (scan / "cam").glob("*.jpg")], "no pictures"),
+        (lambda scan: rewritten(scan / "info/00001-info.json", lambda info: {"cam0": info["cam0"]}), "no pose of cam1"),
+        (lambda scan: rewritten(scan / "info/00001-info.json", lambda info: info | {"cam0": 3}), "cam0: no pose"),
+        (lambda scan: (scan / "cam/00001-cam7.jpg").write_bytes(b""), "no pose of cam7"),
+        (lambda scan: (scan / "sensor_frame.xml").write_text(
+            (scan / "sensor_frame.xml").read_text().replace("<SensorName>cam1", "<SensorName>cam9")), "no intrinsics of cam1"),
+    ],
+)  # fmt: skip
+def test_damaged_scan(damage, message, tmp_path):
+    write_scan(tmp_path)
+    damage(tmp_path)
+    with pytest.raises(WearcapError, match=message):
+        read_hps_scene(tmp_path)
+
+
+def test_invalid_frames_are_left_out(tmp_path):
+    write_scan(tmp_path)
+    rewritten(tmp_path / "info/00000-info.json", lambda info: info | {"valid": "false"})
+    assert len(read_hps_scene(tmp_path)[1]) == 2
+
+
+# Sequences ---------------------------------------------------------------------------------------------------------
+
+
+def write_video(path: Path, frames: int, size: tuple[int, int]) -> None:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        for _ in range(frames):
+            container.mux(stream.encode(av.VideoFrame(*size, "yuv420p")))
+        container.mux(stream.encode())
+
+
+def test_a_sequence_on_one_clock(tmp_path):
+    truth = write_hps(tmp_path)
+    assert is_hps(tmp_path)
+    assert hps_names(tmp_path) == [NAME]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read = read_hps_sequence(tmp_path, NAME)
+    assert (read.name, read.subject, read.location, read.activity) == (NAME, "SUB4", SCAN, "walking")
+    assert Path(read.scene or "").is_file()
+    assert read.shape["beta_3"] == pytest.approx(0.3)
+    same_motion(read.motion, truth)
+    assert read.localization.timestamps[CAM_START].item() == pytest.approx(0.0)
+    assert read.suit.timestamps[IMU_START].item() == pytest.approx(0.0)
+    later = read.localization.timestamps >= 0
+    sure = later & (read.localization.confidence > 0)
+    head = truth.joint("head")
+    seen = head @ read.camera.t_head_cam
+    torch.testing.assert_close(read.localization.t_world_cam[sure], seen[sure[CAM_START:]], atol=1e-4, rtol=0)
+    assert read.camera.camera.model == "opencv"
+    assert read.camera.camera.fx == pytest.approx(871.80)
+    assert read.camera.video is None
+
+
+def test_the_video_keeps_its_own_rate(tmp_path):
+    write_hps(tmp_path, scan=False)
+    write_video(tmp_path / "head_camera_videos" / f"{NAME}.MP4", 12, (1920, 1080))
+    read = read_hps_sequence(tmp_path, NAME)
+    assert len(read.camera.timestamps) == 12
+    assert read.camera.timestamps[0].item() == pytest.approx(-CAM_START / 30)
+    assert Path(read.camera.video).is_file()
+    assert read.scene is None
+
+
+def test_an_mvnx_brings_contacts_and_sensors(tmp_path):
+    write_hps(tmp_path, scan=False)
+    (tmp_path / "hps_mvnx").mkdir()
+    (tmp_path / "hps_mvnx" / f"{NAME}.mvnx").write_text(mvnx(sample()))
+    rewritten(tmp_path / f"hps_inits/{NAME}.json", lambda starts: starts | {"imu_start": 1})
+    read = read_hps_sequence(tmp_path, NAME)
+    assert read.suit.skeleton.name == "xsens23"
+    assert read.suit.contact_prob is not None
+    assert read.suit.timestamps[1].item() == pytest.approx(0.0)
+    assert all(imu.timestamps[1].item() == pytest.approx(0.0) for imu in read.imu.values())
+
+
+def test_names_of_subjects_and_scans():
+    assert subject_of("Double_SUB1_SUB2_talk") == "SUB1"
+    assert scan_name("Double_SUB1_SUB2_talk") == "MPI_EG"
+    assert scan_name("SUB1_MPI_BIB_AB_SEND_Exercises") == "MPI_BIB_AB_SEND"
+    assert scan_name("SUB3_MPI_KINO_lecture_multilevel") == "MPI_KINO"
+    with pytest.raises(WearcapError, match="names no subject"):
+        subject_of("walking")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda root: (root / f"hps_smpl/{NAME}.pkl").unlink(), "no sequence"),
+        (lambda root: (root / f"hps_inits/{NAME}.json").unlink(), "no starts"),
+        (lambda root: rewritten(root / f"hps_inits/{NAME}.json", lambda s: s | {"cam_start": 4000}), "beyond the 110 localised"),
+        (lambda root: rewritten(root / f"hps_inits/{NAME}.json", lambda s: s | {"imu_start": 4000}), "beyond the suit's"),
+        (lambda root: rewritten(root / "head_camera_videos/cameras.json", lambda c: {"029756": c["029756"] | {"captured_videos": []}}),
+         "no intrinsics for the video"),
+        (lambda root: write_video(root / f"head_camera_videos/{NAME}.mp4", 3, (640, 480)), "640x480 pixels. Expected 1920x1080"),
+        (lambda root: (root / f"head_camera_videos/{NAME}.mp4").write_bytes(b"no video at all"), "not a readable video"),
+        (lambda root: (root / "hps_betas/SUB4.json").write_text("{"), "not readable JSON"),
+    ],
+)  # fmt: skip
+def test_damaged_sequences(damage, message, tmp_path):
+    write_hps(tmp_path, scan=False)
+    damage(tmp_path)
+    with pytest.raises(WearcapError, match=message):
+        read_hps_sequence(tmp_path, NAME)
+
+
+@pytest.mark.parametrize("name", ["", "../hps_smpl/a", "*", "SUB4_none"])
+def test_names_that_are_none(name, tmp_path):
+    write_hps(tmp_path, scan=False)
+    with pytest.raises(WearcapError, match="no sequence"):
+        read_hps_sequence(tmp_path, name)
+
+
+def test_a_camera_elsewhere_is_warned_of(tmp_path):
+    truth = write_hps(tmp_path, scan=False)
+    away = rotation.about_axis("z", torch.tensor(0.0))
+    moved = hps_files.Motion(
+        truth.timestamps, smpl24(), truth.R_parent_joint, truth.t_world_root @ away + 7.0
+    )
+    hps_files.write_localization(moved, tmp_path / f"head_camera_localizations/{NAME}.json")
+    with pytest.warns(UserWarning, match="m apart"):
+        read_hps_sequence(tmp_path, NAME)
+
+
+# Fuzz --------------------------------------------------------------------------------------------------------------
+
+
+def small_pickle() -> bytes:
+    return pickle.dumps({"poses": np.zeros((2, 72)), "transes": np.zeros((2, 3))})
+
+
+@fuzz
+@given(damaged=mutated_bytes(small_pickle()))
+def test_fuzzed_motion(damaged, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "fuzzed.pkl"
+    path.write_bytes(damaged)
+    with suppress(WearcapError):
+        read_hps_motion(path)
+
+
+@fuzz
+@given(damaged=mutated('{"0": {"position": [1.0, 2, 3], "quaternion": [1, 0, 0, 0]}, "1": null, "2": null}'))
+def test_fuzzed_localization(damaged, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "fuzzed.json"
+    path.write_text(damaged)
+    with suppress(WearcapError):
+        read_hps_localization(path)
