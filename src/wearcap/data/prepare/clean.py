@@ -34,19 +34,22 @@ class CleaningLimits:
 
 
 def resampled(motion: Motion, fps: float | int) -> Motion:
-    """The motion at `fps`: every n-th frame where the rates divide, else slerp (rotations) and lerp (root)."""
+    """The motion at `fps`: every n-th frame where the rates divide, else slerp (rotations) and lerp (root, contacts)."""
     ratio = motion.fps / fps
     steps = motion.timestamps.diff()
     even = steps.max() < 1.5 * steps.median()
     if even and abs(ratio - round(ratio)) < 0.01 and ratio > 0.5:
         n = round(ratio)
         times, R, t = motion.timestamps[::n], motion.R_parent_joint[::n], motion.t_world_root[::n]
-        return replace(motion, timestamps=times, R_parent_joint=R, t_world_root=t)
+        contact = None if motion.contact_prob is None else motion.contact_prob[::n]
+        return replace(motion, timestamps=times, R_parent_joint=R, t_world_root=t, contact_prob=contact)
     start, stop = motion.timestamps[0].item(), motion.timestamps[-1].item()
     times = start + torch.arange(int((stop - start) * fps + 1e-6) + 1, dtype=torch.float64) / fps
+    contact = motion.contact_prob
     return replace(
         motion, timestamps=times, R_parent_joint=_slerp(motion.timestamps, motion.R_parent_joint, times),
         t_world_root=interpolate(motion.timestamps, motion.t_world_root, times),
+        contact_prob=None if contact is None else interpolate(motion.timestamps, contact, times),
     )  # fmt: skip
 
 
