@@ -57,10 +57,12 @@ def test_trunk_is_vgg16_up_to_conv5_3(network):
 
 
 def test_colours_are_scaled_as_for_imagenet(network):
-    grey = torch.tensor([0.485, 0.456, 0.406])[:, None, None].expand(3, 32, 32)[None]
-    vlad = network.pool(network.encoder(torch.zeros(1, 3, 32, 32)))
-    whitened = network.WPCA[0].weight[:, :, 0, 0] @ vlad[0] + network.WPCA[0].bias
-    torch.testing.assert_close(network(grey)[0], whitened / whitened.norm(), atol=1e-4, rtol=1e-3)
+    seen = []
+    hook = network.encoder.register_forward_pre_hook(lambda _, arguments: seen.append(arguments[0]))
+    colour = torch.tensor([0.485, 0.456 + 0.224, 0.406 - 2 * 0.225])
+    network(colour[:, None, None].expand(1, 3, 32, 32))
+    hook.remove()
+    torch.testing.assert_close(seen[0][0, :, 5, 7], torch.tensor([0.0, 1.0, -2.0]))
 
 
 def test_output_is_of_unit_length_and_the_same_each_time(network):
