@@ -74,6 +74,7 @@ class _Points:
 def read_colmap(folder: str | Path, images: str | Path | None = None) -> ColmapModel:
     """Read cameras, images and points3D (.bin where it is there, else .txt) from a model's folder.
 
+    Without a points3D file, as some give poses alone, there are no tracks.
     `images`: folder of the picture files (default: `images` beside the model, else the model's own folder).
     Raises WearcapError for missing or truncated files, unknown camera models, and numbers that name nothing.
     """
@@ -82,11 +83,15 @@ def read_colmap(folder: str | Path, images: str | Path | None = None) -> ColmapM
     binary = (folder / "images.bin").is_file()
     if binary:
         cameras = _read_cameras_bin(folder / "cameras.bin")
-        found, points = _read_images_bin(folder / "images.bin"), _read_points_bin(folder / "points3D.bin")
+        found = _read_images_bin(folder / "images.bin")
     else:
         cameras = _read_cameras_txt(folder / "cameras.txt")
-        found, points = _read_images_txt(folder / "images.txt"), _read_points_txt(folder / "points3D.txt")
+        found = _read_images_txt(folder / "images.txt")
     found.sort(key=lambda image: image.name)
+    points = _Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    file = folder / ("points3D.bin" if binary else "points3D.txt")
+    if file.is_file():
+        points = (_read_points_bin if binary else _read_points_txt)(file)
     photos = [_photo(image, cameras, images) for image in found]
     return ColmapModel(photos, _tracks(found, points))
 

@@ -1,0 +1,69 @@
+"""Pictures as RGB arrays: single image files, and the frames of a video with their times."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, UnidentifiedImageError
+
+from wearcap.errors import WearcapError
+
+
+def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
+    """Pixels of an image file as they are stored: calibrations speak of these, so no EXIF turn is applied.
+
+    Raises WearcapError when the file is missing or no picture.
+    """
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+    except FileNotFoundError as error:
+        raise WearcapError("no such picture", where=path) from error
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise WearcapError(f"not a readable picture ({error})", where=path, expected="a JPEG or PNG file") from error  # fmt: skip
+
+
+def read_frames(
+    path: str | Path, start: int = 0, stop: int | None = None
+) -> Iterator[tuple[float, UInt8[np.ndarray, "height width 3"]]]:
+    """Frames number `start` to `stop` of a video: time (s) from its first frame, and picture.
+
+    Times are those written in the file; where it has none, frames follow its average rate.
+    Raises WearcapError when the file is missing, damaged or without pictures.
+    """
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise WearcapError("a file without pictures", where=path, expected="a video")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            rate = float(stream.average_rate or 30)
+            begin: float | None = None
+            number = -1
+            for number, frame in enumerate(container.decode(stream)):
+                time = frame.time if frame.time is not None else number / rate
+                begin = time if begin is None else begin
+                if stop is not None and number >= stop:
+                    return
+                if number >= start:
+                    yield time - begin, frame.to_ndarray(format="rgb24")
+            if number < 0:
+                raise WearcapError("a video without frames", where=path)
+    except FileNotFoundError as error:
+        raise WearcapError("no such video", where=path) from error
+    except (av.FFmpegError, OSError) as error:
+        raise WearcapError(f"not a readable video ({error})", where=path, expected="a complete MP4, MKV or AVI file",
+                           fix="Play it in a video player, or copy it again.") from error  # fmt: skip
+
+
+def frame_count(path: str | Path) -> int:
+    """Number of frames that the file states; 0 where it does not say. Raises WearcapError as `read_frames` does."""
+    try:
+        with av.open(str(path)) as container:
+            return container.streams.video[0].frames if container.streams.video else 0
+    except FileNotFoundError as error:
+        raise WearcapError("no such video", where=path) from error
+    except (av.FFmpegError, OSError) as error:
+        raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error

@@ -1,0 +1,277 @@
+"""Camera self-localisation (thesis 4.2.2): retrieval, 2D-3D matches, LO-RANSAC, and a second look with the pose known.
+
+The second look matches keypoints again, this time only with landmarks that project beside them: more and better
+spread matches, so a more exact pose. It is ours, as are confidence and covariance.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64, UInt8
+from rich.console import Console
+from rich.progress import track
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
+from wearcap.localization.absolute_pose import (
+    CameraPose,
+    Fit,
+    pose_covariance,
+    project,
+    ransac_pose,
+    refined_pose,
+)
+from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Matcher
+from wearcap.localization.landmarks import from_bytes
+from wearcap.localization.map_builder import require_same_features
+from wearcap.localization.matching import match_landmarks, match_nearby
+from wearcap.localization.picture import check_size, features_within, flat_picture
+from wearcap.localization.retrieval import Vlad, most_similar
+from wearcap.localization.visual_map import VisualMap
+from wearcap.recording.recording import Localization
+
+
+@dataclass(frozen=True)
+class LocalizerSettings:
+    """How pictures are localised."""
+
+    retrieved: int = 40
+    """Database pictures whose landmarks are matched (K_loc of the document)."""
+    retrieved_with_prior: int = 8
+    """The same where a prior pose is given: so many similar pictures and as many near the prior."""
+    max_landmarks: int = 10_000
+    """Landmarks that are matched: those that most of the chosen pictures observe."""
+    max_ratio: float = 0.85
+    """Ratio test on the distances of descriptors."""
+    min_cosine: float = 0.75
+    """Smallest similarity of descriptors in the second look."""
+    max_error_px: float = 5.0
+    """Reprojection error up to which a match is an inlier, at a picture 1000 pixels wide; grows with the width."""
+    second_look_px: float = 12.0
+    """Distance up to which the second look seeks, at the same width."""
+    min_inliers: int = 12
+    """With fewer there is no pose."""
+    horizontal_fov_deg: float = 100.0
+    """Field of view of the perspective camera that a fisheye's pictures are undistorted to."""
+
+
+class Localizer:
+    """Finds the poses of pictures in a visual map.
+
+    `matcher`: pairs the keypoints of picture and database picture (LightGlue); None: keypoints are matched with the
+    landmarks of all retrieved pictures at once. `descriptor`: the global descriptor that the map was made with; None: its VLAD.
+    Raises WearcapError for an empty map, and one made with other features.
+    """
+
+    def __init__(
+        self,
+        visual_map: VisualMap,
+        extractor: Extractor,
+        matcher: Matcher | None = None,
+        settings: LocalizerSettings = LocalizerSettings(),
+        *,
+        descriptor: GlobalDescriptor | None = None,
+    ):
+        if not len(visual_map) or not len(visual_map.landmarks.points_world):
+            raise WearcapError("the map is empty: nothing can be localised in it", expected="pictures with landmarks",
+                               fix="Build it from photos that show the scene: wearcap scene.")  # fmt: skip
+        require_same_features(visual_map, extractor, descriptor)
+        self.map, self.extractor, self.matcher, self.settings = visual_map, extractor, matcher, settings
+        self.descriptor: GlobalDescriptor = descriptor or Vlad(visual_map.vocabulary)
+        extent = np.linalg.norm(np.ptp(visual_map.landmarks.points_world, axis=0))
+        self._same_m = max(2.5 * visual_map.cell_m, 0.002 * float(extent))
+
+    def __call__(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        camera: Camera | None,
+        prior: Rigid | None = None,
+    ) -> CameraPose | None:
+        """Pose of the picture's camera, or None where none is found.
+
+        `prior`: where the camera may stand; it only chooses database pictures, and where that leads to a weak pose
+        or none the search is done again without it. Raises WearcapError without intrinsics or for a picture of
+        another size than they are for.
+        """
+        if camera is None:
+            raise WearcapError("no intrinsics of the camera", expected="a calibrated camera",
+                               fix="Calibrate it from a checkerboard video: wearcap calibrate.")  # fmt: skip
+        check_size(image, camera, "localization")
+        image, camera, valid = flat_picture(image, camera, self.settings.horizontal_fov_deg)
+        features = features_within(self.extractor(image), valid)
+        if len(features) < self.settings.min_inliers:
+            return None
+        summary = self.descriptor(image, features)
+        count = self.settings.retrieved
+        if prior is not None:
+            few = self.settings.retrieved_with_prior
+            similar = most_similar(summary, self.map.global_descriptors, few)
+            near = nearest_pictures(self.map, prior, few)
+            pose = self._pose(features, camera, np.unique(np.concatenate([similar, near])))
+            if pose is not None and pose.confidence > 0.5:
+                return pose
+        return self._pose(features, camera, most_similar(summary, self.map.global_descriptors, count))
+
+    def _pose(self, features: Features, camera: Camera, images: Int64[np.ndarray, "chosen"]) -> CameraPose | None:  # fmt: skip
+        """Pose from the landmarks of chosen database pictures."""
+        scale = camera.width / 1000
+        chosen = self._landmarks_of(images)
+        points = self.map.landmarks.points_world[chosen]
+        descriptors = from_bytes(self.map.landmarks.descriptors[chosen])
+        if self.matcher is None:
+            settings = {"max_ratio": self.settings.max_ratio, "same_m": self._same_m}
+            pairs = match_landmarks(features.descriptors, descriptors, points, **settings)
+            pixels, matched = features.keypoints[pairs[:, 0]], points[pairs[:, 1]]
+        else:
+            pixels, matched = self._matched_by_pairs(features, images)
+        fit = ransac_pose(pixels, matched, camera, self.settings.max_error_px * scale)
+        if fit is None:
+            return None
+        if self.matcher is None:
+            for reach in (self.settings.second_look_px, self.settings.max_error_px):
+                near = _near_pairs(features.keypoints, points, camera, fit, reach * scale)
+                pairs = match_nearby(features.descriptors, descriptors, near, self.settings.min_cosine)
+                if len(pairs) < self.settings.min_inliers:
+                    return None
+                pixels, matched = features.keypoints[pairs[:, 0]], points[pairs[:, 1]]
+                fit = refined_pose(pixels, matched, camera, fit, self.settings.max_error_px * scale)
+        return self._judged(pixels, matched, camera, fit)
+
+    def _judged(self, pixels: np.ndarray, matched: np.ndarray, camera: Camera, fit: Fit) -> CameraPose | None:  # fmt: skip
+        inliers = int(fit.inlier.sum())
+        if inliers < self.settings.min_inliers:
+            return None
+        covariance = pose_covariance(pixels, matched, camera, fit)
+        return CameraPose(
+            torch.from_numpy(fit.R_world_cam).float(), torch.from_numpy(fit.t_world_cam).float(), inliers,
+            confidence(pixels[fit.inlier], camera, self.settings.min_inliers),
+            torch.from_numpy(covariance).float(),
+        )  # fmt: skip
+
+    def _landmarks_of(self, images: Int64[np.ndarray, "chosen"]) -> Int64[np.ndarray, "landmark"]:
+        """Landmarks that the pictures observe; of too many, those observed most."""
+        views = self.map.landmark_views(images)
+        seen = np.flatnonzero(views)
+        if len(seen) > self.settings.max_landmarks:
+            most = np.argsort(-views[seen], kind="stable")[: self.settings.max_landmarks]
+            seen = np.sort(seen[most])
+        return seen
+
+    def _matched_by_pairs(
+        self, features: Features, images: Int64[np.ndarray, "chosen"]
+    ) -> tuple[Float32[np.ndarray, "match 2"], Float32[np.ndarray, "match 3"]]:
+        """Pixels and world positions from picture-to-picture matches with each database picture."""
+        assert self.matcher is not None
+        pixels, positions = [np.zeros((0, 2), np.float32)], [np.zeros((0, 3), np.float32)]
+        for image in images.tolist():
+            part = self.map.observations(image)
+            camera = self.map.cameras[image]
+            count = part.stop - part.start
+            other = Features(
+                self.map.keypoints[part], from_bytes(self.map.descriptors[part]), np.ones(count, np.float32),
+                (camera.width, camera.height),
+            )  # fmt: skip
+            pairs = self.matcher(features, other)
+            pixels.append(features.keypoints[pairs[:, 0]])
+            positions.append(self.map.positions[part][pairs[:, 1]])
+        return np.concatenate(pixels), np.concatenate(positions)
+
+
+def confidence(pixels: Float32[np.ndarray, "match 2"], camera: Camera, min_inliers: int) -> float:
+    """1 − 2^(−(n − n₀)/12) of n inliers, of which at most 6 count in each of the picture's 8 x 6 cells.
+
+    Ours: wrong poses gather few matches, or many in one spot.
+    """
+    cell = (pixels / [camera.width / 8, camera.height / 6]).astype(np.int64).clip(0, [7, 5])
+    counts = np.bincount(cell[:, 0] + 8 * cell[:, 1], minlength=48)
+    spread = int(np.minimum(counts, 6).sum())
+    return float(1 - 2.0 ** (-max(spread - 0.5 * min_inliers, 0) / 12))
+
+
+def nearest_pictures(
+    visual_map: VisualMap, prior: Rigid, count: int
+) -> Int64[np.ndarray, "chosen"]:  # fmt: skip
+    """Database pictures taken near a pose and in its direction: 1 m counts as much as 30°."""
+    t, forward = prior.t.double().cpu().numpy(), prior.R[:, 2].double().cpu().numpy()
+    distance = np.linalg.norm(visual_map.t_world_cam - t, axis=1)
+    angle = np.arccos(np.clip(visual_map.R_world_cam[:, :, 2] @ forward, -1, 1))
+    cost = distance + angle / np.radians(30)
+    return np.argsort(cost, kind="stable")[:count].astype(np.int64)
+
+
+def _near_pairs(
+    keypoints: Float32[np.ndarray, "keypoint 2"],
+    points: Float32[np.ndarray, "landmark 3"],
+    camera: Camera,
+    fit: Fit,
+    reach_px: float,
+) -> Int64[np.ndarray, "pair 2"]:
+    """(keypoint, landmark) pairs within `reach_px` in the picture, at most the 8 nearest landmarks per keypoint."""
+    seen, valid = project(points, camera, fit)
+    number = np.flatnonzero(valid)
+    if not len(number):
+        return np.zeros((0, 2), np.int64)
+    distance, place = KDTree(seen[number]).query(keypoints, k=min(8, len(number)), distance_upper_bound=reach_px)  # fmt: skip
+    distance, place = distance.reshape(len(keypoints), -1), place.reshape(len(keypoints), -1)
+    row, column = np.nonzero(np.isfinite(distance))
+    return np.stack([row, number[place[row, column]]], 1)
+
+
+def localize_video(
+    frames: Iterable[UInt8[np.ndarray, "height width 3"]],
+    timestamps: Float64[Tensor, "time"],
+    camera: Camera | None,
+    localizer: Localizer,
+    *,
+    use_prior: bool = True,
+    prior_age_s: float = 1.0,
+    progress: bool = False,
+) -> Localization:
+    """Localise every frame. Where no pose is found confidence is 0 and the last pose is held (at first: the first found).
+
+    `use_prior`: the previous frame's pose, if not older than `prior_age_s`, helps to choose database pictures.
+    Raises WearcapError for more or fewer frames than timestamps, and as `Localizer.__call__`.
+    """
+    poses: list[CameraPose | None] = []
+    last: tuple[float, CameraPose] | None = None
+    times: Sequence[float] = timestamps.tolist()
+    for image in track(frames, "localization", total=len(times), console=Console(stderr=True), disable=not progress):  # fmt: skip
+        if len(poses) == len(times):
+            raise WearcapError(f"more frames than the {len(times)} timestamps", expected="one timestamp per frame")  # fmt: skip
+        now = times[len(poses)]
+        prior = None
+        if use_prior and last is not None and now - last[0] <= prior_age_s:
+            prior = Rigid(last[1].R_world_cam, last[1].t_world_cam)
+        pose = localizer(image, camera, prior)
+        last = last if pose is None else (now, pose)
+        poses.append(pose)
+    if len(poses) != len(times):
+        raise WearcapError(f"{len(poses)} frames with {len(times)} timestamps", expected="one timestamp per frame")  # fmt: skip
+    return _as_localization(timestamps, poses)
+
+
+def _as_localization(timestamps: Float64[Tensor, "time"], poses: list[CameraPose | None]) -> Localization:
+    found = [pose for pose in poses if pose is not None]
+    if not found:
+        count = len(poses)
+        return Localization(timestamps, torch.eye(3).repeat(count, 1, 1), torch.zeros(count, 3),
+                            torch.zeros(count), torch.eye(6).repeat(count, 1, 1) * _UNKNOWN)  # fmt: skip
+    held, filled = found[0], []
+    for pose in poses:
+        held = pose or held
+        filled.append(held)
+    sure = torch.tensor([0.0 if pose is None else pose.confidence for pose in poses])
+    covariance = torch.stack([torch.eye(6) * _UNKNOWN if pose is None else pose.covariance for pose in poses])
+    return Localization(
+        timestamps, torch.stack([pose.R_world_cam for pose in filled]), torch.stack([pose.t_world_cam for pose in filled]),
+        sure, covariance,
+    )  # fmt: skip
+
+
+_UNKNOWN = 1e4
+"""Variance (rad², m²) of a pose that was not found."""

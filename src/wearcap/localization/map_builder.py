@@ -1,0 +1,229 @@
+"""Building visual maps from photos and a scan, or from photos and the tracks of structure from motion."""
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int8
+from rich.console import Console
+from rich.progress import track
+from scipy.spatial import KDTree
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+from wearcap.io.colmap import Tracks
+from wearcap.io.video import read_image
+from wearcap.localization.features import Extractor, Features, GlobalDescriptor
+from wearcap.localization.landmarks import from_bytes, merge, to_bytes
+from wearcap.localization.picture import check_size, features_within, flat_picture
+from wearcap.localization.point_map import PointMapper, undistortion
+from wearcap.localization.retrieval import Vlad, train_vocabulary
+from wearcap.localization.visual_map import VisualMap
+from wearcap.recording.photo import Photo
+from wearcap.scene.scan import Scan
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """How a map is built; lengths in the scene's unit (m)."""
+
+    splat_m: float = 0.015
+    """Radius of a scan point's disc."""
+    cell_m: float = 0.02
+    """Keypoints of different photos within a cell of this size become one landmark (scans; tracks are merged already)."""
+    horizontal_fov_deg: float = 100.0
+    """Field of view of the perspective camera that fisheye photos are undistorted to."""
+    track_distance_px: float = 1.5
+    """A keypoint takes the 3D point of a track that was observed within this distance."""
+    words: int = 64
+    """Size of VLAD's vocabulary."""
+    jobs: int = 2
+    """Threads."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """What one photo gives: all descriptors for retrieval, and the keypoints that have a position."""
+
+    camera: Camera
+    descriptors: Int8[np.ndarray, "keypoint feature"]
+    keypoints: Float32[np.ndarray, "keypoint 2"]
+    positions: Float32[np.ndarray, "keypoint 3"]
+    valid: Bool[np.ndarray, "keypoint"]
+    global_descriptor: np.ndarray | None
+
+
+Lift = Callable[[int, Photo, Camera, Features], tuple[np.ndarray, np.ndarray]]
+"""World positions of a photo's keypoints (in the perspective camera's pixels), and where they are valid."""
+
+
+def build_map(
+    photos: Sequence[Photo],
+    source: Scan | Tracks,
+    extractor: Extractor,
+    *,
+    descriptor: GlobalDescriptor | None = None,
+    settings: MapSettings = MapSettings(),
+    progress: bool = False,
+) -> VisualMap:
+    """A map of the photos, their keypoints lifted by a scan or by tracks (whose photo numbers are the photos').
+
+    `descriptor`: what finds similar pictures; None: VLAD over a vocabulary trained on these photos.
+    Raises WearcapError for no photos, photos whose size is not their camera's, unreadable ones, and an empty map.
+    """
+    if not photos:
+        raise WearcapError("no photos to build a map from", expected="database photos with cameras and poses")
+    pictures = _pictures(photos, source, extractor, descriptor, settings, progress)
+    observed = sum(int(picture.valid.sum()) for picture in pictures)
+    if not observed:
+        found = sum(len(picture.keypoints) for picture in pictures)
+        raise WearcapError(
+            f"the map would be empty: none of {found} keypoints in {len(photos)} photos lies on the scene",
+            expected="photos that show the scanned scene", fix=_why_empty(photos, source),
+        )  # fmt: skip
+    vlad = None
+    if descriptor is None:
+        vlad = Vlad(_vocabulary(pictures, settings.words))
+    cell_m = settings.cell_m if isinstance(source, Scan) else 0.0
+    return _assemble(photos, pictures, extractor.name, vlad or descriptor, vlad, cell_m)
+
+
+def extended(
+    visual_map: VisualMap,
+    photos: Sequence[Photo],
+    source: Scan | Tracks,
+    extractor: Extractor,
+    *,
+    descriptor: GlobalDescriptor | None = None,
+    settings: MapSettings = MapSettings(),
+    progress: bool = False,
+) -> VisualMap:
+    """The map with more photos; its vocabulary stays. Raises WearcapError as `build_map`, and for other features."""
+    require_same_features(visual_map, extractor, descriptor)
+    pictures = _pictures(photos, source, extractor, descriptor, settings, progress)
+    vlad = Vlad(visual_map.vocabulary) if descriptor is None else None
+    more = _assemble(photos, pictures, extractor.name, vlad or descriptor, vlad, 0.0)
+    joined = {
+        name: np.concatenate([getattr(visual_map, name), getattr(more, name)])
+        for name in ("R_world_cam", "t_world_cam", "keypoints", "descriptors", "positions", "global_descriptors")
+    }  # fmt: skip
+    landmarks, landmark = merge(joined["positions"], joined["descriptors"], visual_map.cell_m)
+    return replace(
+        visual_map, names=visual_map.names + more.names, cameras=visual_map.cameras + more.cameras,
+        first=np.concatenate([visual_map.first, visual_map.first[-1] + more.first[1:]]),
+        landmark=landmark, landmarks=landmarks, **joined,
+    )  # fmt: skip
+
+
+def require_same_features(
+    visual_map: VisualMap, extractor: Extractor, descriptor: GlobalDescriptor | None
+) -> None:
+    """Raises WearcapError when a map was made with another extractor or another global descriptor."""
+    if extractor.name != visual_map.extractor:
+        raise WearcapError(
+            f"the map was made with {visual_map.extractor!r} features, not {extractor.name!r}",
+            expected="the same features in map and picture", fix="Build the map again, or choose its extractor.",
+        )  # fmt: skip
+    name = descriptor.name if descriptor is not None else Vlad(visual_map.vocabulary).name
+    if name != visual_map.descriptor:
+        raise WearcapError(
+            f"the map was made with the global descriptor {visual_map.descriptor!r}, not {name!r}",
+            expected="the same descriptor in map and picture", fix="Build the map again, or choose its descriptor.",
+        )  # fmt: skip
+
+
+def _pictures(photos, source, extractor, descriptor, settings: MapSettings, progress: bool) -> list[_Picture]:
+    if isinstance(source, Scan):
+        lift = _lift_by_scan(source, settings)
+    else:
+        lift = _lift_by_tracks(source, settings)
+
+    def one(number: int) -> _Picture:
+        photo = photos[number]
+        image = read_image(photo.file)
+        check_size(image, photo.camera, str(photo.file))
+        image, camera, valid_pixels = flat_picture(image, photo.camera, settings.horizontal_fov_deg)
+        features = features_within(extractor(image), valid_pixels)
+        positions, valid = lift(number, photo, camera, features)
+        summary = None if descriptor is None else descriptor(image, features)
+        return _Picture(camera, to_bytes(features.descriptors), features.keypoints, positions, valid, summary)
+
+    with ThreadPoolExecutor(settings.jobs) as pool:
+        done: Iterable[_Picture] = pool.map(one, range(len(photos)))
+        return list(
+            track(done, "photos", total=len(photos), console=Console(stderr=True), disable=not progress)
+        )
+
+
+def _lift_by_scan(scan: Scan, settings: MapSettings) -> Lift:
+    mapper = PointMapper(scan, settings.splat_m)
+
+    def lift(number: int, photo: Photo, camera: Camera, features: Features):
+        point_map = mapper(photo.camera, photo.T_world_cam)
+        if photo.camera.is_fisheye:
+            point_map = undistortion(photo.camera, settings.horizontal_fov_deg).point_map(point_map)
+        return point_map.lift(scan.points, features.keypoints)
+
+    return lift
+
+
+def _lift_by_tracks(tracks: Tracks, settings: MapSettings) -> Lift:
+    order = np.argsort(tracks.photo, kind="stable")
+
+    def lift(number: int, photo: Photo, camera: Camera, features: Features):
+        start, stop = np.searchsorted(tracks.photo[order], [number, number + 1])
+        mine = order[start:stop]
+        if not len(mine) or not len(features):
+            return np.zeros((len(features), 3), np.float32), np.zeros(len(features), bool)
+        pixels = tracks.pixels[mine]
+        if photo.camera.is_fisheye:
+            rays = photo.camera.unproject(torch.from_numpy(pixels).double())
+            pixels = camera.project(rays.nan_to_num(0.0))[0].numpy()
+        distance, nearest = KDTree(pixels).query(features.keypoints)
+        positions = tracks.points_world[tracks.point[mine[nearest]]].astype(np.float32)
+        return positions, distance <= settings.track_distance_px
+
+    return lift
+
+
+def _vocabulary(pictures: list[_Picture], words: int, sample: int = 60_000) -> np.ndarray:
+    """Trained on descriptors from all pictures."""
+    share = max(1, sample // len(pictures))
+    random = np.random.default_rng(0)
+    chosen = [p.descriptors[random.permutation(len(p.descriptors))[:share]] for p in pictures]
+    return train_vocabulary(from_bytes(np.concatenate(chosen)), words)
+
+
+def _assemble(photos, pictures: list[_Picture], extractor: str, descriptor, vlad: Vlad | None, cell_m: float) -> VisualMap:  # fmt: skip
+    positions = np.concatenate([p.positions[p.valid] for p in pictures]).astype(np.float32)
+    descriptors = np.concatenate([p.descriptors[p.valid] for p in pictures])
+    landmarks, landmark = merge(positions, descriptors, cell_m)
+    counts = [int(p.valid.sum()) for p in pictures]
+    summaries = [vlad.aggregate(from_bytes(p.descriptors)) if vlad else p.global_descriptor for p in pictures]
+    return VisualMap(
+        extractor, descriptor.name, tuple(photo.file.name for photo in photos),
+        tuple(picture.camera for picture in pictures),
+        np.stack([photo.T_world_cam.R.double().numpy() for photo in photos]),
+        np.stack([photo.T_world_cam.t.double().numpy() for photo in photos]),
+        np.concatenate([p.keypoints[p.valid] for p in pictures]), descriptors, positions,
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), landmark, landmarks, np.stack(summaries),
+        vlad.vocabulary if vlad else np.zeros((0, descriptors.shape[1]), np.float32), cell_m,
+    )  # fmt: skip
+
+
+def _why_empty(photos: Sequence[Photo], source: Scan | Tracks) -> str:
+    """The likeliest reason: poses and scene in different units or worlds."""
+    points = source.points if isinstance(source, Scan) else source.points_world
+    if not len(points):
+        return "The scene has no points."
+    cameras = np.stack([photo.T_world_cam.t.double().numpy() for photo in photos])
+    low, high = points.min(0), points.max(0)
+    outside = ((cameras < low - 20) | (cameras > high + 20)).any(1).mean()
+    if outside > 0.5:
+        return (
+            f"Most cameras stand far outside the scan ({np.round(low, 1).tolist()} to {np.round(high, 1).tolist()}): "
+            "are both in metres and in the same world?"
+        )
+    return "Are the poses camera-to-world, with OpenCV's camera axes (x right, y down, z forward)?"
