@@ -1,7 +1,7 @@
 """Local features of a picture: keypoints, descriptors, and what extracts, pairs and summarises them."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -29,6 +29,7 @@ class Features:
         return Features(self.keypoints[chosen], self.descriptors[chosen], self.scores[chosen], self.size)
 
 
+@runtime_checkable
 class Extractor(Protocol):
     """Finds and describes keypoints. Two extractors of one name give descriptors that can be compared."""
 
@@ -38,12 +39,14 @@ class Extractor(Protocol):
     def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Features: ...
 
 
+@runtime_checkable
 class Matcher(Protocol):
     """Pairs the keypoints of two pictures: rows (number in `query`, number in `other`), one per pair."""
 
     def __call__(self, query: Features, other: Features) -> Int64[np.ndarray, "match 2"]: ...
 
 
+@runtime_checkable
 class GlobalDescriptor(Protocol):
     """Summarises a picture in one vector of unit length; similar places have a large dot product."""
 
