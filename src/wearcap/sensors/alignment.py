@@ -1,0 +1,128 @@
+"""The suit's world turned and moved into the scene's: thesis eq. 4.14 and 4.15, and the camera's mount (eq. 4.3)."""
+
+from dataclasses import replace
+
+import roma
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, outlier_mask, resample
+from wearcap.recording.motion import Motion
+from wearcap.recording.recording import Localization
+
+MAX_SPEED = 3.0
+"""m/s, thesis §4.2.5."""
+
+
+def align_suit(
+    suit: Motion, localization: Localization, mount: Rigid, first_s: float = 10.0
+) -> tuple[Motion, Float[Tensor, ""]]:
+    """Bring a suit's motion into the scene by one rotation about gravity and one translation: (motion, angle in rad).
+
+    The angle is that of eq. 4.14, robustly over the first `first_s` seconds of localised frames instead of frame 0,
+    which may be wrong; it turns root orientation and path of all frames (eq. 4.15). The translation puts the worn
+    camera where those frames saw it. `mount` is the nominal pose of the camera in head axes, T_head_cam. Clocks
+    must agree already. Raises WearcapError when no localised frame lies within the suit's time.
+    """
+    seen = inliers(localization)
+    inside = localization.timestamps >= suit.timestamps[0]
+    early = _first(seen & inside & (localization.timestamps <= suit.timestamps[-1]), localization, first_s)
+    if not early.any():
+        raise WearcapError(
+            f"none of {len(seen)} frames is localised between {suit.timestamps[0]:.1f} s and "
+            f"{suit.timestamps[-1]:.1f} s", where="localization",
+            expected="camera poses on the suit's clock", fix="Synchronise the clocks, or check the map.",
+        )  # fmt: skip
+    times, weight = localization.timestamps[early], localization.confidence[early]
+    head = suit.joint("head")
+    head = resample(Trajectory(suit.timestamps, head.R, head.t), times).T_world_body
+    T_world_cam = Rigid(localization.R_world_cam[early], localization.t_world_cam[early]).to(head.t.dtype)
+    angle, certainty = yaw_between(head.R, T_world_cam.R @ mount.R.mT)
+    turn = robust_angle(angle, weight * certainty)
+    R_scene_suit = rotation.about_axis("z", turn)
+    move = _weighted_median(T_world_cam.t - (head @ mount.t) @ R_scene_suit.mT, weight)
+    R = suit.R_parent_joint.clone()
+    R[:, 0] = R_scene_suit @ R[:, 0]
+    return replace(suit, R_parent_joint=R, t_world_root=suit.t_world_root @ R_scene_suit.mT + move), turn
+
+
+def inliers(localization: Localization) -> Bool[Tensor, "time"]:
+    """Localised frames (confidence above 0) whose position no inlier neighbour contradicts at 3 m/s."""
+    found = (localization.confidence > 0) & localization.R_world_cam.isfinite().all(-1).all(-1)
+    position = torch.where(found[:, None], localization.t_world_cam, torch.nan)
+    return outlier_mask(Trajectory(localization.timestamps, localization.R_world_cam, position), MAX_SPEED)
+
+
+def _first(seen: Tensor, localization: Localization, first_s: float) -> Tensor:
+    """Of the frames seen, as many from the start as make up `first_s` seconds."""
+    step = localization.timestamps.diff().median().item() if len(seen) > 1 else first_s
+    return seen & (seen.cumsum(0) <= max(round(first_s / step), 1))
+
+
+def yaw_between(
+    R_a: Float[Tensor, "*batch 3 3"], R_b: Float[Tensor, "*batch 3 3"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Angle (rad) about gravity that brings R_a nearest to R_b, and how well it is determined (0…1).
+
+    The geodesic distance of Rz(x) R_a and R_b (eq. 4.14) is smallest where trace(Rz(x) R_a R_b^T) is largest; with
+    Q = R_b R_a^T that is (Q00 + Q11) cos x + (Q10 - Q01) sin x + Q22.
+    """
+    Q = R_b @ R_a.mT
+    cos, sin = Q[..., 0, 0] + Q[..., 1, 1], Q[..., 1, 0] - Q[..., 0, 1]
+    return torch.atan2(sin, cos), torch.hypot(sin, cos) / 2
+
+
+def robust_angle(
+    angle: Float[Tensor, "sample"], weight: Float[Tensor, "sample"], scale_rad: float = 0.05
+) -> Float[Tensor, ""]:
+    """Centre (rad) of angles on the circle: the sample with the least weighted sum of distances to all others, then
+    reweighted means in which an angle `scale_rad` away counts half, and far ones hardly."""
+    # 1000 candidates are enough for a start
+    candidates = angle[:: max(len(angle) // 1000, 1)]
+    distance = rotation.wrap_angle(candidates[:, None] - angle).abs()
+    centre = candidates[(distance @ weight).argmin()]
+    for _ in range(30):
+        off = rotation.wrap_angle(angle - centre)
+        w = weight / (1 + (off / scale_rad) ** 2) ** 2
+        centre = rotation.wrap_angle(centre + (w * off).sum() / w.sum())
+    return centre
+
+
+def _weighted_median(value: Float[Tensor, "sample 3"], weight: Float[Tensor, "sample"]) -> Float[Tensor, "3"]:
+    ordered, order = value.sort(dim=0)
+    share = weight[order].cumsum(0)
+    return ordered.gather(0, (share < share[-1:] / 2).sum(0, keepdim=True))[0]
+
+
+def estimate_head_camera(
+    R_world_head: Float[Tensor, "time 3 3"],
+    R_world_cam: Float[Tensor, "time 3 3"],
+    confidence: Float[Tensor, "time"],
+) -> Float[Tensor, "3 3"]:
+    """R_head_cam from the aligned suit's head and the localised camera (HPS paper eq. 4, thesis eq. 4.3).
+
+    Over all frames with confidence instead of frame 0: the rotation with the least weighted sum of geodesic
+    distances (Weiszfeld steps on the chordal mean). A heading that drifts meanwhile enters as a turn of the mount:
+    give frames from before the drift or with the heading corrected. Raises WearcapError without a frame.
+    """
+    good = (confidence > 0) & R_world_cam.isfinite().all(-1).all(-1)
+    if not good.any():
+        raise WearcapError(
+            "no localised frame", expected="one at least, to tell how the camera sits on the head"
+        )
+    R, weight = R_world_head[good].mT @ R_world_cam[good], confidence[good]
+    median = torch.stack([_weighted_median(R[:, :, column], weight) for column in range(3)], -1)
+    centre = roma.special_procrustes(median)
+    for _ in range(20):
+        w = weight / rotation.geodesic(R, centre.expand_as(R)).clamp(min=0.005)
+        centre = roma.special_procrustes((w[:, None, None] * R).sum(0) / w.sum())
+    return centre  # pyright: ignore[reportReturnType]
+
+
+def body_camera(motion: Motion, t_head_cam: Float[Tensor, "3"]) -> Float[Tensor, "time 3"]:
+    """Where a motion carries the camera of its head (m, world)."""
+    return motion.joint("head") @ t_head_cam
