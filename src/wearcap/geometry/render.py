@@ -5,7 +5,7 @@ camera; through other lenses their edges are straight between projected corners,
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -17,7 +17,7 @@ from wearcap.geometry import raster
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.splats import NEAR_M, camera_from_world, lens_numbers
+from wearcap.geometry.splats import NEAR_M, camera_from_world, lens_numbers, point_depths
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,12 @@ def render(
         )  # fmt: skip
         offset += len(cloud.points)
     colors = _point_colors(splats)
-    return _resolve(camera, fine, R, t, vertices_cam, scene, colors, light, background, nearness, index)
+    frame = _resolve(camera, fine, R, t, vertices_cam, scene, colors, light, background, nearness, index)
+    if not splats:
+        return frame
+    points = np.concatenate([cloud.points for cloud in splats])
+    depth = point_depths(points, frame.point_index, camera_from_world(T_world_cam), camera.is_fisheye)
+    return replace(frame, depth=np.where(frame.index < frame.face_count, frame.depth, depth))
 
 
 def orthographic_map(

@@ -58,19 +58,33 @@ class SplatCloud:
     ) -> tuple[Int32[np.ndarray, "height width"], Float32[np.ndarray, "height width"]]:
         """Number (in the original cloud) and depth (m) of the point seen in each pixel; -1 and infinity where none.
 
-        Depth is along the optical axis, for fisheyes along the ray.
+        Depth is the point's own, along the optical axis, for fisheyes along the ray.
         """
         nearness = np.full((camera.height, camera.width), -np.inf, np.float32)
         index = np.full((camera.height, camera.width), -1, np.int32)
+        pose = camera_from_world(T_world_cam)
         raster.draw_splats(
-            self.points, self.first, self.centers, self.radii + radius_m, camera_from_world(T_world_cam),
-            view_planes(camera), lens_numbers(camera), radius_m, True, 0, nearness, index,
+            self.points, self.first, self.centers, self.radii + radius_m, pose, view_planes(camera),
+            lens_numbers(camera), radius_m, True, 0, nearness, index,
         )  # fmt: skip
+        depth = point_depths(self.points, index, pose, camera.is_fisheye)
         seen = index >= 0
         index[seen] = self.order[index[seen]]
-        nearness[~seen] = 0
-        with np.errstate(divide="ignore"):
-            return index, 1 / nearness
+        return index, depth
+
+
+def point_depths(
+    points: Float32[np.ndarray, "point 3"],
+    index: Int32[np.ndarray, "height width"],
+    pose: Float64[np.ndarray, "3 4"],
+    along_ray: bool,
+) -> Float32[np.ndarray, "height width"]:
+    """Depth (m) of the point named in each pixel, infinite where `index` is negative; `pose`: [R_cam_world | t_cam_world]."""
+    seen = index >= 0
+    points_cam = points[index[seen]] @ pose[:, :3].T + pose[:, 3]
+    depth = np.full(index.shape, np.inf, np.float32)
+    depth[seen] = np.linalg.norm(points_cam, axis=1) if along_ray else points_cam[:, 2]
+    return depth
 
 
 def camera_from_world(T_world_cam: Rigid) -> Float64[np.ndarray, "3 4"]:
