@@ -1,0 +1,245 @@
+"""Camera calibration from pictures of a checkerboard: OpenCV's model with two radial and two tangential coefficients.
+
+The documents calibrate so (thesis §4.3.3) and say no more; how views are chosen and judged is ours.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+
+_SEARCH_WIDTH = 960
+"""Boards are looked for in pictures of at most this width (pixels); corners are then refined in the full picture."""
+_CELLS = (8, 6)
+"""Columns and rows of the picture's cells in which corners are counted for the coverage."""
+_HINT_FRAMES = 12
+
+
+@dataclass(frozen=True)
+class Board:
+    """A checkerboard by its inner corners, where four squares meet: one fewer than squares each way."""
+
+    columns: int
+    rows: int
+    square_m: float | int
+
+    def __post_init__(self):
+        if min(self.columns, self.rows) < 3 or not self.square_m > 0:
+            raise WearcapError(f"a board of {self.columns}x{self.rows} inner corners and squares of {self.square_m} m",
+                               expected="at least 3x3 inner corners, and a positive size in metres")  # fmt: skip
+
+    @property
+    def points(self) -> Float32[np.ndarray, "point 3"]:
+        """Corners on the board (m, z = 0), row by row."""
+        y, x = np.mgrid[: self.rows, : self.columns]
+        return (np.stack([x, y, 0 * x], -1).reshape(-1, 3) * self.square_m).astype(np.float32)
+
+    def __str__(self) -> str:
+        return f"{self.columns}x{self.rows}"
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """How many views are wanted, and when one is bad."""
+
+    max_views: int = 40
+    """The most varied of the sharp views up to this many are used."""
+    min_views: int = 8
+    max_blur_px: float | int = 4.0
+    """Edges of squares that rise over more pixels than this are blurred, unless hardly any are sharper."""
+    outlier_ratio: float | int = 2.5
+    """A view whose residual is so many times the median is rejected …"""
+    outlier_px: float | int = 0.3
+    """… when it also exceeds this (RMS, pixels)."""
+    max_focal_spread: float | int = 0.02
+    """Largest standard deviation of a focal length, as a share of it."""
+    min_tilt_deg: float | int = 8.0
+    """Boards must be turned out of their mean direction by so much; else that deviation means nothing."""
+
+
+SETTINGS = CalibrationSettings()
+
+
+@dataclass(frozen=True)
+class View:
+    """The board as one picture shows it."""
+
+    name: str
+    corners: Float32[np.ndarray, "point 2"]
+    """Pixels, row by row (from either end: a checkerboard may be turned by half a turn)."""
+    blur_px: float
+    """Mean length over which the squares' edges rise."""
+    rms_px: float = np.nan
+    """Residual after calibration; NaN before."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera and how far it is to be believed."""
+
+    camera: Camera
+    rms_px: float
+    """Over all corners of the views used."""
+    focal_std_px: float
+    """The larger standard deviation of the two focal lengths."""
+    coverage: float
+    """Share of the picture's 8 x 6 cells in which corners were seen; distortion is extrapolated in the others."""
+    views: tuple[View, ...]
+    rejected: tuple[View, ...] = ()
+    """Views whose residual was too large."""
+    seen: int = 0
+    """Pictures in which the board was found, before the varied ones were chosen."""
+    examined: int = 0
+
+
+def calibrate_from_pictures(
+    pictures: Iterable[tuple[str, UInt8[np.ndarray, "height width 3"]]],
+    board: Board,
+    settings: CalibrationSettings = SETTINGS,
+) -> Calibration:
+    """Calibrate from named RGB pictures (all of one size), of which some show the board.
+
+    Raises WearcapError when no picture shows it (saying what was tried), for pictures of several sizes, for too few
+    views, and for views that leave the focal length open (all of them frontal, say).
+    """
+    views, missed = [], []
+    size, examined = None, 0
+    for name, picture in pictures:
+        examined += 1
+        size = size or (picture.shape[1], picture.shape[0])
+        if (picture.shape[1], picture.shape[0]) != size:
+            raise WearcapError(f"{picture.shape[1]}x{picture.shape[0]} pixels", where=name, expected=f"{size[0]}x{size[1]}, as the pictures before",
+                               fix="Calibrate each resolution by itself.")  # fmt: skip
+        gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+        view = find_board(gray, board, name)
+        if view is not None:
+            views.append(view)
+        elif not views and len(missed) < _HINT_FRAMES:
+            missed.append(gray)
+    if size is None:
+        raise WearcapError("no pictures to calibrate from", expected="a video, or a folder of pictures")
+    if not views:
+        raise _not_found(board, size, examined, missed)
+    chosen = varied(_sharp(views, settings), size, settings.max_views)
+    return replace(_calibrated(chosen, board, size, settings), seen=len(views), examined=examined)
+
+
+def find_board(gray: UInt8[np.ndarray, "height width"], board: Board, name: str = "") -> View | None:
+    """Corners of the whole board in a grey picture, refined to a fraction of a pixel; None where it is not seen."""
+    shrink = max(1.0, gray.shape[1] / _SEARCH_WIDTH)
+    small = (
+        gray
+        if shrink == 1
+        else cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+    )
+    pattern = (board.columns, board.rows)
+    found, corners = cv2.findChessboardCornersSB(small, pattern, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not found:
+        return None
+    corners = (corners.reshape(-1, 2) + 0.5) * shrink - 0.5
+    grid = corners.reshape(board.rows, board.columns, 2)
+    step = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
+    reach = int(np.clip(step / 3, 2, 11))  # the window must not reach into the next corner
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
+    corners = cv2.cornerSubPix(
+        gray, corners.astype(np.float32).reshape(-1, 1, 2), (reach, reach), (-1, -1), stop
+    )
+    blur = cv2.estimateChessboardSharpness(gray, pattern, corners)[0][0]
+    return View(name, corners.reshape(-1, 2), float(blur))
+
+
+def _sharp(views: list[View], settings: CalibrationSettings) -> list[View]:
+    sharp = [view for view in views if view.blur_px <= settings.max_blur_px]
+    return sharp if len(sharp) >= settings.min_views else views
+
+
+def varied(views: Sequence[View], size: tuple[int, int], count: int) -> list[View]:
+    """Up to `count` views that differ most in place, size and tilt: the sharpest, then ever the one furthest from those."""
+    what = np.array([_appearance(view.corners, size) for view in views])
+    chosen = [int(np.argmin([view.blur_px for view in views]))]
+    distance = np.linalg.norm(what - what[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(views)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(what - what[chosen[-1]], axis=1))
+    return [views[k] for k in sorted(chosen)]
+
+
+def _appearance(
+    corners: Float32[np.ndarray, "point 2"], size: tuple[int, int]
+) -> Float64[np.ndarray, "feature"]:
+    """Place (shares of the picture), size (log of its share), and the projective part of the view: how it is tilted."""
+    side = float(max(size))
+    centred = (corners.astype(np.float64) - corners.mean(0)) / side
+    spread = np.sqrt((centred**2).sum(1).mean())
+    skew = (centred**3).mean(0) / spread**3  # perspective makes the near half of the board larger
+    shape = np.linalg.svd(centred, compute_uv=False)
+    return np.array([*(corners.mean(0) / size), np.log(spread), shape[1] / shape[0], *(3 * skew)])
+
+
+def _calibrated(
+    views: list[View], board: Board, size: tuple[int, int], settings: CalibrationSettings
+) -> Calibration:
+    """Calibrate, reject views with large residuals, calibrate again, until all agree."""
+    rejected: list[View] = []
+    while True:
+        if len(views) < settings.min_views:
+            raise WearcapError(f"{len(views)} good views of the {board} board ({len(rejected)} rejected for their residuals)",
+                               expected=f"at least {settings.min_views}",
+                               fix="Film it slowly, from near and far, tilted to all sides, into the picture's corners.")  # fmt: skip
+        points = [view.corners.reshape(-1, 1, 2) for view in views]
+        rms, K, bent, turns, _, spread, _, residuals = cv2.calibrateCameraExtended(
+            [board.points] * len(views), points, size, None, None, flags=cv2.CALIB_FIX_K3
+        )
+        views = [replace(view, rms_px=float(r)) for view, r in zip(views, residuals[:, 0])]
+        limit = max(settings.outlier_px, settings.outlier_ratio * float(np.median(residuals)))
+        bad = [view for view in views if view.rms_px > limit]
+        if not bad:
+            break
+        rejected += bad
+        views = [view for view in views if view.rms_px <= limit]
+    focal_std, tilt_deg = float(max(spread[0, 0], spread[1, 0])), _tilt_deg(turns)
+    open_focal = focal_std > settings.max_focal_spread * K[0, 0] or tilt_deg < settings.min_tilt_deg
+    if not np.isfinite(K).all() or open_focal:
+        raise WearcapError(f"the views leave the focal length open ({K[0, 0]:.0f} ± {focal_std:.1f} px, boards tilted by {tilt_deg:.1f}°)",
+                           expected=f"a deviation below {100 * settings.max_focal_spread:g} %, tilts of {settings.min_tilt_deg:g}°",
+                           fix="Tilt the board: views from straight ahead do not tell focal length from distance.")  # fmt: skip
+    lens = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    camera = Camera("opencv", *size, *lens, tuple(map(float, bent.ravel()[:4])))
+    return Calibration(camera, float(rms), focal_std, coverage(views, size), tuple(views), tuple(rejected))
+
+
+def _tilt_deg(turns: Sequence[np.ndarray]) -> float:
+    """How far the boards' normals lie from their mean: the 90th percentile of the angles."""
+    normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    normals *= np.sign(normals[:, 2:])  # a board has no up
+    mean = normals.mean(0) / np.linalg.norm(normals.mean(0))
+    return float(np.degrees(np.quantile(np.arccos((normals @ mean).clip(-1, 1)), 0.9)))
+
+
+def coverage(views: Sequence[View], size: tuple[int, int]) -> float:
+    """Share of the picture's cells in which a corner of some view lies."""
+    corners = np.concatenate([view.corners for view in views])
+    cells = np.floor(corners / size * _CELLS).astype(int).clip(0, np.array(_CELLS) - 1)
+    return len(np.unique(cells[:, 1] * _CELLS[0] + cells[:, 0])) / (_CELLS[0] * _CELLS[1])
+
+
+def _not_found(board: Board, size: tuple[int, int], examined: int, missed: list[np.ndarray]) -> WearcapError:
+    """What was tried, and whether another count of corners would have been right."""
+    others = [(board.columns - 1, board.rows - 1), (board.columns + 1, board.rows + 1),
+              (board.columns - 1, board.rows), (board.columns, board.rows - 1)]  # fmt: skip
+    fix = (
+        "Count inner corners, not squares; show the whole board with a white margin, evenly lit and in focus."
+    )
+    for columns, rows in others:
+        if min(columns, rows) >= 3 and any(
+            find_board(gray, replace(board, columns=columns, rows=rows)) for gray in missed
+        ):
+            fix = f"A board of {columns}x{rows} inner corners was found: give columns={columns} rows={rows}."
+            break
+    return WearcapError(f"no board of {board} inner corners in {examined} pictures of {size[0]}x{size[1]} pixels",
+                        expected="a checkerboard, seen as a whole", fix=fix)  # fmt: skip
