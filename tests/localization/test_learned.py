@@ -3,14 +3,21 @@
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
 from safetensors.torch import save_file
+from textured_room import CAMERA, photo_poses, photograph, take_photos, textured_room
 
+from wearcap.cli.conf import compose, conf_dir
 from wearcap.errors import WearcapError
 from wearcap.localization.features import Features
 from wearcap.localization.learned import LightGlueMatcher, NetVladDescriptor, SuperPointExtractor
+from wearcap.localization.localizer import Localizer
+from wearcap.localization.map_builder import MapSettings, build_map
+from wearcap.localization.point_map import PointMapper
 from wearcap.models.lightglue import LightGlue
 from wearcap.models.netvlad import NetVLAD
 from wearcap.models.superpoint import SuperPoint
+from wearcap.scene.scan import Scan
 
 
 def _saved(network: torch.nn.Module, folder) -> str:
@@ -191,3 +198,63 @@ def test_wrong_use_is_explained(superpoint, lightglue):
     )
     with pytest.raises(WearcapError, match="descriptors of 128 numbers"):
         LightGlueMatcher(lightglue)(sift, sift)
+
+
+def spread_descriptors(network: SuperPoint, image: np.ndarray) -> None:
+    """Descriptors of random weights are nearly one vector; the last layer is set so that an image's spread out."""
+    for module in network.modules():
+        if isinstance(module, torch.nn.Conv2d):
+            torch.nn.init.kaiming_normal_(module.weight)
+            torch.nn.init.zeros_(module.bias)
+    seen = []
+    hook = network.convDb.register_forward_hook(lambda _, inputs, output: seen.append(output))
+    network.dense(torch.from_numpy(image).float().mean(-1)[None, None] / 255)
+    hook.remove()
+    outputs = seen[0][0].flatten(1)
+    mean = outputs.mean(1)
+    axes, spread, _ = torch.linalg.svd(outputs - mean[:, None], full_matrices=False)
+    whiten = torch.zeros(256, 256)
+    whiten[:64] = (axes[:, :64] / spread[:64] * spread[0]).T
+    network.convDb.weight.copy_((whiten @ network.convDb.weight[:, :, 0, 0])[:, :, None, None])
+    network.convDb.bias.copy_(-whiten @ mean)
+
+
+@pytest.mark.slow
+def test_a_map_of_learned_features_finds_where_its_photo_was_taken(lightglue, netvlad, tmp_path):
+    """The whole way through map, retrieval, matching and pose; weights made here know their own photo at best."""
+    mapper = PointMapper(textured_room(spacing=0.02), 0.015)
+    photos = take_photos(mapper, CAMERA, photo_poses(3), tmp_path)
+    image = photograph(mapper, CAMERA, photos[1].T_world_cam)
+    torch.manual_seed(0)
+    network = SuperPoint().requires_grad_(False)
+    spread_descriptors(network, image)
+    extract = SuperPointExtractor(_saved(network, tmp_path), max_keypoints=200)
+    describe = NetVladDescriptor(netvlad, max_side=96)
+    scan = Scan(mapper.points)
+    room_map = build_map(photos, scan, extract, descriptor=describe, settings=MapSettings(splat_m=0.015))
+    assert (room_map.extractor, room_map.descriptor) == (extract.name, describe.name)
+    pose = Localizer(room_map, extract, LightGlueMatcher(lightglue), descriptor=describe)(image, CAMERA)
+    assert pose is not None
+    assert pose.inliers > 50
+    torch.testing.assert_close(pose.t_world_cam, photos[1].T_world_cam.t.float(), atol=2e-3, rtol=0)
+
+
+def test_every_choice_of_the_config_builds(superpoint, lightglue, netvlad):
+    choices = {path.stem for path in (conf_dir() / "localization").glob("*.yaml")}
+    weights = {
+        "extractor": ("superpoint", superpoint),
+        "matcher": ("superpoint", lightglue),
+        "descriptor": ("superpoint_netvlad", netvlad),
+    }
+    for choice in choices:
+        given = [
+            f"localization.{part}.weights={path}"
+            for part, (prefix, path) in weights.items()
+            if choice.startswith(prefix)
+        ]
+        config = compose("train", [f"+localization={choice}", *given, "paths.run=x"]).localization
+        parts = {name: instantiate(config[name]) for name in ("extractor", "matcher", "descriptor")}
+        assert parts["extractor"].name.startswith("superpoint" if given else "rootsift")
+        assert (parts["matcher"] is None) == (choice == "sift")
+        assert (parts["descriptor"] is None) == (choice != "superpoint_netvlad")
+    assert choices == {"sift", "superpoint", "superpoint_netvlad"}

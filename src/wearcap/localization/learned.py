@@ -30,13 +30,13 @@ _SUPERPOINT = (
 _LIGHTGLUE = (
     "LightGlue's weights are not part of wearcap",
     "Download superpoint_lightglue.pth from https://github.com/cvg/LightGlue/releases "
-    "and set localization.matcher.weights=PATH, or take localization=sift, which needs no weights.",
+    "and set localization.matcher.weights=PATH, or set localization.matcher=null to match without it.",
 )
 _NETVLAD = (
     "NetVLAD's weights are not part of wearcap",
     "Download a VGG16 checkpoint of https://github.com/Nanne/pytorch-NetVlad "
     "(or Patch-NetVLAD's, with whitening) and set localization.descriptor.weights=PATH, "
-    "or take localization=sift, which needs no weights.",
+    "or set localization.descriptor=null to take VLAD, which needs no weights.",
 )
 
 
