@@ -25,6 +25,7 @@ from wearcap.localization.absolute_pose import (
     project,
     ransac_pose,
     refined_pose,
+    reprojection_errors,
 )
 from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Matcher
 from wearcap.localization.landmarks import from_bytes
@@ -54,8 +55,8 @@ class LocalizerSettings:
     """Reprojection error up to which a match is an inlier, at a picture 1000 pixels wide; grows with the width."""
     second_look_px: float = 12.0
     """Distance up to which the second look seeks, at the same width."""
-    min_inliers: int = 12
-    """With fewer there is no pose."""
+    min_inliers: int = 10
+    """With fewer matches of the first look that agree with the pose there is none."""
     horizontal_fov_deg: float = 100.0
     """Field of view of the perspective camera that a fisheye's pictures are undistorted to."""
 
@@ -129,28 +130,26 @@ class Localizer:
             pixels, matched = features.keypoints[pairs[:, 0]], points[pairs[:, 1]]
         else:
             pixels, matched = self._matched_by_pairs(features, images)
-        fit = ransac_pose(pixels, matched, camera, self.settings.max_error_px * scale)
+        limit = self.settings.max_error_px * scale
+        fit = ransac_pose(pixels, matched, camera, limit)
         if fit is None:
             return None
+        evidence = pixels, matched
         if self.matcher is None:
-            for reach in (self.settings.second_look_px, self.settings.max_error_px):
-                near = _near_pairs(features.keypoints, points, camera, fit, reach * scale)
+            for reach in (self.settings.second_look_px * scale, limit):
+                near = _near_pairs(features.keypoints, points, camera, fit, reach)
                 pairs = match_nearby(features.descriptors, descriptors, near, self.settings.min_cosine)
                 if len(pairs) < self.settings.min_inliers:
                     return None
                 pixels, matched = features.keypoints[pairs[:, 0]], points[pairs[:, 1]]
-                fit = refined_pose(pixels, matched, camera, fit, self.settings.max_error_px * scale)
-        return self._judged(pixels, matched, camera, fit)
-
-    def _judged(self, pixels: np.ndarray, matched: np.ndarray, camera: Camera, fit: Fit) -> CameraPose | None:  # fmt: skip
-        inliers = int(fit.inlier.sum())
-        if inliers < self.settings.min_inliers:
+                fit = refined_pose(pixels, matched, camera, fit, limit)
+        agreeing = evidence[0][reprojection_errors(*evidence, camera, fit) < limit]
+        if len(agreeing) < self.settings.min_inliers:
             return None
         covariance = pose_covariance(pixels, matched, camera, fit)
         return CameraPose(
-            torch.from_numpy(fit.R_world_cam).float(), torch.from_numpy(fit.t_world_cam).float(), inliers,
-            confidence(pixels[fit.inlier], camera, self.settings.min_inliers),
-            torch.from_numpy(covariance).float(),
+            torch.from_numpy(fit.R_world_cam).float(), torch.from_numpy(fit.t_world_cam).float(),
+            int(fit.inlier.sum()), confidence(agreeing, camera), torch.from_numpy(covariance).float(),
         )  # fmt: skip
 
     def _landmarks_of(self, images: Int64[np.ndarray, "chosen"]) -> Int64[np.ndarray, "landmark"]:
@@ -182,15 +181,14 @@ class Localizer:
         return np.concatenate(pixels), np.concatenate(positions)
 
 
-def confidence(pixels: Float32[np.ndarray, "match 2"], camera: Camera, min_inliers: int) -> float:
-    """1 − 2^(−(n − n₀)/12) of n inliers, of which at most 6 count in each of the picture's 8 x 6 cells.
+def confidence(agreeing: Float32[np.ndarray, "match 2"], camera: Camera) -> float:
+    """1 − 2^(−(n − 6)/8) of the n matches made without knowing the pose that agree with it (ours).
 
-    Ours: wrong poses gather few matches, or many in one spot.
+    At most 6 of them count in each of the picture's 8 x 6 cells: wrong poses gather few matches, or many in one spot.
     """
-    cell = (pixels / [camera.width / 8, camera.height / 6]).astype(np.int64).clip(0, [7, 5])
+    cell = (agreeing / [camera.width / 8, camera.height / 6]).astype(np.int64).clip(0, [7, 5])
     counts = np.bincount(cell[:, 0] + 8 * cell[:, 1], minlength=48)
-    spread = int(np.minimum(counts, 6).sum())
-    return float(1 - 2.0 ** (-max(spread - 0.5 * min_inliers, 0) / 12))
+    return float(1 - 2.0 ** (-max(int(np.minimum(counts, 6).sum()) - 6, 0) / 8))
 
 
 def nearest_pictures(

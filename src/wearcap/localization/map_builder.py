@@ -220,10 +220,10 @@ def _why_empty(photos: Sequence[Photo], source: Scan | Tracks) -> str:
         return "The scene has no points."
     cameras = np.stack([photo.T_world_cam.t.double().numpy() for photo in photos])
     low, high = points.min(0), points.max(0)
-    outside = ((cameras < low - 20) | (cameras > high + 20)).any(1).mean()
-    if outside > 0.5:
+    outside = ((cameras < low - 20) | (cameras > high + 20)).any(1).mean() > 0.5
+    if outside or np.ptp(points, axis=0).max() > 100 * max(np.ptp(cameras, axis=0).max(), 1.0):
         return (
-            f"Most cameras stand far outside the scan ({np.round(low, 1).tolist()} to {np.round(high, 1).tolist()}): "
-            "are both in metres and in the same world?"
+            f"The cameras stand around {np.round(np.median(cameras, axis=0), 1).tolist()}, the scene reaches from "
+            f"{np.round(low, 1).tolist()} to {np.round(high, 1).tolist()}: are both in one unit (m) and in one world?"
         )
     return "Are the poses camera-to-world, with OpenCV's camera axes (x right, y down, z forward)?"
