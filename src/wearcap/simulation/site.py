@@ -191,7 +191,11 @@ def _build_open_air(builder: WorldBuilder, layout: Layout, rng: np.random.Genera
     for x in (x_low - 0.2, x_high + 0.2):
         for y, next_y in pairwise(np.linspace(y_low + 0.1, far, 5)):
             tall, hedge = rng.uniform(1.3, 2.4), rng.uniform() < 0.4
-            color, texture = ((0.22, 0.42, 0.2), 35.0) if hedge else (hue(rng, (0.1, 0.35)), 9.0)
+            color, texture = (
+                ((0.24, 0.42, 0.2), 35.0)
+                if hedge
+                else (tuple(rng.uniform(0.4, 0.75) * np.array((1.0, 0.82, 0.72))), 9.0)
+            )
             center, size = (x, (y + next_y) / 2, base + tall / 2), (0.3, next_y - y, tall)
             builder.add_block("hedge" if hedge else "garden_wall", center, size, color, texture)
     ground = ((x_low + x_high) / 2, far / 2, base - 0.11)
