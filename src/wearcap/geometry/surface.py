@@ -61,6 +61,14 @@ class SurfaceIndex:
         _nearest_all(queries, reach_m, *self._grid, distance, index)
         return distance, np.where(index >= 0, self.order[index], -1)
 
+    def nearest_points(
+        self, queries: Float64[np.ndarray, "query 3"], reach_m: float = 0.5
+    ) -> Float64[np.ndarray, "query 3"]:
+        """The nearest point itself (m); NaN beyond `reach_m`."""
+        distance, index = np.empty(len(queries)), np.empty(len(queries), np.int64)
+        _nearest_all(queries, reach_m, *self._grid, distance, index)
+        return np.where(index[:, None] >= 0, self.points[index], np.nan).astype(np.float64)
+
     def plane(
         self, queries: Float64[np.ndarray, "query 3"], radius_m: float = 0.06, reach_m: float = 0.5
     ) -> tuple[Float64[np.ndarray, "query 3"], Float64[np.ndarray, "query 3"]]:
@@ -159,7 +167,9 @@ def _plane_all(queries, radius, reach, points, cell_m, origin, keys, first, coun
         )
         plane_origin[q], normal[q] = np.nan, np.nan
         if row >= 0:
-            fit_plane(points[row], radius, points, cell_m, origin, keys, first, count, plane_origin[q], normal[q])
+            fit_plane(
+                points[row], radius, points, cell_m, origin, keys, first, count, plane_origin[q], normal[q]
+            )
 
 
 @compiled

@@ -48,7 +48,10 @@ def solve_adam_windows(
         if stop == len(data):
             break
         begin += settings.advance
-    mean = [{name: sum(step[name] for step in steps) / len(steps) for name in steps[0]} for steps in zip(*histories)]
+    mean = [
+        {name: sum(step[name] for step in steps) / len(steps) for name in steps[0]}
+        for steps in zip(*histories)
+    ]
     return Solution(HpsState(theta, R, t), mean, f"{settings.steps} steps per window")
 
 

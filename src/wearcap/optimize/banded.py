@@ -14,29 +14,48 @@ from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
-from wearcap.optimize.banded_assembly import Body, Frames, Kinematics, Weights, assemble, update_kinematics
+from wearcap.optimize.banded_assembly import (
+    LEGS,
+    Body,
+    Forms,
+    Frames,
+    Kinematics,
+    Weights,
+    gather,
+    update_kinematics,
+)
 from wearcap.optimize.banded_kernels import factor_and_solve
+from wearcap.optimize.banded_mapping import apply_step, fill_system
 from wearcap.optimize.costs import LOSSES
 from wearcap.optimize.feet import FootPatches
 from wearcap.optimize.hps import TERMS, HpsData, HpsEnergy, HpsState, find_ground
 from wearcap.optimize.solution import Solution
 
-_PAIRS = {"slide", "translation_smooth", "root_smooth", "head_smooth", "translation_step", "root_step", "head_step"}
+_PAIRS = {
+    "slide",
+    "translation_smooth",
+    "root_smooth",
+    "head_smooth",
+    "translation_step",
+    "root_step",
+    "head_step",
+}
 
 
 @dataclass(frozen=True)
 class BandedSettings:
     """How long and how finely to iterate."""
 
-    iterations: int = 12
-    smooth_start: float = 3e-2
+    iterations: int = 20
+    smooth_start: float = 1e-2
     """Rounding of norms (m, rad) in the first iteration …"""
     smooth_end: float = 3e-4
     """… falling geometrically to this in the last."""
     tolerance: float = 1e-4
     """Stop when the energy falls by less than this share, the rounding having reached its end."""
     damping: float = 1e-6
+    relaxation: float = 1.5
+    """Share of each step that is gone after the first two: above 1 the reweighting of norms converges sooner."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,13 +78,13 @@ class ActiveBody:
         offsets = skeleton.t_parent_joint[list(joints)].double().numpy()
         head_chain = np.array([number[joint] for joint in head])
         leg_chains = np.array([[number[joint] for joint in leg] for leg in legs])
-        columns = 3 + np.arange(3)
-        head_columns = np.concatenate([columns, *(columns + 3 * joint for joint in head_chain)])
-        foot_columns = np.stack([np.concatenate([columns - 3, columns, *(columns + 3 * joint for joint in leg)]) for leg in leg_chains])
-        holders, arms, shares = _holders(patches, legs)
-        holders = np.vectorize(number.__getitem__)(holders)
-        arrays = Body(parents, offsets, head_chain, head_columns, leg_chains, foot_columns, holders, arms, shares, patches.patch.numpy())
+        arrays = Body(parents, offsets, head_chain, leg_chains, *_held(patches, legs), patches.patch.numpy())
         return cls(joints, arrays)
+
+    @property
+    def unknowns(self) -> int:
+        """Of a frame."""
+        return LEGS + 3 * self.arrays.leg_chains.size
 
 
 def _chain(skeleton: Skeleton, joint: int) -> list[int]:
@@ -77,11 +96,13 @@ def _chain(skeleton: Skeleton, joint: int) -> list[int]:
     return chain[::-1]
 
 
-def _holders(patches: FootPatches, legs: list[list[int]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Joints that hold each patch vertex (vertex, 2), the vertex in their axes (m), and their shares."""
+def _held(patches: FootPatches, legs: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Patch vertices in the axes of their leg's last two joints (vertex, 2, 3; m), and these joints' shares."""
     body, rows = patches.body, patches.vertex
     if body.pose_blend is not None:
-        raise WearcapError("this body's feet change shape with the pose", fix="Take the solver adam_windows for it.")
+        raise WearcapError(
+            "this body's feet change shape with the pose", fix="Take the solver adam_windows for it."
+        )
     rest, joints = body.rest_vertices[rows].double(), body.skeleton.rest_joints.double()
     weights = torch.zeros(len(rows), len(body.skeleton), dtype=torch.float64)
     weights.scatter_add_(1, body.skin_joints[rows], body.skin_weights[rows].double())
@@ -91,67 +112,103 @@ def _holders(patches: FootPatches, legs: list[list[int]]) -> tuple[np.ndarray, n
         raise WearcapError("vertices of the feet's patches are held by joints other than ankle and toe",
                            expected="a body whose soles follow the feet")  # fmt: skip
     arms = rest[:, None] - joints[holders]
-    return holders.numpy(), arms.numpy(), (shares / shares.sum(1, keepdim=True)).numpy()
+    return arms.numpy(), (shares / shares.sum(1, keepdim=True)).numpy()
 
 
-def solve_banded(energy: HpsEnergy, data: HpsData, settings: BandedSettings = BandedSettings(), start: HpsState | None = None, fixed_start: bool = False) -> Solution:
+def solve_banded(
+    energy: HpsEnergy,
+    data: HpsData,
+    settings: BandedSettings = BandedSettings(),
+    start: HpsState | None = None,
+) -> Solution:
     """Minimise an energy over all frames of `data` at once.
 
-    `start` is where to begin (the initialisation when None); `fixed_start` holds its first frame. Returns the best
-    state met, and the energy by term of each.
+    `start` is where to begin (the initialisation when None). Returns the best state met, and the energy by term of
+    each. Raises WearcapError when the energy leaves something open (a weight of `pose` or `hold` that is zero).
     """
-    active = ActiveBody.of(data.patches)
-    state = data.start if start is None else start
-    frames = _frames(data, active)
-    theta = np.ascontiguousarray(state.theta[:, [joint - 1 for joint in active.joints]].numpy())
-    R_root, t = state.R_world_root.numpy().copy(), state.t_world_root.numpy().copy()
-    kin = _empty_kinematics(len(data), active.arrays)
-    size = 6 + 3 * len(active.joints)
-    diagonal, below = np.empty((len(data), size, size)), np.empty((max(len(data) - 1, 0), size, size))
-    gradient, by_term = np.empty((len(data), size)), np.empty(len(TERMS))
-    best, history, reason = None, [], "all iterations done"
+    problem = Stretch(energy, data, data.start if start is None else start)
+    best, history, reason = problem.state(), [], "all iterations done"
     for iteration in range(settings.iterations + 1):
-        share = min(1.0, iteration / max(settings.iterations - 2, 1))
+        share = min(1.0, iteration / max(settings.iterations - 3, 1))
         smooth = settings.smooth_start ** (1 - share) * settings.smooth_end**share
-        update_kinematics(theta, R_root, t, active.arrays, kin)
-        _look_up_ground(data, kin.points, frames)
-        assemble(theta, t, active.arrays, frames, _weights(energy, len(data), smooth), kin, diagonal, below, gradient, by_term)
-        total = float(by_term.sum())
-        history.append({name: float(value) for name, value in zip(TERMS, by_term) if name in energy.weights} | {"total": total})
-        if best is None or total < best[0]:
-            enough = best is not None and best[0] - total < settings.tolerance * best[0] and share == 1.0
-            best = total, theta.copy(), R_root.copy(), t.copy()
-            if enough:
+        history.append(problem.evaluate(smooth, look_up=iteration < 3 or iteration % 3 == 0))
+        totals = [entry["total"] for entry in history]
+        if totals[-1] <= min(totals):
+            best = problem.state()
+            if share == 1.0 and totals[-2] - totals[-1] < settings.tolerance * totals[-1]:
                 reason = "converged"
                 break
-        if iteration == settings.iterations:
-            break
-        if fixed_start:
-            diagonal[0] += np.eye(size) * 1e12
-        if not factor_and_solve(diagonal, below, gradient, settings.damping):
-            reason = "the normal equations are singular"
-            break
-        t -= gradient[:, :3]
-        R_root = R_root @ rotation.exp(torch.from_numpy(-gradient[:, 3:6])).numpy()
-        theta -= gradient[:, 6:].reshape(theta.shape)
-    return Solution(_state(state, active, *best[1:]), history, reason)
+        if iteration < settings.iterations:
+            problem.advance(settings.damping, settings.relaxation if iteration > 1 else 1.0)
+    return Solution(best, history, reason)
 
 
-def _look_up_ground(data: HpsData, points: np.ndarray, frames: Frames) -> None:
-    """Write the scene beneath the patches into `frames`."""
-    ground = find_ground(data, torch.from_numpy(points))
-    if ground is None:
-        frames.found[:] = 0.0
-        return
-    for name in ("origin", "normal", "found"):
-        getattr(frames, name)[:] = getattr(ground, name).numpy()
-    frames.ground[:] = ground.point.numpy()
+class Stretch:
+    """The arrays of one stretch: its data, the current state, and the system there."""
+
+    def __init__(self, energy: HpsEnergy, data: HpsData, start: HpsState):
+        self.energy, self.data, self.start = energy, data, start
+        self.active = ActiveBody.of(data.patches)
+        self.columns = [joint - 1 for joint in self.active.joints]
+        self.theta = np.ascontiguousarray(start.theta[:, self.columns].numpy())
+        self.R_root, self.t = start.R_world_root.numpy().copy(), start.t_world_root.numpy().copy()
+        body, length, n = self.active.arrays, len(data), self.active.unknowns
+        self.frames, pairs = _frames(data, self.columns), max(length - 1, 0)
+        joints, leg = len(body.parents) + 1, 6 + 3 * body.leg_chains.shape[1]
+        shapes = ((joints, 3, 3), (joints, 3), (joints, 3, 3), (len(body.patch), 3), (2, 12, leg))
+        self.kin = Kinematics(*(np.empty((length, *shape)) for shape in shapes))
+        self.forms = Forms(
+            np.empty((length, 3)), np.empty((pairs, 3, 3, 3)), np.empty((length, 3, 3)),
+            np.empty((length, 2, 12, 12)), np.empty((pairs, 2, 12, 12)), np.empty((length, 2, 12)), np.empty(length),
+        )  # fmt: skip
+        self.system = np.empty((length, n, n)), np.empty((pairs, n, n)), np.empty((length, n))
+
+    def evaluate(self, smooth: float, look_up: bool) -> dict[str, float]:
+        """Energy by term at the current state; with `look_up` the scene beneath the feet is sought anew."""
+        update_kinematics(self.theta, self.R_root, self.t, self.active.arrays, self.kin)
+        if look_up:
+            self._look_up_ground()
+        for form in self.forms:
+            form.fill(0.0)
+        by_term, weights = np.zeros(len(TERMS)), _weights(self.energy, len(self.data), smooth)
+        gather(self.theta, self.t, self.active.arrays, self.frames, weights, self.kin, self.forms, by_term)
+        named = {name: float(value) for name, value in zip(TERMS, by_term) if self.energy.weight(name) > 0}
+        return named | {"total": float(by_term.sum())}
+
+    def advance(self, damping: float, relaxation: float) -> None:
+        """One Gauss-Newton step."""
+        body = self.active.arrays
+        fill_system(self.theta, body, self.frames, self.kin, self.forms, *self.system)
+        if not (np.einsum("tii->ti", self.system[0]) > 0).all():
+            raise WearcapError(
+                "the energy does not determine the motion",
+                expected="weights of pose, hold and steps above zero",
+            )
+        factor_and_solve(*self.system, damping)
+        apply_step(self.system[2], relaxation, self.theta, self.R_root, self.t, body, self.frames, self.kin)
+
+    def state(self) -> HpsState:
+        whole = self.start.theta.clone()
+        whole[:, self.columns] = torch.from_numpy(self.theta)
+        return HpsState(whole, torch.from_numpy(self.R_root.copy()), torch.from_numpy(self.t.copy()))
+
+    def _look_up_ground(self) -> None:
+        ground = find_ground(self.data, torch.from_numpy(self.kin.points), self.energy)
+        if ground is None:
+            self.frames.found[:] = 0.0
+            return
+        for name, found in (
+            ("ground", ground.point),
+            ("origin", ground.origin),
+            ("normal", ground.normal),
+            ("found", ground.found),
+        ):
+            getattr(self.frames, name)[:] = found.numpy()
 
 
-def _frames(data: HpsData, active: ActiveBody) -> Frames:
+def _frames(data: HpsData, columns: list[int]) -> Frames:
     size = torch.bincount(data.patches.patch, minlength=data.contact.shape[1])
     vertices = (len(data), len(data.patches.vertex))
-    columns = [joint - 1 for joint in active.joints]
     arrays = (
         data.start.theta[:, columns], data.R_world_cam @ data.R_head_cam.T, data.cam_confidence, data.start.t_world_root,
         data.hold_confidence, data.contact / size / 4, data.contact[1:] * data.contact[:-1] / size / 4,
@@ -167,20 +224,5 @@ def _weights(energy: HpsEnergy, length: int, smooth: float) -> Weights:
     return Weights(
         np.array([energy.weight(name) for name in TERMS]) / counts,
         np.array([LOSSES.index(loss.kind) for loss in losses]), np.array([loss.delta for loss in losses]),
-        np.full(len(TERMS), smooth),
+        smooth,
     )  # fmt: skip
-
-
-def _empty_kinematics(length: int, body: Body) -> Kinematics:
-    joints = len(body.parents) + 1
-    return Kinematics(
-        np.empty((length, joints, 3, 3)), np.empty((length, joints, 3)), np.empty((length, joints, 3, 3)),
-        np.empty((length, len(body.patch), 3)), np.empty((length, 3, len(body.head_columns))),
-        np.empty((length, 2, 12, body.foot_columns.shape[1])),
-    )  # fmt: skip
-
-
-def _state(start: HpsState, active: ActiveBody, theta: np.ndarray, R_root: np.ndarray, t: np.ndarray) -> HpsState:
-    whole = start.theta.clone()
-    whole[:, [joint - 1 for joint in active.joints]] = torch.from_numpy(theta)
-    return HpsState(whole, torch.from_numpy(R_root), torch.from_numpy(t))

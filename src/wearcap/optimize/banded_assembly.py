@@ -1,4 +1,11 @@
-"""The normal equations of HPS over a stretch of frames: gradient, banded Hessian and energy in one compiled pass."""
+"""The normal equations of HPS over a stretch of frames, in two compiled passes.
+
+First each term adds its quadratic form where it acts: on the translation, the turns of root and head (world
+axes), the twists of each foot. These forms are small, and none mixes two of the five. Then they are mapped to
+the unknowns of a frame: translation (3), root rotation (3, right perturbation), turn of the head beyond the
+root's (3), axis-angles of the two legs. The spine's joints are eliminated: of all that turn the head alike, the
+one nearest to the suit's pose costs least.
+"""
 
 from typing import NamedTuple
 
@@ -6,14 +13,23 @@ import numpy as np
 
 from wearcap.geometry.compiled import compiled
 from wearcap.optimize.banded_kernels import (
-    add_block, foot_map, patch_points, pose_all, reweight, turn_between, vertex_twist,
-)  # fmt: skip
+    foot_map,
+    patch_points,
+    pose_all,
+    reweight,
+    turn_between,
+    vertex_twist,
+)
 
 (
     SELF, CONTACT, CONTACT_PLANE, SLIDE, TRANSLATION_SMOOTH, ROOT_SMOOTH, HEAD_SMOOTH, POSE, HOLD,
     TRANSLATION_STEP, ROOT_STEP, HEAD_STEP,
 ) = range(12)  # fmt: skip
 """Places of `hps.TERMS`."""
+
+HEAD = 6
+"""First of the head's unknowns in a frame; translation and root come before, the legs behind."""
+LEGS = 9
 
 
 class Body(NamedTuple):
@@ -23,16 +39,10 @@ class Body(NamedTuple):
     offsets: np.ndarray
     head_chain: np.ndarray
     """Active joints from the spine to the head."""
-    head_columns: np.ndarray
-    """Unknowns of a frame that turn the head: the root's rotation and the chain's."""
     leg_chains: np.ndarray
     """(2, joints) from hip to toe."""
-    foot_columns: np.ndarray
-    """(2, unknowns) of a frame that move each foot: translation, the root's rotation and the leg's."""
-    holders: np.ndarray
-    """(vertex, 2) active joints that hold each patch vertex."""
     arms: np.ndarray
-    """(vertex, 2, 3) the vertex in each holder's axes (m)."""
+    """(vertex, 2, 3) patch vertices in the axes of their leg's last two joints (m)."""
     shares: np.ndarray
     patch: np.ndarray
 
@@ -61,12 +71,12 @@ class Frames(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """By term: weight over count, kind of loss, its delta; how far the tips of norms are rounded."""
+    """By term: weight over count, kind of loss, its delta; and how far the tips of norms are rounded."""
 
     weight: np.ndarray
     kind: np.ndarray
     delta: np.ndarray
-    smooth: np.ndarray
+    smooth: float
 
 
 class Kinematics(NamedTuple):
@@ -76,203 +86,187 @@ class Kinematics(NamedTuple):
     c: np.ndarray
     axes: np.ndarray
     points: np.ndarray
-    head_map: np.ndarray
-    """(time, 3, unknown) turn of the head (world axes) by `head_columns`."""
     foot_maps: np.ndarray
-    """(time, 2, 12, unknown) twists of each foot's holders by `foot_columns`."""
+    """(time, 2, 12, 6 + leg) twists of each foot's holders."""
+
+
+class Forms(NamedTuple):
+    """Quadratic forms where the terms act; `small` is translation, root, head, whose diagonal forms are w I."""
+
+    small: np.ndarray
+    """(time, 3)."""
+    small_step: np.ndarray
+    """(pair, 3, 3, 3), rows of the next frame."""
+    small_gradient: np.ndarray
+    foot: np.ndarray
+    """(time, 2, 12, 12), lower triangles."""
+    foot_step: np.ndarray
+    foot_gradient: np.ndarray
+    pose: np.ndarray
+    """(time) weight of the pose prior."""
 
 
 @compiled
 def update_kinematics(theta, R_root, t, body, kin):
     """Poses, patch vertices and derivatives of a state."""
     pose_all(theta, R_root, t, body.parents, body.offsets, kin.R, kin.c, kin.axes)
-    patch_points(kin.R, kin.c, body.holders, body.arms, body.shares, kin.points)
+    patch_points(kin.R, kin.c, body.leg_chains, body.arms, body.shares, body.patch, kin.points)
     for j in range(len(t)):
-        for i in range(3):
-            for a in range(3):
-                kin.head_map[j, i, a] = kin.axes[j, 0, i, a]
-                for k in range(len(body.head_chain)):
-                    kin.head_map[j, i, 3 + 3 * k + a] = kin.axes[j, body.head_chain[k], i, a]
         for f in range(2):
-            chain = body.leg_chains[f]
-            foot_map(kin.c[j], kin.axes[j], chain, chain[-2:], kin.foot_maps[j, f])
+            foot_map(kin.c[j], kin.axes[j], body.leg_chains[f], kin.foot_maps[j, f])
 
 
 @compiled
-def assemble(theta, t, body, frames, weights, kin, diagonal, below, gradient, energy):
-    """Energy by term, its gradient, and the Hessian's blocks, all of the rounded, reweighted terms here."""
-    diagonal[:], below[:], gradient[:], energy[:] = 0.0, 0.0, 0.0, 0.0
+def gather(theta, t, body, frames, weights, kin, forms, energy):
+    """Add the forms of all terms at this state, reweighted, to `forms` and their energy to `energy`."""
     for j in range(len(t)):
-        _add_turn_to_camera(j, body, frames, weights, kin, diagonal, gradient, energy)
-        _add_contact(j, body, frames, weights, kin, diagonal, gradient, energy)
-        _add_priors(j, theta, t, frames, weights, diagonal, gradient, energy)
+        _gather_frame(j, theta, t, body, frames, weights, kin, forms, energy)
+        _gather_contact(j, body, frames, weights, kin, forms, energy)
         if j + 1 < len(t):
-            _add_steps(j, t, body, frames, weights, kin, diagonal, below, gradient, energy)
-            _add_slide(j, body, frames, weights, kin, diagonal, below, gradient, energy)
+            _gather_steps(j, t, body, frames, weights, kin, forms, energy)
+            _gather_slide(j, body, frames, weights, kin, forms, energy)
 
 
 @compiled
 def _rho(term, square, share, weights, energy):
     """Add an element's energy; returns its weight in the least squares."""
-    value, weight = reweight(square, weights.kind[term], weights.delta[term], weights.smooth[term])
+    value, weight = reweight(square, weights.kind[term], weights.delta[term], weights.smooth)
     energy[term] += weights.weight[term] * share * value
     return weights.weight[term] * share * weight
 
 
 @compiled
-def _add_map(diagonal, gradient, columns, J, weight, residual):
-    """The element ½ w |r + J d|² of one frame."""
-    for a in range(len(columns)):
-        for i in range(len(residual)):
-            gradient[columns[a]] += weight * J[i, a] * residual[i]
-    add_block(diagonal, columns, columns, weight * (J.T @ J))
-
-
-@compiled
-def _add_turn_to_camera(j, body, frames, weights, kin, diagonal, gradient, energy):
-    """Thesis eq. 4.2."""
-    if weights.weight[SELF] == 0 or frames.cam_confidence[j] == 0:
-        return
-    r = np.empty(3)
-    turn_between(frames.R_cam[j], kin.R[j, body.head_chain[-1]], r)
-    w = _rho(SELF, r @ r, frames.cam_confidence[j], weights, energy)
-    _add_map(diagonal[j], gradient[j], body.head_columns, kin.head_map[j], w, r)
-
-
-@compiled
-def _add_priors(j, theta, t, frames, weights, diagonal, gradient, energy):
-    """Thesis eq. 4.12, and the hold on the translation."""
+def _gather_frame(j, theta, t, body, frames, weights, kin, forms, energy):
+    """Thesis eq. 4.2 and 4.12, and the hold on the translation."""
+    if weights.weight[SELF] > 0 and frames.cam_confidence[j] > 0:
+        r = np.empty(3)
+        turn_between(frames.R_cam[j], kin.R[j, body.head_chain[-1]], r)
+        w = _rho(SELF, r @ r, frames.cam_confidence[j], weights, energy)
+        forms.small[j, 2] += w
+        forms.small_gradient[j, 2] += w * r
     if weights.weight[HOLD] > 0 and frames.hold_confidence[j] > 0:
         r = t[j] - frames.t_hold[j]
         w = _rho(HOLD, r @ r, frames.hold_confidence[j], weights, energy)
-        for i in range(3):
-            diagonal[j, i, i] += w
-            gradient[j, i] += w * r[i]
+        forms.small[j, 0] += w
+        forms.small_gradient[j, 0] += w * r
     if weights.weight[POSE] > 0:
-        d = (theta[j] - frames.theta_imu[j]).ravel()
-        w = _rho(POSE, d @ d, 1.0, weights, energy)
-        for i in range(len(d)):
-            diagonal[j, 6 + i, 6 + i] += w
-            gradient[j, 6 + i] += w * d[i]
+        square = 0.0
+        for a in range(theta.shape[1]):
+            for i in range(3):
+                square += (theta[j, a, i] - frames.theta_imu[j, a, i]) ** 2
+        forms.pose[j] = _rho(POSE, square, 1.0, weights, energy)
 
 
 @compiled
-def _add_contact(j, body, frames, weights, kin, diagonal, gradient, energy):
+def _gather_steps(j, t, body, frames, weights, kin, forms, energy):
+    """Thesis eq. 4.9–4.11, and the same against the suit's steps."""
+    for term in (TRANSLATION_SMOOTH, TRANSLATION_STEP):
+        if weights.weight[term] > 0:
+            r = t[j + 1] - t[j]
+            if term == TRANSLATION_STEP:
+                r = r - frames.t_step[j]
+            w = _rho(term, r @ r, 1.0, weights, energy)
+            _add_step(j, 0, w, np.eye(3), r, forms)
+    r = np.empty(3)
+    for term, group, joint in ((ROOT_SMOOTH, 1, 0), (ROOT_STEP, 1, 0), (HEAD_SMOOTH, 2, body.head_chain[-1]),
+                               (HEAD_STEP, 2, body.head_chain[-1])):  # fmt: skip
+        if weights.weight[term] > 0:
+            step = np.eye(3)
+            if term == ROOT_STEP:
+                step = frames.R_root_step[j]
+            elif term == HEAD_STEP:
+                step = frames.R_head_step[j]
+            turn_between(step @ kin.R[j, joint], kin.R[j + 1, joint], r)
+            w = _rho(term, r @ r, 1.0, weights, energy)
+            _add_step(j, group, w, step, r, forms)
+
+
+@compiled
+def _add_step(j, group, w, step, r, forms):
+    """The element ½ w |r + next - step here|²."""
+    forms.small[j, group] += w
+    forms.small[j + 1, group] += w
+    forms.small_step[j, group] -= w * step
+    forms.small_gradient[j, group] -= w * (step.T @ r)
+    forms.small_gradient[j + 1, group] += w * r
+
+
+@compiled
+def _gather_contact(j, body, frames, weights, kin, forms, energy):
     """Thesis eq. 4.6, to nearest points and to planes."""
     if weights.weight[CONTACT] == 0 and weights.weight[CONTACT_PLANE] == 0:
         return
-    A, Q, g = np.empty((3, 12)), np.empty((12, 12)), np.empty(12)
-    for f in range(2):
-        Q[:], g[:] = 0.0, 0.0
-        used = False
-        for n in range(len(body.patch)):
-            share = frames.contact[j, body.patch[n]] * frames.found[j, n]
-            if body.patch[n] // 2 != f or share == 0:
-                continue
-            used = True
-            vertex_twist(kin.R[j], body.holders, body.arms, body.shares, n, A)
-            if weights.weight[CONTACT] > 0:
-                r = kin.points[j, n] - frames.ground[j, n]
-                w = _rho(CONTACT, r @ r, share, weights, energy)
-                Q += w * (A.T @ A)
-                g += w * (A.T @ r)
-            if weights.weight[CONTACT_PLANE] > 0:
-                normal = frames.normal[j, n]
-                distance = (kin.points[j, n] - frames.origin[j, n]) @ normal
-                w = _rho(CONTACT_PLANE, distance * distance, share, weights, energy)
-                along = A.T @ normal
-                Q += w * np.outer(along, along)
-                g += w * distance * along
-        if used:
-            T, columns = kin.foot_maps[j, f], body.foot_columns[f]
-            along = T.T @ g
-            for a in range(len(columns)):
-                gradient[j, columns[a]] += along[a]
-            add_block(diagonal[j], columns, columns, T.T @ Q @ T)
+    A, along, r = np.empty((12, 3)), np.empty(12), np.empty(3)
+    for n in range(len(body.patch)):
+        f = body.patch[n] // 2
+        share = frames.contact[j, body.patch[n]] * frames.found[j, n]
+        if share == 0:
+            continue
+        width = vertex_twist(kin.R[j], body.leg_chains[f], body.arms[n], body.shares[n], A)
+        Q, g = forms.foot[j, f], forms.foot_gradient[j, f]
+        if weights.weight[CONTACT] > 0:
+            _difference(kin.points[j, n], frames.ground[j, n], r)
+            w = _rho(CONTACT, _square(r), share, weights, energy)
+            _add_square(Q, A, width, w)
+            _add_gradient(g, A, width, r, w)
+        if weights.weight[CONTACT_PLANE] > 0:
+            _difference(kin.points[j, n], frames.origin[j, n], r)
+            up = frames.normal[j, n]
+            distance = r[0] * up[0] + r[1] * up[1] + r[2] * up[2]
+            w = _rho(CONTACT_PLANE, distance * distance, share, weights, energy)
+            for i in range(width):
+                along[i] = A[i, 0] * up[0] + A[i, 1] * up[1] + A[i, 2] * up[2]
+                g[i] += w * distance * along[i]
+                for k in range(i + 1):
+                    Q[i, k] += w * along[i] * along[k]
 
 
 @compiled
-def _add_slide(j, body, frames, weights, kin, diagonal, below, gradient, energy):
+def _gather_slide(j, body, frames, weights, kin, forms, energy):
     """Thesis eq. 4.7."""
     if weights.weight[SLIDE] == 0:
         return
-    A, B = np.empty((3, 12)), np.empty((3, 12))
-    for f in range(2):
-        Q, g = np.zeros((24, 24)), np.zeros(24)
-        used = False
-        for n in range(len(body.patch)):
-            share = frames.stay[j, body.patch[n]]
-            if body.patch[n] // 2 != f or share == 0:
-                continue
-            used = True
-            vertex_twist(kin.R[j], body.holders, body.arms, body.shares, n, A)
-            vertex_twist(kin.R[j + 1], body.holders, body.arms, body.shares, n, B)
-            r = kin.points[j + 1, n] - kin.points[j, n]
-            w = _rho(SLIDE, r @ r, share, weights, energy)
-            Q[:12, :12] += w * (A.T @ A)
-            Q[12:, :12] -= w * (B.T @ A)
-            Q[12:, 12:] += w * (B.T @ B)
-            g[:12] -= w * (A.T @ r)
-            g[12:] += w * (B.T @ r)
-        if used:
-            _add_pair(j, body.foot_columns[f], kin.foot_maps[j, f], kin.foot_maps[j + 1, f], Q, g, diagonal, below,
-                      gradient)  # fmt: skip
-
-
-@compiled
-def _add_pair(j, columns, J, K, Q, g, diagonal, below, gradient):
-    """A form Q, g of motions mapped by J at frame j and K at frame j + 1."""
-    half = len(g) // 2
-    here, next_ = J.T @ g[:half], K.T @ g[half:]
-    for a in range(len(columns)):
-        gradient[j, columns[a]] += here[a]
-        gradient[j + 1, columns[a]] += next_[a]
-    first, last = np.ascontiguousarray(Q[:half, :half]), np.ascontiguousarray(Q[half:, half:])
-    add_block(diagonal[j], columns, columns, J.T @ first @ J)
-    add_block(below[j], columns, columns, K.T @ np.ascontiguousarray(Q[half:, :half]) @ J)
-    add_block(diagonal[j + 1], columns, columns, K.T @ last @ K)
-
-
-@compiled
-def _add_steps(j, t, body, frames, weights, kin, diagonal, below, gradient, energy):
-    """Thesis eq. 4.9–4.11, and the same against the suit's steps."""
-    for term in (TRANSLATION_SMOOTH, TRANSLATION_STEP):
-        if weights.weight[term] == 0:
+    A, B, r = np.empty((12, 3)), np.empty((12, 3)), np.empty(3)
+    for n in range(len(body.patch)):
+        f = body.patch[n] // 2
+        share = frames.stay[j, body.patch[n]]
+        if share == 0:
             continue
-        r = t[j + 1] - t[j]
-        if term == TRANSLATION_STEP:
-            r = r - frames.t_step[j]
-        w = _rho(term, r @ r, 1.0, weights, energy)
-        for i in range(3):
-            diagonal[j, i, i] += w
-            diagonal[j + 1, i, i] += w
-            below[j, i, i] -= w
-            gradient[j, i] -= w * r[i]
-            gradient[j + 1, i] += w * r[i]
-    head, still = body.head_chain[-1], np.eye(3)
-    columns, J, K = body.head_columns, kin.head_map[j], kin.head_map[j + 1]
-    root_J, root_K = np.ascontiguousarray(J[:, :3]), np.ascontiguousarray(K[:, :3])
-    for term in (ROOT_SMOOTH, ROOT_STEP):
-        if weights.weight[term] > 0:
-            step = frames.R_root_step[j] if term == ROOT_STEP else still
-            _add_turn(term, j, columns[:3], step @ root_J, root_K, step @ kin.R[j, 0], kin.R[j + 1, 0], weights,
-                      diagonal, below, gradient, energy)  # fmt: skip
-    for term in (HEAD_SMOOTH, HEAD_STEP):
-        if weights.weight[term] > 0:
-            step = frames.R_head_step[j] if term == HEAD_STEP else still
-            _add_turn(term, j, columns, step @ J, K, step @ kin.R[j, head], kin.R[j + 1, head], weights, diagonal,
-                      below, gradient, energy)  # fmt: skip
+        width = vertex_twist(kin.R[j], body.leg_chains[f], body.arms[n], body.shares[n], A)
+        vertex_twist(kin.R[j + 1], body.leg_chains[f], body.arms[n], body.shares[n], B)
+        _difference(kin.points[j + 1, n], kin.points[j, n], r)
+        w = _rho(SLIDE, _square(r), share, weights, energy)
+        _add_square(forms.foot[j, f], A, width, w)
+        _add_square(forms.foot[j + 1, f], B, width, w)
+        _add_gradient(forms.foot_gradient[j, f], A, width, r, -w)
+        _add_gradient(forms.foot_gradient[j + 1, f], B, width, r, w)
+        Q = forms.foot_step[j, f]
+        for i in range(width):
+            x, y, z = w * B[i, 0], w * B[i, 1], w * B[i, 2]
+            for k in range(width):
+                Q[i, k] -= x * A[k, 0] + y * A[k, 1] + z * A[k, 2]
 
 
 @compiled
-def _add_turn(term, j, columns, J, K, expected, R_next, weights, diagonal, below, gradient, energy):
-    """A turn from frame to frame against the expected one."""
-    r = np.empty(3)
-    turn_between(expected, R_next, r)
-    w = _rho(term, r @ r, 1.0, weights, energy)
-    Q, g = np.zeros((6, 6)), np.empty(6)
-    for i in range(3):
-        Q[i, i] = Q[3 + i, 3 + i] = w
-        Q[3 + i, i] = -w
-        g[i], g[3 + i] = -w * r[i], w * r[i]
-    _add_pair(j, columns, J, K, Q, g, diagonal, below, gradient)
+def _difference(a, b, r):
+    r[0], r[1], r[2] = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@compiled
+def _square(r):
+    return r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+
+
+@compiled
+def _add_square(Q, A, width, weight):
+    """Q += weight A Aᵀ, the lower triangle, over the first `width` rows."""
+    for i in range(width):
+        x, y, z = weight * A[i, 0], weight * A[i, 1], weight * A[i, 2]
+        for k in range(i + 1):
+            Q[i, k] += x * A[k, 0] + y * A[k, 1] + z * A[k, 2]
+
+
+@compiled
+def _add_gradient(g, A, width, r, weight):
+    for i in range(width):
+        g[i] += weight * (A[i, 0] * r[0] + A[i, 1] * r[1] + A[i, 2] * r[2])

@@ -1,11 +1,7 @@
-"""Compiled assembly of HPS' normal equations: time is banded, and only head, root and feet enter.
+"""Compiled pieces of the banded solver: rotations, forward kinematics of the active joints, block elimination.
 
-Unknowns of a frame, in this order: translation (3), root rotation (3, right perturbation), axis-angles of the
-active joints (3 each). Derivatives go through world axes: a perturbation of joint i turns all below it about the
-columns of `axes[i]`. The two joints that hold a foot's vertices move as twists, so that a foot's twenty vertices
-cost one 12 x 12 form.
-
-Weights are of iteratively reweighted least squares: an element's ρ(s) is met by ½ w s², w = ρ'(s) / s.
+Derivatives go through world axes: a perturbation of joint i turns all below it about the columns of `axes[i]`.
+The two joints that hold a foot's vertices move as twists (v, ω), so that its twenty vertices cost one 12 x 12 form.
 """
 
 import numpy as np
@@ -17,7 +13,7 @@ NORM, SQUARE, HUBER, CAUCHY = 0, 1, 2, 3
 
 @compiled
 def reweight(square, kind, delta, smooth):
-    """(ρ, ρ'(s) / s) of an element whose squared norm is given; the weight of a norm is that of its
+    """(ρ, w = ρ'(s) / s) of iteratively reweighted least squares, in which ½ w s² meets ρ, of an element whose squared norm is given; the weight of a norm is that of its
     tip rounded by `smooth`."""
     if kind == SQUARE:
         return square, 2.0
@@ -39,7 +35,11 @@ def exp_and_jacobian(v, R, J):
         a, b, c = 1.0 - square / 6, 0.5 - square / 24, 1.0 / 6 - square / 120
     else:
         angle = np.sqrt(square)
-        a, b, c = np.sin(angle) / angle, (1 - np.cos(angle)) / square, (angle - np.sin(angle)) / (square * angle)
+        a, b, c = (
+            np.sin(angle) / angle,
+            (1 - np.cos(angle)) / square,
+            (angle - np.sin(angle)) / (square * angle),
+        )
     for i in range(3):
         for k in range(3):
             outer = v[i] * v[k]
@@ -107,14 +107,15 @@ def pose_all(theta, R_root, t, parents, offsets, R, c, axes):
 
 
 @compiled
-def patch_points(R, c, holders, arms, weights, points):
-    """Positions of patch vertices held by two joints each."""
+def patch_points(R, c, leg_chains, arms, shares, patch, points):
+    """Positions of patch vertices, each held by the last two joints of its leg."""
     for j in range(len(R)):
-        for n in range(len(holders)):
+        for n in range(len(patch)):
+            chain = leg_chains[patch[n] // 2]
             for i in range(3):
                 points[j, n, i] = 0.0
                 for h in range(2):
-                    joint, share = holders[n, h], weights[n, h]
+                    joint, share = chain[len(chain) - 2 + h], shares[n, h]
                     if share > 0:
                         points[j, n, i] += share * c[j, joint, i]
                         for k in range(3):
@@ -122,34 +123,39 @@ def patch_points(R, c, holders, arms, weights, points):
 
 
 @compiled
-def vertex_twist(R, holders, arms, weights, n, A):
-    """Motion of vertex n (3) by the twists (v, ω) of its foot's two holders: a 3 x 12 matrix."""
+def vertex_twist(R, chain, arms, shares, A):
+    """Motion of a patch vertex by the twists (v, ω) of its leg's last two joints, transposed: (12, 3).
+
+    Returns how many rows count: six where the second joint has no share.
+    """
     for h in range(2):
-        share, joint = weights[n, h], holders[n, h]
-        arm = np.zeros(3)
-        for i in range(3):
-            for k in range(3):
-                arm[i] += R[joint, i, k] * arms[n, h, k]
-        for i in range(3):
-            for k in range(6):
-                A[i, 6 * h + k] = 0.0
-            A[i, 6 * h + i] = share
-        A[0, 6 * h + 4], A[0, 6 * h + 5] = share * arm[2], -share * arm[1]
-        A[1, 6 * h + 5], A[1, 6 * h + 3] = share * arm[0], -share * arm[2]
-        A[2, 6 * h + 3], A[2, 6 * h + 4] = share * arm[1], -share * arm[0]
+        share, joint = shares[h], chain[len(chain) - 2 + h]
+        if share == 0 and h == 1:
+            return 6
+        x = share * (R[joint, 0, 0] * arms[h, 0] + R[joint, 0, 1] * arms[h, 1] + R[joint, 0, 2] * arms[h, 2])
+        y = share * (R[joint, 1, 0] * arms[h, 0] + R[joint, 1, 1] * arms[h, 1] + R[joint, 1, 2] * arms[h, 2])
+        z = share * (R[joint, 2, 0] * arms[h, 0] + R[joint, 2, 1] * arms[h, 1] + R[joint, 2, 2] * arms[h, 2])
+        at = 6 * h
+        A[at : at + 6] = 0.0
+        A[at, 0] = A[at + 1, 1] = A[at + 2, 2] = share
+        A[at + 4, 0], A[at + 5, 0] = z, -y
+        A[at + 3, 1], A[at + 5, 1] = -z, x
+        A[at + 3, 2], A[at + 4, 2] = y, -x
+    return 12
 
 
 @compiled
-def foot_map(c, axes, chain, holders, T):
-    """Twists of a foot's two holders by the unknowns t, root and the joints of the leg: a 12 x (6 + 3 legs) matrix."""
+def foot_map(c, axes, chain, T):
+    """Twists of a leg's last two joints by translation, root and the leg's joints: a 12 x (6 + 3 joints) matrix."""
     T[:] = 0.0
     for h in range(2):
-        top = c[holders[h]]
+        holder = chain[len(chain) - 2 + h]
+        top = c[holder]
         for i in range(3):
             T[6 * h + i, i] = 1.0
         for column in range(len(chain) + 1):
             joint = 0 if column == 0 else chain[column - 1]
-            if joint > holders[h]:
+            if joint > holder:
                 continue
             x, y, z = top[0] - c[joint, 0], top[1] - c[joint, 1], top[2] - c[joint, 2]
             for a in range(3):
@@ -163,50 +169,36 @@ def foot_map(c, axes, chain, holders, T):
 
 
 @compiled
-def add_block(target, rows, columns, block):
-    """Add a block to rows and columns of a matrix."""
-    for a in range(len(rows)):
-        for b in range(len(columns)):
-            target[rows[a], columns[b]] += block[a, b]
-
-
-@compiled
 def factor_and_solve(diagonal, below, right, damping):
     """Solve the block tridiagonal system in place: Cholesky forwards, substitution forwards and backwards.
 
     diagonal (time, n, n) and below (time - 1, n, n; rows of the next frame) are overwritten by the factors, right
-    (time, n) by the solution. Diagonals are raised by their share `damping`. Returns False where the matrix is
-    not positive definite.
+    (time, n) by the solution. Diagonals are raised by their share `damping`. Raises LinAlgError where the matrix
+    is not positive definite.
     """
     count, n = right.shape
     for j in range(count):
-        D = diagonal[j]
         for i in range(n):
-            D[i, i] += damping * D[i, i] + 1e-12
-        for i in range(n):  # D = L Lᵀ, row by row
-            for k in range(i + 1):
-                total = D[i, k]
-                for m in range(k):
-                    total -= D[i, m] * D[k, m]
-                if k < i:
-                    D[i, k] = total / D[k, k]
-                elif total > 0:
-                    D[i, i] = np.sqrt(total)
-                else:
-                    return False
+            diagonal[j, i, i] *= 1.0 + damping
+        D = np.linalg.cholesky(diagonal[j])
+        diagonal[j] = D
         for i in range(n):
             for k in range(i):
                 right[j, i] -= D[i, k] * right[j, k]
             right[j, i] /= D[i, i]
         if j + 1 < count:
-            X = np.ascontiguousarray(below[j].T)  # Lᵀ-1 of the coupling, column of the next frame by column
+            X = np.ascontiguousarray(below[j].T)  # becomes L⁻¹ times the coupling, row by row
             for i in range(n):
                 for k in range(i):
-                    X[i] -= D[i, k] * X[k]
-                X[i] /= D[i, i]
+                    factor = D[i, k]
+                    for m in range(n):
+                        X[i, m] -= factor * X[k, m]
+                inverse = 1.0 / D[i, i]
+                for m in range(n):
+                    X[i, m] *= inverse
             below[j] = X.T
-            diagonal[j + 1] -= np.dot(below[j], X)
-            right[j + 1] -= np.dot(below[j], right[j])
+            diagonal[j + 1] -= np.dot(X.T, X)
+            right[j + 1] -= np.dot(X.T, right[j])
     for j in range(count - 1, -1, -1):
         if j + 1 < count:
             right[j] -= np.dot(below[j].T, right[j + 1])
@@ -214,4 +206,3 @@ def factor_and_solve(diagonal, below, right, damping):
             for k in range(i + 1, n):
                 right[j, i] -= diagonal[j, k, i] * right[j, k]
             right[j, i] /= diagonal[j, i, i]
-    return True

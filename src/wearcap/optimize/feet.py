@@ -56,7 +56,7 @@ class FootPatches:
         )  # fmt: skip
 
 
-def _spread(body: BodyModel, region: Int64[Tensor, "vertex"], count: int) -> Int64[Tensor, "vertex"]:
+def _spread(body: BodyModel, region: Int64[Tensor, "all"], count: int) -> Int64[Tensor, "chosen"]:
     """Vertices of a region chosen one by one, each the furthest from those before."""
     points = body.rest_vertices[region]
     chosen = [int((points - points.mean(0)).norm(dim=1).argmax())]

@@ -120,27 +120,30 @@ class Ground:
     found: Float[Tensor, "time vertex"]
 
 
-def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"]) -> Ground | None:
-    """Look up the scene beneath patch vertices (m, world) in contact; None without a scene.
+def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: HpsEnergy) -> Ground | None:
+    """Look up the scene beneath patch vertices (m, world) in contact, as far as the energy asks for it.
 
-    A patch has one plane: that beneath its middle.
+    A patch has one plane: that beneath its middle. None without a scene, or a term that needs it.
     """
-    if data.surface is None:
+    if data.surface is None or not (energy.weight("contact") or energy.weight("contact_plane")):
         return None
-    middles = data.patches.middles(points.detach().double())
-    stands = data.contact > 0
-    origin, normal = torch.zeros_like(middles), torch.zeros_like(middles)
-    queries = middles[stands].numpy()
-    found = torch.zeros_like(data.contact)
-    where, up = (torch.from_numpy(part) for part in data.surface.plane(queries, reach_m=SURFACE_REACH_M))
-    found[stands] = up.isfinite().all(-1).double()
-    origin[stands], normal[stands] = where.nan_to_num(), up.nan_to_num()
-    of_vertex, point = found[:, data.patches.patch], points.detach().double().clone()
-    seek = of_vertex > 0
-    nearest = data.surface.nearest_points(point[seek].numpy(), 2 * SURFACE_REACH_M)
-    point[seek] = torch.from_numpy(nearest)
-    by_vertex = data.patches.patch
-    return Ground(point, origin[:, by_vertex], normal[:, by_vertex], of_vertex)
+    points = points.detach().double()
+    stands, patch = data.contact > 0, data.patches.patch
+    point, origin, normal = points.clone(), torch.zeros_like(points), torch.zeros_like(points)
+    found = stands[:, patch].double()
+    if energy.weight("contact"):
+        seek = stands[:, patch]
+        point[seek] = torch.from_numpy(data.surface.nearest_points(points[seek].numpy(), SURFACE_REACH_M))
+        found *= point.isfinite().all(-1)
+    if energy.weight("contact_plane"):
+        where, up = (torch.zeros(*stands.shape, 3, dtype=torch.float64) for _ in range(2))
+        queries = data.patches.middles(points)[stands].numpy()
+        where[stands], up[stands] = map(
+            torch.from_numpy, data.surface.plane(queries, reach_m=SURFACE_REACH_M)
+        )
+        origin, normal = where[:, patch], up[:, patch]
+        found *= normal.isfinite().all(-1)
+    return Ground(point.nan_to_num(), origin.nan_to_num(), normal.nan_to_num(), found)
 
 
 def energy_terms(
@@ -155,7 +158,7 @@ def energy_terms(
     head = data.patches.body.skeleton.index("head")
     points = _patch_points(data, T_world_joint, full_mesh)
     if ground is None:
-        ground = find_ground(data, points)
+        ground = find_ground(data, points, energy)
     stands = data.patches.share(data.contact) / 4
     stays = data.patches.share(data.contact[1:] * data.contact[:-1]) / 4
     R_head, R_root, t = T_world_joint.R[:, head], state.R_world_root, state.t_world_root

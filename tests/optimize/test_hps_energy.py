@@ -1,0 +1,212 @@
+"""Every term of HPS: its derivative, its value by hand, and the compiled system against autograd (float64)."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+
+from wearcap.body.anny_body import anny_body
+from wearcap.body.skeleton import xsens23
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.surface import SurfaceIndex
+from wearcap.optimize import costs
+from wearcap.optimize.adam_windows import AdamSettings, solve_adam_windows
+from wearcap.optimize.banded import BandedSettings, Stretch, solve_banded
+from wearcap.optimize.banded_assembly import LEGS
+from wearcap.optimize.banded_mapping import fill_system
+from wearcap.optimize.costs import Loss
+from wearcap.optimize.feet import FootPatches
+from wearcap.optimize.hps import TERMS, HpsData, HpsEnergy, HpsState, energy_terms
+
+MIXED = {
+    "hold": Loss("cauchy", 0.05),
+    "root_step": Loss("huber", 0.01),
+    "head_step": Loss("square"),
+    "contact_plane": Loss("square"),
+}
+
+
+def randn(*shape: int, scale: float = 1.0) -> torch.Tensor:
+    return scale * torch.randn(*shape, dtype=torch.float64)
+
+
+@functools.cache
+def patches() -> FootPatches:
+    return FootPatches.of(anny_body(xsens23()))
+
+
+def still_data(length: int = 8, noise: float = 0.0, seed: int = 0) -> HpsData:
+    """A person who stands on the floor, every input disturbed by `noise` (rad, m)."""
+    torch.manual_seed(seed)
+    body = patches().body
+    joints = len(body.skeleton)
+    lowest = body.rest_vertices[patches().vertex, 2].min().double()
+    start = HpsState(
+        randn(length, joints - 1, 3, scale=noise), rotation.exp(randn(length, 3, scale=noise)),
+        torch.stack([torch.zeros(2, dtype=torch.float64).new_tensor([0.3, -0.2, -lowest])] * length) + randn(length, 3, scale=noise),
+    )  # fmt: skip
+    floor = np.random.default_rng(seed).uniform(-1, 1, (40_000, 3)) * [1, 1, 0.0005]
+    one, turns = torch.ones(length, dtype=torch.float64), rotation.exp(randn(length, 3, scale=noise))
+    return HpsData(
+        patches(), start, rotation.exp(randn(3, scale=0.3)), turns, one, one.clone(),
+        torch.ones(length, 4, dtype=torch.float64), randn(length - 1, 3, scale=noise),
+        rotation.exp(randn(length - 1, 3, scale=noise)), rotation.exp(randn(length - 1, 3, scale=noise)),
+        SurfaceIndex.build(floor.astype(np.float32)),
+    )  # fmt: skip
+
+
+def disturbed(data: HpsData, scale: float) -> HpsState:
+    """A state beside the initialisation; the arms stay."""
+    active = torch.zeros(data.start.theta.shape[1], 1, dtype=torch.float64)
+    active[Stretch(HpsEnergy({}), data, data.start).columns] = 1
+    theta, R, t = data.start.theta, data.start.R_world_root, data.start.t_world_root
+    return HpsState(
+        theta + active * randn(*theta.shape, scale=scale), R @ rotation.exp(randn(len(t), 3, scale=scale)),
+        t + randn(*t.shape, scale=scale),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", costs.LOSSES)
+def test_losses_have_true_derivatives_and_none_at_zero(kind):
+    loss = Loss(kind, 0.7)
+    residual = randn(6, 3).requires_grad_()
+    assert torch.autograd.gradcheck(loss, (residual,))
+    zero = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(loss(zero).sum(), zero)
+    assert (slope == 0).all()
+
+
+def rotations(count: int) -> torch.Tensor:
+    return randn(count, 3, scale=0.5)
+
+
+@pytest.mark.parametrize(
+    ("cost", "inputs"),
+    [
+        (lambda a, b, c: costs.head_orientation(rotation.exp(a), rotation.exp(b), rotation.exp(c)), lambda: (rotations(4), rotations(1)[0], rotations(4))),
+        (costs.foot_contact, lambda: (randn(3, 4, 3), randn(3, 4, 3))),
+        (costs.foot_plane, lambda: (randn(3, 4, 3), randn(3, 4, 3), randn(3, 4, 3))),
+        (costs.foot_slide, lambda: (randn(3, 4, 3),)),
+        (costs.translation_step, lambda: (randn(4, 3), randn(3, 3))),
+        (lambda a, b: costs.rotation_step(rotation.exp(a), rotation.exp(b)), lambda: (rotations(4), rotations(3))),
+        (costs.pose_prior, lambda: (randn(4, 5, 3), randn(4, 5, 3))),
+        (costs.translation_hold, lambda: (randn(4, 3), randn(4, 3))),
+    ],
+)  # fmt: skip
+def test_each_cost_has_the_derivative_that_autograd_says(cost, inputs):
+    torch.manual_seed(1)
+    assert torch.autograd.gradcheck(cost, tuple(value.requires_grad_() for value in inputs()))
+
+
+def test_terms_are_the_means_of_the_equations():
+    data = still_data(5)
+    away = HpsState(data.start.theta, data.start.R_world_root @ rotation.exp(torch.tensor([0.0, 0, 0.1]).double()),
+                    data.start.t_world_root + torch.tensor([0.0, 0, 0.02]).double())  # fmt: skip
+    data_half = still_data(5)
+    data_half.contact[:, 2:] = 0.0
+    terms = energy_terms(HpsEnergy(dict.fromkeys(TERMS, 2.0)), data, away)
+    assert terms["hold"] == pytest.approx(2 * 0.02)
+    assert terms["translation_smooth"] == pytest.approx(0.0)
+    whole, half = (
+        energy_terms(HpsEnergy({"contact_plane": 1.0}), d, away)["contact_plane"].item()
+        for d in (data, data_half)
+    )
+    assert 0.015 < whole < 0.035 and half == pytest.approx(
+        whole / 2, rel=0.2
+    )  # divided by frames times parts, not by contacts
+
+
+def test_the_whole_mesh_gives_the_patches_energy():
+    data = still_data(4, 0.1)
+    energy = HpsEnergy({"contact": 1.0, "slide": 1.0})
+    whole, alone = (energy_terms(energy, data, data.start, full_mesh=full) for full in (True, False))
+    assert all(whole[name] == pytest.approx(alone[name].item(), rel=1e-6) for name in whole)
+
+
+@pytest.mark.parametrize("name", [*TERMS, "all"])
+def test_compiled_energy_and_gradient_agree_with_autograd(name):
+    data = still_data(7, 0.05)
+    data.contact[2:4, 0] = data.contact[5, 3] = 0.0
+    data.cam_confidence[3], data.hold_confidence[5] = 0.0, 0.5
+    energy = HpsEnergy(
+        {term: 1.0 + place for place, term in enumerate(TERMS) if name in (term, "all")}, MIXED
+    )
+    state = disturbed(data, 0.05)
+    stretch = Stretch(energy, data, state)
+    compiled = stretch.evaluate(1e-9, look_up=True)
+    theta, t = state.theta.clone().requires_grad_(), state.t_world_root.clone().requires_grad_()
+    turn = torch.zeros_like(t).requires_grad_()
+    terms = energy_terms(energy, data, HpsState(theta, state.R_world_root @ rotation.exp(turn), t))
+    assert terms.keys() == compiled.keys() - {"total"}
+    assert all(compiled[term] == pytest.approx(terms[term].item(), rel=1e-5) for term in terms)
+    by_t, by_turn, by_theta = torch.autograd.grad(sum(terms.values()), [t, turn, theta], allow_unused=True, materialize_grads=True)  # fmt: skip
+    fill_system(
+        stretch.theta, stretch.active.arrays, stretch.frames, stretch.kin, stretch.forms, *stretch.system
+    )
+    blocks, _, gradient = stretch.system
+    by_theta = by_theta[:, stretch.columns].numpy()
+    legs = stretch.active.arrays.leg_chains.ravel() - 1
+    assert np.abs(gradient[:, :3] - by_t.numpy()).max() < 1e-5
+    assert np.abs(gradient[:, 3:6] - by_turn.numpy()).max() < 1e-5
+    assert np.abs(gradient[:, LEGS:] - by_theta[:, legs].reshape(len(t), -1)).max() < 1e-5
+    spine = stretch.active.arrays.head_chain
+    J = stretch.kin.axes[:, spine].transpose(0, 2, 1, 3).reshape(len(t), 3, -1)
+    by_head = np.linalg.inv(J @ J.mT) @ J @ by_theta[:, spine - 1].reshape(len(t), -1, 1)
+    assert np.abs(gradient[:, 6:9] - by_head[..., 0]).max() < 1e-5
+    assert np.abs(blocks - blocks.mT).max() < 1e-9
+
+
+def planted() -> tuple[HpsData, HpsState]:
+    """A standing person who knows the steps and turns exactly, and whose localised positions are 10 % far off."""
+    data = still_data(40)
+    truth = data.start
+    torch.manual_seed(3)
+    far = torch.where(torch.rand(40, 1) < 0.1, 1.0, 0.02).double() * randn(40, 3)
+    held = HpsState(truth.theta, truth.R_world_root, truth.t_world_root + far)
+    exact = HpsData(
+        data.patches, held, torch.eye(3, dtype=torch.float64), truth.R_world_root, data.cam_confidence, data.hold_confidence,
+        data.contact, torch.zeros(39, 3, dtype=torch.float64), torch.eye(3, dtype=torch.float64).expand(39, 3, 3).clone(),
+        torch.eye(3, dtype=torch.float64).expand(39, 3, 3).clone(), data.surface,
+    )  # fmt: skip
+    return exact, truth
+
+
+DOCUMENT = {"self": 10.0, "contact": 300.0, "slide": 500.0, "head_smooth": 4.0, "root_smooth": 4.0, "pose": 20.0,
+            "hold": 30.0, "translation_step": 800.0}  # fmt: skip
+
+
+def test_the_banded_solver_finds_a_planted_motion():
+    data, truth = planted()
+    solution = solve_banded(HpsEnergy(DOCUMENT), data, BandedSettings(iterations=30))
+    assert (solution.state.t_world_root - truth.t_world_root).norm(
+        dim=1
+    ).max() < 0.025  # of 2 cm and, each tenth, 1 m
+    assert rotation.geodesic(solution.state.R_world_root, truth.R_world_root).max() < 0.005
+    assert solution.history[-1]["total"] < 0.2 * solution.history[0]["total"]
+
+
+def test_the_banded_solver_goes_no_less_low_than_adam():
+    data, _ = planted()
+    energy = HpsEnergy(DOCUMENT)
+    ours = solve_banded(energy, data)
+    adam = solve_adam_windows(energy, data, AdamSettings(steps=100, full_mesh=False))
+    true = [sum(energy_terms(energy, data, s.state).values()).item() for s in (ours, adam)]
+    assert true[0] <= true[1]
+
+
+def test_adam_keeps_the_frame_that_windows_share():
+    data, _ = planted()
+    told = []
+    settings = AdamSettings(window=15, advance=14, steps=5, full_mesh=False)
+    solution = solve_adam_windows(HpsEnergy(DOCUMENT), data, settings, told.append)
+    assert told == [15, 29, 40] and len(solution.state) == 40 and len(solution.history) == 5
+
+
+def test_an_energy_that_leaves_something_open_says_so():
+    data = still_data(4)
+    with pytest.raises(WearcapError, match="does not determine"):
+        solve_banded(HpsEnergy({"slide": 1.0}), data)
+    with pytest.raises(WearcapError, match="no term 'slid'"):
+        HpsEnergy({"slid": 1.0})
