@@ -113,9 +113,8 @@ def test_terms_are_the_means_of_the_equations():
         energy_terms(HpsEnergy({"contact_plane": 1.0}), d, away)["contact_plane"].item()
         for d in (data, data_half)
     )
-    assert 0.015 < whole < 0.035 and half == pytest.approx(
-        whole / 2, rel=0.2
-    )  # divided by frames times parts, not by contacts
+    assert 0.015 < whole < 0.035
+    assert half == pytest.approx(whole / 2, rel=0.2)  # divided by frames times parts, not by contacts
 
 
 def test_the_whole_mesh_gives_the_patches_energy():
@@ -179,12 +178,21 @@ DOCUMENT = {"self": 10.0, "contact": 300.0, "slide": 500.0, "head_smooth": 4.0, 
 
 def test_the_banded_solver_finds_a_planted_motion():
     data, truth = planted()
-    solution = solve_banded(HpsEnergy(DOCUMENT), data, BandedSettings(iterations=30))
-    assert (solution.state.t_world_root - truth.t_world_root).norm(
-        dim=1
-    ).max() < 0.025  # of 2 cm and, each tenth, 1 m
-    assert rotation.geodesic(solution.state.R_world_root, truth.R_world_root).max() < 0.005
-    assert solution.history[-1]["total"] < 0.2 * solution.history[0]["total"]
+    weights = {
+        "self": 10.0,
+        "slide": 500.0,
+        "pose": 20.0,
+        "hold": 30.0,
+        "translation_step": 800.0,
+        "root_step": 400.0,
+    }
+    torch.manual_seed(4)
+    begin = disturbed(data, 0.05)
+    solution = solve_banded(HpsEnergy(weights), data, BandedSettings(iterations=30), begin)
+    away = (solution.state.t_world_root - truth.t_world_root).norm(dim=1)
+    assert away.max() < 0.012  # the median of positions that are 2 cm off, and each tenth 1 m
+    assert rotation.geodesic(solution.state.R_world_root, truth.R_world_root).max() < 0.003
+    assert (solution.state.theta - truth.theta).abs().max() < 0.003
 
 
 def test_the_banded_solver_goes_no_less_low_than_adam():
@@ -201,7 +209,8 @@ def test_adam_keeps_the_frame_that_windows_share():
     told = []
     settings = AdamSettings(window=15, advance=14, steps=5, full_mesh=False)
     solution = solve_adam_windows(HpsEnergy(DOCUMENT), data, settings, told.append)
-    assert told == [15, 29, 40] and len(solution.state) == 40 and len(solution.history) == 5
+    assert told == [15, 29, 40]
+    assert (len(solution.state), len(solution.history)) == (40, 5)
 
 
 def test_an_energy_that_leaves_something_open_says_so():

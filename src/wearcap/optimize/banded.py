@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
