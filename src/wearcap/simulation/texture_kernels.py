@@ -178,8 +178,7 @@ def poster(a, b, extent, red, green, blue, seed, footprint):
     own_wide, own_tall = wide / columns, tall / rows
     x, y, own = x - i * own_wide, y - j * own_tall, seed + 17 * i + 131 * j
     if columns * rows > 1:
-        red, green = 0.3 + 0.65 * chance(i, j, seed + 1), 0.3 + 0.65 * chance(i, j, seed + 2)
-        blue = 0.3 + 0.65 * chance(i, j, seed + 3)
+        red, green, blue = 0.9 - 0.6 * chance(i, j, seed + 1), 0.9 - 0.6 * chance(i, j, seed + 2), 0.8
     red, green, blue = _sheet(x, y, own_wide, own_tall, red, green, blue, own, footprint)
     rim = inside(0.018 - min(min(x, own_wide - x), min(y, own_tall - y)), footprint)
     tone = 0.95 if chance(0, 7, own) < 0.5 else 0.15

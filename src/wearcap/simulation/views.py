@@ -112,7 +112,7 @@ def view_depth(scenery: Scenery, camera: Camera, T_world_cam: Rigid) -> Float32[
 def _exposed(scenery: Scenery, camera: Camera, T_world_cam: Rigid) -> tuple[np.ndarray, np.ndarray]:
     lens = _lens(camera)
     R, t = (part.detach().double().cpu().numpy() for part in (T_world_cam.R, T_world_cam.t))
-    buffers = [_visible(scenery, R @ view.R_cam_view, t, view) for view in lens.views]
+    buffers = [visible(scenery, R @ view.R_cam_view, t, view) for view in lens.views]
     nearness = np.concatenate([near.ravel() for near, _ in buffers])
     index = np.concatenate([face.ravel() for _, face in buffers])
     count = camera.height * camera.width
@@ -150,7 +150,7 @@ class _Lens:
     views: tuple[View, ...]
 
 
-def _visible(scenery: Scenery, R: np.ndarray, t: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
+def visible(scenery: Scenery, R: np.ndarray, t: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
     """Nearness (1/m) and face of every sample of a view."""
     nearness = np.full((view.height, view.width), -np.inf, np.float32)
     index = np.full((view.height, view.width), -1, np.int32)
@@ -161,7 +161,7 @@ def _visible(scenery: Scenery, R: np.ndarray, t: np.ndarray, view: View) -> tupl
     return nearness, index
 
 
-_CUBE = (
+CUBE = (
     np.eye(3),
     np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]),  # to the right
     np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),  # to the left
@@ -181,7 +181,7 @@ def _lens(camera: Camera) -> _Lens:
     rays = np.nan_to_num(rays)
     if camera.is_fisheye:
         size = int(np.ceil(camera.fx + camera.fy))
-        views = [View(R, size / 2, (size - 1) / 2, (size - 1) / 2, size, size) for R in _CUBE]
+        views = [View(R, size / 2, (size - 1) / 2, (size - 1) / 2, size, size) for R in CUBE]
         side = np.stack([rays @ view.R_cam_view[:, 2] for view in views]).argmax(0)
     else:
         views, side = [_single_view(camera, rays[seen])], np.zeros(seen.shape, int)
