@@ -59,3 +59,11 @@ def test_refusals(points, name, options, message, tmp_path):
 def test_millimetres_are_read_where_the_unit_is_given(tmp_path):
     write_ply(Ply((room() * 1000).astype(np.float32)), tmp_path / "a.ply")
     np.testing.assert_allclose(read_scan(tmp_path / "a.ply", metres_per_unit=0.001).points, room(), atol=1e-4)
+
+
+def test_a_sparse_scan_is_read_where_its_unit_is_given(tmp_path):
+    sparse = np.random.default_rng(0).uniform(0, [300, 300, 20], (2000, 3)).astype(np.float32)
+    write_ply(Ply(sparse), tmp_path / "a.ply")
+    with pytest.raises(WearcapError, match="1 for one that is sparse"):
+        read_scan(tmp_path / "a.ply")
+    assert len(read_scan(tmp_path / "a.ply", metres_per_unit=1).points) == 2000

@@ -20,22 +20,23 @@ _MIN_PER_CELL = 1.5
 """Points per occupied half-metre cell below which a cloud is no dense scan (at 5 mm spacing a wall puts 10 000 there)."""
 
 
-def read_scan(path: str | Path, *, needs_colors: bool = False, metres_per_unit: float = 1.0) -> Scan:
-    """Read a scene's cloud (world axes, z up) from a .ply or .pcd file; its unit times `metres_per_unit` is m.
+def read_scan(path: str | Path, *, needs_colors: bool = False, metres_per_unit: float | None = None) -> Scan:
+    """Read a scene's cloud (world axes, z up) from a .ply or .pcd file.
 
-    Raises WearcapError for another kind of file, what `read_ply` and `read_pcd` refuse, no points, extent or density
-    of a cloud that is not in metres, and, with `needs_colors`, a cloud without colour.
+    Its unit times `metres_per_unit` is m; None: it should be m, and is refused where it does not look so. Raises
+    WearcapError for another kind of file, what `read_ply` and `read_pcd` refuse, no points, extent or density of a
+    cloud that is not in metres, and, with `needs_colors`, a cloud without colour.
     """
     path = Path(path)
     reader = {".ply": read_ply, ".pcd": read_pcd}.get(path.suffix.lower())
     if reader is None:
         raise WearcapError("no scan of a kind that can be read", where=path, expected="a .ply or .pcd file")
     content = reader(path)
-    points = content.points if metres_per_unit == 1.0 else content.points * np.float32(metres_per_unit)
+    points = content.points if metres_per_unit is None else content.points * np.float32(metres_per_unit)
     if not len(points):
         raise WearcapError("the scan has no points", where=path, expected="a cloud of the scene's surfaces")
-    if fault := unit_fault(points):
-        raise WearcapError(fault, where=path, expected="metres", fix="Give metres_per_unit=0.001 for a scan in millimetres.")  # fmt: skip
+    if metres_per_unit is None and (fault := unit_fault(points)):
+        raise WearcapError(fault, where=path, expected="metres", fix="Give metres_per_unit=0.001 for a scan in millimetres, 1 for one that is sparse.")  # fmt: skip
     if needs_colors and content.colors is None:
         raise WearcapError("the scan has no colour", where=path, expected="red, green and blue of every point",
                            fix="Export it with colours: pictures of the scene are drawn from them.")  # fmt: skip

@@ -5,8 +5,9 @@ tensor is a reference. Only the classes in `KNOWN` can come back; nothing in a f
 """
 
 import dataclasses
+import functools
 import json
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from torch import Tensor
 
@@ -62,7 +63,30 @@ def unflatten(tree: Any, fetch) -> Any:
         return items
     if tree["$type"] not in KNOWN:
         raise WearcapError(f"unknown part {tree['$type']!r}", expected=f"one of {', '.join(sorted(KNOWN))}")
+    _require_one_length(KNOWN[tree["$type"]], items)
     return KNOWN[tree["$type"]](**items)
+
+
+def _require_one_length(kind: type, items: dict[str, Any]) -> None:
+    """Raise WearcapError unless all tensors over time (by their annotations) are as long as the timestamps."""
+    times = items.get("timestamps")
+    for name in _over_time(kind) if isinstance(times, Tensor) else ():
+        if isinstance(items.get(name), Tensor) and len(items[name]) != len(times):
+            raise WearcapError(f"{kind.__name__}.{name} has {len(items[name])} rows for {len(times)} timestamps",
+                               expected="a row for each timestamp")  # fmt: skip
+
+
+@functools.cache
+def _over_time(kind: type) -> tuple[str, ...]:
+    """Fields annotated with the axis "time" first."""
+    hints = get_type_hints(kind)
+    shapes = {
+        name: [getattr(part, "dim_str", "") for part in (get_args(hint) or (hint,))]
+        for name, hint in hints.items()
+    }
+    return tuple(
+        name for name, found in shapes.items() if any(dims.split()[:1] == ["time"] for dims in found)
+    )
 
 
 def dumps(tree: Any) -> str:

@@ -17,8 +17,9 @@ from wearcap.pipelines.doctor.agreement import (
 from wearcap.pipelines.doctor.body import check_motion
 from wearcap.pipelines.doctor.inertial import check_imu
 from wearcap.pipelines.doctor.load import Patient, patients
+from wearcap.pipelines.doctor.localized import check_claps, check_contact_prob, check_localization
 from wearcap.pipelines.doctor.poses import check_facing, check_rotations, check_speed, check_upright
-from wearcap.pipelines.doctor.report import Finding, Report
+from wearcap.pipelines.doctor.report import Finding, Report, refusal
 from wearcap.pipelines.doctor.timing import check_clock, check_spans
 from wearcap.recording import Recording
 
@@ -44,15 +45,9 @@ def _examine_file(patient: Patient) -> list[Finding]:
     try:
         recording, findings = patient.load()
     except WearcapError as error:
-        return [
-            Finding(
-                "error",
-                "reading",
-                error.what,
-                str(error.where or ""),
-                " ".join(filter(None, [error.expected and f"Expected {error.expected}.", error.fix])),
-            )
-        ]
+        return [refusal(error)]
+    if findings and recording.points is None and not _clocks(recording):
+        return findings  # what kept the reader from giving more has been said
     return [*findings, *examine_recording(recording)]
 
 
@@ -98,7 +93,7 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
     bodies = {}
     for name, motion in (("motion", recording.motion), ("suit", recording.suit)):
         if motion is not None and name in usable:
-            found = check_motion(name, motion, floor)
+            found = [*check_motion(name, motion, floor), *check_contact_prob(name, motion)]
             findings += found
             if _sound(found):
                 bodies[name] = motion
@@ -112,7 +107,9 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
         findings += check_points(recording.points, head)
     if recording.camera is not None:
         findings += check_camera(recording.camera)
-    return findings
+    if recording.localization is not None and "localization" in usable:
+        findings += check_localization(recording.localization, bodies.get("suit", body))
+    return [*findings, *check_claps(recording)]
 
 
 def _track(name: str, track: Trajectory) -> list[Finding]:

@@ -1,4 +1,4 @@
-"""What can be examined in a path: data sets, recording files, MPS folders, motion capture files."""
+"""What can be examined in a path: data sets, recording files, MPS folders, scenes, motion capture files."""
 
 import json
 from collections.abc import Callable
@@ -16,6 +16,7 @@ from wearcap.io.aria_mps import find_mps_file, head_stream, is_mps_folder, read_
 from wearcap.io.asf_amc import read_amc, read_asf
 from wearcap.io.bvh import read_bvh
 from wearcap.io.euroc import read_euroc
+from wearcap.io.hps_sequence import hps_names, is_hps, read_hps_sequence
 from wearcap.io.motion_npz import read_motion
 from wearcap.io.mvnx import read_mvnx
 from wearcap.io.npz import read_npz
@@ -23,7 +24,9 @@ from wearcap.io.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.pcd import read_pcd
 from wearcap.io.ply import read_ply
 from wearcap.io.tum import read_tum
+from wearcap.pipelines.doctor.localized import check_files
 from wearcap.pipelines.doctor.report import Finding
+from wearcap.pipelines.doctor.scene import is_scene, read_scene
 from wearcap.pipelines.doctor.timing import check_clock
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
@@ -59,10 +62,12 @@ def patients(path: Path) -> list[Patient]:
     for is_kind, read in _FOLDERS:
         if is_kind(path):
             return [Patient(path.resolve().name, partial(read, path))]
+    if is_hps(path):
+        return [Patient(name, partial(_read_hps, path, name)) for name in hps_names(path)]
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) in _MOTIONS]
     if not files:
         raise WearcapError("nothing to examine here", where=path,
-                           expected=f"a data set (manifest.json), an MPS, Nymeria or ADT folder, or files like {', '.join(_MOTIONS)}")  # fmt: skip
+                           expected=f"a data set (manifest.json), an MPS, Nymeria, ADT or HPS folder, a scene (pointcloud.ply, photos.json), or files like {', '.join(_MOTIONS)}")  # fmt: skip
     return [Patient(file.relative_to(path).as_posix(), partial(_read_file, file)) for file in files]
 
 
@@ -91,7 +96,13 @@ def _as_head(track: Trajectory) -> HeadStream:
 
 
 def _read_stored(store: RecordingStore, name: str) -> Loaded:
-    return store.load(name), []
+    recording = store.load(name)
+    return recording, check_files(recording, store.root)
+
+
+def _read_hps(root: Path, name: str) -> Loaded:
+    recording = read_hps_sequence(root, name)
+    return recording, check_files(recording, root)
 
 
 def _read_mps(folder: Path) -> Loaded:
@@ -166,6 +177,7 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Loaded]], ...] = 
     (is_nymeria, lambda folder: (read_nymeria(folder), [])),
     (is_mps_folder, _read_mps),
     (is_adt, lambda folder: (read_adt(folder), [])),
+    (is_scene, read_scene),
 )
 _MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _read_npz}
 _READERS: dict[str, Callable] = {

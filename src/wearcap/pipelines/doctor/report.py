@@ -2,6 +2,8 @@
 
 from dataclasses import asdict, dataclass
 
+from wearcap.errors import WearcapError
+
 SEVERITIES = ("ok", "note", "warning", "error")
 
 
@@ -21,6 +23,12 @@ class Finding:
     def __post_init__(self):
         if self.severity not in SEVERITIES:
             raise ValueError(f"severity {self.severity!r} is none of {SEVERITIES}")
+
+
+def refusal(error: WearcapError, check: str = "reading") -> Finding:
+    """What a reader refused, as a finding."""
+    mend = " ".join(filter(None, [error.expected and f"Expected {error.expected}.", error.fix]))
+    return Finding("error", check, error.what, str(error.where or ""), mend)
 
 
 @dataclass(frozen=True)

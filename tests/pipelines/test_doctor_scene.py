@@ -1,0 +1,249 @@
+"""The doctor on scenes and on camera-localised recordings: the sound ones pass, each planted defect is named."""
+
+import json
+from dataclasses import replace
+
+import av
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from small_scene import LEVEL, inverted, room_cloud, write_room
+from walking_person import sound_recording
+
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rotation import about_axis
+from wearcap.io.photos import write_photos
+from wearcap.io.ply import Ply, write_ply
+from wearcap.pipelines.doctor import Finding, examine
+from wearcap.pipelines.doctor.localized import check_contact_prob
+from wearcap.recording import CameraStream, Localization, Recording, RecordingStore
+
+CAMERA = Camera("opencv", 64, 48, 40.0, 40.0, 31.5, 23.5, (0.0, 0.0, 0.0, 0.0))
+
+
+def found(report, severity: str) -> list[Finding]:
+    return [finding for _, finding in report.of_severity(severity)]
+
+
+# Scenes ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_sound_scene(tmp_path):
+    write_room(tmp_path)
+    report = examine(tmp_path)
+    assert not found(report, "error")
+    assert not found(report, "warning")
+    assert {"scan", "scan: density", "photos", "photos: size", "photos: poses"} <= {
+        f.check for f in found(report, "ok")
+    }
+
+
+def rewritten(path, change) -> None:
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+
+
+def without_intrinsics(content):
+    del content["photos"][1]["camera"]["fx"]
+    return content
+
+
+def smaller(folder):
+    Image.new("RGB", (40, 30)).save(folder / "photos/00002-cam0.jpg")
+
+
+def sparse(folder):
+    points = room_cloud(0.12)
+    write_ply(
+        Ply(points, np.random.default_rng(0).integers(0, 255, points.shape, dtype=np.uint8)),
+        folder / "pointcloud.ply",
+    )
+
+
+def grey(folder):
+    points = room_cloud()
+    write_ply(Ply(points, np.full(points.shape, 128, np.uint8)), folder / "pointcloud.ply")
+
+
+def y_up(folder):
+    points = room_cloud()[:, [1, 2, 0]] * np.array([1, 1, 3], np.float32)
+    write_ply(
+        Ply(points, np.random.default_rng(0).integers(0, 255, points.shape, dtype=np.uint8)),
+        folder / "pointcloud.ply",
+    )
+
+
+SCENE_DEFECTS = {
+    "millimetres": (lambda folder: write_room(folder, unit=1000), "error", "millimetres"),
+    "no colour": (lambda folder: write_room(folder, colors=False), "error", "no colour"),
+    "one colour": (grey, "error", "one colour"),
+    "no points": (lambda folder: write_ply(Ply(np.zeros((0, 3), np.float32)), folder / "pointcloud.ply"), "error", "no points"),
+    "no scan": (lambda folder: (folder / "pointcloud.ply").unlink(), "error", "the scan is missing"),
+    "sparse": (sparse, "warning", "sparse"),
+    "y up": (y_up, "warning", "taller than wide"),
+    "no photos": (lambda folder: write_room(folder, photos=0), "error", "no photos"),
+    "no list": (lambda folder: (folder / "photos.json").unlink(), "error", "no photos"),
+    "no intrinsics": (lambda folder: rewritten(folder / "photos.json", without_intrinsics), "error", "lacks 'fx'"),
+    "a photo is missing": (lambda folder: (folder / "photos/00001-cam0.jpg").unlink(), "error", "files are missing"),
+    "a photo is damaged": (lambda folder: (folder / "photos/00001-cam0.jpg").write_bytes(b"\xff\xd8 cut"), "error", "cannot be read"),
+    "a photo is smaller": (smaller, "error", "image size and calibration differ"),
+    "poses inverted": (lambda folder: write_photos(inverted(write_room(folder)), folder), "error", "do not see the scan"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("defect", SCENE_DEFECTS)
+def test_a_defect_of_a_scene_is_named_once(defect, tmp_path):
+    plant, severity, message = SCENE_DEFECTS[defect]
+    write_room(tmp_path)
+    plant(tmp_path)
+    findings = [f for f in found(examine(tmp_path), severity) if message in f.what]
+    assert len(findings) == 1
+    assert findings[0].fix
+    assert len(found(examine(tmp_path), "error")) == (severity == "error")
+
+
+def test_a_scan_of_the_hps_data_set(tmp_path, monkeypatch):
+    from pathlib import Path
+
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "io")
+    import hps_files
+
+    hps_files.write_scan(tmp_path)
+    for path in (tmp_path / "cam").glob("*.jpg"):
+        Image.new("RGB", (918, 690)).save(path)
+    report = examine(tmp_path)
+    assert any("1 calibrations" in f.evidence for f in found(report, "ok"))
+    assert {f.what for f in found(report, "error")} == {
+        "all points have one colour",
+        "photos do not see the scan",
+    }
+
+
+def test_sequences_of_the_hps_data_set(tmp_path, monkeypatch):
+    from pathlib import Path
+
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "io")
+    import hps_files
+
+    hps_files.write_hps(tmp_path, scan=False)
+    report = examine(tmp_path)
+    assert list(report.findings) == [hps_files.NAME]
+    (tmp_path / "head_camera_videos/cameras.json").write_text("{}")
+    assert [f.what for f in found(examine(tmp_path), "error")] == [
+        f"no intrinsics for the video of {hps_files.NAME!r}"
+    ]
+
+
+# Recordings --------------------------------------------------------------------------------------------------------
+
+
+def localized(shift_s: float = 0.0) -> Recording:
+    """A walk with its suit, and a camera on the head that was found in 9 frames of 10, with noise of 1 cm and 0.2°."""
+    base = sound_recording()
+    head, frames = base.motion.joint("head"), len(base.motion)
+    random = torch.Generator().manual_seed(0)
+    confidence = (torch.rand(frames, generator=random) > 0.1).float()
+    R = head.R @ LEVEL @ about_axis("x", 0.003 * torch.randn(frames, generator=random))
+    t = head.t + 0.01 * torch.randn(frames, 3, generator=random)
+    return replace(
+        base, suit=replace(base.motion, contact_prob=base.contacts.contact.float()),
+        localization=Localization(base.motion.timestamps + shift_s, R, t, confidence),
+        camera=CameraStream(base.motion.timestamps, CAMERA, LEVEL, torch.zeros(3)),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def sound() -> Recording:
+    return localized()
+
+
+def test_a_sound_localised_recording(sound):
+    report = examine(sound)
+    assert not [(f.check, f.what, f.evidence) for f in [*found(report, "error"), *found(report, "warning")]]
+    assert {"localization", "localization: speed", "localization: clock offset", "suit: contacts"} <= {
+        f.check for f in found(report, "ok")
+    }
+    assert [f.what[:13] for f in found(report, "note") if f.check == "claps"] == ["no clap found"]
+
+
+def spot(recording: Recording, **changes) -> Recording:
+    return replace(recording, localization=replace(recording.localization, **changes))
+
+
+def jumping(recording: Recording) -> Recording:
+    t = recording.localization.t_world_cam.clone()
+    t[::4, 0] += 9.0
+    return spot(recording, t_world_cam=t)
+
+
+def suit(recording: Recording, contact) -> Recording:
+    return replace(recording, suit=replace(recording.suit, contact_prob=contact))
+
+
+DEFECTS = {
+    "never found": (lambda r: spot(r, confidence=torch.zeros_like(r.localization.confidence)), "error", "hardly any frame"),
+    "seldom found": (lambda r: spot(r, confidence=r.localization.confidence * (torch.arange(len(r.suit)) % 4 == 0)), "warning", "few frames"),
+    "jumps": (jumping, "warning", "positions jump"),
+    "no rotations": (lambda r: spot(r, R_world_cam=1.3 * r.localization.R_world_cam), "error", "no rotations"),
+    "upside down": (lambda r: spot(r, R_world_cam=r.localization.R_world_cam @ about_axis("z", torch.tensor(3.14159))), "warning", "upside down"),
+    "late": (lambda r: localized(0.2), "error", "the camera is late"),
+    "NaN": (lambda r: spot(r, t_world_cam=r.localization.t_world_cam * torch.nan), "error", "positions are NaN"),
+    "no contact": (lambda r: suit(r, torch.zeros(len(r.suit), 4)), "warning", "feet never touch"),
+    "no probability": (lambda r: suit(r, torch.full((len(r.suit), 4), 7.0)), "error", "no probabilities"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_a_defect_of_a_recording_is_named(defect, sound):
+    plant, severity, message = DEFECTS[defect]
+    assert [f for f in found(examine(plant(sound)), severity) if message in f.what]
+
+
+def cut_contacts(recording: Recording, rows: int) -> Recording:
+    """What a reader without checks would make: the type itself does not allow it."""
+    short = replace(recording.suit)
+    object.__setattr__(short, "contact_prob", recording.suit.contact_prob[:rows])
+    return replace(recording, suit=short)
+
+
+def test_contacts_shorter_than_poses(sound, tmp_path):
+    short = cut_contacts(sound, 50)
+    assert [f.what for f in check_contact_prob("suit", short.suit)] == ["contacts are shorter than poses"]
+    RecordingStore(tmp_path).add(short, split="test", config_hash="x")
+    errors = found(examine(tmp_path), "error")
+    assert len(errors) == 1
+    assert f"Motion.contact_prob has 50 rows for {len(sound.suit)} timestamps" in errors[0].what
+
+
+def filmed(recording: Recording, root, size: tuple[int, int], frames: int) -> Recording:
+    with av.open(str(root / "head.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=60)
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        for _ in range(frames):
+            container.mux(stream.encode(av.VideoFrame(*size, "yuv420p")))
+        container.mux(stream.encode())
+    return replace(recording, camera=replace(recording.camera, video="head.mp4"))
+
+
+@pytest.mark.parametrize(
+    ("size", "cut", "message"),
+    [
+        ((64, 48), 0, ""),
+        ((80, 48), 0, "image size and calibration differ"),
+        ((64, 48), 100, "differ in number"),
+    ],
+)
+def test_the_video_is_looked_at(size, cut, message, sound, tmp_path):
+    recording = filmed(sound, tmp_path, size, len(sound.camera.timestamps) - cut)
+    RecordingStore(tmp_path).add(recording, split="test", config_hash="x")
+    errors = found(examine(tmp_path), "error")
+    assert [message in f.what for f in errors] == ([True] if message else [])
+
+
+def test_missing_files_are_named(sound, tmp_path):
+    gone = replace(sound, scene="scenes/none.ply", camera=replace(sound.camera, video="none.mp4"))
+    RecordingStore(tmp_path).add(gone, split="test", config_hash="x")
+    assert {f.what for f in found(examine(tmp_path), "error")} == {
+        "the scan is missing",
+        "the video cannot be read",
+    }
