@@ -5,6 +5,7 @@ import gzip
 import json
 import os
 import struct
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from wearcap.cli import main as cli
 from wearcap.cli import train
 from wearcap.io.bvh import write_bvh
 from wearcap.io.motion_npz import write_motion
-from wearcap.recording import RecordingStore
+from wearcap.recording import ImuStream, Localization, RecordingStore
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 SMALL = ["debug=fast", "data.window=60", "trainer.accelerator=cpu", "model.net.width=32", "model.net.layers=1",
@@ -209,6 +210,14 @@ ROWS = {
     "view: no recording": (lambda data, ckpt, tmp, out: ["view", f"{tmp}/none"], "no recording here"),
     "render: no recording": (
         lambda data, ckpt, tmp, out: ["render", f"{tmp}/none", "--out", f"{out}/a.png"], "no recording here"),
+    "prepare hps: no folder": (
+        lambda data, ckpt, tmp, out: ["prepare", "hps", f"source={tmp}/none", f"output={out}"], "no such folder"),
+    "calibrate: no video": (
+        lambda data, ckpt, tmp, out: ["calibrate", f"source={tmp}/none.mp4", "columns=9", "rows=6", "square_m=0.02",
+                                      f"hydra.run.dir={out}", f"output={out}/camera.json"], "no such file or folder"),
+    "calibrate: no square": (
+        lambda data, ckpt, tmp, out: ["calibrate", f"source={tmp}", "columns=9", "rows=6", f"hydra.run.dir={out}"],
+        "square_m has no value"),
     "doctor: nothing there": (lambda data, ckpt, tmp, out: ["doctor", f"{tmp}/none"], "no such file or folder"),
 }  # fmt: skip
 
@@ -288,3 +297,69 @@ def test_a_recording_with_nan_joints_is_named_by_the_doctor(tmp_path, capsys):
     RecordingStore(tmp_path).add(recording_of(motion, "r"), split="test", config_hash="x")
     assert exit_code(["doctor", str(tmp_path)]) == 1
     assert "NaN" in capsys.readouterr().out
+
+
+# Scenes and camera-localised recordings ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_scene(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parent / "pipelines")
+    import small_scene
+
+    return small_scene
+
+
+def photo_rows(folder: Path, change) -> None:
+    path = folder / "photos.json"
+    content = json.loads(path.read_text())
+    change(content["photos"])
+    path.write_text(json.dumps(content))
+
+
+SCENES = {
+    "missing intrinsics": (lambda scene, folder: photo_rows(folder, lambda rows: rows[0]["camera"].pop("fx")), "lacks 'fx'"),
+    "an empty map": (lambda scene, folder: photo_rows(folder, lambda rows: rows.clear()), "no photos"),
+    "a cloud without colour": (lambda scene, folder: scene.write_room(folder, colors=False), "no colour"),
+    "a scene in millimetres": (lambda scene, folder: scene.write_room(folder, unit=1000), "looks like millimetres"),
+    "image size and calibration": (
+        lambda scene, folder: photo_rows(folder, lambda rows: rows[0]["camera"].update(width=160)), "size and calibration differ"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("row", SCENES)
+def test_the_doctor_names_a_scenes_fault_once(row, small_scene, tmp_path, capsys):
+    damage, message = SCENES[row]
+    small_scene.write_room(tmp_path)
+    damage(small_scene, tmp_path)
+    assert exit_code(["doctor", "--json", str(tmp_path)]) == 1
+    findings = next(iter(json.loads(capsys.readouterr().out)["findings"].values()))
+    errors = [finding for finding in findings if finding["severity"] == "error"]
+    assert len(errors) == 1
+    assert message in errors[0]["what"]
+    assert errors[0]["fix"]
+
+
+def test_contacts_shorter_than_poses(tmp_path, capsys):
+    motion = swaying_motion(90)
+    recording = recording_of(motion, "r")
+    short = replace(motion)
+    object.__setattr__(short, "contact_prob", torch.zeros(50, 4))  # the type itself would refuse it here
+    RecordingStore(tmp_path).add(replace(recording, suit=short), split="test", config_hash="x")
+    assert exit_code(["doctor", "--json", str(tmp_path)]) == 1
+    assert "Motion.contact_prob has 50 rows for 90 timestamps" in capsys.readouterr().out
+
+
+def test_no_clap_is_said(tmp_path, capsys):
+    motion = swaying_motion(600)
+    wrist = motion.joint("left_wrist")
+    imu = ImuStream(motion.timestamps, "left_wrist", R_world_imu=wrist.R, acc_world=torch.zeros(600, 3))
+    found = Localization(motion.timestamps, wrist.R, wrist.t, torch.ones(600))
+    recording = replace(recording_of(motion, "r"), imu={"left_wrist": imu}, localization=found)
+    RecordingStore(tmp_path).add(recording, split="test", config_hash="x")
+    with suppress(SystemExit):
+        cli.main(["doctor", "--json", str(tmp_path)])
+    findings = json.loads(capsys.readouterr().out)["findings"]["r"]
+    assert ["no clap found" in finding["what"] for finding in findings if finding["check"] == "claps"] == [
+        True
+    ]
