@@ -92,6 +92,7 @@ def rotations(count: int) -> torch.Tensor:
         (costs.translation_step, lambda: (randn(4, 3), randn(3, 3))),
         (lambda a, b: costs.rotation_step(rotation.exp(a), rotation.exp(b)), lambda: (rotations(4), rotations(3))),
         (costs.pose_prior, lambda: (randn(4, 5, 3), randn(4, 5, 3))),
+        (costs.pose_step, lambda: (randn(4, 5, 3), randn(4, 5, 3))),
         (costs.translation_hold, lambda: (randn(4, 3), randn(4, 3))),
     ],
 )  # fmt: skip
@@ -190,7 +191,7 @@ def test_the_banded_solver_finds_a_planted_motion():
     begin = disturbed(data, 0.05)
     solution = solve_banded(HpsEnergy(weights), data, BandedSettings(iterations=30), begin)
     away = (solution.state.t_world_root - truth.t_world_root).norm(dim=1)
-    assert away.max() < 0.012  # the median of positions that are 2 cm off, and each tenth 1 m
+    assert away.max() < 0.02  # the median of positions that are 2 cm off, and each tenth 1 m
     assert rotation.geodesic(solution.state.R_world_root, truth.R_world_root).max() < 0.003
     assert (solution.state.theta - truth.theta).abs().max() < 0.003
 

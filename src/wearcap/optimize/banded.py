@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.optimize.banded_assembly import (
     LEGS,
@@ -25,7 +24,7 @@ from wearcap.optimize.banded_assembly import (
 from wearcap.optimize.banded_kernels import factor_and_solve
 from wearcap.optimize.banded_mapping import apply_step, fill_system
 from wearcap.optimize.costs import LOSSES
-from wearcap.optimize.feet import FootPatches
+from wearcap.optimize.feet import FootPatches, chain_to
 from wearcap.optimize.hps import TERMS, HpsData, HpsEnergy, HpsState, find_ground
 from wearcap.optimize.solution import Solution
 
@@ -37,6 +36,7 @@ _PAIRS = {
     "translation_step",
     "root_step",
     "head_step",
+    "pose_step",
 }
 
 
@@ -68,8 +68,7 @@ class ActiveBody:
     def of(cls, patches: FootPatches) -> "ActiveBody":
         """Raises WearcapError when a patch is held by other joints than its foot's last two."""
         skeleton = patches.body.skeleton
-        head = _chain(skeleton, skeleton.index("head"))
-        legs = [_chain(skeleton, skeleton.index(f"{side}_toe")) for side in ("left", "right")]
+        head, legs = chain_to(skeleton, skeleton.index("head")), patches.legs
         joints = tuple(sorted({*head, *legs[0], *legs[1]}))
         number = {joint: k + 1 for k, joint in enumerate(joints)} | {0: 0}
         parents = np.array([number[skeleton.parents[joint]] for joint in joints])
@@ -83,15 +82,6 @@ class ActiveBody:
     def unknowns(self) -> int:
         """Of a frame."""
         return LEGS + 3 * self.arrays.leg_chains.size
-
-
-def _chain(skeleton: Skeleton, joint: int) -> list[int]:
-    """Joints from just below the root to `joint`."""
-    chain = []
-    while joint > 0:
-        chain.append(joint)
-        joint = skeleton.parents[joint]
-    return chain[::-1]
 
 
 def _held(patches: FootPatches, legs: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +147,7 @@ class Stretch:
         self.kin = Kinematics(*(np.empty((length, *shape)) for shape in shapes))
         self.forms = Forms(
             np.empty((length, 3)), np.empty((pairs, 3, 3, 3)), np.empty((length, 3, 3)),
-            np.empty((length, 2, 12, 12)), np.empty((pairs, 2, 12, 12)), np.empty((length, 2, 12)), np.empty(length),
+            np.empty((length, 2, 12, 12)), np.empty((pairs, 2, 12, 12)), np.empty((length, 2, 12)), np.empty(length), np.empty(pairs),
         )  # fmt: skip
         self.system = np.empty((length, n, n)), np.empty((pairs, n, n)), np.empty((length, n))
 

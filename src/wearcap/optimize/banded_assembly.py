@@ -23,8 +23,8 @@ from wearcap.optimize.banded_kernels import (
 
 (
     SELF, CONTACT, CONTACT_PLANE, SLIDE, TRANSLATION_SMOOTH, ROOT_SMOOTH, HEAD_SMOOTH, POSE, HOLD,
-    TRANSLATION_STEP, ROOT_STEP, HEAD_STEP,
-) = range(12)  # fmt: skip
+    TRANSLATION_STEP, ROOT_STEP, HEAD_STEP, POSE_STEP,
+) = range(13)  # fmt: skip
 """Places of `hps.TERMS`."""
 
 HEAD = 6
@@ -104,6 +104,8 @@ class Forms(NamedTuple):
     foot_gradient: np.ndarray
     pose: np.ndarray
     """(time) weight of the pose prior."""
+    pose_step: np.ndarray
+    """(pair) weight of the legs' pose steps."""
 
 
 @compiled
@@ -125,6 +127,7 @@ def gather(theta, t, body, frames, weights, kin, forms, energy):
         if j + 1 < len(t):
             _gather_steps(j, t, body, frames, weights, kin, forms, energy)
             _gather_slide(j, body, frames, weights, kin, forms, energy)
+            _gather_pose_step(j, theta, body, frames, weights, forms, energy)
 
 
 @compiled
@@ -179,6 +182,25 @@ def _gather_steps(j, t, body, frames, weights, kin, forms, energy):
             turn_between(step @ kin.R[j, joint], kin.R[j + 1, joint], r)
             w = _rho(term, r @ r, 1.0, weights, energy)
             _add_step(j, group, w, step, r, forms)
+
+
+@compiled
+def _gather_pose_step(j, theta, body, frames, weights, forms, energy):
+    if weights.weight[POSE_STEP] == 0:
+        return
+    square = 0.0
+    for f in range(2):
+        for joint in body.leg_chains[f]:
+            for i in range(3):
+                square += pose_change(j, joint, i, theta, frames) ** 2
+    forms.pose_step[j] = _rho(POSE_STEP, square, 1.0, weights, energy)
+
+
+@compiled
+def pose_change(j, joint, i, theta, frames):
+    """How much more a joint's axis-angle is off the suit's at frame j + 1 than at j."""
+    here = theta[j, joint - 1, i] - frames.theta_imu[j, joint - 1, i]
+    return theta[j + 1, joint - 1, i] - frames.theta_imu[j + 1, joint - 1, i] - here
 
 
 @compiled

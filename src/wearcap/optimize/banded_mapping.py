@@ -3,7 +3,7 @@
 import numpy as np
 
 from wearcap.geometry.compiled import compiled
-from wearcap.optimize.banded_assembly import HEAD, LEGS
+from wearcap.optimize.banded_assembly import HEAD, LEGS, pose_change
 from wearcap.optimize.banded_kernels import exp_and_jacobian
 
 
@@ -80,6 +80,13 @@ def _fill_foot(j, f, theta, body, frames, kin, forms, diagonal, below, gradient)
             diagonal[j, at, at] += forms.pose[j]
             away = theta[j, chain[k] - 1, i] - frames.theta_imu[j, chain[k] - 1, i]
             gradient[j, at] += forms.pose[j] * away
+            if j + 1 < len(diagonal):
+                w, change = forms.pose_step[j], pose_change(j, chain[k], i, theta, frames)
+                diagonal[j, at, at] += w
+                diagonal[j + 1, at, at] += w
+                below[j, at, at] -= w
+                gradient[j, at] -= w * change
+                gradient[j + 1, at] += w * change
     Q = forms.foot[j, f]
     if Q[0, 0] > 0:
         for i in range(12):

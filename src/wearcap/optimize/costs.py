@@ -97,6 +97,13 @@ def pose_prior(
     return (theta - theta_imu).flatten(1)
 
 
+def pose_step(
+    theta: Float[Tensor, "time joint 3"], theta_imu: Float[Tensor, "time joint 3"]
+) -> Float[Tensor, "pair component"]:
+    """Change from frame to frame of the way off the suit's pose, whose errors are slow (ours)."""
+    return pose_prior(theta, theta_imu).diff(dim=0)
+
+
 def translation_hold(
     t_world_root: Float[Tensor, "time 3"], held: Float[Tensor, "time 3"]
 ) -> Float[Tensor, "time 3"]:

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from wearcap.body.model import BodyModel
+from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
 
 PATCH_REGIONS = ("left_heel", "left_toes", "right_heel", "right_toes")
@@ -31,6 +32,12 @@ class FootPatches:
         patch = torch.cat([torch.full((len(v),), k) for k, v in enumerate(chosen)])
         return cls(body, torch.cat(chosen), patch)
 
+    @property
+    def legs(self) -> list[list[int]]:
+        """Joints of the left and the right leg, from hip to toes; the last two hold the patches."""
+        skeleton = self.body.skeleton
+        return [chain_to(skeleton, skeleton.index(f"{side}_toe")) for side in ("left", "right")]
+
     def points(self, T_world_joint: Rigid) -> Float[Tensor, "time vertex 3"]:
         """Positions (m) in the world, given the poses of all joints."""
         return self._only.vertices(T_world_joint)
@@ -54,6 +61,15 @@ class FootPatches:
             whole.skeleton, whole.rest_vertices[self.vertex], whole.faces[:0],
             whole.skin_joints[self.vertex], whole.skin_weights[self.vertex], pose_blend=blend,
         )  # fmt: skip
+
+
+def chain_to(skeleton: Skeleton, joint: int) -> list[int]:
+    """Joints from just below the root to `joint`."""
+    chain = []
+    while joint > 0:
+        chain.append(joint)
+        joint = skeleton.parents[joint]
+    return chain[::-1]
 
 
 def _spread(body: BodyModel, region: Int64[Tensor, "all"], count: int) -> Int64[Tensor, "chosen"]:

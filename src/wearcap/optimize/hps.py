@@ -17,7 +17,7 @@ from wearcap.optimize.feet import FootPatches
 
 TERMS = (
     "self", "contact", "contact_plane", "slide", "translation_smooth", "root_smooth", "head_smooth", "pose",
-    "hold", "translation_step", "root_step", "head_step",
+    "hold", "translation_step", "root_step", "head_step", "pose_step",
 )  # fmt: skip
 """`costs` by the names under which a config weighs them."""
 
@@ -156,6 +156,7 @@ def energy_terms(
     """
     T_world_joint = data.pose(state)
     head = data.patches.body.skeleton.index("head")
+    legs = [joint - 1 for leg in data.patches.legs for joint in leg]
     points = _patch_points(data, T_world_joint, full_mesh)
     if ground is None:
         ground = find_ground(data, points, energy)
@@ -176,6 +177,7 @@ def energy_terms(
         "translation_step": lambda: (costs.translation_step(t, data.t_step), None),
         "root_step": lambda: (costs.rotation_step(R_root, data.R_root_step), None),
         "head_step": lambda: (costs.rotation_step(R_head, data.R_head_step), None),
+        "pose_step": lambda: (costs.pose_step(state.theta[:, legs], data.start.theta[:, legs]), None),
     }  # fmt: skip
     terms = {}
     for name, weight in energy.weights.items():

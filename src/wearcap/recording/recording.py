@@ -119,6 +119,18 @@ class FloorTrack:
 
 
 @dataclass(frozen=True)
+class Intervals:
+    """Named stretches of a recording on the motion's clock, for evaluation: what was done where along the way."""
+
+    start_s: Float64[Tensor, "interval"]
+    stop_s: Float64[Tensor, "interval"]
+    distance_m: Float[Tensor, "interval"]
+    """Travelled since the recording's start when the interval begins."""
+    names: tuple[str, ...]
+    """One per interval, such as "stand" and "move"."""
+
+
+@dataclass(frozen=True)
 class Recording:
     """Everything one wearer's sensors saw, and what is known to be true. Streams keep their own clocks' rates."""
 
@@ -138,6 +150,7 @@ class Recording:
     contacts: ContactTrack | None = None
     object_motion: dict[str, Trajectory] = field(default_factory=dict)
     floor: FloorTrack | None = None
+    intervals: Intervals | None = None
     # about
     skeleton: Skeleton | None = None
     shape: dict[str, float] = field(default_factory=dict)

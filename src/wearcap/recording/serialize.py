@@ -23,7 +23,7 @@ KNOWN: dict[str, type] = {
     for cls in (
         Motion, Skeleton, Site, Camera, Trajectory, containers.Recording, containers.HeadStream,
         containers.ImuStream, containers.CameraStream, containers.Localization, containers.PointCloud,
-        containers.Cue, containers.ContactTrack, containers.FloorTrack,
+        containers.Cue, containers.ContactTrack, containers.FloorTrack, containers.Intervals,
     )
 }  # fmt: skip
 

@@ -9,14 +9,15 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64, UInt16
+from jaxtyping import Bool, Float, Float32, Int64, UInt16
 from sklearn.cluster import DBSCAN
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.pointcloud import voxel_downsample
+from wearcap.geometry.render import Splats, render
 from wearcap.geometry.rigid import Rigid
-from wearcap.sensors.registration import Registration, register
+from wearcap.sensors.registration import STAGES, Registration, register
 
 CLUSTER_EPS_M = 0.12
 """DBSCAN's distance (thesis §4.5.1)."""
@@ -26,6 +27,8 @@ _CLUSTER_VOXEL_M = 0.02
 """Points are clustered by voxel, each weighing as many as it holds: a sixth of eps, and a hundred times fewer."""
 _SEEN_SHARE = 0.5
 """A background pixel counts where at least so many of the empty frames saw it."""
+_SPLAT_M = 0.02
+"""Radius at which a scan's points hide what is behind them: its spacing, and some more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,19 +117,35 @@ def largest_cluster(
 
 
 def register_view(
-    view: DepthView, scene: Float[np.ndarray, "scene_point 3"], correction: Rigid | None = None
+    view: DepthView, scene: Float32[np.ndarray, "scene_point 3"], correction: Rigid | None = None
 ) -> tuple[DepthView, Registration]:
-    """The camera at the pose that ICP of its empty depth image to the scene's scan (m) finds, and the report.
+    """The camera at the pose that ICP of its empty depth image to the scene's scan (m) finds, and ICP's report.
 
-    `view.T_world_cam` is the approximate pose, as visual localisation gives it; `correction` is a person's, see
-    `register`. Raises WearcapError as `register` does.
+    `view.T_world_cam` is the approximate pose, as visual localisation gives it. Where the result is wrong, a person
+    gives it back with a `correction` in scene axes (new = correction @ old), and ICP starts from there: the
+    document's localisation, ICP, manual correction, ICP. ICP runs twice, each time to the points that the camera
+    would see from where it is thought to be: scans show walls from both sides, 10 cm apart.
+    Raises WearcapError as `register` does.
     """
     empty = view.background.depth_m
     solid = np.isfinite(empty) & ~_flying(empty, Subtraction().edge_m)
-    registration = register(
-        unproject_depth(empty, solid, view.camera), scene, view.T_world_cam, correction=correction
-    )
-    return replace(view, T_world_cam=registration.T_scene_cloud), registration
+    cloud = unproject_depth(empty, solid, view.camera)
+    pose = view.T_world_cam.to(torch.float64)
+    if correction is not None:
+        pose = correction.to(torch.float64) @ pose
+    pose = register(cloud, visible_points(scene, pose), pose).T_scene_cloud
+    result = register(cloud, visible_points(scene, pose), pose, STAGES[1:])
+    return replace(view, T_world_cam=result.T_scene_cloud), result
+
+
+def visible_points(
+    scene: Float32[np.ndarray, "scene_point 3"], T_world_cam: Rigid
+) -> Float32[np.ndarray, "point 3"]:
+    """Points of a scan (m) that nothing hides from a camera at about this pose, within 100° (ours)."""
+    wide = Camera.pinhole(500, 500, 100.0)
+    splats = Splats(scene, np.ones(3, np.float32), _SPLAT_M, metric=True)
+    seen = np.unique(render(wide, T_world_cam, splats=[splats]).point_index)
+    return scene[seen[seen >= 0]]
 
 
 def person_cloud(

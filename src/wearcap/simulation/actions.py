@@ -47,20 +47,20 @@ def activity(name: str, weight: float, outdoors: float = 1.0) -> Callable[[Act],
 
 def start_place(world: World, rng: np.random.Generator) -> tuple[np.ndarray, float]:
     """A free floor point (m), off the stairs, and a heading (rad) to start from."""
-    return _free_point(world, rng), float(rng.uniform(-np.pi, np.pi))
+    return free_point(world, rng), float(rng.uniform(-np.pi, np.pi))
 
 
-def _free_point(world: World, rng: np.random.Generator, beside_z: float | None = None) -> np.ndarray:
+def free_point(world: World, rng: np.random.Generator, beside_z: float | None = None) -> np.ndarray:
     """A random place to stand freely; in the open, often one that is higher or lower than `beside_z` (m)."""
     points = world.sample_floor(rng, 24)
-    free = (world.clearance(points) > FREE_M) & ~_on_stairs(world, points)
+    free = (world.clearance(points) > FREE_M) & ~on_stairs(world, points)
     if world.outdoors and beside_z is not None and rng.random() < ELSEWHERE:
         other = free & (np.abs(points[:, 2] - beside_z) > 0.3)
         free = other if other.any() else free
     return points[np.flatnonzero(free)[0]] if free.any() else points[0]
 
 
-def _on_stairs(world: World, points: np.ndarray) -> np.ndarray:
+def on_stairs(world: World, points: np.ndarray) -> np.ndarray:
     """Whether floor points lie on a flight or within a step of its ends."""
     near = np.zeros(len(points), bool)
     for flight in world.flights:
@@ -123,11 +123,11 @@ def run(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 
 def _way_to_run(plan: Plan, world: World, rng: np.random.Generator, tries: int = 4) -> np.ndarray | None:
     for _ in range(tries):
-        goal = _free_point(world, rng)
+        goal = free_point(world, rng)
         if np.linalg.norm(goal[:2] - plan.position[:2]) < 3.0:
             continue
         path = world.plan_path(plan.position, goal, rng)
-        if path is not None and _length(path) > 5.0 and np.abs(np.diff(path[:, 2])).max() < RUN_RISE_M:
+        if path is not None and path_length(path) > 5.0 and np.abs(np.diff(path[:, 2])).max() < RUN_RISE_M:
             return path
     return None
 
@@ -136,20 +136,28 @@ def approach(
     plan: Plan, world: World, rng: np.random.Generator, goal: np.ndarray | None, heading: float | None = None
 ) -> bool:
     """Walk to a floor point (m; a free one when None) and turn to a heading (rad) there; False if no way leads there."""
-    goal = _free_point(world, rng, float(plan.position[2])) if goal is None else goal
+    goal = free_point(world, rng, float(plan.position[2])) if goal is None else goal
     path = world.plan_path(plan.position, goal, rng)
-    if path is None or (heading is None and _length(path) < 1.2):
+    if path is None or (heading is None and pathpath_length(path) < 1.2):
         return False
+    follow(plan, world, rng, path, heading)
+    return True
+
+
+def follow(
+    plan: Plan, world: World, rng: np.random.Generator, path: np.ndarray, heading: float | None = None
+) -> None:
+    """Walk along a path that `World.plan_path` found and turn to a heading (rad) at its end."""
     start = plan.time
-    if _length(path) > 0.25:
+    if pathpath_length(path) > 0.25:
         speed = plan.style.speed * float(np.exp(rng.normal(0.0, 0.13)))
         walk_along(plan, path, rng, speed, world.flights)
         look_about(plan, start + 1.0, plan.time, rng, spread=0.22, rest=3.0)
     if heading is not None and abs(wrap(heading - plan.heading)) > 0.2:
         turn_to(plan, heading, rng)
     plan.time += rng.uniform(0.25, 0.6)
-    return True
 
 
-def _length(path: np.ndarray) -> float:
+def path_length(path: np.ndarray) -> float:
+    """Of a way over the floor, in the plane (m)."""
     return float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())

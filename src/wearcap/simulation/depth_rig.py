@@ -20,6 +20,9 @@ KINECT = Camera("pinhole", 640, 576, 504.0, 504.0, 319.5, 287.5)
 """Azure Kinect's unbinned narrow mode: 65° x 59° of its 75° x 65°, whose rim the lens bends."""
 _CLEARANCE_M = 0.2
 """A tripod stands no nearer to a wall or a piece of furniture."""
+_TALLEST_M = 2.0
+_NEAREST_M = 1.4
+"""A camera nearer than this does not see a person from head to foot."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,8 @@ class DepthNoise:
     floor_m: float = 0.0015
     per_metre: float = 0.0015
     """White noise: deviation floor_m + per_metre · depth."""
+    bias_m: float = 0.003
+    """Deviation of each camera's constant offset (the data sheet allows 11 mm)."""
     flying_share: float = 0.4
     """Of the pixels along edges that lie somewhere between both surfaces."""
     edge_m: float = 0.05
@@ -50,8 +55,8 @@ class SimulatedRig:
     depth_mm: UInt16[np.ndarray, "camera time height width"]
 
 
-def look_at(position: Float[np.ndarray, "*batch 3"], target: Float[np.ndarray, "3"]) -> Rigid:
-    """Poses of upright cameras (z forward, y down; float64) at positions, looking at the target (m)."""
+def look_at(position: Float[np.ndarray, "*batch 3"], target: Float[np.ndarray, "*#batch 3"]) -> Rigid:
+    """Poses of upright cameras (z forward, y down; float64) at positions, looking at targets (m)."""
     forward = target - position
     forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -65,13 +70,13 @@ def place_rig(
     spot: Float[np.ndarray, "3"],
     *,
     radius_m: float = 2.4,
-    height_m: float = 1.6,
+    height_m: float = 1.8,
     count: int = 3,
 ) -> Rigid:
     """Poses "camera" of tripods around a floor point, evenly turned, that see a person there from all sides.
 
     The turn is the one that lets the nearest camera stand furthest off, up to `radius_m`, with nothing between.
-    Raises WearcapError where one would stand nearer than 1.2 m.
+    Raises WearcapError where one would stand nearer than 1.4 m.
     """
     reach = np.arange(0.3, radius_m + 1e-6, 0.05)
     turn = np.deg2rad(np.arange(0, 360, 5))
@@ -82,12 +87,16 @@ def place_rig(
     apart = len(turn) // count
     worst = np.min([np.roll(room, -k * apart) for k in range(count)], 0)
     first = int(worst.argmax())
-    if worst[first] < 1.2:
+    if worst[first] < _NEAREST_M:
         raise WearcapError(f"no room for {count} cameras around {np.round(spot, 2).tolist()}",
-                           expected="a spot with 1.4 m of free floor on all sides")  # fmt: skip
+                           expected="a spot with 1.6 m of free floor on all sides")  # fmt: skip
     chosen = first + apart * np.arange(count)
-    position = spot + direction[chosen % len(turn)] * room[chosen % len(turn), None] + [0, 0, height_m]
-    return look_at(position, spot + np.array([0.0, 0.0, 0.85]))
+    distance = room[chosen % len(turn)]
+    feet, crown = np.arctan2(-height_m, distance), np.arctan2(_TALLEST_M - height_m, distance)
+    position = spot + direction[chosen % len(turn)] * distance[:, None] + [0, 0, height_m]
+    aim = np.zeros((count, 3)) + spot
+    aim[:, 2] += height_m + distance * np.tan((feet + crown) / 2)
+    return look_at(position, aim)
 
 
 def approximate(
@@ -116,25 +125,22 @@ def simulate_rig(
 
     T_world_cam: poses "camera".
     """
-    empty, depth = [], []
-    for number in range(len(T_world_cam.t)):
-        pose = T_world_cam[number]
+    count, size = len(T_world_cam.t), (camera.height, camera.width)
+    empty = np.zeros((count, stills, *size), np.uint16)
+    depth = np.zeros((count, len(people), *size), np.uint16)
+    for number in range(count):
+        pose, bias = T_world_cam[number], noise.bias_m * rng.standard_normal()
         background = render(camera, pose, world).depth
-        empty.append([_sensed(background, noise, rng) for _ in range(stills)])
-        depth.append(
-            [
-                _sensed(np.minimum(background, render(camera, pose, [body]).depth), noise, rng)
-                for body in people
-            ]
-        )
-    shape = (len(empty), -1, camera.height, camera.width)
-    images = [np.array(part, np.uint16).reshape(shape) if np.size(part) else
-              np.zeros((shape[0], 0, *shape[2:]), np.uint16) for part in (empty, depth)]  # fmt: skip
-    return SimulatedRig(camera, T_world_cam, *images)
+        for still in range(stills):
+            empty[number, still] = _sensed(background, bias, noise, rng)
+        for frame, body in enumerate(people):
+            true = np.minimum(background, render(camera, pose, [body]).depth)
+            depth[number, frame] = _sensed(true, bias, noise, rng)
+    return SimulatedRig(camera, T_world_cam, empty, depth)
 
 
 def _sensed(
-    depth_m: Float32[np.ndarray, "height width"], noise: DepthNoise, rng: np.random.Generator
+    depth_m: Float32[np.ndarray, "height width"], bias_m: float, noise: DepthNoise, rng: np.random.Generator
 ) -> UInt16[np.ndarray, "height width"]:
     """A true depth image as the camera reports it, in whole millimetres, 0 where nothing comes back."""
     true = np.where(np.isfinite(depth_m), depth_m, 2 * noise.farthest_m)
@@ -144,7 +150,7 @@ def _sensed(
     flying = edge & (chance < noise.flying_share)
     value = np.where(flying, near + rng.random(true.shape, np.float32) * (far - near), true)
     deviation = noise.floor_m + noise.per_metre * value
-    value = value + deviation * rng.standard_normal(true.shape, np.float32)
+    value = value + bias_m + deviation * rng.standard_normal(true.shape, np.float32)
     lost = rng.random(true.shape, np.float32) < np.where(edge, noise.edge_dropout, noise.dropout)
     lost |= (value < noise.nearest_m) | (value > noise.farthest_m)
     return np.where(lost, 0, np.rint(1000 * value)).astype(np.uint16)

@@ -138,6 +138,13 @@ class NavigationGrid:
         points[:, :2] += rng.uniform(-0.5, 0.5, (count, 2)) * self.cell
         return points
 
+    def lengths_from(self, start: Float[np.ndarray, "3"]) -> Float[np.ndarray, "node"]:
+        """Length (m) of the shortest way from a floor point to every walkable cell (`node_points`)."""
+        first = self.nearest_node(start)
+        if first is None:
+            return np.full(len(self.node_points), np.inf)
+        return scipy.sparse.csgraph.dijkstra(self._graph[0], indices=first)
+
     def shortest(
         self, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], shyness: float
     ) -> Float[np.ndarray, "point 3"] | None:

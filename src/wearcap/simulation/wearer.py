@@ -72,18 +72,26 @@ def simulate_motion(
     None draws them at random by their weights.
     """
     plan = _plan(world, person, rng, duration_s + TAIL_S, activities)
+    return perform(plan, world, rng, duration_s, fps)
+
+
+def perform(
+    plan: Plan, world: World, rng: np.random.Generator, duration_s: float, fps: float
+) -> SimulatedMotion:
+    """The motion that a plan describes; the plan should reach `TAIL_S` beyond the duration."""
+    skeleton = plan.skeleton
     count = round(duration_s * fps)
     times = np.arange(count + round(TAIL_S * fps)) / fps
     feet = {
-        side: foot_motion(plan.prints[side], FootShape.of(person.skeleton, side), plan.heel_lift[side], times)
+        side: foot_motion(plan.prints[side], FootShape.of(skeleton, side), plan.heel_lift[side], times)
         for side in SIDES
     }
     trunk = trunk_motion(plan, feet, times, fps, rng)
     R_world_joint = _body(plan, feet, trunk, times, fps, rng)
     motion = Motion(
         timestamps=torch.from_numpy(times),
-        skeleton=person.skeleton,
-        R_parent_joint=local_rotations(person.skeleton, R_world_joint).float(),
+        skeleton=skeleton,
+        R_parent_joint=local_rotations(skeleton, R_world_joint).float(),
         t_world_root=torch.from_numpy(trunk.pelvis).float(),
         provenance={"source": "simulated wearer"},
     ).sliced(0, count)
