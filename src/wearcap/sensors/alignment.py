@@ -44,7 +44,8 @@ def align_suit(
     angle, certainty = yaw_between(head.R, T_world_cam.R @ mount.R.mT)
     turn = robust_angle(angle, weight * certainty)
     R_scene_suit = rotation.about_axis("z", turn)
-    move = _weighted_median(T_world_cam.t - (head @ mount.t) @ R_scene_suit.mT, weight)
+    worn: Tensor = head @ mount.t  # pyright: ignore[reportAssignmentType]
+    move = _weighted_median(T_world_cam.t - worn @ R_scene_suit.mT, weight)
     R = suit.R_parent_joint.clone()
     R[:, 0] = R_scene_suit @ R[:, 0]
     return replace(suit, R_parent_joint=R, t_world_root=suit.t_world_root @ R_scene_suit.mT + move), turn
@@ -116,13 +117,14 @@ def estimate_head_camera(
         )
     R, weight = R_world_head[good].mT @ R_world_cam[good], confidence[good]
     median = torch.stack([_weighted_median(R[:, :, column], weight) for column in range(3)], -1)
-    centre = roma.special_procrustes(median)
+    centre: Tensor = roma.special_procrustes(median)  # pyright: ignore[reportAssignmentType]
     for _ in range(20):
         w = weight / rotation.geodesic(R, centre.expand_as(R)).clamp(min=0.005)
-        centre = roma.special_procrustes((w[:, None, None] * R).sum(0) / w.sum())
-    return centre  # pyright: ignore[reportReturnType]
+        mean = (w[:, None, None] * R).sum(0) / w.sum()
+        centre = roma.special_procrustes(mean)  # pyright: ignore[reportAssignmentType]
+    return centre
 
 
 def body_camera(motion: Motion, t_head_cam: Float[Tensor, "3"]) -> Float[Tensor, "time 3"]:
     """Where a motion carries the camera of its head (m, world)."""
-    return motion.joint("head") @ t_head_cam
+    return motion.joint("head") @ t_head_cam  # pyright: ignore[reportReturnType]

@@ -1,0 +1,111 @@
+"""Foot contacts for suits that report none: from the feet's speed or their sensors (thesis §4.2.4: "a peak in the
+acceleration of the leg"). The documents give no thresholds: these are ours."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.body.kinematics import site_positions
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import require_rising
+from wearcap.recording.motion import Motion
+from wearcap.recording.recording import ImuStream
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """Thresholds, in pairs: contact begins below the first and ends above the second."""
+
+    speed: tuple[float, float] = (0.1, 0.15)
+    """Of a patch (m/s)."""
+    max_height_m: float = 0.35
+    """Above the lowest patch: two stairs; higher feet hang."""
+    gyro: tuple[float, float] = (0.35, 0.7)
+    """Of a foot that lies flat (rad/s)."""
+    acc: tuple[float, float] = (3.0, 6.0)
+    """Free acceleration of a foot that lies flat (m/s²)."""
+    reach_s: tuple[float, float] = (0.15, 0.35)
+    """How far before it lies flat the peak of heel strike is looked for, and after it that of push-off."""
+    shortest_s: float = 0.07
+    """Shorter contacts, and shorter pauses between two, are none."""
+
+
+CONTACTS = ContactSettings()
+
+
+def contacts_from_motion(motion: Motion, settings: ContactSettings = CONTACTS) -> Bool[Tensor, "time patch"]:
+    """Contacts of `FOOT_PATCHES`: each patch from its own speed. The skeleton needs the sites of that name."""
+    missing = [patch for patch in FOOT_PATCHES if patch not in motion.skeleton.sites]
+    if missing:
+        raise WearcapError(f"skeleton {motion.skeleton.name!r} has no {missing[0]!r}",
+                           expected=f"sites {', '.join(FOOT_PATCHES)}")  # fmt: skip
+    if len(motion) < 3:
+        raise WearcapError(f"a motion of {len(motion)} frames", expected="three or more")
+    require_rising(motion.timestamps)
+    patches = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES).double()
+    between = (patches.diff(dim=0) / motion.timestamps.diff()[:, None, None]).norm(dim=-1)
+    # A patch that stands in this frame has stood since the last one or will until the next.
+    speed = torch.minimum(torch.cat([between[:1], between]), torch.cat([between, between[-1:]]))
+    slow = _hysteresis(speed, settings.speed)
+    low = patches[..., 2] - patches[..., 2].amin(1, keepdim=True) < settings.max_height_m
+    return _without_short(slow & low, settings.shortest_s * motion.fps)
+
+
+def contacts_from_imu(
+    left: ImuStream, right: ImuStream, settings: ContactSettings = CONTACTS
+) -> Bool[Tensor, "time patch"]:
+    """Contacts of `FOOT_PATCHES` at the sensors' timestamps, from a sensor on each foot with the same timestamps.
+
+    A foot lies flat while it neither turns nor accelerates. The heel touches from the acceleration's peak before
+    that (heel strike), the toes until the peak after it (push-off). Raises WearcapError where gyro or acceleration
+    is missing.
+    """
+    if not torch.equal(left.timestamps, right.timestamps):
+        raise WearcapError("the two feet's sensors differ in their timestamps", expected="one clock and rate")
+    require_rising(left.timestamps)
+    fps = 1 / left.timestamps.diff().median().item()
+    feet = [_foot_contacts(foot, fps, settings) for foot in (left, right)]
+    return torch.cat(feet, 1)
+
+
+def _foot_contacts(foot: ImuStream, fps: float, settings: ContactSettings) -> Bool[Tensor, "time 2"]:
+    if foot.gyro_imu is None or foot.acc_world is None:
+        raise WearcapError(
+            "no angular rate or free acceleration", where=foot.joint, expected="gyro_imu and acc_world"
+        )
+    gyro, acc = foot.gyro_imu.norm(dim=-1)[:, None], foot.acc_world.norm(dim=-1)[:, None]
+    flat = _hysteresis(gyro, settings.gyro) & _hysteresis(acc, settings.acc)
+    flat = _without_short(flat, settings.shortest_s * fps)[:, 0].numpy()
+    heel, toes, amount = flat.copy(), flat.copy(), acc[:, 0].numpy()
+    edge = np.diff(np.concatenate([[0], flat.astype(np.int8), [0]]))
+    before, after = (round(reach * fps) for reach in settings.reach_s)
+    # One turn per step walked.
+    for start, stop in zip(np.nonzero(edge == 1)[0].tolist(), np.nonzero(edge == -1)[0].tolist()):
+        first = max(start - before, 0)
+        heel[first + int(amount[first : start + 1].argmax()) : start] = True
+        last = min(stop + after, len(flat))
+        toes[stop : stop + 1 + int(amount[stop:last].argmax()) if stop < last else stop] = True
+    return torch.from_numpy(np.stack([heel, toes], 1))
+
+
+def _hysteresis(
+    value: Float[Tensor, "time column"], thresholds: tuple[float, float]
+) -> Bool[Tensor, "time column"]:
+    """True from where a value falls below the first threshold until it rises above the second."""
+    frame = torch.arange(1, len(value) + 1)[:, None].expand_as(value)
+    below = torch.where(value < thresholds[0], frame, 0).cummax(0).values
+    above = torch.where(value > thresholds[1], frame, 0).cummax(0).values
+    return below > above
+
+
+def _without_short(state: Bool[Tensor, "time column"], frames: float) -> Bool[Tensor, "time column"]:
+    """Pauses shorter than so many frames closed, then contacts shorter than that dropped."""
+    window = np.ones((max(int(np.ceil(frames)), 1), 1), bool)
+    held = np.pad(state.numpy(), ((len(window), len(window)), (0, 0)), mode="edge")
+    held = scipy.ndimage.binary_opening(scipy.ndimage.binary_closing(held, window), window)
+    return torch.from_numpy(held[len(window) : -len(window)])

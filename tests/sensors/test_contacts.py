@@ -1,0 +1,100 @@
+"""Derived foot contacts against the simulated wearer's truth, and on planted steps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from wearcap.body.skeleton import xsens23
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.recording import ImuStream, Motion
+from wearcap.sensors.contacts import contacts_from_imu, contacts_from_motion
+from wearcap.sensors.imu import ImuNoise, synthesize_imu
+from wearcap.sensors.suit import SuitNoise, suit_motion
+from wearcap.simulation.simulate import person_of, world_of
+from wearcap.simulation.wearer import simulate_motion
+
+
+@pytest.fixture(scope="module")
+def walked():
+    rng = np.random.default_rng(0)
+    return simulate_motion(
+        world_of("val", 0), person_of("val", 0), rng, 40.0, 60.0, ["walk", "stand", "walk"]
+    )
+
+
+def precision_recall(found, truth):
+    hit = (found & truth).sum().item()
+    return hit / found.sum().item(), hit / truth.sum().item()
+
+
+def test_contacts_of_a_worn_suits_pose(walked):
+    suit = suit_motion(walked.motion, walked.contact, SuitNoise(), np.random.default_rng(1))
+    precision, recall = precision_recall(contacts_from_motion(suit), walked.contact)
+    assert precision > 0.86
+    assert recall > 0.97
+
+
+def test_contacts_from_sensors_on_the_feet(walked):
+    rng = np.random.default_rng(1)
+    feet = [
+        synthesize_imu(walked.motion, f"{side}_ankle", noise=ImuNoise(), rng=rng, n=2)
+        for side in ("left", "right")
+    ]
+    precision, recall = precision_recall(contacts_from_imu(*feet), walked.contact)
+    assert precision > 0.84
+    assert recall > 0.93
+
+
+def sliding(speed):
+    """A T-pose that slides along with these speeds (m/s), one per frame, at 100 Hz."""
+    skeleton = xsens23()
+    way = torch.tensor(speed).cumsum(0) / 100
+    R = torch.eye(3).repeat(len(way), len(skeleton), 1, 1)
+    root = torch.stack([way, 0 * way, 0 * way + skeleton.root_height], -1)
+    return Motion(torch.arange(len(way), dtype=torch.float64) / 100, skeleton, R, root)
+
+
+def test_hysteresis_ignores_hesitation_and_short_moments():
+    speed = [1.0] * 50 + [0.05] * 30 + [0.13] * 30 + [0.05] * 20 + [0.13] * 20 + [1.0] * 20 + [0.13] * 20
+    speed += [0.02] * 3 + [1.0] * 20 + [0.0] * 30 + [1.0] * 3 + [0.0] * 30
+    found = contacts_from_motion(sliding(speed))[:, 0].float()
+    change = found.diff().nonzero()[:, 0] + 1
+    assert found[0] == 0
+    assert (change - torch.tensor([50, 150, 213])).abs().max() <= 1
+    assert found[-1] == 1
+
+
+def test_a_foot_held_high_does_not_stand():
+    motion = sliding([0.0] * 50)
+    R = motion.R_parent_joint.clone()
+    R[:, motion.skeleton.index("left_hip")] = rotation.about_axis("y", torch.tensor(-1.5))
+    found = contacts_from_motion(replace(motion, R_parent_joint=R))
+    assert found.all(0).tolist() == [False, False, True, True]
+    assert not found[:, :2].any()
+
+
+def test_heel_from_its_strike_and_toes_until_they_push_off():
+    """A foot that turns, strikes at 1.0 s, lies flat from 1.1 to 1.5 s, and pushes off at 1.7 s."""
+    time = torch.arange(300, dtype=torch.float64) / 100
+    gyro, acc = torch.full((300, 3), 2.0), torch.full((300, 3), 1.0)
+    gyro[110:150] = 0.05
+    acc[100], acc[170] = 30.0, 20.0
+    foot = ImuStream(time, "left_ankle", acc_world=acc, gyro_imu=gyro)
+    heel, toes = contacts_from_imu(foot, foot)[:, :2].T
+    assert heel.nonzero()[:, 0].tolist() == list(range(100, 150))
+    assert toes.nonzero()[:, 0].tolist() == list(range(110, 171))
+
+
+def test_what_lacks_is_named():
+    motion = sliding([0.0] * 20)
+    bare = replace(motion, skeleton=replace(motion.skeleton, sites={}))
+    with pytest.raises(WearcapError, match="has no 'left_heel'"):
+        contacts_from_motion(bare)
+    foot = ImuStream(motion.timestamps, "left_ankle", gyro_imu=torch.zeros(20, 3))
+    with pytest.raises(WearcapError, match="left_ankle: no angular rate or free acceleration"):
+        contacts_from_imu(foot, foot)
+    with pytest.raises(WearcapError, match="differ in their timestamps"):
+        contacts_from_imu(foot, replace(foot, timestamps=foot.timestamps + 1))
