@@ -45,7 +45,7 @@ class LocalizerSettings:
     """Database pictures whose landmarks are matched (K_loc of the document)."""
     retrieved_with_prior: int = 8
     """The same where a prior pose is given: so many similar pictures and as many near the prior."""
-    max_landmarks: int = 10_000
+    max_landmarks: int = 8_000
     """Landmarks that are matched: those that most of the chosen pictures observe."""
     max_ratio: float = 0.85
     """Ratio test on the distances of descriptors."""
