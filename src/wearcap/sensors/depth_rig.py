@@ -163,7 +163,8 @@ def person_cloud(
     for image, view in zip(depth_mm, views):
         mask = foreground(image, view.background, subtraction)
         points = torch.from_numpy(unproject_depth(image / np.float32(1000), mask, view.camera))
-        parts.append((view.T_world_cam.to(torch.float64) @ points).numpy())
+        pose = view.T_world_cam.to(torch.float64)
+        parts.append((points @ pose.R.T + pose.t).numpy())
     merged = np.concatenate(parts)
     return merged[largest_cluster(merged)]
 
