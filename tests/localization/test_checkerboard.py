@@ -211,7 +211,7 @@ def test_a_camera_file_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{}", "no 'model'|no 'cx'"),
+        ("{}", "no intrinsics .lacks 'cx'"),
         ("[1]", "no intrinsics"),
         ("{", "not readable JSON"),
         ('{"camera": {"model": "opencv"}}', "intrinsics"),

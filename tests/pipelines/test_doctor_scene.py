@@ -15,6 +15,8 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.photos import write_photos
 from wearcap.io.ply import Ply, write_ply
+from wearcap.localization.landmarks import Landmarks
+from wearcap.localization.visual_map import VisualMap
 from wearcap.pipelines.doctor import Finding, examine
 from wearcap.pipelines.doctor.localized import check_contact_prob
 from wearcap.recording import CameraStream, Localization, Recording, RecordingStore
@@ -245,5 +247,45 @@ def test_missing_files_are_named(sound, tmp_path):
     RecordingStore(tmp_path).add(gone, split="test", config_hash="x")
     assert {f.what for f in found(examine(tmp_path), "error")} == {
         "the scan is missing",
-        "the video cannot be read",
+        "no such video",
     }
+
+
+# Maps --------------------------------------------------------------------------------------------------------------
+
+
+def small_map(pictures: int, each: int) -> VisualMap:
+    random = np.random.default_rng(0)
+    count = pictures * each
+    positions = random.uniform(-3, 3, (count, 3)).astype(np.float32)
+    descriptors = random.integers(-9, 9, (count, 128), dtype=np.int8)
+    landmarks = Landmarks(positions, descriptors)
+    return VisualMap(
+        "sift", "vlad", tuple(f"{k}.jpg" for k in range(pictures)), (CAMERA,) * pictures, np.tile(np.eye(3), (pictures, 1, 1)),
+        np.zeros((pictures, 3)), np.zeros((count, 2), np.float32), descriptors, positions,
+        np.arange(pictures + 1, dtype=np.int64) * each, np.arange(count, dtype=np.int32), landmarks,
+        np.zeros((pictures, 8), np.float32), np.zeros((2, 128), np.float32), 0.02,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("pictures", "each", "severity", "message"),
+    [
+        (3, 100, "ok", "holds landmarks"),
+        (3, 10, "warning", "hardly a keypoint"),
+        (0, 0, "error", "the map is empty"),
+        (3, 0, "error", "the map is empty"),
+    ],
+)
+def test_maps(pictures, each, severity, message, tmp_path):
+    small_map(pictures, each).save(tmp_path / "map.safetensors")
+    assert [
+        message in f.what for f in found(examine(tmp_path / "map.safetensors"), severity) if f.check == "map"
+    ] == [True]
+
+
+def test_a_damaged_map_is_one_error(tmp_path):
+    small_map(3, 100).save(tmp_path / "map.safetensors")
+    content = (tmp_path / "map.safetensors").read_bytes()
+    (tmp_path / "map.safetensors").write_bytes(content[: len(content) // 2])
+    assert len(found(examine(tmp_path / "map.safetensors"), "error")) == 1

@@ -28,8 +28,8 @@ def camera_from_row(row: Any, where: str | Path) -> Camera:
         return Camera(str(row["model"]), int(row["width"]), int(row["height"]), *(float(row[key]) for key in _NUMBERS),
                       tuple(map(float, row["distortion"])))  # fmt: skip
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        what = f"no {error} in the intrinsics" if isinstance(error, KeyError) else f"no intrinsics ({error})"
-        raise WearcapError(what, where=where, expected=EXAMPLE) from error
+        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise WearcapError(f"no intrinsics ({what})", where=where, expected=EXAMPLE) from error
     except WearcapError as error:
         raise WearcapError(error.what, where=where, expected=error.expected) from error
 

@@ -26,7 +26,6 @@ from wearcap.recording import Localization, Motion
 
 FPS = 30.0
 """Of the motion, the suit's exports and, resampled from 29.97, the localised video."""
-VIDEO_FPS = 30000 / 1001
 IMAGE_SIZE = (1920, 1080)
 """Width and height of the head cameras' videos."""
 PELVIS_SMPL = (-0.0018, -0.2233, 0.0282)

@@ -11,7 +11,6 @@ from dataclasses import replace
 from glob import escape
 from pathlib import Path
 
-import av
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -20,7 +19,6 @@ from wearcap.errors import WearcapError
 from wearcap.io.hps import (
     FPS,
     IMAGE_SIZE,
-    VIDEO_FPS,
     nominal_mount,
     read_hps_cameras,
     read_hps_localization,
@@ -31,6 +29,7 @@ from wearcap.io.hps import (
 from wearcap.io.hps_scene import CLOUD
 from wearcap.io.hps_unity import read_unity_motion
 from wearcap.io.mvnx import read_mvnx
+from wearcap.io.video import video_info
 from wearcap.recording import CameraStream, Localization, Motion, Recording
 
 _SUBJECT = re.compile(r"SUB\d+")
@@ -174,17 +173,11 @@ def _camera(root: Path, name: str, clap_s: float, localization: Localization | N
 
 def _video_times(path: Path) -> Float64[Tensor, "time"]:
     """Times of a video's frames (s from its first), at its own rate; its pictures must have the calibration's size."""
-    try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            size, rate = (stream.width, stream.height), float(stream.average_rate or VIDEO_FPS)
-            count = stream.frames or round(float(container.duration or 0) * 1e-6 * rate)
-    except (av.FFmpegError, IndexError) as error:
-        raise WearcapError(f"not a readable video ({error})", where=path, expected="an MP4 file") from error
-    if size != IMAGE_SIZE or not count:
-        raise WearcapError(f"a video of {count} frames of {size[0]}x{size[1]} pixels", where=path,
+    video = video_info(path)
+    if (video.width, video.height) != IMAGE_SIZE or not video.frames:
+        raise WearcapError(f"a video of {video.frames} frames of {video.width}x{video.height} pixels", where=path,
                            expected=f"{IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, as its camera was calibrated")  # fmt: skip
-    return torch.arange(count, dtype=torch.float64) / rate
+    return torch.arange(video.frames, dtype=torch.float64) / video.fps
 
 
 def _warn_if_apart(motion: Motion, localization: Localization, path: Path) -> None:

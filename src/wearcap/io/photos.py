@@ -9,8 +9,8 @@ import torch
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
+from wearcap.io.camera_json import camera_from_row, camera_row
 from wearcap.io.text import read_text
 from wearcap.recording.photo import Photo
 
@@ -51,31 +51,21 @@ def write_photos(photos: list[Photo], folder: str | Path) -> None:
                 raise WearcapError("this photo lies outside its scene", where=file, expected=f"in {folder}")
             file = file.relative_to(folder)
         rows.append(
-            {"file": file.as_posix(), "camera": _camera_row(photo.camera),
+            {"file": file.as_posix(), "camera": camera_row(photo.camera),
              "R_world_cam": photo.T_world_cam.R.double().tolist(),
              "t_world_cam": photo.T_world_cam.t.double().tolist()}
         )  # fmt: skip
     write_text(folder / FILE_NAME, json.dumps({"photos": rows}, indent=1) + "\n")
 
 
-def _camera_row(camera: Camera) -> dict[str, Any]:
-    names = ("model", "width", "height", "fx", "fy", "cx", "cy")
-    return {name: getattr(camera, name) for name in names} | {"distortion": list(camera.distortion)}
-
-
 def _photo(row: Any, folder: Path, where: str) -> Photo:
     try:
         file, camera = Path(row["file"]), row["camera"]
         R, t = (np.array(row[key], np.float64) for key in ("R_world_cam", "t_world_cam"))
-        lens = Camera(
-            str(camera["model"]), int(camera["width"]), int(camera["height"]),
-            *(float(camera[key]) for key in ("fx", "fy", "cx", "cy")), tuple(map(float, camera["distortion"])),
-        )  # fmt: skip
     except (ValueError, KeyError, TypeError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise WearcapError(f"unreadable ({what})", where=where, expected=_EXAMPLE) from error
-    except WearcapError as error:
-        raise WearcapError(error.what, where=where, expected=error.expected) from error
+    lens = camera_from_row(camera, where)
     if file.is_absolute() or ".." in file.parts:
         raise WearcapError(f"file {str(file)!r} lies outside the scene's folder", where=where)
     if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):

@@ -3,12 +3,11 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-import av
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from wearcap.errors import WearcapError
+from wearcap.io.video import read_frames, read_image, video_info
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 
@@ -27,28 +26,12 @@ def read_pictures(
             raise WearcapError("no pictures in this folder", where=source, expected=", ".join(SUFFIXES))
         wanted = np.unique(np.linspace(0, len(files) - 1, max_count).round().astype(int))
         for path in (files[k] for k in wanted):
-            picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-            if picture is None:
-                raise WearcapError("not a readable picture", where=path, expected="a whole image file")
-            yield path.name, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+            yield path.name, read_image(path)
     elif source.is_file():
-        yield from _video_frames(source, max_count)
+        step = max(1, -(-video_info(source).frames // max_count))
+        for count, (_, picture) in enumerate(read_frames(source, step=step)):
+            yield f"frame {count * step}", picture
     else:
         raise WearcapError(
             "no such file or folder", where=source, expected="a video, or a folder of pictures"
         )
-
-
-def _video_frames(path: Path, max_count: int) -> Iterator[tuple[str, np.ndarray]]:
-    try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            step = max(1, -(-(stream.frames or max_count) // max_count))
-            for number, frame in enumerate(container.decode(stream)):
-                if number % step == 0:
-                    yield f"frame {number}", frame.to_ndarray(format="rgb24")
-    except (av.FFmpegError, IndexError) as error:
-        raise WearcapError(
-            f"not a readable video ({error})", where=path, expected="a whole video file"
-        ) from error

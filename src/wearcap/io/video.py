@@ -1,6 +1,7 @@
 """Pictures as RGB arrays: single image files, and the frames of a video with their times."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import av
@@ -26,9 +27,9 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def read_frames(
-    path: str | Path, start: int = 0, stop: int | None = None
+    path: str | Path, start: int = 0, stop: int | None = None, step: int = 1
 ) -> Iterator[tuple[float, UInt8[np.ndarray, "height width 3"]]]:
-    """Frames number `start` to `stop` of a video: time (s) from its first frame, and picture.
+    """Every `step`-th of the frames `start` to `stop` of a video: time (s) from its first frame, and picture.
 
     Times are those written in the file; where it has none, frames follow its average rate.
     Raises WearcapError when the file is missing, damaged or without pictures.
@@ -47,7 +48,7 @@ def read_frames(
                 begin = time if begin is None else begin
                 if stop is not None and number >= stop:
                     return
-                if number >= start:
+                if number >= start and (number - start) % step == 0:
                     yield time - begin, frame.to_ndarray(format="rgb24")
             if number < 0:
                 raise WearcapError("a video without frames", where=path)
@@ -56,6 +57,33 @@ def read_frames(
     except (av.FFmpegError, OSError) as error:
         raise WearcapError(f"not a readable video ({error})", where=path, expected="a complete MP4, MKV or AVI file",
                            fix="Play it in a video player, or copy it again.") from error  # fmt: skip
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video's header says."""
+
+    width: int
+    height: int
+    fps: float
+    frames: int
+    """0 where neither the number of frames nor the duration is stated."""
+
+
+def video_info(path: str | Path) -> VideoInfo:
+    """Size, average rate and length of a video. Raises WearcapError as `read_frames` does."""
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise WearcapError("a file without pictures", where=path, expected="a video")
+            stream = container.streams.video[0]
+            fps = float(stream.average_rate or 30)
+            frames = stream.frames or round((container.duration or 0) / av.time_base * fps)
+            return VideoInfo(stream.width, stream.height, fps, frames)
+    except FileNotFoundError as error:
+        raise WearcapError("no such video", where=path) from error
+    except (av.FFmpegError, OSError) as error:
+        raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error
 
 
 def frame_count(path: str | Path) -> int:

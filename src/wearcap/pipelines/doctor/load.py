@@ -26,7 +26,7 @@ from wearcap.io.ply import read_ply
 from wearcap.io.tum import read_tum
 from wearcap.pipelines.doctor.localized import check_files
 from wearcap.pipelines.doctor.report import Finding
-from wearcap.pipelines.doctor.scene import is_scene, read_scene
+from wearcap.pipelines.doctor.scene import is_map, is_scene, read_map, read_scene
 from wearcap.pipelines.doctor.timing import check_clock
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
@@ -80,6 +80,8 @@ def _kind(path: Path) -> str | None:
 def _read_file(path: Path) -> Loaded:
     content = _READERS[_kind(path) or ""](path)
     name = path.name
+    if isinstance(content, tuple):
+        return content
     if isinstance(content, Recording):
         return content, []
     if isinstance(content, Motion):
@@ -145,8 +147,9 @@ def _mps_summary(folder: Path) -> list[Finding]:
     ]
 
 
-def _read_recording(path: Path) -> Recording:
-    return RecordingFile(path).load()
+def _read_recording(path: Path) -> Recording | Loaded:
+    """A recording, or a visual map."""
+    return read_map(path) if is_map(path) else RecordingFile(path).load()
 
 
 def _read_amc(path: Path) -> Motion:

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-import av
 import torch
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory, angular_velocity, outlier_mask, smooth
+from wearcap.io.video import video_info
 from wearcap.pipelines.doctor.inertial import offset_finding
 from wearcap.pipelines.doctor.poses import check_rotations
-from wearcap.pipelines.doctor.report import Finding
+from wearcap.pipelines.doctor.report import Finding, refusal
 from wearcap.pipelines.doctor.signals import lag_between
 from wearcap.recording import Localization, Motion, Recording
 from wearcap.sensors.claps import detect_claps
@@ -131,15 +131,13 @@ def check_files(recording: Recording, root: Path) -> list[Finding]:
 def _video(path: Path, frames: int, size: tuple[int, int]) -> list[Finding]:
     check = "camera: video"
     try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            found, count = (stream.width, stream.height), stream.frames
-    except (av.FFmpegError, IndexError) as error:
-        return [Finding("error", check, "the video cannot be read", f"{path}: {error}", "Put it there, or copy it again.")]  # fmt: skip
-    if found != size:
+        video = video_info(path)
+    except WearcapError as error:
+        return [refusal(error, check)]
+    if (video.width, video.height) != size:
         return [Finding("error", check, "image size and calibration differ",
-                        f"{found[0]}x{found[1]} pixels, calibrated at {size[0]}x{size[1]}",
+                        f"{video.width}x{video.height} pixels, calibrated at {size[0]}x{size[1]}",
                         "Calibrate at the video's size (wearcap calibrate), or scale the intrinsics (Camera.scaled).")]  # fmt: skip
-    if count and abs(count - frames) > 1:
-        return [Finding("error", check, "frames and timestamps differ in number", f"{count} and {frames}", "Pair them again.")]  # fmt: skip
-    return [Finding("ok", check, "fits its calibration", f"{count} frames of {size[0]}x{size[1]}")]
+    if video.frames and abs(video.frames - frames) > 1:
+        return [Finding("error", check, "frames and timestamps differ in number", f"{video.frames} and {frames}", "Pair them again.")]  # fmt: skip
+    return [Finding("ok", check, "fits its calibration", f"{video.frames} frames of {size[0]}x{size[1]}")]

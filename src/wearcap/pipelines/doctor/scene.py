@@ -1,8 +1,9 @@
-"""A scene's folder: its scan (unit, colour, density, up axis) and the photos that a map is built from."""
+"""A scene's folder: its scan (unit, colour, density, up axis), the photos that a map is built from, and the map."""
 
 from pathlib import Path
 
 import numpy as np
+import safetensors
 import torch
 from jaxtyping import Float32
 from PIL import Image
@@ -11,6 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.io.hps_scene import CLOUD, is_hps_scene, read_hps_scene
 from wearcap.io.photos import FILE_NAME, read_photos
 from wearcap.io.scan import read_scan
+from wearcap.localization.visual_map import VisualMap
 from wearcap.pipelines.doctor.report import Finding, refusal
 from wearcap.recording import PointCloud, Recording
 from wearcap.recording.photo import Photo
@@ -19,6 +21,7 @@ from wearcap.scene.scan import Scan
 SPARSE_M = 0.03
 """Spacing beyond which pictures drawn from a scan have holes at arm's length."""
 _CELL_M = 0.1
+_FEW_KEYPOINTS = 30
 _LOOKED_AT = 40
 """Photos whose files are opened, of many."""
 _MARGIN_M = 1.0
@@ -59,6 +62,35 @@ def read_scene(folder: Path) -> tuple[Recording, list[Finding]]:
         findings.append(refusal(error, "photos") if listed else NO_PHOTOS)
     shown = torch.zeros(0, 3) if scan is None else torch.from_numpy(_thinned(scan.points))
     return Recording(folder.resolve().name, points=PointCloud(shown) if len(shown) else None), findings
+
+
+def is_map(path: Path) -> bool:
+    """Whether a .safetensors file says that it is a visual map."""
+    try:
+        with safetensors.safe_open(str(path), framework="numpy") as file:
+            return "wearcap_map" in (file.metadata() or {})
+    except (safetensors.SafetensorError, OSError, RuntimeError):
+        return False
+
+
+def read_map(path: Path) -> tuple[Recording, list[Finding]]:
+    """A visual map, as its landmarks, and whether anything can be localised in it."""
+    visual_map = VisualMap.load(path)
+    points, pictures = visual_map.landmarks.points_world, len(visual_map)
+    if not len(points) or not pictures:
+        return Recording(path.name), [
+            Finding("error", "map", "the map is empty", f"{pictures} pictures, {len(points)} landmarks",
+                    "Build it from photos that show the scene: wearcap scene.")]  # fmt: skip
+    seen = np.diff(visual_map.first)
+    evidence = f"{pictures} pictures, {len(points)} landmarks, {np.median(seen):.0f} keypoints in half of the pictures or more"
+    bare = float((seen < _FEW_KEYPOINTS).mean())
+    found = Finding("ok", "map", "holds landmarks", evidence)
+    if bare > 0.3:
+        found = Finding("warning", "map", "pictures with hardly a keypoint", f"{100 * bare:.0f} % of them; {evidence}",
+                        "Pictures of bare walls help nobody: take others, or larger ones.")  # fmt: skip
+    return Recording(path.name, points=PointCloud(torch.from_numpy(_thinned(points.astype(np.float32))))), [
+        found
+    ]
 
 
 def check_scan(scan: Scan) -> list[Finding]:
