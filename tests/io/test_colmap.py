@@ -94,6 +94,17 @@ def test_a_model_reads_alike_in_both_encodings(tmp_path, kind):
     assert ahead.tolist() == tracks.pixels[0].tolist()
 
 
+def test_tracks_of_some_photos(tmp_path):
+    write_text_model(tmp_path)
+    tracks = read_colmap(tmp_path).tracks
+    swapped = tracks.of_photos(np.array([1, 0]))
+    assert swapped.photo.tolist() == [1, 1, 0]
+    assert swapped.pixels.tolist() == tracks.pixels.tolist()
+    alone = tracks.of_photos(np.array([1]))
+    assert (alone.photo.tolist(), alone.pixels.tolist()) == ([0], [[10, 20]])
+    assert not len(tracks.of_photos(np.zeros(0, np.int64)).photo)
+
+
 @pytest.mark.parametrize(
     ("number", "model", "lens"),
     [

@@ -44,6 +44,13 @@ class Tracks:
     point: Int64[np.ndarray, "observation"]
     pixels: Float32[np.ndarray, "observation 2"]
 
+    def of_photos(self, chosen: Int64[np.ndarray, "chosen"]) -> "Tracks":
+        """The observations of some photos, which are numbered anew in the order given."""
+        order = np.argsort(chosen)
+        place = np.minimum(np.searchsorted(chosen[order], self.photo), max(len(chosen) - 1, 0))
+        keep = np.isin(self.photo, chosen)
+        return Tracks(self.points_world, self.colors, order[place[keep]], self.point[keep], self.pixels[keep])
+
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:

@@ -84,14 +84,3 @@ def video_info(path: str | Path) -> VideoInfo:
         raise WearcapError("no such video", where=path) from error
     except (av.FFmpegError, OSError) as error:
         raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error
-
-
-def frame_count(path: str | Path) -> int:
-    """Number of frames that the file states; 0 where it does not say. Raises WearcapError as `read_frames` does."""
-    try:
-        with av.open(str(path)) as container:
-            return container.streams.video[0].frames if container.streams.video else 0
-    except FileNotFoundError as error:
-        raise WearcapError("no such video", where=path) from error
-    except (av.FFmpegError, OSError) as error:
-        raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error

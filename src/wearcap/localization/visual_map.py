@@ -9,7 +9,7 @@ import numpy as np
 import safetensors
 import torch
 from jaxtyping import Float32, Float64, Int8, Int32, Int64
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
@@ -82,7 +82,7 @@ class VisualMap:
         tensors = {name: np.ascontiguousarray(getattr(self, name)) for name in _ARRAYS}
         tensors |= {f"landmarks.{f.name}": getattr(self.landmarks, f.name) for f in dataclasses.fields(Landmarks)}  # fmt: skip
         with atomic_path(path) as temporary:
-            save_file(tensors, temporary, {"wearcap_map": json.dumps(header, sort_keys=True)})
+            temporary.write_bytes(save(tensors, {"wearcap_map": json.dumps(header, sort_keys=True)}))
 
     @classmethod
     def load(cls, path: str | Path) -> "VisualMap":

@@ -1,0 +1,96 @@
+"""`wearcap scene`: a scanned or photographed scene goes in; the map that cameras are localised in comes out."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from rich import print as show
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from wearcap.cli.conf import hydra_main
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.io.colmap import Tracks
+from wearcap.io.scene_folder import read_scene
+from wearcap.io.video import read_image
+from wearcap.localization.localizer import Localizer
+from wearcap.localization.map_builder import build_map, extended
+from wearcap.localization.visual_map import VisualMap
+from wearcap.recording.photo import Photo
+from wearcap.scene.scan import Scan
+
+HELP = "the visual map of a scene: wearcap scene scene=FOLDER output=map.safetensors"
+
+
+def run(config: DictConfig) -> VisualMap:
+    """Build or extend the map that the config describes, report on it, and save it."""
+    if config.every < 1 or config.check < 0:
+        raise WearcapError(f"every={config.every} check={config.check}", expected="every=1 (all photos) or more, check=0 or more")  # fmt: skip
+    photos, source = read_scene(config.scene, config.images, config.metres_per_unit)
+    extractor, matcher, descriptor = (
+        instantiate(config.localization[part]) for part in ("extractor", "matcher", "descriptor")
+    )
+    options = {"descriptor": descriptor, "settings": instantiate(config.settings), "progress": True}
+    taken = np.arange(0, len(photos), config.every)
+    held = (
+        taken[:: len(taken) // config.check][: config.check]
+        if 0 < config.check <= len(taken) // 4
+        else taken[:0]
+    )
+    rest = np.setdiff1d(taken, held)
+    if config.extend is None:
+        made = build_map(*_part(photos, source, rest), extractor, **options)
+    else:
+        made = extended(VisualMap.load(config.extend), *_part(photos, source, rest), extractor, **options)
+    if len(held):
+        localizer = Localizer(made, extractor, matcher, instantiate(config.localizer), descriptor=descriptor)
+        _check(localizer, [photos[number] for number in held])
+        made = extended(made, *_part(photos, source, held), extractor, **options)
+    _tell(made)
+    made.save(config.output)
+    show(f"map: {config.output}")
+    return made
+
+
+def _part(photos: list[Photo], source: Scan | Tracks, chosen: np.ndarray) -> tuple[list[Photo], Scan | Tracks]:  # fmt: skip
+    part = source.of_photos(chosen) if isinstance(source, Tracks) else source
+    return [photos[number] for number in chosen], part
+
+
+def _tell(made: VisualMap) -> None:
+    counts = np.diff(made.first)
+    low, high = (reduce(made.t_world_cam, 0) for reduce in (np.min, np.max))
+    table = Table(show_header=False)
+    table.add_row("pictures", f"{len(made)}")
+    table.add_row("keypoints with a 3D position", f"{len(made.keypoints)} ({np.median(counts):.0f} in the median picture)")  # fmt: skip
+    table.add_row("landmarks", f"{len(made.landmarks.points_world)}")
+    table.add_row("features", f"{made.extractor}, {made.descriptor}")
+    table.add_row("cameras from", " ".join(f"{value:.2f}" for value in low))
+    table.add_row("to", " ".join(f"{value:.2f}" for value in high))
+    show(table)
+    poor = np.flatnonzero(counts < 50)
+    if len(poor):
+        names = ", ".join(made.names[number] for number in poor[:5])
+        show(f"[yellow]{len(poor)} pictures have fewer than 50 keypoints on the scene: {names}[/yellow]")
+
+
+def _check(localizer: Localizer, photos: Sequence[Photo]) -> None:
+    """Localise photos that are not in the map yet."""
+    errors = []
+    for photo in track(photos, "check", console=Console(stderr=True)):
+        pose = localizer(read_image(photo.file), photo.camera)
+        if pose is not None:
+            turn = rotation.log(pose.R_world_cam.double().T @ photo.T_world_cam.R.double()).norm().rad2deg()
+            errors.append(((pose.t_world_cam - photo.T_world_cam.t).norm().item(), turn.item()))
+    show(f"{len(errors)} of {len(photos)} photos are found in the map of the others", end="")
+    if errors:
+        shift, turn = np.median(errors, axis=0)
+        show(f"; median error {shift:.3f} (m, or the model's own unit), {turn:.2f}°", end="")
+    show("")
+
+
+def main(arguments: list[str]) -> None:
+    hydra_main("scene", run, arguments)

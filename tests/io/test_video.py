@@ -1,0 +1,63 @@
+"""Videos and pictures that were written on the spot."""
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from wearcap.errors import WearcapError
+from wearcap.io.video import read_frames, read_image
+
+
+def write_video(path, count: int = 12, rate: int = 25) -> None:
+    """Frame k is gray 20 k."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=rate)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for k in range(count):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 20 * k, np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def test_frames_come_with_their_times(tmp_path):
+    write_video(tmp_path / "a.mp4")
+    times, pictures = zip(*read_frames(tmp_path / "a.mp4"))
+    np.testing.assert_allclose(times, np.arange(12) / 25, atol=1e-6)
+    assert {picture.shape for picture in pictures} == {(48, 64, 3)}
+    np.testing.assert_allclose([picture.mean() for picture in pictures], 20 * np.arange(12), atol=4)
+    part = list(read_frames(tmp_path / "a.mp4", 3, 6))
+    np.testing.assert_allclose([time for time, _ in part], [0.12, 0.16, 0.2], atol=1e-6)
+    np.testing.assert_allclose([picture.mean() for _, picture in part], [60, 80, 100], atol=4)
+
+
+def test_what_is_no_video(tmp_path):
+    with pytest.raises(WearcapError, match="no such video"):
+        list(read_frames(tmp_path / "a.mp4"))
+    (tmp_path / "a.mp4").write_bytes(b"no video at all, but some bytes")
+    with pytest.raises(WearcapError, match="not a readable video"):
+        list(read_frames(tmp_path / "a.mp4"))
+    write_video(tmp_path / "b.mp4")
+    (tmp_path / "a.mp4").write_bytes((tmp_path / "b.mp4").read_bytes()[:400])
+    with pytest.raises(WearcapError, match="video"):
+        list(read_frames(tmp_path / "a.mp4"))
+    with av.open(str(tmp_path / "sound.wav"), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        sound.rate = 8000
+        container.mux(stream.encode(sound))
+    with pytest.raises(WearcapError, match="without pictures"):
+        list(read_frames(tmp_path / "sound.wav"))
+
+
+def test_pictures_are_not_turned_by_what_their_exif_says(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (10, 20, 3)).astype(np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(pixels).save(tmp_path / "a.png", exif=exif)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), pixels)
+    with pytest.raises(WearcapError, match="no such picture"):
+        read_image(tmp_path / "b.png")
+    (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:60])
+    with pytest.raises(WearcapError, match="not a readable picture"):
+        read_image(tmp_path / "b.png")

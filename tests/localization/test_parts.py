@@ -1,0 +1,303 @@
+"""The parts of localisation, one by one, against what is known."""
+
+import numpy as np
+import pytest
+import torch
+from textured_room import CAMERA, SIZE, looking, textured_room
+
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
+from wearcap.localization.absolute_pose import Fit, lens_of, pose_covariance, ransac_pose, refined_pose
+from wearcap.localization.features import Features, RootSift, root
+from wearcap.localization.landmarks import from_bytes, merge, to_bytes
+from wearcap.localization.localizer import confidence
+from wearcap.localization.matching import match_landmarks, match_nearby
+from wearcap.localization.point_map import PointMapper, undistortion
+from wearcap.localization.retrieval import Vlad, most_similar, train_vocabulary
+from wearcap.scene.scan import Scan
+
+FISHEYE = Camera("fisheye", 300, 300, 95.0, 95.0, 150.0, 149.0, (0.01, -0.004, 0.001, 0.0))
+
+
+def unit_rows(count: int, width: int, seed: int = 0) -> np.ndarray:
+    rows = np.random.default_rng(seed).normal(size=(count, width)).astype(np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+# Features
+
+
+def blobs(centers: list[tuple[float, float]]) -> np.ndarray:
+    y, x = np.mgrid[:240, :320]
+    gray = sum(200 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 32) for cx, cy in centers)
+    return np.repeat((20 + gray).astype(np.uint8)[..., None], 3, 2)
+
+
+@pytest.mark.parametrize("max_side", [None, 160])
+def test_keypoints_lie_where_blobs_are(max_side):
+    centers = [(60.3, 80.6), (200.0, 50.0), (150.5, 180.25)]
+    features = RootSift(20, max_side=max_side)(blobs(centers))
+    assert features.size == (320, 240)
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-5)
+    for center in centers:
+        assert np.linalg.norm(features.keypoints - center, axis=1).min() < 0.12
+
+
+def test_no_more_keypoints_than_asked_for_and_the_strongest_of_them():
+    image = np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8)
+    many, few = RootSift(1000)(image), RootSift(30)(image)
+    assert len(few) == 30
+    assert few.scores.min() >= np.sort(many.scores)[-31] - 1e-6
+    assert len(RootSift()(np.full((100, 100, 3), 99, np.uint8))) == 0
+    with pytest.raises(WearcapError, match="SIFT with 0 keypoints"):
+        RootSift(0)
+
+
+def test_root_turns_euclidean_into_hellinger():
+    a, b = np.random.default_rng(0).random((2, 5, 128)).astype(np.float32)
+    p, q = a / a.sum(1, keepdims=True), b / b.sum(1, keepdims=True)
+    np.testing.assert_allclose((root(a) * root(b)).sum(1), np.sqrt(p * q).sum(1), rtol=1e-5)
+
+
+# Point maps
+
+
+def test_keypoints_are_lifted_onto_the_walls_and_not_at_edges():
+    wall = np.stack(np.meshgrid(np.arange(-2, 2, 0.01), np.arange(-1.5, 1.5, 0.01)), -1).reshape(-1, 2)
+    slanted = np.concatenate([wall, 3 + 0.7 * wall[:, :1]], 1)
+    pole = np.stack(np.meshgrid(np.arange(-0.1, 0.1, 0.01), np.arange(-1.5, 1.5, 0.01)), -1).reshape(-1, 2)
+    pole = np.concatenate([pole, np.full((len(pole), 1), 1.8)], 1)
+    scan = Scan(np.concatenate([slanted, pole]).astype(np.float32))
+    camera = Camera("opencv", 200, 160, 150.0, 150.0, 99.5, 79.5, (-0.05, 0.01, 0.001, 0.001))
+    point_map = PointMapper(scan, 0.009)(camera, Rigid.identity())
+    random = np.random.default_rng(0)
+    keypoints = random.uniform([60, 30], [140, 130], (400, 2)).astype(np.float32)
+    positions, valid = point_map.lift(scan.points, keypoints)
+    on_wall = np.abs(positions[:, 2] - 3 - 0.7 * positions[:, 0])
+    on_pole = np.abs(positions[:, 2] - 1.8)
+    assert np.minimum(on_wall, on_pole)[valid].max() < 0.002
+    pixels, _ = camera.project(torch.from_numpy(positions).double())
+    np.testing.assert_allclose(pixels.numpy()[valid], keypoints[valid], atol=1e-3)
+    edges = camera.project(torch.tensor([[-0.1, 0.0, 1.8], [0.1, 0.0, 1.8]], dtype=torch.float64))[0][:, 0]
+    at_edge = np.abs(keypoints[:, :1] - edges.numpy()).min(1) < 1
+    assert at_edge.sum() > 5
+    assert not valid[at_edge].any()
+    assert valid[np.abs(keypoints[:, :1] - edges.numpy()).min(1) > 5].mean() > 0.95
+    outside = np.array([[-5, 20], [400, 20], [np.float32(0.2), 0.4]], np.float32)
+    assert not point_map.lift(scan.points, outside)[1].any()
+
+
+def test_a_fisheye_and_its_point_map_are_undistorted_alike():
+    scan = textured_room(0.02)
+    mapper = PointMapper(scan, 0.016)
+    pose = looking((2.0, 2.2, 1.3), 0.8, 0.1, 0.05)
+    remap = undistortion(FISHEYE, 90.0)
+    flat = remap.point_map(mapper(FISHEYE, pose))
+    assert (flat.camera.model, flat.camera.fx) == ("pinhole", pytest.approx(150.0))
+    direct = mapper(flat.camera, pose)
+    seen = (flat.index >= 0) & (direct.index >= 0)
+    assert seen.mean() > 0.95
+    apart = np.linalg.norm(scan.points[flat.index[seen]] - scan.points[direct.index[seen]], axis=1)
+    assert np.median(apart) < 0.025
+    assert np.median(np.abs(flat.depth - direct.depth)[seen]) < 0.015
+    picture, other = remap.image(mapper.color_picture(mapper(FISHEYE, pose))), mapper.color_picture(direct)
+    assert np.abs(picture.astype(int) - other)[seen].mean() < 35  # shifted pictures differ by 60 and more
+    keypoints = np.random.default_rng(0).uniform(40, 260, (200, 2)).astype(np.float32)
+    positions, valid = flat.lift(scan.points, keypoints)
+    off = np.minimum(np.abs(positions), np.abs(positions - SIZE)).min(1)
+    assert valid.mean() > 0.7
+    assert np.median(off[valid]) < 0.003
+    with pytest.raises(WearcapError, match="perspective view of 179"):
+        undistortion(FISHEYE, 179.0)
+
+
+def test_a_narrow_fisheye_does_not_reach_a_wide_view():
+    narrow = Camera("fisheye", 300, 300, 190.0, 190.0, 150.0, 149.0, (0.0,) * 4)
+    remap = undistortion(narrow, 120.0)
+    assert 0.2 < remap.valid.mean() < 0.9
+    assert not remap.image(np.full((300, 300, 3), 200, np.uint8))[~remap.valid].any()
+
+
+# Retrieval
+
+
+def test_vlad_is_the_sum_of_residuals():
+    vocabulary = np.eye(3, 8, dtype=np.float32)
+    descriptors = unit_rows(40, 8)
+    nearest = np.argmin(((descriptors[:, None] - vocabulary) ** 2).sum(-1), 1)
+    expected = np.zeros((3, 8))
+    for word, row in zip(nearest, descriptors):
+        expected[word] += row - vocabulary[word]
+    found = Vlad(vocabulary, intra=False).aggregate(descriptors)
+    np.testing.assert_allclose(found, (expected / np.linalg.norm(expected)).ravel(), atol=1e-6)
+    intra = Vlad(vocabulary).aggregate(descriptors).reshape(3, 8)
+    np.testing.assert_allclose(np.linalg.norm(intra, axis=1), 3**-0.5, atol=1e-6)
+    rooted = Vlad(vocabulary, intra=False, signed_root=True).aggregate(descriptors)
+    np.testing.assert_allclose(rooted**2 * np.sign(rooted), found / np.abs(found).sum(), atol=1e-6)
+    assert not Vlad(vocabulary).aggregate(np.zeros((0, 8), np.float32)).any()
+    flags = [(intra, signed) for intra in (False, True) for signed in (False, True)]
+    assert len({Vlad(vocabulary, *two).name for two in flags}) == 4
+
+
+def test_the_vocabulary_finds_planted_clusters():
+    centers = 5 * unit_rows(6, 8)
+    samples = np.repeat(centers, 50, 0) + 0.05 * unit_rows(300, 8, 1)
+    found = train_vocabulary(samples, 6)
+    distance = np.linalg.norm(found[:, None] - centers, axis=-1)
+    assert sorted(distance.argmin(1)) == list(range(6))
+    assert distance.min(1).max() < 0.05
+    np.testing.assert_array_equal(found, train_vocabulary(samples, 6))
+    with pytest.raises(WearcapError, match="3 descriptors for a vocabulary of 6 words"):
+        train_vocabulary(samples[:3], 6)
+
+
+def test_most_similar_sorts_by_cosine():
+    database = unit_rows(50, 16)
+    query = database[7] + 0.01 * database[3]
+    best = most_similar(query, database, 5)
+    assert best.tolist() == np.argsort(-(database @ query))[:5].tolist()
+    assert best[0] == 7
+    assert len(most_similar(query, database[:3], 40)) == 3
+
+
+# Landmarks and matches
+
+
+def test_descriptors_survive_their_bytes():
+    rows = np.sqrt(np.abs(unit_rows(50, 128)) / np.abs(unit_rows(50, 128)).sum(1, keepdims=True))
+    assert (from_bytes(to_bytes(rows)) * rows).sum(1).min() > 0.999
+
+
+def test_observations_of_one_place_become_one_landmark():
+    looks = unit_rows(3, 32)
+    places = np.array([[0.005, 0.005, 0.005], [1.005, 0.005, 0.005]], np.float32)
+    which = [(0, 0), (0, 0), (0, 1), (1, 0), (0, 1), (1, 2)]
+    positions = np.stack([places[place] for place, _ in which]) + 0.002 * unit_rows(6, 3, 4)
+    descriptors = to_bytes(np.stack([looks[look] for _, look in which]))
+    landmarks, landmark = merge(positions, descriptors, 0.02)
+    assert len(landmarks.points_world) == 4
+    assert landmark[0] == landmark[1] != landmark[2] == landmark[4]
+    np.testing.assert_allclose(landmarks.points_world[landmark[0]], positions[:2].mean(0), atol=1e-6)
+    assert (from_bytes(landmarks.descriptors)[landmark] * from_bytes(descriptors)).sum(1).min() > 0.99
+    exact, by_track = merge(places[[0, 1, 0]], descriptors[:3], 0.0)
+    assert by_track.tolist() == [0, 1, 0]
+    assert len(exact.points_world) == 2
+
+
+def test_matches_are_mutual_and_pass_the_ratio_test():
+    descriptors = unit_rows(3000, 32)
+    positions = np.random.default_rng(1).normal(size=(3000, 3)).astype(np.float32)
+    chosen = np.random.default_rng(2).permutation(3000)[:200]
+    query = descriptors[chosen] + 0.15 * unit_rows(200, 32, 3)
+    query /= np.linalg.norm(query, axis=1, keepdims=True)
+    found = match_landmarks(query, descriptors, positions, tile=700)
+    assert len(found) > 180
+    np.testing.assert_array_equal(found[:, 1], chosen[found[:, 0]])
+    similarity = query @ descriptors.T
+    order = np.sort(np.sqrt(2 - 2 * np.clip(similarity, -1, 1)), axis=1)
+    assert (order[found[:, 0], 0] < 0.85 * order[found[:, 0], 1]).all()
+    assert not len(match_landmarks(query[:0], descriptors, positions))
+
+
+def test_a_double_at_the_same_place_does_not_spoil_the_ratio_test():
+    base = unit_rows(40, 32)
+    near = base + 0.02 * unit_rows(40, 32, 1)
+    descriptors = np.concatenate([base, near / np.linalg.norm(near, axis=1, keepdims=True)])
+    places = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
+    together = np.concatenate([places, places + np.float32(0.01)])
+    apart = np.concatenate([places, places + np.float32(5.0)])
+    query = base + 0.05 * unit_rows(40, 32, 2)
+    query /= np.linalg.norm(query, axis=1, keepdims=True)
+    assert len(match_landmarks(query, descriptors, together)) == 40
+    assert len(match_landmarks(query, descriptors, apart)) < 10
+
+
+def test_nearby_pairs_are_one_to_one_and_alike():
+    descriptors = unit_rows(20, 32)
+    near = np.array([[0, 0], [0, 1], [1, 1], [2, 5], [3, 1]])
+    found = match_nearby(descriptors, descriptors, near, 0.75)
+    assert found.tolist() == [[0, 0], [1, 1]]
+    assert not len(match_nearby(descriptors, descriptors, near[:0], 0.75))
+
+
+# Absolute pose
+
+
+def planted(camera: Camera, noise_px: float, outliers: float, seed: int, count: int = 300):
+    random = np.random.default_rng(seed)
+    pose = Rigid(
+        rotation.exp(torch.from_numpy(random.normal(size=3))), torch.from_numpy(random.normal(size=3))
+    )
+    pixels = random.uniform([0, 0], [camera.width - 1, camera.height - 1], (count, 2))
+    rays = camera.unproject(torch.from_numpy(pixels))
+    points = (pose @ (rays * torch.from_numpy(random.uniform(2, 8, (count, 1))))).numpy()
+    seen = pixels + noise_px * random.normal(size=pixels.shape)
+    wrong = random.random(count) < outliers
+    seen[wrong] = random.uniform([0, 0], [camera.width, camera.height], (int(wrong.sum()), 2))
+    return pose, seen.astype(np.float32), points.astype(np.float32), wrong
+
+
+def pose_error(fit: Fit, pose: Rigid) -> np.ndarray:
+    """Rotation vector (rad) and shift (m) of the true pose from the found one, in the world."""
+    turn = rotation.log(pose.R @ torch.from_numpy(fit.R_world_cam).T).numpy()
+    return np.concatenate([turn, pose.t.numpy() - fit.t_world_cam])
+
+
+PINHOLE = Camera("pinhole", 960, 540, 600.0, 610.0, 470.0, 260.0)
+LENSES = [
+    PINHOLE,
+    Camera("opencv", 960, 540, 600.0, 610.0, 470.0, 260.0, (-0.2, 0.05, 0.003, -0.002)),
+    Camera("opencv", 960, 540, 600.0, 610.0, 470.0, 260.0, (-0.2, 0.05, 0.003, -0.002, 0.01)),
+]
+
+
+@pytest.mark.parametrize("camera", LENSES, ids=lambda camera: f"{camera.model}{len(camera.distortion)}")
+@pytest.mark.parametrize("outliers", [0.0, 0.7])
+def test_planted_poses(camera, outliers):
+    for seed in range(3):
+        pose, pixels, points, wrong = planted(camera, 0.0, outliers, seed)
+        start = ransac_pose(pixels, points, camera, 4.0)
+        assert start is not None
+        fit = refined_pose(pixels, points, camera, start, 4.0)
+        assert np.abs(pose_error(fit, pose)).max() < 1e-5
+        assert fit.inlier[~wrong].all()
+        assert fit.inlier[wrong].mean() < 0.05 if outliers else True
+
+
+def test_the_covariance_is_that_of_many_draws():
+    errors, covariances = [], []
+    for seed in range(60):
+        pose, pixels, points, _ = planted(LENSES[1], 1.0, 0.0, seed, 60)
+        start = ransac_pose(pixels, points, LENSES[1], 6.0)
+        assert start is not None
+        fit = refined_pose(pixels, points, LENSES[1], start, 20.0)
+        errors.append(pose_error(fit, pose))
+        covariances.append(pose_covariance(pixels, points, LENSES[1], fit))
+    square = [error @ np.linalg.solve(cov, error) for error, cov in zip(errors, covariances)]
+    assert np.mean(square) / 6 == pytest.approx(
+        1.0, abs=0.35
+    )  # 60 draws: standard deviation 0.075, robust loss more
+
+
+def test_few_matches_and_other_lenses():
+    assert ransac_pose(np.zeros((3, 2), np.float32), np.zeros((3, 3), np.float32), PINHOLE, 4.0) is None
+    with pytest.raises(WearcapError, match="camera model 'fisheye'"):
+        lens_of(FISHEYE)
+
+
+def test_confidence_rises_with_spread_matches_only():
+    random = np.random.default_rng(0)
+    spread = random.uniform([0, 0], [CAMERA.width, CAMERA.height], (200, 2)).astype(np.float32)
+    values = [confidence(spread[:count], CAMERA) for count in (0, 6, 12, 30, 200)]
+    assert values == sorted(values)
+    assert values[0] == 0
+    assert values[-1] > 0.99
+    assert confidence(np.tile(spread[:1], (200, 1)), CAMERA) == 0
+
+
+def test_features_are_chosen_by_mask_and_by_number():
+    features = Features(spread := np.arange(8, dtype=np.float32).reshape(4, 2), unit_rows(4, 3), np.ones(4, np.float32), (9, 9))  # fmt: skip
+    assert features.subset(np.array([3, 0])).keypoints.tolist() == spread[[3, 0]].tolist()
+    assert len(features.subset(np.array([True, False, False, True]))) == 2
