@@ -1,5 +1,6 @@
 """Timed poses of one body: resampling, velocities, outliers, gaps, smoothing."""
 
+import math
 from dataclasses import dataclass
 
 import roma
@@ -157,25 +158,30 @@ def outlier_mask(trajectory: Trajectory, max_speed: float) -> Bool[Tensor, "time
         kept = kept[~dropped[piece]]
     valid = torch.zeros_like(finite)
     valid[kept] = True
-    while len(back := _agreeing(position, time, valid, finite & ~valid, max_speed)):
-        valid[back] = True
+    valid[_agreeing(position, time, valid, finite & ~valid, max_speed)] = True
     return valid
 
 
 def _agreeing(position: Tensor, time: Tensor, valid: Tensor, candidate: Tensor, max_speed: float) -> Tensor:
-    """In each stretch between valid frames the first candidate that is near enough to both of them."""
+    """Candidates, from first to last, that are near enough to the next valid frame and to the one before, which may
+    be a candidate that was just taken."""
     kept, frame = valid.nonzero()[:, 0], candidate.nonzero()[:, 0]
     if not len(kept):
         return frame[:0]
     stretch = torch.searchsorted(kept, frame)
-    near = torch.ones_like(frame, dtype=torch.bool)
-    for neighbour, exists in ((stretch - 1, stretch > 0), (stretch, stretch < len(kept))):
-        other = kept[neighbour.clamp(0, len(kept) - 1)]
-        reach = max_speed * (time[frame] - time[other]).abs()
-        near &= ~exists | ((position[frame] - position[other]).norm(dim=-1) <= reach)
+    following = kept[stretch.clamp(max=len(kept) - 1)]
+    way = (position[frame] - position[following]).norm(dim=-1)
+    near = (stretch == len(kept)) | (way <= max_speed * (time[following] - time[frame]))
     frame, stretch = frame[near], stretch[near]
-    first = torch.cat([stretch.new_ones(1, dtype=torch.bool), stretch.diff() > 0])[: len(frame)]
-    return frame[first]
+    before = torch.where(stretch > 0, kept[(stretch - 1).clamp(min=0)], -1).tolist()
+    p, t, taken, last = position.tolist(), time.tolist(), [], -1
+    # One after the other: each answer depends on the one before.
+    for now, last_kept in zip(frame.tolist(), before):
+        last = max(last, last_kept)
+        if last < 0 or math.dist(p[now], p[last]) <= max_speed * (t[now] - t[last]):
+            taken.append(now)
+            last = now
+    return torch.tensor(taken, dtype=torch.int64, device=position.device)
 
 
 def filled(trajectory: Trajectory, valid: Bool[Tensor, "time"]) -> Trajectory:
