@@ -24,6 +24,7 @@ from wearcap.recording import (
     FloorTrack,
     HeadStream,
     ImuStream,
+    Intervals,
     Localization,
     Motion,
     PointCloud,
@@ -58,7 +59,8 @@ def full_recording(name: str = "all") -> Recording:
         points=PointCloud(torch.randn(50, 3), torch.rand(50), torch.rand(50, dtype=torch.float64)),
         cues={"wrist": Cue(times, "left_wrist", torch.randn(FRAMES, 2), torch.rand(FRAMES))}, scene="room.ply",
         motion=motion, contacts=ContactTrack(times, FOOT_PATCHES, torch.rand(FRAMES, 4) > 0.5),
-        object_motion={"door": track}, floor=FloorTrack(times, torch.zeros(FRAMES)), skeleton=skeleton,
+        object_motion={"door": track}, floor=FloorTrack(times, torch.zeros(FRAMES)),
+        intervals=Intervals(times[:2], times[1:3], torch.zeros(2), ("stand", "move")), skeleton=skeleton,
         shape={"height": 1.8}, subject="s1", location="flat", activity="walk", source="test", license="MIT",
         session="pair",
     )  # fmt: skip

@@ -8,6 +8,7 @@ from wearcap.recording.recording import (
     FloorTrack,
     HeadStream,
     ImuStream,
+    Intervals,
     Localization,
     PointCloud,
     Recording,
@@ -15,6 +16,7 @@ from wearcap.recording.recording import (
 from wearcap.recording.store import RecordingStore
 
 __all__ = [
-    "CameraStream", "ContactTrack", "Cue", "FloorTrack", "HeadStream", "ImuStream", "Localization",
+    "CameraStream", "ContactTrack", "Cue", "FloorTrack", "HeadStream", "ImuStream", "Intervals",
+    "Localization",
     "Motion", "PointCloud", "Recording", "RecordingStore",
 ]  # fmt: skip

@@ -47,10 +47,10 @@ def activity(name: str, weight: float, outdoors: float = 1.0) -> Callable[[Act],
 
 def start_place(world: World, rng: np.random.Generator) -> tuple[np.ndarray, float]:
     """A free floor point (m), off the stairs, and a heading (rad) to start from."""
-    return free_point(world, rng), float(rng.uniform(-np.pi, np.pi))
+    return _free_point(world, rng), float(rng.uniform(-np.pi, np.pi))
 
 
-def free_point(world: World, rng: np.random.Generator, beside_z: float | None = None) -> np.ndarray:
+def _free_point(world: World, rng: np.random.Generator, beside_z: float | None = None) -> np.ndarray:
     """A random place to stand freely; in the open, often one that is higher or lower than `beside_z` (m)."""
     points = world.sample_floor(rng, 24)
     free = (world.clearance(points) > FREE_M) & ~on_stairs(world, points)
@@ -123,7 +123,7 @@ def run(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 
 def _way_to_run(plan: Plan, world: World, rng: np.random.Generator, tries: int = 4) -> np.ndarray | None:
     for _ in range(tries):
-        goal = free_point(world, rng)
+        goal = _free_point(world, rng)
         if np.linalg.norm(goal[:2] - plan.position[:2]) < 3.0:
             continue
         path = world.plan_path(plan.position, goal, rng)
@@ -136,9 +136,9 @@ def approach(
     plan: Plan, world: World, rng: np.random.Generator, goal: np.ndarray | None, heading: float | None = None
 ) -> bool:
     """Walk to a floor point (m; a free one when None) and turn to a heading (rad) there; False if no way leads there."""
-    goal = free_point(world, rng, float(plan.position[2])) if goal is None else goal
+    goal = _free_point(world, rng, float(plan.position[2])) if goal is None else goal
     path = world.plan_path(plan.position, goal, rng)
-    if path is None or (heading is None and pathpath_length(path) < 1.2):
+    if path is None or (heading is None and path_length(path) < 1.2):
         return False
     follow(plan, world, rng, path, heading)
     return True
@@ -149,7 +149,7 @@ def follow(
 ) -> None:
     """Walk along a path that `World.plan_path` found and turn to a heading (rad) at its end."""
     start = plan.time
-    if pathpath_length(path) > 0.25:
+    if path_length(path) > 0.25:
         speed = plan.style.speed * float(np.exp(rng.normal(0.0, 0.13)))
         walk_along(plan, path, rng, speed, world.flights)
         look_about(plan, start + 1.0, plan.time, rng, spread=0.22, rest=3.0)
