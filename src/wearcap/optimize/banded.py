@@ -56,6 +56,9 @@ class BandedSettings:
     """Share of each step that is gone after the first two: above 1 the reweighting of norms converges sooner."""
 
 
+DEFAULTS = BandedSettings()
+
+
 @dataclass(frozen=True, eq=False)
 class ActiveBody:
     """The joints that the energy sees, and their arrays for the kernels."""
@@ -106,7 +109,7 @@ def _held(patches: FootPatches, legs: list[list[int]]) -> tuple[np.ndarray, np.n
 def solve_banded(
     energy: HpsEnergy,
     data: HpsData,
-    settings: BandedSettings = BandedSettings(),
+    settings: BandedSettings = DEFAULTS,
     start: HpsState | None = None,
 ) -> Solution:
     """Minimise an energy over all frames of `data` at once.
