@@ -82,8 +82,8 @@ def robust_angle(
 ) -> Float[Tensor, ""]:
     """Centre (rad) of angles on the circle: the sample with the least weighted sum of distances to all others, then
     reweighted means in which an angle `scale_rad` away counts half, and far ones hardly."""
-    # 1000 candidates are enough for a start
-    candidates = angle[:: max(len(angle) // 1000, 1)]
+    # So many candidates are enough for a start
+    candidates = angle[:: max(len(angle) // 300, 1)]
     distance = rotation.wrap_angle(candidates[:, None] - angle).abs()
     centre = candidates[(distance @ weight).argmin()]
     for _ in range(30):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.ndimage
+import scipy.signal
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
@@ -66,6 +66,8 @@ def initialize(
 ) -> Initialization:
     """Turn the aligned suit's root to the camera's heading and place it so that its camera sits at the camera's.
 
+    "orientation" takes R_head_cam's yaw as relative: what remains of it shows on the way and is corrected, so that
+    `estimate_head_camera` with the head of the motion returned gives the better R_head_cam.
     Outliers at 3 m/s are removed to convergence. Raises WearcapError when no frame is localised in the suit's time.
     """
     settings, suit, seen = settings or InitializationSettings(), suit_aligned, inliers(localization)
@@ -203,10 +205,12 @@ def _robust_smooth(
     step = times.diff().median().item() if len(times) > 1 else 1.0
     cell = ((times - times[0]) / step).round().long()
     columns, w = value.numpy(), weight.numpy()
+    reach = int(4 * sigma_s / step) + 1
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1)[:, None] * step / sigma_s) ** 2)
     for _ in range(6):
         grid = np.zeros((int(cell[-1]) + 1, columns.shape[1] + 1))
         np.add.at(grid, cell.numpy(), np.column_stack([w[:, None] * columns, w]))
-        grid = scipy.ndimage.gaussian_filter1d(grid, sigma_s / step, axis=0, mode="constant")[cell.numpy()]
+        grid = scipy.signal.fftconvolve(grid, kernel, mode="same", axes=0)[cell.numpy()]
         smooth = grid[:, :-1] / grid[:, -1:]
         off = np.linalg.norm(columns - smooth, axis=1)
         w = weight.numpy() / (1 + (off / scale) ** 2) ** 2
