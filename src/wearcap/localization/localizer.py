@@ -4,7 +4,8 @@ The second look matches keypoints again, this time only with landmarks that proj
 spread matches, so a more exact pose. It is ours, as are confidence and covariance.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +48,7 @@ class LocalizerSettings:
     """The same where a prior pose is given: so many similar pictures and as many near the prior."""
     max_landmarks: int = 8_000
     """Landmarks that are matched: those that most of the chosen pictures observe."""
+    max_landmarks_with_prior: int = 4_000
     max_ratio: float = 0.85
     """Ratio test on the distances of descriptors."""
     min_cosine: float = 0.75
@@ -59,6 +61,17 @@ class LocalizerSettings:
     """With fewer matches of the first look that agree with the pose there is none."""
     horizontal_fov_deg: float = 100.0
     """Field of view of the perspective camera that a fisheye's pictures are undistorted to."""
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """A picture as the map is asked about it."""
+
+    camera: Camera
+    """Of the picture, or the perspective one that it was undistorted to."""
+    features: Features
+    summary: Float32[np.ndarray, "global"]
+    """Its global descriptor."""
 
 
 class Localizer:
@@ -96,8 +109,14 @@ class Localizer:
         """Pose of the picture's camera, or None where none is found.
 
         `prior`: where the camera may stand; it only chooses database pictures, and where that leads to a weak pose
-        or none the search is done again without it. Raises WearcapError without intrinsics or for a picture of
-        another size than they are for.
+        or none the search is done again without it. Raises WearcapError as `describe`.
+        """
+        return self.locate(self.describe(image, camera), prior)
+
+    def describe(self, image: UInt8[np.ndarray, "height width 3"], camera: Camera | None) -> Described:
+        """Features of a picture, undistorted where its camera is a fisheye: the half of the work without the map.
+
+        Raises WearcapError without intrinsics or for a picture of another size than they are for.
         """
         if camera is None:
             raise WearcapError("no intrinsics of the camera", expected="a calibrated camera",
@@ -105,23 +124,29 @@ class Localizer:
         check_size(image, camera, "localization")
         image, camera, valid = flat_picture(image, camera, self.settings.horizontal_fov_deg)
         features = features_within(self.extractor(image), valid)
-        if len(features) < self.settings.min_inliers:
+        return Described(camera, features, self.descriptor(image, features))
+
+    def locate(self, picture: Described, prior: Rigid | None = None) -> CameraPose | None:
+        """Pose of a described picture's camera; `prior` as in a call."""
+        if len(picture.features) < self.settings.min_inliers:
             return None
-        summary = self.descriptor(image, features)
-        count = self.settings.retrieved
         if prior is not None:
             few = self.settings.retrieved_with_prior
-            similar = most_similar(summary, self.map.global_descriptors, few)
-            near = nearest_pictures(self.map, prior, few)
-            pose = self._pose(features, camera, np.unique(np.concatenate([similar, near])))
+            similar = most_similar(picture.summary, self.map.global_descriptors, few)
+            images = np.union1d(similar, nearest_pictures(self.map, prior, few))
+            pose = self._pose(picture, images, self.settings.max_landmarks_with_prior)
             if pose is not None and pose.confidence > 0.5:
                 return pose
-        return self._pose(features, camera, most_similar(summary, self.map.global_descriptors, count))
+        images = most_similar(picture.summary, self.map.global_descriptors, self.settings.retrieved)
+        return self._pose(picture, images, self.settings.max_landmarks)
 
-    def _pose(self, features: Features, camera: Camera, images: Int64[np.ndarray, "chosen"]) -> CameraPose | None:  # fmt: skip
+    def _pose(
+        self, picture: Described, images: Int64[np.ndarray, "chosen"], max_landmarks: int
+    ) -> CameraPose | None:
         """Pose from the landmarks of chosen database pictures."""
+        camera, features = picture.camera, picture.features
         scale = camera.width / 1000
-        chosen = self._landmarks_of(images)
+        chosen = self._landmarks_of(images, max_landmarks)
         points = self.map.landmarks.points_world[chosen]
         descriptors = from_bytes(self.map.landmarks.descriptors[chosen])
         if self.matcher is None:
@@ -152,12 +177,12 @@ class Localizer:
             int(fit.inlier.sum()), confidence(agreeing, camera), torch.from_numpy(covariance).float(),
         )  # fmt: skip
 
-    def _landmarks_of(self, images: Int64[np.ndarray, "chosen"]) -> Int64[np.ndarray, "landmark"]:
+    def _landmarks_of(self, images: Int64[np.ndarray, "chosen"], count: int) -> Int64[np.ndarray, "landmark"]:
         """Landmarks that the pictures observe; of too many, those observed most."""
         views = self.map.landmark_views(images)
         seen = np.flatnonzero(views)
-        if len(seen) > self.settings.max_landmarks:
-            most = np.argsort(-views[seen], kind="stable")[: self.settings.max_landmarks]
+        if len(seen) > count:
+            most = np.argsort(-views[seen], kind="stable")[:count]
             seen = np.sort(seen[most])
         return seen
 
@@ -238,19 +263,33 @@ def localize_video(
     poses: list[CameraPose | None] = []
     last: tuple[float, CameraPose] | None = None
     times: Sequence[float] = timestamps.tolist()
-    for image in track(frames, "localization", total=len(times), console=Console(stderr=True), disable=not progress):  # fmt: skip
+    described = _one_ahead(lambda image: localizer.describe(image, camera), frames)
+    for picture in track(described, "localization", total=len(times), console=Console(stderr=True), disable=not progress):  # fmt: skip
         if len(poses) == len(times):
             raise WearcapError(f"more frames than the {len(times)} timestamps", expected="one timestamp per frame")  # fmt: skip
         now = times[len(poses)]
         prior = None
         if use_prior and last is not None and now - last[0] <= prior_age_s:
             prior = Rigid(last[1].R_world_cam, last[1].t_world_cam)
-        pose = localizer(image, camera, prior)
+        pose = localizer.locate(picture, prior)
         last = last if pose is None else (now, pose)
         poses.append(pose)
     if len(poses) != len(times):
         raise WearcapError(f"{len(poses)} frames with {len(times)} timestamps", expected="one timestamp per frame")  # fmt: skip
     return _as_localization(timestamps, poses)
+
+
+def _one_ahead(describe: Callable[[np.ndarray], Described], frames: Iterable[np.ndarray]) -> Iterator[Described]:  # fmt: skip
+    """Describe frames in a second thread, one ahead of what is asked for."""
+    with ThreadPoolExecutor(1) as pool:
+        waiting: Future[Described] | None = None
+        for frame in frames:
+            following = pool.submit(describe, frame)
+            if waiting is not None:
+                yield waiting.result()
+            waiting = following
+        if waiting is not None:
+            yield waiting.result()
 
 
 def _as_localization(timestamps: Float64[Tensor, "time"], poses: list[CameraPose | None]) -> Localization:
