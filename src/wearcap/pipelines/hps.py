@@ -69,13 +69,18 @@ class HPS:
         return initialize(aligned, localization, mount.R, mount.t, self.initialization)
 
     def problem(
-        self, recording: Recording, aligned: Motion, start: Initialization, scan: Scan | None
-    ) -> HpsData:
-        """What the energy is told: the start, localised cameras, contacts, and the suit's own steps."""
+        self, recording: Recording, aligned: Motion, start: Initialization, scan: Scan | None,
+        R_head_cam: Float[Tensor, "3 3"] | None = None,
+    ) -> HpsData:  # fmt: skip
+        """What the energy is told: the start, localised cameras, contacts, and the suit's own steps.
+
+        `R_head_cam` is estimated from the frames that are localised (HPS paper eq. 4) where it is not given.
+        """
         motion, (_, localization, _) = start.motion, required(recording)
         R_cam, sure = at_frames(localization, motion.timestamps)
         root, head = motion.R_parent_joint[:, 0].double(), motion.joint("head").R.double()
-        R_head_cam = estimate_head_camera(head, R_cam, sure)
+        if R_head_cam is None:
+            R_head_cam = estimate_head_camera(head, R_cam, sure)
         if not self.evidence.confident:
             sure = (sure > 0).double()
         body = anny_body(motion.skeleton, recording.shape or None)

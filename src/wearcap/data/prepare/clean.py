@@ -45,6 +45,11 @@ def resampled(motion: Motion, fps: float | int) -> Motion:
         return replace(motion, timestamps=times, R_parent_joint=R, t_world_root=t, contact_prob=contact)
     start, stop = motion.timestamps[0].item(), motion.timestamps[-1].item()
     times = start + torch.arange(int((stop - start) * fps + 1e-6) + 1, dtype=torch.float64) / fps
+    return at_times(motion, times)
+
+
+def at_times(motion: Motion, times: Float64[Tensor, "new_time"]) -> Motion:
+    """The motion at other times within its own: slerp (rotations), lerp (root, contacts)."""
     contact = motion.contact_prob
     return replace(
         motion, timestamps=times, R_parent_joint=_slerp(motion.timestamps, motion.R_parent_joint, times),

@@ -1,0 +1,223 @@
+"""HPS while it is being recorded: frames go in as they come, finished motion comes out some time later.
+
+A window of the newest seconds is solved again and again; frames older than `lag_s` are final and hold those that
+follow. Memory is that of a window, however long the recording.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from wearcap.data.prepare.clean import at_times
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.optimize.hps import HpsData, HpsState
+from wearcap.pipelines.hps import HPS
+from wearcap.recording import Motion, Recording
+from wearcap.recording.recording import Localization
+from wearcap.scene.scan import Scan
+from wearcap.sensors.alignment import align_suit, estimate_head_camera, inliers
+from wearcap.sensors.initialization import Initialization, initialize
+
+
+@dataclass(frozen=True)
+class StreamSettings:
+    """Lengths in seconds."""
+
+    start_s: float = 5.0
+    """Of localised frames before the suit is aligned and the first motion comes."""
+    window_s: float = 20.0
+    """What heading and camera's mount are drawn from."""
+    lag_s: float = 1.0
+    """Age at which a frame is final."""
+    advance_s: float = 0.5
+    """A window is solved each time so much is new."""
+    behind_s: float = 1.5
+    """Of final frames that a window is tied to."""
+    tie: float = 30.0
+    """Weight of a final frame's position among localised ones (1)."""
+
+
+class HpsStream:
+    """Feed `push` with pieces of a recording, in order; finished pieces of motion are returned."""
+
+    def __init__(self, hps: HPS, about: Recording, scan: Scan | None, settings: StreamSettings | None = None):
+        """`about` gives the wearer's shape and the camera with its mount; its streams are not read.
+
+        Raises WearcapError without a camera.
+        """
+        if about.camera is None:
+            raise WearcapError(
+                "no camera in this recording", where=about.name, expected="its mount on the head"
+            )
+        self.hps, self.about, self.scan = hps, about, scan
+        self.settings = settings or StreamSettings()
+        self.mount = Rigid(about.camera.R_head_cam, about.camera.t_head_cam)
+        self.suit: Motion | None = None
+        """What was pushed and is still needed, at the pipeline's rate."""
+        self.seen: Localization | None = None
+        self.turn: tuple[Float[Tensor, ""], Float[Tensor, "3"]] | None = None
+        """Angle and translation of the alignment, once it is known."""
+        self.R_head_cam = self.mount.R.double()
+        self.yaw = torch.zeros((), dtype=torch.float64)
+        self.done: Motion | None = None
+        """The last final frames."""
+        self._solved_to = -torch.inf
+
+    def push(self, suit: Motion, localization: Localization | None = None) -> Motion | None:
+        """Take in what is new of suit and localisation; returns the frames that have become final, if any."""
+        self.suit = suit if self.suit is None else _joined(self.suit, suit)
+        if localization is not None and len(localization.timestamps):
+            self.seen = localization if self.seen is None else _more(self.seen, localization)
+        newest = self.suit.timestamps[-1].item()
+        if self.turn is None and not self._align():
+            return None
+        if newest - self._solved_to < self.settings.advance_s:
+            return None
+        return self._advance(newest - self.settings.lag_s)
+
+    def finish(self) -> Motion | None:
+        """The frames that are left when the recording has ended. Raises WearcapError when none was ever localised."""
+        if self.suit is None:
+            return None
+        if self.turn is None and not self._align(enough=False):
+            raise WearcapError(
+                "the camera was never localised", expected="some localised frames", where=self.about.name
+            )
+        return self._advance(self.suit.timestamps[-1].item() + 1.0)
+
+    def _align(self, enough: bool = True) -> bool:
+        """Align once `start_s` seconds are localised; whether that was possible."""
+        assert self.suit is not None
+        if self.seen is None:
+            return False
+        good = inliers(self.seen) & (self.seen.timestamps <= self.suit.timestamps[-1])
+        count = int(good.sum())
+        if not count or (enough and count * _step(self.seen.timestamps) < self.settings.start_s):
+            return False
+        aligned, angle = align_suit(self.suit, self.seen, self.mount)
+        turned = self.suit.t_world_root @ rotation.about_axis("z", angle).mT
+        self.turn = angle, (aligned.t_world_root - turned)[0]
+        return True
+
+    def _advance(self, final_s: float) -> Motion | None:
+        """Solve the newest window and hand out its frames up to `final_s`."""
+        assert self.suit is not None
+        fps, settings = self.hps.fps, self.settings
+        aligned = self._window()
+        self._solved_to = self.suit.timestamps[-1].item()
+        start = self._start(aligned)
+        after = self.done.timestamps[-1].item() if self.done is not None else -torch.inf
+        times = aligned.timestamps
+        first = int(torch.searchsorted(times, after - settings.behind_s)) if self.done is not None else 0
+        data = self.hps.problem(self._recording(), aligned, start, self.scan, self.R_head_cam)[first:]
+        solution = self.hps.optimize(self._tied(data, times[first:]))
+        part = replace(start, motion=start.motion.sliced(first, len(times)))
+        motion = self.hps.motion(part, solution)
+        new = (motion.timestamps > after + 0.5 / fps) & (motion.timestamps <= final_s)
+        if not new.any():
+            return None
+        begin, stop = int(new.nonzero()[0]), int(new.nonzero()[-1]) + 1
+        keep = int((settings.behind_s + 1.0) * fps)
+        self.done = motion.sliced(max(0, stop - keep), stop)
+        self._forget(motion.timestamps[stop - 1].item() - settings.window_s)
+        return motion.sliced(begin, stop)
+
+    def _window(self) -> Motion:
+        """The suit's frames at the pipeline's rate, aligned."""
+        assert self.suit is not None
+        assert self.turn is not None
+        fps, (angle, move) = self.hps.fps, self.turn
+        first, last = (round(self.suit.timestamps[end].item() * fps) for end in (0, -1))
+        times = torch.arange(first, last + 1, dtype=torch.float64) / fps
+        inside = (times >= self.suit.timestamps[0]) & (times <= self.suit.timestamps[-1])
+        motion, turn = at_times(self.suit, times[inside]), rotation.about_axis("z", angle)
+        R = motion.R_parent_joint.clone()
+        R[:, 0] = turn @ R[:, 0]
+        return replace(motion, R_parent_joint=R, t_world_root=motion.t_world_root @ turn.mT + move)
+
+    def _start(self, aligned: Motion) -> Initialization:
+        """The window's initialisation; while nothing of it is localised, the suit carries on from the last frames."""
+        seen = self.seen
+        if seen is not None and (_inside(seen, aligned) & inliers(seen)).any():
+            start = initialize(aligned, seen, self.mount.R, self.mount.t, self.hps.initialization)
+            self.yaw = start.yaw_correction[-1].double()
+            sure = torch.where(inliers(seen) & _inside(seen, aligned), seen.confidence, 0.0)
+            nearest = torch.searchsorted(aligned.timestamps, seen.timestamps).clamp(max=len(aligned) - 1)
+            self.R_head_cam = estimate_head_camera(
+                start.motion.joint("head").R[nearest].double(), seen.R_world_cam.double(), sure.double()
+            )
+            return start
+        turn = rotation.about_axis("z", self.yaw.float())
+        R = aligned.R_parent_joint.clone()
+        R[:, 0] = turn @ R[:, 0]
+        carried = replace(aligned, R_parent_joint=R, t_world_root=aligned.t_world_root @ turn.mT)
+        if self.done is not None:
+            at = int(
+                torch.searchsorted(carried.timestamps, self.done.timestamps[-1]).clamp(max=len(carried) - 1)
+            )
+            move = self.done.t_world_root[-1] - carried.t_world_root[at]
+            carried = replace(carried, t_world_root=carried.t_world_root + move)
+        lost = torch.zeros(len(aligned), dtype=torch.bool)
+        return Initialization(carried, lost, self.yaw.expand(len(aligned)))
+
+    def _tied(self, data: HpsData, times: Float64[Tensor, "time"]) -> HpsData:
+        """Final frames hold those that follow: their positions stand for the camera's."""
+        if self.done is None:
+            return data
+        known = int((times <= self.done.timestamps[-1] + 0.5 / self.hps.fps).sum())
+        final = self.done.sliced(len(self.done) - known, len(self.done))
+        t, hold = data.start.t_world_root.clone(), data.hold_confidence.clone()
+        t[:known], hold[:known] = final.t_world_root.double(), self.settings.tie
+        return replace(
+            data, start=HpsState(data.start.theta, data.start.R_world_root, t), hold_confidence=hold
+        )
+
+    def _recording(self) -> Recording:
+        assert self.seen is not None
+        return replace(self.about, suit=self.suit, localization=self.seen)
+
+    def _forget(self, before_s: float) -> None:
+        """Drop what no later window needs."""
+        assert self.suit is not None
+        first = int(torch.searchsorted(self.suit.timestamps, before_s))
+        self.suit = self.suit.sliced(first, len(self.suit))
+        if self.seen is not None:
+            self.seen = _cut(self.seen, int(torch.searchsorted(self.seen.timestamps, before_s)))
+
+
+def _step(timestamps: Float64[Tensor, "time"]) -> float:
+    return timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
+
+
+def _inside(seen: Localization, motion: Motion) -> Tensor:
+    return (seen.timestamps >= motion.timestamps[0]) & (seen.timestamps <= motion.timestamps[-1])
+
+
+def _joined(first: Motion, then: Motion) -> Motion:
+    """Two pieces of one motion. Raises WearcapError when the second does not follow the first."""
+    if len(then) and then.timestamps[0] <= first.timestamps[-1]:
+        raise WearcapError(f"a piece that begins at {then.timestamps[0]:.3f} s follows one that ends at {first.timestamps[-1]:.3f} s",
+                           expected="pieces in order, without overlap")  # fmt: skip
+    contact = first.contact_prob
+    if contact is not None and then.contact_prob is not None:
+        contact = torch.cat([contact, then.contact_prob])
+    return replace(
+        first, timestamps=torch.cat([first.timestamps, then.timestamps]), contact_prob=contact,
+        R_parent_joint=torch.cat([first.R_parent_joint, then.R_parent_joint]),
+        t_world_root=torch.cat([first.t_world_root, then.t_world_root]),
+    )  # fmt: skip
+
+
+def _more(first: Localization, then: Localization) -> Localization:
+    names = ("timestamps", "R_world_cam", "t_world_cam", "confidence")
+    return Localization(*(torch.cat([getattr(first, name), getattr(then, name)]) for name in names))
+
+
+def _cut(seen: Localization, first: int) -> Localization:
+    return Localization(
+        seen.timestamps[first:], seen.R_world_cam[first:], seen.t_world_cam[first:], seen.confidence[first:]
+    )
