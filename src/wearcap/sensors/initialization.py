@@ -181,7 +181,7 @@ def _covered(suit: Motion, localization: Localization, seen: Tensor) -> Bool[Ten
     """Frames of the suit that have an inlier within one and a half steps of the localisation."""
     step = localization.timestamps.diff().median().item() if len(seen) > 1 else 0.0
     times = localization.timestamps[seen]
-    after = torch.searchsorted(times, suit.timestamps).clamp(max=len(times) - 1)
+    after = torch.searchsorted(times, suit.timestamps.contiguous()).clamp(max=len(times) - 1)
     gap = torch.stack([times[after], times[(after - 1).clamp(min=0)]]) - suit.timestamps
     return gap.abs().amin(0) <= 1.5 * step
 
