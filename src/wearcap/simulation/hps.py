@@ -71,6 +71,12 @@ class Simulated:
     recording: Recording
     session: SimulatedSession
     world: World
+    clock: tuple[float, float]
+    """The camera's: lead over the suit's at its zero (s), and what it gains (ms per hour)."""
+
+    def to_camera(self, suit_s: float) -> float:
+        """The camera's time at a time of the suit."""
+        return suit_s * (1 + self.clock[1] / 3.6e6) + self.clock[0]
 
 
 def site_number(split: str, index: int) -> int:
@@ -114,7 +120,7 @@ def simulate_hps(
         intervals=session.intervals, skeleton=person.skeleton, shape=person.shape, subject=person.name,
         location=world.name, activity="session", source="wearcap simulation", license="MIT (generated)",
     )  # fmt: skip
-    return Simulated(recording, session, world)
+    return Simulated(recording, session, world, clock)
 
 
 def _wrist(

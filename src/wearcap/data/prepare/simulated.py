@@ -42,7 +42,7 @@ def simulated_tasks(
         raise WearcapError(f"recordings of {duration_s} s at {fps} Hz", expected="positive numbers")
     if unknown := set(recordings) - set(SPLITS):
         raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
-    simulator = _source_files()
+    simulator = source_files()
     tasks = []
     for split, count in recordings.items():
         if splits.of(f"sim-{split}-person-000") != split:
@@ -56,7 +56,7 @@ def simulated_tasks(
     return tasks
 
 
-def _source_files() -> str:
+def source_files() -> str:
     """Digest of the code that simulates."""
     folders = [Path(package.__file__ or "").parent for package in (wearcap.simulation, wearcap.sensors)]
     return content_hash(*(path for folder in folders for path in sorted(folder.glob("*.py"))))
