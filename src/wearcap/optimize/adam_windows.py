@@ -22,6 +22,7 @@ class AdamSettings:
     learning_rate: float = 1e-3
     full_mesh: bool = True
     """Skin the whole body at each step, as the document does; False: the patches alone, with the same result."""
+    dtype: torch.dtype = torch.float32
 
 
 def solve_adam_windows(
@@ -34,6 +35,7 @@ def solve_adam_windows(
 
     `progress` is told the number of frames after each window.
     """
+    data = data.to(settings.dtype)
     state = data.start
     theta, R, t = state.theta.clone(), state.R_world_root.clone(), state.t_world_root.clone()
     histories, begin = [], 0
@@ -52,7 +54,9 @@ def solve_adam_windows(
         {name: sum(step[name] for step in steps) / len(steps) for name in steps[0]}
         for steps in zip(*histories)
     ]
-    return Solution(HpsState(theta, R, t), mean, f"{settings.steps} steps per window")
+    return Solution(
+        HpsState(theta.double(), R.double(), t.double()), mean, f"{settings.steps} steps per window"
+    )
 
 
 def _solve_window(

@@ -105,6 +105,13 @@ class HpsData:
             R_head_step=self.R_head_step[pairs],
         )  # fmt: skip
 
+    def to(self, dtype: torch.dtype) -> "HpsData":
+        """All numbers in another precision (the surface stays)."""
+        tensors = {name: value.to(dtype) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(
+            self, start=HpsState(*(part.to(dtype) for part in vars(self.start).values())), **tensors
+        )
+
     def pose(self, state: HpsState) -> Rigid:
         """Poses of all joints."""
         return forward_kinematics(self.patches.body.skeleton, state.R_parent_joint, state.t_world_root)
@@ -127,7 +134,7 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
     """
     if data.surface is None or not (energy.weight("contact") or energy.weight("contact_plane")):
         return None
-    points = points.detach().double()
+    dtype, points = points.dtype, points.detach().double()
     stands, patch = data.contact > 0, data.patches.patch
     point, origin, normal = points.clone(), torch.zeros_like(points), torch.zeros_like(points)
     found = stands[:, patch].double()
@@ -143,7 +150,8 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
         )
         origin, normal = where[:, patch], up[:, patch]
         found *= normal.isfinite().all(-1)
-    return Ground(point.nan_to_num(), origin.nan_to_num(), normal.nan_to_num(), found)
+    parts = (point.nan_to_num(), origin.nan_to_num(), normal.nan_to_num(), found)
+    return Ground(*(part.to(dtype) for part in parts))
 
 
 def energy_terms(
