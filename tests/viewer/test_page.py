@@ -18,12 +18,12 @@ from PIL import Image
 from websockets.sync.client import connect
 
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
-from wearcap.cli.view import dataset_folder
 from wearcap.cli.view import main as view
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.motion_npz import write_motion
 from wearcap.recording import ContactTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
+from wearcap.recording.locate import dataset_folder
 from wearcap.viewer.page import CAPTURE_COLOR, Page
 from wearcap.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
 from wearcap.viewer.page_timeline import Timeline

@@ -2,7 +2,6 @@
 
 import argparse
 import logging
-from pathlib import Path
 
 from wearcap.errors import WearcapError
 
@@ -26,7 +25,7 @@ def main(arguments: list[str]) -> None:
         raise WearcapError(f"port {options.port}", expected="1 to 65535")
 
     from wearcap.io.motion_npz import read_motion
-    from wearcap.recording.locate import load_recording
+    from wearcap.recording.locate import dataset_folder, load_recording
     from wearcap.viewer.page import Page
 
     # Browsers open connections in advance and drop them; the server's log of that is no news to a user.
@@ -41,12 +40,3 @@ def main(arguments: list[str]) -> None:
         page.run()
     finally:
         page.stop()
-
-
-def dataset_folder(where: str | Path) -> Path:
-    """The data set's directory of what a user typed for a recording: files of the recording lie relative to it."""
-    path = Path(where)
-    for folder in (path, *path.parents):
-        if (folder / "manifest.json").is_file():
-            return folder
-    return path.parent

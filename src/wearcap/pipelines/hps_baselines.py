@@ -1,11 +1,22 @@
 """What the documents compare HPS with (thesis §4.5.1): the suit alone, and the suit carried by the camera."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 from wearcap.data.prepare.clean import resampled
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory, filled, interpolate
-from wearcap.pipelines.hps import required
+from wearcap.pipelines.hps import mount, require, required
+from wearcap.pipelines.hps_camera import (
+    Localize,
+    MapLocalization,
+    Synchronization,
+    camera_report,
+    camera_stages,
+    on_one_clock,
+)
+from wearcap.pipelines.stages import Source, Stage, run_stages
 from wearcap.recording import Motion, Recording
 from wearcap.scene.scan import Scan
 from wearcap.sensors.alignment import align_suit, body_camera, inliers
@@ -19,15 +30,46 @@ class HpsBaseline:
 
     kind: str
     fps: float = 30.0
+    synchronization: Synchronization = field(default_factory=Synchronization)
+    localization: Localize = field(default_factory=MapLocalization)
 
     def __post_init__(self):
         if self.kind not in KINDS:
             raise WearcapError(f"no baseline {self.kind!r}", expected=f"one of {', '.join(KINDS)}")
 
-    def __call__(self, recording: Recording, scan: Scan | None = None) -> Motion:
+    @property
+    def name(self) -> str:
+        return self.kind
+
+    def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
         """The suit's pose, placed by the suit itself, by the camera, or by its path without outliers."""
-        suit, localization, mount = required(recording)
-        motion = align_suit(resampled(suit, self.fps), localization, mount)[0]
+        return run_stages(self.stages(Source(recording, folder, scan)))[0]["place"]
+
+    def stages(self, source: Source) -> list[Stage]:
+        """HPS' first two, then the suit is placed. Raises WearcapError as HPS does."""
+        recording = source.recording
+        require(recording, "suit", "camera")
+        return [
+            *camera_stages(source, self.synchronization, self.localization),
+            Stage(
+                "place", lambda done: self.place(on_one_clock(recording, done)),
+                lambda: (self.kind, self.fps, recording.suit, *mount(recording)), ("synchronize", "localize"),
+                ("pipelines/hps_baselines.py", "sensors/alignment.py", "geometry", "body"),
+            ),
+        ]  # fmt: skip
+
+    def motion_of(self, results: dict[str, Any]) -> Motion | None:
+        """The motion, once it is placed."""
+        return results.get("place")
+
+    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
+        """Clock and share localised."""
+        return camera_report(results)
+
+    def place(self, recording: Recording) -> Motion:
+        """The suit's motion in the scene."""
+        suit, localization, T_head_cam = required(recording)
+        motion = align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
         motion = replace(motion, provenance={"pipeline": self.kind})
         if self.kind == "imu":
             return motion
@@ -38,4 +80,4 @@ class HpsBaseline:
         )
         at = motion.timestamps.clamp(path.timestamps[0], path.timestamps[-1])
         camera = interpolate(path.timestamps, path.t_world_body, at)
-        return replace(motion, t_world_root=motion.t_world_root + camera - body_camera(motion, mount.t))
+        return replace(motion, t_world_root=motion.t_world_root + camera - body_camera(motion, T_head_cam.t))

@@ -1,4 +1,4 @@
-"""Recordings by what a user types."""
+"""Recordings, and the folder of their data set, by what a user types."""
 
 from pathlib import Path
 
@@ -25,3 +25,12 @@ def load_recording(where: str | Path) -> Recording:
         return RecordingStore.open(path.parent).load(path.name)
     raise WearcapError("no recording here", where=path,
                        expected="DATASET/NAME or a .safetensors file that `wearcap prepare` wrote")  # fmt: skip
+
+
+def dataset_folder(where: str | Path) -> Path:
+    """The data set's folder of what a user typed for a recording: files that the recording names lie relative to it."""
+    path = Path(where)
+    for folder in (path, *path.parents):
+        if (folder / "manifest.json").is_file():
+            return folder
+    return path.parent

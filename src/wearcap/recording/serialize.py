@@ -50,21 +50,21 @@ def flatten(value: Any, key: str = "") -> tuple[Any, dict[str, Tensor]]:
     return tree, tensors
 
 
-def unflatten(tree: Any, fetch) -> Any:
-    """Rebuild what `flatten` took apart; `fetch(key)` gives a tensor."""
+def unflatten(tree: Any, fetch, known: dict[str, type] = KNOWN) -> Any:
+    """Rebuild what `flatten` took apart; `fetch(key)` gives a tensor, only classes in `known` come back."""
     if not isinstance(tree, dict):
         return tree
     if "$tensor" in tree:
         return fetch(tree["$tensor"])
     if "$tuple" in tree:
         return tuple(tree["$tuple"])
-    items = {name: unflatten(item, fetch) for name, item in tree.items() if name != "$type"}
+    items = {name: unflatten(item, fetch, known) for name, item in tree.items() if name != "$type"}
     if "$type" not in tree:
         return items
-    if tree["$type"] not in KNOWN:
-        raise WearcapError(f"unknown part {tree['$type']!r}", expected=f"one of {', '.join(sorted(KNOWN))}")
-    _require_one_length(KNOWN[tree["$type"]], items)
-    return KNOWN[tree["$type"]](**items)
+    if tree["$type"] not in known:
+        raise WearcapError(f"unknown part {tree['$type']!r}", expected=f"one of {', '.join(sorted(known))}")
+    _require_one_length(known[tree["$type"]], items)
+    return known[tree["$type"]](**items)
 
 
 def _require_one_length(kind: type, items: dict[str, Any]) -> None:
