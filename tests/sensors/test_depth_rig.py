@@ -44,6 +44,18 @@ def test_the_background_is_the_mean_of_what_was_measured():
         empty_scene(frames[:0])
 
 
+def test_pixels_that_flicker_are_not_steady():
+    frames = np.full((6, 12, 12), 2000, np.uint16)
+    frames += np.random.default_rng(0).integers(0, 10, frames.shape).astype(np.uint16)
+    frames[::2, 4, 4] = 2045
+    frames[:, 8] = 0
+    steady = empty_scene(frames).steady
+    assert not steady[4, 4], "now and then 4 cm further: its mean is neither place"
+    assert not steady[8].any()
+    assert steady.mean() > 0.85
+    assert empty_scene(frames[:1]).steady.mean() > 0.85, "a single frame says nothing about flicker"
+
+
 def test_what_stands_before_the_background_is_kept_and_flying_pixels_are_not():
     background = Background(np.full((30, 40), 3.0, np.float32), np.full((30, 40), 0.002, np.float32))
     background.depth_m[:5] = np.inf
@@ -188,7 +200,7 @@ def test_walls_are_registered_from_the_side_that_is_seen(scene: Scene):
     kept = visible_points(scene.scan, scene.rig.T_world_cam[0])
     outside = (scene.scan[:, :2] < -0.05).any(1) | (scene.scan[:, :2] > [6.05, 5.05]).any(1)
     assert outside.mean() > 0.2
-    assert ((kept[:, :2] < -0.05).any(1) | (kept[:, :2] > [6.05, 5.05]).any(1)).mean() < 0.01
+    assert ((kept[:, :2] < -0.05).any(1) | (kept[:, :2] > [6.05, 5.05]).any(1)).mean() < 0.03
     assert len(kept) > 20_000
 
 

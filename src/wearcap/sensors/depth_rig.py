@@ -17,6 +17,7 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.pointcloud import voxel_downsample
 from wearcap.geometry.render import Splats, render
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.surface import SurfaceIndex
 from wearcap.sensors.registration import STAGES, Registration, register
 
 CLUSTER_EPS_M = 0.12
@@ -27,8 +28,12 @@ _CLUSTER_VOXEL_M = 0.02
 """Points are clustered by voxel, each weighing as many as it holds: a sixth of eps, and a hundred times fewer."""
 _SEEN_SHARE = 0.5
 """A background pixel counts where at least so many of the empty frames saw it."""
+_FLICKER = 2.5
+"""Times the camera's usual relative deviation that a steady pixel may have."""
 _SPLAT_M = 0.02
 """Radius at which a scan's points hide what is behind them: its spacing, and some more."""
+_BESIDE_M = 0.04
+"""Points so near to a visible one are of the same surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +44,13 @@ class Background:
     """Mean; infinite where nothing came back."""
     deviation_m: Float[np.ndarray, "height width"]
     """Standard deviation over time."""
+
+    @property
+    def steady(self) -> Bool[np.ndarray, "height width"]:
+        """Measured pixels that flicker no more than others at their depth: means along edges lie in mid-air."""
+        known = np.isfinite(self.depth_m) & ~_flying(self.depth_m, Subtraction().edge_m)
+        relative = np.where(known, self.deviation_m / self.depth_m, np.inf)
+        return known & (relative <= _FLICKER * np.median(relative[known])) if known.any() else known
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,9 +139,8 @@ def register_view(
     would see from where it is thought to be: scans show walls from both sides, 10 cm apart.
     Raises WearcapError as `register` does.
     """
-    empty = view.background.depth_m
-    solid = np.isfinite(empty) & ~_flying(empty, Subtraction().edge_m)
-    cloud = unproject_depth(empty, solid, view.camera)
+    empty = view.background
+    cloud = unproject_depth(empty.depth_m, empty.steady, view.camera)
     pose = view.T_world_cam.to(torch.float64)
     if correction is not None:
         pose = correction.to(torch.float64) @ pose
@@ -144,8 +155,14 @@ def visible_points(
     """Points of a scan (m) that nothing hides from a camera at about this pose, within 100° (ours)."""
     wide = Camera.pinhole(500, 500, 100.0)
     splats = Splats(scene, np.ones(3, np.float32), _SPLAT_M, metric=True)
-    seen = np.unique(render(wide, T_world_cam, splats=[splats]).point_index)
-    return scene[seen[seen >= 0]]
+    index = np.unique(render(wide, T_world_cam, splats=[splats]).point_index)
+    seen = scene[index[index >= 0]]
+    if not len(seen):
+        return seen
+    near = scene[((scene > seen.min(0) - _BESIDE_M) & (scene < seen.max(0) + _BESIDE_M)).all(1)]
+    # The points drawn are those that noise brought nearest to the camera: all beside them are taken.
+    distance, _ = SurfaceIndex.build(seen).nearest(near.astype(np.float64), _BESIDE_M)
+    return near[np.isfinite(distance)]
 
 
 def person_cloud(
