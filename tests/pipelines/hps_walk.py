@@ -29,15 +29,15 @@ CLAPS_S = (1.31, 1.93, 27.42)
 
 
 def floor_points() -> np.ndarray:
-    """10 x 10 m at a height of 0, 2.5 cm apart."""
+    """10 x 10 m, 2.5 cm apart, at the height of the walker's soles."""
     grid = np.arange(-5.0, 5.0, 0.025)
-    return np.stack(np.meshgrid(grid, grid, [0.0], indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+    return np.stack(np.meshgrid(grid, grid, [0.012], indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
 
 
 def drifting(truth: Motion, contact: torch.Tensor) -> Motion:
-    """As a suit sees it: its own origin and heading, which drifts by a degree a second."""
+    """As a suit sees it: its own origin and heading, which drifts by a fifth of a degree a second."""
     seconds = truth.timestamps - truth.timestamps[0]
-    turn = rotation.about_axis("z", (0.8 + np.deg2rad(1.0) * seconds).float())
+    turn = rotation.about_axis("z", (0.8 + np.deg2rad(0.2) * seconds).float())
     R = truth.R_parent_joint.clone()
     R[:, 0] = turn @ R[:, 0]
     steps = (turn[1:] @ truth.t_world_root.diff(dim=0)[..., None])[..., 0]

@@ -8,42 +8,55 @@ from rich import print as show
 from rich.progress import Progress
 
 from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import load_pipeline, trained_on
+from wearcap.cli.load import load_pipeline, staged, trained_on
+from wearcap.errors import WearcapError
 from wearcap.metrics.table import Row, Scores, aggregate, rich_table, write_scores
 from wearcap.pipelines.baselines import MeanPose, NearestWindow
 from wearcap.pipelines.evaluation import Pipeline, evaluate
+from wearcap.pipelines.hmd2 import HMD2
 from wearcap.recording import RecordingStore
 
-HELP = "score a checkpoint: wearcap evaluate checkpoint=… [dataset=DIR] [split=test]"
+HELP = "score a checkpoint: wearcap evaluate checkpoint=… [dataset=DIR] [split=test], or pipeline=hps dataset=DIR"
 
 
 def run(config: DictConfig) -> Scores:
-    """Evaluate the checkpoint(s) and baselines; prints and saves the table."""
-    checkpoints = (
-        list(config.checkpoint) if isinstance(config.checkpoint, ListConfig) else [config.checkpoint]
-    )
-    sources, validated = trained_on(checkpoints[0])
-    store = RecordingStore.open(config.dataset or validated)
+    """Evaluate the checkpoint(s) and baselines, or a pipeline that needs none; prints and saves the table."""
+    given = config.checkpoint
+    checkpoints = list(given) if isinstance(given, ListConfig) else [given]
+    pipeline = load_pipeline(checkpoints[0], config.pipeline, config.device)
     with Progress(transient=True) as progress:
-        rows: list[Row] = []
-        for index, checkpoint in enumerate(checkpoints):
-            pipeline = load_pipeline(checkpoint, config.pipeline, config.device)
-            seeds = [index * 1000 + seed for seed in config.seeds]
-            rows += _rows(pipeline, store, seeds, config, progress, Path(checkpoint).parts[-3:][0])
-        scores: Scores = {"wearcap": aggregate(rows)}
-        if config.baselines:
-            for name, method in (("mean pose", MeanPose), ("nearest window", NearestWindow)):
-                baseline = method.fit([RecordingStore.open(source) for source in sources])
-                scores[name] = aggregate(list(_rows(baseline, store, [0], config, progress, name)))
-    about = {
-        "dataset": str(store.root),
-        "split": config.split,
-        "checkpoint": ", ".join(map(str, checkpoints)),
-    }
+        if isinstance(pipeline, HMD2):
+            store, scores = _learned(checkpoints, config, progress)
+        else:
+            if config.dataset is None:
+                raise WearcapError("dataset has no value", fix="Give it on the command line: dataset=DIR.")
+            store = RecordingStore.open(config.dataset)
+            capture = staged(pipeline, config, store.root, progress.console.print)
+            rows = _rows(capture, store, list(config.seeds)[:1], config, progress, pipeline.name)
+            scores = {pipeline.name: aggregate(list(rows))}
+    about = {"dataset": str(store.root), "split": config.split, "checkpoint": ", ".join(map(str, checkpoints))}  # fmt: skip
     show(rich_table(f"{store.root.name}, {config.split} split", scores))
     write_scores(config.output, scores, about)
     show(f"table: {config.output}")
     return scores
+
+
+def _learned(checkpoints: list[str], config: DictConfig, progress: Progress) -> tuple[RecordingStore, Scores]:
+    """The data set, and the checkpoints' scores beside the baselines'."""
+    sources, validated = trained_on(checkpoints[0])
+    store = RecordingStore.open(config.dataset or validated)
+    rows: list[Row] = []
+    for index, checkpoint in enumerate(checkpoints):
+        pipeline = load_pipeline(checkpoint, config.pipeline, config.device)
+        assert isinstance(pipeline, HMD2)
+        seeds = [index * 1000 + seed for seed in config.seeds]
+        rows += _rows(pipeline, store, seeds, config, progress, Path(checkpoint).parts[-3:][0])
+    scores: Scores = {"wearcap": aggregate(rows)}
+    if config.baselines:
+        for name, method in (("mean pose", MeanPose), ("nearest window", NearestWindow)):
+            baseline = method.fit([RecordingStore.open(source) for source in sources])
+            scores[name] = aggregate(list(_rows(baseline, store, [0], config, progress, name)))
+    return store, scores
 
 
 def _rows(

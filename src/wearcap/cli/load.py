@@ -1,12 +1,16 @@
-"""From a checkpoint to the system its own config describes, and to a pipeline around it."""
+"""From a checkpoint to the system its own config describes, and from a config to a pipeline, around it or without one."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from wearcap.errors import WearcapError
 from wearcap.pipelines.hmd2 import HMD2
+from wearcap.pipelines.stages import StagedCapture, StagedPipeline
+from wearcap.recording.locate import dataset_folder
 from wearcap.training.checkpoint import load_weights, read_checkpoint
 from wearcap.training.motion_diffusion import MotionDiffusion
 
@@ -19,13 +23,32 @@ def load_system(checkpoint: str | Path) -> tuple[MotionDiffusion, dict[str, Any]
     return system.eval(), config
 
 
-def load_pipeline(checkpoint: str | Path, pipeline: DictConfig, device: str) -> HMD2:
-    """The pipeline of a config group around a checkpoint's network."""
+def load_pipeline(checkpoint: str | Path | None, pipeline: DictConfig, device: str) -> HMD2 | StagedPipeline:
+    """The pipeline of a config group: around a checkpoint's network where it is learned (`_partial_`), else by itself.
+
+    Raises WearcapError for a learned pipeline without a checkpoint, and for a checkpoint that nothing is to be done with.
+    """
+    learned, name = bool(pipeline.get("_partial_")), pipeline._target_.rpartition(".")[2]
+    if not learned and checkpoint is not None:
+        raise WearcapError(f"a checkpoint, but {name} has no network", where=checkpoint, fix="Leave checkpoint=… out, or choose another pipeline=….")  # fmt: skip
+    made = instantiate(pipeline, _convert_="all")
+    if not learned:
+        return made
+    if checkpoint is None:
+        raise WearcapError(f"no checkpoint, but {name} needs a trained network", fix="Give checkpoint=…, or a pipeline without one, such as pipeline=hps.")  # fmt: skip
     system, _ = load_system(checkpoint)
-    return instantiate(pipeline, _convert_="all")(
+    return made(
         net=system.net, features=system.features, schedule=system.schedule, skeleton=system.skeleton,
         fps=system.fps, device=device,
     )  # fmt: skip
+
+
+def staged(
+    pipeline: StagedPipeline, config: DictConfig, data: str | Path, tell: Callable[[str], None] | None = None
+) -> StagedCapture:
+    """A pipeline of stages for the recordings of a data set: its files, its cache, the scene that was chosen."""
+    scene, cache = (None if path is None else Path(path) for path in (config.scene, config.cache))
+    return StagedCapture(pipeline, dataset_folder(data), scene, config.metres_per_unit, cache, tell)
 
 
 def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:

@@ -3,11 +3,14 @@
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Bool
+import torch
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.data.prepare.clean import at_times
 from wearcap.errors import WearcapError
+from wearcap.metrics.position import mpjpe_cm, root_error_cm
 from wearcap.metrics.table import Row, evaluate_motion
 from wearcap.pipelines.hmd2 import hang_from_head
 from wearcap.recording import Motion, Recording, RecordingStore
@@ -38,12 +41,42 @@ def evaluate(
 
 
 def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
-    """All metrics of one capture against its recording's truth, both hung from the true head."""
-    truth = recording.motion
+    """All metrics of one capture at its own frames against its recording's truth.
+
+    Both are hung from the true head, but for `world_root_cm` and `world_mpjpe_cm`: these are measured where the capture
+    put the body in the world.
+    """
+    truth, contact = recording.motion, _foot_contact(recording)
     if truth is None:
         raise WearcapError("no true motion to compare with", where=name, expected="a recording with `motion`")
+    if _within(motion, truth):
+        frame = _nearest_frames(truth, motion.timestamps)
+        truth, contact = at_times(truth, motion.timestamps), None if contact is None else contact[frame]
     hung = hang_from_head(motion, truth.joint("head"))
-    return Row(name, seed, len(truth), evaluate_motion(hung, truth, _foot_contact(recording)))
+    scores = evaluate_motion(hung, truth, contact)
+    joints, joints_true = motion.T_world_joint.t, truth.T_world_joint.t
+    scores["world_root_cm"] = root_error_cm(joints[:, 0], joints_true[:, 0]).item()
+    scores["world_mpjpe_cm"] = mpjpe_cm(joints, joints_true).item()
+    return Row(name, seed, len(truth), scores)
+
+
+def _within(motion: Motion, truth: Motion) -> bool:
+    """Whether a motion has another rate than the truth, and no frame outside its time."""
+    same = len(motion) == len(truth) and torch.allclose(
+        motion.timestamps, truth.timestamps, rtol=0, atol=1e-6
+    )
+    ends = truth.timestamps[[0, -1]] if len(truth) > 1 and len(motion) > 1 else None
+    return (
+        not same
+        and ends is not None
+        and bool(motion.timestamps[0] >= ends[0] - 1e-6 and motion.timestamps[-1] <= ends[1] + 1e-6)
+    )
+
+
+def _nearest_frames(motion: Motion, timestamps: Float64[Tensor, "time"]) -> Int64[Tensor, "time"]:
+    """Frame of a motion that is nearest to each time."""
+    middle = (motion.timestamps[1:] + motion.timestamps[:-1]) / 2
+    return torch.searchsorted(middle, timestamps.contiguous())
 
 
 def _foot_contact(recording: Recording) -> Bool[Tensor, "time patch"] | None:

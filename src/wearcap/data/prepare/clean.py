@@ -40,7 +40,8 @@ def resampled(motion: Motion, fps: float | int) -> Motion:
     even = steps.max() < 1.5 * steps.median()
     if even and abs(ratio - round(ratio)) < 0.01 and ratio > 0.5:
         n = round(ratio)
-        times, R, t = motion.timestamps[::n], motion.R_parent_joint[::n], motion.t_world_root[::n]
+        times = motion.timestamps[::n].contiguous()
+        R, t = motion.R_parent_joint[::n], motion.t_world_root[::n]
         contact = None if motion.contact_prob is None else motion.contact_prob[::n]
         return replace(motion, timestamps=times, R_parent_joint=R, t_world_root=t, contact_prob=contact)
     start, stop = motion.timestamps[0].item(), motion.timestamps[-1].item()
