@@ -5,6 +5,7 @@
 Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables). Systems:
 
     hmd2_head     HMD2 on the head path alone: MPJPE and its parts, realism, beside trivial baselines
+    hps           HPS on simulated sessions: its document's three tables, drift, outages of localisation
     simulation    how far simulated people differ from CMU's: gait statistics, and a discriminator
 
 Each system is a module tables_SYSTEM.py in this folder with `add_arguments(parser)` and

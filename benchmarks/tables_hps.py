@@ -1,0 +1,273 @@
+"""HPS on simulated sessions of more than 400 m: Tables 4.1 to 4.3 of its document, drift, outages, time per stage.
+
+Sessions, scans and the rig's clouds are kept in OUTPUT/hps/cache, pictures go to OUTPUT/hps.
+"""
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from hps_pictures import draw_drift
+from hps_runs import DISTURBED, ROWS, TRUTH, SeedRun, run_seed
+from hps_sessions import SessionSettings
+from joblib import Parallel, delayed
+from rich.console import Console
+from rich.table import Table
+
+from wearcap.files import write_text
+from wearcap.metrics.table import Summary
+from wearcap.pipelines.hps_evaluation import in_order
+from wearcap.simulation.hps import HpsConfig
+from wearcap.simulation.hps_session import Protocol
+
+DOCUMENT = {
+    "stand": {
+        "IMU": (6.85, 54.49, 69.02, 108.44), "IMU + Cam": (9.24, 742.32, 136.81, 32.17),
+        "IMU + Cam (filtered)": (10.48, 6.93, 5.93, 6.15), "HPS w/o scene": (7.21, 6.48, 5.80, 5.69),
+        "HPS": (5.20, 4.60, 4.26, 4.53),
+    },
+    "move": {
+        "IMU": (6.77, 51.57, 61.11, 100.44), "IMU + Cam": (2189.75, 569.71, 719.44, 261.72),
+        "IMU + Cam (filtered)": (10.05, 21.75, 7.34, 12.59), "HPS w/o scene": (9.19, 20.68, 6.67, 11.96),
+        "HPS": (6.44, 15.96, 4.76, 10.07),
+    },
+}  # fmt: skip
+"""Thesis Tables 4.1 and 4.2 (cm)."""
+DOCUMENT_FEET = {
+    "IMU": (188.38, 0.92), "IMU + Cam": (39.8, 52.09), "IMU + Cam (filtered)": (0.95, 1.75),
+    "HPS w/o scene": (0.32, 2.00), "HPS": (0.056, 0.90),
+}  # fmt: skip
+"""Thesis Table 4.3: distance to surface (cm), foot sliding (cm per frame)."""
+TITLES = {"stand": "Table 4.1: standing in an A-pose", "move": "Table 4.2: walking, standing, leaning"}
+WIDTH = 150
+"""Columns of the tables where the output is no terminal, or a narrow one."""
+ORDERED = ("IMU", "IMU + Cam (filtered)", "HPS w/o scene")
+"""Each must be worse than the next, and the last worse than HPS."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seeds", type=int, default=5, help="simulated sessions (1 when quick)")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--split", default="test", help="whose people and sites: train, val or test")
+    parser.add_argument("--spacing", type=float, default=0.02, help="between points of the scan (m)")
+    parser.add_argument("--returns", type=float, nargs="+", default=list(Protocol.returns_m),
+                        help="distances (m) after which the wearer is back at the capture spot")  # fmt: skip
+    parser.add_argument("--end", type=float, default=Protocol.end_m, help="length of the session (m)")
+    parser.add_argument(
+        "--jobs", type=int, default=2, help="seeds at a time; a single one uses as many cores"
+    )
+
+
+def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
+    """Print and write all tables; returns the path of the JSON file."""
+    count = 1 if options.quick else options.seeds
+    folder = options.output / "hps"
+    protocol = Protocol(returns_m=tuple(options.returns), end_m=options.end)
+    settings = SessionSettings(options.split, HpsConfig(protocol=protocol), options.spacing)
+    jobs = min(options.jobs, count)
+    first = options.first_seed
+    seeds = [
+        SeedRun(settings, first + k, folder / "cache", folder if k == 0 else None, options.jobs // jobs)
+        for k in range(count)
+    ]
+    runs = Parallel(n_jobs=jobs)(delayed(run_seed)(seed) for seed in seeds)
+    places = ["at start", *(f"{distance:.0f} m" for distance in options.returns)]
+    tree: dict[str, Any] = {"about": about, "places": places, **summarized(runs)}
+    show = Console(width=max(Console().width, WIDTH), highlight=False).print
+    for name in ("stand", "move"):
+        show(_chamfer_table(name, places, tree["chamfer_cm"][name]))
+    for table in (_feet_table(tree), _drift_table(tree), _whole_table(tree), _outage_table(tree), _seconds_table(tree)):  # fmt: skip
+        show(table)
+    show(_order_line(tree["order_beyond_start"]))
+    draw_drift(folder / "drift.png", {row: [run["scores"][row]["drift"] for run in runs] for row in ROWS})
+    tree["seeds"] = runs
+    path = options.output / "hps.json"
+    write_text(path, json.dumps(_finite(tree), indent=1, allow_nan=False) + "\n")
+    return path
+
+
+def summarized(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means and spreads over seeds of all that the tables show."""
+    rows = (*ROWS, TRUTH)
+    return {
+        "chamfer_cm": _chamfer(runs, rows, "literal", "mean_cm"),
+        "chamfer_surface_cm": _chamfer(runs, rows, "surface", "mean_cm"),
+        "cloud_to_body_cm": _chamfer(runs, rows, "literal", "cloud_to_body_cm"),
+        "feet": _over_seeds(runs, rows, "feet"),
+        "feet_true_contact": _over_seeds(runs, rows, "feet_true_contact"),
+        "whole": _over_seeds(runs, rows, "joints"),
+        "slope_cm_per_100m": {
+            row: _summary([run["scores"][row]["drift"]["slope_cm_per_100m"] for run in runs]) for row in ROWS
+        },
+        "standing_slope_cm_per_100m": {row: _summary([_standing_slope(run, row) for run in runs]) for row in ROWS},
+        "order_beyond_start": {
+            best: {name: [_ordered(run, name, best) for run in runs] for name in TITLES} for best in ("HPS", "ours")
+        },
+        "outages": {row: _outages(runs, row) for row in DISTURBED},
+        "stage_seconds": {row: {
+            stage: _summary([run["stage_seconds"][row][stage] for run in runs]) for stage in runs[0]["stage_seconds"][row]
+        } for row in ROWS},
+        "frames": _summary([float(run["frames"]) for run in runs]),
+    }  # fmt: skip
+
+
+def _of_visits(run: dict[str, Any], row: str, name: str, form: str, key: str) -> list[float]:
+    """A row's scores at the visits of a kind, in order."""
+    parts = zip(run["visits"], run["scores"][row][form])
+    return [part[key] for visit, part in parts if visit["name"] == name]
+
+
+def _chamfer(runs: list[dict[str, Any]], rows: tuple[str, ...], form: str, key: str) -> dict[str, Any]:
+    """Summaries by kind of visit, row and place."""
+    return {
+        name: {
+            row: [_summary(list(values)) for values in zip(*(_of_visits(run, row, name, form, key) for run in runs))]
+            for row in rows
+        }
+        for name in TITLES
+    }  # fmt: skip
+
+
+def _standing_slope(run: dict[str, Any], row: str) -> float:
+    """Of the documented Chamfer distance over the visits' distances: least squares, cm per 100 m."""
+    distance = [visit["distance_m"] for visit in run["visits"] if visit["name"] == "stand"]
+    error = _of_visits(run, row, "stand", "literal", "mean_cm")
+    x, y = sum(distance) / len(distance), sum(error) / len(error)
+    spread = sum((d - x) ** 2 for d in distance)
+    return 100 * sum((d - x) * (e - y) for d, e in zip(distance, error)) / spread if spread else math.nan
+
+
+def _ordered(run: dict[str, Any], name: str, best: str) -> bool:
+    """Whether IMU > filtered > w/o scene > `best`, by the mean over the visits after the start."""
+    later = [_of_visits(run, row, name, "literal", "mean_cm")[1:] for row in (*ORDERED, best)]
+    return in_order([sum(values) / len(values) for values in later])
+
+
+def _over_seeds(runs: list[dict[str, Any]], rows: tuple[str, ...], part: str) -> dict[str, Any]:
+    return {
+        row: {name: _summary([run["scores"][row][part][name] for run in runs]) for name in runs[0]["scores"][row][part]}
+        for row in rows
+    }  # fmt: skip
+
+
+def _outages(runs: list[dict[str, Any]], row: str) -> dict[str, Any]:
+    parts = [run["outages"]["rows"][row] for run in runs]
+    return {
+        where: {name: _summary([part[where][name] for part in parts]) for name in parts[0][where]}
+        for where in parts[0] if all(where in part for part in parts)
+    }  # fmt: skip
+
+
+def _summary(values: list[float]) -> dict[str, float | int | None]:
+    """Mean and sample deviation over seeds, as JSON; NaN is left out."""
+    known = [value for value in values if math.isfinite(value)]
+    if not known:
+        return {"mean": math.nan, "std": None, "seeds": 0}
+    mean = sum(known) / len(known)
+    spread = math.sqrt(sum((v - mean) ** 2 for v in known) / (len(known) - 1)) if len(known) > 1 else None
+    return {"mean": mean, "std": spread, "seeds": len(known)}
+
+
+def _cell(summary: dict[str, Any], digits: int = 2) -> str:
+    """Mean ± deviation."""
+    parts = Summary(summary["mean"], summary["std"], summary["seeds"])
+    spread = "" if parts.std is None else f" ± {parts.std:.{digits}f}"
+    return f"{parts.mean:.{digits}f}{spread}"
+
+
+def _table(title: str, columns: list[str]) -> Table:
+    table = Table(title=title)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="right" if number else "left", no_wrap=True)
+    return table
+
+
+def _chamfer_table(name: str, places: list[str], entries: dict[str, Any]) -> Table:
+    title = f"{TITLES[name]}: bidirectional Chamfer (cm), in brackets the document's"
+    table = _table(title, ["", *places])
+    for row, summaries in entries.items():
+        known = DOCUMENT[name].get(row, ())
+        beside = [f"  [{value:.2f}]" for value in known] if len(known) == len(summaries) else []
+        beside += [""] * (len(summaries) - len(beside))
+        table.add_row(row, *(_cell(summary) + value for summary, value in zip(summaries, beside)))
+    return table
+
+
+def _feet_table(tree: dict[str, Any]) -> Table:
+    table = _table(
+        "Table 4.3: feet in contact (cm; sliding per frame), in brackets the document's",
+        ["", "to surface, signed", "absolute", "sliding", "absolute, true contact", "sliding, true contact"],
+    )
+    for row, feet in tree["feet"].items():
+        known, true = DOCUMENT_FEET.get(row), tree["feet_true_contact"][row]
+        beside = [f"  [{value:g}]" for value in known] if known else ["", ""]
+        table.add_row(
+            row, _cell(feet["distance_cm"], 3) + beside[0], _cell(feet["absolute_distance_cm"], 3),
+            _cell(feet["sliding_cm"], 3) + beside[1], _cell(true["absolute_distance_cm"], 3), _cell(true["sliding_cm"], 3),
+        )  # fmt: skip
+    return table
+
+
+def _drift_table(tree: dict[str, Any]) -> Table:
+    table = _table(
+        "Growth with distance (cm per 100 m)", ["", "root error, bins of 20 m", "standing Chamfer"]
+    )
+    for row in ROWS:
+        table.add_row(
+            row,
+            _cell(tree["slope_cm_per_100m"][row], 3),
+            _cell(tree["standing_slope_cm_per_100m"][row], 3),
+        )
+    return table
+
+
+def _whole_table(tree: dict[str, Any]) -> Table:
+    columns = ["mpjpe_cm", "root_cm", "p95_cm", "jitter_m_s3", "jitter_ratio", "foot_skate_cm_s"]
+    table = _table("Whole recording, joints in the world", ["", *columns])
+    for row, scores in tree["whole"].items():
+        table.add_row(row, *(_cell(scores[column]) for column in columns))
+    return table
+
+
+def _outage_table(tree: dict[str, Any]) -> Table:
+    table = _table(
+        "Outages of localisation, planted in mid-walk: error (cm) and its ratio to that of the same frames without",
+        ["", "frames", "root", "ratio", "joints", "ratio"],
+    )
+    for row, parts in tree["outages"].items():
+        for where, scores in parts.items():
+            table.add_row(row, where, *(_cell(scores[name]) for name in ("root_cm", "root_ratio", "joint_cm", "joint_ratio")))  # fmt: skip
+    return table
+
+
+def _seconds_table(tree: dict[str, Any]) -> Table:
+    stages = list(dict.fromkeys(stage for row in ROWS for stage in tree["stage_seconds"][row]))
+    table = _table(
+        f"Seconds per stage, of {tree['frames']['mean']:.0f} frames on average", ["", *stages, "frames/s"]
+    )
+    for row, seconds in tree["stage_seconds"].items():
+        total = sum(summary["mean"] for summary in seconds.values())
+        table.add_row(
+            row, *(_cell(seconds[stage], 1) if stage in seconds else "" for stage in stages),
+            f"{tree['frames']['mean'] / max(total, 1e-9):.0f}",
+        )  # fmt: skip
+    return table
+
+
+def _order_line(order: dict[str, dict[str, list[bool]]]) -> str:
+    parts = [
+        f"{' > '.join((*ORDERED, best))}, {name}: {sum(held)} of {len(held)} seeds"
+        for best, kinds in order.items() for name, held in kinds.items()
+    ]  # fmt: skip
+    return "Order beyond the start (mean over visits):\n  " + "\n  ".join(parts)
+
+
+def _finite(tree: Any) -> Any:
+    """What is not finite becomes null."""
+    if isinstance(tree, dict):
+        return {key: _finite(value) for key, value in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [_finite(value) for value in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
