@@ -6,7 +6,6 @@ from pathlib import Path
 from omegaconf import DictConfig
 from rich import print as show
 from rich.console import Console
-from rich.markup import escape
 
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.conf import hydra_main
@@ -16,8 +15,13 @@ from wearcap.files import write_text
 from wearcap.io.bvh import write_bvh
 from wearcap.io.gltf import write_glb
 from wearcap.io.motion_npz import write_motion
+from wearcap.io.scan import read_scan
 from wearcap.pipelines.hmd2 import HMD2
+from wearcap.pipelines.hps import HPS
+from wearcap.pipelines.hps_stream import follow
+from wearcap.pipelines.stages import CLOUD
 from wearcap.recording import Motion, Recording
+from wearcap.recording.growing import follow_pieces
 from wearcap.recording.locate import load_recording
 from wearcap.viewer.video import write_video
 
@@ -29,18 +33,20 @@ def run(config: DictConfig) -> Motion | None:
 
     A pipeline of stages writes report.json, too; `until` a stage before there is a motion, that alone.
     """
-    recording = load_recording(config.recording)
     pipeline = load_pipeline(config.checkpoint, config.pipeline, config.device)
     folder = Path(config.output)
+    if config.live:
+        return _live(pipeline, config, folder)
+    recording = load_recording(config.recording)
     if isinstance(pipeline, HMD2):
         if config.until is not None or config.cache is not None:
             raise WearcapError(f"until={config.until} cache={config.cache}", expected="a pipeline with stages, such as pipeline=hps")  # fmt: skip
         motion = pipeline(recording, seed=config.seed)
         motion.provenance.update(checkpoint=str(config.checkpoint))
     else:
-        console = Console(stderr=True)
-        capture = staged(pipeline, config, config.recording, lambda line: console.print(escape(line)))
-        captured = capture.run(recording, config.until)
+        captured = staged(pipeline, config, config.recording, Console(stderr=True)).run(
+            recording, config.until
+        )
         write_text(folder / "report.json", json.dumps(captured.report, indent=1) + "\n")
         motion = captured.motion
     if motion is not None:
@@ -60,5 +66,24 @@ def _write(motion: Motion, recording: Recording, folder: Path, config: DictConfi
         write_video(folder / "motion.mp4", shown | {"capture": motion}, max_seconds=config.video_seconds)
 
 
+def _live(pipeline: object, config: DictConfig, folder: Path) -> None:
+    """Follow a growing recording: motion-000000.npz, … appear as frames become final."""
+    if not isinstance(pipeline, HPS):
+        raise WearcapError("this pipeline cannot follow a growing recording", expected="pipeline=hps")
+    source = Path(config.recording)
+    if not source.is_dir():
+        raise WearcapError(
+            "no such folder", where=source, expected="a growing recording: piece-000000.safetensors, …"
+        )
+    scan = None
+    if config.scene is not None:
+        scene = Path(config.scene)
+        scan = read_scan(scene / CLOUD if scene.is_dir() else scene, metres_per_unit=config.metres_per_unit)
+    for number, motion in enumerate(follow(pipeline, follow_pieces(source), scan, source)):
+        write_motion(motion, folder / f"motion-{number:06d}.npz")
+        show(f"{motion.timestamps[-1].item():9.2f} s", flush=True)
+    show(f"motion: {folder}")
+
+
 def main(arguments: list[str]) -> None:
-    hydra_main("capture", run, arguments)
+    hydra_main("capture", run, ["live=true" if argument == "--live" else argument for argument in arguments])

@@ -185,9 +185,6 @@ class Stretch:
 
     def _look_up_ground(self) -> None:
         ground = find_ground(self.data, torch.from_numpy(self.kin.points), self.energy)
-        if ground is None:
-            self.frames.found[:] = 0.0
-            return
         for name, found in (
             ("ground", ground.point),
             ("origin", ground.origin),

@@ -127,13 +127,14 @@ class Ground:
     found: Float[Tensor, "time vertex"]
 
 
-def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: HpsEnergy) -> Ground | None:
+def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: HpsEnergy) -> Ground:
     """Look up the scene beneath patch vertices (m, world) in contact, as far as the energy asks for it.
 
-    A patch has one plane: that beneath its middle. None without a scene, or a term that needs it.
+    A patch has one plane: that beneath its middle. Nothing is found without a scene.
     """
     if data.surface is None or not (energy.weight("contact") or energy.weight("contact_plane")):
-        return None
+        none = torch.zeros_like(points.detach())
+        return Ground(none, none, none, none[..., 0])
     dtype, points = points.dtype, points.detach().double()
     stands, patch = data.contact > 0, data.patches.patch
     point, origin, normal = points.clone(), torch.zeros_like(points), torch.zeros_like(points)
@@ -189,7 +190,7 @@ def energy_terms(
     }  # fmt: skip
     terms = {}
     for name, weight in energy.weights.items():
-        if weight == 0 or (name.startswith("contact") and ground is None):
+        if weight == 0:
             continue
         residual, share_of = elements[name]()
         value = energy.loss(name)(residual)

@@ -79,6 +79,7 @@ class HPS:
         """
         recording = source.recording
         require(recording, "suit", "camera")
+        first = camera_stages(source, self.synchronization, self.localization)
         if source.scan is None and (
             terms := [t for t in ("contact", "contact_plane") if self.energy.weight(t)]
         ):
@@ -87,7 +88,7 @@ class HPS:
                                fix="Without one: pipeline=hps_without_scene.")  # fmt: skip
         body = (recording.suit, *mount(recording))
         return [
-            *camera_stages(source, self.synchronization, self.localization),
+            *first,
             Stage(
                 "align", lambda done: self.align(on_one_clock(recording, done)), lambda: (self.fps, *body),
                 ("synchronize", "localize"), ("sensors/alignment.py", "data/prepare/clean.py", "geometry", "body"),

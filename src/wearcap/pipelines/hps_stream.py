@@ -4,7 +4,9 @@ A window of the newest seconds is solved again and again; frames older than `lag
 follow. Memory is that of a window, however long the recording.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float, Float64
@@ -187,6 +189,38 @@ class HpsStream:
         self.suit = self.suit.sliced(first, len(self.suit))
         if self.seen is not None:
             self.seen = _cut(self.seen, int(torch.searchsorted(self.seen.timestamps, before_s)))
+
+
+def follow(
+    hps: HPS,
+    pieces: Iterable[Recording],
+    scan: Scan | None,
+    folder: Path = Path(),
+    settings: StreamSettings | None = None,
+) -> Iterator[Motion]:
+    """Motion of a recording that is still being made, piece by piece; `folder` holds what pieces name.
+
+    A piece's camera is localised where it brings pictures and no poses. Camera and suit must share a clock: claps
+    are heard too late. Raises WearcapError when they do not, or a piece has no suit.
+    """
+    stream: HpsStream | None = None
+    for piece in pieces:
+        if piece.suit is None:
+            raise WearcapError(
+                "no suit in this piece", where=piece.name, expected="a suit's motion in each piece"
+            )
+        if hps.synchronization.by_claps(piece):
+            raise WearcapError("claps cannot bring a growing recording's clocks together", where=piece.name,
+                               fix="Set the clocks before, and give pipeline.synchronization.clock=shared.")  # fmt: skip
+        if stream is None:
+            stream = HpsStream(hps, piece, scan, settings)
+        seen = hps.localize(piece, folder) if piece.camera is not None else piece.localization
+        done = stream.push(piece.suit, seen)
+        if done is not None:
+            yield done
+    last = stream.finish() if stream is not None else None
+    if last is not None:
+        yield last
 
 
 def _step(timestamps: Float64[Tensor, "time"]) -> float:

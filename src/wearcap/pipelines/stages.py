@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import safetensors
+from rich.console import Console
 from safetensors.torch import load, save
 
 from wearcap.errors import WearcapError
@@ -29,7 +30,6 @@ from wearcap.sensors.initialization import Initialization
 RESULTS = KNOWN | {cls.__name__: cls for cls in (Clock, Initialization, Solution, HpsState)}
 """What may come back from a cache."""
 CLOUD = "pointcloud.ply"
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,33 +140,39 @@ class StageCache:
 
 
 def run_stages(
-    stages: list[Stage], cache: StageCache | None = None, until: str | None = None, tell: Tell | None = None
+    stages: list[Stage],
+    cache: StageCache | None = None,
+    until: str | None = None,
+    console: Console | None = None,
 ) -> tuple[dict[str, Any], list[StageRun]]:
-    """Results by stage, up to and with `until`, and how each came about; `tell` is given a line for each.
+    """Results by stage, up to and with `until`, and how each came about; the console shows a line for each.
 
     What the cache holds is reused, what it holds damaged is made again. Raises WearcapError for an unknown `until`.
     """
     names = [stage.name for stage in stages]
     if until is not None and until not in names:
         raise WearcapError(f"no stage {until!r}", expected=f"one of {', '.join(names)}")
-    tell = tell or (lambda line: None)
+    console = console or Console(quiet=True)
     results: dict[str, Any] = {}
     digests: dict[str, str] = {}
     runs = []
     for stage in stages:
         key = _key(stage, digests) if cache else ""
-        kept = _kept(stage, key, cache, tell)
+        kept = _kept(stage, key, cache, console)
         if kept is not None:
             results[stage.name], digests[stage.name], seconds = kept
         else:
-            tell(f"{stage.name} …")
+            if console.is_terminal:
+                console.print(f"{stage.name} …")
             begin = time.perf_counter()
             results[stage.name] = stage.make(results)
             seconds = time.perf_counter() - begin
             if cache:
                 digests[stage.name] = cache.write(stage.name, key, results[stage.name], seconds)
         runs.append(StageRun(stage.name, round(seconds, 3), kept is not None))
-        tell(f"{stage.name}: {'reused' if kept is not None else f'{seconds:.1f} s'}")
+        console.print(
+            f"{stage.name}: {'reused' if kept is not None else f'{seconds:.1f} s'}", highlight=False
+        )
         if stage.name == until:
             break
     return results, runs
@@ -177,13 +183,17 @@ def _key(stage: Stage, digests: dict[str, str]) -> str:
     return digest(stage.name, code_digest(*stage.code), list(stage.reads()), followed)
 
 
-def _kept(stage: Stage, key: str, cache: StageCache | None, tell: Tell) -> tuple[Any, str, float] | None:
+def _kept(
+    stage: Stage, key: str, cache: StageCache | None, console: Console
+) -> tuple[Any, str, float] | None:
     if cache is None:
         return None
     try:
         return cache.read(stage.name, key)
     except WearcapError as error:
-        tell(f"{stage.name}: {error.where} is {error.what}; it is made again")
+        console.print(
+            f"{stage.name}: {error.where} is {error.what}; it is made again", markup=False, soft_wrap=True
+        )
         return None
 
 
@@ -206,13 +216,13 @@ class StagedCapture:
     """The scene's folder or cloud; None: what each recording names."""
     metres_per_unit: float | int | None = None
     cache: Path | None = None
-    tell: Tell | None = None
+    console: Console | None = None
 
     def run(self, recording: Recording, until: str | None = None) -> Captured:
         """One recording, up to and with the stage `until`."""
         source = Source(recording, self.folder, self._scan(recording), self.metres_per_unit)
         cache = None if self.cache is None else StageCache(self.cache / recording.name)
-        results, runs = run_stages(self.pipeline.stages(source), cache, until, self.tell)
+        results, runs = run_stages(self.pipeline.stages(source), cache, until, self.console)
         report = {
             "pipeline": self.pipeline.name,
             "recording": recording.name,

@@ -1,0 +1,48 @@
+"""A recording that is still being made: a folder of pieces, each a recording of some seconds, in order.
+
+`piece-000000.safetensors`, `piece-000001.safetensors`, … appear whole (written under another name and renamed); the
+file `end` says that there are no more. The first piece tells about the wearer, the camera and the scene.
+"""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from wearcap.errors import WearcapError
+from wearcap.files import write_text
+from wearcap.recording.recording import Recording
+from wearcap.recording.store import RecordingFile, save_recording
+
+END = "end"
+
+
+def piece_path(folder: str | Path, number: int) -> Path:
+    return Path(folder) / f"piece-{number:06d}.safetensors"
+
+
+def write_piece(recording: Recording, folder: str | Path, number: int) -> None:
+    """Add the next piece."""
+    save_recording(recording, piece_path(folder, number))
+
+
+def close_pieces(folder: str | Path) -> None:
+    """Say that the recording has ended."""
+    write_text(Path(folder) / END, "")
+
+
+def follow_pieces(folder: str | Path, patience_s: float = 60.0, poll_s: float = 0.1) -> Iterator[Recording]:
+    """Pieces as they appear, until `end`. Raises WearcapError when none comes for `patience_s`."""
+    folder, number, since = Path(folder), 0, time.monotonic()
+    while True:
+        ended = (folder / END).exists()  # asked first: what was written before the end is still there
+        if piece_path(folder, number).exists():
+            yield RecordingFile(piece_path(folder, number)).load()
+            number, since = number + 1, time.monotonic()
+        elif ended:
+            return
+        elif time.monotonic() - since > patience_s:
+            raise WearcapError(f"no piece {number} after {patience_s:.0f} s", where=folder,
+                               expected=f"{piece_path(folder, number).name}, or a file named {END!r}",
+                               fix="Is the recorder still running?")  # fmt: skip
+        else:
+            time.sleep(poll_s)
