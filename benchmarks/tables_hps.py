@@ -72,7 +72,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         SeedRun(settings, first + k, folder / "cache", folder if k == 0 else None, options.jobs // jobs)
         for k in range(count)
     ]
-    runs = Parallel(n_jobs=jobs)(delayed(run_seed)(seed) for seed in seeds)
+    runs = [run for run in Parallel(n_jobs=jobs)(delayed(run_seed)(seed) for seed in seeds) if run]
     places = ["at start", *(f"{distance:.0f} m" for distance in options.returns)]
     tree: dict[str, Any] = {"about": about, "places": places, **summarized(runs)}
     show = Console(width=max(Console().width, WIDTH), highlight=False).print
