@@ -15,9 +15,10 @@ import torch
 
 from wearcap.cli import main as cli
 from wearcap.cli import train
+from wearcap.geometry.camera import Camera
 from wearcap.io.bvh import write_bvh
 from wearcap.io.motion_npz import write_motion
-from wearcap.recording import ImuStream, Localization, RecordingStore
+from wearcap.recording import CameraStream, ImuStream, Localization, RecordingStore
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 SMALL = ["debug=fast", "data.window=60", "trainer.accelerator=cpu", "model.net.width=32", "model.net.layers=1",
@@ -162,6 +163,26 @@ def with_checkpoint(verb: str, checkpoint: Path, out: Path, *more: str) -> list[
     ]
 
 
+def hps(data: Path, out: Path, *more: str) -> list[str]:
+    """Capture the data set's only recording, or r4."""
+    recording = data / "r4" if (data / "recordings/r4.safetensors").is_file() else data
+    return ["capture", "pipeline=hps", f"recording={recording}", f"hydra.run.dir={out}", "video=false", *more]
+
+
+def suited(root: Path, short: bool = False, **parts) -> Path:
+    """A data set of one recording with a suit, a localised camera, and no scan."""
+    motion = swaying_motion(90)
+    head = motion.joint("head")
+    suit = replace(motion, contact_prob=torch.ones(90, 4))
+    if short:
+        object.__setattr__(suit, "contact_prob", torch.zeros(50, 4))  # the type itself would refuse it here
+    camera = CameraStream(motion.timestamps, Camera.pinhole(64, 48, 60.0), torch.eye(3), torch.zeros(3))
+    found = Localization(motion.timestamps, head.R, head.t, torch.ones(90))
+    sensed = {"suit": suit, "camera": camera, "localization": found} | parts
+    RecordingStore(root).add(replace(recording_of(motion, "r"), **sensed), split="test", config_hash="x")
+    return root
+
+
 ROWS = {
     "train: no data set": (lambda data, ckpt, tmp, out: training(tmp / "none", out), "no data set here"),
     "train: three frames": (
@@ -203,6 +224,38 @@ ROWS = {
     "capture: no checkpoint": (
         lambda data, ckpt, tmp, out: with_checkpoint("capture", tmp / "none.ckpt", out, f"recording={data}/r4"),
         "no such checkpoint"),
+    "capture: learned, without a checkpoint": (
+        lambda data, ckpt, tmp, out: ["capture", f"recording={data}/r4", f"hydra.run.dir={out}"],
+        "no checkpoint, but HMD2 needs a trained network"),
+    "capture: a checkpoint for nothing": (
+        lambda data, ckpt, tmp, out: hps(data, out, f"checkpoint={ckpt}"), "a checkpoint, but HPS has no network"),
+    "capture: stages of a pipeline without": (
+        lambda data, ckpt, tmp, out: with_checkpoint("capture", ckpt, out, f"recording={data}/r4", "until=align"),
+        "until=align cache=None"),
+    "hps: no suit": (lambda data, ckpt, tmp, out: hps(data, out), "r4: no suit and no camera in this recording"),
+    "hps: no camera": (
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d", camera=None), out), "r: no camera in this recording"),
+    "hps: no poses, no map": (
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d", localization=None), out), "no localisation in this recording, and no map"),
+    "hps: no such map": (
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline.localization.map=none.map"), "none.map: no such map"),
+    "hps: no scan": (
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out), "no scan of the scene, which the energy's term contact_plane needs"),
+    "hps: a scene without a cloud": (
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, f"scene={data}"), "no scan of a scene here"),
+    "hps: no clap": (
+        lambda data, ckpt, tmp, out: hps(
+            suited(tmp / "d"), out, "pipeline=hps_without_scene", "pipeline.synchronization.clock=claps",
+            "pipeline.synchronization.camera_claps_s=[1.0]"), "no clap found"),
+    "hps: a clock that is none": (
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline.synchronization.clock=clap"), "clock='clap'"),
+    "hps: contacts shorter than poses": (
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d", short=True), out), "Motion.contact_prob has 50 rows for 90 timestamps"),
+    "hps: no stage": (
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline=hps_without_scene", "until=optimise"), "no stage 'optimise'"),
+    "evaluate: no data set for hps": (
+        lambda data, ckpt, tmp, out: ["evaluate", "pipeline=hps", f"hydra.run.dir={out}", f"output={out}/t.json"],
+        "dataset has no value"),
     "prepare: no folder": (
         lambda data, ckpt, tmp, out: ["prepare", "cmu", f"source={tmp}/none", f"output={out}"], "no such folder"),
     "prepare: typo": (

@@ -35,14 +35,16 @@ def floor_points() -> np.ndarray:
 
 
 def drifting(truth: Motion, contact: torch.Tensor) -> Motion:
-    """As a suit sees it: its own origin and heading, which drifts by a fifth of a degree a second."""
+    """As a suit sees it: its own origin and heading, which drift by 2 cm and a fifth of a degree a second."""
     seconds = truth.timestamps - truth.timestamps[0]
     turn = rotation.about_axis("z", (0.8 + np.deg2rad(0.2) * seconds).float())
     R = truth.R_parent_joint.clone()
     R[:, 0] = turn @ R[:, 0]
     steps = (turn[1:] @ truth.t_world_root.diff(dim=0)[..., None])[..., 0]
     first = torch.tensor([[4.0, -2.0, truth.t_world_root[0, 2].item()]])
-    t = torch.cat([first, first + steps.cumsum(0)])
+    t = torch.cat([first, first + steps.cumsum(0)]) + 0.02 * seconds.float()[:, None] * torch.tensor(
+        [0.6, 0.8, 0.0]
+    )
     return replace(truth, R_parent_joint=R, t_world_root=t, contact_prob=contact.float())
 
 

@@ -31,7 +31,7 @@ def run(config: DictConfig) -> Scores:
             if config.dataset is None:
                 raise WearcapError("dataset has no value", fix="Give it on the command line: dataset=DIR.")
             store = RecordingStore.open(config.dataset)
-            capture = staged(pipeline, config, store.root, progress.console.print)
+            capture = staged(pipeline, config, store.root, progress.console)
             rows = _rows(capture, store, list(config.seeds)[:1], config, progress, pipeline.name)
             scores = {pipeline.name: aggregate(list(rows))}
     about = {"dataset": str(store.root), "split": config.split, "checkpoint": ", ".join(map(str, checkpoints))}  # fmt: skip

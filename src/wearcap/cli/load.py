@@ -1,11 +1,11 @@
 """From a checkpoint to the system its own config describes, and from a config to a pipeline, around it or without one."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig
+from rich.console import Console
 
 from wearcap.errors import WearcapError
 from wearcap.pipelines.hmd2 import HMD2
@@ -43,12 +43,10 @@ def load_pipeline(checkpoint: str | Path | None, pipeline: DictConfig, device: s
     )  # fmt: skip
 
 
-def staged(
-    pipeline: StagedPipeline, config: DictConfig, data: str | Path, tell: Callable[[str], None] | None = None
-) -> StagedCapture:
+def staged(pipeline: StagedPipeline, config: DictConfig, data: str | Path, console: Console) -> StagedCapture:
     """A pipeline of stages for the recordings of a data set: its files, its cache, the scene that was chosen."""
     scene, cache = (None if path is None else Path(path) for path in (config.scene, config.cache))
-    return StagedCapture(pipeline, dataset_folder(data), scene, config.metres_per_unit, cache, tell)
+    return StagedCapture(pipeline, dataset_folder(data), scene, config.metres_per_unit, cache, console)
 
 
 def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:

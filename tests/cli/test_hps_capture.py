@@ -1,0 +1,89 @@
+"""`wearcap capture` and `wearcap evaluate` with HPS: files, report, cache; no checkpoint."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from wearcap.cli import capture, evaluate
+from wearcap.cli.conf import compose
+from wearcap.errors import WearcapError
+from wearcap.io.motion_npz import read_motion
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    sys.path.append(str(Path(__file__).parents[1] / "pipelines"))
+    from hps_walk import hps_dataset, hps_recording
+
+    root = tmp_path_factory.mktemp("data")
+    hps_dataset(root, hps_recording("walk", 12.0), hps_recording("other", 6.0))
+    return root
+
+
+def arguments(data: Path, out: Path, *more: str) -> list[str]:
+    return ["pipeline=hps", "pipeline.solver.settings.iterations=3", f"hydra.run.dir={out}", *more]
+
+
+def capturing(data: Path, out: Path, *more: str) -> None:
+    capture.main(arguments(data, out, f"recording={data}/walk", "body=false", "video_seconds=0.2", *more))
+
+
+def test_a_recording_becomes_files_and_a_report(data, tmp_path, capfd):
+    out, cache = tmp_path / "out", f"cache={tmp_path / 'cache'}"
+    capturing(data, out, cache, "until=initialize", "video=false")
+    start = read_motion(out / "motion.npz")
+    assert "initialize: " in capfd.readouterr().err
+    capturing(data, out, cache)
+    told = capfd.readouterr().err
+    assert "initialize: reused" in told
+    assert "optimize: reused" not in told
+    assert {path.name for path in out.glob("motion.*")} == {
+        "motion.npz",
+        "motion.bvh",
+        "motion.glb",
+        "motion.mp4",
+    }
+    report = json.loads((out / "report.json").read_text())
+    assert [stage["reused"] for stage in report["stages"]] == [True] * 4 + [False]
+    assert report["localized"]["share"] == 1.0
+    motion = read_motion(out / "motion.npz")
+    assert motion.provenance["pipeline"] == "hps"
+    assert len(motion) == len(start) == 360
+    assert (motion.t_world_root - start.t_world_root).abs().max() > 1e-3
+
+
+def test_a_stage_before_any_motion_leaves_its_report(data, tmp_path):
+    capturing(data, tmp_path, "until=localize")
+    assert {path.name for path in tmp_path.glob("*.*") if path.is_file()} >= {"report.json"}
+    assert not (tmp_path / "motion.npz").exists()
+
+
+def test_another_scene_can_be_given(data, tmp_path):
+    capturing(data, tmp_path, f"scene={data}/scene", "video=false")
+    with pytest.raises(WearcapError, match="no scan of a scene here"):
+        capturing(data, tmp_path, f"scene={data}", "video=false")
+
+
+def test_a_data_set_is_scored(data, tmp_path, capfd):
+    table = tmp_path / "table.json"
+    evaluate.main(
+        arguments(data, tmp_path, f"dataset={data}", f"output={table}", f"cache={tmp_path / 'cache'}")
+    )
+    written = json.loads(table.read_text())
+    assert written["about"]["dataset"] == str(data)
+    scores = written["methods"]["hps"]
+    assert scores["world_root_cm"]["mean"] < 8
+    assert {path.name for path in (tmp_path / "cache").iterdir()} == {"walk", "other"}
+    evaluate.main([f"dataset={data}", "pipeline=hps_imu", f"output={table}", f"hydra.run.dir={tmp_path}"])
+    imu = json.loads(table.read_text())["methods"]["imu"]
+    assert imu["world_root_cm"]["mean"] > scores["world_root_cm"]["mean"]
+
+
+def test_localisation_by_learned_features_is_a_choice():
+    chosen = compose(
+        "capture", ["pipeline=hps_document", "recording=x", "localization@pipeline.localization=superpoint"]
+    )
+    assert chosen.pipeline.localization.extractor._target_.endswith("SuperPointExtractor")
+    assert chosen.pipeline.localization._target_.endswith("MapLocalization")

@@ -1,0 +1,259 @@
+"""HPS from a recording to a motion: planted errors go, steps resume, pictures are localised, faults are said."""
+
+import functools
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hps_walk import CLAPS_S, MOUNT, floor_points, hps_dataset, hps_recording
+from PIL import Image
+
+from wearcap.errors import WearcapError
+from wearcap.localization.features import RootSift
+from wearcap.localization.map_builder import MapSettings, build_map
+from wearcap.localization.point_map import PointMapper
+from wearcap.optimize.banded import BandedSettings, solve_banded
+from wearcap.optimize.costs import Loss
+from wearcap.optimize.hps import HpsEnergy
+from wearcap.pipelines import hps as hps_module
+from wearcap.pipelines.evaluation import evaluate
+from wearcap.pipelines.hps import HPS, at_frames
+from wearcap.pipelines.hps_baselines import HpsBaseline
+from wearcap.pipelines.hps_camera import MapLocalization, Synchronization
+from wearcap.pipelines.stages import StagedCapture
+from wearcap.recording import Motion, Recording
+from wearcap.scene.scan import Scan
+
+ENERGY = HpsEnergy(
+    {"self": 220.0, "hold": 9.0, "translation_step": 1e4, "root_step": 1e5, "head_step": 6e4, "pose": 400.0,
+     "slide": 9e3, "contact_plane": 4.4e3},
+    {"self": Loss("cauchy", 0.1), "hold": Loss("cauchy", 0.1), "slide": Loss("huber", 0.01),
+     "contact_plane": Loss("cauchy", 0.02), "translation_step": Loss("square"), "root_step": Loss("square"),
+     "head_step": Loss("square"), "pose": Loss("square")},
+)  # fmt: skip
+SOLVER = functools.partial(solve_banded, settings=BandedSettings(iterations=4, relaxation=1.0))
+PIPELINE = HPS(ENERGY, SOLVER)
+CLAPPING = Synchronization("auto", camera_claps_s=list(CLAPS_S))
+STAGES = ["synchronize", "localize", "align", "initialize", "optimize"]
+
+
+@pytest.fixture(scope="module")
+def walk() -> Recording:
+    return hps_recording(seconds=12.0)
+
+
+def root_error_m(motion: Motion, recording: Recording) -> torch.Tensor:
+    assert recording.motion is not None
+    frame = torch.searchsorted(recording.motion.timestamps, motion.timestamps - 1e-6)
+    return (motion.t_world_root - recording.motion.t_world_root[frame]).norm(dim=-1)
+
+
+def test_planted_errors_of_suit_and_clock_go():
+    recording = hps_recording(camera_lead_s=1.7)
+    capture = StagedCapture(replace(PIPELINE, synchronization=CLAPPING), Path(), scene=None)
+    scanned = replace(recording, scene=None)
+    with pytest.raises(
+        WearcapError, match="no scan of the scene, which the energy's term contact_plane needs"
+    ):
+        capture.run(scanned)
+    pipeline = replace(PIPELINE, synchronization=CLAPPING)
+    motion = pipeline(recording, Scan(floor_points()))
+    assert motion.timestamps.diff().median().item() == pytest.approx(1 / 30)
+    assert root_error_m(motion, recording).mean() < 0.05
+    clock = pipeline.synchronize(recording, Path())
+    assert clock is not None
+    assert clock.offset_s == pytest.approx(1.7, abs=0.002)
+    wrong_clock = PIPELINE(recording, Scan(floor_points()))
+    assert root_error_m(wrong_clock, recording).mean() > 0.5
+
+
+def test_the_report_tells_what_was_found(walk, tmp_path):
+    hps_dataset(tmp_path / "data", walk)
+    captured = StagedCapture(PIPELINE, tmp_path / "data").run(walk)
+    report = captured.report
+    assert [stage["stage"] for stage in report["stages"]] == STAGES
+    assert report["clock"] is None
+    assert report["localized"] == {"frames": 360, "share": 1.0}
+    assert report["alignment_deg"] == pytest.approx(-np.rad2deg(0.8), abs=3)
+    assert report["energy"][-1]["total"] < report["energy"][0]["total"]
+    assert set(report["energy"][0]) == {*ENERGY.weights, "total"}
+    assert isinstance(report["stopped"], str)
+    started = StagedCapture(PIPELINE, tmp_path / "data").run(walk, until="initialize")
+    assert started.motion is not None
+    assert "energy" not in started.report
+    assert StagedCapture(PIPELINE, tmp_path / "data").run(walk, until="localize").motion is None
+
+
+def test_a_killed_capture_goes_on_to_the_same_motion(walk, tmp_path, monkeypatch):
+    hps_dataset(tmp_path / "data", walk)
+    capture = StagedCapture(PIPELINE, tmp_path / "data", cache=tmp_path / "cache")
+    monkeypatch.setattr(hps_module.HPS, "optimize", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        capture.run(walk)
+    monkeypatch.undo()
+    resumed = capture.run(walk)
+    assert [stage["reused"] for stage in resumed.report["stages"]] == [True, True, True, True, False]
+    straight = StagedCapture(PIPELINE, tmp_path / "data").run(walk)
+    assert resumed.motion is not None
+    assert straight.motion is not None
+    assert torch.equal(resumed.motion.t_world_root, straight.motion.t_world_root)
+    assert torch.equal(resumed.motion.R_parent_joint, straight.motion.R_parent_joint)
+    reused = capture.run(walk)
+    assert all(stage["reused"] for stage in reused.report["stages"])
+    assert reused.motion is not None
+    assert torch.equal(reused.motion.t_world_root, straight.motion.t_world_root)
+
+
+@pytest.mark.parametrize(
+    ("changed", "stale"),
+    [
+        (lambda r, root: (r, replace(PIPELINE, solver=functools.partial(SOLVER, settings=BandedSettings(iterations=2)))), ["optimize"]),
+        (lambda r, root: (r, replace(PIPELINE, name="other")), []),
+        (lambda r, root: (replace(r, motion=None), PIPELINE), []),
+        (lambda r, root: (replace(r, suit=r.suit.sliced(0, 600)), PIPELINE), ["align", "initialize", "optimize"]),
+        (lambda r, root: (rescanned(r, root), PIPELINE), ["optimize"]),
+    ],
+    ids=["solver", "name", "truth", "suit", "scan"],
+)  # fmt: skip
+def test_only_what_follows_a_change_is_made_again(changed, stale, walk, tmp_path):
+    hps_dataset(tmp_path / "data", walk)
+    StagedCapture(PIPELINE, tmp_path / "data", cache=tmp_path / "cache").run(walk)
+    recording, pipeline = changed(walk, tmp_path / "data")
+    runs = (
+        StagedCapture(pipeline, tmp_path / "data", cache=tmp_path / "cache").run(recording).report["stages"]
+    )
+    assert [run["stage"] for run in runs if not run["reused"]] == stale
+
+
+def rescanned(recording: Recording, root: Path) -> Recording:
+    path = root / "scene/pointcloud.ply"
+    path.write_bytes(path.read_bytes() + b"\n")
+    return recording
+
+
+def test_a_baseline_shares_the_first_stages(walk, tmp_path):
+    hps_dataset(tmp_path / "data", walk)
+    StagedCapture(PIPELINE, tmp_path / "data", cache=tmp_path / "cache").run(walk)
+    for kind in ("imu", "imu_cam_filtered"):
+        run = StagedCapture(HpsBaseline(kind), tmp_path / "data", cache=tmp_path / "cache").run(walk)
+        assert [stage["reused"] for stage in run.report["stages"]] == [True, True, False]
+        assert run.motion is not None
+        assert run.motion.provenance["pipeline"] == kind
+
+
+def test_it_is_scored_in_the_world_and_hung(walk, tmp_path):
+    store = hps_dataset(tmp_path, walk)
+    imu, ours = (
+        next(evaluate(StagedCapture(p, tmp_path), store, ["walk"], [0])).scores
+        for p in (HpsBaseline("imu"), PIPELINE)
+    )
+    assert ours["world_root_cm"] < imu["world_root_cm"]
+    assert ours["mpjpe_cm"] < 5
+    assert ours["world_mpjpe_cm"] == pytest.approx(ours["world_root_cm"], rel=0.5)
+
+
+def test_rarely_localised_orientations_are_carried_by_the_suit(walk):
+    head = walk.motion.joint("head")
+    motion, found = walk.motion, walk.localization
+    rare = replace(
+        found, timestamps=found.timestamps[::9], R_world_cam=found.R_world_cam[::9],
+        t_world_cam=found.t_world_cam[::9], confidence=found.confidence[::9],
+    )  # fmt: skip
+    R_cam, sure = at_frames(rare, motion)
+    inside = motion.timestamps < rare.timestamps[-1] + 0.1
+    assert (sure[inside] == 1).all()
+    off = (R_cam - (head.R @ MOUNT.R).double()).abs().amax((1, 2))
+    assert off[inside].max() < 1e-5
+
+
+# Pictures ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """A data set with a painted room, its map, and pictures that a head took in it."""
+    sys.path.append(str(Path(__file__).parents[1] / "localization"))
+    from textured_room import CAMERA, looking, photo_poses, photograph, take_photos, textured_room
+
+    root = tmp_path_factory.mktemp("filmed")
+    (root / "scene").mkdir()
+    mapper = PointMapper(textured_room(), 0.01)
+    photos = take_photos(mapper, CAMERA, photo_poses(10), root / "scene")
+    build_map(photos, Scan(mapper.points), RootSift(400), settings=MapSettings(splat_m=0.01, words=8)).save(
+        root / "scene/map.safetensors"
+    )
+    poses = [looking((2.0 + 0.05 * k, 2.0, 1.6), 0.3 + 0.02 * k, 0.1) for k in range(6)]
+    for number, pose in enumerate(poses):
+        Image.fromarray(photograph(mapper, CAMERA, pose)).save(root / f"{number}.png")
+    files = tuple(f"{number}.png" for number in range(6))
+    walk = hps_recording(seconds=2.0)
+    assert walk.camera is not None
+    stream = replace(walk.camera, timestamps=walk.camera.timestamps[:6], camera=CAMERA, image_files=files)
+    return root, replace(walk, camera=stream, localization=None), poses
+
+
+def test_pictures_are_localised_in_the_scenes_map(filmed):
+    root, recording, poses = filmed
+    found = MapLocalization(RootSift(400), every=2)(recording, root)
+    assert torch.equal(found.timestamps, recording.camera.timestamps[::2])
+    assert (found.confidence > 0.5).all()
+    truth = torch.stack([pose.t for pose in poses[::2]])
+    assert (found.t_world_cam - truth).norm(dim=-1).max() < 0.02
+    # 6 Hz of the stream's 30
+    assert len(MapLocalization(RootSift(400))(recording, root).timestamps) == 2
+
+
+def test_poses_that_are_there_are_taken_unless_a_map_is_given(filmed, walk):
+    root, recording, _ = filmed
+    known = replace(recording, localization=walk.localization)
+    assert MapLocalization()(known, root) is walk.localization
+    again = MapLocalization(RootSift(400), map=str(root / "scene"), every=5)(known, root)
+    assert len(again.timestamps) == 2
+
+
+def test_another_map_is_another_result(filmed, tmp_path):
+    root, recording, _ = filmed
+    cache = tmp_path / "cache"
+    capture = StagedCapture(
+        replace(PIPELINE, localization=MapLocalization(RootSift(400), every=3)), root, scene=root / "0.ply", cache=cache
+    )  # fmt: skip
+    (root / "0.ply").write_bytes(b"")
+    assert not capture.run(recording, until="localize").report["stages"][1]["reused"]
+    assert capture.run(recording, until="localize").report["stages"][1]["reused"]
+    path = root / "scene/map.safetensors"
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    assert not capture.run(recording, until="localize").report["stages"][1]["reused"]
+    path.write_bytes(content)
+
+
+# Faults --------------------------------------------------------------------------------------------------------------
+
+FAULTS = {
+    "no suit": (lambda r: replace(r, suit=None), PIPELINE, "walk: no suit in this recording"),
+    "no camera": (lambda r: replace(r, camera=None), PIPELINE, "walk: no camera in this recording"),
+    "no poses": (lambda r: replace(r, localization=None), PIPELINE, "no localisation in this recording, and no map"),
+    "no map": (lambda r: r, replace(PIPELINE, localization=MapLocalization(map="none.safetensors")), "none.safetensors: no such map"),
+    "no pictures": (lambda r: r, replace(PIPELINE, localization=MapLocalization(map=__file__)), "no pictures of the head camera"),
+    "no clap": (lambda r: hps_recording(seconds=12.0), replace(PIPELINE, synchronization=Synchronization("claps", [1.0])),
+                "no clap found"),
+    "silent video": (lambda r: r, replace(PIPELINE, synchronization=Synchronization("claps")), "a camera without a video"),
+    "no contacts": (lambda r: replace(r, suit=replace(r.suit, contact_prob=None)), PIPELINE, "no foot contacts for 360 frames"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_missing_is_said(fault, walk):
+    change, pipeline, message = FAULTS[fault]
+    with pytest.raises(WearcapError, match=message):
+        pipeline(change(walk), Scan(floor_points()))
+
+
+def test_settings_that_cannot_be_are_refused():
+    with pytest.raises(WearcapError, match="clock='clap'. Expected one of shared, claps, auto"):
+        Synchronization("clap")
+    with pytest.raises(WearcapError, match="every=0"):
+        MapLocalization(every=0)

@@ -1,0 +1,170 @@
+"""Stages: what is current is reused, a change reaches no further than it must, and a killed run goes on."""
+
+import functools
+import io
+import os
+import signal
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from torch import nn
+
+from wearcap.errors import WearcapError
+from wearcap.pipelines.digest import code_digest, digest
+from wearcap.pipelines.stages import Stage, StageCache, run_stages
+from wearcap.sensors.clock import Clock
+
+CLOCK = Clock(torch.tensor([1.5, 9.0]).double(), torch.tensor([0.5, 8.0]).double(), 0.1, 0.0, 2)
+
+
+@dataclass(frozen=True)
+class Settings:
+    shift: float = 1.0
+    gain: float = 2.0
+    names: tuple[str, ...] = ("a",)
+
+
+def three(settings: Settings, made: list[str], die: bool = False) -> list[Stage]:
+    """start → doubled (rounded) → end; `made` is told what was made."""
+
+    def start(done):
+        made.append("start")
+        return replace(CLOCK, camera_s=CLOCK.camera_s + settings.shift)
+
+    def doubled(done):
+        made.append("doubled")
+        return {"value": (settings.gain * done["start"].camera_s).round()}
+
+    def end(done):
+        if die:
+            os.kill(os.getpid(), signal.SIGKILL)
+        made.append("end")
+        return None if settings.gain == 0 else done["doubled"]["value"].sum().item()
+
+    return [
+        Stage("start", start, lambda: [settings.shift]),
+        Stage("doubled", doubled, lambda: [settings.gain], ("start",)),
+        Stage("end", end, list, ("doubled",)),
+    ]
+
+
+def run(cache, settings=Settings(), until=None):
+    made, shown = [], Console(file=io.StringIO(), width=200)
+    results, runs = run_stages(three(settings, made), StageCache(cache), until, shown)
+    assert [r.reused for r in runs] == [r.stage not in made for r in runs]
+    return results, made, shown.file.getvalue().splitlines()
+
+
+def test_what_is_current_is_reused(tmp_path):
+    first, made, _ = run(tmp_path)
+    assert made == ["start", "doubled", "end"]
+    again, made, told = run(tmp_path)
+    assert made == []
+    assert told == ["start: reused", "doubled: reused", "end: reused"]
+    assert torch.equal(again["start"].camera_s, first["start"].camera_s)
+    assert (again["start"].drift_s_per_hour, again["end"]) == (0.1, first["end"])
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_change_reaches_what_follows_as_far_as_it_tells(tmp_path):
+    run(tmp_path)
+    assert run(tmp_path, Settings(gain=3.0))[1] == ["doubled", "end"]
+    # Another start that rounds to the same: the last stage has nothing new to read.
+    assert run(tmp_path, Settings(shift=1.001))[1] == ["start", "doubled"]
+    assert run(tmp_path)[1] == []
+
+
+def test_it_stops_after_the_stage_asked_for(tmp_path):
+    results, made, _ = run(tmp_path, until="doubled")
+    assert made == list(results) == ["start", "doubled"]
+    assert run(tmp_path)[1] == ["end"]
+    with pytest.raises(WearcapError, match="no stage 'dubled'. Expected one of start, doubled, end"):
+        run(tmp_path, until="dubled")
+
+
+def test_nothing_as_a_result_is_kept_too(tmp_path):
+    assert run(tmp_path, Settings(gain=0.0))[0]["end"] is None
+    assert run(tmp_path, Settings(gain=0.0))[1] == []
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-7])
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[-3] ^= 1
+    path.write_bytes(bytes(content))
+
+
+@pytest.mark.parametrize("damage", [cut, flip, os.remove], ids=["cut", "flipped", "gone"])
+@pytest.mark.parametrize("ending", ["json", "safetensors"])
+def test_a_damaged_result_is_made_again_with_a_note(ending, damage, tmp_path):
+    run(tmp_path)
+    (path,) = tmp_path.glob(f"doubled-*.{ending}")
+    if damage is flip and ending == "json":
+        path.write_text(path.read_text().replace('"doubled.value"', '"value"').replace("$tensor", "$tenso"))
+    else:
+        damage(path)
+    _, made, told = run(tmp_path)
+    assert made == ["doubled"]
+    noted = [line for line in told if "it is made again" in line]
+    assert len(noted) == (0 if (damage, ending) == (os.remove, "json") else 1)
+    assert run(tmp_path)[1] == []
+
+
+def test_a_killed_run_goes_on_where_it_stood(tmp_path):
+    child = os.fork()
+    if child == 0:
+        run_stages(three(Settings(), [], die=True), StageCache(tmp_path))
+        os._exit(0)
+    assert os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
+    results, made, _ = run(tmp_path)
+    assert made == ["end"]
+    assert results["end"] == run_stages(three(Settings(), []))[0]["end"]
+
+
+def test_a_result_is_there_whole_or_not_at_all(tmp_path, monkeypatch):
+    """Between the two files of a result the power fails."""
+    replaced = os.replace
+
+    def fail(source, target):
+        if str(target).endswith(".json"):
+            raise KeyboardInterrupt
+        replaced(source, target)
+
+    monkeypatch.setattr("wearcap.files.os.replace", fail)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path)
+    monkeypatch.undo()
+    assert run(tmp_path)[1] == ["start", "doubled", "end"]
+
+
+def test_digests_follow_content(tmp_path):
+    file = tmp_path / "a.bin"
+    file.write_bytes(b"a")
+    part = functools.partial(run, settings=Settings())
+    values = [1, 1.0, True, "1", None, [1], [[1]], {"a": 1}, torch.ones(2), torch.ones(2, 1), torch.ones(2).double(),
+              np.ones(2), Settings(), Settings(gain=3.0), file, part, run, nn.Linear(2, 1)]  # fmt: skip
+    seen = [digest(value) for value in values]
+    assert len(set(seen)) == len(values)
+    assert seen == [digest(value) for value in values]
+    assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1})
+    assert digest(part) == digest(functools.partial(run, settings=Settings()))
+    before = digest(file)
+    file.write_bytes(b"bb")
+    assert digest(file) != before
+    for wrong in (lambda: 0, object()):
+        with pytest.raises(TypeError):
+            digest(wrong)
+    with pytest.raises(WearcapError, match="no such file"):
+        digest(tmp_path / "none")
+
+
+def test_sources_have_a_digest():
+    assert code_digest("sensors/clock.py") != code_digest("sensors")
+    with pytest.raises(WearcapError, match="no such file"):
+        code_digest("sensors/none.py")
