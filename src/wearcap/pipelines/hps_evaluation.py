@@ -26,6 +26,8 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Intervals
 from wearcap.scene.scan import Scan
 
+FEET_S, FEET_EVERY_S = 2.0, 6.0
+"""Feet are examined for so long out of so much: in all about the document's three minutes, spread evenly."""
 BIN_M = 20.0
 """Stretches of way whose errors are averaged before a slope is fitted."""
 MARGIN_S = 5.0
@@ -146,7 +148,10 @@ def nearest_frames(timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "ins
 
 def foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time patch"]) -> FootSurface:
     """Distance to the scan and sliding of the captured feet during `contact` (Table 4.3)."""
-    return foot_surface(*foot_vertices(truth.body, motion.T_world_joint, contact), truth.surface)
+    times = truth.motion.timestamps
+    examined = (times - times[0]) % FEET_EVERY_S < FEET_S
+    touching = contact & examined[:, None]
+    return foot_surface(*foot_vertices(truth.body, motion.T_world_joint, touching), truth.surface)
 
 
 def joint_errors_cm(motion: Motion, truth: Motion) -> Float[Tensor, "time joint"]:
