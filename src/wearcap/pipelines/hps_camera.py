@@ -88,8 +88,8 @@ class Synchronization:
             return fit_clock(heard, detect_claps(*wrists), self.max_offset_s)
         except WearcapError as error:
             fix = (
-                "Give synchronization.camera_claps_s=[…], or synchronization.clock=shared where camera and "
-                "suit are on one clock already."
+                "Give pipeline.synchronization.max_offset_s=SECONDS if both started within so much, or "
+                "….camera_claps_s=[…], or ….clock=shared where camera and suit are on one clock already."
             )
             raise WearcapError(error.what, where=error.where or recording.name, expected=error.expected, fix=fix) from error  # fmt: skip
 
