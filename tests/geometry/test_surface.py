@@ -19,7 +19,8 @@ def test_nearest_agrees_with_a_tree(count, cell_m):
     near = true < 0.3
     assert np.allclose(distance[near], true[near], atol=1e-6)
     assert np.allclose(np.linalg.norm(points[index[near]] - queries[near], axis=1), true[near], atol=1e-6)
-    assert np.isinf(distance[~near]).all() and (index[~near] == -1).all()
+    assert np.isinf(distance[~near]).all()
+    assert (index[~near] == -1).all()
 
 
 def test_planes_of_a_tilted_noisy_floor_look_up():
@@ -39,7 +40,8 @@ def test_planes_of_a_tilted_noisy_floor_look_up():
 def test_nothing_near_gives_no_plane():
     index = SurfaceIndex.build(np.zeros((3, 3), np.float32))
     origin, normal = index.plane(np.array([[0.0, 0.0, 0.1], [5.0, 5.0, 5.0]]))
-    assert np.isnan(origin).all() and np.isnan(normal).all()
+    assert np.isnan(origin).all()
+    assert np.isnan(normal).all()
 
 
 def test_an_empty_cloud_and_a_kilometre_are_refused():

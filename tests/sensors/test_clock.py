@@ -93,6 +93,8 @@ def test_what_cannot_be_told_is_refused():
         fit_clock(times([1.7e9]), times([3.0]))
     with pytest.raises(WearcapError, match="several ways"):
         fit_clock(times([10.0, 11.0, 12.0]), times([20.0, 21.0]))
+    early = fit_clock(times([12.0, 12.9, 14.1]), times([10.0, 10.9, 12.1, 310.0, 310.9, 312.1]))
+    assert abs(early.offset_s - 2.0) < 1e-6  # not 298 s before: the camera stopped early
     assert fit_clock(times([1.7e9]), times([3.0]), max_offset_s=float("inf")).offset_s == 1.7e9 - 3
 
 

@@ -19,6 +19,9 @@ GROUP_S = 5.0
 PRIOR_SPREAD_S = 110.0
 """Claps that are spread by less say little of drift: 3 ms of a clap's noise against 100 ms/h of usual drift."""
 
+TOGETHER_S = 60.0
+"""Recorders are started about together: of offsets that fit alike, one that is smaller by this is taken."""
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -65,7 +68,8 @@ def fit_clock(
     """The clock on which most claps of the two lists (s, any order) coincide; some may be missing in either.
 
     One common clap gives the offset, claps at several times the drift too. Raises WearcapError when a list is
-    empty, when no pair is less than `max_offset_s` apart, and when two offsets fit equally well.
+    empty, when no pair is less than `max_offset_s` apart, and when two offsets fit equally
+    well, neither of them smaller by a minute.
     """
     camera, suit = (np.sort(claps.numpy()) for claps in (claps_camera, claps_suit))
     for name, claps in (("camera", camera), ("suit", suit)):
@@ -119,6 +123,9 @@ def _matched(camera: np.ndarray, suit: np.ndarray, max_offset_s: float) -> tuple
     score, at, pairs = ranked[0]
     rivals = [other for other in ranked[1:] if abs(other[1] - at) > TOLERANCE_S and other[0] > score - 0.3]
     if rivals:
+        nearest, *others = sorted([ranked[0], *rivals], key=lambda entry: abs(entry[1]))
+        if abs(nearest[1]) + TOGETHER_S < abs(others[0][1]):
+            return nearest[2]
         raise WearcapError(
             f"the {len(camera)} claps of the camera and {len(suit)} of the suit fit together in several ways, with "
             f"offsets of {at:.3f} s and {rivals[0][1]:.3f} s",
