@@ -4,12 +4,17 @@ import json
 import sys
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
 
 from wearcap.cli import capture, evaluate
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+from wearcap.io.camera_json import write_camera
 from wearcap.io.motion_npz import read_motion
+from wearcap.recording.locate import load_recording
 
 
 @pytest.fixture(scope="module")
@@ -87,3 +92,30 @@ def test_localisation_by_learned_features_is_a_choice():
     )
     assert chosen.pipeline.localization.extractor._target_.endswith("SuperPointExtractor")
     assert chosen.pipeline.localization._target_.endswith("MapLocalization")
+
+
+def test_the_pages_way_to_a_recording_of_ones_own(tmp_path, monkeypatch):
+    """docs/hps.md: MVNX, video and camera become a recording that can be loaded."""
+    sys.path.append(str(Path(__file__).parents[1] / "io"))
+    from test_mvnx import mvnx, sample
+
+    page = (Path(__file__).parents[2] / "docs/hps.md").read_text(encoding="utf-8")
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "walk.mvnx").write_text(mvnx(sample(30)))
+    write_camera(Camera.pinhole(64, 48, 60.0), own / "camera.json")
+    with av.open(str(own / "walk.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for shade in range(9):
+            picture = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 20 * shade, np.uint8), format="rgb24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    monkeypatch.chdir(tmp_path)
+    exec(page.split("```python")[1].split("```")[0], {})
+    recording = load_recording("own/walk")
+    assert len(recording.camera.timestamps) == 9
+    assert recording.suit.contact_prob is not None
+    assert "head" in recording.imu
+    with pytest.raises(WearcapError, match="no localisation in this recording, and no map"):
+        capture.main([*arguments(own, tmp_path / "out"), "recording=own/walk"])
