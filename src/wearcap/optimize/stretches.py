@@ -24,8 +24,8 @@ def solve_in_stretches(
 ) -> Solution:
     """`solve_banded` over stretches of about `stretch` frames, `jobs` at a time.
 
-    Borders lie in outages of localisation never, and `overlap` counts frames that were localised. The history is the
-    stretches' mean, by their share of the frames; its last entry that of the states returned.
+    No border lies in an outage of localisation, and `overlap` counts frames that were localised. The history is the
+    stretches' mean, by their share of the frames.
     """
     spans = list(_spans(data, stretch, overlap))
     with ThreadPoolExecutor(max_workers=max(jobs, 1)) as pool:

@@ -1,7 +1,7 @@
 """A recording that is still being made: a folder of pieces, each a recording of some seconds, in order.
 
 `piece-000000.safetensors`, `piece-000001.safetensors`, … appear whole (written under another name and renamed); the
-file `end` says that there are no more. The first piece tells about the wearer, the camera and the scene.
+file `end` says that there are no more. The first piece tells about the wearer and the camera.
 """
 
 import time
