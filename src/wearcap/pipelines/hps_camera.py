@@ -127,7 +127,7 @@ class MapLocalization:
         if own is None or not own.is_file():
             raise WearcapError("no localisation in this recording, and no map", where=recording.name,
                                expected="camera poses, or a visual map of the scene",
-                               fix="Build one (wearcap scene) and give localization.map=FILE.")  # fmt: skip
+                               fix="Build one (wearcap scene) and give pipeline.localization.map=FILE.")  # fmt: skip
         return own
 
     def reads(self, recording: Recording, folder: Path) -> list[Any]:
