@@ -15,7 +15,7 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Localization
 
 MAX_SPEED = 3.0
-"""m/s, thesis §4.2.5."""
+"""m/s between localised positions beyond which one of them is wrong (thesis §4.2.5)."""
 
 
 def align_suit(
@@ -81,7 +81,7 @@ def robust_angle(
     angle: Float[Tensor, "sample"], weight: Float[Tensor, "sample"], scale_rad: float = 0.05
 ) -> Float[Tensor, ""]:
     """Centre (rad) of angles on the circle: the sample with the least weighted sum of distances to all others, then
-    reweighted means in which an angle `scale_rad` away counts half, and far ones hardly."""
+    reweighted means in which an angle `scale_rad` away counts a quarter, and far ones hardly."""
     # So many candidates are enough for a start
     candidates = angle[:: max(len(angle) // 300, 1)]
     distance = rotation.wrap_angle(candidates[:, None] - angle).abs()

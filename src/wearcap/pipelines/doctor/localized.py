@@ -12,10 +12,9 @@ from wearcap.pipelines.doctor.poses import check_rotations
 from wearcap.pipelines.doctor.report import Finding, refusal
 from wearcap.pipelines.doctor.signals import lag_between
 from wearcap.recording import Localization, Motion, Recording
+from wearcap.sensors.alignment import MAX_SPEED
 from wearcap.sensors.claps import detect_claps
 
-MAX_SPEED = 3.0
-"""m/s between localised positions beyond which one of them is wrong (thesis §4.3.6)."""
 LONG_OUTAGE_S = 30.0
 
 
