@@ -31,7 +31,7 @@ def test_the_yaw_is_the_nearest_of_all():
 @pytest.mark.parametrize("angle_deg", [0.0, 75.0, 179.9, -120.0])
 @pytest.mark.parametrize("noise", [PERFECT, NOISY])
 def test_a_planted_rotation_is_recovered(angle_deg, noise):
-    """Within 0.1° exactly; noise of 1.5° over some 250 frames leaves 0.1° too."""
+    """Within 0.1° exactly; noise of 1.5° over some 250 frames leaves less than 0.2°."""
     motion = strolling_motion(40.0)
     suit = turned(motion, -math.radians(angle_deg), (3.0, -7.0, 0.4))
     aligned, angle = align_suit(suit, localized(motion, noise), MOUNT)

@@ -26,7 +26,7 @@ class FootSurface:
     """Feet in contact against the scan; NaN where nothing was in contact near it."""
 
     distance_cm: float
-    """Mean signed point-to-plane distance, positive above the surface (FACTS: the table's distance to surface)."""
+    """Mean signed point-to-plane distance, positive above the surface (the table's distance to surface)."""
     absolute_distance_cm: float
     """Mean of its absolute value: sinking here and floating there do not cancel."""
     sliding_cm: float

@@ -1,4 +1,4 @@
-"""From three depth cameras to a cloud of the person alone, in the scene (thesis §4.5.1, FACTS §1.7).
+"""From three depth cameras to a cloud of the person alone, in the scene (thesis §4.5.1).
 
 Depth images are uint16 millimetres along the optical axis, 0 where nothing came back, as Kinects give them.
 """

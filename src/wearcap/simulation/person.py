@@ -1,4 +1,4 @@
-"""Simulated people: bones, habits, and where the device sits on the head (SIMULATION.md's typical adults)."""
+"""Simulated people, typical adults: bones, habits, and where the device sits on the head."""
 
 from dataclasses import dataclass
 
