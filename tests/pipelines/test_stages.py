@@ -148,7 +148,7 @@ def test_digests_follow_content(tmp_path):
     file.write_bytes(b"a")
     part = functools.partial(run, settings=Settings())
     values = [1, 1.0, True, "1", None, [1], [[1]], {"a": 1}, torch.ones(2), torch.ones(2, 1), torch.ones(2).double(),
-              np.ones(2), Settings(), Settings(gain=3.0), file, part, run, nn.Linear(2, 1)]  # fmt: skip
+              np.ones(2), Settings(), Settings(gain=3.0), file, part, run, nn.Linear(2, 1), torch.float32, torch.float64]  # fmt: skip
     seen = [digest(value) for value in values]
     assert len(set(seen)) == len(values)
     assert seen == [digest(value) for value in values]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor, nn
 
 from wearcap.errors import WearcapError
@@ -45,7 +46,7 @@ def _code_digest(places: tuple[str, ...]) -> str:
 
 def _parts(value: Any) -> Iterator[bytes | memoryview]:
     yield f"<{type(value).__qualname__}>".encode()
-    if value is None or isinstance(value, bool | int | float | str):
+    if value is None or isinstance(value, bool | int | float | str | torch.dtype):
         yield repr(value).encode()
     elif isinstance(value, Tensor | np.ndarray):
         array = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
