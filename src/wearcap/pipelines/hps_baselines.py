@@ -54,7 +54,7 @@ class HpsBaseline:
             Stage(
                 "place", lambda done: self.place(on_one_clock(recording, done)),
                 lambda: (self.kind, self.fps, recording.suit, *mount(recording)), ("synchronize", "localize"),
-                ("pipelines/hps_baselines.py", "sensors/alignment.py", "geometry", "body"),
+                ("pipelines/hps_baselines.py", "sensors/alignment.py", "data/prepare/clean.py", "geometry", "body"),
             ),
         ]  # fmt: skip
 
