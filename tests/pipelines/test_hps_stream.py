@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.pipelines.hps import HPS
-from wearcap.pipelines.hps_stream import StreamSettings, follow
+from wearcap.pipelines.hps_stream import HpsStream, StreamSettings, follow
 from wearcap.recording import Recording
 from wearcap.recording.growing import close_pieces, follow_pieces, piece_path, write_piece
 from wearcap.scene.scan import Scan
@@ -75,6 +75,17 @@ def test_lost_localisation_is_bridged_by_the_suit():
     assert error[-60:].mean() < 6.0
 
 
+def test_a_camera_that_falls_silent_for_longer_than_a_window_is_bridged_too():
+    recording = hps_recording(seconds=20.0)
+    stream = HpsStream(hps(), recording, Scan(floor_points()), SETTINGS)
+    parts = pieces(recording)
+    done = [stream.push(part.suit, part.localization if k < 5 else None) for k, part in enumerate(parts)]
+    motions = [motion for motion in (*done, stream.finish()) if motion is not None]
+    error = root_error_cm(motions, recording)
+    assert len(error) == 600
+    assert error.max() < 60.0  # the suit alone: 30 cm off by then, and turned by 3°
+
+
 def test_no_more_than_a_window_is_kept(monkeypatch):
     from wearcap.pipelines import hps_stream
 
@@ -111,7 +122,11 @@ def test_what_cannot_be_followed_says_why():
     with pytest.raises(WearcapError, match="clock=shared"):
         list(follow(hps(), pieces(clapping), None))
     parts = pieces(hps_recording(seconds=4.0))
-    with pytest.raises(WearcapError, match="does not|pieces in order"):
+    with pytest.raises(
+        WearcapError, match="no scan of the scene, which the energy's term contact_plane needs"
+    ):
+        list(follow(hps(), parts, None))
+    with pytest.raises(WearcapError, match="pieces in order"):
         list(
             follow(
                 hps("problem@pipeline.energy=hps"),

@@ -80,12 +80,7 @@ class HPS:
         recording = source.recording
         require(recording, "suit", "camera")
         first = camera_stages(source, self.synchronization, self.localization)
-        if source.scan is None and (
-            terms := [t for t in ("contact", "contact_plane") if self.energy.weight(t)]
-        ):
-            raise WearcapError(f"no scan of the scene, which the energy's term {' and '.join(terms)} needs",
-                               where=recording.name, expected="a recording that names its scan, or scene=FOLDER",
-                               fix="Without one: pipeline=hps_without_scene.")  # fmt: skip
+        self.require_scan(source.scan, recording.name)
         body = (recording.suit, *mount(recording))
         return [
             *first,
@@ -101,9 +96,18 @@ class HPS:
             Stage(
                 "optimize", lambda done: self.optimize(self._stated(source, done)),
                 lambda: (self.energy, self.solver, self.evidence, source.scan, source.metres_per_unit, recording.shape),
-                ("synchronize", "localize", "align", "initialize"), ("optimize", "pipelines/hps.py", "geometry", "body"),
+                ("synchronize", "localize", "align", "initialize"),
+                ("optimize", "pipelines/hps.py", "sensors/alignment.py", "io/scan.py", "geometry", "body"),
             ),
         ]  # fmt: skip
+
+    def require_scan(self, scan: Path | Scan | None, where: str) -> None:
+        """Raise WearcapError when the energy asks for a scan and there is none."""
+        terms = [name for name in ("contact", "contact_plane") if self.energy.weight(name)]
+        if scan is None and terms:
+            raise WearcapError(f"no scan of the scene, which the energy's term {' and '.join(terms)} needs",
+                               where=where, expected="a recording that names its scan, or scene=FOLDER",
+                               fix="Without one: pipeline=hps_without_scene.")  # fmt: skip
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
         """The motion after the last stage that was run: aligned, initial, or optimised."""

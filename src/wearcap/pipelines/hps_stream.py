@@ -49,12 +49,13 @@ class HpsStream:
     def __init__(self, hps: HPS, about: Recording, scan: Scan | None, settings: StreamSettings | None = None):
         """`about` gives the wearer's shape and the camera with its mount; its streams are not read.
 
-        Raises WearcapError without a camera.
+        Raises WearcapError without a camera, or a scan where the energy asks for one.
         """
         if about.camera is None:
             raise WearcapError(
                 "no camera in this recording", where=about.name, expected="its mount on the head"
             )
+        hps.require_scan(scan, about.name)
         self.hps, self.about, self.scan = hps, about, scan
         self.settings = settings or StreamSettings()
         self.mount = Rigid(about.camera.R_head_cam, about.camera.t_head_cam)
@@ -187,8 +188,9 @@ class HpsStream:
         assert self.suit is not None
         first = int(torch.searchsorted(self.suit.timestamps, before_s))
         self.suit = self.suit.sliced(first, len(self.suit))
-        if self.seen is not None:
-            self.seen = _cut(self.seen, int(torch.searchsorted(self.seen.timestamps, before_s)))
+        if self.seen is not None:  # two stay, which tell the rate where nothing new comes
+            first = int(torch.searchsorted(self.seen.timestamps, before_s))
+            self.seen = _cut(self.seen, max(min(first, len(self.seen.timestamps) - 2), 0))
 
 
 def follow(
@@ -201,7 +203,7 @@ def follow(
     """Motion of a recording that is still being made, piece by piece; `folder` holds what pieces name.
 
     A piece's camera is localised where it brings pictures and no poses. Camera and suit must share a clock: claps
-    are heard too late. Raises WearcapError when they do not, or a piece has no suit.
+    are heard too late. Raises WearcapError when they do not, a piece has no suit, or the energy asks for a scan.
     """
     stream: HpsStream | None = None
     for piece in pieces:
