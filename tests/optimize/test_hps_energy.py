@@ -19,6 +19,7 @@ from wearcap.optimize.banded_mapping import fill_system
 from wearcap.optimize.costs import Loss
 from wearcap.optimize.feet import FootPatches
 from wearcap.optimize.hps import TERMS, HpsData, HpsEnergy, HpsState, energy_terms
+from wearcap.optimize.stretches import _spans, solve_in_stretches
 
 MIXED = {
     "hold": Loss("cauchy", 0.05),
@@ -212,6 +213,24 @@ def test_adam_keeps_the_frame_that_windows_share():
     solution = solve_adam_windows(HpsEnergy(DOCUMENT), data, settings, told.append)
     assert told == [15, 29, 40]
     assert (len(solution.state), len(solution.history)) == (40, 5)
+    alone = solve_adam_windows(HpsEnergy(DOCUMENT), data[:15], settings).state
+    assert torch.equal(solution.state.t_world_root[:15], alone.t_world_root)
+    assert torch.equal(solution.state.theta[:15], alone.theta)
+    assert (solution.state.t_world_root[15] - data.start.t_world_root[15]).abs().max() > 1e-4
+
+
+def test_stretches_join_to_the_whole():
+    data, _ = planted()
+    data.hold_confidence[9:13] = 0.0  # where a border would lie
+    energy = HpsEnergy(DOCUMENT | {"root_step": 400.0})
+    settings = BandedSettings(iterations=12)
+    whole = solve_banded(energy, data, settings).state
+    joined = solve_in_stretches(energy, data, settings, stretch=10, overlap=8, jobs=1)
+    assert len(joined.state) == len(data)
+    assert (joined.state.t_world_root - whole.t_world_root).norm(dim=1).max() < 0.02
+    spans = list(_spans(data, 10, 8))
+    assert [span[1:3] for span in spans] == [(0, 13), (13, 23), (23, 33), (33, 40)]
+    assert all(first <= keep < stop <= last for first, keep, stop, last in spans)
 
 
 def test_an_energy_that_leaves_something_open_says_so():
