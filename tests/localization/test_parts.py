@@ -1,5 +1,8 @@
 """The parts of localisation, one by one, against what is known."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -9,13 +12,16 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
+from wearcap.io.colmap import Tracks
 from wearcap.localization.absolute_pose import Fit, lens_of, pose_covariance, ransac_pose, refined_pose
 from wearcap.localization.features import Features, RootSift, root
 from wearcap.localization.landmarks import from_bytes, merge, to_bytes
 from wearcap.localization.localizer import confidence
+from wearcap.localization.map_builder import MapSettings, _lift_by_tracks
 from wearcap.localization.matching import match_landmarks, match_nearby
-from wearcap.localization.point_map import PointMapper, undistortion
+from wearcap.localization.point_map import PointMap, PointMapper, undistortion
 from wearcap.localization.retrieval import Vlad, most_similar, train_vocabulary
+from wearcap.recording.photo import Photo
 from wearcap.scene.scan import Scan
 
 FISHEYE = Camera("fisheye", 300, 300, 95.0, 95.0, 150.0, 149.0, (0.01, -0.004, 0.001, 0.0))
@@ -118,6 +124,43 @@ def test_a_narrow_fisheye_does_not_reach_a_wide_view():
     remap = undistortion(narrow, 120.0)
     assert 0.2 < remap.valid.mean() < 0.9
     assert not remap.image(np.full((300, 300, 3), 200, np.uint8))[~remap.valid].any()
+
+
+def test_a_border_between_two_pixels_does_not_lead_out_of_the_picture():
+    """float32 rounds what lies a hair within the border at 299.5 up to it, and that to pixel 300."""
+    lens = Camera("fisheye", 300, 300, 190.0, 190.0, 150.0, 149.5, (0.0,) * 4)
+    flat = undistortion(lens, 90.0).camera
+    seen, _ = lens.project(flat.unproject(torch.tensor([250.0, 149.0], dtype=torch.float64)))
+    lens = replace(lens, cx=lens.cx + 299.5 - 1e-9 - seen[0].item())
+    remap = undistortion(lens, 90.0)
+    assert remap.valid[149, 250]
+    index, depth = np.zeros((300, 300), np.int32), np.ones((300, 300), np.float32)
+    flat_map = remap.point_map(PointMap(lens, Rigid.identity(), index, depth))
+    assert flat_map.index[149, 250] == 0
+
+
+def test_tracks_behind_the_perspective_view_lift_nothing():
+    wide = Camera("fisheye", 400, 400, 80.0, 80.0, 200.0, 200.0, (0.0,) * 4)
+    flat = undistortion(wide, 100.0).camera
+    points = torch.tensor([[0.3, 0.1, 2.0], [0.5, 0.2, -0.3]], dtype=torch.float64)
+    pixels, seen = wide.project(points)
+    assert seen.all()
+    tracks = Tracks(
+        points.numpy(),
+        np.zeros((2, 3), np.uint8),
+        np.zeros(2, np.int64),
+        np.arange(2),
+        pixels.float().numpy(),
+    )
+    ahead = flat.project(points[:1])[0][0].tolist()
+    direction = points[1] / points[1].norm()
+    mirrored = [flat.fx * direction[0].item() + flat.cx, flat.fy * direction[1].item() + flat.cy]
+    keypoints = np.array([ahead, mirrored], np.float32)
+    features = Features(keypoints, unit_rows(2, 8), np.ones(2, np.float32), (400, 400))
+    lift = _lift_by_tracks(tracks, MapSettings())
+    positions, valid = lift(0, Photo(Path("a.png"), wide, Rigid.identity()), flat, features)
+    assert valid.tolist() == [True, False]
+    np.testing.assert_allclose(positions[0], points[0], atol=1e-6)
 
 
 # Retrieval

@@ -73,16 +73,7 @@ def build_map(
     `descriptor`: what finds similar pictures; None: VLAD over a vocabulary trained on these photos.
     Raises WearcapError for no photos, photos whose size is not their camera's, unreadable ones, and an empty map.
     """
-    if not photos:
-        raise WearcapError("no photos to build a map from", expected="database photos with cameras and poses")
     pictures = _pictures(photos, source, extractor, descriptor, settings, progress)
-    observed = sum(int(picture.valid.sum()) for picture in pictures)
-    if not observed:
-        found = sum(len(picture.keypoints) for picture in pictures)
-        raise WearcapError(
-            f"the map would be empty: none of {found} keypoints in {len(photos)} photos lies on the scene",
-            expected="photos that show the scanned scene", fix=_why_empty(photos, source),
-        )  # fmt: skip
     vlad = None
     if descriptor is None:
         vlad = Vlad(_vocabulary(pictures, settings.words))
@@ -135,6 +126,9 @@ def require_same_features(
 
 
 def _pictures(photos, source, extractor, descriptor, settings: MapSettings, progress: bool) -> list[_Picture]:
+    """What each photo gives. Raises WearcapError without photos, and when none of them shows the scene."""
+    if not photos:
+        raise WearcapError("no photos to build a map from", expected="database photos with cameras and poses")
     if isinstance(source, Scan):
         lift = _lift_by_scan(source, settings)
     else:
@@ -152,9 +146,16 @@ def _pictures(photos, source, extractor, descriptor, settings: MapSettings, prog
 
     with ThreadPoolExecutor(settings.jobs) as pool:
         done: Iterable[_Picture] = pool.map(one, range(len(photos)))
-        return list(
+        pictures = list(
             track(done, "photos", total=len(photos), console=Console(stderr=True), disable=not progress)
         )
+    if not any(picture.valid.any() for picture in pictures):
+        found = sum(len(picture.keypoints) for picture in pictures)
+        raise WearcapError(
+            f"the map would be empty: none of {found} keypoints in {len(photos)} photos lies on the scene",
+            expected="photos that show the scanned scene", fix=_why_empty(photos, source),
+        )  # fmt: skip
+    return pictures
 
 
 def _lift_by_scan(scan: Scan, settings: MapSettings) -> Lift:
@@ -175,12 +176,13 @@ def _lift_by_tracks(tracks: Tracks, settings: MapSettings) -> Lift:
     def lift(number: int, photo: Photo, camera: Camera, features: Features):
         start, stop = np.searchsorted(tracks.photo[order], [number, number + 1])
         mine = order[start:stop]
-        if not len(mine) or not len(features):
-            return np.zeros((len(features), 3), np.float32), np.zeros(len(features), bool)
         pixels = tracks.pixels[mine]
         if photo.camera.is_fisheye:
             rays = photo.camera.unproject(torch.from_numpy(pixels).double())
-            pixels = camera.project(rays.nan_to_num(0.0))[0].numpy()
+            flat, valid = camera.project(rays.nan_to_num(0.0))
+            pixels, mine = flat[valid].numpy(), mine[valid.numpy()]
+        if not len(mine) or not len(features):
+            return np.zeros((len(features), 3), np.float32), np.zeros(len(features), bool)
         distance, nearest = KDTree(pixels).query(features.keypoints)
         positions = tracks.points_world[tracks.point[mine[nearest]]].astype(np.float32)
         return positions, distance <= settings.track_distance_px

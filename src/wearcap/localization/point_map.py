@@ -141,7 +141,9 @@ def undistortion(camera: Camera, horizontal_fov_deg: float = 100.0) -> Undistort
         torch.meshgrid(*(torch.arange(n).double() for n in (width, height)), indexing="xy"), -1
     )
     pixels, seen = camera.project(flat.unproject(grid))
-    x, y = torch.where(seen[..., None], pixels.clamp(min=0), -1.0).float().unbind(-1)
+    # Half a pixel around the picture counts as seen: the outermost pixels' centres are taken for it.
+    pixels = torch.minimum(pixels.clamp(min=0), pixels.new_tensor([width - 1, height - 1]))
+    x, y = torch.where(seen[..., None], pixels, -1.0).float().unbind(-1)
     return Undistortion(flat, x.contiguous().numpy(), y.contiguous().numpy())
 
 
