@@ -183,8 +183,19 @@ def test_a_matcher_of_picture_pairs(mapper, room_map):
 
     truth = planted(1)[0]
     settings = LocalizerSettings(retrieved=10)
-    pose = Localizer(room_map, EXTRACTOR, mutual, settings)(photograph(mapper, QUERY, truth), QUERY)
-    assert errors(pose, truth)[1] < 0.03
+    localizer = Localizer(room_map, EXTRACTOR, mutual, settings)
+    image = photograph(mapper, QUERY, truth)
+    assert errors(localizer(image, QUERY), truth)[1] < 0.03
+    twice = replace(
+        room_map, names=room_map.names * 2, cameras=room_map.cameras * 2,
+        first=np.concatenate([room_map.first, room_map.first[-1] + room_map.first[1:]]),
+        **{name: np.concatenate([getattr(room_map, name)] * 2) for name in (
+            "R_world_cam", "t_world_cam", "keypoints", "descriptors", "positions", "landmark", "global_descriptors"
+        )},
+    )  # fmt: skip
+    again = Localizer(twice, EXTRACTOR, mutual, replace(settings, retrieved=20))
+    # the same pictures once more tell no more
+    assert again(image, QUERY).inliers == localizer(image, QUERY).inliers
 
 
 def test_the_nearest_pictures_look_the_same_way(room_map):
@@ -211,7 +222,9 @@ def test_queries_of_another_size_and_without_intrinsics(room_map):
         localizer(np.zeros((270, 480, 3), np.uint8), None)
 
 
-def test_no_photos_and_photos_that_do_not_see_the_scan(mapper, photos):
+def test_no_photos_and_photos_that_do_not_see_the_scan(mapper, photos, room_map):
+    with pytest.raises(WearcapError, match="no photos"):
+        extended(room_map, [], Scan(mapper.points), EXTRACTOR, settings=SETTINGS)
     with pytest.raises(WearcapError, match="no photos"):
         build_map([], Scan(mapper.points), EXTRACTOR)
     with pytest.raises(WearcapError, match=r"would be empty.*one unit"):

@@ -189,9 +189,12 @@ class Localizer:
     def _matched_by_pairs(
         self, features: Features, images: Int64[np.ndarray, "chosen"]
     ) -> tuple[Float32[np.ndarray, "match 2"], Float32[np.ndarray, "match 3"]]:
-        """Pixels and world positions from picture-to-picture matches with each database picture."""
+        """Pixels and world positions from picture-to-picture matches with each database picture.
+
+        A keypoint and a landmark that several pictures pair are one match: repeated, it would pass for many witnesses.
+        """
         assert self.matcher is not None
-        pixels, positions = [np.zeros((0, 2), np.float32)], [np.zeros((0, 3), np.float32)]
+        found = [np.zeros((0, 2), np.int64)]
         for image in images.tolist():
             part = self.map.observations(image)
             camera = self.map.cameras[image]
@@ -201,9 +204,9 @@ class Localizer:
                 (camera.width, camera.height),
             )  # fmt: skip
             pairs = self.matcher(features, other)
-            pixels.append(features.keypoints[pairs[:, 0]])
-            positions.append(self.map.positions[part][pairs[:, 1]])
-        return np.concatenate(pixels), np.concatenate(positions)
+            found.append(np.stack([pairs[:, 0], self.map.landmark[part][pairs[:, 1]].astype(np.int64)], 1))
+        keypoint, landmark = np.unique(np.concatenate(found), axis=0).T
+        return features.keypoints[keypoint], self.map.landmarks.points_world[landmark]
 
 
 def confidence(agreeing: Float32[np.ndarray, "match 2"], camera: Camera) -> float:
