@@ -32,6 +32,7 @@ from wearcap.io.hps import (
 from wearcap.io.hps_scene import is_hps_scene, read_hps_scene
 from wearcap.io.hps_sequence import hps_names, is_hps, read_hps_sequence, scan_name, subject_of
 from wearcap.io.hps_unity import read_unity_motion, rotations_from_unity
+from wearcap.recording import Localization
 
 
 def same_motion(a, b, atol: float = 1e-5) -> None:
@@ -163,6 +164,7 @@ def test_localization(tmp_path):
         ({"0": {"position": [0, float("nan"), 0], "quaternion": [1, 0, 0, 0]}}, "frame 0"),
         ({"first": None}, "frame 'first'"),
         ({"99999999999": None}, "frame '99999999999'"),
+        ({"9" * 5000: None}, "frame '9999"),
         ({"0": None, "00": None}, "twice"),
         ([], "holds a list"),
     ],
@@ -194,6 +196,25 @@ def test_localization_at_30_hz(tmp_path):
     torch.testing.assert_close(read.t_world_cam[found, 0], (1.2 * t).float(), atol=1e-4, rtol=0)
     expected = rotation.about_axis("z", 0.2 * t).float()
     assert rotation.geodesic(read.R_world_cam[found], expected).max() < 1e-3
+
+
+def test_a_lost_neighbour_does_not_pull_a_frame_that_all_but_coincides():
+    times = torch.tensor([0.0, 0.9995, 2.0], dtype=torch.float64)
+    position = torch.tensor([[0.0, 0, 0], [100.0, 50, 1.7], [0.0, 0, 0]])
+    seen = Localization(times, torch.eye(3).repeat(3, 1, 1), position, torch.tensor([0.0, 1.0, 0.0]))
+    read = resampled_localization(seen, 1.0)
+    assert read.confidence.tolist() == [0.0, 1.0, 0.0]
+    torch.testing.assert_close(read.t_world_cam[1], position[1])
+
+
+def test_a_single_localised_frame_is_resampled_to_itself():
+    one = Localization(
+        torch.tensor([2.0], dtype=torch.float64), torch.eye(3)[None], torch.ones(1, 3), torch.ones(1)
+    )
+    read = resampled_localization(one, 30.0)
+    assert read.timestamps.tolist() == [2.0]
+    assert read.confidence.tolist() == [1.0]
+    torch.testing.assert_close(read.t_world_cam, one.t_world_cam)
 
 
 @pytest.mark.parametrize(

@@ -125,7 +125,7 @@ def read_hps_localization(path: str | Path, fps: float | int = FPS) -> Localizat
 def _frame_numbers(rows: dict[str, Any], path: str | Path) -> dict[str, int]:
     frames = {}
     for key in rows:
-        if not (key.isascii() and key.isdigit() and int(key) < MAX_FRAMES):
+        if not (key.isascii() and key.isdigit() and len(key) < 20 and int(key) < MAX_FRAMES):
             raise WearcapError(f"frame {key[:30]!r}", where=path, expected="frame numbers from 0 as keys")
         frames[key] = int(key)
     if len(set(frames.values())) < len(frames):
@@ -178,17 +178,17 @@ def read_hps_cameras(path: str | Path) -> dict[str, Camera]:
 
 def resampled_localization(localization: Localization, fps: float | int) -> Localization:
     """Poses at another rate: between two found frames slerp and lerp, elsewhere confidence 0; covariances are dropped."""
-    old, found = localization.timestamps, localization.confidence > 0
+    old = localization.timestamps
     count = int((old[-1] - old[0]).item() * fps + 1e-6) + 1
     times = old[0] + torch.arange(count, dtype=torch.float64) / fps
-    after = torch.searchsorted(old, times).clamp(1, max(len(old) - 1, 1))
-    before = after - 1
-    blend = ((times - old[before]) / (old[after] - old[before])).clamp(0, 1).float()
+    after = torch.searchsorted(old, times).clamp(max=len(old) - 1)
+    before = (after - 1).clamp(min=0)
+    blend = ((times - old[before]) / (old[after] - old[before]).clamp(min=1e-9)).clamp(0, 1).float()
+    # A frame that all but coincides with an old one takes that alone: the next may have no pose to lean on.
+    blend = torch.where(blend < 1e-3, 0.0, torch.where(blend > 1 - 1e-3, 1.0, blend))
     sure = torch.minimum(localization.confidence[before], localization.confidence[after])
-    sure = torch.where(blend < 1e-3, localization.confidence[before], sure)
-    sure = torch.where(blend > 1 - 1e-3, localization.confidence[after], sure) * (
-        found[before] | found[after]
-    )
+    sure = torch.where(blend == 0, localization.confidence[before], sure)
+    sure = torch.where(blend == 1, localization.confidence[after], sure)
     R, t = localization.R_world_cam, localization.t_world_cam
     turn = rotation.exp(blend[:, None] * rotation.log(R[before].mT @ R[after]))
     known = (sure > 0)[:, None]

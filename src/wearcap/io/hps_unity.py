@@ -18,7 +18,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.amass import A
 from wearcap.io.hps import FPS, PELVIS_SMPL
-from wearcap.io.text import at_line, finite_floats, read_text
+from wearcap.io.text import at_line, finite_floats, is_finite_number, read_text
 from wearcap.recording import Motion
 
 _ARM = ("collar", "shoulder", "elbow", "wrist", "hand")
@@ -81,13 +81,5 @@ def _table(path: str | Path, widths: tuple[int, ...]) -> np.ndarray:
     try:
         return finite_floats(token for _, tokens in lines for token in tokens).reshape(len(lines), width)
     except ValueError as error:
-        wrong = next(number for number, tokens in lines if not _finite(tokens))
+        wrong = next(number for number, tokens in lines if not all(map(is_finite_number, tokens)))
         raise WearcapError(f"what is no finite number ({error})", where=at_line(path, wrong)) from error
-
-
-def _finite(tokens: list[str]) -> bool:
-    try:
-        finite_floats(tokens)
-    except ValueError:
-        return False
-    return True
