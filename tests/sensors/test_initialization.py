@@ -12,6 +12,7 @@ from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
+from wearcap.recording.recording import Localization
 from wearcap.sensors.alignment import align_suit, body_camera, inliers, yaw_between
 from wearcap.sensors.initialization import InitializationSettings, initialize
 from wearcap.sensors.suit import SuitNoise, suit_motion
@@ -124,6 +125,13 @@ def test_what_cannot_be_started_is_refused():
         initialize(motion, localized(motion, LocalizationNoise(outages_s=((0.0, 9.0),))), MOUNT.R, MOUNT.t)
     with pytest.raises(WearcapError, match="yaw='north'.*tangent, orientation"):
         InitializationSettings(yaw="north")
+    with pytest.raises(WearcapError, match="bridge='line' with path_smoothing_s=1"):
+        InitializationSettings(bridge="line")
     lonely = localized(motion, LocalizationNoise(0, 0, 0, outages_s=((0.0, 2.0), (2.04, 9.0))))
     start = initialize(motion, lonely, MOUNT.R, MOUNT.t)
     assert (start.motion.t_world_root - motion.t_world_root).norm(dim=-1).max() < 0.05
+    alone = (lonely.confidence > 0).nonzero()[:1, 0]
+    alone = Localization(
+        lonely.timestamps[alone] + 0.001, lonely.R_world_cam[alone], lonely.t_world_cam[alone], lonely.confidence[alone]
+    )  # fmt: skip
+    assert initialize(motion, alone, MOUNT.R, MOUNT.t).valid.any()

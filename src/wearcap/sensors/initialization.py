@@ -38,12 +38,16 @@ class InitializationSettings:
     """m/s over a tangent; slower frames are stationary."""
     yaw_smoothing_s: float = 10.0
     path_smoothing_s: float = 1.0
-    """Standard deviation (as for yaw) of the smoothing of the camera's path less the suit's; 0: none (document)."""
+    """Standard deviation (as for yaw) of the smoothing of the camera's path less the suit's, for bridge="suit" alone;
+    0: none (document)."""
 
     def __post_init__(self):
         for name, value, choices in (("yaw", self.yaw, YAWS), ("bridge", self.bridge, BRIDGES)):
             if value not in choices:
                 raise WearcapError(f"{name}={value!r}", expected=f"one of {', '.join(choices)}")
+        if self.bridge == "line" and self.path_smoothing_s:
+            raise WearcapError(f"bridge='line' with path_smoothing_s={self.path_smoothing_s:g}",
+                               expected="path_smoothing_s=0: what is smoothed is the way beside the suit's")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,7 @@ def initialize(
     else:
         yaw = _orientation_yaw(suit, localization, seen, R_head_cam, settings)
         yaw = yaw + _path_turn(moved, yaw, settings)
-    if settings.bridge == "suit" or settings.path_smoothing_s:
+    if settings.bridge == "suit":
         camera = _bridged(moved, yaw, settings)
     turn = rotation.about_axis("z", yaw).to(body.dtype)
     R = suit.R_parent_joint.clone()
@@ -103,8 +107,8 @@ class _Paths:
     valid: Bool[Tensor, "time"]
 
     def steps(self, span_s: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Horizontal ways during the next `span_s` by suit and camera (complex, m), and where both ends are valid
-        with no more than `span_s` lost between."""
+        """Horizontal ways during the next `span_s` by suit and camera (complex, m), and where they are whole: valid
+        from one end to the other."""
         ahead = torch.searchsorted(self.timestamps, self.timestamps + span_s - 1e-6).clamp(
             max=len(self.timestamps) - 1
         )
@@ -179,7 +183,8 @@ def _bridged(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Fl
 
 def _covered(suit: Motion, localization: Localization, seen: Tensor) -> Bool[Tensor, "time"]:
     """Frames of the suit that have an inlier within one and a half steps of the localisation."""
-    step = localization.timestamps.diff().median().item() if len(seen) > 1 else 0.0
+    clock = localization.timestamps if len(seen) > 1 else suit.timestamps
+    step = clock.diff().median().item()
     times = localization.timestamps[seen]
     after = torch.searchsorted(times, suit.timestamps.contiguous()).clamp(max=len(times) - 1)
     gap = torch.stack([times[after], times[(after - 1).clamp(min=0)]]) - suit.timestamps
