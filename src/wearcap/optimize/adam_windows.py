@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.optimize.hps import HpsData, HpsEnergy, HpsState, energy_terms
 from wearcap.optimize.solution import Solution
@@ -23,6 +24,11 @@ class AdamSettings:
     full_mesh: bool = True
     """Skin the whole body at each step, as the document does; False: the patches alone, with the same result."""
     dtype: torch.dtype = torch.float32
+
+    def __post_init__(self):
+        if not 0 < self.advance < self.window:
+            raise WearcapError(f"windows of {self.window} frames that advance by {self.advance}",
+                               expected="less than a window: neighbours share a frame")  # fmt: skip
 
 
 def solve_adam_windows(

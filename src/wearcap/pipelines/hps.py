@@ -162,9 +162,8 @@ class HPS:
         if not self.evidence.confident:
             sure = (sure > 0).double()
         body = anny_body(motion.skeleton, recording.shape or None)
-        heading = rotation.about_axis(
-            "z", (start.yaw_correction[1:] + start.yaw_correction[:-1]).double() / 2
-        )
+        yaw = start.yaw_correction.double()
+        heading = rotation.about_axis("z", yaw[:-1] + rotation.wrap_angle(yaw.diff()) / 2)
         return HpsData(
             FootPatches.of(body),
             HpsState(rotation.log(motion.R_parent_joint[:, 1:].double()), root, motion.t_world_root.double()),
