@@ -17,6 +17,7 @@ from wearcap.localization.point_map import PointMapper
 from wearcap.models.lightglue import LightGlue
 from wearcap.models.netvlad import NetVLAD
 from wearcap.models.superpoint import SuperPoint
+from wearcap.models.weights import read_weights
 from wearcap.scene.scan import Scan
 
 
@@ -179,7 +180,7 @@ def test_another_network_s_weights_are_refused(make, superpoint):
 
 
 def test_netvlad_of_another_trunk_is_refused(netvlad, tmp_path):
-    state = torch.load(netvlad, weights_only=False)["state_dict"]
+    state = dict(read_weights(netvlad))
     state["encoder.0.weight"] = torch.zeros(64, 1, 3, 3)
     torch.save(state, tmp_path / "w.pth")
     with pytest.raises(WearcapError, match="encoder.0.weight is 64×1×3×3 and should be 64×3×3×3"):
