@@ -10,12 +10,12 @@ from hps_sessions import Session
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from wearcap.body.regions import FOOT_REGIONS
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
-from wearcap.metrics.surface import PATCH_REGIONS
 from wearcap.pipelines.hps_evaluation import HpsTruth, nearest_frames
 from wearcap.recording import Motion
 from wearcap.simulation.depth_rig import look_at
@@ -135,8 +135,8 @@ def draw_feet(
     width, height = TILE
     sheet = Image.new("RGB", (width * len(FEET), height * count), "white")
     for row, frame in enumerate(chosen):
-        foot = truth.body.vertices(truth.motion.T_world_joint[frame], PATCH_REGIONS["left_heel"]).mean(0)
-        toes = truth.body.vertices(truth.motion.T_world_joint[frame], PATCH_REGIONS["left_toe_tip"]).mean(0)
+        foot = truth.body.vertices(truth.motion.T_world_joint[frame], FOOT_REGIONS["left_heel"]).mean(0)
+        toes = truth.body.vertices(truth.motion.T_world_joint[frame], FOOT_REGIONS["left_toe_tip"]).mean(0)
         views = _beside((foot + toes).double().numpy() / 2, (toes - foot).double().numpy())
         for column, name in enumerate(FEET):
             same = int(nearest_frames(shown[name].timestamps, truth.motion.timestamps[frame : frame + 1]))

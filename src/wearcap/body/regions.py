@@ -10,6 +10,11 @@ from wearcap.body.skeleton import Skeleton
 SOLE_HEIGHT = 0.025
 """A foot's vertices within this of its lowest (m) are its sole."""
 
+FOOT_REGIONS = {
+    "left_heel": "left_heel", "left_toe_tip": "left_toes", "right_heel": "right_heel", "right_toe_tip": "right_toes",
+}  # fmt: skip
+"""The region of the surface behind each of `FOOT_PATCHES`, in their order."""
+
 
 def contact_regions(
     skeleton: Skeleton,

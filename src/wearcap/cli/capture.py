@@ -16,10 +16,10 @@ from wearcap.io.bvh import write_bvh
 from wearcap.io.gltf import write_glb
 from wearcap.io.motion_npz import write_motion
 from wearcap.io.scan import read_scan
+from wearcap.io.scene_folder import cloud_file
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.hps import HPS
 from wearcap.pipelines.hps_stream import follow
-from wearcap.pipelines.stages import CLOUD
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.locate import load_recording
@@ -77,8 +77,7 @@ def _live(pipeline: object, config: DictConfig, folder: Path) -> None:
         )
     scan = None
     if config.scene is not None:
-        scene = Path(config.scene)
-        scan = read_scan(scene / CLOUD if scene.is_dir() else scene, metres_per_unit=config.metres_per_unit)
+        scan = read_scan(cloud_file(config.scene), metres_per_unit=config.metres_per_unit)
     for number, motion in enumerate(follow(pipeline, follow_pieces(source), scan, source)):
         write_motion(motion, folder / f"motion-{number:06d}.npz")
         show(f"{motion.timestamps[-1].item():9.2f} s", flush=True)

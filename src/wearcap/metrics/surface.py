@@ -7,18 +7,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.model import BodyModel
+from wearcap.body.regions import FOOT_REGIONS
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.surface import SurfaceIndex
-
-PATCH_REGIONS = {
-    "left_heel": "left_heel",
-    "left_toe_tip": "left_toes",
-    "right_heel": "right_heel",
-    "right_toe_tip": "right_toes",
-}
-"""The body's region behind each of `FOOT_PATCHES`."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +68,6 @@ def foot_vertices(
     if len(contact) != len(T_world_joint.t):
         raise WearcapError(f"contacts of {len(contact)} frames for poses of {len(T_world_joint.t)}",
                            expected="as many of either")  # fmt: skip
-    vertices = [body.vertices(T_world_joint, PATCH_REGIONS[patch]) for patch in FOOT_PATCHES]
+    vertices = [body.vertices(T_world_joint, FOOT_REGIONS[patch]) for patch in FOOT_PATCHES]
     touching = [contact[:, i, None].expand(-1, part.shape[1]) for i, part in enumerate(vertices)]
     return torch.cat(vertices, 1), torch.cat(touching, 1)

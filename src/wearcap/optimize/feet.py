@@ -8,11 +8,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from wearcap.body.model import BodyModel
+from wearcap.body.regions import FOOT_REGIONS
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
-
-PATCH_REGIONS = ("left_heel", "left_toes", "right_heel", "right_toes")
-"""Regions of the body's surface, in the order of `FOOT_PATCHES`."""
 
 PATCH_VERTICES = 10
 
@@ -24,12 +22,12 @@ class FootPatches:
     body: BodyModel
     vertex: Int64[Tensor, "vertex"]
     patch: Int64[Tensor, "vertex"]
-    """Number in `PATCH_REGIONS` of each vertex."""
+    """Number in `FOOT_PATCHES` of each vertex."""
 
     @classmethod
     def of(cls, body: BodyModel, count: int = PATCH_VERTICES) -> "FootPatches":
         """`count` vertices of each region, spread out (all of them where a region has fewer)."""
-        chosen = [_spread(body, body.regions[name], count) for name in PATCH_REGIONS]
+        chosen = [_spread(body, body.regions[name], count) for name in FOOT_REGIONS.values()]
         patch = torch.cat([torch.full((len(v),), k) for k, v in enumerate(chosen)])
         return cls(body, torch.cat(chosen), patch)
 
@@ -45,12 +43,12 @@ class FootPatches:
 
     def share(self, contact: Float[Tensor, "*batch patch"]) -> Float[Tensor, "*batch vertex"]:
         """Contact of each vertex's patch, divided by the patch's number of vertices: sums over vertices are means."""
-        size = torch.bincount(self.patch, minlength=len(PATCH_REGIONS)).to(contact)
+        size = torch.bincount(self.patch, minlength=len(FOOT_REGIONS)).to(contact)
         return (contact / size)[..., self.patch]
 
     def middles(self, points: Float[Tensor, "time vertex 3"]) -> Float[Tensor, "time patch 3"]:
         """Mean position of each patch's vertices."""
-        one = torch.nn.functional.one_hot(self.patch, len(PATCH_REGIONS)).to(points)
+        one = torch.nn.functional.one_hot(self.patch, len(FOOT_REGIONS)).to(points)
         return torch.einsum("tvi,vp->tpi", points, one / one.sum(0))
 
     @cached_property

@@ -18,6 +18,7 @@ from safetensors.torch import load, save
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.io.scan import read_scan
+from wearcap.io.scene_folder import cloud_file
 from wearcap.optimize.hps import HpsState
 from wearcap.optimize.solution import Solution
 from wearcap.pipelines.digest import code_digest, digest
@@ -29,7 +30,6 @@ from wearcap.sensors.initialization import Initialization
 
 RESULTS = KNOWN | {cls.__name__: cls for cls in (Clock, Initialization, Solution, HpsState)}
 """What may come back from a cache."""
-CLOUD = "pointcloud.ply"
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,8 +239,4 @@ class StagedCapture:
         """The scene's cloud. Raises WearcapError when the scene that was given has none."""
         if self.scene is None:
             return self.folder / recording.scene if recording.scene else None
-        path = self.scene / CLOUD if self.scene.is_dir() else self.scene
-        if not path.is_file():
-            raise WearcapError("no scan of a scene here", where=self.scene,
-                               expected=f"a folder with {CLOUD}, or a .ply or .pcd file")  # fmt: skip
-        return path
+        return cloud_file(self.scene)

@@ -19,6 +19,7 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.photos import FILE_NAME, write_photos
 from wearcap.io.ply import Ply, write_ply
+from wearcap.io.scene_folder import CLOUD
 from wearcap.recording.photo import Photo
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.scan import Scanner, place_stations, scan_world
@@ -28,7 +29,7 @@ RIG_CAMERA = Camera("fisheye", 800, 800, 330.0, 330.0, 399.5, 399.5, (-0.012, 0.
 """139° across and 180° from corner to corner."""
 RIG_CAMERAS = 4
 RIG_HEIGHT_M, RIG_TILT_DEG, RIG_RADIUS_M = 1.85, 8.0, 0.12
-CLOUD, MADE = "pointcloud.ply", "made.json"
+MADE = "made.json"
 
 
 @dataclass(frozen=True)

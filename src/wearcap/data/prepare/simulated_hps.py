@@ -10,13 +10,14 @@ from wearcap.data.prepare.engine import Task, content_hash
 from wearcap.data.prepare.simulated import source_files
 from wearcap.data.prepare.splits import Splits
 from wearcap.errors import WearcapError
+from wearcap.io.scene_folder import CLOUD
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS
 from wearcap.simulation.changes import changed_world
 from wearcap.simulation.head_video import Filming, write_head_video
 from wearcap.simulation.hps import HEAD_CAMERA_TRUTH, HpsConfig, Simulated, simulate_hps
 from wearcap.simulation.hps_session import Protocol
-from wearcap.simulation.scene_files import CLOUD, SceneSettings, write_scene
+from wearcap.simulation.scene_files import SceneSettings, write_scene
 from wearcap.simulation.views import Scenery
 
 
