@@ -31,6 +31,7 @@ from wearcap.recording import (
     Recording,
     RecordingStore,
 )
+from wearcap.recording.interactions import Interactions
 from wearcap.recording.serialize import dumps, flatten, unflatten
 from wearcap.recording.store import RecordingFile, save_recording
 
@@ -51,6 +52,10 @@ def full_recording(name: str = "all") -> Recording:
                     contact_prob=torch.rand(FRAMES, 4), object_motion={"door": track},
                     provenance={"source": "a test"})  # fmt: skip
     camera = Camera("pinhole", 640, 480, 500.0, 500.0, 320.0, 240.0)
+    held = Interactions(
+        times[:2], times[1:3], torch.tensor([[True, False], [True, True]]), ("door", ""), ("hinged", "")
+    )
+    motion = replace(motion, hand_contact_prob=torch.rand(FRAMES, 2), interactions=held)
     return Recording(
         name, head=HeadStream(times, rotations(FRAMES), torch.randn(FRAMES, 3), torch.eye(3), torch.zeros(3)),
         imu={"left": ImuStream(times, "left_wrist", gyro_imu=torch.randn(FRAMES, 3), R_joint_imu=torch.eye(3))},
@@ -58,6 +63,7 @@ def full_recording(name: str = "all") -> Recording:
         localization=Localization(times, rotations(FRAMES), torch.randn(FRAMES, 3), torch.rand(FRAMES)),
         points=PointCloud(torch.randn(50, 3), torch.rand(50), torch.rand(50, dtype=torch.float64)),
         cues={"wrist": Cue(times, "left_wrist", torch.randn(FRAMES, 2), torch.rand(FRAMES))}, scene="room.ply",
+        environment="environment.json", interactions=held,
         motion=motion, contacts=ContactTrack(times, FOOT_PATCHES, torch.rand(FRAMES, 4) > 0.5),
         object_motion={"door": track}, floor=FloorTrack(times, torch.zeros(FRAMES)),
         intervals=Intervals(times[:2], times[1:3], torch.zeros(2), ("stand", "move")), skeleton=skeleton,

@@ -11,6 +11,7 @@ from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording.interactions import Interactions
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,10 @@ class Motion:
     t_world_root: Float[Tensor, "time 3"]
     contact_prob: Float[Tensor, "time patch"] | None = None
     """Probability of floor contact of `FOOT_PATCHES`."""
+    hand_contact_prob: Float[Tensor, "time hand"] | None = None
+    """Probability that each of `HANDS` holds something."""
     object_motion: dict[str, Trajectory] | None = None
+    interactions: Interactions | None = None
     provenance: dict[str, str] = field(default_factory=dict)
     """Pipeline, checkpoint, config hash, or the source of a truth."""
 
@@ -50,6 +54,7 @@ class Motion:
         """Frames start…stop-1; object trajectories keep their own clocks and are cut to the same time span."""
         times = self.timestamps[start:stop]
         contact = None if self.contact_prob is None else self.contact_prob[start:stop]
+        hands = None if self.hand_contact_prob is None else self.hand_contact_prob[start:stop]
         objects = self.object_motion
         if objects is not None and len(times):
             objects = {
@@ -57,7 +62,7 @@ class Motion:
             }
         return replace(
             self, timestamps=times, R_parent_joint=self.R_parent_joint[start:stop],
-            t_world_root=self.t_world_root[start:stop], contact_prob=contact, object_motion=objects,
+            t_world_root=self.t_world_root[start:stop], contact_prob=contact, hand_contact_prob=hands, object_motion=objects,
         )  # fmt: skip
 
 

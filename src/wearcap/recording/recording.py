@@ -9,6 +9,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording.interactions import Interactions
 from wearcap.recording.motion import Motion
 
 
@@ -145,10 +146,13 @@ class Recording:
     cues: dict[str, Cue] = field(default_factory=dict)
     scene: str | None = None
     """File of the surroundings' geometry (.ply or .glb), relative to the data set's directory."""
+    environment: str | None = None
+    """File of the objects that can be moved (`io.environment`), relative to the data set's directory."""
     # true
     motion: Motion | None = None
     contacts: ContactTrack | None = None
     object_motion: dict[str, Trajectory] = field(default_factory=dict)
+    interactions: Interactions | None = None
     floor: FloorTrack | None = None
     intervals: Intervals | None = None
     # about

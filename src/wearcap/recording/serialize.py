@@ -16,6 +16,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import recording as containers
+from wearcap.recording.interactions import Interactions
 from wearcap.recording.motion import Motion
 
 KNOWN: dict[str, type] = {
@@ -23,7 +24,7 @@ KNOWN: dict[str, type] = {
     for cls in (
         Motion, Skeleton, Site, Camera, Trajectory, containers.Recording, containers.HeadStream,
         containers.ImuStream, containers.CameraStream, containers.Localization, containers.PointCloud,
-        containers.Cue, containers.ContactTrack, containers.FloorTrack, containers.Intervals,
+        containers.Cue, containers.ContactTrack, containers.FloorTrack, containers.Intervals, Interactions,
     )
 }  # fmt: skip
 

@@ -1,0 +1,36 @@
+"""Which hands held which object when."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+HANDS = ("left", "right")
+
+
+@dataclass(frozen=True)
+class Interactions:
+    """Stretches of time in which a fixed set of hands holds one object, ordered by their start."""
+
+    start_s: Float64[Tensor, "interval"]
+    stop_s: Float64[Tensor, "interval"]
+    hands: Bool[Tensor, "interval hand"]
+    """Of `HANDS`."""
+    objects: tuple[str, ...]
+    """Names in the environment; "" where it is not known."""
+    classes: tuple[str, ...]
+    """Each of `scene.objects.CONTACT_CLASSES`; "" where it is not known."""
+
+    def __len__(self) -> int:
+        return len(self.start_s)
+
+    def hand_contact(
+        self, timestamps: Float64[Tensor, "time"], contact_class: str | None = None
+    ) -> Bool[Tensor, "time hand"]:
+        """Whether each hand holds something (of a class, where one is given) at each time (start ≤ t < stop)."""
+        times = timestamps[:, None]
+        within = (self.start_s <= times) & (times < self.stop_s)
+        if contact_class is not None:
+            within = within & torch.tensor([name == contact_class for name in self.classes], dtype=torch.bool)
+        return (within[..., None] & self.hands).any(1)
