@@ -1,21 +1,11 @@
 """The viewer's page: its clock, what it sends, and what a real browser draws of it."""
 
-import base64
-import io
-import json
-import shutil
-import subprocess
-import time
-import urllib.request
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from PIL import Image
-from websockets.sync.client import connect
 
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
 from wearcap.cli.view import main as view
@@ -27,6 +17,7 @@ from wearcap.recording.locate import dataset_folder
 from wearcap.viewer.page import CAPTURE_COLOR, Page
 from wearcap.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
 from wearcap.viewer.page_timeline import Timeline
+from wearcap_browser import chromium
 
 
 def a_walk(frames: int = 60, sideways: float = 0.0) -> Motion:
@@ -188,57 +179,6 @@ def test_the_verb_refuses_what_is_not_there(tmp_path):
     assert dataset_folder(tmp_path / "a") == tmp_path
 
 
-class Chromium:
-    """A headless browser on one page, spoken to over its debugging socket."""
-
-    def __init__(self, binary: str, folder: Path, url: str):
-        command = [
-            binary, "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-            "--hide-scrollbars", "--window-size=1100,700", f"--user-data-dir={folder}",
-            "--remote-debugging-port=0", "--remote-allow-origins=*", url,
-        ]  # fmt: skip
-        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        port = self.poll(lambda: (folder / "DevToolsActivePort").read_text().split()[0])
-        targets = self.poll(lambda: [t for t in self.targets(port) if t["type"] == "page"])
-        self.socket = connect(targets[0]["webSocketDebuggerUrl"], max_size=2**26)
-        self.count = 0
-
-    @staticmethod
-    def targets(port: str) -> list[dict]:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=10) as reply:
-            return json.load(reply)
-
-    @staticmethod
-    def poll(ask, seconds: float = 60.0):
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            try:
-                if answer := ask():
-                    return answer
-            except (OSError, IndexError):
-                pass
-            time.sleep(0.3)
-        pytest.fail("the browser did not get there in time")
-
-    def call(self, method: str, **parameters) -> dict:
-        self.count += 1
-        self.socket.send(json.dumps({"id": self.count, "method": method, "params": parameters}))
-        while (reply := json.loads(self.socket.recv(timeout=60))).get("id") != self.count:
-            pass
-        return reply["result"]
-
-    def evaluate(self, script: str):
-        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
-
-    def screenshot(self) -> np.ndarray:
-        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-
-    def close(self) -> None:
-        self.process.terminate()
-        self.process.wait(20)
-
-
 def like(picture: np.ndarray, color: tuple[int, int, int]) -> int:
     """Pixels whose hue is the colour's, in whatever light."""
     total = picture.astype(float).sum(-1, keepdims=True)
@@ -250,23 +190,17 @@ def like(picture: np.ndarray, color: tuple[int, int, int]) -> int:
 @pytest.mark.slow
 def test_chromium_draws_the_page(page, tmp_path):
     """Canvas, controls and the body in a real browser; it plays, and hides what is put away."""
-    binary = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if binary is None:
-        pytest.skip("no Chromium found: apt-get install chromium")
-    browser = Chromium(binary, tmp_path / "profile", page.url)
-    try:
-        browser.poll(lambda: "Truth and capture" in (browser.evaluate("document.body.innerText") or ""))
-        text = browser.evaluate("document.body.innerText")
+    with chromium(tmp_path / "profile", page.url) as browser:
+        browser.poll(lambda: "Truth and capture" in browser.text())
+        text = browser.text()
         for label in ("walk", "Play", "Time (s)", "Speed", "Follow with the camera"):
             assert label in text, label
         assert browser.evaluate("document.querySelectorAll('canvas').length") >= 1
         browser.poll(lambda: like(browser.screenshot(), CAPTURE_COLOR) > 1000)
-        Image.fromarray(browser.screenshot()).save(tmp_path / "page.png")
         page.jump(1.5)
         browser.poll(
             lambda: browser.evaluate("[...document.querySelectorAll('input')].some(i => i.value == '1.5')")
         )
         page.arrange("truth")
         browser.poll(lambda: like(browser.screenshot(), CAPTURE_COLOR) < 100)
-    finally:
-        browser.close()
+        assert not browser.exceptions
