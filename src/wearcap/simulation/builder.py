@@ -204,6 +204,23 @@ class WorldBuilder:
         )  # fmt: skip
 
 
+def piece_mesh(piece: Piece) -> Mesh:
+    """The surface of a piece of furniture in its own frame."""
+    builder = WorldBuilder(piece.kind)
+    builder.place(piece, (0.0, 0.0, 0.0), 0.0)
+    vertices, faces, colors = [], [], []
+    start = 0
+    for corners, triangles, color, _texture, _item in builder._triangles:
+        vertices.append(corners)
+        faces.append(triangles + start)
+        colors.append(np.tile(np.array(color), (len(corners), 1)))
+        start += len(corners)
+    return Mesh(
+        np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32),
+        np.concatenate(colors).astype(np.float32),
+    )  # fmt: skip
+
+
 def _reachable(world: w.World, point: np.ndarray, within_m: float) -> bool:
     node = world.navigation.nearest_node(point)
     return node is not None and bool(
