@@ -1,0 +1,121 @@
+"""From contact probabilities to intervals in which a fixed set of hands holds on (thesis §5.3.2)."""
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """How probabilities become contacts. Raises WearcapError for a threshold outside 0…1 or a negative gap."""
+
+    threshold: float = 0.5
+    gap_s: float = 0.5
+    """Gaps up to this long between two contacts of a hand are filled (thesis Table 5.4)."""
+
+    def __post_init__(self):
+        if not 0.0 < self.threshold < 1.0 or self.gap_s < 0:
+            raise WearcapError(f"threshold {self.threshold}, gap {self.gap_s} s",
+                               expected="a probability between 0 and 1, and no negative time")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ContactInterval:
+    """Frames start … stop − 1 in which the same hands (left, right) hold on."""
+
+    start: int
+    stop: int
+    hands: tuple[bool, bool]
+
+
+def active(
+    contact_prob: Float[Tensor, "time hand"], timestamps: Float64[Tensor, "time"], settings: ContactSettings
+) -> Bool[Tensor, "time hand"]:
+    """Contacts of each hand after threshold and gap filling."""
+    above = contact_prob >= settings.threshold
+    frames = torch.arange(len(above))[:, None].expand_as(above)
+    last = torch.where(above, frames, -1).cummax(0).values
+    following = torch.where(above, frames, len(above)).flip(0).cummin(0).values.flip(0)
+    inside = (last >= 0) & (following < len(above))
+    clamped = len(above) - 1
+    gap = timestamps[following.clamp(max=clamped)] - timestamps[last.clamp(min=0)]
+    return above | (inside & (gap <= settings.gap_s + 1e-9))
+
+
+def contact_intervals(contact: Bool[Tensor, "time hand"]) -> list[ContactInterval]:
+    """Runs of frames with the same, not empty set of hands, in order: split where the set changes."""
+    if not len(contact):
+        return []
+    change = (contact[1:] != contact[:-1]).any(1).nonzero()[:, 0] + 1
+    edges = [0, *change.tolist(), len(contact)]
+    rows = [(a, b, contact[a].tolist()) for a, b in zip(edges[:-1], edges[1:])]
+    return [ContactInterval(a, b, (bool(left), bool(right))) for a, b, (left, right) in rows if left or right]
+
+
+@dataclass
+class ContactStream:
+    """The same frame by frame: an interval is given out as soon as it is known to be over.
+
+    A frame without contact is decided `gap_s` later, or when contact comes back before. Memory is bounded by the gap.
+    """
+
+    settings: ContactSettings = field(default_factory=ContactSettings)
+    _waiting: deque = field(default_factory=deque)
+    """Undecided frames from the oldest on: (number, time, above)."""
+    _last: list[float] = field(default_factory=lambda: [-float("inf")] * 2)
+    _count: int = 0
+    _open: tuple[int, tuple[bool, bool]] | None = None
+
+    def push(self, contact_prob: Float[Tensor, "hand"], time_s: float) -> list[ContactInterval]:
+        """Take one frame's probabilities; intervals that are over by now. Raises WearcapError when time stands."""
+        if self._waiting and time_s <= self._waiting[-1][1]:
+            raise WearcapError(
+                f"a frame at {time_s} s after one at {self._waiting[-1][1]} s", expected="rising times"
+            )
+        above = [bool(p >= self.settings.threshold) for p in contact_prob.tolist()]
+        for hand in range(2):
+            if above[hand]:
+                if time_s - self._last[hand] <= self.settings.gap_s + 1e-9:
+                    for _, time, held in self._waiting:
+                        held[hand] |= time > self._last[hand]
+                self._last[hand] = time_s
+        self._waiting.append((self._count, time_s, above))
+        self._count += 1
+        return self._decided(time_s)
+
+    def flush(self) -> list[ContactInterval]:
+        """What is left at the end."""
+        done = self._decided(float("inf"))
+        return done + self._closed(self._count)
+
+    def _decided(self, now_s: float) -> list[ContactInterval]:
+        """Step over the frames that no later contact can change: each hand holds, or let go longer ago than the gap."""
+        done = []
+        while self._waiting:
+            number, time, held = self._waiting[0]
+            if any(not on and last < time and now_s - last < self.settings.gap_s
+                   for on, last in zip(held, self._last)):  # fmt: skip
+                break
+            self._waiting.popleft()
+            done += self._step(number, (held[0], held[1]))
+        return done
+
+    def _step(self, number: int, held: tuple[bool, bool]) -> list[ContactInterval]:
+        if self._open is not None and self._open[1] == held:
+            return []
+        done = self._closed(number)
+        if any(held):
+            self._open = (number, held)
+        return done
+
+    def _closed(self, stop: int) -> list[ContactInterval]:
+        if self._open is None:
+            return []
+        start, hands = self._open
+        self._open = None
+        return [ContactInterval(start, stop, hands)]

@@ -1,0 +1,70 @@
+import pytest
+import torch
+
+from wearcap.errors import WearcapError
+from wearcap.pipelines.contact_intervals import (
+    ContactInterval,
+    ContactSettings,
+    ContactStream,
+    active,
+    contact_intervals,
+)
+
+
+def times(count: int, fps: float = 60.0) -> torch.Tensor:
+    return torch.arange(count, dtype=torch.float64) / fps
+
+
+def test_gaps_up_to_the_limit_are_filled_and_longer_ones_are_not():
+    prob = torch.zeros(200, 2)
+    prob[10:20] = 1.0
+    prob[49:60, 0] = 1.0  # 30 steps = 0.5 s after frame 19
+    prob[50:60, 1] = 1.0  # 31 steps
+    held = active(prob, times(200), ContactSettings(gap_s=0.5))
+    assert held[10:60, 0].all()
+    assert not held[20:50, 1].any()
+    assert not held[:10].any()
+    assert not held[60:].any()
+
+
+def test_an_interval_is_split_where_the_hands_change():
+    held = torch.zeros(30, 2, dtype=torch.bool)
+    held[5:20, 0] = True
+    held[10:25, 1] = True
+    assert contact_intervals(held) == [
+        ContactInterval(5, 10, (True, False)),
+        ContactInterval(10, 20, (True, True)),
+        ContactInterval(20, 25, (False, True)),
+    ]
+
+
+def test_nothing_in_nothing_out():
+    assert contact_intervals(torch.zeros(0, 2, dtype=torch.bool)) == []
+    assert contact_intervals(torch.zeros(9, 2, dtype=torch.bool)) == []
+    assert ContactStream().flush() == []
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("gap_s", [0.0, 0.25, 0.5])
+def test_frame_by_frame_gives_the_same_as_all_at_once(seed, gap_s):
+    torch.manual_seed(seed)
+    count = 600
+    logits = torch.randn(count // 6, 2).repeat_interleave(6, 0) + 0.3 * torch.randn(count, 2)
+    prob = torch.sigmoid(logits - 0.8)
+    stamps = (times(count) + 0.004 * torch.rand(count)).contiguous()
+    settings = ContactSettings(0.5, gap_s)
+    stream, found = ContactStream(settings), []
+    for row, time in zip(prob, stamps.tolist()):
+        found += stream.push(row, time)
+        assert len(stream._waiting) <= 2 + (gap_s + 0.05) * 60
+    assert found + stream.flush() == contact_intervals(active(prob, stamps, settings))
+
+
+def test_settings_and_times_that_make_no_sense_are_refused():
+    with pytest.raises(WearcapError, match="between 0 and 1"):
+        ContactSettings(threshold=1.0)
+    stream = ContactStream(ContactSettings(gap_s=0.5))
+    stream.push(torch.tensor([1.0, 0.0]), 1.0)
+    stream.push(torch.tensor([0.0, 0.0]), 1.1)
+    with pytest.raises(WearcapError, match="rising"):
+        stream.push(torch.tensor([0.0, 0.0]), 1.1)
