@@ -1,5 +1,6 @@
 """Exact distances from points to a triangle mesh: a tree of boxes over its faces, searched by compiled loops."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,10 +45,71 @@ class TriangleIndex:
     def nearest(
         self, queries: Float64[np.ndarray, "query 3"]
     ) -> tuple[Float64[np.ndarray, "query"], Int64[np.ndarray, "query"]]:
-        """Distance (m) from each point to the surface, and the face that is nearest."""
-        distance, face = np.empty(len(queries)), np.empty(len(queries), np.int64)
-        _nearest_all(queries, self.corners, self.low, self.high, self.span, distance, face)
-        return distance, self.order[face]
+        """Distance (m) from each point to the surface, and the face that is nearest (NaN and 0 for points with NaN)."""
+        distance, face, _ = self._search(queries)
+        return distance, face
+
+    def nearest_points(
+        self, queries: Float64[np.ndarray, "query 3"]
+    ) -> tuple[Float64[np.ndarray, "query"], Float64[np.ndarray, "query 3"]]:
+        """Distance (m) from each point to the surface, and the nearest point of it (NaN for points with NaN)."""
+        distance, _, point = self._search(queries)
+        return distance, point
+
+    def _search(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        distance, face, point = (
+            np.empty(len(queries)),
+            np.empty(len(queries), np.int64),
+            np.empty((len(queries), 3)),
+        )
+        _nearest_all(queries, self.corners, self.low, self.high, self.span, distance, face, point)
+        return distance, self.order[face], point
+
+
+@dataclass(frozen=True, eq=False)
+class BodiesIndex:
+    """Several meshes, each to be moved rigidly, ready for queries of the nearest one. Build it with `BodiesIndex.build`."""
+
+    corners: Float64[np.ndarray, "face 3 3"]
+    low: Float64[np.ndarray, "node 3"]
+    high: Float64[np.ndarray, "node 3"]
+    span: Int64[np.ndarray, "node 3"]
+    roots: Int64[np.ndarray, "body"]
+    """First node of each body's tree; bodies of one shape share it."""
+
+    @classmethod
+    def build(
+        cls, shapes: Sequence[TriangleIndex], shape_of_body: Int64[np.ndarray, "body"]
+    ) -> "BodiesIndex":
+        """Join the shapes' trees. Raises ValueError without a shape."""
+        first_face = np.cumsum([0, *(len(shape.corners) for shape in shapes)])
+        first_node = np.cumsum([0, *(len(shape.span) for shape in shapes)])
+        spans = []
+        for shape, face, node in zip(shapes, first_face, first_node):
+            child = np.where(shape.span[:, 2:] > 0, shape.span[:, 2:] + node, 0)
+            spans.append(np.concatenate([shape.span[:, :2] + face, child], 1))
+        return cls(
+            np.concatenate([shape.corners for shape in shapes]), np.concatenate([shape.low for shape in shapes]),
+            np.concatenate([shape.high for shape in shapes]), np.concatenate(spans), first_node[shape_of_body],
+        )  # fmt: skip
+
+    def nearest(
+        self,
+        queries: Float64[np.ndarray, "query 3"],
+        bodies: Int64[np.ndarray, "chosen"],
+        R_world_body: Float64[np.ndarray, "chosen 3 3"],
+        t_world_body: Float64[np.ndarray, "chosen 3"],
+        reach_m: float,
+    ) -> tuple[Int64[np.ndarray, "query"], Float64[np.ndarray, "query"], Float64[np.ndarray, "query 3"]]:
+        """For each point the nearest of the chosen bodies (its number among all), the distance (m) and the closest
+        point in the world; -1, infinity and NaN where none is nearer than `reach_m`."""
+        count = len(queries)
+        body, distance, point = np.empty(count, np.int64), np.empty(count), np.empty((count, 3))
+        _nearest_bodies(
+            queries, R_world_body, t_world_body, self.roots[bodies], reach_m, self.corners, self.low, self.high,
+            self.span, body, distance, point,
+        )  # fmt: skip
+        return np.append(bodies, -1)[body], distance, point
 
 
 @compiled
@@ -90,19 +152,22 @@ def _box_distance(p, low, high):
 
 
 @compiled
-def _segment_distance(px, py, pz, ux, uy, uz):
-    """Squared distance from p to the segment from the origin to u."""
+def _segment_nearest(px, py, pz, ux, uy, uz):
+    """Squared distance from p to the segment from the origin to u, and the share of u that is nearest."""
     length = ux * ux + uy * uy + uz * uz
     share = 0.0
     if length > 0:
         share = min(max((px * ux + py * uy + pz * uz) / length, 0.0), 1.0)
     dx, dy, dz = px - share * ux, py - share * uy, pz - share * uz
-    return dx * dx + dy * dy + dz * dz
+    return dx * dx + dy * dy + dz * dz, share
 
 
 @compiled
-def _triangle_distance(p, triangle):
-    """Squared distance from a point to a triangle: to its plane above the inside, else to the nearest side."""
+def _triangle_nearest(p, triangle):
+    """Squared distance from p to a triangle (a, a + u, a + v), and s, t of the nearest point a + s·u + t·v.
+
+    It lies in the plane above the inside, else on the nearest side.
+    """
     px, py, pz = p[0] - triangle[0, 0], p[1] - triangle[0, 1], p[2] - triangle[0, 2]
     ux, uy, uz = (
         triangle[1, 0] - triangle[0, 0], triangle[1, 1] - triangle[0, 1], triangle[1, 2] - triangle[0, 2]
@@ -117,38 +182,98 @@ def _triangle_distance(p, triangle):
         s, t = (vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area
         if s >= 0 and t >= 0 and s + t <= 1:
             dx, dy, dz = px - s * ux - t * vx, py - s * uy - t * vy, pz - s * uz - t * vz
-            return dx * dx + dy * dy + dz * dz
-    first = _segment_distance(px, py, pz, ux, uy, uz)
-    second = _segment_distance(px, py, pz, vx, vy, vz)
-    third = _segment_distance(px - ux, py - uy, pz - uz, vx - ux, vy - uy, vz - uz)
-    return min(first, second, third)
+            return dx * dx + dy * dy + dz * dz, s, t
+    first, along_u = _segment_nearest(px, py, pz, ux, uy, uz)
+    second, along_v = _segment_nearest(px, py, pz, vx, vy, vz)
+    third, across = _segment_nearest(px - ux, py - uy, pz - uz, vx - ux, vy - uy, vz - uz)
+    if first <= second and first <= third:
+        return first, along_u, 0.0
+    if second <= third:
+        return second, 0.0, along_v
+    return third, 1.0 - across, across
 
 
 @compiled
-def _nearest_all(queries, corners, low, high, span, distance, face):
+def _nearest_face(p, root, best, corners, low, high, span, stack, reach):
+    """(squared distance, row in `corners`) of the face nearest to p below a node; (best, -1) where none is nearer."""
+    found = -1
+    depth, stack[0], reach[0] = 1, root, _box_distance(p, low[root], high[root])
+    while depth > 0:
+        depth -= 1
+        node = stack[depth]
+        if reach[depth] >= best:
+            continue
+        child = span[node, 2]
+        if child == 0:
+            for i in range(span[node, 0], span[node, 1]):
+                square, _, _ = _triangle_nearest(p, corners[i])
+                if square < best:
+                    best, found = square, i
+            continue
+        near, far = child, child + 1
+        near_reach = _box_distance(p, low[near], high[near])
+        far_reach = _box_distance(p, low[far], high[far])
+        if far_reach < near_reach:
+            near, far, near_reach, far_reach = far, near, far_reach, near_reach
+        stack[depth], reach[depth] = far, far_reach
+        stack[depth + 1], reach[depth + 1] = near, near_reach
+        depth += 2
+    return best, found
+
+
+@compiled
+def _nearest_all(queries, corners, low, high, span, distance, face, point):
+    """Neighbouring queries are often near each other, as along a path: the last one's face bounds the search."""
     stack, reach = np.empty(128, np.int64), np.empty(128)
+    last = 0
     for q in range(len(queries)):
         p = queries[q]
-        best, found = np.inf, -1
-        depth, stack[0], reach[0] = 1, 0, 0.0
-        while depth > 0:
-            depth -= 1
-            node = stack[depth]
-            if reach[depth] >= best:
+        if not (np.isfinite(p[0]) and np.isfinite(p[1]) and np.isfinite(p[2])):
+            distance[q], face[q], point[q] = np.nan, 0, np.nan
+            continue
+        best, _, _ = _triangle_nearest(p, corners[last])
+        best, found = _nearest_face(p, 0, best, corners, low, high, span, stack, reach)
+        last = found if found >= 0 else last
+        _, s, t = _triangle_nearest(p, corners[last])
+        distance[q], face[q] = np.sqrt(best), last
+        for axis in range(3):
+            a = corners[last, 0, axis]
+            point[q, axis] = a + s * (corners[last, 1, axis] - a) + t * (corners[last, 2, axis] - a)
+
+
+@compiled
+def _nearest_bodies(queries, R, t, roots, reach_m, corners, low, high, span, body, distance, point):
+    """Every body's box bounds its distance; the nearest box is searched first, the others only while they can win."""
+    stack, reach = np.empty(128, np.int64), np.empty(128)
+    bound, local = np.empty(len(roots)), np.empty((len(roots), 3))
+    for q in range(len(queries)):
+        body[q], distance[q], point[q] = -1, np.inf, np.nan
+        first = -1
+        for k in range(len(roots)):
+            dx, dy, dz = queries[q, 0] - t[k, 0], queries[q, 1] - t[k, 1], queries[q, 2] - t[k, 2]
+            for axis in range(3):
+                local[k, axis] = R[k, 0, axis] * dx + R[k, 1, axis] * dy + R[k, 2, axis] * dz
+            bound[k] = _box_distance(local[k], low[roots[k]], high[roots[k]])
+            if first < 0 or bound[k] < bound[first]:
+                first = k
+        if first < 0 or not np.isfinite(queries[q, 0] + queries[q, 1] + queries[q, 2]):
+            continue
+        best, row, owner = reach_m * reach_m, -1, -1
+        for turn in range(-1, len(roots)):
+            k = first if turn < 0 else turn
+            if bound[k] >= best or turn == first:
                 continue
-            child = span[node, 2]
-            if child == 0:
-                for i in range(span[node, 0], span[node, 1]):
-                    square = _triangle_distance(p, corners[i])
-                    if square < best:
-                        best, found = square, i
-                continue
-            near, far = child, child + 1
-            near_reach = _box_distance(p, low[near], high[near])
-            far_reach = _box_distance(p, low[far], high[far])
-            if far_reach < near_reach:
-                near, far, near_reach, far_reach = far, near, far_reach, near_reach
-            stack[depth], reach[depth] = far, far_reach
-            stack[depth + 1], reach[depth + 1] = near, near_reach
-            depth += 2
-        distance[q], face[q] = np.sqrt(best), found
+            square, found = _nearest_face(local[k], roots[k], best, corners, low, high, span, stack, reach)
+            if found >= 0:
+                best, row, owner = square, found, k
+        if row < 0:
+            continue
+        body[q], distance[q] = owner, np.sqrt(best)
+        _, s, along = _triangle_nearest(local[owner], corners[row])
+        for axis in range(3):
+            local[owner, axis] = corners[row, 0, axis] + s * (corners[row, 1, axis] - corners[row, 0, axis])
+            local[owner, axis] += along * (corners[row, 2, axis] - corners[row, 0, axis])
+        for axis in range(3):
+            point[q, axis] = t[owner, axis]
+            for b in range(3):
+                point[q, axis] += R[owner, axis, b] * local[owner, b]

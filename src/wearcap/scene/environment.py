@@ -1,0 +1,140 @@
+"""An interactive environment: objects that can be moved, and which of them is nearest to a hand (thesis §5.2, §5.3)."""
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.triangle_distance import BodiesIndex, TriangleIndex
+from wearcap.scene.objects import CONTACT_CLASSES, SceneObject
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """The object nearest to each of some points of the world."""
+
+    object_index: Int64[Tensor, "query"]
+    """Number in `Environment.objects`; -1 where none is within reach."""
+    distance: Float[Tensor, "query"]
+    """From the point to the object's surface (m), infinity where none is within reach."""
+    point_world: Float[Tensor, "query 3"]
+    """The object's closest point (m), NaN where none is within reach."""
+
+
+@dataclass(frozen=True, eq=False)
+class Environment:
+    """Objects by unique names. Raises WearcapError for a name that two objects bear."""
+
+    objects: tuple[SceneObject, ...]
+
+    def __post_init__(self):
+        twice = [name for name, count in Counter(item.name for item in self.objects).items() if count > 1]
+        if twice:
+            raise WearcapError(f"several objects are named {twice[0]!r}", expected="unique names")
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+    def by_name(self, name: str) -> SceneObject:
+        """The object of that name. Raises WearcapError where there is none."""
+        return self.objects[self.index(name)]
+
+    def index(self, name: str) -> int:
+        """Number of the object of that name. Raises WearcapError where there is none."""
+        if name not in self._index:
+            raise WearcapError(f"no object {name!r}", expected=f"one of {', '.join(self._index) or 'none'}")
+        return self._index[name]
+
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {item.name: k for k, item in enumerate(self.objects)}
+
+    @cached_property
+    def _shapes(self) -> list[TriangleIndex]:
+        """One tree per object; objects of one mesh share it."""
+        meshes = {id(item.mesh): item.mesh for item in self.objects}
+        built = {key: surface_index(mesh) for key, mesh in meshes.items()}
+        return [built[id(item.mesh)] for item in self.objects]
+
+    @cached_property
+    def _bodies(self) -> BodiesIndex:
+        shapes = {id(shape): shape for shape in self._shapes}
+        number = {key: k for k, key in enumerate(shapes)}
+        of_body = np.array([number[id(shape)] for shape in self._shapes], np.int64)
+        return BodiesIndex.build(list(shapes.values()), of_body)
+
+    @cached_property
+    def _initial_R(self) -> np.ndarray:
+        return np.array([item.R_world_object.tolist() for item in self.objects], np.float64).reshape(-1, 3, 3)
+
+    @cached_property
+    def _initial_t(self) -> np.ndarray:
+        return np.array([item.t_world_object.tolist() for item in self.objects], np.float64).reshape(-1, 3)
+
+    def nearest(
+        self,
+        points_world: Float[Tensor, "query 3"],
+        T_world_object: dict[str, Rigid] | None = None,
+        contact_class: str | None = None,
+        reach_m: float = float("inf"),
+    ) -> Nearest:
+        """The nearest object to each point, by exact distance to triangles (to points, in a cloud).
+
+        Objects stand at `T_world_object` where it names them, else where they stood at the beginning; with a
+        `contact_class` only objects of that class count. A point with NaN has no nearest object.
+        """
+        if contact_class not in (None, *CONTACT_CLASSES):
+            raise WearcapError(
+                f"no contact class {contact_class!r}", expected=f"one of {', '.join(CONTACT_CLASSES)}"
+            )
+        R, t = self._initial_R.copy(), self._initial_t.copy()
+        for name, pose in (T_world_object or {}).items():
+            R[self.index(name)], t[self.index(name)] = pose.R.numpy(), pose.t.numpy()
+        chosen = np.flatnonzero(
+            [contact_class in (None, item.freedom.contact_class) for item in self.objects]
+        )
+        if not len(chosen):
+            return _nothing(points_world)
+        index, distance, point = self._bodies.nearest(
+            points_world.double().contiguous().numpy(), chosen, R[chosen], t[chosen], float(reach_m)
+        )
+        dtype = points_world.dtype
+        return Nearest(
+            torch.from_numpy(index), torch.from_numpy(distance).to(dtype), torch.from_numpy(point).to(dtype)
+        )
+
+    def distance(
+        self, name: str, points_world: Float[Tensor, "time 3"], T_world_object: Rigid
+    ) -> tuple[Float[Tensor, "time"], Float[Tensor, "time 3"]]:
+        """Distance (m) of a point to one object over time, and the object's closest point in the world.
+
+        `T_world_object` is the object's pose at each time, or one pose for all. NaN where the point is NaN.
+        """
+        shape, R, t = self._shapes[self.index(name)], T_world_object.R.double(), T_world_object.t.double()
+        local = (R.mT @ (points_world.double() - t)[..., None])[..., 0]
+        distance, point = shape.nearest_points(local.contiguous().numpy())
+        closest = (R @ torch.from_numpy(point)[..., None])[..., 0] + t
+        return torch.from_numpy(distance).to(points_world.dtype), closest.to(points_world.dtype)
+
+
+def surface_index(mesh: Mesh) -> TriangleIndex:
+    """Tree over a mesh's triangles; a cloud's points are triangles without extent. Raises WearcapError for NaN."""
+    faces = mesh.faces.astype(np.int64)
+    if not len(faces):
+        faces = np.repeat(np.arange(len(mesh.vertices))[:, None], 3, axis=1)
+    return TriangleIndex.build(mesh.vertices.astype(np.float64), faces)
+
+
+def _nothing(points_world: Tensor) -> Nearest:
+    count = len(points_world)
+    return Nearest(
+        torch.full((count,), -1), points_world.new_full((count,), float("inf")),
+        points_world.new_full((count, 3), float("nan")),
+    )  # fmt: skip
