@@ -1,5 +1,6 @@
 """Seeded flats: rooms on one or both sides of a hallway, furnished; some with stairs to a second storey."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -36,16 +37,23 @@ class Layout:
 def build_flat(rng: np.random.Generator, name: str, stairs: bool | None = None) -> World:
     """A flat of 2–5 rooms (per storey at most) with doors of 0.80–0.95 m; `stairs` None leaves it to chance."""
     builder = WorldBuilder(name, rng.uniform(-np.pi, np.pi), tuple(rng.uniform(-5.0, 5.0, 2).tolist()))
-    with_stairs = bool(rng.uniform() < STAIR_SHARE) if stairs is None else stairs
-    layout = _draw_layout(rng, with_stairs)
-    hall = (0.0, layout.hall[0], layout.width, layout.hall[1])
-    if with_stairs:
-        hole, upper_z = _build_stairs(builder, layout, rng)
-        _build_storey(builder, layout, 0, 0.0, [hall], rng)
-        _build_storey(builder, layout, 1, upper_z, _around(hall, hole), rng)
-    else:
-        _build_storey(builder, layout, 0, 0.0, [hall], rng)
+    lay_out(builder, rng, bool(rng.uniform() < STAIR_SHARE) if stairs is None else stairs)
     return builder.finish(cell=0.1)
+
+
+def lay_out(
+    builder: WorldBuilder, rng: np.random.Generator, stairs: bool,
+    furnish: Callable[[Plan, str, np.random.Generator], None] = Plan.furnish,
+) -> None:  # fmt: skip
+    """Walls, floors and what `furnish` puts into each room, by its kind (`ROOM_KINDS`)."""
+    layout = _draw_layout(rng, stairs)
+    hall = (0.0, layout.hall[0], layout.width, layout.hall[1])
+    if stairs:
+        hole, upper_z = _build_stairs(builder, layout, rng)
+        _build_storey(builder, layout, 0, 0.0, [hall], rng, furnish)
+        _build_storey(builder, layout, 1, upper_z, _around(hall, hole), rng, furnish)
+    else:
+        _build_storey(builder, layout, 0, 0.0, [hall], rng, furnish)
 
 
 def _draw_layout(rng: np.random.Generator, with_stairs: bool) -> Layout:
@@ -70,7 +78,7 @@ def _split(rng: np.random.Generator, width: float, count: int, low: float, high:
 
 def _build_storey(
     builder: WorldBuilder, layout: Layout, level: int, z: float, hall: list[Box],
-    rng: np.random.Generator,
+    rng: np.random.Generator, furnish: Callable[[Plan, str, np.random.Generator], None],
 ) -> None:  # fmt: skip
     slab, wall_color = (0.05 if level == 0 else z - HEIGHT), hue(rng, (0.0, 0.15))
     for outline in hall:
@@ -86,7 +94,7 @@ def _build_storey(
         builder.rooms.append(Room(f"{kind} {level}.{number}", builder.to_world(corners), z))
         inset = THICKNESS / 2 + 0.01
         inner = (outline[0] + inset, outline[1] + inset, outline[2] - inset, outline[3] - inset)
-        Plan(builder, inner, z, list(kept_free)).furnish(str(kind), rng)
+        furnish(Plan(builder, inner, z, list(kept_free)), str(kind), rng)
     corners = rectangle(_middle(hall[0]), (hall[0][2] - hall[0][0], hall[0][3] - hall[0][1]))
     builder.rooms.append(Room(f"hallway {level}", builder.to_world(corners), z))
 
