@@ -1,0 +1,221 @@
+"""Making an interactive environment out of a scan: select points, cut objects out, say how they move, undo."""
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from scipy.spatial import KDTree
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import Mesh
+from wearcap.scene.environment import Environment, surface_index
+from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.placing import floor_beneath, footprint, usual_freedom
+from wearcap.scene.scan import Scan
+from wearcap.scene.selection import Box, SlicedCloud
+
+USUAL_KIND = {
+    "door": "hinge", "window": "hinge", "drawer": "axis", "sofa": "plane", "table": "plane", "chair": "plane",
+    "cupboard": "plane", "box": "free", "other": "plane",
+}  # fmt: skip
+"""Categories that are offered, and how such things mostly move."""
+FEWEST_POINTS = 20
+"""An object of fewer points would be a speck."""
+_SAME_M = 0.0005
+"""A point of an object that was cut out of this scan lies no further from the scan's."""
+_SURFACE_M = 0.02
+"""Points of the scan so near to an object's triangles are seen as its."""
+_OUTSIDE_M = 0.5
+_HISTORY = 200
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    item: SceneObject
+    points: Int64[np.ndarray, "taken"]
+    """Numbers of the scan's points that it took, ascending."""
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    cuts: tuple[_Cut, ...]
+    selected: Int64[np.ndarray, "point"]
+
+
+class ObjectEditing:
+    """The objects cut out of a scan so far, the points that are selected for the next, and all steps back.
+
+    Every verb is one step of `undo`; consecutive ones with the same `stroke` (a brush's way, a slider that is
+    dragged) are one step together. The scan itself never changes.
+    """
+
+    def __init__(self, scan: Scan, environment: Environment | None = None):
+        """Raises WearcapError for objects that do not stand in this scan."""
+        self.scan = scan
+        self._cloud = SlicedCloud(scan.points)
+        objects = environment.objects if environment is not None else ()
+        for item in objects:
+            _must_stand_inside(item, scan.points)
+        taken = tuple(_Cut(item, self._points_of(item)) for item in objects)
+        self._state = _State(taken, np.empty(0, np.int64))
+        self._past: list[_State] = []
+        self._stroke: object = None
+
+    @property
+    def selected(self) -> Int64[np.ndarray, "point"]:
+        """Numbers of the selected points, ascending."""
+        return self._state.selected
+
+    @property
+    def environment(self) -> Environment:
+        """All objects, in the order in which they were made."""
+        return Environment(tuple(cut.item for cut in self._state.cuts))
+
+    @property
+    def revision(self) -> object:
+        """Another object whenever the environment has changed (and not when only the selection has)."""
+        return self._state.cuts
+
+    def left(self) -> Bool[np.ndarray, "point"]:
+        """Points of the scan that belong to no object."""
+        left = np.ones(len(self.scan.points), bool)
+        for cut in self._state.cuts:
+            left[cut.points] = False
+        return left
+
+    def select_box(self, box: Box, add: bool = True) -> None:
+        """Add the points in a box to the selection, or take them away."""
+        self._select(self._cloud.in_box(box), add)
+
+    def select_ball(
+        self, center: Float[np.ndarray, "3"], radius_m: float, add: bool = True, stroke: object = None
+    ) -> None:
+        """Add the points around a place to the selection, or take them away: a dab of the brush."""
+        self._select(self._cloud.in_ball(center, radius_m), add, stroke)
+
+    def clear_selection(self) -> None:
+        if len(self.selected):
+            self._step(replace(self._state, selected=np.empty(0, np.int64)))
+
+    def _select(self, points: Int64[np.ndarray, "inside"], add: bool, stroke: object = None) -> None:
+        if add:
+            for cut in self._state.cuts:
+                points = np.setdiff1d(points, cut.points, assume_unique=True)
+            points = np.union1d(self.selected, points)
+        else:
+            points = np.setdiff1d(self.selected, points, assume_unique=True)
+        if len(points) != len(self.selected):
+            self._step(replace(self._state, selected=points), stroke)
+
+    def cut(self, name: str, category: str, kind: str | None = None) -> SceneObject:
+        """Make the selected points an object, with the freedom that is usual for its category or for the kind.
+
+        Its origin is the middle of its footprint on the floor, its axes are the world's. Raises WearcapError for
+        too few points or a name that cannot be.
+        """
+        self._check_name(name)
+        if len(self.selected) < FEWEST_POINTS:
+            raise WearcapError(f"{len(self.selected)} points are selected", expected=f"{FEWEST_POINTS} or more",
+                               fix="Select the object's points with the box or the brush first.")  # fmt: skip
+        points = self.scan.points[self.selected]
+        rest = self.left()
+        rest[self.selected] = False
+        floor = floor_beneath(points, self.scan.points[rest])
+        origin = np.array([*footprint(points).center, floor])
+        colors = np.full(3, 0.6, np.float32)
+        if self.scan.colors is not None:
+            colors = self.scan.colors[self.selected].astype(np.float32) / 255
+        mesh = Mesh((points - origin).astype(np.float32), np.empty((0, 3), np.int32), colors)
+        kind = kind or USUAL_KIND.get(category, "plane")
+        item = SceneObject(name, category, mesh, torch.eye(3), torch.from_numpy(origin).float(),
+                           usual_freedom(kind, points, floor))  # fmt: skip
+        self._step(_State((*self._state.cuts, _Cut(item, self.selected)), np.empty(0, np.int64)))
+        return item
+
+    def free_name(self, category: str) -> str:
+        """A name that no object has: "door_1", "door_2", …"""
+        names = {cut.item.name for cut in self._state.cuts}
+        return next(name for k in range(1, len(names) + 2) if (name := f"{category}_{k}") not in names)
+
+    def rename(self, name: str, new: str) -> None:
+        """Raises WearcapError for a name that cannot be."""
+        if new != name:
+            self._check_name(new)
+            self._change(replace(self._find(name).item, name=new), name)
+
+    def set_freedom(self, name: str, freedom: Freedom, stroke: object = None) -> None:
+        self._change(replace(self._find(name).item, freedom=freedom), name, stroke)
+
+    def set_kind(self, name: str, kind: str) -> None:
+        """Another kind of freedom, with what is usual for it."""
+        item = self._find(name).item
+        if kind != item.freedom.kind:
+            points, floor = points_world(item), float(item.t_world_object[2])
+            self.set_freedom(name, usual_freedom(kind, points, floor))
+
+    def delete(self, name: str) -> None:
+        """Give the object's points back to the scan."""
+        gone = self._find(name)
+        self._step(replace(self._state, cuts=tuple(cut for cut in self._state.cuts if cut is not gone)))
+
+    def undo(self) -> bool:
+        """Back by one step; whether there was one."""
+        self._stroke = None
+        if not self._past:
+            return False
+        self._state = self._past.pop()
+        return True
+
+    def _step(self, state: _State, stroke: object = None) -> None:
+        if stroke is None or stroke != self._stroke:
+            self._past = [*self._past[-_HISTORY + 1 :], self._state]
+        self._state, self._stroke = state, stroke
+
+    def _change(self, item: SceneObject, name: str, stroke: object = None) -> None:
+        cuts = (replace(cut, item=item) if cut.item.name == name else cut for cut in self._state.cuts)
+        self._step(replace(self._state, cuts=tuple(cuts)), stroke)
+
+    def _find(self, name: str) -> _Cut:
+        return self._state.cuts[self.environment.index(name)]
+
+    def _check_name(self, name: str) -> None:
+        if not _NAME.fullmatch(name):
+            raise WearcapError(f"an object cannot be named {name!r}",
+                               expected="letters, digits, _ and -: it becomes a file's name")  # fmt: skip
+        if name.lower() in {cut.item.name.lower() for cut in self._state.cuts}:
+            raise WearcapError(f"there is an object {name!r} already", expected="another name")
+
+    def _points_of(self, item: SceneObject) -> Int64[np.ndarray, "taken"]:
+        """The scan's points that an object of a file consists of, or that lie on its triangles."""
+        points = points_world(item)
+        low, high = points.min(0) - _SURFACE_M, points.max(0) + _SURFACE_M
+        around = self._cloud.in_box(Box(tuple((low + high) / 2), tuple(high - low)))
+        if not len(around):
+            return around
+        there = self.scan.points[around].astype(np.float64)
+        if not len(item.mesh.faces):
+            return around[KDTree(points).query(there, distance_upper_bound=_SAME_M)[0] <= _SAME_M]
+        R, t = item.R_world_object.double().numpy(), item.t_world_object.double().numpy()
+        distance, _ = surface_index(item.mesh).nearest_points((there - t) @ R)
+        return around[distance <= _SURFACE_M]
+
+
+def points_world(item: SceneObject) -> Float[np.ndarray, "vertex 3"]:
+    """An object's vertices where it stands at the beginning (float64)."""
+    R, t = item.R_world_object.double().numpy(), item.t_world_object.double().numpy()
+    return item.mesh.vertices.astype(np.float64) @ R.T + t
+
+
+def _must_stand_inside(item: SceneObject, scan: Float[np.ndarray, "point 3"]) -> None:
+    points = points_world(item)
+    if not len(points):
+        raise WearcapError("an object without a shape", where=item.name, expected="a mesh or a cloud")
+    middle = (points.min(0) + points.max(0)) / 2
+    beyond = float(np.maximum(scan.min(0) - middle, middle - scan.max(0)).max())
+    if beyond > _OUTSIDE_M:
+        raise WearcapError(f"the object {item.name!r} stands {beyond:.1f} m outside the scan",
+                           expected="an environment of this scene",
+                           fix="Give the scan that it was made from, or another environment file.")  # fmt: skip

@@ -1,0 +1,78 @@
+"""Choosing points of a scan: in a box, within a brush's radius, along a ray of the view."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+_SPREAD = 0.006
+"""Points no further from a ray than this share of their distance (half a degree or so) are under the pointer …"""
+_NEAR_M = 0.012
+"""… or no further than this, close by."""
+_DEPTH_M = 0.06
+"""Points behind the first one by no more than this lie on the same surface."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box that stands upright, turned by `yaw` (rad, counter-clockwise from above); world axes, m."""
+
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    """Its whole length, width and height."""
+    yaw: float = 0.0
+
+    def contains(self, points: Float[np.ndarray, "point 3"]) -> Bool[np.ndarray, "point"]:
+        """Points inside or on the box."""
+        away = points - np.asarray(self.center)
+        cos, sin = np.cos(self.yaw), np.sin(self.yaw)
+        along, across = cos * away[:, 0] + sin * away[:, 1], cos * away[:, 1] - sin * away[:, 0]
+        half = np.asarray(self.size) / 2
+        return (abs(along) <= half[0]) & (abs(across) <= half[1]) & (abs(away[:, 2]) <= half[2])
+
+    @property
+    def reach_x(self) -> float:
+        """Half of its extent along the world's x axis."""
+        return (abs(np.cos(self.yaw)) * self.size[0] + abs(np.sin(self.yaw)) * self.size[1]) / 2
+
+
+class SlicedCloud:
+    """Points ordered along x: what is near a place lies in a thin slice, so that millions answer in milliseconds."""
+
+    def __init__(self, points: Float[np.ndarray, "point 3"]):
+        self.order = np.argsort(points[:, 0], kind="stable")
+        self.points = points[self.order]
+        self._x = np.ascontiguousarray(self.points[:, 0])
+
+    def in_box(self, box: Box) -> Int64[np.ndarray, "inside"]:
+        """Numbers of the points in a box, ascending."""
+        part = self._slice(box.center[0], box.reach_x)
+        return np.sort(self.order[part][box.contains(self.points[part])])
+
+    def in_ball(self, center: Float[np.ndarray, "3"], radius_m: float) -> Int64[np.ndarray, "inside"]:
+        """Numbers of the points within a distance of a place, ascending."""
+        part = self._slice(float(center[0]), radius_m)
+        return np.sort(self.order[part][((self.points[part] - center) ** 2).sum(1) <= radius_m**2])
+
+    def _slice(self, middle: float, reach: float) -> slice:
+        # The margin keeps points in that float32 puts just beyond the end.
+        low, high = np.searchsorted(self._x, [middle - reach - 1e-4, middle + reach + 1e-4])
+        return slice(int(low), int(high))
+
+
+def first_hit(
+    points: Float[np.ndarray, "point 3"], origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+) -> int | None:
+    """Number of the point that a ray meets first (the nearest to the ray on that surface); None where it meets none.
+
+    `direction` need not be a unit vector.
+    """
+    ray = direction / np.linalg.norm(direction)
+    away = points - origin
+    depth = away @ ray
+    aside = np.sqrt(np.maximum((away**2).sum(1) - depth**2, 0.0))
+    under = np.flatnonzero((depth > 0.02) & (aside < np.maximum(_SPREAD * depth, _NEAR_M)))
+    if not len(under):
+        return None
+    front = under[depth[under] < depth[under].min() + _DEPTH_M]
+    return int(front[aside[front].argmin()])
