@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
@@ -130,6 +130,23 @@ def surface_index(mesh: Mesh) -> TriangleIndex:
     if not len(faces):
         faces = np.repeat(np.arange(len(mesh.vertices))[:, None], 3, axis=1)
     return TriangleIndex.build(mesh.vertices.astype(np.float64), faces)
+
+
+def box_in_world(item: SceneObject) -> Float64[np.ndarray, "2 3"]:
+    """Least and greatest corner (m) of the box around an object where it stands at the beginning."""
+    points = (
+        item.mesh.vertices @ item.R_world_object.double().numpy().T + item.t_world_object.double().numpy()
+    )
+    return np.stack([points.min(0), points.max(0)])
+
+
+def hinge_gap_m(item: SceneObject) -> float:
+    """How far an object's hinge is, seen from above, from the box around it; 0 for objects without a hinge."""
+    if item.freedom.pivot is None:
+        return 0.0
+    low, high = box_in_world(item)[:, :2]
+    pivot = np.array(item.freedom.pivot[:2])
+    return float(np.linalg.norm(np.maximum(np.maximum(low - pivot, pivot - high), 0.0)))
 
 
 def _nothing(points_world: Tensor) -> Nearest:
