@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -53,7 +54,7 @@ def contact_intervals(contact: Bool[Tensor, "time hand"]) -> list[ContactInterva
         return []
     change = (contact[1:] != contact[:-1]).any(1).nonzero()[:, 0] + 1
     edges = [0, *change.tolist(), len(contact)]
-    rows = [(a, b, contact[a].tolist()) for a, b in zip(edges[:-1], edges[1:])]
+    rows = [(a, b, contact[a].tolist()) for a, b in pairwise(edges)]
     return [ContactInterval(a, b, (bool(left), bool(right))) for a, b, (left, right) in rows if left or right]
 
 

@@ -34,7 +34,10 @@ class CleaningLimits:
 
 
 def resampled(motion: Motion, fps: float | int) -> Motion:
-    """The motion at `fps`: every n-th frame where the rates divide, else slerp (rotations) and lerp (root, contacts)."""
+    """The motion at `fps`: every n-th frame where the rates divide, else slerp (rotations) and lerp (root, contacts).
+
+    Objects keep their own frames.
+    """
     ratio = motion.fps / fps
     steps = motion.timestamps.diff()
     even = steps.max() < 1.5 * steps.median()
@@ -42,8 +45,17 @@ def resampled(motion: Motion, fps: float | int) -> Motion:
         n = round(ratio)
         times = motion.timestamps[::n].contiguous()
         R, t = motion.R_parent_joint[::n], motion.t_world_root[::n]
-        contact = None if motion.contact_prob is None else motion.contact_prob[::n]
-        return replace(motion, timestamps=times, R_parent_joint=R, t_world_root=t, contact_prob=contact)
+        contact, hands = (
+            None if p is None else p[::n] for p in (motion.contact_prob, motion.hand_contact_prob)
+        )
+        return replace(
+            motion,
+            timestamps=times,
+            R_parent_joint=R,
+            t_world_root=t,
+            contact_prob=contact,
+            hand_contact_prob=hands,
+        )
     start, stop = motion.timestamps[0].item(), motion.timestamps[-1].item()
     times = start + torch.arange(int((stop - start) * fps + 1e-6) + 1, dtype=torch.float64) / fps
     return at_times(motion, times)
@@ -51,11 +63,14 @@ def resampled(motion: Motion, fps: float | int) -> Motion:
 
 def at_times(motion: Motion, times: Float64[Tensor, "new_time"]) -> Motion:
     """The motion at other times within its own: slerp (rotations), lerp (root, contacts)."""
-    contact = motion.contact_prob
+    contact, hands = (
+        None if prob is None else interpolate(motion.timestamps, prob, times)
+        for prob in (motion.contact_prob, motion.hand_contact_prob)
+    )
     return replace(
         motion, timestamps=times, R_parent_joint=_slerp(motion.timestamps, motion.R_parent_joint, times),
-        t_world_root=interpolate(motion.timestamps, motion.t_world_root, times),
-        contact_prob=None if contact is None else interpolate(motion.timestamps, contact, times),
+        t_world_root=interpolate(motion.timestamps, motion.t_world_root, times), contact_prob=contact,
+        hand_contact_prob=hands,
     )  # fmt: skip
 
 

@@ -1,0 +1,50 @@
+"""How well objects and the hands that move them were captured (thesis Tables 5.1, 5.2). Metres in, cm and degrees out."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import geodesic
+
+PAUSE_S = 0.5
+"""Interactions with one object that follow each other sooner are one handling: hands were changed."""
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """Of an object's pose at one time, or over several."""
+
+    distance_cm: Float[Tensor, "*batch"]
+    """Between the object's centres."""
+    angle_deg: Float[Tensor, "*batch"]
+
+
+def object_error(T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]) -> PoseError:
+    """Error of an object's poses; `center` is its middle in its own axes (m)."""
+    found, true = T_found.to(torch.float64), T_true.to(torch.float64)
+    apart = (found @ center.double() - true @ center.double()).norm(dim=-1)
+    return PoseError(100 * apart, geodesic(found.R, true.R).rad2deg())
+
+
+def contact_mean(value: Float[Tensor, "time hand"], contact: Bool[Tensor, "time hand"]) -> Float[Tensor, ""]:
+    """Mean over the frames and hands that are in contact; NaN where none is."""
+    return value[contact].mean() if bool(contact.any()) else value.new_tensor(float("nan"))
+
+
+def handlings(
+    start_s: Float[Tensor, "interval"], stop_s: Float[Tensor, "interval"], objects: tuple[str, ...],
+    pause_s: float = PAUSE_S,
+) -> list[tuple[str, float, float]]:  # fmt: skip
+    """(object, start, stop) of every uninterrupted handling of an object: intervals that follow within `pause_s`."""
+    merged: list[tuple[str, float, float]] = []
+    for name in sorted(set(objects)):
+        rows = sorted((a, b) for a, b, o in zip(start_s.tolist(), stop_s.tolist(), objects) if o == name)
+        for start, stop in rows:
+            if merged and merged[-1][0] == name and start - merged[-1][2] <= pause_s:
+                merged[-1] = (name, merged[-1][1], max(stop, merged[-1][2]))
+            else:
+                merged.append((name, start, stop))
+    return sorted(merged, key=lambda row: row[1])

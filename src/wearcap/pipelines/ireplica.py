@@ -1,0 +1,99 @@
+"""iReplica (thesis ch. 5): the wearer of HPS moves doors, sofas and tables, told by contact from pose alone.
+
+The document's steps in order, each a stage: those of HPS → contacts → interact.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.data.prepare.clean import resampled
+from wearcap.errors import WearcapError
+from wearcap.io.environment import read_environment
+from wearcap.pipelines.hps import HPS
+from wearcap.pipelines.object_tracker import ObjectTracker
+from wearcap.pipelines.stages import Source, Stage, run_stages
+from wearcap.recording import Motion, Recording
+from wearcap.scene.environment import Environment
+from wearcap.scene.scan import Scan
+
+Predictor = Callable[[Motion], dict[str, Float[Tensor, "time hand"]]]
+"""Contact probabilities by class, at a motion's frames, from its pose alone."""
+
+
+@dataclass(eq=False)
+class IReplica:
+    """Captures the wearer and the objects that the wearer moves."""
+
+    hps: HPS
+    predictor: Predictor
+    tracker: ObjectTracker
+    environment: str | Path | None = None
+    """File of the objects; None: the one that the recording names."""
+    fps: float = 60.0
+    """Of contacts, objects and motion, whatever HPS runs at."""
+    name: str = "ireplica"
+
+    def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
+        """The wearer's motion with `object_motion` and `interactions` at `fps`. Raises WearcapError as `stages`."""
+        results, _ = run_stages(self.stages(Source(recording, folder, scan)))
+        return results["interact"]
+
+    def stages(self, source: Source) -> list[Stage]:
+        """HPS' steps, then contacts and interactions. Raises WearcapError as HPS does, and without an environment."""
+        path = self.environment_file(source)
+        environment = read_environment(path)
+        suit = source.recording.suit
+        return [
+            *self.hps.stages(source),
+            Stage(
+                "contacts", lambda done: self.contacts(suit), lambda: (self.predictor, suit, self.fps), (),
+                ("pipelines/contact_prediction.py", "models", "data", "body", "geometry"),
+            ),
+            Stage(
+                "interact", lambda done: self.interact(self.hps.motion_of(done), done["contacts"], environment),
+                lambda: (path, *sorted(path.parent.glob("objects/*.ply")), self.tracker, self.fps), ("optimize", "initialize", "contacts"),
+                ("pipelines/object_tracker.py", "pipelines/attachment.py", "pipelines/snapping.py", "optimize", "scene",
+                 "body", "geometry"),
+            ),
+        ]  # fmt: skip
+
+    def environment_file(self, source: Source) -> Path:
+        """Where the objects are described. Raises WearcapError where neither pipeline nor recording says it."""
+        if self.environment is not None:
+            return Path(self.environment)
+        if source.recording.environment is None:
+            raise WearcapError("no objects that can be moved", where=source.recording.name,
+                               expected="a recording that names its environment, or pipeline.environment=FILE",
+                               fix="Make one with `wearcap scene`.")  # fmt: skip
+        return source.folder / source.recording.environment
+
+    def motion_of(self, results: dict[str, Any]) -> Motion | None:
+        """With objects after the last stage; before it, HPS' motion."""
+        return results["interact"] if "interact" in results else self.hps.motion_of(results)
+
+    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
+        """HPS' report, and what was held when."""
+        about = self.hps.report(source, results)
+        if "interact" in results:
+            held = results["interact"].interactions
+            rows = zip(held.start_s.tolist(), held.stop_s.tolist(), held.hands.tolist(), held.objects)
+            about["interactions"] = [
+                {"start_s": start, "stop_s": stop, "left": hands[0], "right": hands[1], "object": name}
+                for start, stop, hands, name in rows
+            ]
+        return about
+
+    def contacts(self, suit: Motion) -> dict[str, Tensor]:
+        """Contact probabilities of both hands by class, from the suit's pose alone (thesis §5.3.2)."""
+        motion = resampled(suit, self.fps)
+        return {"timestamps": motion.timestamps, **self.predictor(motion)}
+
+    def interact(self, registered: Motion, contacts: dict[str, Tensor], environment: Environment) -> Motion:
+        """Attach, correct, move and release, one interval after the other (thesis §5.3.1–5.3.3)."""
+        motion = self.tracker(registered, contacts, environment)
+        return replace(motion, provenance=motion.provenance | {"pipeline": self.name})

@@ -1,0 +1,119 @@
+"""Attach, correct, move and release: from a registered wearer's contacts to moving objects (thesis §5.3.1–5.3.3)."""
+
+from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from wearcap.body.kinematics import site_positions
+from wearcap.data.prepare.clean import at_times
+from wearcap.geometry.trajectory import interpolate
+from wearcap.pipelines.attachment import (
+    AttachmentSettings,
+    Held,
+    Room,
+    class_intervals,
+    interactions_of,
+    object_trajectories,
+)
+from wearcap.pipelines.contact_intervals import ContactInterval, ContactSettings
+from wearcap.recording import Motion
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import SceneObject
+
+PALMS = ("left_palm", "right_palm")
+"""The keypoints in the middle of each hand (thesis §5.3.3)."""
+
+
+@runtime_checkable
+class Correction(Protocol):
+    """Moves the wearer in the plane so that hands meet what they hold (thesis §5.3.1)."""
+
+    def start(self, palms_world: Float[Tensor, "time hand 3"], motion: Motion) -> None:
+        """Begin a recording."""
+        ...
+
+    def offset(
+        self,
+        contact: ContactInterval,
+        thing: SceneObject,
+        points_world: Float[Tensor, "hand 3"],
+        goes_on: bool,
+    ) -> Float[Tensor, "frame 2"]:
+        """By how much to move the wearer (m) at an interval's frames; intervals come in order of time."""
+        ...
+
+    def finish(self, held: list[Held]) -> Float[Tensor, "time 2"]:
+        """By how much at every frame of the recording, smooth into and out of interactions."""
+        ...
+
+
+@dataclass(eq=False)
+class ObjectTracker:
+    """Lets objects follow the hands that hold them, one interval of contact after the other."""
+
+    correction: Correction | None
+    """None: the row "w/o contact correction"."""
+    contact: ContactSettings = field(default_factory=ContactSettings)
+    attachment: AttachmentSettings = field(default_factory=AttachmentSettings)
+
+    def __call__(self, registered: Motion, contacts: dict[str, Tensor], environment: Environment) -> Motion:
+        """The corrected motion with `object_motion`, `interactions` and `hand_contact_prob`, at the contacts' frames.
+
+        `contacts` are probabilities "time hand" by class, beside their "timestamps".
+        """
+        motion = within(registered, contacts["timestamps"])
+        prob = {
+            name: interpolate(contacts["timestamps"], value, motion.timestamps)
+            for name, value in contacts.items() if name != "timestamps"
+        }  # fmt: skip
+        palms = site_positions(motion.skeleton, motion.T_world_joint, PALMS).double()
+        spans = class_intervals(prob, motion.timestamps, self.contact, self.attachment.one_class)
+        held = self._held(motion, palms, spans, environment)
+        offset = palms.new_zeros(len(motion), 2) if self.correction is None else self.correction.finish(held)
+        shift = torch.nn.functional.pad(offset, (0, 1))
+        return replace(
+            motion, t_world_root=(motion.t_world_root.double() + shift).float(),
+            hand_contact_prob=torch.stack(list(prob.values())).amax(0).float(),
+            object_motion=object_trajectories(environment, held, motion.timestamps),
+            interactions=interactions_of(held, motion.timestamps),
+        )  # fmt: skip
+
+    def _held(
+        self, motion: Motion, palms: Float64[Tensor, "time hand 3"], spans: list[tuple[ContactInterval, str]],
+        environment: Environment,
+    ) -> list[Held]:  # fmt: skip
+        room, held = Room(environment, self.attachment), []
+        if self.correction is not None:
+            self.correction.start(palms, motion)
+        for contact, contact_class in spans:
+            before = self._kept(held, contact, contact_class)
+            thing = before or room.nearest(palms[contact.start], contact_class, contact)
+            if thing is None:
+                continue
+            points = room.touched(thing, palms[contact.start], contact)
+            frames = palms[contact.start : contact.stop].clone()
+            if self.correction is not None:
+                offset = self.correction.offset(contact, thing, points, before is not None)
+                frames[..., :2] += offset[:, None]
+            held.append(room.take(contact, contact_class, thing, points, before is not None, frames))
+        return held
+
+    def _kept(self, held: list[Held], contact: ContactInterval, contact_class: str) -> SceneObject | None:
+        """What the hands hold already when only the set of hands changes."""
+        if not self.attachment.keep_object:
+            return None
+        for row in reversed(held[-4:]):
+            shared = any(a and b for a, b in zip(row.interval.hands, contact.hands))
+            if row.contact_class == contact_class and row.interval.stop == contact.start and shared:
+                return row.thing
+        return None
+
+
+def within(registered: Motion, timestamps: Float64[Tensor, "time"]) -> Motion:
+    """The registered motion at the contacts' frames, as far as it reaches."""
+    first, last = registered.timestamps[0], registered.timestamps[-1]
+    inside = (timestamps >= first) & (timestamps <= last)
+    return at_times(registered, timestamps[inside].contiguous())

@@ -1,0 +1,151 @@
+import numpy as np
+import pytest
+import torch
+
+from wearcap.body.kinematics import site_positions
+from wearcap.body.skeleton import xsens23
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.pipelines.attachment import AttachmentSettings
+from wearcap.pipelines.ireplica_baselines import held_when_near, interpolated_objects, static_objects
+from wearcap.pipelines.ireplica_evaluation import score_interactions
+from wearcap.pipelines.object_tracker import PALMS, ObjectTracker
+from wearcap.recording import Motion, Recording
+from wearcap.recording.interactions import Interactions
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Freedom, SceneObject
+
+FPS, FRAMES = 60.0, 360
+TAKE, LEAVE = 60, 240
+CUBE = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.2, 0.2) for z in (-0.2, 0.2)], np.float32)
+QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+FACES = np.array([f for a, b, c, d in QUADS for f in ((a, b, c), (a, c, d))], np.int32)
+
+
+def cube(name: str, place: torch.Tensor, freedom: Freedom) -> SceneObject:
+    return SceneObject(
+        name, "box", Mesh(CUBE, FACES, np.ones(3, np.float32)), torch.eye(3), place.float(), freedom
+    )
+
+
+def walked(way: torch.Tensor) -> Motion:
+    """Someone in a T-pose who is moved along x."""
+    skeleton = xsens23()
+    root = torch.tensor([0.0, 0.0, skeleton.root_height]) + torch.nn.functional.pad(
+        way[:, None].float(), (0, 2)
+    )
+    times = torch.arange(len(way), dtype=torch.float64) / FPS
+    return Motion(times, skeleton, torch.eye(3).repeat(len(way), len(skeleton), 1, 1), root)
+
+
+@pytest.fixture
+def way() -> torch.Tensor:
+    """At rest, 1 m in the two seconds in which something is held, at rest, on."""
+    u = ((torch.arange(FRAMES) - TAKE - 30) / 120.0).clamp(0, 1)
+    return u * u * (3 - 2 * u) + 0.5 * ((torch.arange(FRAMES) - 260) / 100.0).clamp(0, 1)
+
+
+@pytest.fixture
+def scene(way) -> tuple[Motion, Environment]:
+    motion = walked(way)
+    left, right = site_positions(motion.skeleton, motion.T_world_joint, PALMS)[0]
+    beside = torch.tensor([0.2, 0.0, 0.0])
+    things = (
+        cube("near", left + beside, Freedom("plane")),
+        cube("far", left + 5 * beside, Freedom("plane")),
+        cube(
+            "door",
+            right + beside,
+            Freedom("hinge", pivot=tuple((right + 4 * beside).tolist()), limits=(-2.0, 2.0)),
+        ),
+    )
+    return motion, Environment(things)
+
+
+def held_left(frames: int = FRAMES) -> torch.Tensor:
+    prob = torch.zeros(frames, 2)
+    prob[TAKE:LEAVE, 0] = 0.9
+    return prob
+
+
+def tracker(**settings) -> ObjectTracker:
+    return ObjectTracker(None, attachment=AttachmentSettings(**settings))
+
+
+def test_what_is_held_goes_along_and_stays_where_it_is_left(scene, way):
+    motion, environment = scene
+    contacts = {"timestamps": motion.timestamps, "sliding": held_left(), "hinged": torch.zeros(FRAMES, 2)}
+    captured = tracker()(motion, contacts, environment)
+    near = captured.object_motion["near"]
+    moved = near.t_world_body[:, 0] - near.t_world_body[0, 0]
+    torch.testing.assert_close(moved[TAKE:LEAVE], (way - way[TAKE])[TAKE:LEAVE], atol=1e-5, rtol=0)
+    assert (moved[LEAVE:] == moved[LEAVE - 1]).all()
+    assert len(captured.object_motion["far"]) == 2
+    assert captured.interactions.objects == ("near",)
+    assert captured.interactions.hands.tolist() == [[True, False]]
+    assert captured.interactions.start_s.item() == pytest.approx(TAKE / FPS)
+    assert captured.interactions.stop_s.item() == pytest.approx(LEAVE / FPS)
+
+
+def test_a_contact_of_a_class_without_an_object_in_reach_is_ignored(scene):
+    motion, environment = scene
+    contacts = {"timestamps": motion.timestamps, "hinged": held_left(), "sliding": torch.zeros(FRAMES, 2)}
+    assert len(tracker()(motion, contacts, environment).interactions) == 0
+
+
+def test_a_hand_that_joins_keeps_the_object_and_is_a_new_interval(scene):
+    motion, environment = scene
+    both = held_left()
+    both[120:180, 1] = 0.9  # the right palm is far from "near"
+    contacts = {"timestamps": motion.timestamps, "sliding": both}
+    captured = tracker()(motion, contacts, environment)
+    assert captured.interactions.objects == ("near",) * 3
+    steps = captured.object_motion["near"].t_world_body.diff(dim=0).norm(dim=-1)
+    assert steps.max() < 0.02
+
+
+def test_the_less_probable_class_gives_way(scene):
+    motion, environment = scene
+    right = torch.zeros(FRAMES, 2)
+    right[TAKE:LEAVE, 1] = 0.6
+    contacts = {"timestamps": motion.timestamps, "hinged": right + 0.2 * (right > 0), "sliding": right}
+    assert tracker()(motion, contacts, environment).interactions.objects == ("door",)
+    together = tracker(one_class=False)(motion, contacts, environment)
+    assert "door" in together.interactions.objects
+
+
+def test_scores_tell_the_perfect_capture_from_the_static_one(scene, way):
+    motion, environment = scene
+    contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
+    captured = tracker()(motion, contacts, environment)
+    held = Interactions(torch.tensor([TAKE / FPS]).double(), torch.tensor([LEAVE / FPS]).double(),
+                        torch.tensor([[True, False]]), ("near",), ("sliding",))  # fmt: skip
+    truth = Recording(
+        "r", motion=motion, interactions=held, object_motion={"near": captured.object_motion["near"]}
+    )
+    perfect = score_interactions(captured, truth, environment)
+    assert perfect.handlings[0].end_cm == pytest.approx(0.0, abs=1e-3)
+    assert perfect.handlings[0].hand_object_cm < 0.1
+    still = score_interactions(static_objects(motion, environment), truth, environment)
+    assert still.handlings[0].end_cm == pytest.approx(100.0, abs=0.5)
+    assert still.handlings[0].hand_cm == pytest.approx(0.0, abs=1e-3)
+    assert still.object_chamfer_cm > 5 > perfect.object_chamfer_cm
+    line = score_interactions(
+        interpolated_objects(motion, environment, held, truth.object_motion), truth, environment
+    )
+    assert line.handlings[0].end_cm < 0.1
+    assert line.handlings[0].hand_object_cm > 2 * perfect.handlings[0].hand_object_cm
+    near = score_interactions(held_when_near(tracker(), motion, environment), truth, environment)
+    assert near.handlings[0].end_cm < 60
+
+
+def test_objects_keep_their_own_clock(scene, way):
+    motion, environment = scene
+    track = Trajectory(motion.timestamps[[0, -1]], torch.eye(3).repeat(2, 1, 1), torch.zeros(2, 3))
+    held = Interactions(
+        torch.zeros(0).double(), torch.zeros(0).double(), torch.zeros(0, 2, dtype=torch.bool), (), ()
+    )
+    truth = Recording("r", motion=motion, interactions=held, object_motion={"near": track})
+    scores = score_interactions(static_objects(motion, environment), truth, environment)
+    assert scores.handlings == ()
+    assert scores.false_moves_cm == 0
