@@ -1,0 +1,252 @@
+"""Bending a path in the ground plane through control points (thesis eq. 5.1, 5.2): the problem, its energy, Adam.
+
+A suit measures well how far its wearer goes and badly where to: lengths of steps are kept, headings are unknown. A
+step is the way from one frame to the next. Whatever the sampling, what is unknown is the turn φ = α̂ − α of each
+step, l̂ = l(0) + Σ R(φ) step, and E_tr counts how φ changes. A step of zero length has no heading and keeps the
+turn of the last step that has one (at the path's beginning: that of the first).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Float64, Int64
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import require_rising
+from wearcap.optimize.costs import Loss
+
+NORMS = ("square", "absolute")
+STILL_M = 1e-6
+"""Steps up to this length have no heading."""
+
+
+@dataclass(frozen=True)
+class Bending:
+    """What eq. 5.2 leaves to choose. Raises WearcapError for a rigidity that is not positive or an unknown norm."""
+
+    rigidity: float = 100.0
+    """λ: metres of the control term per unit of E_tr (rad²/s, or rad for "absolute")."""
+    norm: str = "square"
+    """Of the difference of heading rates, where eq. 5.1 prints none: ∫ (dα̂/dτ − dα/dτ)² dτ, or ∫ |…| dτ."""
+    loss: Loss = field(default_factory=Loss)
+    """Of a control point's distance: the document's norm; "huber", and "cauchy" for bursts of wrong points (ours)."""
+    free_start: bool = False
+    """The first point is unknown too: the path may be shifted (a control point at its time pulls it)."""
+    held_headings: bool = False
+    """The path comes from and goes on to steps that do not turn: for a window within a longer path."""
+
+    def __post_init__(self):
+        if not (self.rigidity > 0 and math.isfinite(self.rigidity)):
+            raise WearcapError(f"a rigidity of {self.rigidity}", expected="a positive number")
+        if self.norm not in NORMS:
+            raise WearcapError(
+                f"no norm {self.norm!r} of heading rates", expected=f"one of {', '.join(NORMS)}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class BendingProblem:
+    """A path and its control points, checked and taken apart into steps (float64; m, s, rad)."""
+
+    settings: Bending
+    path: Float64[Tensor, "time 2"]
+    timestamps: Float64[Tensor, "time"]
+    leader: Int64[Tensor, "step"]
+    """The step whose turn each step has: itself where it has a heading."""
+    control_step: Int64[Tensor, "control"]
+    """The step within which each control point lies, rising …"""
+    control_share: Float64[Tensor, "control"]
+    """… and how far along it (0…1)."""
+    control_points: Float64[Tensor, "control 2"]
+    control_weights: Float64[Tensor, "control"]
+
+    @property
+    def step(self) -> Float64[Tensor, "step 2"]:
+        return self.path.diff(dim=0)
+
+    @property
+    def link_s(self) -> Float64[Tensor, "link"]:
+        """Time (s) from each step's middle to the next one's; before and after them the end steps' own."""
+        steps = self.timestamps.diff()
+        return torch.cat([steps[:1], (steps[:-1] + steps[1:]) / 2, steps[-1:]])
+
+
+@dataclass(frozen=True, eq=False)
+class BentPath:
+    """Where a solver ended: the path in the plane, and the energy by term ("control", "bending", "total")."""
+
+    path: Float64[Tensor, "time 2"]
+    turn: Float64[Tensor, "step"]
+    """φ = α̂ − α (rad, unwrapped)."""
+    heading: Float64[Tensor, "step"]
+    """α̂ (rad, within ±π)."""
+    history: list[dict[str, float]] = field(default_factory=list)
+    """One entry per iteration; the state returned is the best of them."""
+    reason: str = ""
+    """Why the solver stopped."""
+
+    @property
+    def frame_turn(self) -> Float64[Tensor, "time"]:
+        """By how much (rad, about the vertical) whoever walks the path turns with it, at each frame."""
+        before, after = torch.cat([self.turn[:1], self.turn]), torch.cat([self.turn, self.turn[-1:]])
+        return (before + after) / 2
+
+
+Solver = Callable[[BendingProblem], BentPath]
+
+
+def bend(
+    path: Float[Tensor, "time 2"],
+    timestamps: Float64[Tensor, "time"],
+    control_times: Float64[Tensor, "control"],
+    control_points: Float[Tensor, "control 2"],
+    weights: Float[Tensor, "control"] | None = None,
+    *,
+    settings: Bending,
+    solver: Solver,
+) -> BentPath:
+    """The path (m, in the ground plane) that keeps its lengths of steps and its shape, and nears the control points.
+
+    `control_times` lie between frames or on them, and rise (several points may share a time). `weights` are ones
+    when None. Raises WearcapError for what is not finite, times out of order or outside the path, negative weights.
+    """
+    return solver(bending_problem(path, timestamps, control_times, control_points, weights, settings))
+
+
+def bending_problem(
+    path: Float[Tensor, "time 2"],
+    timestamps: Float64[Tensor, "time"],
+    control_times: Float64[Tensor, "control"],
+    control_points: Float[Tensor, "control 2"],
+    weights: Float[Tensor, "control"] | None,
+    settings: Bending,
+) -> BendingProblem:
+    """What `bend` hands to its solver; raises what it raises."""
+    require_rising(timestamps)
+    weights = torch.ones_like(control_times) if weights is None else weights
+    if len(path) < 2:
+        raise WearcapError(f"a path of {len(path)} frames cannot be bent", expected="at least two")
+    for what, value in (
+        ("path", path), ("control times", control_times), ("control points", control_points), ("weights", weights),
+    ):  # fmt: skip
+        bad = ~value.reshape(len(value), -1).isfinite().all(1)
+        if bad.any():
+            raise WearcapError(f"{what}: entry {int(bad.nonzero()[0])} is not a number", expected="finite numbers",
+                               fix="Leave out frames that were not localised.")  # fmt: skip
+    if (weights < 0).any():
+        raise WearcapError("a control point of negative weight", expected="zero or more")
+    falls = control_times.diff() < 0
+    if falls.any():
+        number = int(falls.nonzero()[0]) + 1
+        raise WearcapError(f"control point {number} ({control_times[number].item():.3f} s) lies before its predecessor",
+                           expected="control times in order", fix="Sort the control points by time.")  # fmt: skip
+    outside = (control_times < timestamps[0]) | (control_times > timestamps[-1])
+    if outside.any():
+        raise WearcapError(
+            f"{int(outside.sum())} of {len(control_times)} control points, first at {control_times[outside][0].item():.3f} s, lie outside the path",
+            expected=f"times from {timestamps[0].item():.3f} s to {timestamps[-1].item():.3f} s",
+        )  # fmt: skip
+    path = path.double()
+    at = (torch.searchsorted(timestamps, control_times.contiguous(), right=True) - 1).clamp(max=len(path) - 2)
+    share = (control_times - timestamps[at]) / (timestamps[at + 1] - timestamps[at])
+    return BendingProblem(
+        settings, path, timestamps, _leaders(path), at, share, control_points.double(), weights.double()
+    )
+
+
+def headings(path: Float64[Tensor, "time 2"]) -> Float64[Tensor, "step"]:
+    """α of each step (rad, within ±π): atan2 of eq. 5.1; where nothing moves, that of the last step that did."""
+    step = path.diff(dim=0)[_leaders(path)]
+    return torch.atan2(step[:, 1], step[:, 0])
+
+
+def wrapped(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The same angle within ±π (rad); its derivative is one."""
+    return angle - (2 * math.pi) * (angle.detach() / (2 * math.pi)).round()
+
+
+def bent(
+    problem: BendingProblem, turn: Float64[Tensor, "step"], shift: Float64[Tensor, "2"]
+) -> Float64[Tensor, "time 2"]:
+    """l̂: the steps turned by φ one after the other, from the first point moved by `shift` (m)."""
+    turn, step = turn[problem.leader], problem.step
+    cosine, sine = turn.cos(), turn.sin()
+    x, y = step.unbind(-1)
+    turned = torch.stack([cosine * x - sine * y, sine * x + cosine * y], -1)
+    start = problem.path[:1] + shift
+    return torch.cat([start, start + turned.cumsum(0)])
+
+
+def control_offset(path: Float64[Tensor, "time 2"], problem: BendingProblem) -> Float64[Tensor, "control 2"]:
+    """l̂(τ_i) − p_i (m; eq. 5.2), linear within steps."""
+    at, share = problem.control_step, problem.control_share[:, None]
+    return torch.lerp(path[at], path[at + 1], share) - problem.control_points
+
+
+def heading_change(
+    heading: Float64[Tensor, "step"], original: Float64[Tensor, "step"], held: bool = False
+) -> Float64[Tensor, "link"]:
+    """dα̂ − dα from step to step (rad, wrapped; eq. 5.1); `held`: before and after them nothing turns."""
+    off = heading - original
+    if not held:
+        return wrapped(off.diff())
+    return wrapped(torch.cat([off[:1], off.diff(), -off[-1:]]))
+
+
+def energy_terms(
+    problem: BendingProblem, turn: Float64[Tensor, "step"], shift: Float64[Tensor, "2"]
+) -> dict[str, Float64[Tensor, ""]]:
+    """The terms of eq. 5.2, differentiable in φ (rad) and in the shift of the first point (m)."""
+    settings = problem.settings
+    offset = control_offset(bent(problem, turn, shift), problem)
+    off = turn[problem.leader]
+    change = heading_change(off, torch.zeros_like(off), settings.held_headings)
+    seconds = problem.link_s if settings.held_headings else problem.link_s[1:-1]
+    tension = change**2 / seconds if settings.norm == "square" else change.abs()
+    return {
+        "control": (problem.control_weights * settings.loss(offset)).sum(),
+        "bending": settings.rigidity * tension.sum(),
+    }
+
+
+def bent_path(
+    problem: BendingProblem,
+    turn: Float64[Tensor, "step"],
+    shift: Float64[Tensor, "2"],
+    history: list[dict[str, float]],
+    reason: str,
+) -> BentPath:
+    """What a solver returns for its unknowns."""
+    turn = turn[problem.leader]
+    heading = wrapped(headings(problem.path) + turn)
+    return BentPath(bent(problem, turn, shift), turn, heading, history, reason)
+
+
+def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: float = 1e-2) -> BentPath:
+    """The document's solver (thesis §5.4.2); the rate (rad, m) is its hyperparameter. Returns the best state met."""
+    turn = torch.zeros(len(problem.leader), dtype=torch.float64, requires_grad=True)
+    shift = torch.zeros(2, dtype=torch.float64, requires_grad=problem.settings.free_start)
+    unknowns = [value for value in (turn, shift) if value.requires_grad]
+    adam = torch.optim.Adam(unknowns, lr=learning_rate)
+    history, least, best = [], math.inf, (turn.detach(), shift.detach())
+    for iteration in range(iterations + 1):
+        adam.zero_grad()
+        terms = energy_terms(problem, turn, shift)
+        total = terms["control"] + terms["bending"]
+        history.append({name: value.item() for name, value in terms.items()} | {"total": total.item()})
+        if history[-1]["total"] < least:
+            least, best = history[-1]["total"], (turn.detach().clone(), shift.detach().clone())
+        if iteration < iterations:
+            total.backward()
+            adam.step()
+    return bent_path(problem, *best, history, f"{iterations} iterations")
+
+
+def _leaders(path: Float64[Tensor, "time 2"]) -> Int64[Tensor, "step"]:
+    moves = path.diff(dim=0).norm(dim=1) > STILL_M
+    number = torch.arange(len(moves))
+    first = int(moves.long().argmax()) if len(moves) else 0
+    return torch.where(moves, number, first).cummax(0).values
