@@ -41,7 +41,6 @@ class Piece:
     """x, y, height, heading, depth to the front edge."""
     reaches: tuple[tuple[float, float, float], ...] = ()
     """Points a hand reaches for from the front."""
-    degrees_of_freedom: tuple[w.DegreeOfFreedom, ...] = ()
 
 
 def hue(
@@ -66,6 +65,8 @@ class WorldBuilder:
     flights: list[w.Flight] = field(default_factory=list)
     rooms: list[w.Room] = field(default_factory=list)
     doors: list[w.Door] = field(default_factory=list)
+    windows: list[w.Door] = field(default_factory=list)
+    """Gaps above a sill, given by the floor point beneath them."""
     spots: list[w.CaptureSpot] = field(default_factory=list)
     _triangles: list[tuple] = field(default_factory=list)
 
@@ -130,14 +131,14 @@ class WorldBuilder:
         self.surfaces.append(w.Surface(kind, self.to_world(polygon), plane_world, level))
 
     def add_object(
-        self, kind: str, outline, z_range: tuple[float, float], position, heading: float = 0.0, dof=()
+        self, kind: str, outline, z_range: tuple[float, float], position, heading: float = 0.0
     ) -> int:
         """An obstacle without triangles; returns its index for `add_box(item=…)`."""
         place = self.to_world(np.asarray(position))
         number = len(self.objects)
         self.objects.append(
             w.WorldObject(f"{kind}_{number:03d}", kind, self.to_world(outline), z_range,
-                          tuple(place.tolist()), self.heading + heading, dof)
+                          tuple(place.tolist()), self.heading + heading)
         )  # fmt: skip
         return number
 
@@ -155,7 +156,7 @@ class WorldBuilder:
         about = turn(heading)
         outline = rectangle((x, y), piece.size, heading)
         z_range = (z + piece.z_range[0], z + piece.z_range[1])
-        item = self.add_object(piece.kind, outline, z_range, position, heading, piece.degrees_of_freedom)
+        item = self.add_object(piece.kind, outline, z_range, position, heading)
         for part in piece.parts:
             xy = about @ np.array(part.center[:2]) + np.array([x, y])
             center = (xy[0], xy[1], z + part.center[2])

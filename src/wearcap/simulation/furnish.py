@@ -53,9 +53,15 @@ class Plan:
             self.kept_free.append(ahead)
         return True
 
-    def against_wall(self, piece: Piece, rng: np.random.Generator, tries: int = 12) -> tuple | None:
-        """Put a piece with its back to a random wall; returns (x, y, heading), or None where nothing fits."""
-        front = FRONT_M if piece.seats or piece.reaches else 0.0
+    def against_wall(
+        self, piece: Piece, rng: np.random.Generator, tries: int = 12, front: float | None = None
+    ) -> tuple | None:
+        """Put a piece with its back to a random wall; returns (x, y, heading), or None where nothing fits.
+
+        Without `front`, what is used from its front has `FRONT_M` free before it.
+        """
+        if front is None:
+            front = FRONT_M if piece.seats or piece.reaches else 0.0
         depth, width = piece.size[0] / 2 + 0.02, piece.size[1] / 2 + 0.02
         x_low, y_low, x_high, y_high = self.room
         for _ in range(tries):

@@ -59,16 +59,22 @@ class NavigationGrid:
             layer = height[surface.level][window]
             layer[inside] = np.fmax(layer[inside], surface.height(middles[window][inside]))
         clearance = np.minimum(_drop_distance(height, cell), FAR_M)
-        for item in objects:
-            window = _window(item.footprint, origin, cell, shape, FAR_M)
-            distance = distance_to_convex(middles[window], item.footprint)
-            for floor, clear in zip(height, clearance):
-                bars = (item.z_range[0] < floor[window] + HEADROOM_M) & (
-                    item.z_range[1] > floor[window] + LOW_M
-                )
-                clear[window] = np.where(bars, np.minimum(clear[window], distance), clear[window])
+        _keep_off(objects, origin, cell, height, clearance)
         free = np.isfinite(height) & (clearance >= CLEARANCE_M)
         return cls(origin, cell, height, clearance, _largest_part(height, free))
+
+    def barred(self, objects: tuple, around: Float[np.ndarray, "3"]) -> "NavigationGrid":
+        """The grid with more obstacles, walkable where one gets to from a floor point (m)."""
+        clearance = self.clearance.copy()
+        _keep_off(objects, self.origin, self.cell, self.height, clearance)
+        free = np.isfinite(self.height) & (clearance >= CLEARANCE_M)
+        cells = np.argwhere(free)
+        middles = self.origin + (cells[:, 1:] + 0.5) * self.cell
+        offset = np.linalg.norm(middles - around[:2], axis=1)
+        offset += np.where(np.abs(self.height[free] - around[2]) < 0.6, 0.0, np.inf)
+        part = _parts(self.height, free)
+        walkable = part == part[tuple(cells[offset.argmin()])] if len(cells) else free
+        return NavigationGrid(self.origin, self.cell, self.height, clearance, walkable)
 
     @cached_property
     def _node(self) -> Int[np.ndarray, "layer i j"]:
@@ -202,9 +208,29 @@ def _links(height: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _largest_part(height: np.ndarray, free: np.ndarray) -> np.ndarray:
+    part = _parts(height, free)
+    sizes = np.bincount(part[part >= 0], minlength=1)
+    return part == sizes.argmax()
+
+
+def _parts(height: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Numbers of the connected parts of the free cells; -1 elsewhere."""
     first, second = _links(height, free)
     graph = scipy.sparse.coo_array((np.ones(len(first)), (first, second)), shape=(free.size, free.size))
     _, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    part = np.where(free.reshape(-1), part, -1)
-    sizes = np.bincount(part[part >= 0], minlength=1)
-    return (part == sizes.argmax()).reshape(free.shape)
+    return np.where(free, part.reshape(free.shape), -1)
+
+
+def _keep_off(
+    objects: tuple, origin: np.ndarray, cell: float, height: np.ndarray, clearance: np.ndarray
+) -> None:
+    """Lower, in place, the clearance of the cells about objects to the distance from them."""
+    shape = height.shape[1:]
+    for item in objects:
+        window = _window(item.footprint, origin, cell, shape, FAR_M)
+        i, j = (np.arange(part.start, part.stop) for part in window)
+        middles = np.stack(np.meshgrid(i, j, indexing="ij"), -1) * cell + origin + cell / 2
+        distance = distance_to_convex(middles, item.footprint)
+        for floor, clear in zip(height, clearance):
+            bars = (item.z_range[0] < floor[window] + HEADROOM_M) & (item.z_range[1] > floor[window] + LOW_M)
+            clear[window] = np.where(bars, np.minimum(clear[window], distance), clear[window])

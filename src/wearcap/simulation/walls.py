@@ -57,6 +57,10 @@ def build_wall(builder: WorldBuilder, wall: Wall, color: tuple, rng: np.random.G
         _panel(builder, wall, middle - width / 2, place, (high, HEIGHT), color)
         if kind == "window":
             _panel(builder, wall, middle - width / 2, place, (0.0, low), color)
+            sill = builder.to_world(np.array([*wall.at(middle), wall.z]))
+            builder.windows.append(
+                w.Door(tuple(sill.tolist()), builder.heading + wall.heading + np.pi / 2, width)
+            )
         _frame(builder, wall, middle, width, low, high)
         if kind == "door":
             x, y = wall.at(middle)

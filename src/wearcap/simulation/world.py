@@ -22,18 +22,6 @@ STEP_UP_M = 0.35
 
 
 @dataclass(frozen=True)
-class DegreeOfFreedom:
-    """One way in which an object moves: turning about, or sliding along, an axis through a point."""
-
-    name: str
-    kind: str
-    """"hinge" (limits in rad) or "slide" (limits in m)."""
-    axis: tuple[float, float, float]
-    pivot: tuple[float, float, float]
-    limits: tuple[float, float]
-
-
-@dataclass(frozen=True)
 class WorldObject:
     """A thing with a footprint, which walkers keep off; its faces are those of the world's mesh with its index."""
 
@@ -45,7 +33,6 @@ class WorldObject:
     z_range: tuple[float, float]
     position: tuple[float, float, float]
     heading: float
-    degrees_of_freedom: tuple[DegreeOfFreedom, ...] = ()
 
 
 @dataclass(frozen=True)
