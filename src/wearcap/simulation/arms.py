@@ -1,18 +1,24 @@
 """Arms: swing against the legs, held postures, and hands that reach for points in the world."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.simulation.comfort import ArmBones, Taken, elbow_pole, forearm_and_wrist, take
+from wearcap.simulation.grips import Grip
 from wearcap.simulation.ik import two_bone
 from wearcap.simulation.plan import LEFT_SIGN, Plan
 from wearcap.simulation.posture import Trunk
 from wearcap.simulation.track import blur, ease, wander
 
+AROUND_S, TRACE = 0.7, 0.01
+"""A grip's place counts a little for some time before and after the grip, so that nothing jumps there."""
 ELBOW_POLE = torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64)
 """Side of the upper arm, in its rest axes, to which the bent elbow points."""
 
@@ -31,8 +37,7 @@ def arm_motion(
     plan: Plan,
     side: str,
     trunk: Trunk,
-    R_world_chest: Float[Tensor, "time 3 3"],
-    t_world_chest: Float[Tensor, "time 3"],
+    chest: Rigid,
     running: Float[np.ndarray, "time"],
     times: Float[np.ndarray, "time"],
     fps: float,
@@ -42,49 +47,146 @@ def arm_motion(
 
     `running` is 1 where the wearer runs, smooth between.
     """
-    skeleton, sign, hand = plan.skeleton, LEFT_SIGN[side], plan.hands[side]
-    collar, upper, lower = (
-        skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double()
-        for joint in ("collar", "shoulder", "elbow")
-    )
-    forearm = skeleton.t_parent_joint[skeleton.index(f"{side}_wrist")].double()
-    length = float(lower.norm() + forearm.norm())
+    sign, hand, bones = LEFT_SIGN[side], plan.hands[side], arm_bones(plan.skeleton, side)
+    lower, forearm, hinge, length = bones.upper, bones.fore, bones.hinge, bones.length
+    R_world_chest = chest.R
     pose = hand.pose.sample(times)
     pose_weight = torch.from_numpy(hand.pose_weight.sample(times))
     goal = torch.from_numpy(hand.goal.sample(times))
     goal_weight = torch.from_numpy(hand.goal_weight.sample(times))
 
     R_swing, bend = _swing(plan, sign, trunk, running, times, fps, rng)
-    at_collar = t_world_chest + (R_world_chest @ collar)
-    in_chest = _rotate(R_world_chest.transpose(-1, -2), goal - at_collar) - upper
-    R_collar = R_world_chest @ _collar_turn(sign, trunk, in_chest / length, goal_weight[:, 0])
-    at_shoulder = at_collar + R_collar @ upper
+    held, held_weight = held_wrist(plan, side, chest, times)
+    aim = goal + (held_weight > 0)[:, None] * (held - goal)
+    girdle = shoulder_girdle(plan, side, trunk, chest, aim, torch.maximum(goal_weight[:, 0], held_weight))
+    at_shoulder = girdle.at_shoulder
 
-    hinge = torch.tensor([0.0, 0.0, -sign], dtype=torch.float64)
     R_upper = R_world_chest @ R_swing
     wrist = _rotate(
         R_upper, lower + _rotate(rotation.exp(bend[:, None] * hinge), forearm.expand(len(times), 3))
     )
     mirror = torch.tensor([1.0, sign, 1.0], dtype=torch.float64)
-    held = torch.from_numpy(pose[:, :3].copy()) * mirror * length
-    swivel = torch.from_numpy(pose[:, 3].copy())
-    out = torch.stack([torch.full_like(swivel, -0.35), sign * swivel.sin(), -swivel.cos()], -1)
+    posed = torch.from_numpy(pose[:, :3].copy()) * mirror * length
+    out = elbow_pole(torch.from_numpy(pose[:, 3].copy()), sign)
     pole = R_upper @ ELBOW_POLE
-    wrist = wrist + pose_weight * (_rotate(R_world_chest, held) - wrist)
+    wrist = wrist + pose_weight * (_rotate(R_world_chest, posed) - wrist)
     wrist = wrist + goal_weight * (goal - at_shoulder - wrist)
     strength = torch.maximum(pose_weight, goal_weight)
     pole = pole + strength * (_rotate(R_world_chest, out) - pole)
+    grips = _gripped(plan, side, bones, chest, at_shoulder, times, fps)
+    for part, share, taken in grips:
+        wrist[part] += share[:, None] * (taken.wrist - at_shoulder[part] - wrist[part])
+        pole[part] += share[:, None] * (
+            _rotate(R_world_chest[part], elbow_pole(taken.swivel, sign)) - pole[part]
+        )
     R_shoulder, flexion = two_bone(lower, forearm, hinge, _shy_of_shoulder(wrist, length), pole)
 
     relaxed = wander(rng, len(times), 3, 3.0, 0.05, fps)
     turn = pose_weight[:, 0] * torch.from_numpy(pose[:, 4].copy()) + torch.from_numpy(relaxed[:, 0])
     fold = pose_weight[:, 0] * torch.from_numpy(pose[:, 5].copy()) + torch.from_numpy(relaxed[:, 1] + 0.06)
-    axis = forearm / forearm.norm()
-    R_elbow = (
-        R_shoulder @ rotation.exp(flexion[:, None] * hinge) @ rotation.exp(0.7 * sign * turn[:, None] * axis)
-    )
+    R_forearm = R_shoulder @ rotation.exp(flexion[:, None] * hinge)
+    R_elbow, R_hand = _turned(bones, R_forearm, turn, fold, grips)
+    return ArmMotion(girdle.R_collar, R_shoulder, R_elbow, R_elbow @ R_hand)
+
+
+def _turned(
+    bones: ArmBones,
+    R_forearm: Float[Tensor, "time 3 3"],
+    turn: Float[Tensor, "time"],
+    fold: Float[Tensor, "time"],
+    grips: list[tuple[slice, Tensor, Taken]],
+) -> tuple[Float[Tensor, "time 3 3"], Float[Tensor, "time 3 3"]]:
+    """The elbow's rotation in the world and the wrist's in the forearm: at ease, or as the grips have it."""
+    axis, sign = bones.axis, bones.sign
     R_hand = rotation.exp(0.3 * sign * turn[:, None] * axis) @ rotation.about_axis("x", -sign * fold)
-    return ArmMotion(R_collar, R_shoulder, R_elbow, R_elbow @ R_hand)
+    turn = 0.7 * sign * turn
+    for part, share, taken in grips:
+        wanted_turn, wanted_bend = forearm_and_wrist(R_forearm[part], taken.hand, axis)
+        turn[part] += share * (wanted_turn - turn[part])
+        R_hand[part] = rotation.exp(torch.lerp(rotation.log(R_hand[part]), wanted_bend, share[:, None]))
+    return R_forearm @ rotation.exp(turn[:, None] * axis), R_hand
+
+
+def arm_bones(skeleton: Skeleton, side: str) -> ArmBones:
+    """One arm's lengths and axes, in float64."""
+    upper, fore = skeleton.t_parent_joint[skeleton.indices(f"{side}_elbow", f"{side}_wrist")].double()
+    sign = LEFT_SIGN[side]
+    hinge = torch.tensor([0.0, 0.0, -sign], dtype=torch.float64)
+    palm = torch.tensor(skeleton.sites[f"{side}_palm"].t_joint_site, dtype=torch.float64)
+    return ArmBones(upper, fore, hinge, palm, sign)
+
+
+@dataclass(frozen=True)
+class Girdle:
+    """The collar bone's rotation and where it carries the shoulder."""
+
+    R_collar: Float[Tensor, "time 3 3"]
+    at_shoulder: Float[Tensor, "time 3"]
+
+
+def shoulder_girdle(
+    plan: Plan,
+    side: str,
+    trunk: Trunk,
+    chest: Rigid,
+    goal: Float[Tensor, "time 3"],
+    weight: Float[Tensor, "time"],
+) -> Girdle:
+    """The shoulder, which goes along with a hand that is led to a goal in the world."""
+    skeleton = plan.skeleton
+    collar, shoulder = skeleton.t_parent_joint[
+        skeleton.indices(f"{side}_collar", f"{side}_shoulder")
+    ].double()
+    at_collar = chest.t + (chest.R @ collar)
+    in_chest = _rotate(chest.R.transpose(-1, -2), goal - at_collar) - shoulder
+    length = arm_bones(skeleton, side).length
+    R_collar = chest.R @ _collar_turn(LEFT_SIGN[side], trunk, in_chest / length, weight)
+    return Girdle(R_collar, at_collar + R_collar @ shoulder)
+
+
+def held_wrist(
+    plan: Plan, side: str, chest: Rigid, times: Float[np.ndarray, "time"]
+) -> tuple[Float[Tensor, "time 3"], Float[Tensor, "time"]]:
+    """About where a side's grips want the wrist (m), and how much (0…1); the chest's place where they do not."""
+    bones = arm_bones(plan.skeleton, side)
+    wrist, free = torch.zeros_like(chest.t), torch.ones(len(times), dtype=torch.float64)
+    total = torch.full_like(free, 1e-12)
+    for grip in plan.grips[side]:
+        part = slice(*np.searchsorted(times, (grip.start_s - AROUND_S, grip.stop_s + AROUND_S)).tolist())
+        hold = grip.hold(np.clip(times[part], grip.start_s, grip.stop_s), chest[part])
+        hand = hold.hand(bones.sign, torch.zeros(len(hold.palm), dtype=torch.float64))
+        weight = torch.from_numpy(grip.weight(times[part]))
+        near = replace(grip, reach_s=grip.reach_s + AROUND_S, return_s=grip.return_s + AROUND_S)
+        share = weight + TRACE * torch.from_numpy(near.weight(times[part]))
+        wrist[part] += share[:, None] * (hold.palm - hand @ bones.palm)
+        total[part] += share
+        free[part] *= 1.0 - weight
+    none = (total < 1e-9)[:, None]
+    return torch.where(none, chest.t, wrist / total[:, None]), 1.0 - free
+
+
+def _gripped(
+    plan: Plan,
+    side: str,
+    bones: ArmBones,
+    chest: Rigid,
+    at_shoulder: Float[Tensor, "time 3"],
+    times: np.ndarray,
+    fps: float,
+) -> list[tuple[slice, Tensor, Taken]]:
+    """A side's grips: the frames of each, its weight there and how the arm takes it."""
+    found = []
+    for grip in plan.grips[side]:
+        part, share = _span(grip, times)
+        if part.start < part.stop:
+            hold = grip.hold(times[part], chest[part])
+            found.append((part, share, take(bones, hold, chest.R[part], at_shoulder[part], fps)))
+    return found
+
+
+def _span(grip: Grip, times: np.ndarray) -> tuple[slice, Tensor]:
+    part = slice(*np.searchsorted(times, (grip.start_s, grip.stop_s)).tolist())
+    return part, torch.from_numpy(grip.weight(times[part]))
 
 
 def _rotate(R: Tensor, vector: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from wearcap.body.skeleton import Skeleton
+from wearcap.simulation.grips import Grip
 from wearcap.simulation.style import Style
 from wearcap.simulation.track import Track
 
@@ -79,10 +80,14 @@ class Plan:
         self.time = 0.0
         self.labels: list[Label] = []
         self.hands = {side: HandScore() for side in SIDES}
+        self.grips: dict[str, list[Grip]] = {side: [] for side in SIDES}
+        """In the order of time; one may be reached for while the one before it is left."""
         self.lean = Track(np.zeros(3))
         """Trunk beyond its habit: forward lean, bend to the right, twist to the left (rad)."""
         self.crouch = Track(np.zeros(1))
         """Lowering of the pelvis (m)."""
+        self.shift = Track(np.zeros(2))
+        """Of the pelvis from where balance would carry it, forwards and to the left (m): who pushes leans on it."""
         self.heel_lift = {side: Track(np.zeros(1)) for side in SIDES}
         """Pitch of a standing foot on its ball (rad)."""
         self.seat_weight = Track(np.zeros(2))
@@ -131,6 +136,14 @@ class Plan:
         heading = prints[-1].heading + wrap(print_.heading - prints[-1].heading)
         prints.append(replace(print_, land_s=land_s, heading=heading))
         self.time = land_s
+
+    def grip(self, side: str, grip: Grip) -> None:
+        """Let a hand hold something; it must have let go of what it held before."""
+        if self.grips[side] and self.grips[side][-1].release_s > grip.start_s + 1e-9:
+            raise ValueError(
+                f"the {side} hand reaches at {grip.start_s} s for one thing while it holds another"
+            )
+        self.grips[side].append(grip)
 
     @property
     def position(self) -> Float[np.ndarray, "3"]:

@@ -7,11 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.gait import FootMotion, load_on_left
 from wearcap.simulation.plan import SIDES, Plan
 from wearcap.simulation.track import blur, falling_at_most, lower_envelope, pendulum, wander
 
+SPINE = ("l5", "l3", "t12", "t8")
 GRAVITY = 9.81
 ENVELOPE_S = 0.06
 STEP_ENVELOPE_S, LEVELLED = 0.26, 0.12
@@ -46,41 +49,81 @@ def rotation_of(angles: Float[np.ndarray, "time 3"]) -> Float[Tensor, "time 3 3"
     return about("z", yaw) @ about("y", pitch) @ about("x", roll)
 
 
-def trunk_motion(
+@dataclass(frozen=True)
+class Stance:
+    """What follows from the feet before the trunk is placed over them, with all that is drawn at random."""
+
+    heading: Float[np.ndarray, "time"]
+    load: Float[np.ndarray, "time"]
+    """Share of the weight on the left foot."""
+    mass: Float[np.ndarray, "time 2"]
+    """The centre of mass over the floor (m)."""
+    speed: Float[np.ndarray, "time"]
+    acceleration: Float[np.ndarray, "time 2"]
+    stride: Float[np.ndarray, "time"]
+    drift: Float[np.ndarray, "time 6"]
+
+    @property
+    def forward(self) -> Float[np.ndarray, "time 2"]:
+        return np.stack([np.cos(self.heading), np.sin(self.heading)], 1)
+
+
+HELP = ("lean", "bend", "twist", "crouch", "ahead", "aside")
+"""How the trunk helps hands to reach, columns of `help_`: as `Plan.lean` (rad), `crouch` and `shift` (m)."""
+
+
+def stance_motion(
     plan: Plan,
     feet: dict[str, FootMotion],
     times: Float[np.ndarray, "time"],
     fps: float,
     rng: np.random.Generator,
-) -> Trunk:
-    """Pelvis and chest that follow from the feet, the plan's channels and the wearer's habits."""
+) -> Stance:
+    """How the wearer's mass moves over the feet."""
     left, right = (feet[side] for side in SIDES)
-    style, count = plan.style, len(times)
+    count = len(times)
     heading = blur((left.heading + right.heading) / 2, 0.13, fps)
     forward = np.stack([np.cos(heading), np.sin(heading)], 1)
     load = load_on_left(np.stack([left.planted, right.planted], 1), times, rng)
     pressure = load[:, None] * left.pressure + (1 - load[:, None]) * right.pressure
-    pressure = pressure[:, :2] + wander(rng, count, 2, 2.2, style.sway, fps)
+    pressure = pressure[:, :2] + wander(rng, count, 2, 2.2, plan.style.sway, fps)
     rate = float(np.sqrt(GRAVITY / (1.06 * plan.hip_height)))
     mass = pendulum(pressure, rate, fps)
     velocity = np.gradient(mass, axis=0) * fps
     speed = blur((velocity * forward).sum(1), 0.3, fps)
     acceleration = blur(rate**2 * (mass - pressure), 0.1, fps)
     stride = blur(((left.ankle - right.ankle)[:, :2] * forward).sum(1), 0.06, fps)
+    return Stance(heading, load, mass, speed, acceleration, stride, wander(rng, count, 6, 2.5, 0.010, fps))
+
+
+def trunk_motion(
+    plan: Plan,
+    feet: dict[str, FootMotion],
+    stance: Stance,
+    times: Float[np.ndarray, "time"],
+    fps: float,
+    help_: Float[np.ndarray, "time 6"] | None = None,
+) -> Trunk:
+    """Pelvis and chest that follow from the feet, the plan's channels, the wearer's habits and the hands' need."""
+    style, heading, forward, stride, drift = (
+        plan.style, stance.heading, stance.forward, stance.stride, stance.drift
+    )  # fmt: skip
     seated = plan.seat_weight.sample(times)
-    moving = np.clip(np.abs(speed) / 0.8, 0.0, 1.0)
-    lean = plan.lean.sample(times)
-    drift = wander(rng, count, 6, 2.5, 0.010, fps)
+    moving = np.clip(np.abs(stance.speed) / 0.8, 0.0, 1.0)
+    lean, crouch, shift = plan.lean.sample(times), plan.crouch.sample(times)[:, 0], plan.shift.sample(times)
+    if help_ is not None:
+        lean, crouch, shift = lean + help_[:, :3], crouch + help_[:, 3], shift + help_[:, 4:]
 
     pelvis_angles = np.stack(
         [
             heading - style.pelvis_yaw * stride * (1 - seated[:, 0]) + 0.3 * lean[:, 2],
             style.pelvis_tilt * (0.4 + 0.6 * moving) + 0.45 * lean[:, 0] + drift[:, 0],
-            _list(style.pelvis_list, blur(load, 0.05, fps), moving) + 0.15 * lean[:, 1],
+            _list(style.pelvis_list, blur(stance.load, 0.05, fps), moving) + 0.15 * lean[:, 1],
         ],
         1,
     )
-    sideways = (acceleration * np.stack([-forward[:, 1], forward[:, 0]], 1)).sum(1)
+    across = np.stack([-forward[:, 1], forward[:, 0]], 1)
+    sideways = (stance.acceleration * across).sum(1)
     chest_angles = np.stack(
         [
             heading
@@ -88,8 +131,8 @@ def trunk_motion(
             + lean[:, 2]
             + drift[:, 1],
             style.slouch
-            + 0.035 * speed
-            + 0.03 * blur((acceleration * forward).sum(1), 0.12, fps)
+            + 0.035 * stance.speed
+            + 0.03 * blur((stance.acceleration * forward).sum(1), 0.12, fps)
             + lean[:, 0]
             + drift[:, 2],
             -0.35 * pelvis_angles[:, 2] - 0.025 * sideways + lean[:, 1] + drift[:, 3],
@@ -97,15 +140,37 @@ def trunk_motion(
         1,
     )
     back = 0.26 * plan.hip_height * np.sin(np.clip(lean[:, 0], -0.5, 1.5)) + 0.012 - HIPS_AHEAD_M * moving
-    place = mass - back[:, None] * forward
+    place = stance.mass - back[:, None] * forward
+    place = place + shift[:, :1] * forward + shift[:, 1:] * across
     seat = plan.seat.sample(times)
     place += seated[:, :1] * (seat[:, :2] - place)
-    height = (
-        _height(plan, feet, place, moving, rotation_of(pelvis_angles), fps) - plan.crouch.sample(times)[:, 0]
-    )
+    height = _height(plan, feet, place, moving, rotation_of(pelvis_angles), fps) - crouch
     height += seated[:, 1] * (seat[:, 2] - height)
     pelvis = np.concatenate([place, height[:, None]], 1)
-    return Trunk(pelvis, pelvis_angles, chest_angles, heading, stride, speed)
+    return Trunk(pelvis, pelvis_angles, chest_angles, heading, stride, stance.speed)
+
+
+@dataclass(frozen=True)
+class Spine:
+    """World rotations of the joints of `SPINE` in order, the last one the chest's, and where the chest is."""
+
+    R_world: Float[Tensor, "time joint 3 3"]
+    t_world_chest: Float[Tensor, "time 3"]
+
+    @property
+    def chest(self) -> Rigid:
+        return Rigid(self.R_world[:, -1], self.t_world_chest)
+
+
+def spine_motion(skeleton: Skeleton, trunk: Trunk) -> Spine:
+    """The turn between pelvis and chest, shared evenly among the spine's joints."""
+    R_pelvis, R_chest = rotation_of(trunk.pelvis_angles), rotation_of(trunk.chest_angles)
+    between = rotation.log(R_pelvis.transpose(-1, -2) @ R_chest)
+    position, rotations = torch.from_numpy(trunk.pelvis), [R_pelvis]
+    for number, name in enumerate(SPINE, start=1):
+        position = position + rotations[-1] @ skeleton.t_parent_joint[skeleton.index(name)].double()
+        rotations.append(R_pelvis @ rotation.exp(number / len(SPINE) * between))
+    return Spine(torch.stack(rotations[1:], 1), position)
 
 
 def _list(amount: float, load: np.ndarray, moving: np.ndarray) -> np.ndarray:

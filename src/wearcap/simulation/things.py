@@ -12,20 +12,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.simulation import furniture
 from wearcap.simulation.builder import Part, Piece, hue, piece_mesh
-
-Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class GripPlace:
-    """Where a palm lies on a thing, in the thing's axes."""
-
-    point: Vector
-    """Of the palm (m)."""
-    normal: Vector
-    """Out of the thing's surface, towards the hand: a unit vector."""
-    fingers: Vector
-    """Where the fingers would best point; the arm may turn them some 40° about the normal."""
+from wearcap.simulation.grips import GripPlace, Vector
 
 
 @dataclass(frozen=True)

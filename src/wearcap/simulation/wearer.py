@@ -20,7 +20,8 @@ from wearcap.simulation.gait import FootMotion, FootShape, foot_motion
 from wearcap.simulation.gaze import head_angles
 from wearcap.simulation.ik import two_bone
 from wearcap.simulation.plan import SIDES, Label, Plan
-from wearcap.simulation.posture import Trunk, rotation_of, trunk_motion
+from wearcap.simulation.posture import SPINE, Trunk, rotation_of, spine_motion, stance_motion, trunk_motion
+from wearcap.simulation.reach_help import reach_help
 from wearcap.simulation.style import Style
 from wearcap.simulation.track import blur
 from wearcap.simulation.world import World
@@ -28,7 +29,6 @@ from wearcap.simulation.world import World
 __all__ = ["SimulatedMotion", "hands", "settle", "simulate_motion"]
 """`hands` and `settle` are imported because that enters their activities."""
 
-SPINE = ("l5", "l3", "t12", "t8")
 NECK_SHARE = 0.45
 TOUCH_M = 0.02
 TAIL_S = 1.5
@@ -86,7 +86,8 @@ def perform(
         side: foot_motion(plan.prints[side], FootShape.of(skeleton, side), plan.heel_lift[side], times)
         for side in SIDES
     }
-    trunk = trunk_motion(plan, feet, times, fps, rng)
+    stance = stance_motion(plan, feet, times, fps, rng)
+    trunk = trunk_motion(plan, feet, stance, times, fps, reach_help(plan, feet, stance, times, fps))
     R_world_joint = _body(plan, feet, trunk, times, fps, rng)
     motion = Motion(
         timestamps=torch.from_numpy(times),
@@ -151,9 +152,10 @@ def _body(
     """World rotations of all joints."""
     skeleton = plan.skeleton
     R = torch.eye(3, dtype=torch.float64).repeat(len(times), len(skeleton), 1, 1)
-    R_pelvis, R_chest = rotation_of(trunk.pelvis_angles), rotation_of(trunk.chest_angles)
-    R[:, skeleton.index("pelvis")] = R_pelvis
-    t_chest = _spine(skeleton, R, R_pelvis, R_chest, torch.from_numpy(trunk.pelvis))
+    R[:, skeleton.index("pelvis")] = rotation_of(trunk.pelvis_angles)
+    spine = spine_motion(skeleton, trunk)
+    R[:, skeleton.indices(*SPINE)] = spine.R_world
+    R_chest, t_chest = spine.chest.R, spine.chest.t
 
     neck, head = skeleton.t_parent_joint[skeleton.indices("neck", "head")].double()
     eyes = t_chest + R_chest @ (neck + head) + torch.tensor([0.0, 0.0, 0.1])
@@ -165,21 +167,10 @@ def _body(
 
     running = blur(np.mean([feet[side].running for side in SIDES], 0), 0.15, fps)
     for side in SIDES:
-        arm = arm_motion(plan, side, trunk, R_chest, t_chest, running, times, fps, rng)
+        arm = arm_motion(plan, side, trunk, spine.chest, running, times, fps, rng)
         _set_arm(skeleton, R, side, arm)
         _leg(skeleton, R, side, feet[side], trunk)
     return R
-
-
-def _spine(skeleton: Skeleton, R: Tensor, R_pelvis: Tensor, R_chest: Tensor, t_pelvis: Tensor) -> Tensor:
-    """Share the turn between pelvis and chest evenly among the spine's joints; returns where the chest is."""
-    between = rotation.log(R_pelvis.transpose(-1, -2) @ R_chest)
-    position, above = t_pelvis, R_pelvis
-    for number, name in enumerate(SPINE, start=1):
-        position = position + above @ skeleton.t_parent_joint[skeleton.index(name)].double()
-        above = R_pelvis @ rotation.exp(number / len(SPINE) * between)
-        R[:, skeleton.index(name)] = above
-    return position
 
 
 def _set_arm(skeleton: Skeleton, R: Tensor, side: str, arm: ArmMotion) -> None:

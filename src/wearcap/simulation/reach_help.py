@@ -1,0 +1,91 @@
+"""The trunk comes along where a gripping hand's goal lies beyond the arm's reach."""
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.simulation.arms import arm_bones, held_wrist, shoulder_girdle
+from wearcap.simulation.gait import FootMotion
+from wearcap.simulation.plan import SIDES, Plan
+from wearcap.simulation.posture import HELP, Spine, Stance, Trunk, spine_motion, trunk_motion
+from wearcap.simulation.track import lower_envelope
+
+REACH = 0.955
+"""From this share of the arm's length on the trunk helps."""
+EASY = np.array([0.30, 0.10, 0.22, 0.14, 0.09, 0.06])
+"""How readily each of `HELP` is used (rad, m)."""
+MOST = np.array([0.9, 0.3, 0.6, 0.45, 0.30, 0.20])
+ENVELOPE_S = 0.22
+ROUNDS, EAGER = 7, 1.25
+
+
+def reach_help(
+    plan: Plan,
+    feet: dict[str, FootMotion],
+    stance: Stance,
+    times: Float[np.ndarray, "time"],
+    fps: float,
+) -> Float[np.ndarray, "time 6"] | None:
+    """What the trunk adds to the plan, columns as `HELP`, smooth; None where nothing is held.
+
+    The lack of reach is covered by a smooth curve that nowhere lies below it, and shared among the trunk's ways
+    to move by least squares (each weighed by how readily it is used); since that is linear, in rounds.
+    """
+    if not any(plan.grips.values()):
+        return None
+    wanted = help_ = np.zeros((len(times), len(HELP)))
+    crouch = plan.crouch.sample(times)[:, 0]
+    for _ in range(ROUNDS):
+        trunk = trunk_motion(plan, feet, stance, times, fps, help_)
+        spine = spine_motion(plan.skeleton, trunk)
+        lacks, ways = zip(*(_lack(plan, side, spine, trunk, times, fps) for side in SIDES))
+        if max(float(lack.max()) for lack in lacks) < 1e-4:
+            break
+        step = _shared(np.stack(lacks, 1), np.stack(ways, 1))
+        step[:, 3] = np.maximum(step[:, 3], -crouch - wanted[:, 3])
+        wanted = wanted + EAGER * step
+        help_ = MOST * np.tanh(wanted / MOST)
+    return help_
+
+
+def _lack(
+    plan: Plan, side: str, spine: Spine, trunk: Trunk, times: np.ndarray, fps: float
+) -> tuple[Float[np.ndarray, "time"], Float[np.ndarray, "time 6"]]:
+    """How far a hand's goal is out of reach (m), and by how much each way to help brings the shoulder nearer."""
+    bones = arm_bones(plan.skeleton, side)
+    wrist, weight = held_wrist(plan, side, spine.chest, times)
+    girdle = shoulder_girdle(plan, side, trunk, spine.chest, wrist, weight)
+    offset = wrist - girdle.at_shoulder
+    distance = offset.norm(dim=-1)
+    lack = ((distance - REACH * bones.length).clamp(min=0) * weight).numpy()
+    toward = (offset / distance[:, None].clamp(min=1e-6)).numpy()
+    return -lower_envelope(-lack, ENVELOPE_S, fps), _gains(plan, spine, trunk, girdle.at_shoulder, toward)
+
+
+def _gains(
+    plan: Plan,
+    spine: Spine,
+    trunk: Trunk,
+    shoulder: Float[Tensor, "time 3"],
+    toward: Float[np.ndarray, "time 3"],
+) -> Float[np.ndarray, "time 6"]:
+    """How far the shoulder moves along `toward` per unit of each of `HELP`: lever arms of pelvis and chest."""
+    zero = np.zeros_like(trunk.heading)
+    ahead = np.stack([np.cos(trunk.heading), np.sin(trunk.heading), zero], 1)
+    left = np.stack([-ahead[:, 1], ahead[:, 0], zero], 1)
+    up = np.stack([zero, zero, zero + 1.0], 1)
+    chest = spine.t_world_chest.numpy()
+    above, low = shoulder.numpy() - chest, chest - trunk.pelvis
+    turns = [(left, 0.72, -0.26 * plan.hip_height), (ahead, 0.6, 0.0), (up, 0.65, 0.0)]
+    moves = [np.cross(axis, above + share * low) + back * ahead for axis, share, back in turns]
+    moves += [-up, ahead, left]
+    return np.stack([(move * toward).sum(1) for move in moves], 1)
+
+
+def _shared(
+    lack: Float[np.ndarray, "time hand"], gain: Float[np.ndarray, "time hand 6"]
+) -> Float[np.ndarray, "time 6"]:
+    """The least effort that brings both hands within reach: W² Gᵀ (G W² Gᵀ + ε)⁻¹ lack."""
+    weighed = gain * EASY**2
+    normal = weighed @ gain.transpose(0, 2, 1) + 4e-4 * np.eye(2)
+    return (weighed * np.linalg.solve(normal, lack[..., None])).sum(1)
