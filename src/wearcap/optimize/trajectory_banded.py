@@ -40,7 +40,7 @@ def bend_banded(
         history.append(path.terms(0.0))
         if history[-1]["total"] < least:
             best, least = path.state(), history[-1]["total"]
-        if fell < (tolerance if smooth == smooth_end else 1e-2) * before:
+        if fell <= (tolerance if smooth == smooth_end else 1e-2) * before:
             if smooth == smooth_end:
                 reason = "converged"
                 break

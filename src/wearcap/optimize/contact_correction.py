@@ -1,0 +1,148 @@
+"""Moving a wearer onto what the hands touch, smoothly in and out (thesis §5.3.1), as an offset of the root's path.
+
+The document bends the path once more, with the touched point as the only control point (`bend_contacts`). Bending
+keeps lengths of steps: who walks straight at a thing cannot be moved towards it. Ours (`offset_for`) adds an offset
+that the contacts prescribe and that is as smooth and small as it can be elsewhere: one linear system with five
+diagonals for a whole recording.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from scipy.linalg import solveh_banded
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import require_rising
+from wearcap.optimize.trajectory import BentPath
+
+SETTLED = 2.0717
+"""x with exp(−x) (cos x + sin x) = 0.05: how an offset that its contact lets go of fades, over rate · time."""
+KEEP = 10.0
+"""Weight of a bent window's end; the contact has one. A point out of reach shall not move what follows."""
+
+
+@dataclass(frozen=True)
+class OffsetSettings:
+    """a and b of min Σ hold · weight ‖δ − target‖² + ∫ a ‖δ''‖² + b ‖δ‖² dt (b outside of contacts, and one)."""
+
+    transition_s: float = 1.5
+    """Before and after a contact the offset is within 5 % of its size (it swings 4 % beyond zero); a follows from
+    it. An offset of D m adds a speed of up to 1.34 D / transition_s to the root, and so to feet that stand."""
+    hold: float = 1e3
+    """Of a contact's frame of weight one. A single one is met to 0.2 % (for transitions of 1 to 2 s); every frame,
+    changes faster than about 50 ms are smoothed."""
+
+    def __post_init__(self):
+        if not (self.transition_s > 0 and self.hold > 0):
+            raise WearcapError(f"a transition of {self.transition_s} s, a hold of {self.hold}", expected="positive numbers")  # fmt: skip
+
+    @property
+    def stiffness(self) -> float:
+        """a (s⁴)."""
+        return (self.transition_s / SETTLED) ** 4 / 4
+
+
+def contact_targets(
+    hands: Float[Tensor, "time hand 3"],
+    wanted: Float[Tensor, "time hand 3"],
+    contact: Float[Tensor, "time hand"],
+) -> tuple[Float[Tensor, "time 3"], Float[Tensor, "time"]]:
+    """Offsets (m) that bring the hands where they shall be, the mean of those in contact, and weights (0…1).
+
+    `contact` weighs hands (0: not touching, whatever `wanted` says there).
+    """
+    missing = torch.where(contact[..., None] > 0, wanted - hands, 0.0)
+    total = contact.sum(1)
+    mean = (missing * contact[..., None]).sum(1) / torch.where(total > 0, total, 1.0)[:, None]
+    return mean, total.clamp(max=1.0)
+
+
+def offset_for(
+    targets: Float[Tensor, "time axis"],
+    weights: Float[Tensor, "time"],
+    timestamps: Float64[Tensor, "time"],
+    settings: OffsetSettings = OffsetSettings(),
+) -> Float64[Tensor, "time axis"]:
+    """The offset (m) of the whole recording: near the targets where they weigh, smooth, and fading elsewhere.
+
+    Weights are 0 outside of contacts and about 1 within: in the first frame alone (the document's p_c), or in all
+    frames (a hand on a hinge's arc). Solved exactly, in time linear in the recording's length. Raises WearcapError
+    for negative weights, targets that are not finite where they weigh, timestamps that do not rise.
+    """
+    require_rising(timestamps)
+    if not (weights >= 0).all():
+        raise WearcapError("a target of negative weight", expected="zero or more")
+    bad = (weights > 0) & ~targets.isfinite().all(1)
+    if bad.any():
+        raise WearcapError(f"the target of frame {int(bad.nonzero()[0])} is not a number",
+                           expected="finite metres where the weight is above zero")  # fmt: skip
+    pull = settings.hold * weights.double().numpy()
+    wanted = torch.where(weights[:, None] > 0, targets, 0.0).double().numpy()
+    if len(targets) < 3:
+        return torch.from_numpy(wanted)
+    return torch.from_numpy(
+        solveh_banded(_form(timestamps.numpy(), pull, settings.stiffness), pull[:, None] * wanted)
+    )
+
+
+def _form(times: np.ndarray, pull: np.ndarray, stiffness: float) -> np.ndarray:
+    """Upper bands of the system: two above the diagonal, for solveh_banded."""
+    before, after = np.diff(times)[:-1], np.diff(times)[1:]
+    around = (before + after) / 2
+    # second differences of neighbours at uneven times: left · δ₋ + middle · δ + right · δ₊
+    left, right = 1 / (before * around), 1 / (after * around)
+    middle, weight = -left - right, stiffness * around
+    bands = np.zeros((3, len(times)))
+    bands[2] = pull + np.where(pull > 0, 0.0, np.gradient(times))
+    for shift, coefficient in enumerate((left, middle, right)):
+        bands[2, shift : shift + len(around)] += weight * coefficient**2
+    bands[1, 1:-1] += weight * left * middle
+    bands[1, 2:] += weight * middle * right
+    bands[0, 2:] += weight * left * right
+    return bands
+
+
+def bend_contacts(
+    targets: Float[Tensor, "time 2"],
+    weights: Float[Tensor, "time"],
+    timestamps: Float64[Tensor, "time"],
+    path: Float[Tensor, "time 2"],
+    *,
+    bend: Callable[..., BentPath],
+    transition_s: float = 1.5,
+) -> Float64[Tensor, "time 2"]:
+    """The document's correction as an offset (m): for each contact the path is bent to its first frame's target.
+
+    `bend` is `trajectory.bend` with its settings (held headings) and solver. A contact is a run of frames that
+    weigh. From `transition_s` before it to `transition_s` after it, or to the neighbouring contact's start, the
+    path is bent; the rest stays, also where the bent piece, out of reach, does not quite come back to it.
+    """
+    require_rising(timestamps)
+    touches = torch.cat([weights.new_zeros(1), (weights > 0).to(weights), weights.new_zeros(1)]).diff()
+    starts, stops = (touches > 0).nonzero()[:, 0].tolist(), (touches < 0).nonzero()[:, 0].tolist()
+    new, last = path.double().clone(), len(path) - 1
+    limits = [0, *starts, last]
+    for (earliest, start), latest, stop in zip(pairwise(limits), limits[2:], stops):
+        first = max(int(torch.searchsorted(timestamps, timestamps[start] - transition_s)), earliest)
+        final = min(int(torch.searchsorted(timestamps, timestamps[stop - 1] + transition_s)), latest)
+        if final <= first:
+            continue
+        window = slice(first, final + 1)
+        points = torch.stack([path[start].double() + targets[start], new[final]])
+        times = timestamps[[start, final]]
+        piece = bend(new[window], timestamps[window], times, points, torch.tensor([1.0, KEEP])).path
+        gone = (timestamps[window] - times[0]).clamp(min=0) / (times[1] - times[0]).clamp(min=1e-9)
+        new[window] = piece + gone[:, None] * (new[final] - piece[-1])
+    return new - path
+
+
+def added_speed(
+    offset: Float[Tensor, "time axis"], timestamps: Float64[Tensor, "time"]
+) -> Float[Tensor, "pair"]:
+    """Speed (m/s) that an offset adds to the root from frame to frame; feet that stand slide by as much."""
+    return offset.diff(dim=0).norm(dim=1) / timestamps.diff()
