@@ -68,6 +68,16 @@ def held_left(frames: int = FRAMES) -> torch.Tensor:
     return prob
 
 
+def objects_of(motion: Motion) -> dict[str, Trajectory]:
+    assert motion.object_motion is not None
+    return motion.object_motion
+
+
+def held_of(motion: Motion) -> Interactions:
+    assert motion.interactions is not None
+    return motion.interactions
+
+
 def tracker(**settings) -> ObjectTracker:
     return ObjectTracker(None, attachment=AttachmentSettings(**settings))
 
@@ -76,21 +86,21 @@ def test_what_is_held_goes_along_and_stays_where_it_is_left(scene, way):
     motion, environment = scene
     contacts = {"timestamps": motion.timestamps, "sliding": held_left(), "hinged": torch.zeros(FRAMES, 2)}
     captured = tracker()(motion, contacts, environment)
-    near = captured.object_motion["near"]
+    near = objects_of(captured)["near"]
     moved = near.t_world_body[:, 0] - near.t_world_body[0, 0]
     torch.testing.assert_close(moved[TAKE:LEAVE], (way - way[TAKE])[TAKE:LEAVE], atol=1e-5, rtol=0)
     assert (moved[LEAVE:] == moved[LEAVE - 1]).all()
-    assert len(captured.object_motion["far"]) == 2
-    assert captured.interactions.objects == ("near",)
-    assert captured.interactions.hands.tolist() == [[True, False]]
-    assert captured.interactions.start_s.item() == pytest.approx(TAKE / FPS)
-    assert captured.interactions.stop_s.item() == pytest.approx(LEAVE / FPS)
+    assert len(objects_of(captured)["far"]) == 2
+    assert held_of(captured).objects == ("near",)
+    assert held_of(captured).hands.tolist() == [[True, False]]
+    assert held_of(captured).start_s.item() == pytest.approx(TAKE / FPS)
+    assert held_of(captured).stop_s.item() == pytest.approx(LEAVE / FPS)
 
 
 def test_a_contact_of_a_class_without_an_object_in_reach_is_ignored(scene):
     motion, environment = scene
     contacts = {"timestamps": motion.timestamps, "hinged": held_left(), "sliding": torch.zeros(FRAMES, 2)}
-    assert len(tracker()(motion, contacts, environment).interactions) == 0
+    assert len(held_of(tracker()(motion, contacts, environment))) == 0
 
 
 def test_a_hand_that_joins_keeps_the_object_and_is_a_new_interval(scene):
@@ -99,8 +109,8 @@ def test_a_hand_that_joins_keeps_the_object_and_is_a_new_interval(scene):
     both[120:180, 1] = 0.9  # the right palm is far from "near"
     contacts = {"timestamps": motion.timestamps, "sliding": both}
     captured = tracker()(motion, contacts, environment)
-    assert captured.interactions.objects == ("near",) * 3
-    steps = captured.object_motion["near"].t_world_body.diff(dim=0).norm(dim=-1)
+    assert held_of(captured).objects == ("near",) * 3
+    steps = objects_of(captured)["near"].t_world_body.diff(dim=0).norm(dim=-1)
     assert steps.max() < 0.02
 
 
@@ -109,9 +119,9 @@ def test_the_less_probable_class_gives_way(scene):
     right = torch.zeros(FRAMES, 2)
     right[TAKE:LEAVE, 1] = 0.6
     contacts = {"timestamps": motion.timestamps, "hinged": right + 0.2 * (right > 0), "sliding": right}
-    assert tracker()(motion, contacts, environment).interactions.objects == ("door",)
+    assert held_of(tracker()(motion, contacts, environment)).objects == ("door",)
     together = tracker(one_class=False)(motion, contacts, environment)
-    assert "door" in together.interactions.objects
+    assert "door" in held_of(together).objects
 
 
 def test_scores_tell_the_perfect_capture_from_the_static_one(scene, way):
@@ -121,7 +131,7 @@ def test_scores_tell_the_perfect_capture_from_the_static_one(scene, way):
     held = Interactions(torch.tensor([TAKE / FPS]).double(), torch.tensor([LEAVE / FPS]).double(),
                         torch.tensor([[True, False]]), ("near",), ("sliding",))  # fmt: skip
     truth = Recording(
-        "r", motion=motion, interactions=held, object_motion={"near": captured.object_motion["near"]}
+        "r", motion=motion, interactions=held, object_motion={"near": objects_of(captured)["near"]}
     )
     perfect = score_interactions(captured, truth, environment)
     assert perfect.handlings[0].end_cm == pytest.approx(0.0, abs=1e-3)

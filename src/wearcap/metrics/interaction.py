@@ -25,7 +25,8 @@ class PoseError:
 def object_error(T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]) -> PoseError:
     """Error of an object's poses; `center` is its middle in its own axes (m)."""
     found, true = T_found.to(torch.float64), T_true.to(torch.float64)
-    apart = (found @ center.double() - true @ center.double()).norm(dim=-1)
+    middles = [(T.R @ center.double()) + T.t for T in (found, true)]
+    apart = (middles[0] - middles[1]).norm(dim=-1)
     return PoseError(100 * apart, geodesic(found.R, true.R).rad2deg())
 
 

@@ -12,6 +12,8 @@ import viser
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.recording import Motion, Recording
+from wearcap.scene.environment import Environment
+from wearcap.viewer.objects import ObjectsLayer
 from wearcap.viewer.page_layers import (
     BodyLayer,
     FeetLayer,
@@ -35,9 +37,12 @@ class Page:
 
     def __init__(
         self, recording: Recording, motion: Motion | None = None, *, folder: Path | None = None,
-        host: str = "127.0.0.1", port: int = 8080,
+        host: str = "127.0.0.1", port: int = 8080, environment: Environment | None = None,
     ):  # fmt: skip
-        """`motion`: what was captured; `folder`: the data set's, where `recording.scene` lies."""
+        """`motion`: what was captured; `folder`: the data set's, where `recording.scene` lies.
+
+        Objects of an `environment` stand where the capture has them, else where they truly were.
+        """
         self.timeline = _timeline(recording, motion)
         self._stopped = False
         scene = read_scene(folder / recording.scene) if recording.scene and folder is not None else None
@@ -53,6 +58,13 @@ class Page:
             add_points(self.server, recording.points)
         if scene is not None:
             self.server.scene.add_mesh_trimesh("/scene", scene)
+        if environment is not None:
+            tracks = (
+                motion.object_motion
+                if motion is not None and motion.object_motion
+                else recording.object_motion
+            )
+            self.layers.append(ObjectsLayer(self.server, environment, tracks))
         self._add_floor(recording)
         self._add_controls(recording)
         self._followed = self._focus()

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.model import BodyModel
@@ -18,13 +19,17 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh, capsules, checker_floor
 from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
+from wearcap.recording.interactions import HANDS
 from wearcap.recording.motion import Motion
+from wearcap.scene.environment import Environment
+from wearcap.viewer.objects import posed_meshes
 from wearcap.viewer.page_layers import stick_body
 
 PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], [0.62, 0.45, 0.62]])
 """Colours of the motions, in order."""
 
 CONTACT_COLOR = np.array([0.80, 0.18, 0.12])
+HOLD_COLOR = np.array([0.20, 0.62, 0.25])
 TILES = np.array([[0.90, 0.90, 0.89], [0.80, 0.81, 0.82]])
 SKY = (0.965, 0.97, 0.975)
 VIEW = (-0.62, 0.78)
@@ -40,26 +45,44 @@ class Actor:
     body: BodyModel
     color: Float[np.ndarray, "3"]
     floor_z: float
+    environment: Environment | None = None
+    """Objects that are drawn where the motion's `object_motion` has them."""
 
     def meshes(self, frame: int) -> list[Mesh]:
-        """Body and contact marks of one frame."""
+        """Body, marks of feet and hands in contact, and objects of one frame."""
         T = self.motion.T_world_joint[frame]
         vertices = self.body.vertices(T).detach().numpy().astype(np.float32)
         body = Mesh(
             vertices, self.body.faces.numpy().astype(np.int32), self.color.astype(np.float32), smooth=True
         )
-        prob = self.motion.contact_prob
+        palms = tuple(f"{side}_palm" for side in HANDS)
+        feet = self._marks(T, FOOT_PATCHES, self.motion.contact_prob, frame, 0.028, CONTACT_COLOR)
+        hands = self._marks(T, palms, self.motion.hand_contact_prob, frame, 0.055, HOLD_COLOR)
+        if self.environment is None:
+            return [body, *feet, *hands]
+        objects = posed_meshes(
+            self.environment, self.motion.object_motion or {}, self.motion.timestamps[frame].item()
+        )
+        return [body, *feet, *hands, *objects]
+
+    def _marks(
+        self, T_world_joint: Rigid, sites: tuple[str, ...], prob: Tensor | None, frame: int, radius: float,
+        color: Float[np.ndarray, "3"],
+    ) -> list[Mesh]:  # fmt: skip
+        """Balls at the sites that are in contact."""
         skeleton = self.motion.skeleton
-        if prob is None or not set(FOOT_PATCHES) <= set(skeleton.sites):
-            return [body]
-        feet = site_positions(skeleton, T, FOOT_PATCHES).double().numpy()[(prob[frame] > 0.5).numpy()]
-        if not len(feet):
-            return [body]
-        size = np.full(len(feet), 0.028)
-        return [body, capsules(feet, feet, size, size, np.tile(CONTACT_COLOR, (len(feet), 1)), 8)]
+        if prob is None or not set(sites) <= set(skeleton.sites):
+            return []
+        places = site_positions(skeleton, T_world_joint, sites).double().numpy()[(prob[frame] > 0.5).numpy()]
+        if not len(places):
+            return []
+        size = np.full(len(places), radius)
+        return [capsules(places, places, size, size, np.tile(color, (len(places), 1)), 8)]
 
 
-def actors(motions: dict[str, Motion], body: BodyModel | None = None) -> list[Actor]:
+def actors(
+    motions: dict[str, Motion], body: BodyModel | None = None, environment: Environment | None = None
+) -> list[Actor]:
     """One actor per motion, in sticks unless a body is given for them all. Raises WearcapError for none."""
     if not motions:
         raise WearcapError("no motion to draw", expected="at least one")
@@ -68,7 +91,7 @@ def actors(motions: dict[str, Motion], body: BodyModel | None = None) -> list[Ac
         lowest = motion.T_world_joint.t[..., 2].amin(1)
         floor_z = float(torch.quantile(lowest[:: max(1, len(lowest) // 5000)], 0.05)) - 0.02
         color = PALETTE[number % len(PALETTE)]
-        shown.append(Actor(label, motion, body or stick_body(motion.skeleton), color, floor_z))
+        shown.append(Actor(label, motion, body or stick_body(motion.skeleton), color, floor_z, environment))
     return shown
 
 
@@ -118,13 +141,16 @@ def contact_sheet(
     size: tuple[int, int] = (200, 240),
     body: BodyModel | None = None,
     world: Mesh | None = None,
+    environment: Environment | None = None,
+    distance: float = 4.2,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Frames of motions on a shared clock, one row per motion, the camera following the first motion's root.
 
     `size` is a panel's (width, height). Without `frames`, `columns` frames spread over the shortest motion are
-    drawn; with more frames than columns, the rows repeat below. Raises WearcapError for frames that are not there.
+    drawn; with more frames than columns, the rows repeat below. Objects of an `environment` are drawn where each
+    motion has them. Raises WearcapError for frames that are not there.
     """
-    shown = actors(motions, body)
+    shown = actors(motions, body, environment)
     length = min(len(motion) for motion in motions.values())
     spread = np.linspace(0, length - 1, columns).round().astype(int).tolist()
     frames = spread if frames is None else list(frames)
@@ -137,7 +163,7 @@ def contact_sheet(
         for column, frame in enumerate(chosen):
             target = focus(shown[0].motion, frame)
             for row, actor in enumerate(shown):
-                image = panel(actor, frame, target, size, world=world)
+                image = panel(actor, frame, target, size, world=world, distance=distance)
                 seconds = (actor.motion.timestamps[frame] - actor.motion.timestamps[0]).item()
                 text = f"{actor.label}  {seconds:.2f} s" if column == 0 else f"{seconds:.2f} s"
                 sheet.paste(captioned(image, text), (column * width, (band * len(shown) + row) * height))

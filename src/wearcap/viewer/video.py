@@ -12,6 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.mesh import Mesh
 from wearcap.recording.motion import Motion
+from wearcap.scene.environment import Environment
 from wearcap.viewer.picture import actors, captioned, focus, panel
 
 
@@ -23,6 +24,7 @@ def write_video(
     size: tuple[int, int] = (480, 400),
     body: BodyModel | None = None,
     world: Mesh | None = None,
+    environment: Environment | None = None,
     max_seconds: float | None = None,
     progress: bool = True,
 ) -> None:
@@ -34,7 +36,7 @@ def write_video(
         raise WearcapError(
             f"a video of {size[0]}x{size[1]} at {fps} fps", expected="even sizes, a positive rate"
         )
-    shown = actors(motions, body)
+    shown = actors(motions, body, environment)
     start = max(motion.timestamps[0].item() for motion in motions.values())
     stop = min(motion.timestamps[-1].item() for motion in motions.values())
     if stop < start:
