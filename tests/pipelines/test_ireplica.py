@@ -1,3 +1,6 @@
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -6,10 +9,14 @@ from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import xsens23
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.optimize.contact_correction import OffsetSettings
+from wearcap.optimize.trajectory import Bending, bend
+from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.pipelines.attachment import AttachmentSettings
 from wearcap.pipelines.ireplica_baselines import held_when_near, interpolated_objects, static_objects
 from wearcap.pipelines.ireplica_evaluation import score_interactions
 from wearcap.pipelines.object_tracker import PALMS, ObjectTracker
+from wearcap.pipelines.snapping import BendCorrection, HingeFit, SnapCorrection, fit_about_hinge
 from wearcap.recording import Motion, Recording
 from wearcap.recording.interactions import Interactions
 from wearcap.scene.environment import Environment
@@ -159,3 +166,45 @@ def test_objects_keep_their_own_clock(scene, way):
     scores = score_interactions(static_objects(motion, environment), truth, environment)
     assert scores.handlings == ()
     assert scores.false_moves_cm == 0
+
+
+@pytest.mark.parametrize("off", [(0.05, 0.08), (-0.1, 0.0)])
+def test_the_wearer_is_snapped_onto_a_door_by_the_arc_of_the_hand(off):
+    """A hand that turns with a door, registered some centimetres off, is put back on its circle about the hinge."""
+    pivot, radius = torch.tensor([2.0, 1.0]).double(), 0.75
+    angle = torch.linspace(0, 1.5, 200).double()
+    true = pivot + radius * torch.stack([angle.cos(), angle.sin()], 1)
+    wrong = true + torch.tensor(off).double()
+    touch = torch.tensor([0.0, -off[1]]).double()  # the nearest point of the leaf tells one direction alone
+    found = fit_about_hinge(wrong, pivot, touch, HingeFit())
+    assert (found + torch.tensor(off)).norm() < 0.4 * torch.tensor(off).norm()
+
+
+def test_corrections_move_the_wearer_to_the_object_and_back(scene):
+    motion, environment = scene
+    off = replace(motion, t_world_root=motion.t_world_root + torch.tensor([0.0, -0.3, 0.0]))
+    contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
+    plain = ObjectTracker(None)(off, contacts, environment)
+    snapped = ObjectTracker(SnapCorrection(OffsetSettings(transition_s=0.8)))(off, contacts, environment)
+    shift = (snapped.t_world_root - off.t_world_root)[:, 1]
+    torch.testing.assert_close(shift[TAKE:LEAVE], torch.full((LEAVE - TAKE,), 0.1), atol=3e-3, rtol=0)
+    assert shift[[0, -1]].abs().max() < 0.03
+    assert shift.diff().abs().max() * FPS < 0.25
+    thing = environment.by_name("near")
+    for captured, least, most in ((plain, 0.05, 0.2), (snapped, 0.0, 0.005)):
+        palm = site_positions(captured.skeleton, captured.T_world_joint, PALMS)[TAKE:LEAVE, 0]
+        T = objects_of(captured)[thing.name].T_world_body[TAKE:LEAVE]
+        distance, _ = environment.distance(thing.name, palm, T)
+        assert least <= distance.mean() < most
+
+
+def test_the_documents_correction_runs_on_the_same_contacts(scene):
+    motion, environment = scene
+    off = replace(motion, t_world_root=motion.t_world_root + torch.tensor([0.0, -0.25, 0.0]))
+    contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
+    correction = BendCorrection(
+        partial(bend, settings=Bending(rigidity=1.0, held_headings=True), solver=bend_banded)
+    )
+    captured = ObjectTracker(correction)(off, contacts, environment)
+    assert held_of(captured).objects == ("near",)
+    assert captured.t_world_root.isfinite().all()
