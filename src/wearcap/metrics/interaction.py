@@ -1,5 +1,6 @@
 """How well objects and the hands that move them were captured (thesis Tables 5.1, 5.2). Metres in, cm and degrees out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -28,6 +29,39 @@ def object_error(T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]) -> P
     middles = [(T.R @ center.double()) + T.t for T in (found, true)]
     apart = (middles[0] - middles[1]).norm(dim=-1)
     return PoseError(100 * apart, geodesic(found.R, true.R).rad2deg())
+
+
+@dataclass(frozen=True)
+class Handling:
+    """One handling of an object and how it was captured."""
+
+    object: str
+    category: str
+    start_s: float
+    stop_s: float
+    end_cm: float
+    """Of the object's centre where it was left (Table 5.1)."""
+    end_deg: float
+    moved_cm: float
+    """How far the truth's centre moved: the error of one who holds it static, were it right before."""
+    hand_object_cm: float
+    """From contacting palms to the captured object, mean over the true contact (Table 5.2)."""
+    hand_cm: float
+    """Of contacting palms from where they truly were."""
+    object_cm: float
+    """Of the object's centre from where it truly was, mean over the true contact."""
+    object_deg: float
+
+
+MEASURES = ("end_cm", "end_deg", "hand_object_cm", "hand_cm", "object_cm", "object_deg")
+
+
+def summary(rows: Sequence[Handling]) -> dict[str, float]:
+    """Mean of every measure over handlings; NaN without any."""
+    return {
+        name: sum(getattr(row, name) for row in rows) / len(rows) if rows else float("nan")
+        for name in MEASURES
+    }
 
 
 def contact_mean(value: Float[Tensor, "time hand"], contact: Bool[Tensor, "time hand"]) -> Float[Tensor, ""]:

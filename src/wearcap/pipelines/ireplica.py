@@ -88,6 +88,13 @@ class IReplica:
             ]
         return about
 
+    def registered(self, source: Source) -> Motion:
+        """The wearer's motion in the scene by HPS alone. Raises WearcapError as HPS does."""
+        results, _ = run_stages(self.hps.stages(source))
+        motion = self.hps.motion_of(results)
+        assert motion is not None
+        return motion
+
     def contacts(self, suit: Motion) -> dict[str, Tensor]:
         """Contact probabilities of both hands by class, from the suit's pose alone (thesis §5.3.2)."""
         motion = resampled(suit, self.fps)

@@ -18,7 +18,7 @@ from wearcap.data.prepare.clean import at_times
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.metrics.interaction import contact_mean, handlings, object_error
+from wearcap.metrics.interaction import Handling, contact_mean, handlings, object_error
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.pipelines.object_tracker import PALMS
 from wearcap.recording import Motion, Recording
@@ -28,28 +28,6 @@ from wearcap.scene.objects import SceneObject
 SETTLED_S = 0.6
 """An object's end is looked at so long after it was released, or when it is taken again: releases are seen late."""
 CHAMFER_EVERY_S, CHAMFER_POINTS = 1.0, 1500
-
-
-@dataclass(frozen=True)
-class Handling:
-    """One handling of an object and how it was captured."""
-
-    object: str
-    category: str
-    start_s: float
-    stop_s: float
-    end_cm: float
-    """Of the object's centre where it was left (Table 5.1)."""
-    end_deg: float
-    moved_cm: float
-    """How far the truth's centre moved: the error of one who holds it static, were it right before."""
-    hand_object_cm: float
-    """From contacting palms to the captured object, mean over the true contact (Table 5.2)."""
-    hand_cm: float
-    """Of contacting palms from where they truly were."""
-    object_cm: float
-    """Of the object's centre from where it truly was, mean over the true contact."""
-    object_deg: float
 
 
 @dataclass(frozen=True)
