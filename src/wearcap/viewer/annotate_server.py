@@ -1,0 +1,223 @@
+"""The annotator's web server: the page's own files, a recording's numbers once, its video in ranges, and saves.
+
+It listens on this machine alone, and answers only pages that it sent itself.
+"""
+
+import json
+import os
+import re
+import sys
+import threading
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from wearcap.errors import WearcapError
+from wearcap.io.contact_labels import annotation_of, hcontact_of
+from wearcap.viewer.annotate import Desk
+from wearcap.viewer.annotation_file import Conflict
+
+PAGE = Path(__file__).parent / "annotator"
+TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8",
+         ".svg": "image/svg+xml"}  # fmt: skip
+VIDEO_TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".webm": "video/webm", ".mkv": "video/x-matroska",
+               ".avi": "video/x-msvideo", ".ogv": "video/ogg"}  # fmt: skip
+MAX_SAVE_BYTES = 16 << 20
+PIECE_BYTES = 1 << 18
+_LOCAL = {"127.0.0.1", "localhost", "::1"}
+_PORTS_TRIED = 50
+
+
+class AnnotationServer:
+    """Serves a desk until stopped; `port` is the next free one from the wished one on."""
+
+    def __init__(self, desk: Desk, port: int = 8090):
+        """Raises WearcapError when no port is free."""
+        for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
+            try:
+                self._server = _Server(("127.0.0.1", candidate), _Handler)
+                break
+            except OSError:
+                continue
+        else:
+            raise WearcapError(f"no free port from {port} on", fix="Give another one with --port.")
+        self._server.desk = desk
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self._server.server_port}"
+
+    def wait(self) -> None:
+        """Serve until interrupted."""
+        while self._thread.is_alive():
+            self._thread.join(1.0)
+
+    def stop(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    allow_reuse_address = os.name == "posix"
+    desk: Desk
+
+    def handle_error(self, request, client_address) -> None:
+        """Browsers drop connections as they seek in a video; that is no news."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server: _Server  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def log_message(self, format: str, *args) -> None:
+        """A line for every request helps nobody."""
+
+    def do_HEAD(self) -> None:
+        self._answer(self._get)
+
+    def do_GET(self) -> None:
+        self._answer(self._get)
+
+    def do_POST(self) -> None:
+        self._answer(self._post)
+
+    def _answer(self, action) -> None:
+        """Run an action; what a user can mend becomes {"error": …} with a fitting status."""
+        try:
+            if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _LOCAL:
+                self._send_error(HTTPStatus.FORBIDDEN, "this page is for this machine alone")
+            else:
+                action(urlsplit(self.path).path)
+        except Conflict as error:
+            self._send_error(HTTPStatus.CONFLICT, str(error))
+        except (WearcapError, OSError) as error:
+            if isinstance(error, ConnectionError):
+                self.close_connection = True
+            else:
+                self._send_error(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+
+    def _get(self, path: str) -> None:
+        if path == "/recordings":
+            return self._send_json(self._listing())
+        if match := re.fullmatch(r"/recordings/(\d{1,6})(?:/(\w+))?", path):
+            return self._get_recording(int(match[1]), match[2] or "")
+        file = PAGE / (path[1:] or "index.html")
+        if file.parent == PAGE and file.suffix in TYPES and file.is_file():
+            return self._send(file.read_bytes(), TYPES[file.suffix])
+        return self._send_error(HTTPStatus.NOT_FOUND, f"nothing at {path}")
+
+    def _get_recording(self, index: int, part: str) -> None:
+        desk = self.server.desk
+        if index >= len(desk.names):
+            return self._send_error(HTTPStatus.NOT_FOUND, f"no recording {index}")
+        take = desk.take(index)
+        if part == "":
+            labels, revision = desk.file(index).read()
+            about = take.header() | {"labels": annotation_of(labels, take.clock), "revision": revision}
+            return self._send_json(about | {"file": str(desk.file(index).path)})
+        if part == "numbers":
+            return self._send(take.numbers(), "application/octet-stream")
+        if part == "export":
+            labels, _ = desk.file(index).read()
+            text = json.dumps({"contacts": hcontact_of(labels, take.clock)}, indent=1) + "\n"
+            return self._send(text.encode(), "application/json", download=f"{take.clock.name}.json")
+        if part == "video" and take.video is not None:
+            return self._send_video(take.video.path)
+        return self._send_error(HTTPStatus.NOT_FOUND, f"recording {index} has no {part}")
+
+    def _listing(self) -> list[dict]:
+        desk = self.server.desk
+        return [{"name": name, "annotated": desk.path(name).is_file()} for name in desk.names]  # fmt: skip
+
+    def _post(self, path: str) -> None:
+        match = re.fullmatch(r"/recordings/(\d{1,6})/labels", path)
+        length = self.headers.get("Content-Length", "")
+        self.close_connection = True  # until the body has been read
+        if match is None or int(match[1]) >= len(self.server.desk.names):
+            return self._send_error(HTTPStatus.NOT_FOUND, f"nothing to save at {path}")
+        origin = self.headers.get("Origin")
+        foreign = origin is not None and urlsplit(origin).netloc != self.headers.get("Host")
+        if foreign or self.headers.get_content_type() != "application/json":
+            return self._send_error(HTTPStatus.FORBIDDEN, "only this server's own page may save")
+        if not length.isdecimal() or int(length) > MAX_SAVE_BYTES:
+            return self._send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a save of {length or '?'} bytes")
+        body = self.rfile.read(int(length))
+        self.close_connection = False
+        try:
+            sent = json.loads(body)
+            labels, base, client = sent["labels"], str(sent["base"]), str(sent["client"])
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            return self._send_error(HTTPStatus.BAD_REQUEST, f"not a save: {error}")
+        file = self.server.desk.file(int(match[1]))
+        revision = file.save(labels, base, client=client, force=sent.get("force") is True)
+        return self._send_json({"revision": revision})
+
+    def _send_json(self, content: Any) -> None:
+        self._send(json.dumps(content).encode(), "application/json")
+
+    def _send_error(self, status: HTTPStatus, message: str) -> None:
+        self._send(json.dumps({"error": message}).encode(), "application/json", status)
+
+    def _send(self, data: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK, download: str = "") -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        if kind.startswith("text/html"):
+            self.send_header("Content-Security-Policy", "default-src 'self'")
+        if download:
+            quoted = re.sub(r"[^\w.\- ]", "_", download, flags=re.ASCII)
+            self.send_header("Content-Disposition", f'attachment; filename="{quoted}"')
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(data)
+
+    def _send_video(self, path: Path) -> None:
+        """A whole file, or the one range that was asked for (RFC 9110, section 14)."""
+        size = path.stat().st_size
+        span = byte_range(self.headers.get("Range", ""), size)
+        if span is None:
+            self.send_response(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE)
+            self.send_header("Content-Range", f"bytes */{size}")
+            self.send_header("Content-Length", "0")
+            return self.end_headers()
+        start, stop, partial = span
+        self.send_response(HTTPStatus.PARTIAL_CONTENT if partial else HTTPStatus.OK)
+        self.send_header("Content-Type", VIDEO_TYPES.get(path.suffix.lower(), "application/octet-stream"))
+        self.send_header("Accept-Ranges", "bytes")
+        self.send_header("Content-Length", str(stop - start))
+        if partial:
+            self.send_header("Content-Range", f"bytes {start}-{stop - 1}/{size}")
+        self.end_headers()
+        if self.command == "HEAD":
+            return None
+        with open(path, "rb") as file:
+            file.seek(start)
+            while start < stop and (piece := file.read(min(PIECE_BYTES, stop - start))):
+                self.wfile.write(piece)
+                start += len(piece)
+        if start < stop:  # the file was cut short meanwhile
+            self.close_connection = True
+        return None
+
+
+def byte_range(header: str, size: int) -> tuple[int, int, bool] | None:
+    """Start, stop and whether it is a part, of a Range header; None where nothing of it lies in the file."""
+    match = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", header.strip())
+    if match is None or not (match[1] or match[2]):
+        return 0, size, False
+    if not match[1]:
+        start, stop = max(0, size - int(match[2])), size
+    else:
+        start, stop = int(match[1]), min(size, int(match[2]) + 1 if match[2] else size)
+        if match[2] and int(match[2]) < start:
+            return 0, size, False
+    return (start, stop, True) if start < stop else None
