@@ -1,0 +1,183 @@
+"""Opening and closing doors, windows, cabinet doors and drawers: a hand on the handle, the body out of the way."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.simulation.actions import approach
+from wearcap.simulation.grips import drawn_grip
+from wearcap.simulation.house import House
+from wearcap.simulation.openables import Openable
+from wearcap.simulation.outline import distance_to_convex
+from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan, wrap
+from wearcap.simulation.shuffling import shuffle
+from wearcap.simulation.stances import Stances, Task, find_stances, smooth_way
+from wearcap.simulation.track import ease
+from wearcap.simulation.world import World, WorldObject
+
+KEY_S = 0.2
+NEAR_M = 2.2
+"""Things further from the handle are no hindrance."""
+OTHER_HAND = 0.25
+"""How often the hand that would do worse is taken all the same."""
+YAW_MOST = 1.1
+"""A hand turns on its handle up to this (rad)."""
+BEYOND_M = 0.4
+"""Past a leaf's edge one would rather stand."""
+OUT_RAD, OUT_M = 0.25, 0.08
+"""From here on nothing of a leaf or a drawer's front is within its frame."""
+PALM_M = 0.085
+"""From wrist to palm."""
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One use of an openable: from value to value with a hand on one of its handles."""
+
+    item: Openable
+    start: float
+    stop: float
+    handle: int
+    side: str
+    seconds: float
+    stances: Stances
+
+    def values(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time"]:
+        return self.start + ease(share) * (self.stop - self.start)
+
+
+def operate(
+    plan: Plan, house: House, rng: np.random.Generator, item: Openable, value: float, handle: int = 0
+) -> bool:
+    """Go to an openable and bring it to a value by one of its handles; False, with nothing done, where one cannot."""
+    world = house.world(plan.position)
+    turn = plan_turn(plan, house, world, rng, item, value, handle)
+    if turn is None:
+        return False
+    first = turn.stances.places[0]
+    goal = np.array([first[0], first[1], plan.position[2]])
+    far = np.linalg.norm(goal[:2] - plan.position[:2]) > 0.1 or abs(wrap(first[2] - plan.heading)) > 0.3
+    if far and not approach(plan, world, rng, goal, float(first[2])):
+        return False
+    _perform(plan, house, turn, rng)
+    return True
+
+
+def plan_turn(
+    plan: Plan,
+    house: House,
+    world: World,
+    rng: np.random.Generator,
+    item: Openable,
+    value: float,
+    handle: int,
+) -> Turn | None:
+    """Hand, tempo and way of the body; None where the thing would hit something or one cannot stand for it."""
+    start, shoulder = house.values[item.name], 1.50 * plan.hip_height
+    amount = abs(value - start) / (np.deg2rad(80.0) if item.hinged else 0.4)
+    seconds = float(np.clip((0.9 + 1.3 * amount) * rng.normal(1.0, 0.12) / plan.style.briskness, 1.0, 3.2))
+    keys = max(round(seconds / KEY_S), 6)
+    values = start + ease(np.linspace(0.0, 1.0, keys)) * (value - start)
+    way, footprint = item.handle(handle, values), item.footprint(values)
+    near = [other for other in world.objects
+            if other.name != item.name and distance_to_convex(way[:, :2], other.footprint).min() < NEAR_M]  # fmt: skip
+    if _hits(item, values, near):
+        return None
+    floor = float(plan.position[2])
+    solid = [other for other in near if other.z_range[0] < floor + 1.9 and other.z_range[1] > floor + 0.1]
+    high = [
+        other
+        for other in solid
+        if other.z_range[1] > way[0, 2] - 0.05 and other.z_range[0] < floor + shoulder
+    ]
+    task = Task(
+        way, footprint, tuple(other.footprint for other in solid), tuple(other.footprint for other in high), 1.0,
+        floor + shoulder, plan.arm_length + PALM_M, low=item.z_range[1] < way[0, 2] + 0.2,
+        beyond=_beyond(item, handle),
+    )  # fmt: skip
+    walkable = world.navigation.node_points[:, :2]
+    walkable = walkable[np.linalg.norm(walkable - way[0, :2], axis=1) < 2.0]
+    found = {side: find_stances(replace(task, sign=LEFT_SIGN[side]), walkable, rng) for side in SIDES}
+    able = sorted((side for side in SIDES if found[side] is not None), key=lambda side: found[side].cost)
+    if not able:
+        return None
+    side = (
+        able[-1]
+        if rng.random() < OTHER_HAND and found[able[-1]].cost < found[able[0]].cost + 8.0
+        else able[0]
+    )
+    return Turn(item, start, value, handle, side, seconds, found[side])
+
+
+def _beyond(item: Openable, handle: int) -> tuple[Float[np.ndarray, "2"], float] | None:
+    if not item.hinged or handle:
+        return None
+    pivot, width = item.object.freedom.pivot, float(item.outline[:, 0].max())
+    assert pivot is not None
+    return np.array(pivot[:2]), width + BEYOND_M
+
+
+def _hits(item: Openable, values: Float[np.ndarray, "key"], near: list[WorldObject]) -> bool:
+    """Whether a leaf or drawer, once it is out of its frame, meets what stands about."""
+    others = [
+        other.footprint for other in near
+        if other.z_range[0] < item.z_range[1] - 0.02 and other.z_range[1] > item.z_range[0] + 0.02
+    ]  # fmt: skip
+    out = values[np.abs(values - item.closed) > (OUT_RAD if item.hinged else OUT_M)]
+    footprint = item.footprint(out)
+    edges = np.concatenate([footprint[:, (1, 2)], footprint[:, (1, 2)].mean(1, keepdims=True)], 1)
+    return any((distance_to_convex(edges, outline) < 0.015).any() for outline in others)
+
+
+def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> None:
+    """Write the grip, the steps, where the thing goes and who held it when."""
+    item, start = turn.item, plan.time
+    touch = start + 0.75 / plan.style.briskness
+    begin = touch + float(rng.uniform(0.05, 0.25))
+    stop = begin + turn.seconds
+    release = stop + float(rng.uniform(0.02, 0.25))
+    count = max(round(turn.seconds * 30), 8)
+    places = turn.stances.places.copy()
+    here = np.array([*plan.position[:2], places[0, 2] + wrap(plan.heading - places[0, 2])])
+    fade = np.linspace(1.0, 0.0, len(places))[:, None] ** 2
+    way = smooth_way(places + fade * (here - places[0]), count)
+    times = np.linspace(begin, stop, count)
+
+    def poses(at: Float[np.ndarray, "time"]) -> Rigid:
+        return item.pose(turn.values((at - begin) / turn.seconds))
+
+    yaw = _hand_yaw(plan, turn, way)
+
+    def moves(at: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
+        pose = poses(at)
+        about = rotation.about_axis("z", torch.from_numpy(np.interp(at, times, yaw)))
+        point = torch.tensor(item.handles[turn.handle].point, dtype=torch.float64)
+        R = about @ pose.R
+        return Rigid(R, pose @ point - (R @ point[:, None])[..., 0])
+
+    grip = drawn_grip(item.handles[turn.handle], moves, touch, release, rng, plan.style.briskness)
+    plan.grip(turn.side, replace(grip, reach_s=touch - start))
+    plan.gaze_point.move(start, start, item.handle(turn.handle, np.array(turn.start)))
+    plan.gaze_weight.move(start, start + 0.45, 0.8)
+    plan.gaze_weight.move(begin + 0.5 * turn.seconds, begin + 0.5 * turn.seconds + 0.6, 0.0)
+    body = lambda at: np.stack([np.interp(at, times, column) for column in way.T], 1)  # noqa: E731
+    shuffle(plan, rng, body, begin - 0.1, stop)
+    house.moves.append((begin, stop, item.name, poses))
+    house.record(touch, release, (turn.side,), item.name)
+    house.values[item.name] = turn.stop
+    plan.time = max(plan.time, release)
+
+
+def _hand_yaw(plan: Plan, turn: Turn, way: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time"]:
+    """How far the hand turns on the handle (rad), so that the fingers point where the arm does."""
+    values = turn.values(np.linspace(0.0, 1.0, len(way)))
+    handle, pose = turn.item.handle(turn.handle, values), turn.item.pose(values)
+    fingers = (pose.R.numpy() @ np.array(turn.item.handles[turn.handle].fingers))[:, :2]
+    across = np.stack([-np.sin(way[:, 2]), np.cos(way[:, 2])], 1)
+    arm = handle[:, :2] - way[:, :2] - 0.18 * LEFT_SIGN[turn.side] * across
+    angle = np.arctan2(fingers[:, 0] * arm[:, 1] - fingers[:, 1] * arm[:, 0], (fingers * arm).sum(1))
+    return YAW_MOST * np.tanh(np.unwrap(angle) / YAW_MOST)
