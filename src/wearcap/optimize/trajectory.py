@@ -130,9 +130,10 @@ def bending_problem(
     if len(path) < 2:
         raise WearcapError(f"a path of {len(path)} frames cannot be bent", expected="at least two")
     for what, value in (
-        ("path", path), ("control times", control_times), ("control points", control_points), ("weights", weights),
+        ("path", path), ("control times", control_times[:, None]), ("control points", control_points),
+        ("weights", weights[:, None]),
     ):  # fmt: skip
-        bad = ~value.reshape(len(value), -1).isfinite().all(1)
+        bad = ~value.isfinite().all(1)
         if bad.any():
             raise WearcapError(f"{what}: entry {int(bad.nonzero()[0])} is not a number", expected="finite numbers",
                                fix="Leave out frames that were not localised.")  # fmt: skip
@@ -221,6 +222,7 @@ def bent_path(
 ) -> BentPath:
     """What a solver returns for its unknowns."""
     turn = turn[problem.leader]
+    turn = torch.cat([wrapped(turn[:1]), wrapped(turn.diff())]).cumsum(0)
     heading = wrapped(headings(problem.path) + turn)
     return BentPath(bent(problem, turn, shift), turn, heading, history, reason)
 

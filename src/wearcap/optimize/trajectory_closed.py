@@ -23,9 +23,9 @@ from wearcap.optimize.trajectory import (
 def bend_closed(problem: BendingProblem, tolerance_m: float = 1e-6, rounds: int = 20) -> BentPath:
     """Least ∫ (dα̂/dτ − dα/dτ)² dτ among all paths through the control points; weights and rigidity do not matter.
 
-    The first round is the closed form for small turns; further ones linearise anew until points are met within
-    `tolerance_m`. Needs `held_headings`, a fixed start and the norm "square". Raises WearcapError where these are
-    not given, or where steps of these lengths cannot reach the points.
+    The first round is the closed form for small turns; further ones linearise anew until the points are met and the
+    path stays, both within `tolerance_m`. Needs `held_headings`, a fixed start and the norm "square". Raises WearcapError where these are
+    not given, or where turns would not be small.
     """
     settings = problem.settings
     if not settings.held_headings or settings.free_start or settings.norm != "square":
@@ -35,23 +35,22 @@ def bend_closed(problem: BendingProblem, tolerance_m: float = 1e-6, rounds: int 
     stiffness = _stiffness(problem, leaders)
     turn, shift = torch.zeros(len(problem.leader), dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     history, reason = [_entry(problem, turn)], ""
+    path = problem.path
     for _ in range(rounds):
-        forms = _point_forms(problem, bent(problem, turn, shift))[:, leaders]
-        missing = -control_offset(bent(problem, turn, shift), problem).flatten().numpy()
+        forms = _point_forms(problem, path)[:, leaders]
         soft = solveh_banded(stiffness, forms.T)
-        wanted = missing + forms @ turn[leaders].numpy()
+        wanted = forms @ turn[leaders].numpy() - control_offset(path, problem).flatten().numpy()
         pulls = np.linalg.lstsq(forms @ soft, wanted, rcond=1e-10)[0]
         turn[leaders] = torch.from_numpy(soft @ pulls)
-        turn = turn[problem.leader]
+        turn, before = turn[problem.leader], path
+        path = bent(problem, turn, shift)
         history.append(_entry(problem, turn))
-        if control_offset(bent(problem, turn, shift), problem).norm(dim=1).amax() < tolerance_m:
+        if max((path - before).abs().max(), control_offset(path, problem).abs().max()) < tolerance_m:
             reason = "points met"
             break
     if not reason:
-        raise WearcapError(
-            "steps of these lengths do not reach the control points",
-            expected="points nearer to the path, or a longer way to them",
-        )
+        raise WearcapError("the control points ask for large turns, or lie out of reach of steps of these lengths",
+                           expected="points near the path, beside it", fix="Take the solver bend_banded.")  # fmt: skip
     return bent_path(problem, turn, shift, history, reason)
 
 
