@@ -15,9 +15,9 @@ from hps_sessions import SessionSettings
 from joblib import Parallel, delayed
 from rich.console import Console
 from rich.table import Table
+from tabling import cell, finite, new_table, summarize
 
 from wearcap.files import write_text
-from wearcap.metrics.table import Summary
 from wearcap.pipelines.hps_evaluation import in_order
 from wearcap.simulation.hps import HpsConfig
 from wearcap.simulation.hps_session import Protocol
@@ -84,7 +84,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     draw_drift(folder / "drift.png", {row: [run["scores"][row]["drift"] for run in runs] for row in ROWS})
     tree["seeds"] = runs
     path = options.output / "hps.json"
-    write_text(path, json.dumps(_finite(tree), indent=1, allow_nan=False) + "\n")
+    write_text(path, json.dumps(finite(tree), indent=1, allow_nan=False) + "\n")
     return path
 
 
@@ -99,17 +99,17 @@ def summarized(runs: list[dict[str, Any]]) -> dict[str, Any]:
         "feet_true_contact": _over_seeds(runs, rows, "feet_true_contact"),
         "whole": _over_seeds(runs, rows, "joints"),
         "slope_cm_per_100m": {
-            row: _summary([run["scores"][row]["drift"]["slope_cm_per_100m"] for run in runs]) for row in ROWS
+            row: summarize([run["scores"][row]["drift"]["slope_cm_per_100m"] for run in runs]) for row in ROWS
         },
-        "standing_slope_cm_per_100m": {row: _summary([_standing_slope(run, row) for run in runs]) for row in ROWS},
+        "standing_slope_cm_per_100m": {row: summarize([_standing_slope(run, row) for run in runs]) for row in ROWS},
         "order_beyond_start": {
             best: {name: [_ordered(run, name, best) for run in runs] for name in TITLES} for best in ("HPS", "ours")
         },
         "outages": {row: _outages(runs, row) for row in DISTURBED},
         "stage_seconds": {row: {
-            stage: _summary([run["stage_seconds"][row][stage] for run in runs]) for stage in runs[0]["stage_seconds"][row]
+            stage: summarize([run["stage_seconds"][row][stage] for run in runs]) for stage in runs[0]["stage_seconds"][row]
         } for row in ROWS},
-        "frames": _summary([float(run["frames"]) for run in runs]),
+        "frames": summarize([float(run["frames"]) for run in runs]),
     }  # fmt: skip
 
 
@@ -123,7 +123,7 @@ def _chamfer(runs: list[dict[str, Any]], rows: tuple[str, ...], form: str, key: 
     """Summaries by kind of visit, row and place."""
     return {
         name: {
-            row: [_summary(list(values)) for values in zip(*(_of_visits(run, row, name, form, key) for run in runs))]
+            row: [summarize(list(values)) for values in zip(*(_of_visits(run, row, name, form, key) for run in runs))]
             for row in rows
         }
         for name in TITLES
@@ -147,7 +147,7 @@ def _ordered(run: dict[str, Any], name: str, best: str) -> bool:
 
 def _over_seeds(runs: list[dict[str, Any]], rows: tuple[str, ...], part: str) -> dict[str, Any]:
     return {
-        row: {name: _summary([run["scores"][row][part][name] for run in runs]) for name in runs[0]["scores"][row][part]}
+        row: {name: summarize([run["scores"][row][part][name] for run in runs]) for name in runs[0]["scores"][row][part]}
         for row in rows
     }  # fmt: skip
 
@@ -155,48 +155,24 @@ def _over_seeds(runs: list[dict[str, Any]], rows: tuple[str, ...], part: str) ->
 def _outages(runs: list[dict[str, Any]], row: str) -> dict[str, Any]:
     parts = [run["outages"]["rows"][row] for run in runs]
     return {
-        where: {name: _summary([part[where][name] for part in parts]) for name in parts[0][where]}
+        where: {name: summarize([part[where][name] for part in parts]) for name in parts[0][where]}
         for where in parts[0] if all(where in part for part in parts)
     }  # fmt: skip
 
 
-def _summary(values: list[float]) -> dict[str, float | int | None]:
-    """Mean and sample deviation over seeds, as JSON; NaN is left out."""
-    known = [value for value in values if math.isfinite(value)]
-    if not known:
-        return {"mean": math.nan, "std": None, "seeds": 0}
-    mean = sum(known) / len(known)
-    spread = math.sqrt(sum((v - mean) ** 2 for v in known) / (len(known) - 1)) if len(known) > 1 else None
-    return {"mean": mean, "std": spread, "seeds": len(known)}
-
-
-def _cell(summary: dict[str, Any], digits: int = 2) -> str:
-    """Mean ± deviation."""
-    parts = Summary(summary["mean"], summary["std"], summary["seeds"])
-    spread = "" if parts.std is None else f" ± {parts.std:.{digits}f}"
-    return f"{parts.mean:.{digits}f}{spread}"
-
-
-def _table(title: str, columns: list[str]) -> Table:
-    table = Table(title=title)
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="right" if number else "left", no_wrap=True)
-    return table
-
-
 def _chamfer_table(name: str, places: list[str], entries: dict[str, Any]) -> Table:
     title = f"{TITLES[name]}: bidirectional Chamfer (cm), in brackets the document's"
-    table = _table(title, ["", *places])
+    table = new_table(title, ["", *places])
     for row, summaries in entries.items():
         known = DOCUMENT[name].get(row, ())
         beside = [f"  [{value:.2f}]" for value in known] if len(known) == len(summaries) else []
         beside += [""] * (len(summaries) - len(beside))
-        table.add_row(row, *(_cell(summary) + value for summary, value in zip(summaries, beside)))
+        table.add_row(row, *(cell(summary) + value for summary, value in zip(summaries, beside)))
     return table
 
 
 def _feet_table(tree: dict[str, Any]) -> Table:
-    table = _table(
+    table = new_table(
         "Table 4.3: feet in contact (cm; sliding per frame), in brackets the document's",
         ["", "to surface, signed", "absolute", "sliding", "absolute, true contact", "sliding, true contact"],
     )
@@ -204,53 +180,53 @@ def _feet_table(tree: dict[str, Any]) -> Table:
         known, true = DOCUMENT_FEET.get(row), tree["feet_true_contact"][row]
         beside = [f"  [{value:g}]" for value in known] if known else ["", ""]
         table.add_row(
-            row, _cell(feet["distance_cm"], 3) + beside[0], _cell(feet["absolute_distance_cm"], 3),
-            _cell(feet["sliding_cm"], 3) + beside[1], _cell(true["absolute_distance_cm"], 3), _cell(true["sliding_cm"], 3),
+            row, cell(feet["distance_cm"], 3) + beside[0], cell(feet["absolute_distance_cm"], 3),
+            cell(feet["sliding_cm"], 3) + beside[1], cell(true["absolute_distance_cm"], 3), cell(true["sliding_cm"], 3),
         )  # fmt: skip
     return table
 
 
 def _drift_table(tree: dict[str, Any]) -> Table:
-    table = _table(
+    table = new_table(
         "Growth with distance (cm per 100 m)", ["", "root error, bins of 20 m", "standing Chamfer"]
     )
     for row in ROWS:
         table.add_row(
             row,
-            _cell(tree["slope_cm_per_100m"][row], 3),
-            _cell(tree["standing_slope_cm_per_100m"][row], 3),
+            cell(tree["slope_cm_per_100m"][row], 3),
+            cell(tree["standing_slope_cm_per_100m"][row], 3),
         )
     return table
 
 
 def _whole_table(tree: dict[str, Any]) -> Table:
     columns = ["mpjpe_cm", "root_cm", "p95_cm", "jitter_m_s3", "jitter_ratio", "foot_skate_cm_s"]
-    table = _table("Whole recording, joints in the world", ["", *columns])
+    table = new_table("Whole recording, joints in the world", ["", *columns])
     for row, scores in tree["whole"].items():
-        table.add_row(row, *(_cell(scores[column]) for column in columns))
+        table.add_row(row, *(cell(scores[column]) for column in columns))
     return table
 
 
 def _outage_table(tree: dict[str, Any]) -> Table:
-    table = _table(
+    table = new_table(
         "Outages of localisation, planted in mid-walk: error (cm) and its ratio to that of the same frames without",
         ["", "frames", "root", "ratio", "joints", "ratio"],
     )
     for row, parts in tree["outages"].items():
         for where, scores in parts.items():
-            table.add_row(row, where, *(_cell(scores[name]) for name in ("root_cm", "root_ratio", "joint_cm", "joint_ratio")))  # fmt: skip
+            table.add_row(row, where, *(cell(scores[name]) for name in ("root_cm", "root_ratio", "joint_cm", "joint_ratio")))  # fmt: skip
     return table
 
 
 def _seconds_table(tree: dict[str, Any]) -> Table:
     stages = list(dict.fromkeys(stage for row in ROWS for stage in tree["stage_seconds"][row]))
-    table = _table(
+    table = new_table(
         f"Seconds per stage, of {tree['frames']['mean']:.0f} frames on average", ["", *stages, "frames/s"]
     )
     for row, seconds in tree["stage_seconds"].items():
         total = sum(summary["mean"] for summary in seconds.values())
         table.add_row(
-            row, *(_cell(seconds[stage], 1) if stage in seconds else "" for stage in stages),
+            row, *(cell(seconds[stage], 1) if stage in seconds else "" for stage in stages),
             f"{tree['frames']['mean'] / max(total, 1e-9):.0f}",
         )  # fmt: skip
     return table
@@ -262,12 +238,3 @@ def _order_line(order: dict[str, dict[str, list[bool]]]) -> str:
         for best, kinds in order.items() for name, held in kinds.items()
     ]  # fmt: skip
     return "Order beyond the start (mean over visits):\n  " + "\n  ".join(parts)
-
-
-def _finite(tree: Any) -> Any:
-    """What is not finite becomes null."""
-    if isinstance(tree, dict):
-        return {key: _finite(value) for key, value in tree.items()}
-    if isinstance(tree, list | tuple):
-        return [_finite(value) for value in tree]
-    return None if isinstance(tree, float) and not math.isfinite(tree) else tree

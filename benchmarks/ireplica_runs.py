@@ -1,0 +1,242 @@
+"""One recording of interactions, captured by every row of iReplica's tables and scored; and with worse sensors."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hydra.utils import instantiate
+from torch import Tensor
+
+from wearcap.body.kinematics import local_rotations
+from wearcap.cli.conf import compose
+from wearcap.data.prepare.clean import resampled
+from wearcap.geometry import rotation
+from wearcap.io.environment import read_environment
+from wearcap.pipelines.contact_intervals import ContactSettings
+from wearcap.pipelines.contact_prediction import ContactPredictor
+from wearcap.pipelines.ireplica import IReplica
+from wearcap.pipelines.ireplica_baselines import (
+    held_when_near,
+    interpolated_objects,
+    nearness,
+    static_objects,
+)
+from wearcap.pipelines.ireplica_evaluation import score_interactions
+from wearcap.pipelines.object_tracker import ObjectTracker
+from wearcap.pipelines.stages import Source
+from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.recording.interactions import Interactions
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import CONTACT_CLASSES
+from wearcap.sensors.noise import smooth_noise
+
+GAPS_S = (0.0, 0.25, 0.5, 1.0, 2.0)
+"""Of the document's Table 5.4."""
+
+
+@dataclass(frozen=True)
+class Networks:
+    """Checkpoints of contact networks."""
+
+    ours: tuple[Path, ...]
+    published: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class RecordingRun:
+    """What one recording is run with; picklable."""
+
+    dataset: Path
+    name: str
+    networks: Networks
+    robustness: bool
+
+
+@dataclass(frozen=True)
+class Case:
+    """A recording with what is measured against."""
+
+    recording: Recording
+    environment: Environment
+    source: Source
+
+    @classmethod
+    def load(cls, dataset: Path, name: str) -> "Case":
+        store = RecordingStore.open(dataset)
+        recording = store.load(name)
+        assert recording.environment is not None
+        assert recording.scene is not None
+        environment = read_environment(store.root / recording.environment)
+        return cls(recording, environment, Source(recording, store.root, store.root / recording.scene))
+
+
+def pipeline_of(name: str, checkpoints: tuple[Path, ...]) -> IReplica:
+    """A pipeline config of the command line around contact networks."""
+    config = compose("capture", [f"pipeline={name}", "checkpoint=null", "recording=null"]).pipeline
+    config.hps.solver.jobs = 1
+    return instantiate(config, _convert_="all")(predictor=ContactPredictor.load(*checkpoints))
+
+
+def run_recording(run: RecordingRun) -> dict[str, Any]:
+    """Every row's scores of one recording, ready for JSON."""
+    torch.set_num_threads(1)
+    case = Case.load(run.dataset, run.name)
+    ours = pipeline_of("ireplica", run.networks.ours)
+    published = pipeline_of("ireplica_document", run.networks.published)
+    motion = ours.registered(case.source)
+    contacts = {"ours": _contacts(ours, case), "published": _contacts(published, case)}
+    rows = {name: capture(motion) for name, capture in _rows(case, ours, published, contacts).items()}
+    found = {
+        "recording": run.name, "subject": case.recording.subject, "location": case.recording.location,
+        "rows": {name: scored(captured, case) for name, captured in rows.items()},
+        "gaps": {str(gap): scored(_with_gap(ours.tracker, gap)(motion, contacts["ours"], case.environment), case)
+                 for gap in GAPS_S},
+        "detection": {
+            **{name: detection(value, case.recording) for name, value in contacts.items()},
+            "nearest object by distance": detection(
+                {"timestamps": motion.timestamps, **nearness(motion, {}, case.environment)}, case.recording),
+        },
+    }  # fmt: skip
+    if run.robustness:
+        found["robustness"] = {name: _worse(ours, case, change) for name, change in DISTURBANCES.items()}
+    return found
+
+
+def _rows(
+    case: Case, ours: IReplica, published: IReplica, contacts: dict[str, dict[str, Tensor]]
+) -> dict[str, Callable[[Motion], Motion]]:
+    """Name of a row → what captures it from HPS' motion."""
+    environment, held, true = case.environment, case.recording.interactions, case.recording.object_motion
+    assert held is not None
+    track = lambda tracker, which: lambda motion: tracker(motion, contacts[which], environment)  # noqa: E731
+    changed = lambda **how: replace(ours.tracker, attachment=replace(ours.tracker.attachment, **how))  # noqa: E731
+    oracle = true_contacts(held, contacts["ours"]["timestamps"])
+    correction = ours.tracker.correction
+    return {
+        "HPS": lambda motion: static_objects(motion, environment),
+        "HPS w/ GT": lambda motion: interpolated_objects(motion, environment, held, true),
+        "nearest object by distance": lambda motion: held_when_near(ours.tracker, motion, environment),
+        "as published": track(published.tracker, "published"),
+        "as published, w/o contact corr.": track(replace(published.tracker, correction=None), "published"),
+        "ours": track(ours.tracker, "ours"),
+        "ours, w/o contact corr.": track(replace(ours.tracker, correction=None), "ours"),
+        "ours, the document's correction": track(replace(ours.tracker, correction=published.tracker.correction), "ours"),
+        "ours, no fit about hinges": track(replace(ours.tracker, correction=replace(correction, hinge=None)), "ours"),  # pyright: ignore[reportArgumentType, reportCallIssue]
+        "ours, published networks": track(ours.tracker, "published"),
+        "ours, right hand carries": track(changed(anchor="right"), "ours"),
+        "ours, no gaps filled": track(_with_gap(ours.tracker, 0.0), "ours"),
+        "ours, classes in parallel": track(changed(one_class=False), "ours"),
+        "ours, true contacts": lambda motion: ours.tracker(motion, oracle, environment),
+    }  # fmt: skip
+
+
+def _with_gap(tracker: ObjectTracker, gap_s: float) -> ObjectTracker:
+    return replace(tracker, contact=ContactSettings(tracker.contact.threshold, gap_s))
+
+
+def _contacts(pipeline: IReplica, case: Case) -> dict[str, Tensor]:
+    assert case.recording.suit is not None
+    return pipeline.contacts(case.recording.suit)
+
+
+def true_contacts(held: Interactions, timestamps: Tensor) -> dict[str, Tensor]:
+    """The truth in place of a network."""
+    return {"timestamps": timestamps} | {
+        name: held.hand_contact(timestamps, name).float() for name in CONTACT_CLASSES
+    }
+
+
+def detection(contacts: dict[str, Tensor], recording: Recording) -> dict[str, dict[str, list[float]]]:
+    """Probabilities and truth per class, thinned to 20 Hz and in short numbers: pooled over recordings later."""
+    held = recording.interactions
+    assert held is not None
+    every = max(1, round(1 / (20 * contacts["timestamps"].diff().median().item())))
+    times = contacts["timestamps"][::every].contiguous()
+    return {
+        name: {"prob": [round(p, 4) for p in contacts[name][::every].flatten().tolist()],
+               "true": held.hand_contact(times, name).flatten().int().tolist()}
+        for name in CONTACT_CLASSES
+    }  # fmt: skip
+
+
+def scored(motion: Motion, case: Case) -> dict[str, Any]:
+    return asdict(score_interactions(motion, case.recording, case.environment))
+
+
+def _worse(ours: IReplica, case: Case, change: Callable[[Recording], Recording]) -> dict[str, Any]:
+    """Scores with sensors that are worse: HPS and contacts are run again."""
+    recording = change(case.recording)
+    worse = replace(case, source=replace(case.source, recording=recording))
+    assert recording.suit is not None
+    contacts = ours.contacts(recording.suit)
+    captured = ours.interact(ours.registered(worse.source), contacts, case.environment)
+    return scored(captured, case) | {"detection": detection(contacts, case.recording)}
+
+
+def poses_off(degrees: float) -> Callable[[Recording], Recording]:
+    """Every segment's orientation in the world off by so much more (rms), slowly varying as a suit's errors do."""
+
+    def change(recording: Recording) -> Recording:
+        suit, rng = recording.suit, np.random.default_rng(7)
+        assert suit is not None
+        shape = (len(suit), len(suit.skeleton) * 3)
+        error = np.deg2rad(degrees) / np.sqrt(3) * smooth_noise(rng, *shape, 6.0, suit.fps)
+        turn = rotation.exp(error.unflatten(-1, (len(suit.skeleton), 3)).float())
+        R = local_rotations(suit.skeleton, suit.T_world_joint.R @ turn)
+        return replace(recording, suit=replace(suit, R_parent_joint=R))
+
+    return change
+
+
+def places_off(metres: float) -> Callable[[Recording], Recording]:
+    """Every localised camera off by so much more (rms), changing over seconds."""
+
+    def change(recording: Recording) -> Recording:
+        found, rng = recording.localization, np.random.default_rng(8)
+        assert found is not None
+        fps = 1 / found.timestamps.diff().median().item()
+        error = metres / np.sqrt(3) * smooth_noise(rng, len(found.timestamps), 3, 4.0, fps).float()
+        return replace(recording, localization=replace(found, t_world_cam=found.t_world_cam + error))
+
+    return change
+
+
+def frames_lost(share: float) -> Callable[[Recording], Recording]:
+    """The suit's frames missing at random, but for the first and the last."""
+
+    def change(recording: Recording) -> Recording:
+        suit = recording.suit
+        assert suit is not None
+        kept = torch.rand(len(suit), generator=torch.Generator().manual_seed(9)) >= share
+        kept[[0, -1]] = True
+        contact = None if suit.contact_prob is None else suit.contact_prob[kept]
+        return replace(recording, suit=replace(
+            suit, timestamps=suit.timestamps[kept], R_parent_joint=suit.R_parent_joint[kept],
+            t_world_root=suit.t_world_root[kept], contact_prob=contact,
+        ))  # fmt: skip
+
+    return change
+
+
+def at_rate(fps: float) -> Callable[[Recording], Recording]:
+    def change(recording: Recording) -> Recording:
+        assert recording.suit is not None
+        return replace(recording, suit=resampled(recording.suit, fps))
+
+    return change
+
+
+DISTURBANCES: dict[str, Callable[[Recording], Recording]] = {
+    "as simulated": lambda recording: recording,
+    "poses off by 2° more": poses_off(2.0),
+    "poses off by 5° more": poses_off(5.0),
+    "localisation off by 2 cm more": places_off(0.02),
+    "localisation off by 5 cm more": places_off(0.05),
+    "10 % of the suit's frames lost": frames_lost(0.1),
+    "20 % of the suit's frames lost": frames_lost(0.2),
+    "suit at 50 Hz": at_rate(50.0),
+    "suit at 30 Hz": at_rate(30.0),
+}

@@ -1,0 +1,264 @@
+"""iReplica on simulated recordings of held-out people and objects: Tables 5.1 to 5.5 of its document, and robustness.
+
+HPS with noisy localisation registers the wearer; every row below captures the same motion. Recordings of the split are
+dealt out to `--seeds` groups: means are over groups, ± their deviation. Without checkpoints, the networks are those in
+checkpoints/.
+"""
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from ireplica_runs import DISTURBANCES, GAPS_S, Networks, RecordingRun, run_recording
+from joblib import Parallel, delayed
+from rich.console import Console
+from rich.table import Table
+from tabling import cell, finite, new_table, summarize
+
+from wearcap.errors import WearcapError
+from wearcap.files import write_text
+from wearcap.metrics.detection import mean_detection_scores
+from wearcap.recording import RecordingStore
+from wearcap.scene.objects import CONTACT_CLASSES
+
+DOCUMENT_END = {
+    "HPS": (60.81, 46.89),
+    "as published": (6.88, 7.13),
+    "as published, w/o contact corr.": (11.68, 10.28),
+}
+"""Thesis Table 5.1, column All: cm and degrees."""
+DOCUMENT_HAND = {
+    "HPS": 33.61,
+    "HPS w/ GT": 10.44,
+    "as published": 2.93,
+    "as published, w/o contact corr.": 11.37,
+}
+"""Thesis Table 5.2, column All (cm)."""
+DOCUMENT_DETECTION = (0.807, 0.786, 0.880, 0.905)
+"""Thesis Table 5.3: AP, precision, recall, accuracy at 0.5."""
+DOCUMENT_GAPS = (13.61, 8.49, 7.13, 8.86, 8.86)
+"""Thesis Table 5.4 (cm)."""
+DOCUMENT_CHAMFER = {"HPS": (9.771, 22.651), "as published": (8.981, 8.471)}
+"""Thesis Table 5.5: body and object (cm)."""
+KINDS = {
+    "door": ("door", "window", "cabinet_door"), "drawer": ("drawer",), "sofa": ("sofa", "armchair"),
+    "table": ("table", "coffee_table"), "chair": ("chair",), "box": ("box",),
+}  # fmt: skip
+"""Columns of the tables, and the categories that they gather."""
+NETWORKS = Path("checkpoints")
+WIDTH = 170
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--dataset", type=Path, default=Path("datasets/simulated_interactions"),
+                        help="made by `wearcap prepare simulated_interactions preset=standard`")  # fmt: skip
+    parser.add_argument("--split", default="test", help="whose people and objects: train, val or test")
+    parser.add_argument("--seeds", type=int, default=5, help="groups of recordings (2 when quick)")
+    parser.add_argument("--ours", type=Path, nargs="+", default=[NETWORKS / "contact_sequence.ckpt"],
+                        help="checkpoint(s) of our contact network")  # fmt: skip
+    parser.add_argument("--published", type=Path, nargs="+",
+                        default=[NETWORKS / f"contact_transformer_{name}.ckpt" for name in CONTACT_CLASSES],
+                        help="checkpoints of the published networks, one per class")  # fmt: skip
+    parser.add_argument("--no-robustness", action="store_true", help="leave out the runs with worse sensors")
+    parser.add_argument("--jobs", type=int, default=2, help="recordings at a time")
+
+
+def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
+    """Print and write the tables; returns the file."""
+    if not (options.dataset / "manifest.json").is_file():
+        raise WearcapError("no such data set", where=options.dataset,
+                           fix=f"Run: wearcap prepare simulated_interactions preset=standard output={options.dataset}")  # fmt: skip
+    names = RecordingStore.open(options.dataset).names(options.split)
+    seeds = min(2 if options.quick else options.seeds, len(names))
+    names = names[:seeds] if options.quick else names
+    networks = Networks(tuple(options.ours), tuple(options.published))
+    # worse sensors once per group: HPS is run again for each
+    runs = [
+        RecordingRun(
+            options.dataset, name, networks, index < seeds and not (options.no_robustness or options.quick)
+        )
+        for index, name in enumerate(names)
+    ]
+    found = Parallel(n_jobs=options.jobs)(delayed(_told)(run) for run in runs)
+    groups: list[list[Any]] = [list(found[k::seeds]) for k in range(seeds)]
+    tree = {"about": about | {"dataset": str(options.dataset), "split": options.split, "recordings": names}} | _tree(groups)  # fmt: skip
+    _show(tree)
+    path = options.output / "ireplica.json"
+    write_text(path, json.dumps(finite(tree), indent=1, allow_nan=False) + "\n")
+    return path
+
+
+def _told(run: RecordingRun) -> dict[str, Any]:
+    found = run_recording(run)
+    rows = found["rows"]["ours"]["handlings"]
+    ends = sum(row["end_cm"] for row in rows) / max(len(rows), 1)
+    print(f"{run.name}: {len(rows)} handlings, ours ends {ends:.1f} cm off", file=sys.stderr, flush=True)
+    return found
+
+
+def _tree(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
+    """All figures, over groups."""
+    first = groups[0][0]
+    gaps = {str(gap): [[run["gaps"][str(gap)] for run in group] for group in groups] for gap in GAPS_S}
+    disturbed = [[run["robustness"] for run in group if "robustness" in run] for group in groups]
+    return {
+        "handlings": sum(len(run["rows"]["ours"]["handlings"]) for group in groups for run in group),
+        "rows": {row: _row([[run["rows"][row] for run in group] for group in groups]) for row in first["rows"]},
+        "gaps": {gap: _measure(parts, "end_cm", None) for gap, parts in gaps.items()},
+        "detection": {
+            name: _detection([[run["detection"][name] for run in group] for group in groups])
+            for name in first["detection"]
+        },
+        "robustness": {
+            name: _row([[run[name] for run in group] for group in disturbed])
+            | _detection([[run[name]["detection"] for run in group] for group in disturbed])
+            for name in DISTURBANCES
+        } if any(disturbed) else {},
+    }  # fmt: skip
+
+
+def _row(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
+    """One row's measures: over all handlings, by kind of object, and of whole recordings."""
+    kinds = {
+        kind: {name: _measure(groups, name, categories) for name in ("end_cm", "end_deg", "hand_object_cm")}
+        for kind, categories in KINDS.items()
+    }
+    whole = ("mpjpe_cm", "body_chamfer_cm", "object_chamfer_cm", "false_moves_cm")
+    measures = ("end_cm", "end_deg", "hand_object_cm", "hand_cm", "object_cm", "object_deg", "moved_cm")
+    return {
+        "all": {name: _measure(groups, name, None) for name in measures},
+        "median": {name: _measure(groups, name, None, middle=True) for name in ("end_cm", "end_deg")},
+        "kinds": kinds,
+        "whole": {
+            name: summarize([_mean([run[name] for run in group]) for group in groups]) for name in whole
+        },
+    }
+
+
+def _measure(
+    groups: list[list[dict[str, Any]]], name: str, categories: tuple[str, ...] | None, middle: bool = False
+) -> dict[str, Any]:
+    """Mean (or median) over the handlings of each group, summarised over groups."""
+    values = [
+        [
+            row[name]
+            for run in group
+            for row in run["handlings"]
+            if categories is None or row["category"] in categories
+        ]
+        for group in groups
+    ]
+    return summarize([_median(group) if middle else _mean(group) for group in values])
+
+
+def _mean(values: list[float]) -> float:
+    known = [value for value in values if math.isfinite(value)]
+    return sum(known) / len(known) if known else math.nan
+
+
+def _median(values: list[float]) -> float:
+    return float(torch.tensor(values).median()) if values else math.nan
+
+
+def _detection(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
+    """Scores over each group's frames, mean over hands and classes, and per class (thesis Table 5.3)."""
+    by_class: dict[str, list[tuple[float, ...]]] = {name: [] for name in CONTACT_CLASSES}
+    for group in groups:
+        for name in CONTACT_CLASSES:
+            prob = torch.tensor([p for run in group for p in run[name]["prob"]]).unflatten(0, (-1, 2))
+            true = torch.tensor([t for run in group for t in run[name]["true"]]).unflatten(0, (-1, 2))
+            by_class[name].append(tuple(mean_detection_scores(prob, true > 0)))
+    columns = ("average_precision", "precision", "recall", "accuracy", "calibration_error")
+    both = [[_mean([a, b]) for a, b in zip(*rows)] for rows in zip(*by_class.values())]
+    return {
+        "detection": {name: summarize([row[k] for row in both]) for k, name in enumerate(columns)},
+        "by_class": {
+            kind: {name: summarize([row[k] for row in rows]) for k, name in enumerate(columns)}
+            for kind, rows in by_class.items()
+        },
+    }
+
+
+def _show(tree: dict[str, Any]) -> None:
+    console = Console()
+    if not console.is_terminal or console.width < WIDTH:
+        console = Console(width=WIDTH)
+    parts = (_ends(tree), _hands(tree), _detections(tree), _gaps(tree), _chamfer(tree))
+    for part in (*parts, *([_robustness(tree)] if tree["robustness"] else [])):
+        console.print(part)
+    console.print(f"{tree['handlings']} handlings in {len(tree['about']['recordings'])} recordings")
+
+
+def _ends(tree: dict[str, Any]) -> Table:
+    shown = new_table("Table 5.1: objects where they were left, cm / degrees; in brackets the document's, on its recordings",
+                      ["", *KINDS, "all", "median"])  # fmt: skip
+    for row, found in tree["rows"].items():
+        known = DOCUMENT_END.get(row)
+        beside = f"  [{known[0]:.1f} / {known[1]:.1f}]" if known else ""
+        cells = [_two(found["kinds"][kind]) for kind in KINDS]
+        shown.add_row(row, *cells, _two(found["all"], spread=True) + beside, _two(found["median"]))
+    return shown
+
+
+def _two(found: dict[str, Any], spread: bool = False) -> str:
+    parts = (found["end_cm"], found["end_deg"])
+    return " / ".join(cell(part if spread else part | {"std": None}, 1) for part in parts)
+
+
+def _hands(tree: dict[str, Any]) -> Table:
+    columns = {"hand_object_cm": "hand to object", "hand_cm": "hand, to its true place", "object_cm": "object, to its true place",
+               "object_deg": "degrees"}  # fmt: skip
+    shown = new_table("Table 5.2: during true contact (cm); in brackets the document's", ["", *columns.values(), "body (MPJPE)", "untouched moved"])  # fmt: skip
+    for row, found in tree["rows"].items():
+        known = DOCUMENT_HAND.get(row)
+        cells = [cell(found["all"][name], 1) for name in columns]
+        cells[0] += f"  [{known:.1f}]" if known else ""
+        shown.add_row(
+            row, *cells, cell(found["whole"]["mpjpe_cm"], 1), cell(found["whole"]["false_moves_cm"], 1)
+        )
+    return shown
+
+
+def _detections(tree: dict[str, Any]) -> Table:
+    columns = ("average_precision", "precision", "recall", "accuracy", "calibration_error")
+    shown = new_table(
+        "Table 5.3: contact, mean over hands and classes; per class in the rows below", ["", *columns]
+    )
+    for name, found in tree["detection"].items():
+        shown.add_row(name, *(cell(found["detection"][column], 3) for column in columns))
+        for kind, scores in found["by_class"].items():
+            shown.add_row(f"  {kind}", *(cell(scores[column], 3) for column in columns))
+    shown.add_row("the document's, on H-contact", *(f"{value:.3f}" for value in DOCUMENT_DETECTION), "")
+    return shown
+
+
+def _gaps(tree: dict[str, Any]) -> Table:
+    shown = new_table("Table 5.4: gaps filled (s) and where objects end (cm)", ["", *tree["gaps"]])
+    shown.add_row("ours", *(cell(found, 1) for found in tree["gaps"].values()))
+    shown.add_row("the document's", *(f"{value:.2f}" for value in DOCUMENT_GAPS))
+    return shown
+
+
+def _chamfer(tree: dict[str, Any]) -> Table:
+    shown = new_table("Table 5.5: Chamfer to the true surfaces during interactions (cm); in brackets the document's",
+                      ["", "body", "object"])  # fmt: skip
+    for row, found in tree["rows"].items():
+        known = DOCUMENT_CHAMFER.get(row)
+        beside = [f"  [{value:.1f}]" for value in known] if known else ["", ""]
+        names = ("body_chamfer_cm", "object_chamfer_cm")
+        shown.add_row(row, *(cell(found["whole"][name], 1) + value for name, value in zip(names, beside)))
+    return shown
+
+
+def _robustness(tree: dict[str, Any]) -> Table:
+    shown = new_table("Worse sensors: ours, one recording per group", ["", "AP", "end cm / degrees", "hand cm", "object cm"])  # fmt: skip
+    for name, found in tree["robustness"].items():
+        shown.add_row(
+            name, cell(found["detection"]["average_precision"], 3), _two(found["all"], spread=True),
+            cell(found["all"]["hand_cm"], 1), cell(found["all"]["object_cm"], 1),
+        )  # fmt: skip
+    return shown

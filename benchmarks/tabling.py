@@ -1,0 +1,41 @@
+"""What tables of several systems share: summaries over seeds, their cells, JSON without NaN."""
+
+import math
+from typing import Any
+
+from rich.table import Table
+
+from wearcap.metrics.table import Summary
+
+
+def summarize(values: list[float]) -> dict[str, float | int | None]:
+    """Mean and sample deviation over seeds, as JSON; NaN is left out."""
+    known = [value for value in values if math.isfinite(value)]
+    if not known:
+        return {"mean": math.nan, "std": None, "seeds": 0}
+    mean = sum(known) / len(known)
+    spread = math.sqrt(sum((v - mean) ** 2 for v in known) / (len(known) - 1)) if len(known) > 1 else None
+    return {"mean": mean, "std": spread, "seeds": len(known)}
+
+
+def cell(summary: dict[str, Any], digits: int = 2) -> str:
+    """Mean ± deviation."""
+    parts = Summary(summary["mean"], summary["std"], summary["seeds"])
+    spread = "" if parts.std is None else f" ± {parts.std:.{digits}f}"
+    return f"{parts.mean:.{digits}f}{spread}"
+
+
+def new_table(title: str, columns: list[str]) -> Table:
+    table = Table(title=title)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="right" if number else "left", no_wrap=True)
+    return table
+
+
+def finite(tree: Any) -> Any:
+    """What is not finite becomes null."""
+    if isinstance(tree, dict):
+        return {key: finite(value) for key, value in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [finite(value) for value in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
