@@ -73,10 +73,10 @@ class Case:
         return cls(recording, environment, Source(recording, store.root, store.root / recording.scene))
 
 
-def pipeline_of(name: str, checkpoints: tuple[Path, ...]) -> IReplica:
+def pipeline_of(name: str, checkpoints: tuple[Path, ...], jobs: int = 1) -> IReplica:
     """A pipeline config of the command line around contact networks."""
     config = compose("capture", [f"pipeline={name}", "checkpoint=null", "recording=null"]).pipeline
-    config.hps.solver.jobs = 1
+    config.hps.solver.jobs = jobs
     return instantiate(config, _convert_="all")(predictor=ContactPredictor.load(*checkpoints))
 
 
