@@ -14,7 +14,8 @@ from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.recording.serialize import flatten, unflatten
 from wearcap.sensors.claps import detect_claps
 from wearcap.sensors.slam import R_DEVICE_CAM
-from wearcap.simulation.hps import HEAD_CAMERA_TRUTH, HpsConfig, simulate_hps, view_texture
+from wearcap.simulation.head_camera import HEAD_CAMERA_TRUTH, view_texture
+from wearcap.simulation.hps import HpsConfig, simulate_hps
 from wearcap.simulation.hps_session import Protocol
 from wearcap.simulation.localization_noise import LocalizationNoise, localize_statistically, with_outage
 from wearcap.simulation.site import build_site

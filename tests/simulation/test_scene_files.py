@@ -18,8 +18,8 @@ from wearcap.recording.recording import CameraStream
 from wearcap.sensors.claps import camera_claps
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.changes import MOVABLE, changed_world
+from wearcap.simulation.head_camera import HEAD_CAMERA
 from wearcap.simulation.head_video import Filming, film, write_head_video
-from wearcap.simulation.hps import HEAD_CAMERA
 from wearcap.simulation.scene_files import SceneSettings, plan_photos, write_scene
 from wearcap.simulation.site import build_site
 from wearcap.simulation.views import Scenery, render_view, view_depth

@@ -14,8 +14,9 @@ from wearcap.io.scene_folder import CLOUD
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS
 from wearcap.simulation.changes import changed_world
+from wearcap.simulation.head_camera import HEAD_CAMERA_TRUTH
 from wearcap.simulation.head_video import Filming, write_head_video
-from wearcap.simulation.hps import HEAD_CAMERA_TRUTH, HpsConfig, Simulated, simulate_hps
+from wearcap.simulation.hps import HpsConfig, Simulated, simulate_hps
 from wearcap.simulation.hps_session import Protocol
 from wearcap.simulation.scene_files import SceneSettings, write_scene
 from wearcap.simulation.views import Scenery
