@@ -114,7 +114,7 @@ def bend_contacts(
     path: Float[Tensor, "time 2"],
     *,
     bend: Callable[..., BentPath],
-    transition_s: float = 1.5,
+    transition_s: float = 3.0,
 ) -> Float64[Tensor, "time 2"]:
     """The document's correction as an offset (m): for each contact the path is bent to its first frame's target.
 
