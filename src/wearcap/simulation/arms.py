@@ -56,9 +56,9 @@ def arm_motion(
     goal_weight = torch.from_numpy(hand.goal_weight.sample(times))
 
     R_swing, bend = _swing(plan, sign, trunk, running, times, fps, rng)
-    held, held_weight = held_wrist(plan, side, chest, times)
-    aim = goal + (held_weight > 0)[:, None] * (held - goal)
-    girdle = shoulder_girdle(plan, side, trunk, chest, aim, torch.maximum(goal_weight[:, 0], held_weight))
+    held = held_wrist(plan, side, chest, times)
+    aim = goal + (held.weight > 0)[:, None] * (held.wrist - goal)
+    girdle = shoulder_girdle(plan, side, trunk, chest, aim, torch.maximum(goal_weight[:, 0], held.weight))
     at_shoulder = girdle.at_shoulder
 
     R_upper = R_world_chest @ R_swing
@@ -144,25 +144,36 @@ def shoulder_girdle(
     return Girdle(R_collar, at_collar + R_collar @ shoulder)
 
 
-def held_wrist(
-    plan: Plan, side: str, chest: Rigid, times: Float[np.ndarray, "time"]
-) -> tuple[Float[Tensor, "time 3"], Float[Tensor, "time"]]:
-    """About where a side's grips want the wrist (m), and how much (0…1); the chest's place where they do not."""
+@dataclass(frozen=True)
+class Wanted:
+    """Where a side's grips want the wrist."""
+
+    wrist: Float[Tensor, "time 3"]
+    """About there in the world (m); the chest's place where nothing is held."""
+    weight: Float[Tensor, "time"]
+    """How much (0…1)."""
+    near: Float[Tensor, "time"]
+    """The same, but rising `AROUND_S` earlier and falling as much later."""
+
+
+def held_wrist(plan: Plan, side: str, chest: Rigid, times: Float[np.ndarray, "time"]) -> Wanted:
+    """Where a side's grips want the wrist, the hand turned as they would best have it."""
     bones = arm_bones(plan.skeleton, side)
-    wrist, free = torch.zeros_like(chest.t), torch.ones(len(times), dtype=torch.float64)
-    total = torch.full_like(free, 1e-12)
+    wrist, free = torch.zeros_like(chest.t), torch.ones(2, len(times), dtype=torch.float64)
+    total = torch.full_like(free[0], 1e-12)
     for grip in plan.grips[side]:
         part = slice(*np.searchsorted(times, (grip.start_s - AROUND_S, grip.stop_s + AROUND_S)).tolist())
         hold = grip.hold(np.clip(times[part], grip.start_s, grip.stop_s), chest[part])
         hand = hold.hand(bones.sign, torch.zeros(len(hold.palm), dtype=torch.float64))
-        weight = torch.from_numpy(grip.weight(times[part]))
-        near = replace(grip, reach_s=grip.reach_s + AROUND_S, return_s=grip.return_s + AROUND_S)
-        share = weight + TRACE * torch.from_numpy(near.weight(times[part]))
+        longer = replace(grip, reach_s=grip.reach_s + AROUND_S, return_s=grip.return_s + AROUND_S)
+        weights = torch.from_numpy(np.stack([each.weight(times[part]) for each in (grip, longer)]))
+        share = weights[0] + TRACE * weights[1]
         wrist[part] += share[:, None] * (hold.palm - hand @ bones.palm)
         total[part] += share
-        free[part] *= 1.0 - weight
+        free[:, part] *= 1.0 - weights
     none = (total < 1e-9)[:, None]
-    return torch.where(none, chest.t, wrist / total[:, None]), 1.0 - free
+    weight, near = 1.0 - free
+    return Wanted(torch.where(none, chest.t, wrist / total[:, None]), weight, near)
 
 
 def _gripped(

@@ -8,12 +8,14 @@ from wearcap.simulation.arms import arm_bones, held_wrist, shoulder_girdle
 from wearcap.simulation.gait import FootMotion
 from wearcap.simulation.plan import SIDES, Plan
 from wearcap.simulation.posture import HELP, Spine, Stance, Trunk, spine_motion, trunk_motion
-from wearcap.simulation.track import lower_envelope
+from wearcap.simulation.track import blur, ease, lower_envelope
 
 REACH = 0.955
 """From this share of the arm's length on the trunk helps."""
-EASY = np.array([0.30, 0.10, 0.22, 0.14, 0.09, 0.06])
+EASY = np.array([0.36, 0.10, 0.24, 0.04, 0.09, 0.06])
 """How readily each of `HELP` is used (rad, m)."""
+LOW_EASY, LOW_M, LOW_BY_M = 0.13, 0.78, 0.40
+"""Knees bend more readily (m) for goals that are lower above the floor than the first by up to the second (m)."""
 MOST = np.array([0.9, 0.3, 0.6, 0.45, 0.30, 0.20])
 ENVELOPE_S = 0.22
 ROUNDS, EAGER = 7, 1.25
@@ -35,17 +37,33 @@ def reach_help(
         return None
     wanted = help_ = np.zeros((len(times), len(HELP)))
     crouch = plan.crouch.sample(times)[:, 0]
+    easy = np.tile(EASY, (len(times), 1))
+    easy[:, 3] += LOW_EASY * _low(plan, feet, stance, times, fps)
     for _ in range(ROUNDS):
         trunk = trunk_motion(plan, feet, stance, times, fps, help_)
         spine = spine_motion(plan.skeleton, trunk)
         lacks, ways = zip(*(_lack(plan, side, spine, trunk, times, fps) for side in SIDES))
         if max(float(lack.max()) for lack in lacks) < 1e-4:
             break
-        step = _shared(np.stack(lacks, 1), np.stack(ways, 1))
+        step = _shared(np.stack(lacks, 1), np.stack(ways, 1), easy)
         step[:, 3] = np.maximum(step[:, 3], -crouch - wanted[:, 3])
         wanted = wanted + EAGER * step
         help_ = MOST * np.tanh(wanted / MOST)
     return help_
+
+
+def _low(
+    plan: Plan, feet: dict[str, FootMotion], stance: Stance, times: np.ndarray, fps: float
+) -> Float[np.ndarray, "time"]:
+    """How much the hands' goals are low ones, smooth."""
+    spine = spine_motion(plan.skeleton, trunk_motion(plan, feet, stance, times, fps))
+    floor = np.minimum(*(feet[side].ground[:, 2] for side in SIDES))
+    low = np.zeros(len(times))
+    for side in SIDES:
+        held = held_wrist(plan, side, spine.chest, times)
+        below = ease((LOW_M - (held.wrist[:, 2].numpy() - floor)) / LOW_BY_M)
+        low = np.maximum(low, below * held.near.numpy())
+    return blur(low, ENVELOPE_S, fps)
 
 
 def _lack(
@@ -53,13 +71,16 @@ def _lack(
 ) -> tuple[Float[np.ndarray, "time"], Float[np.ndarray, "time 6"]]:
     """How far a hand's goal is out of reach (m), and by how much each way to help brings the shoulder nearer."""
     bones = arm_bones(plan.skeleton, side)
-    wrist, weight = held_wrist(plan, side, spine.chest, times)
-    girdle = shoulder_girdle(plan, side, trunk, spine.chest, wrist, weight)
-    offset = wrist - girdle.at_shoulder
+    held = held_wrist(plan, side, spine.chest, times)
+    girdle = shoulder_girdle(plan, side, trunk, spine.chest, held.wrist, held.weight)
+    offset = held.wrist - girdle.at_shoulder
     distance = offset.norm(dim=-1)
-    lack = ((distance - REACH * bones.length).clamp(min=0) * weight).numpy()
+    lack = ((distance - REACH * bones.length).clamp(min=0) * held.weight).numpy()
     toward = (offset / distance[:, None].clamp(min=1e-6)).numpy()
-    return -lower_envelope(-lack, ENVELOPE_S, fps), _gains(plan, spine, trunk, girdle.at_shoulder, toward)
+    lack = -lower_envelope(-lack, ENVELOPE_S, fps)
+    # a hand that lacks nothing should weigh little on what the other one asks
+    counts = held.near.numpy() * (0.12 + 0.88 * ease(lack / 0.06))
+    return counts * lack, counts[:, None] * _gains(plan, spine, trunk, girdle.at_shoulder, toward)
 
 
 def _gains(
@@ -83,9 +104,11 @@ def _gains(
 
 
 def _shared(
-    lack: Float[np.ndarray, "time hand"], gain: Float[np.ndarray, "time hand 6"]
+    lack: Float[np.ndarray, "time hand"],
+    gain: Float[np.ndarray, "time hand 6"],
+    easy: Float[np.ndarray, "time 6"],
 ) -> Float[np.ndarray, "time 6"]:
     """The least effort that brings both hands within reach: W² Gᵀ (G W² Gᵀ + ε)⁻¹ lack."""
-    weighed = gain * EASY**2
+    weighed = gain * easy[:, None] ** 2
     normal = weighed @ gain.transpose(0, 2, 1) + 4e-4 * np.eye(2)
     return (weighed * np.linalg.solve(normal, lack[..., None])).sum(1)

@@ -14,6 +14,9 @@ from wearcap.simulation import furniture
 from wearcap.simulation.builder import Part, Piece, hue, piece_mesh
 from wearcap.simulation.grips import GripPlace, Vector
 
+SKIN_M = 0.008
+"""A palm's site lies so far inside the hand: it keeps off what the hand touches."""
+
 
 @dataclass(frozen=True)
 class Rail:
@@ -42,7 +45,7 @@ class Rail:
         normal, fingers = (
             np.cos(tilt) * normal - np.sin(tilt) * fingers, np.cos(tilt) * fingers + np.sin(tilt) * normal,
         )  # fmt: skip
-        return GripPlace(_vector(point), _vector(normal), _vector(fingers))
+        return GripPlace(_vector(point + SKIN_M * normal), _vector(normal), _vector(fingers))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,15 +91,15 @@ def _sofa(name: str, rng: np.random.Generator) -> Thing:
     """Held at the upper edge of its back from behind, or of an arm from that side."""
     piece = furniture.armchair(rng) if rng.random() < 0.3 else furniture.sofa(rng)
     half_depth, half_width = piece.size[0] / 2, piece.size[1] / 2
-    back = Rail((-half_depth + 0.035, half_width - 0.1, 0.85), (-half_depth + 0.035, 0.1 - half_width, 0.85),
-                (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 0.0, 0.035)  # fmt: skip
+    back = Rail((-half_depth + 0.012, half_width - 0.1, 0.85), (-half_depth + 0.012, 0.1 - half_width, 0.85),
+                (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 0.0, 0.012)  # fmt: skip
     rails = [back]
     for sign in (1.0, -1.0):
-        y = sign * (half_width - 0.045)
+        y = sign * (half_width - 0.015)
         back_end, front_end = (-half_depth + 0.3, y, 0.62), (half_depth - 0.06, y, 0.62)
         # who looks at the right arm (sign < 0) has the sofa's back on the left
         start, stop = (back_end, front_end) if sign < 0 else (front_end, back_end)
-        rails.append(Rail(start, stop, (0.0, 0.0, 1.0), (0.0, -sign, 0.0), -sign * np.pi / 2, 0.045))
+        rails.append(Rail(start, stop, (0.0, 0.0, 1.0), (0.0, -sign, 0.0), -sign * np.pi / 2, 0.015))
     return _sliding(name, "sofa", piece, rails)
 
 
@@ -113,11 +116,11 @@ def _table(name: str, rng: np.random.Generator) -> Thing:
         ahead, left = np.array([np.cos(facing), np.sin(facing)]), np.array([-np.sin(facing), np.cos(facing)])
         deep = abs(ahead @ np.array([half_depth, half_width]))
         wide = abs(left @ np.array([half_depth, half_width])) - 0.08
-        edge = -(deep - 0.045) * ahead
+        edge = -(deep - 0.012) * ahead
         ends = (np.append(edge + way * wide * left, top) for way in (1.0, -1.0))
         start, stop = (_vector(end) for end in ends)
         rails.append(
-            Rail(start, stop, (0.0, 0.0, 1.0), (float(ahead[0]), float(ahead[1]), 0.0), facing, 0.045)
+            Rail(start, stop, (0.0, 0.0, 1.0), (float(ahead[0]), float(ahead[1]), 0.0), facing, 0.012)
         )
     return _sliding(name, "table", bare, rails)
 
@@ -159,7 +162,7 @@ def _box(name: str, rng: np.random.Generator) -> Thing:
         )
         fingers = _vector((ahead - 0.35 * np.array(up)) / np.hypot(1.0, 0.35))
         hands = (
-            GripPlace(_vector(way * half * left + [0.0, 0.0, level]), _vector(way * left), fingers)
+            GripPlace(_vector(way * (half + SKIN_M) * left + [0.0, 0.0, level]), _vector(way * left), fingers)
             for way in (1.0, -1.0)
         )
         sides.append((*hands, facing))

@@ -1,0 +1,312 @@
+"""Pushing and pulling sofas, tables and chairs over the floor, with one hand, both, or one after the other."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from wearcap.geometry.rigid import Rigid
+from wearcap.simulation.gait import glide
+from wearcap.simulation.gaze import turn_head
+from wearcap.simulation.grips import Grip, GripPlace, Moves, drawn_grip
+from wearcap.simulation.handling import Handling, handling_of
+from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan, wrap
+from wearcap.simulation.shuffling import shuffle, step_to
+from wearcap.simulation.things import Rail, Thing, floor_pose
+from wearcap.simulation.track import ease
+
+SPEEDS = {"sofa": (0.12, 0.26), "table": (0.13, 0.32), "chair": (0.18, 0.42)}
+"""Mean speed of what is moved (m/s); the greatest is about 1.5 times that."""
+EFFORT = {"sofa": 1.0, "table": 0.6, "chair": 0.2}
+"""How heavy it is, for the body's lean."""
+TURN_LEVER_M = 0.7
+"""A turn of one radian takes as long as so much way (m)."""
+TURN_FREE = np.deg2rad(4.0)
+"""Turned by more, a thing needs both hands."""
+PUSH, PULL = np.deg2rad(62.0), np.deg2rad(118.0)
+"""Ways within the first against the holder's heading are pushed, beyond the second pulled, between them sideways."""
+
+
+@dataclass(frozen=True)
+class Slide:
+    """How somebody will move a thing, decided but not yet on the plan."""
+
+    thing: Thing
+    start: Float[np.ndarray, "3"]
+    """Where it stands: x, y (m), heading (rad)."""
+    stop: Float[np.ndarray, "3"]
+    """Where it will stand, the heading unwrapped."""
+    bow: float
+    """Sideways deviation of its way from the straight line (m)."""
+    rail: Rail
+    places: dict[str, GripPlace]
+    """By hand."""
+    hands: tuple[tuple[str, ...], ...]
+    """Sets of hands, one after the other."""
+    local: Float[np.ndarray, "3"]
+    """The body in the thing's axes: x, y, heading."""
+    seconds: float
+    pause_s: float
+    """Rest in the middle of the way, hands on; 0 for none."""
+    way_angle: float
+    """Of the way against the body's heading, -π … π."""
+
+    def thing_at(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
+        """The thing's x, y and heading when a share of the way is done."""
+        change = self.stop - self.start
+        across = np.array([-change[1], change[0], 0.0])
+        across /= max(float(np.linalg.norm(across)), 1e-9)
+        return (
+            self.start + share[:, None] * change + self.bow * (np.sin(np.pi * share) ** 2)[:, None] * across
+        )
+
+    def body_at(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
+        """The wearer's x, y and heading then."""
+        x, y, heading = self.thing_at(share).T
+        cos, sin = np.cos(heading), np.sin(heading)
+        return np.stack(
+            [x + cos * self.local[0] - sin * self.local[1], y + sin * self.local[0] + cos * self.local[1],
+             heading + self.local[2]], 1,
+        )  # fmt: skip
+
+    @property
+    def stand(self) -> Float[np.ndarray, "3"]:
+        """Where the wearer goes first: x, y, heading."""
+        return self.body_at(np.zeros(1))[0]
+
+    def share(self, since: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time"]:
+        """Share of the way after so many seconds, with the pause."""
+        if self.pause_s == 0.0:
+            return glide(np.clip(since / self.seconds, 0.0, 1.0), (0.4, 0.4))
+        half = self.seconds / 2
+        first, second = since / half, (since - half - self.pause_s) / half
+        return 0.5 * (ease(first) + ease(second))
+
+    @property
+    def duration_s(self) -> float:
+        return self.seconds + self.pause_s
+
+
+def slide_options(
+    plan: Plan,
+    thing: Thing,
+    start: Float[np.ndarray, "3"],
+    stop: Float[np.ndarray, "3"],
+    rng: np.random.Generator,
+) -> Iterator[Slide]:
+    """Ways for this wearer to bring a sliding thing from one place to another (x, y in m, heading in rad).
+
+    They come in a random order that prefers pushing and pulling to moving sideways. Who takes one makes sure that
+    its `thing_at` and `body_at` are free, goes to its `stand` and calls `slide`.
+    """
+    start = np.asarray(start, np.float64)
+    stop = np.append(np.asarray(stop, np.float64)[:2], start[2] + wrap(stop[2] - start[2]))
+    turns = abs(stop[2] - start[2]) > TURN_FREE
+    if not turns:
+        stop[2] = start[2]
+    way = stop[:2] - start[:2]
+    found = []
+    for rail in thing.rails:
+        angle = (
+            wrap(float(np.arctan2(way[1], way[0])) - start[2] - rail.facing) if np.hypot(*way) > 0.05 else 0.0
+        )
+        for both in (True, False):
+            if (both and not rail.both_hands) or (turns and not both):
+                continue
+            aside = PUSH < abs(angle) < PULL
+            if aside and thing.category == "sofa":
+                continue
+            weight = (0.25 if aside else 1.0) * (
+                1.0 if both else {"chair": 1.5, "table": 0.5}.get(thing.category, 0.25)
+            )
+            found.append((rng.exponential(1.0) / weight, rail, both, angle))
+    for _, rail, both, angle in sorted(found, key=lambda option: option[0]):
+        yield _drawn(plan, thing, start, stop, rail, both, angle, rng)
+
+
+def _drawn(
+    plan: Plan, thing: Thing, start: np.ndarray, stop: np.ndarray, rail: Rail, both: bool, angle: float,
+    rng: np.random.Generator,
+) -> Slide:  # fmt: skip
+    """Draw what is left open: hands and their places, tempo, pause, distance."""
+    change = stop - start
+    length, turned = float(np.linalg.norm(change[:2])), abs(change[2])
+    low, high = SPEEDS[thing.category]
+    speed = float(rng.uniform(low, high)) * plan.style.briskness**0.5
+    seconds = max((length + TURN_LEVER_M * turned) / speed, 1.2)
+    pause = float(rng.uniform(0.5, 1.6)) if seconds > 3.0 and rng.random() < 0.25 else 0.0
+    hands = _hand_sets(both, turned > 0, seconds, rng)
+    used = sorted({side for group in hands for side in group})
+    wide = 2.0 * float(
+        plan.skeleton.t_parent_joint[plan.skeleton.indices("left_collar", "left_shoulder"), 1].sum()
+    )
+    apart = min(wide * rng.uniform(0.75, 1.5), rail.length) if len(used) > 1 else 0.0
+    reach = max(rail.length - apart, 0.0) / 2
+    middle = rail.length / 2 + float(np.clip(rng.normal(0.0, 0.4), -1, 1)) * min(reach, 0.5)
+    if turned > 0.5:  # the lever is longer near an end
+        middle = rail.length / 2 + float(rng.choice([-1.0, 1.0])) * reach * rng.uniform(0.0, 0.8)
+    tilt = float(rng.uniform(0.0, 0.18))
+    places, offsets = {}, {}
+    for side in used:
+        offsets[side] = -LEFT_SIGN[side] * apart / 2 + 0.03 * rng.standard_normal() * (rail.length > 0.1)
+        along = float(np.clip(middle + offsets[side], 0.0, rail.length))
+        places[side] = rail.at(along, tilt + float(rng.normal(0.0, 0.05)))
+    return Slide(
+        thing, start, stop, float(np.clip(rng.normal(0.0, 0.05), -0.1, 0.1)) * length if turned == 0 else 0.0, rail,
+        places, hands, _body(plan, rail, places, speed, angle, EFFORT[thing.category], rng), seconds, pause, angle,
+    )  # fmt: skip
+
+
+def _hand_sets(
+    both: bool, turns: bool, seconds: float, rng: np.random.Generator
+) -> tuple[tuple[str, ...], ...]:
+    """Which hands hold, one set after the other; only both may turn a thing."""
+    if turns:
+        return (SIDES,)
+    first = SIDES[int(rng.random() < 0.6)]
+    other = SIDES[1 - SIDES.index(first)]
+    if seconds < 3.5 or rng.random() > (0.3 if both else 0.25):
+        return (SIDES,) if both else ((first,),)
+    if not both:
+        return ((first,), (other,))
+    return [((first,), SIDES), (SIDES, (first,)), ((first,), SIDES, (other,))][int(rng.integers(3))]
+
+
+def _body(
+    plan: Plan, rail: Rail, places: dict[str, GripPlace], speed: float, angle: float, rng: np.random.Generator
+) -> Float[np.ndarray, "3"]:
+    """Where the feet's middle is in the thing's axes: toes clear of the thing, hands before their shoulders."""
+    point = np.mean([place.point for place in places.values()], 0)
+    ahead = np.array([np.cos(rail.facing), np.sin(rail.facing)])
+    left = np.array([-ahead[1], ahead[0]])
+    heavy = 0.15 * effort if abs(angle) < PUSH else 0.05 * effort
+    distance = plan.sole[1] + 0.05 + 0.55 * speed + heavy + float(rng.uniform(0.0, 0.07))
+    aside = 0.0
+    if len(places) == 1:
+        aside = -LEFT_SIGN[next(iter(places))] * float(rng.uniform(0.10, 0.24))
+    turned = 0.06 * rng.standard_normal()
+    if PUSH < abs(angle) < PULL:
+        turned += 0.25 * np.sign(angle)
+    place = point[:2] - (rail.stand_off + distance) * ahead + aside * left
+    return np.append(place, rail.facing + turned)
+
+
+def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 0.0) -> Handling:
+    """Take hold of a thing, move it and let go; the wearer stands at or near `choice.stand`.
+
+    Writes footsteps, lean, grips and gaze; `plan.time` becomes the end. The thing rests at `choice.stop` then.
+    """
+    if (
+        np.hypot(*(choice.stand[:2] - plan.position[:2])) > 0.03
+        or abs(wrap(choice.stand[2] - plan.heading)) > 0.1
+    ):
+        step_to(plan, rng, choice.stand[:2], choice.stand[2])
+    touch = plan.time + float(np.clip(rng.normal(0.8, 0.15) / plan.style.briskness, 0.5, 1.3))
+    begin = touch + float(rng.uniform(0.25, 0.8))
+    end = begin + choice.duration_s
+
+    def moves(times: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
+        return floor_pose(choice.thing_at(choice.share(times - begin)), floor_z)
+
+    release = end + float(rng.uniform(0.1, 0.7))
+    grips = _grips(plan, choice, moves, (touch, begin, end, release), rng)
+    for side, grip in grips:
+        plan.grip(side, grip)
+    _lean(plan, choice, plan.time, begin, end, release, rng)
+    _look(plan, choice, touch, begin, end, floor_z, rng)
+    heading = plan.heading
+    base = float(choice.body_at(np.zeros(1))[0, 2])
+    unwrap = heading + wrap(base - heading) - base
+
+    def body(times: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
+        return choice.body_at(choice.share(times - begin)) + np.array([0.0, 0.0, unwrap])
+
+    shuffle(plan, rng, body, begin, end)
+    plan.time = max(plan.time, release + 0.5 * max(grip.return_s for _, grip in grips))
+    return handling_of(choice.thing.name, "sliding", moves, grips)
+
+
+def _grips(
+    plan: Plan, choice: Slide, moves: Moves, when: tuple[float, float, float, float], rng: np.random.Generator
+) -> list[tuple[str, Grip]]:
+    """A grip per hand, from the first to the last set that it belongs to; sets change while the thing moves."""
+    touch, begin, end, release = when
+    count = len(choice.hands)
+    cuts = begin + (end - begin) * (np.arange(1, count) + 0.25 * rng.uniform(-1, 1, count - 1)) / count
+    grips = []
+    for side in choice.places:
+        member = [k for k, group in enumerate(choice.hands) if side in group]
+        first, last = member[0], member[-1]
+        # who comes takes hold a little before the other lets go
+        start = touch + _stagger(rng) if first == 0 else cuts[first - 1] - float(rng.uniform(0.1, 0.4))
+        stop = release + _stagger(rng) if last == count - 1 else cuts[last]
+        grips.append((side, drawn_grip(choice.places[side], moves, start, stop, rng, plan.style.briskness)))
+    return grips
+
+
+def _stagger(rng: np.random.Generator) -> float:
+    """Hands come and go together, or one after the other (s)."""
+    return float(rng.uniform(0.05, 0.25)) if rng.random() < 0.5 else 0.0
+
+
+def _lean(
+    plan: Plan,
+    choice: Slide,
+    start: float,
+    begin: float,
+    end: float,
+    release: float,
+    rng: np.random.Generator,
+) -> None:
+    """Into a push, back in a pull; a little already when taking hold."""
+    effort = EFFORT[choice.thing.category]
+    pushes, pulls = abs(choice.way_angle) < PUSH, abs(choice.way_angle) > PULL
+    ready = float(np.clip(rng.normal(0.22, 0.06), 0.08, 0.4))
+    lean, shift, crouch = ready, 0.0, 0.0
+    if pushes:
+        lean = float(np.clip(rng.normal(0.22 + 0.34 * effort, 0.08), 0.12, 0.75))
+        shift, crouch = 0.15 * effort * rng.uniform(0.6, 1.2), 0.06 * effort * rng.uniform(0.0, 1.0)
+    elif pulls:
+        lean = float(np.clip(rng.normal(0.20 - 0.05 * effort, 0.08), 0.0, 0.4))
+        shift, crouch = -0.10 * effort * rng.uniform(0.5, 1.2), 0.07 * effort * rng.uniform(0.3, 1.2)
+    twist = 0.0
+    if len(choice.places) == 1:
+        twist = -LEFT_SIGN[next(iter(choice.places))] * float(rng.uniform(0.02, 0.18))
+    plan.lean.move(start, begin - 0.1, (ready, 0.0, 0.5 * twist))
+    plan.lean.move(begin - 0.2, begin + 0.7, (lean, 0.0, twist))
+    plan.crouch.move(begin - 0.2, begin + 0.7, crouch)
+    plan.shift.move(begin - 0.2, begin + 0.6, (shift, 0.0))
+    plan.shift.move(end - 0.6, end + 0.1, (0.0, 0.0))
+    plan.crouch.move(end - 0.3, release + 0.4, 0.0)
+    plan.lean.move(end - 0.3, release + 0.7, (0.0, 0.0, 0.0))
+
+
+def _look(
+    plan: Plan,
+    choice: Slide,
+    touch: float,
+    begin: float,
+    end: float,
+    floor_z: float,
+    rng: np.random.Generator,
+) -> None:
+    """At the place of the grip, then about where the way leads."""
+    local = torch.tensor(next(iter(choice.places.values())).point, dtype=torch.float64)
+    pose = floor_pose(choice.start, floor_z)
+    point = (pose.R @ local + pose.t).numpy()
+    plan.gaze_point.move(touch - 0.6, touch - 0.6, point)
+    plan.gaze_weight.move(touch - 0.6, touch - 0.2, 0.85)
+    plan.gaze_weight.move(begin + 0.1, begin + 0.8, 0.0)
+    time, back = begin + 0.6, abs(choice.way_angle) > PULL
+    while time < end - 0.8:
+        side = (
+            float(rng.choice([-1.0, 1.0])) * rng.uniform(0.7, 1.1)
+            if back and rng.random() < 0.4
+            else rng.normal(0, 0.2)
+        )
+        time = (
+            turn_head(plan, time, (side, float(rng.normal(0.35, 0.12)))) + float(rng.exponential(1.2)) + 0.3
+        )
+    turn_head(plan, max(time, end), (0.0, plan.style.head_pitch))
