@@ -20,17 +20,22 @@ from websockets.sync.client import connect
 T = TypeVar("T")
 SHIFT, CONTROL = 8, 2
 """Modifiers of clicks and keys, to be added up."""
-_CODES = {"Enter": 13, "Tab": 9, "Escape": 27, "Backspace": 8, "Delete": 46, "End": 35, "Home": 36,
+_CODES = {"Enter": 13, "Tab": 9, "Escape": 27, "Backspace": 8, "Delete": 46, "End": 35, "Home": 36, "PageUp": 33, "PageDown": 34,
           "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, " ": 32}  # fmt: skip
 
 
 @contextmanager
-def chromium(folder: Path, url: str, size: tuple[int, int] = (1100, 700)) -> Iterator["Chromium"]:
-    """A browser on a page, closed at the end; `folder` keeps its profile. Skips the test where none is installed."""
+def chromium(
+    folder: Path, url: str, size: tuple[int, int] = (1100, 700), webgl: bool = True
+) -> Iterator["Chromium"]:
+    """A browser on a page, closed at the end; `folder` keeps its profile. Skips the test where none is installed.
+
+    Pages that need no WebGL are drawn many times faster without: a processor that plays graphics card is slow.
+    """
     binary = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if binary is None:
         pytest.skip("no Chromium found: apt-get install chromium")
-    browser = Chromium(binary, folder, url, size)
+    browser = Chromium(binary, folder, url, size, webgl)
     try:
         yield browser
     finally:
@@ -40,9 +45,12 @@ def chromium(folder: Path, url: str, size: tuple[int, int] = (1100, 700)) -> Ite
 class Chromium:
     """One browser window, spoken to over its debugging socket. Positions are pixels from the upper left."""
 
-    def __init__(self, binary: str, folder: Path, url: str, size: tuple[int, int] = (1100, 700)):
+    def __init__(
+        self, binary: str, folder: Path, url: str, size: tuple[int, int] = (1100, 700), webgl: bool = True
+    ):
+        drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"] if webgl else ["--disable-gpu"]
         command = [
-            binary, "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+            binary, "--headless=new", "--no-sandbox", *drawing,
             "--hide-scrollbars", f"--window-size={size[0]},{size[1]}", f"--user-data-dir={folder}",
             "--remote-debugging-port=0", "--remote-allow-origins=*", "about:blank",
         ]  # fmt: skip

@@ -100,7 +100,7 @@ def _export(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
 
     from wearcap.files import write_text
-    from wearcap.io.contact_labels import hcontact_of
+    from wearcap.io.contact_labels import hcontact_text
     from wearcap.viewer.annotate import Desk
 
     desk = Desk.of(options.recording, options.output)
@@ -112,14 +112,11 @@ def _export(arguments: list[str]) -> None:
     for index in annotated:
         labels, _ = desk.file(index).read()
         target = Path(f"{desk.names[index]}.json")
-        target = (
-            (options.to / target if several or options.to.is_dir() else options.to) if options.to else target
-        )
+        if options.to:
+            target = options.to / target if several or options.to.is_dir() else options.to
         if target.resolve() == desk.path(desk.names[index]).resolve():
             raise WearcapError("the export would replace the labels it comes from", where=target)
-        write_text(
-            target, json.dumps({"contacts": hcontact_of(labels, desk.file(index).clock)}, indent=1) + "\n"
-        )
+        write_text(target, hcontact_text(labels, desk.file(index).clock))
         print(
             f"wrote {target}: {len(labels['left'])} contacts of the left hand, {len(labels['right'])} of the right"
         )

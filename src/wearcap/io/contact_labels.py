@@ -74,8 +74,12 @@ def read_contact_labels(path: str | Path, clock: LabelClock) -> Interactions:
 
 def write_contact_labels(path: str | Path, interactions: Interactions, clock: LabelClock) -> None:
     """Write H-contact's JSON (hands and times alone) atomically. Raises WearcapError for overlapping labels."""
-    labels = labels_of(interactions, clock)
-    write_text(path, json.dumps({"contacts": hcontact_of(labels, clock)}, indent=1) + "\n")
+    write_text(path, hcontact_text(labels_of(interactions, clock), clock))
+
+
+def hcontact_text(labels: Labels, clock: LabelClock) -> str:
+    """H-contact's JSON: hands and times alone."""
+    return json.dumps({"contacts": hcontact_of(labels, clock)}, indent=1) + "\n"
 
 
 def hcontact_of(labels: Labels, clock: LabelClock) -> dict[str, list[list[float]]]:

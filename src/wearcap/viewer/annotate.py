@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
 from wearcap.io.contact_labels import LabelClock
+from wearcap.io.environment import read_environment
 from wearcap.io.video import video_info
 from wearcap.recording.interactions import HANDS
 from wearcap.recording.locate import dataset_folder, load_recording
@@ -92,7 +93,7 @@ def take_of(
             notice = f"The video {path} is not there: give it with --video."
     return Take(
         clock, shown.timestamps.numpy(), points, _floor(recording, shown, points), names, bones,
-        _hands(shown, names), _objects(recording), video, notice,
+        _hands(shown, names), _objects(recording, folder), video, notice,
     )  # fmt: skip
 
 
@@ -141,10 +142,14 @@ def _floor(recording: Recording, motion: Motion, points: np.ndarray) -> Float32[
     return np.full(len(points), np.quantile(lowest, 0.05), np.float32)
 
 
-def _objects(recording: Recording) -> dict[str, str]:
+def _objects(recording: Recording, folder: Path) -> dict[str, str]:
+    """What can be touched: the environment's objects, and those that the recording speaks of."""
     objects = dict.fromkeys(recording.object_motion, "")
     if recording.interactions is not None:
         objects |= dict(zip(recording.interactions.objects, recording.interactions.classes))
+    if recording.environment:
+        environment = read_environment(folder / recording.environment)
+        objects |= {thing.name: thing.freedom.contact_class for thing in environment.objects}
     objects.pop("", None)
     return dict(sorted(objects.items()))
 

@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from wearcap.errors import WearcapError
-from wearcap.io.contact_labels import annotation_of, hcontact_of
+from wearcap.io.contact_labels import annotation_of, hcontact_text
 from wearcap.viewer.annotate import Desk
 from wearcap.viewer.annotation_file import Conflict
 
@@ -57,6 +57,8 @@ class AnnotationServer:
             self._thread.join(1.0)
 
     def stop(self) -> None:
+        """No further answers, on connections that are open either."""
+        self._server.stopped = True
         self._server.shutdown()
         self._server.server_close()
 
@@ -65,6 +67,7 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
     allow_reuse_address = os.name == "posix"
     desk: Desk
+    stopped = False
 
     def handle_error(self, request, client_address) -> None:
         """Browsers drop connections as they seek in a video; that is no news."""
@@ -90,6 +93,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, action) -> None:
         """Run an action; what a user can mend becomes {"error": …} with a fitting status."""
+        if self.server.stopped:
+            self.close_connection = True
+            return
         try:
             if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _LOCAL:
                 self._send_error(HTTPStatus.FORBIDDEN, "this page is for this machine alone")
@@ -126,7 +132,7 @@ class _Handler(BaseHTTPRequestHandler):
             return self._send(take.numbers(), "application/octet-stream")
         if part == "export":
             labels, _ = desk.file(index).read()
-            text = json.dumps({"contacts": hcontact_of(labels, take.clock)}, indent=1) + "\n"
+            text = hcontact_text(labels, take.clock)
             return self._send(text.encode(), "application/json", download=f"{take.clock.name}.json")
         if part == "video" and take.video is not None:
             return self._send_video(take.video.path)

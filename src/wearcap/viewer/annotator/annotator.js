@@ -268,7 +268,7 @@ class Annotator {
     released("class", target => this.describe({kind: target.value}));
     window.addEventListener("pagehide", () => this.saver && this.saver.leave());
     window.addEventListener("beforeunload", event => {
-      if (this.saver && this.saver.dirty) { this.saver.leave(); event.preventDefault(); }
+      if (this.saver && this.saver.failed) event.preventDefault(); // what only waits is sent on leaving
     });
   }
 

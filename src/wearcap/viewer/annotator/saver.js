@@ -12,7 +12,7 @@ export class Saver {
     const {name, frames, start_s, revision} = take.header;
     this.key = `wearcap annotate ${name} ${frames} ${start_s}`;
     this.base = revision;
-    this.dirty = this.busy = this.closed = false;
+    this.dirty = this.busy = this.closed = this.failed = false;
     this.version = 0;
     this.refused = null;
     this.recover(take.header.labels);
@@ -69,6 +69,7 @@ export class Saver {
         this.refuse(reply.status, answer.error);
       }
     } catch {
+      this.failed = true;
       this.show("failed", "not saved: the server does not answer, trying again");
       if (!this.closed) this.plan(RETRY_MS);
     }
@@ -77,13 +78,14 @@ export class Saver {
   }
 
   done() {
-    this.dirty = false;
+    this.dirty = this.failed = false;
     localStorage.removeItem(this.key);
     this.show("saved", "saved");
   }
 
   refuse(status, error) {
     this.refused = error;
+    this.failed = true;
     this.show("failed", "not saved");
     this.ask({kind: status === 409 ? "conflict" : "refused", error});
   }
