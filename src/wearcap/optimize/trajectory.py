@@ -27,7 +27,7 @@ STILL_M = 1e-6
 class Bending:
     """What eq. 5.2 leaves to choose. Raises WearcapError for a rigidity that is not positive or an unknown norm."""
 
-    rigidity: float = 100.0
+    rigidity: float = 10.0
     """λ: metres of the control term per unit of E_tr (rad²/s, or rad for "absolute")."""
     norm: str = "square"
     """Of the difference of heading rates, where eq. 5.1 prints none: ∫ (dα̂/dτ − dα/dτ)² dτ, or ∫ |…| dτ."""
