@@ -1,4 +1,7 @@
-"""`wearcap scene`: a scanned or photographed scene goes in; the map that cameras are localised in comes out."""
+"""`wearcap scene`: a scanned or photographed scene goes in; the map that cameras are localised in comes out.
+
+`wearcap scene edit` opens the page that makes an interactive environment of it.
+"""
 
 from collections.abc import Sequence
 
@@ -22,7 +25,7 @@ from wearcap.localization.visual_map import VisualMap
 from wearcap.recording.photo import Photo
 from wearcap.scene.scan import Scan
 
-HELP = "the visual map of a scene: wearcap scene scene=FOLDER output=map.safetensors"
+HELP = "the visual map of a scene: wearcap scene scene=FOLDER output=map.safetensors; its objects: wearcap scene edit FOLDER"
 
 
 def run(config: DictConfig) -> VisualMap:
@@ -93,4 +96,9 @@ def _check(localizer: Localizer, photos: Sequence[Photo]) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    hydra_main("scene", run, arguments)
+    if arguments[:1] == ["edit"]:
+        from wearcap.cli.scene_edit import main as edit
+
+        edit(arguments[1:])
+    else:
+        hydra_main("scene", run, arguments)

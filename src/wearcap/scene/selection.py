@@ -6,9 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 _SPREAD = 0.006
-"""Points no further from a ray than this share of their distance (half a degree or so) are under the pointer …"""
-_NEAR_M = 0.012
-"""… or no further than this, close by."""
+"""Points no further from a ray than this share of their distance (half a degree or so) are under the pointer."""
 _DEPTH_M = 0.06
 """Points behind the first one by no more than this lie on the same surface."""
 
@@ -61,17 +59,21 @@ class SlicedCloud:
 
 
 def first_hit(
-    points: Float[np.ndarray, "point 3"], origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+    points: Float[np.ndarray, "point 3"],
+    origin: Float[np.ndarray, "3"],
+    direction: Float[np.ndarray, "3"],
+    radius_m: float = 0.012,
 ) -> int | None:
     """Number of the point that a ray meets first (the nearest to the ray on that surface); None where it meets none.
 
-    `direction` need not be a unit vector.
+    Points are met as balls of a radius, or as what is under the pointer far away. `direction` need not be a unit
+    vector.
     """
     ray = direction / np.linalg.norm(direction)
     away = points - origin
     depth = away @ ray
     aside = np.sqrt(np.maximum((away**2).sum(1) - depth**2, 0.0))
-    under = np.flatnonzero((depth > 0.02) & (aside < np.maximum(_SPREAD * depth, _NEAR_M)))
+    under = np.flatnonzero((depth > 0.02) & (aside < np.maximum(_SPREAD * depth, radius_m)))
     if not len(under):
         return None
     front = under[depth[under] < depth[under].min() + _DEPTH_M]

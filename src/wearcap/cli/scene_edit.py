@@ -1,0 +1,54 @@
+"""`wearcap scene edit`: the page that cuts objects out of a scan and says how they move."""
+
+import argparse
+import logging
+from pathlib import Path
+
+from wearcap.errors import WearcapError
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(
+        prog="wearcap scene edit",
+        description="Make an interactive environment of a scan, in the browser: cut objects out, say how they "
+        "move, try it. It saves itself; opened again, it goes on.",
+    )
+    parser.add_argument("scene", help="the scene's folder with pointcloud.ply, or a .ply or .pcd file")
+    parser.add_argument(
+        "--environment", help="the file to make or to go on with (default: environment.json beside the scan)"
+    )
+    parser.add_argument(
+        "--metres-per-unit", type=float, help="of a scan in another unit (0.001 for millimetres)"
+    )
+    parser.add_argument(
+        "--port", type=int, default=8080, help="port of the page (default 8080, else the next free)"
+    )
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to serve on (default: this machine only)"
+    )
+    options = parser.parse_args(arguments)
+    if not 0 < options.port < 65536:
+        raise WearcapError(f"port {options.port}", expected="1 to 65535")
+
+    from wearcap.io.environment import FILE_NAME
+    from wearcap.io.scan import read_scan
+    from wearcap.io.scene_folder import cloud_file
+    from wearcap.viewer.object_editor import ObjectEditor
+
+    cloud = cloud_file(options.scene)
+    file = Path(options.environment) if options.environment else cloud.parent / FILE_NAME
+    if file.is_dir():
+        file /= FILE_NAME
+    if file.suffix != ".json":
+        raise WearcapError(
+            "an environment is a .json file", where=file, expected="environment.json or a folder"
+        )
+    # Browsers open connections in advance and drop them; the server's log of that is no news to a user.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    scan = read_scan(cloud, metres_per_unit=options.metres_per_unit)
+    page = ObjectEditor(scan, file, title=cloud.parent.resolve().name, host=options.host, port=options.port)
+    print(f"{cloud}: open {page.url} (Ctrl+C ends; objects are saved in {file})")
+    try:
+        page.run()
+    finally:
+        page.stop()

@@ -1,0 +1,382 @@
+"""The page that makes an interactive environment: cut objects out of a scan, say how they move, try it, save.
+
+What can be done to the objects stands in `scene/editing.py`; here clicks and drags become its verbs.
+"""
+
+import threading
+import time as wall
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import viser
+from jaxtyping import Float
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.io.environment import MAX_HINGE_GAP_M, read_environment, write_environment
+from wearcap.scene.editing import ObjectEditing, points_world
+from wearcap.scene.environment import hinge_gap_m
+from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.placing import hinge_places, snapped
+from wearcap.scene.scan import Scan
+from wearcap.viewer.object_editor_panels import HINTS, TOOLS, ObjectPanel, SelectPanel
+from wearcap.viewer.object_editor_view import EditorView, axis_toward, pose_of, ray_to
+
+SNAP_M = 0.12
+SAVE_AFTER_S, TRY_AGAIN_S = 0.7, 10.0
+_CEILING_M = 2.1
+"""A view from above looks into the rooms: what is higher above the floor is hidden at first."""
+_SIDE_M = 4.0
+
+
+class ObjectEditor:
+    """The page of one scan. `run` serves until interrupted and saves what changes; `stop` saves and closes."""
+
+    def __init__(
+        self, scan: Scan, file: Path, title: str = "scene", host: str = "127.0.0.1", port: int = 8080
+    ):
+        """`file`: the environment.json to go on with, or to make. Raises WearcapError for one of another scene."""
+        environment = read_environment(file) if file.exists() else None
+        try:
+            self.editing = ObjectEditing(scan, environment)
+        except WearcapError as error:
+            raise WearcapError(error.what, where=file, expected=error.expected, fix=error.fix) from error
+        self.file, self._stopped, self._lock = file, False, threading.RLock()
+        self._saved = self._shown = self.editing.revision
+        self._selection = self.editing.selected
+        self._changed_at, self._problem, self._stroke = 0.0, "", 0
+        self.server = viser.ViserServer(host=host, port=port, label="wearcap scene", verbose=False)
+        self.server.scene.set_up_direction("+z")
+        self.server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self.view = EditorView(self.server, scan)
+        self._add_controls(title)
+        self._wire_select()
+        self._wire_objects()
+        self._wire_view()
+        self._look_at_the_middle()
+        self.current: str | None = None
+        self._tried: Rigid | None = None
+        self._show_scan()
+        self._show_box()
+        self._show_objects()
+        self._tell()
+
+    @property
+    def url(self) -> str:
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def _add_controls(self, title: str) -> None:
+        gui, points = self.server.gui, self.editing.scan.points
+        gui.add_markdown(f"**{title}**")
+        self._status = gui.add_markdown("")
+        self.tool = gui.add_dropdown("Tool", TOOLS, initial_value="look")
+        self._hint = gui.add_markdown(f"*{HINTS['look']}*")
+        heights = np.quantile(points[:: max(1, len(points) // 100_000), 2], [0.01, 0.999])
+        low, high = round(float(heights[0]), 2), round(max(float(heights[1]), float(heights[0]) + 0.1), 2)
+        self.top = gui.add_slider("Show up to (m)", low, high, 0.05, min(low + _CEILING_M, high))
+        self.undo_button = gui.add_button("Undo")
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Select"):
+            self.select = SelectPanel(gui)
+        with tabs.add_tab("Objects"):
+            self.objects = ObjectPanel(gui)
+        self.select.name.value = self.editing.free_name(self.select.category.value)
+        middle = (np.median(points, 0) + 0.0).astype(float)
+        self.box_center = (float(middle[0]), float(middle[1]), low + 0.5)
+        keys = (("Undo", "Z", "cmd/ctrl", self.undo), ("Look", "V", None, lambda: self.use("look")),
+                ("Box", "B", None, lambda: self.use("box")), ("Brush", "P", None, lambda: self.use("brush")),
+                ("Eraser", "E", None, lambda: self.use("eraser")),
+                ("Hinge or slide", "H", None, lambda: self.use("hinge / slide")), ("Try", "T", None, lambda: self.use("try")))  # fmt: skip
+        for label, key, modifier, action in keys:
+            gui.add_command(label, hotkey=key, modifier=modifier).on_trigger(self._acting(action))
+        self.undo_button.on_click(self._acting(self.undo))
+        self.tool.on_update(self._acting(lambda: self.use(self.tool.value)))
+        self.top.on_update(self._acting(self._show_scan))
+
+    def _acting(self, action: Callable[[], None]) -> Callable[..., None]:
+        """For a control: one action at a time, only when a person caused it, and what it refuses is shown to them."""
+
+        def act(event) -> None:
+            if event.client is None:  # our own writing of a control's value
+                return
+            with self._lock:
+                try:
+                    action()
+                except WearcapError as error:
+                    event.client.add_notification(
+                        "That does not go", str(error), color="red", auto_close_seconds=10
+                    )
+                self._refresh()
+
+        return act
+
+    def _wire_select(self) -> None:
+        panel, act = self.select, self._acting
+        for slider in panel.shape_sliders:
+            slider.on_update(act(self._show_box))
+        panel.take.on_click(act(lambda: self.editing.select_box(self.box)))
+        panel.leave.on_click(act(lambda: self.editing.select_box(self.box, add=False)))
+        panel.clear.on_click(act(self.editing.clear_selection))
+        panel.radius.on_update(act(lambda: self.view.show_brush(None, panel.radius.value)))
+        panel.category.on_update(act(self._suggest_name))
+        panel.cut.on_click(act(self.cut))
+
+    def _wire_objects(self) -> None:
+        panel, act = self.objects, self._acting
+        panel.choice.on_update(act(lambda: self.choose(panel.current)))
+        panel.rename.on_click(act(self.rename))
+        panel.kind.on_update(act(lambda: self.editing.set_kind(self._item().name, panel.chosen_kind)))
+        panel.next_end.on_click(act(self.next_hinge))
+        panel.direction.on_update(act(self._turn_axis))
+        for slider in panel.limit_sliders:
+            slider.on_update(act(self._set_limits))
+        for slider in (panel.try_deg, panel.try_m):
+            slider.on_update(act(self.try_value))
+        panel.back.on_click(act(self.put_back))
+        panel.delete.on_click(act(self.delete))
+
+    def _wire_view(self) -> None:
+        view, act = self.view, self._acting
+
+        @self.server.scene.on_click()
+        def _(event: viser.SceneClickEvent) -> None:
+            origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+            act(lambda: self.clicked(origin, direction))(event)
+
+        @view.brush.on_drag
+        def _(event: viser.SceneNodeDragEvent) -> None:
+            if event.phase != "end":
+                ray = ray_to(event.end_position, event.client.camera)
+                act(lambda: self.paint(*ray, fresh=event.phase == "start"))(event)
+
+        view.box_handle.on_update(act(self._box_dragged))
+        view.freedom_handle.on_update(self._when_released(self._freedom_dragged))
+        view.try_handle.on_update(act(self._try_dragged))
+
+    def _when_released(self, action: Callable[[], None]) -> Callable[[viser.TransformControlsEvent], None]:
+        act = self._acting(action)
+        return lambda event: act(event) if event.phase == "end" else None
+
+    @property
+    def box(self):
+        """The box as it stands."""
+        return self.select.box(self.box_center)
+
+    def use(self, tool: str) -> None:
+        """Take another tool."""
+        self.put_back()
+        self.tool.value = tool
+        self._hint.content = f"*{HINTS[tool]}*"
+        self.view.show_brush(None, self.select.radius.value)
+        self._show_box()
+        self._show_objects()
+
+    def clicked(self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]) -> None:
+        """A click in the view, as the ray from the camera; what it does is the tool's."""
+        tool = self.tool.value
+        if tool == "look":
+            if (name := self.view.picked(origin, direction)) is not None:
+                self.choose(name)
+        elif tool in ("brush", "eraser"):
+            self.paint(origin, direction, fresh=True)
+        elif tool != "try" and (place := self.view.hit(origin, direction)) is not None:
+            if tool == "box":
+                self.box_center = (float(place[0]), float(place[1]), float(place[2]))
+                self._show_box()
+            else:
+                self._place_freedom(place, level=True)
+
+    def paint(self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], fresh: bool) -> None:
+        """A dab of the brush or eraser where a ray meets the scan; `fresh` begins another stroke."""
+        self._stroke += fresh
+        place = self.view.hit(origin, direction)
+        if place is None or self.tool.value not in ("brush", "eraser"):
+            return
+        radius = float(self.select.radius.value)
+        self.view.show_brush(place, radius)
+        self.editing.select_ball(place, radius, self.tool.value == "brush", stroke=("paint", self._stroke))
+
+    def cut(self) -> None:
+        """Cut the selection out under the name and category of the panel; it becomes the current object."""
+        item = self.editing.cut(self.select.name.value.strip(), self.select.category.value)
+        self.current = item.name
+        self._suggest_name()
+
+    def choose(self, name: str | None) -> None:
+        self.put_back()
+        self.current = name
+        self._show_objects()
+
+    def rename(self) -> None:
+        new = self.objects.name.value.strip()
+        self.editing.rename(self._item().name, new)
+        self.current = new
+
+    def delete(self) -> None:
+        self.editing.delete(self._item().name)
+        self._suggest_name()
+
+    def undo(self) -> None:
+        self.put_back()
+        self.editing.undo()
+        self._suggest_name()
+
+    def next_hinge(self) -> None:
+        """The hinge at the next of the likely places round the object's footprint."""
+        item = self._item()
+        places = hinge_places(points_world(item), float(item.t_world_object[2]))
+        nearest = np.linalg.norm(places - np.array(item.freedom.pivot), axis=1).argmin()
+        self._set_pivot(item, places[(nearest + 1) % len(places)])
+
+    def try_value(self) -> None:
+        """Show the current object where the slider says, within its limits; its place in the file stays."""
+        item = self._item()
+        if item.freedom.kind in ("hinge", "axis"):
+            value = item.freedom.clamped(torch.tensor(self.objects.tried(item.freedom.kind)))
+            self._tried = item.freedom.moved(item.T_world_object, value)
+            self.view.place(item.name, self._tried)
+
+    def put_back(self) -> None:
+        """Every object to its place at the beginning."""
+        if self._tried is not None:
+            self._tried = None
+            self.objects.try_deg.value = self.objects.try_m.value = 0.0
+            self._show_objects()
+
+    def _item(self) -> SceneObject:
+        if self.current is None:
+            raise WearcapError("there is no object yet", fix="Select its points and cut it out first.")
+        return self.editing.environment.by_name(self.current)
+
+    def _suggest_name(self) -> None:
+        self.select.name.value = self.editing.free_name(self.select.category.value)
+
+    def _set_limits(self) -> None:
+        item = self._item()
+        limits = self.objects.limits(item.freedom.kind)
+        self.editing.set_freedom(
+            item.name, replace(item.freedom, limits=limits), stroke=("limits", item.name)
+        )
+
+    def _turn_axis(self) -> None:
+        item, angle = self._item(), np.deg2rad(self.objects.direction.value)
+        freedom = replace(item.freedom, axis=(float(np.cos(angle)), float(np.sin(angle)), 0.0))
+        self.editing.set_freedom(item.name, freedom, stroke=("axis", item.name))
+
+    def _freedom_dragged(self) -> None:
+        self._place_freedom(np.array(self.view.freedom_handle.position, np.float64), level=False)
+
+    def _place_freedom(self, place: Float[np.ndarray, "3"], level: bool) -> None:
+        """The hinge at a place (at the object's edge if that is near), or the slide's axis toward it."""
+        item = self._item()
+        if item.freedom.kind == "hinge":
+            places = hinge_places(points_world(item), float(item.t_world_object[2]))
+            self._set_pivot(item, snapped(place, places, SNAP_M))
+        elif item.freedom.kind == "axis":
+            box = points_world(item)
+            height = (box[:, 2].min() + box[:, 2].max()) / 2
+            axis = axis_toward(item, np.array([*place[:2], height if level else place[2]]))
+            if axis is not None:
+                self.editing.set_freedom(item.name, replace(item.freedom, axis=axis))
+        else:
+            raise WearcapError(f"{item.name} {'is carried' if item.freedom.kind == 'free' else 'slides on the floor'}",
+                               expected="an object with a hinge or a slide", fix="Choose how it moves under Objects.")  # fmt: skip
+        self._show_objects()
+
+    def _set_pivot(self, item: SceneObject, pivot: Float[np.ndarray, "3"]) -> None:
+        x, y, z = pivot.tolist()
+        freedom = Freedom("hinge", pivot=(x, y, z), limits=item.freedom.limits)
+        gap = hinge_gap_m(replace(item, freedom=freedom))
+        if gap > MAX_HINGE_GAP_M:
+            self._show_objects()
+            raise WearcapError(f"the hinge would be {gap:.2f} m from {item.name}", expected=f"at most {MAX_HINGE_GAP_M} m")  # fmt: skip
+        self.editing.set_freedom(item.name, freedom)
+
+    def _box_dragged(self) -> None:
+        x, y, z = np.asarray(self.view.box_handle.position, np.float64).tolist()
+        self.box_center = x, y, z
+        self.view.box.position = self.box_center
+
+    def _show_box(self) -> None:
+        self.view.show_box(self.box, self.tool.value == "box")
+
+    def _try_dragged(self) -> None:
+        """On the floor: shifted and turned about z; carried: anywhere."""
+        item, pose = self._item(), pose_of(self.view.try_handle)
+        self._tried = pose
+        self.view.place(item.name, pose)
+
+    def _show_scan(self) -> None:
+        self.view.show_scan(self.editing.left(), float(self.top.value))
+
+    def _refresh(self) -> None:
+        """Bring view and panels to the state of the editing; what is as it was is not sent again."""
+        if self.editing.selected is not self._selection:
+            self._selection = self.editing.selected
+            self.view.show_selection(self._selection)
+        if self.editing.revision is not self._shown:
+            self._shown, self._changed_at = self.editing.revision, wall.monotonic()
+            self._show_scan()
+            self._show_objects()
+        self._tell()
+
+    def _show_objects(self) -> None:
+        """The objects in their places, and all that belongs to the current one."""
+        items, tool = self.editing.environment.objects, self.tool.value
+        if self.current not in [item.name for item in items]:
+            self.current = items[-1].name if items else None
+        item = self._item() if items else None
+        self.view.show_objects(items, self.current)
+        self.objects.show(items, item)
+        self.view.show_freedom(item, handled=tool == "hinge / slide")
+        by_hand = item is not None and tool == "try" and item.freedom.kind in ("plane", "free")
+        self.view.show_try_handle(item if by_hand else None)
+
+    def _tell(self) -> None:
+        state = f"saved in {self.file.name}" if self.file.exists() else "nothing to save yet"
+        if self.editing.revision is not self._saved:
+            state = self._problem or "…"
+        count = len(self.editing.environment)
+        chosen = f"{len(self.editing.selected):,} points selected"
+        self._status.content = f"{chosen} · {count} object{'s' * (count != 1)} · {state}"
+
+    def _look_at_the_middle(self) -> None:
+        points = self.editing.scan.points
+        low, high = np.quantile(points[:: max(1, len(points) // 100_000)], [0.02, 0.98], axis=0)
+        middle = np.array([*(low + high)[:2] / 2, low[2] + 0.5])
+        far = 0.75 * max(float(np.linalg.norm((high - low)[:2])), _SIDE_M)
+        camera = self.server.initial_camera
+        camera.look_at = tuple(middle)
+        camera.position = tuple(middle + far * np.array([-0.4, -0.4, 1.0]))
+
+    def save(self) -> None:
+        """Write the environment if it has changed. Raises WearcapError where that cannot be."""
+        with self._lock:
+            revision = self.editing.revision
+            if revision is not self._saved:
+                write_environment(self.editing.environment, self.file)
+                self._saved, self._problem = revision, ""
+                self._tell()
+
+    def run(self, seconds: float = np.inf) -> None:
+        """Serve until interrupted, or for so many seconds; changes are saved when nothing happened for a moment."""
+        begin, not_before = wall.monotonic(), 0.0
+        while not self._stopped and (now := wall.monotonic()) - begin < seconds:
+            if now > max(not_before, self._changed_at + SAVE_AFTER_S):
+                try:
+                    self.save()
+                except WearcapError as error:
+                    self._problem, not_before = f"**not saved: {error}**", now + TRY_AGAIN_S
+                    self._tell()
+            wall.sleep(0.1)
+
+    def stop(self) -> None:
+        """Save what is not saved yet, and close. Raises WearcapError where it cannot be written."""
+        self._stopped = True
+        try:
+            self.save()
+        finally:
+            self.server.stop()

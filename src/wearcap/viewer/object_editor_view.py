@@ -1,0 +1,225 @@
+"""What the object editor draws: the scan, the selection, the objects where they stand, hinges, slides and handles."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import viser
+from jaxtyping import Bool, Float, Int64, UInt8
+from scipy.spatial import KDTree
+
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
+from wearcap.scene.editing import points_world
+from wearcap.scene.objects import SceneObject
+from wearcap.scene.scan import Scan
+from wearcap.scene.selection import Box, first_hit
+
+SHOWN_POINTS, SHOWN_SELECTED, SHOWN_OF_OBJECT = 250_000, 80_000, 40_000
+SELECTED_COLOR, BOX_COLOR, BRUSH_COLOR, HINGE_COLOR = (
+    (255, 120, 20),
+    (30, 120, 240),
+    (255, 120, 20),
+    (220, 30, 120),
+)
+TINTS = np.array(
+    [[70, 160, 150], [90, 110, 220], [190, 110, 190], [130, 170, 60], [210, 150, 60], [90, 170, 220]]
+)
+CURRENT_TINT = np.array([230, 60, 130])
+_ARROW_M = 0.5
+_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)], np.float32)
+_EDGES = _CORNERS[[[a, a + step] for step in (1, 2, 4) for a in range(8) if not a & step]]
+"""Of a unit box."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    item: SceneObject
+    tinted: tuple[int, bool]
+    node: viser.PointCloudHandle | viser.MeshHandle
+    label: viser.LabelHandle
+    points: Float[np.ndarray, "shown 3"]
+    """Of the world, for picking."""
+
+
+class EditorView:
+    """The 3D part of the page. Everything here is told what to show; nothing is decided."""
+
+    def __init__(self, server: viser.ViserServer, scan: Scan):
+        self.scene, self.scan = server.scene, scan
+        rng = np.random.default_rng(0)
+        count = min(len(scan.points), SHOWN_POINTS)
+        self._thinned = np.sort(rng.choice(len(scan.points), count, replace=False))
+        self._colors = scan.colors if scan.colors is not None else by_height(scan.points)
+        self.point_m = 1.9 * typical_spacing(scan.points[self._thinned])
+        self._center = scan.points.mean(0, dtype=np.float64)
+        self.visible = scan.points[:0]
+        """Points of the scan that are drawn."""
+        self._objects: dict[str, _Shown] = {}
+        self.box = self.scene.add_line_segments("/box", _EDGES, BOX_COLOR, thickness=0.012)
+        self.box_handle = self.scene.add_transform_controls("/box_handle", scale=0.45, disable_rotations=True)
+        self.brush = self.scene.add_icosphere("/brush", 1.0, BRUSH_COLOR, opacity=0.35, visible=False)
+        self.freedom_handle = self.scene.add_transform_controls(
+            "/freedom_handle", scale=0.35, disable_rotations=True, visible=False, depth_test=False
+        )
+        self.try_handle = self.scene.add_transform_controls(
+            "/try_handle", scale=0.6, active_axes=(True, True, False), visible=False, depth_test=False
+        )
+
+    def show_scan(self, left: Bool[np.ndarray, "point"], top_m: float) -> None:
+        """The points that belong to no object, up to a height."""
+        shown = self._thinned[left[self._thinned]]
+        shown = shown[self.scan.points[shown, 2] <= top_m]
+        self.visible = self.scan.points[shown]
+        self._add_cloud("/scan", self.visible, self._colors[shown], self.point_m)
+
+    def show_selection(self, selected: Int64[np.ndarray, "selected"]) -> None:
+        """Densely, and a little larger than the scan's own points, so that they cover those."""
+        shown = selected[:: max(1, -(-len(selected) // SHOWN_SELECTED))]
+        colors = np.broadcast_to(np.array(SELECTED_COLOR, np.uint8), (len(shown), 3))
+        self._add_cloud("/selection", self.scan.points[shown], colors, 1.35 * self.point_m)
+
+    def _add_cloud(
+        self,
+        name: str,
+        points: Float[np.ndarray, "shown 3"],
+        colors: UInt8[np.ndarray, "shown 3"],
+        size: float,
+    ) -> None:
+        if not len(points):
+            self.scene.remove_by_name(name)
+            return
+        # Relative to the middle: float32 in the browser is exact to less than a millimetre there only.
+        self.scene.add_point_cloud(
+            name, (points - self._center).astype(np.float32), colors, point_size=size, precision="float32",
+            position=self._center, point_shape="rounded", point_shading="flat",
+        )  # fmt: skip
+
+    def show_box(self, box: Box, visible: bool) -> None:
+        self.box.visible = self.box_handle.visible = visible
+        self.box.points = _EDGES * np.array(box.size, np.float32)
+        self.box.wxyz = (np.cos(box.yaw / 2), 0.0, 0.0, np.sin(box.yaw / 2))
+        self.box.position = self.box_handle.position = np.array(box.center)
+
+    def show_brush(self, place: Float[np.ndarray, "3"] | None, radius_m: float) -> None:
+        self.brush.visible = place is not None
+        self.brush.scale = radius_m
+        if place is not None:
+            self.brush.position = place
+
+    def show_objects(self, items: tuple[SceneObject, ...], current: str | None) -> None:
+        """Each in its own tint, the current one in its own; what is shown already stays."""
+        wanted = {item.name: (item, (k % len(TINTS), item.name == current)) for k, item in enumerate(items)}
+        for name, shown in list(self._objects.items()):
+            item, tinted = wanted.get(name, (None, None))
+            if item is None or item.mesh is not shown.item.mesh or tinted != shown.tinted:
+                shown.node.remove()
+                del self._objects[name]
+        for name, (item, tinted) in wanted.items():
+            if name not in self._objects:
+                self._objects[name] = self._add_object(item, tinted)
+            self.place(name, item.T_world_object)
+
+    def _add_object(self, item: SceneObject, tinted: tuple[int, bool]) -> _Shown:
+        node, mesh = f"/objects/{item.name}", item.mesh
+        tint = CURRENT_TINT if tinted[1] else TINTS[tinted[0]]
+        every = max(1, -(-len(mesh.vertices) // SHOWN_OF_OBJECT))
+        own = mesh.color[::every] if len(mesh.color) == len(mesh.vertices) else np.full(3, 0.6)
+        colors = 0.45 * 255 * own + 0.55 * tint
+        if len(mesh.faces):
+            handle = self.scene.add_mesh_simple(node, mesh.vertices, mesh.faces.astype(np.uint32), color=tuple(int(c) for c in tint))  # fmt: skip
+        else:
+            vertices = mesh.vertices[::every]
+            rows = np.broadcast_to(colors, vertices.shape).astype(np.uint8)
+            handle = self.scene.add_point_cloud(node, vertices, rows, point_size=1.2 * self.point_m,
+                                                precision="float32", point_shape="rounded", point_shading="flat")  # fmt: skip
+        top = mesh.vertices[:, 2].max() + 0.1
+        label = self.scene.add_label(
+            f"{node}/name", item.name, position=(0.0, 0.0, float(top)), anchor="bottom-center"
+        )
+        return _Shown(item, tinted, handle, label, points_world(item)[::every])
+
+    def place(self, name: str, T_world_object: Rigid) -> None:
+        """Put an object somewhere (to try how it moves)."""
+        node = self._objects[name].node
+        node.wxyz = quat_wxyz_from_matrix(T_world_object.R.double()).numpy()
+        node.position = T_world_object.t.double().numpy()
+
+    def show_freedom(self, item: SceneObject | None, handled: bool) -> None:
+        """The current object's hinge as a line, or its slide as an arrow; with a handle to drag where asked for."""
+        self.scene.remove_by_name("/freedom")
+        kind = item.freedom.kind if item is not None else None
+        self.freedom_handle.visible = handled and kind in ("hinge", "axis")
+        if item is None or kind not in ("hinge", "axis"):
+            return
+        points = points_world(item)
+        if item.freedom.pivot is not None:
+            foot = np.array(item.freedom.pivot)
+            line = np.array([[foot, [*foot[:2], points[:, 2].max() + 0.15]]])
+            self.scene.add_line_segments("/freedom", line, HINGE_COLOR, thickness=0.025)
+            self.freedom_handle.active_axes = (True, True, False)
+            self.freedom_handle.position = foot
+        else:
+            middle = (points.min(0) + points.max(0)) / 2
+            tip = middle + _ARROW_M * np.array(item.freedom.axis)
+            self.scene.add_arrows("/freedom", np.array([[middle, tip]]), HINGE_COLOR)
+            self.freedom_handle.active_axes = (True, True, True)
+            self.freedom_handle.position = tip
+
+    def show_try_handle(self, item: SceneObject | None) -> None:
+        """A handle to move an object by hand: on the floor, or anywhere where it is carried."""
+        self.try_handle.visible = item is not None
+        if item is not None:
+            self.try_handle.active_axes = (True, True, item.freedom.kind == "free")
+            self.try_handle.wxyz = quat_wxyz_from_matrix(item.R_world_object.double()).numpy()
+            self.try_handle.position = item.t_world_object.double().numpy()
+
+    def hit(
+        self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "3"] | None:
+        """The place on the scan that a ray of the view meets first."""
+        number = first_hit(self.visible, origin, direction, self.point_m)
+        return None if number is None else self.visible[number].astype(np.float64)
+
+    def picked(self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]) -> str | None:
+        """The object that a ray of the view meets first."""
+        best, nearest = None, np.inf
+        for name, shown in self._objects.items():
+            number = first_hit(shown.points, origin, direction, self.point_m)
+            if number is not None and (far := float(np.linalg.norm(shown.points[number] - origin))) < nearest:
+                best, nearest = name, far
+        return best
+
+
+def axis_toward(item: SceneObject, place: Float[np.ndarray, "3"]) -> tuple[float, float, float] | None:
+    """Unit vector from the middle of an object to a place; None where they coincide."""
+    points = points_world(item)
+    way = place - (points.min(0) + points.max(0)) / 2
+    length = float(np.linalg.norm(way))
+    return None if length < 1e-3 else tuple((way / length).tolist())
+
+
+def by_height(points: Float[np.ndarray, "point 3"]) -> UInt8[np.ndarray, "point 3"]:
+    """Colours for a scan without any: from blue at the floor to sand at the ceiling."""
+    low, high = np.quantile(points[:: max(1, len(points) // 10_000), 2], [0.02, 0.98])
+    share = np.clip((points[:, 2:] - low) / max(high - low, 1e-6), 0, 1)
+    return ((1 - share) * np.array([60, 90, 130]) + share * np.array([220, 170, 90])).astype(np.uint8)
+
+
+def typical_spacing(points: Float[np.ndarray, "point 3"]) -> float:
+    """Distance (m) of neighbours in a cloud: the median over a sample."""
+    sample = points[:: max(1, len(points) // 500)]
+    distance, _ = KDTree(points).query(sample, k=2)
+    return float(np.clip(np.median(distance[:, -1]), 0.002, 0.2)) if len(points) > 1 else 0.02
+
+
+def ray_to(place: tuple[float, float, float], camera: viser.CameraHandle) -> tuple[np.ndarray, np.ndarray]:
+    """Origin and direction of the ray from a client's camera to a place."""
+    origin = np.asarray(camera.position, np.float64)
+    return origin, np.asarray(place, np.float64) - origin
+
+
+def pose_of(handle: viser.TransformControlsHandle) -> Rigid:
+    """Where a handle was dragged to."""
+    R = matrix_from_quat_wxyz(torch.tensor(np.asarray(handle.wxyz, np.float64)))
+    return Rigid(R.float(), torch.tensor(np.asarray(handle.position, np.float64)).float())
