@@ -175,7 +175,13 @@ def _hand_sets(
 
 
 def _body(
-    plan: Plan, rail: Rail, places: dict[str, GripPlace], speed: float, angle: float, rng: np.random.Generator
+    plan: Plan,
+    rail: Rail,
+    places: dict[str, GripPlace],
+    speed: float,
+    angle: float,
+    effort: float,
+    rng: np.random.Generator,
 ) -> Float[np.ndarray, "3"]:
     """Where the feet's middle is in the thing's axes: toes clear of the thing, hands before their shoulders."""
     point = np.mean([place.point for place in places.values()], 0)
