@@ -8,11 +8,13 @@ import torch
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import xsens23
 from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.rotation import about_axis
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.optimize.contact_correction import OffsetSettings
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.pipelines.attachment import AttachmentSettings
+from wearcap.pipelines.hand_snapping import HandSnapping
 from wearcap.pipelines.ireplica_baselines import held_when_near, interpolated_objects, static_objects
 from wearcap.pipelines.ireplica_evaluation import score_interactions
 from wearcap.pipelines.object_tracker import PALMS, ObjectTracker
@@ -208,3 +210,26 @@ def test_the_documents_correction_runs_on_the_same_contacts(scene):
     captured = ObjectTracker(correction)(off, contacts, environment)
     assert held_of(captured).objects == ("near",)
     assert captured.t_world_root.isfinite().all()
+
+
+def test_hands_are_put_onto_what_they_hold_by_the_arms_alone(scene):
+    motion, environment = scene
+    bent = motion.R_parent_joint.clone()
+    bent[:, motion.skeleton.index("left_elbow")] = about_axis("z", torch.tensor(-0.6))
+    motion = replace(motion, R_parent_joint=bent)
+    contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
+    plain = ObjectTracker(None)(motion, contacts, environment)
+    snapped = ObjectTracker(None, hands=HandSnapping())(motion, contacts, environment)
+    thing = environment.by_name("near")
+    T = objects_of(snapped)[thing.name].T_world_body[TAKE:LEAVE]
+    apart = []
+    for captured in (plain, snapped):
+        palm = site_positions(captured.skeleton, captured.T_world_joint, PALMS)[TAKE:LEAVE, 0]
+        apart.append(environment.distance(thing.name, palm, T)[0].mean())
+    assert apart[1] < 0.004 < 0.05 < apart[0]
+    joints = [captured.T_world_joint for captured in (plain, snapped)]
+    wrist, elbow = motion.skeleton.indices("left_wrist", "left_elbow")
+    torch.testing.assert_close(joints[0].R[:, wrist], joints[1].R[:, wrist], atol=1e-5, rtol=0)
+    others = [j for j in range(len(motion.skeleton)) if j not in (wrist, elbow)]
+    torch.testing.assert_close(joints[0].t[:, others], joints[1].t[:, others])
+    assert (joints[1].t - joints[0].t).diff(dim=0).diff(dim=0).abs().max() < 0.004

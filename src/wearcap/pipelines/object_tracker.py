@@ -19,6 +19,7 @@ from wearcap.pipelines.attachment import (
     object_trajectories,
 )
 from wearcap.pipelines.contact_intervals import ContactInterval, ContactSettings
+from wearcap.pipelines.hand_snapping import HandSnapping
 from wearcap.recording import Motion
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
@@ -58,6 +59,8 @@ class ObjectTracker:
     """None: the row "w/o contact correction"."""
     contact: ContactSettings = field(default_factory=ContactSettings)
     attachment: AttachmentSettings = field(default_factory=AttachmentSettings)
+    hands: HandSnapping | None = None
+    """Puts hands onto what they hold by the arms (ours); None: the wearer is moved as a whole alone."""
 
     def __call__(self, registered: Motion, contacts: dict[str, Tensor], environment: Environment) -> Motion:
         """The corrected motion with `object_motion`, `interactions` and `hand_contact_prob`, at the contacts' frames.
@@ -74,12 +77,13 @@ class ObjectTracker:
         held = self._held(motion, palms, spans, environment)
         offset = palms.new_zeros(len(motion), 2) if self.correction is None else self.correction.finish(held)
         shift = torch.nn.functional.pad(offset, (0, 1))
-        return replace(
+        moved = replace(
             motion, t_world_root=(motion.t_world_root.double() + shift).float(),
             hand_contact_prob=torch.stack(list(prob.values())).amax(0).float(),
             object_motion=object_trajectories(environment, held, motion.timestamps),
             interactions=interactions_of(held, motion.timestamps),
         )  # fmt: skip
+        return moved if self.hands is None else self.hands(moved, held, environment)
 
     def _held(
         self, motion: Motion, palms: Float64[Tensor, "time hand 3"], spans: list[tuple[ContactInterval, str]],

@@ -78,8 +78,7 @@ class SnapCorrection:
     """Ours: the wearer is moved as a whole by one offset per interaction, and smoothly from one to the next.
 
     While an object is held the offset stays, so that errors of a touch do not become motion of the object. About a
-    hinge it is fitted to the whole arc, as hands must stay at one distance from the axis, and what is left of the
-    radius' error is taken out frame by frame.
+    hinge it is fitted to the whole arc, as hands must stay at one distance from the axis.
     """
 
     offset_settings: OffsetSettings = field(default_factory=OffsetSettings)
