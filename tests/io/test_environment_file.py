@@ -13,7 +13,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.environment import read_environment, write_environment
-from wearcap.io.ply import Ply, write_ply
+from wearcap.io.ply import Ply, read_ply, write_ply
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 
@@ -222,3 +222,74 @@ def test_damaged_files_are_read_or_refused(folder, text):
     except WearcapError:
         return
     assert all(item.t_world_object.isfinite().all() for item in environment.objects)
+
+
+MOVABLE = (
+    "Chair",
+    "Sofa",
+    "KitchenTable",
+    "CoffeeTable",
+    "Trash",
+    "NightStand",
+    "ReadingDesk",
+    "Ball",
+    "ShoeRack",
+)
+
+
+def furnished(folder) -> Environment:
+    """The small house: furniture where its layout says, and a door that turns about its left edge."""
+    layout = json.loads((folder / "small_house_layout.json").read_text())
+    meshes = {}
+    for row in layout:
+        file = folder / "meshes" / f"{row['model']}_visual.ply"
+        if row["model"] not in meshes and file.is_file() and row["model"].startswith((*MOVABLE, "Door")):
+            ply = read_ply(file)
+            meshes[row["model"]] = Mesh(ply.points, ply.faces, GREY)
+    objects = []
+    for row in (row for row in layout if row["model"] in meshes):
+        *xyz, roll, pitch, yaw = row["pose_xyz_rpy"]
+        R = rotation.about_axis("z", torch.tensor(yaw)) @ rotation.about_axis("y", torch.tensor(pitch)) @ rotation.about_axis("x", torch.tensor(roll))  # fmt: skip
+        t, mesh, freedom = torch.tensor(xyz), meshes[row["model"]], Freedom("plane")
+        if row["model"].startswith("Door"):
+            edge = R @ torch.tensor([float(mesh.vertices[:, 0].min()), 0.0, 0.0]) + t
+            freedom = Freedom("hinge", pivot=tuple(edge.tolist()), limits=(0.0, math.pi / 2))
+        objects.append(SceneObject(row["name"], row["model"].split("_")[0].lower(), mesh, R, t, freedom))
+    return Environment(tuple(objects))
+
+
+@pytest.mark.real
+def test_a_furnished_house(real_data, tmp_path):
+    house = furnished(real_data / "furniture_meshes")
+    assert len(house) == 20
+    write_environment(house, tmp_path)
+    read = read_environment(tmp_path)
+    assert [item.name for item in read.objects] == [item.name for item in house.objects]
+    rng = np.random.default_rng(0)
+    points = torch.tensor(np.c_[rng.uniform(-9, 9, (3000, 2)), rng.uniform(0, 2, 3000)]).float()
+    here, back = house.nearest(points, reach_m=0.5), read.nearest(points, reach_m=0.5)
+    same = here.object_index == back.object_index
+    assert same.float().mean() > 0.999, "but for ties"
+    torch.testing.assert_close(here.distance[same], back.distance[same], atol=1e-5, rtol=0)
+    alone = torch.stack(
+        [house.distance(item.name, points, item.T_world_object)[0] for item in house.objects], 1
+    )
+    nearest = alone.amin(1)
+    assert ((here.object_index >= 0) == (nearest < 0.5)).all()
+    reached = here.object_index >= 0
+    torch.testing.assert_close(here.distance[reached], nearest[reached], atol=1e-6, rtol=0)
+
+
+@pytest.mark.real
+def test_a_doors_handle_is_found_where_the_door_has_turned_to(real_data):
+    house = furnished(real_data / "furniture_meshes")
+    door = next(item for item in house.objects if item.freedom.kind == "hinge")
+    far_edge = door.mesh.vertices[door.mesh.vertices[:, 0].argmax()].copy()
+    far_edge[2] = 1.0
+    opened = door.freedom.moved(door.T_world_object, torch.tensor(math.pi / 2))
+    hand = (opened.R @ torch.from_numpy(far_edge) + opened.t)[None]
+    closed = house.nearest(hand, contact_class="hinged", reach_m=0.3)
+    turned = house.nearest(hand, {door.name: opened}, "hinged", 0.3)
+    assert closed.object_index.item() == -1
+    assert turned.object_index.item() == house.index(door.name)
+    assert turned.distance.item() < 0.15

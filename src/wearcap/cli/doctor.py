@@ -20,7 +20,7 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="wearcap doctor", description=HELP)
     parser.add_argument(
         "path",
-        help="data set folder, DATASET/NAME, recording file, Aria MPS folder, scene folder, motion capture file or folder",
+        help="data set folder, DATASET/NAME, recording file, Aria MPS folder, scene folder, environment.json, motion capture file or folder",
     )
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     parser.add_argument("--quiet", action="store_true", help="leave out what is sound")

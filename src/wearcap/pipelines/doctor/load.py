@@ -1,4 +1,4 @@
-"""What can be examined in a path: data sets, recording files, MPS folders, scenes, motion capture files."""
+"""What can be examined in a path: data sets, recording files, MPS folders, scenes, environments, motion capture files."""
 
 import json
 from collections.abc import Callable
@@ -24,6 +24,7 @@ from wearcap.io.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.pcd import read_pcd
 from wearcap.io.ply import read_ply
 from wearcap.io.tum import read_tum
+from wearcap.pipelines.doctor.environment import is_environment, read_environment_file
 from wearcap.pipelines.doctor.localized import check_files
 from wearcap.pipelines.doctor.report import Finding
 from wearcap.pipelines.doctor.scene import is_map, is_scene, read_map, read_scene
@@ -67,7 +68,7 @@ def patients(path: Path) -> list[Patient]:
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) in _MOTIONS]
     if not files:
         raise WearcapError("nothing to examine here", where=path,
-                           expected=f"a data set (manifest.json), an MPS, Nymeria, ADT or HPS folder, a scene (pointcloud.ply, photos.json), or files like {', '.join(_MOTIONS)}")  # fmt: skip
+                           expected=f"a data set (manifest.json), an MPS, Nymeria, ADT or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), or files like {', '.join(_MOTIONS)}")  # fmt: skip
     return [Patient(file.relative_to(path).as_posix(), partial(_read_file, file)) for file in files]
 
 
@@ -105,6 +106,12 @@ def _read_stored(store: RecordingStore, name: str) -> Loaded:
 def _read_hps(root: Path, name: str) -> Loaded:
     recording = read_hps_sequence(root, name)
     return recording, check_files(recording, root)
+
+
+def _read_place(folder: Path) -> Loaded:
+    """A scene, an environment, or both in one folder."""
+    recording, findings = read_scene(folder) if is_scene(folder) else (Recording(folder.resolve().name), [])
+    return recording, [*findings, *(read_environment_file(folder)[1] if is_environment(folder) else [])]
 
 
 def _read_mps(folder: Path) -> Loaded:
@@ -180,10 +187,10 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Loaded]], ...] = 
     (is_nymeria, lambda folder: (read_nymeria(folder), [])),
     (is_mps_folder, _read_mps),
     (is_adt, lambda folder: (read_adt(folder), [])),
-    (is_scene, read_scene),
+    (lambda folder: is_scene(folder) or is_environment(folder), _read_place),
 )
 _MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _read_npz}
 _READERS: dict[str, Callable] = {
     **_MOTIONS, ".safetensors": _read_recording, ".csv": _read_csv, ".txt": read_tum, ".tum": read_tum,
-    ".ply": read_ply, ".pcd": read_pcd,
+    ".ply": read_ply, ".pcd": read_pcd, ".json": read_environment_file,
 }  # fmt: skip
