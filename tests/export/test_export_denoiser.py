@@ -13,7 +13,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.data.features import HeadFeatures
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
-from wearcap.export import denoiser, exported, runner, sidecar
+from wearcap.export import exported, network, runner, sidecar
 from wearcap.geometry import rotation
 from wearcap.models.denoiser import MotionDenoiser
 from wearcap.pipelines.hmd2 import HMD2
@@ -79,7 +79,7 @@ def exports(pipeline, tmp_path_factory):
 @pytest.mark.parametrize("format", FORMATS)
 def test_toy_network_agrees_at_other_batch_sizes(tmp_path, format):
     net = Toy().train()
-    report = denoiser.export_denoiser(net, toy_example(), tmp_path / f"toy.{format}", format)
+    report = network.export_network(net, toy_example(), tmp_path / f"toy.{format}", format, 1e-4)
     assert report.max_abs_error < 1e-6
     assert report.latency_ms > 0
     assert report.bytes == (tmp_path / f"toy.{format}").stat().st_size
@@ -139,7 +139,7 @@ class Moody(nn.Module):
 
 def test_a_deviating_export_is_refused_and_leaves_nothing(tmp_path):
     with pytest.raises(WearcapError, match="differs from the eager one"):
-        denoiser.export_denoiser(Moody(), toy_example(), tmp_path / "toy.pt2", "pt2")
+        network.export_network(Moody(), toy_example(), tmp_path / "toy.pt2", "pt2", 1e-4)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -147,18 +147,18 @@ def test_not_a_number_is_refused(tmp_path):
     net = Toy()
     nn.init.constant_(net.linear.weight, math.nan)
     with pytest.raises(WearcapError, match="nan"):
-        denoiser.export_denoiser(net, toy_example(), tmp_path / "toy.pt2", "pt2")
+        network.export_network(net, toy_example(), tmp_path / "toy.pt2", "pt2", 1e-4)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_missing_library_and_wrong_names_are_told(tmp_path, monkeypatch):
     with pytest.raises(WearcapError, match="one of onnx, pt2"):
-        denoiser.export_denoiser(Toy(), toy_example(), tmp_path / "toy.tflite", "tflite")
+        network.export_network(Toy(), toy_example(), tmp_path / "toy.tflite", "tflite", 1e-4)
     with pytest.raises(WearcapError, match=r"ends in \.pt2"):
-        denoiser.export_denoiser(Toy(), toy_example(), tmp_path / "toy.onnx", "pt2")
+        network.export_network(Toy(), toy_example(), tmp_path / "toy.onnx", "pt2", 1e-4)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(WearcapError, match=r'onnxscript.*pip install "wearcap\[export\]"'):
-        denoiser.export_denoiser(Toy(), toy_example(), tmp_path / "toy.onnx", "onnx")
+        network.export_network(Toy(), toy_example(), tmp_path / "toy.onnx", "onnx", 1e-4)
 
 
 @pytest.mark.parametrize("format", FORMATS)

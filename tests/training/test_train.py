@@ -14,10 +14,10 @@ from wearcap.cli import capture, evaluate, export, train
 from wearcap.cli.conf import compose, conf_dir
 from wearcap.cli.load import load_system
 from wearcap.errors import WearcapError
-from wearcap.training.checkpoint import read_checkpoint
+from wearcap.models.checkpoint import read_checkpoint
 from wearcap_testing import small_dataset
 
-EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("*.yaml"))
+EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("motion_*.yaml"))
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 
 
@@ -48,6 +48,12 @@ def test_every_experiment_takes_a_step(experiment, data, tmp_path):
     changed = arguments(data, run, "trainer.precision=32-true", "data.workers=0", "data.batch_size=2")
     train.main([f"experiment={experiment}", *changed[1:]])
     assert (run / "checkpoints" / "last.ckpt").is_file()
+
+
+def test_every_experiment_is_tried_by_a_test():
+    """Those of contact detection in test_contact_detection."""
+    named = {path.stem for path in (conf_dir() / "experiment").glob("*.yaml")}
+    assert named == {name for name in named if name.startswith(("motion_", "contact_"))}
 
 
 def test_a_run_leaves_its_record(checkpoint):

@@ -4,21 +4,27 @@ from omegaconf import DictConfig
 from rich import print as show
 
 from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.load import load_pipeline, load_system
 from wearcap.errors import WearcapError
-from wearcap.export.denoiser import ExportReport
+from wearcap.export.contact import export_contact
+from wearcap.export.network import ExportReport
 from wearcap.export.sidecar import export_hmd2
+from wearcap.pipelines.contact_prediction import load_detector
 from wearcap.pipelines.hmd2 import HMD2
+from wearcap.training.contact_detection import ContactDetection
 
 HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2"
 
 
 def run(config: DictConfig) -> ExportReport:
-    """Export the denoiser with its sidecar; prints the error against eager and both latencies."""
-    pipeline = load_pipeline(config.checkpoint, config.pipeline, "cpu")
-    if not isinstance(pipeline, HMD2):
-        raise WearcapError(f"{pipeline.name} has no network to export", expected="a learned pipeline, such as pipeline=hmd2")  # fmt: skip
-    report = export_hmd2(pipeline, config.output, config.format)
+    """Export the network with its sidecar; prints the error against eager and both latencies."""
+    if isinstance(load_system(config.checkpoint)[0], ContactDetection):
+        report = export_contact(load_detector(config.checkpoint), config.output, config.format)
+    else:
+        pipeline = load_pipeline(config.checkpoint, config.pipeline, "cpu")
+        if not isinstance(pipeline, HMD2):
+            raise WearcapError(f"{pipeline.name} has no network to export", expected="a learned pipeline, such as pipeline=hmd2")  # fmt: skip
+        report = export_hmd2(pipeline, config.output, config.format)
     show(f"exported: {config.output}\n{report}")
     return report
 

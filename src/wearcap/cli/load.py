@@ -8,18 +8,19 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from wearcap.errors import WearcapError
+from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.stages import StagedCapture, StagedPipeline
 from wearcap.recording.locate import dataset_folder
-from wearcap.training.checkpoint import load_weights, read_checkpoint
+from wearcap.training.contact_detection import ContactDetection
 from wearcap.training.motion_diffusion import MotionDiffusion
 
 
-def load_system(checkpoint: str | Path) -> tuple[MotionDiffusion, dict[str, Any]]:
+def load_system(checkpoint: str | Path) -> tuple[MotionDiffusion | ContactDetection, dict[str, Any]]:
     """The trained system (averaged weights, evaluation mode) and the config it was trained with."""
     config, state = read_checkpoint(checkpoint)
     system = instantiate(config["model"], _convert_="all")
-    load_weights(system, state, checkpoint)
+    load_checkpoint(system, state, checkpoint)
     return system.eval(), config
 
 
@@ -37,6 +38,8 @@ def load_pipeline(checkpoint: str | Path | None, pipeline: DictConfig, device: s
     if checkpoint is None:
         raise WearcapError(f"no checkpoint, but {name} needs a trained network", fix="Give checkpoint=…, or a pipeline without one, such as pipeline=hps.")  # fmt: skip
     system, _ = load_system(checkpoint)
+    if not isinstance(system, MotionDiffusion):
+        raise WearcapError(f"{name} needs a motion denoiser", where=checkpoint, expected="a checkpoint of one, not of a contact network")  # fmt: skip
     return made(
         net=system.net, features=system.features, schedule=system.schedule, skeleton=system.skeleton,
         fps=system.fps, device=device,

@@ -27,7 +27,11 @@ def train(config: DictConfig) -> float:
     record_run(run, OmegaConf.to_yaml(config, resolve=True))
     resume = resume_path(config.resume, Path(config.paths.outputs) / "train" / config.name)
     data, system = instantiate(config.data, _convert_="all"), instantiate(config.model, _convert_="all")
-    callbacks = [instantiate(callback, _convert_="all") for callback in config.callbacks.values() if callback]
+    callbacks = [
+        instantiate(callback, _convert_="all")
+        for callback in config.callbacks.values()
+        if callback and "_target_" in callback
+    ]
     callbacks.insert(0, ConfigInCheckpoint(OmegaConf.to_container(config, resolve=True)))
     if config.early_stop:
         callbacks.append(EarlyStopping("val/loss", patience=config.early_stop))

@@ -1,14 +1,86 @@
 """Windows for Lightning: datasets and loaders, composed and nothing else."""
 
+from collections.abc import Sized
+from typing import Protocol, runtime_checkable
+
 import lightning
+from torch import Tensor
 from torch.utils.data import DataLoader
 
+from wearcap.data.contact_features import PoseFeatures
+from wearcap.data.contact_windows import NONE, Augmentation, ContactDataset
 from wearcap.data.statistics import collate
 from wearcap.data.windows import FixedSampler, SeededSampler, Source, WindowDataset
 
 
-class MotionWindows(lightning.LightningDataModule):
+@runtime_checkable
+class Drawn(Sized, Protocol):
+    """A dataset whose windows are drawn by weight; an item is asked for by (window, seed)."""
+
+    weights: Tensor
+
+    def __getitem__(self, item: tuple[int, int]) -> tuple[Tensor, ...]: ...
+
+
+class SeededWindows(lightning.LightningDataModule):
     """Training windows drawn afresh each epoch by seed, validation windows always the same."""
+
+    def __init__(
+        self,
+        sources: dict[str, dict | None],
+        batch_size: int,
+        steps_per_epoch: int | None,
+        val_windows: int | None,
+        workers: int,
+        seed: int,
+        val_sources: dict[str, dict | None] | None,
+    ):
+        """`sources` maps a name to {root, weight}; `val_sources` (default: the same) are validated on.
+
+        An epoch has `steps_per_epoch` steps of `batch_size` windows, however many windows there are; None: as many
+        as there are windows.
+        """
+        super().__init__()
+        self.sources = [Source(**source) for source in sources.values() if source]
+        self.val_sources = [Source(**source) for source in (val_sources or sources).values() if source]
+        self.batch_size, self.steps_per_epoch, self.val_windows = batch_size, steps_per_epoch, val_windows
+        self.workers, self.seed = workers, seed
+
+    def dataset(self, split: str) -> Drawn:
+        """Windows of a split; those of the training split are varied."""
+        raise NotImplementedError
+
+    def setup(self, stage: str) -> None:
+        if stage == "fit":
+            self.train, self.val = self.dataset("train"), self.dataset("val")
+
+    def _world(self) -> dict[str, int]:
+        return {"rank": self.trainer.global_rank, "world": self.trainer.world_size} if self.trainer else {}
+
+    def train_dataloader(self) -> DataLoader:
+        world = self._world()
+        steps = self.steps_per_epoch or max(1, len(self.train) // self.batch_size)
+        count = steps * self.batch_size * world.get("world", 1)
+        sampler = SeededSampler(self.train.weights, count, self.seed, **world)
+        return self._loader(self.train, sampler)
+
+    def val_dataloader(self) -> DataLoader:
+        return self._loader(self.val, FixedSampler(len(self.val), self.val_windows))
+
+    def _loader(self, dataset: Drawn, sampler) -> DataLoader:
+        return DataLoader(
+            dataset, self.batch_size, sampler=sampler, num_workers=self.workers, collate_fn=collate,
+            persistent_workers=self.workers > 0,
+            # A forked worker can inherit a held lock of the main process's threads and hang.
+            multiprocessing_context="forkserver" if self.workers else None, pin_memory=self.trainer is not None and self._on_gpu(),
+        )  # fmt: skip
+
+    def _on_gpu(self) -> bool:
+        return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
+
+
+class MotionWindows(SeededWindows):
+    """Windows of head paths and motions, for the motion diffusion."""
 
     def __init__(
         self,
@@ -25,17 +97,10 @@ class MotionWindows(lightning.LightningDataModule):
         balance: float = 1.0,
         val_sources: dict[str, dict | None] | None = None,
     ):
-        """`sources` maps a name to {root, weight}; `val_sources` (default: the same) are validated on.
-
-        An epoch has `steps_per_epoch` steps of `batch_size` windows, however many windows there are. `balance`: see
-        `WindowDataset`; it is for training alone.
-        """
-        super().__init__()
-        self.sources = [Source(**source) for source in sources.values() if source]
-        self.val_sources = [Source(**source) for source in (val_sources or sources).values() if source]
+        """See `SeededWindows`; `balance`: see `WindowDataset`, for training alone."""
+        super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
         self.window, self.stride, self.fps = window, stride, fps
-        self.batch_size, self.steps_per_epoch, self.val_windows = batch_size, steps_per_epoch, val_windows
-        self.workers, self.seed, self.augment, self.balance = workers, seed, augment, balance
+        self.augment, self.balance = augment, balance
 
     def dataset(self, split: str) -> WindowDataset:
         """Windows of a split; the training split is jittered and mirrored."""
@@ -45,29 +110,38 @@ class MotionWindows(lightning.LightningDataModule):
             mirror=self.augment and train, balance=self.balance if train else 1.0,
         )  # fmt: skip
 
-    def setup(self, stage: str) -> None:
-        if stage == "fit":
-            self.train, self.val = self.dataset("train"), self.dataset("val")
 
-    def _world(self) -> dict[str, int]:
-        return {"rank": self.trainer.global_rank, "world": self.trainer.world_size} if self.trainer else {}
+class ContactWindows(SeededWindows):
+    """Windows of poses with the truth about hand contact, for contact detection."""
 
-    def train_dataloader(self) -> DataLoader:
-        world = self._world()
-        count = self.steps_per_epoch * self.batch_size * world.get("world", 1)
-        sampler = SeededSampler(self.train.weights, count, self.seed, **world)
-        return self._loader(self.train, sampler)
+    def __init__(
+        self,
+        sources: dict[str, dict | None],
+        features: PoseFeatures,
+        classes: list[str],
+        window: int,
+        stride: int,
+        fps: float,
+        batch_size: int,
+        steps_per_epoch: int | None = None,
+        val_windows: int | None = None,
+        workers: int = 0,
+        seed: int = 0,
+        stream: str = "suit",
+        augmentation: Augmentation = NONE,
+        balance: float = 1.0,
+        val_sources: dict[str, dict | None] | None = None,
+    ):
+        """See `SeededWindows` and `ContactDataset`; `augmentation` and `balance` are for training alone."""
+        super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
+        self.features, self.classes = features, tuple(classes)
+        self.window, self.stride, self.fps, self.stream = window, stride, fps, stream
+        self.augmentation, self.balance = augmentation, balance
 
-    def val_dataloader(self) -> DataLoader:
-        return self._loader(self.val, FixedSampler(len(self.val), self.val_windows))
-
-    def _loader(self, dataset: WindowDataset, sampler) -> DataLoader:
-        return DataLoader(
-            dataset, self.batch_size, sampler=sampler, num_workers=self.workers, collate_fn=collate,
-            persistent_workers=self.workers > 0,
-            # A forked worker can inherit a held lock of the main process's threads and hang.
-            multiprocessing_context="forkserver" if self.workers else None, pin_memory=self.trainer is not None and self._on_gpu(),
+    def dataset(self, split: str) -> ContactDataset:
+        train = split == "train"
+        return ContactDataset(
+            self.sources if train else self.val_sources, split, window=self.window, stride=self.stride, fps=self.fps,
+            classes=self.classes, skeleton=self.features.skeleton, stream=self.stream,
+            augmentation=self.augmentation if train else NONE, balance=self.balance if train else 1.0,
         )  # fmt: skip
-
-    def _on_gpu(self) -> bool:
-        return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"

@@ -1,17 +1,22 @@
 """Mean and scale of features over a training split, saved with the weights."""
 
+from typing import TypeVar
+
 import torch
 from torch import Tensor
 
 from wearcap.data.features import HeadFeatures
-from wearcap.data.windows import Window, WindowDataset
+from wearcap.data.windows import WindowDataset
+
+W = TypeVar("W", bound=tuple)
 
 MIN_SCALE = 0.05
 """No feature is stretched more than this: rotations that hardly vary would otherwise be mostly noise."""
 
 
-def collate(windows: list[Window]) -> Window:
-    return Window(*(torch.stack(field) for field in zip(*windows)))
+def collate(windows: list[W]) -> W:
+    """Windows, each a tuple of tensors, as one with a leading batch axis."""
+    return type(windows[0])(*(torch.stack(field) for field in zip(*windows)))
 
 
 def feature_statistics(

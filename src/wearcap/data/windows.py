@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
@@ -16,6 +16,8 @@ from wearcap.data.floor import floor_beneath
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.store import RecordingFile, RecordingStore
+
+_FLIP = (1.0, -1.0, 1.0)
 
 
 class Window(NamedTuple):
@@ -42,6 +44,51 @@ class Source:
     weight: float = 1.0
 
 
+def share_out(
+    sources: list[Source],
+    split: str,
+    *,
+    window: int,
+    stride: int,
+    fps: float,
+    balance: float = 1.0,
+    min_frames: int = 30,
+) -> tuple[list[Path], Int64[Tensor, "window 3"], Float64[Tensor, "window"]]:
+    """Recordings of a split, its windows as (recording, first frame, frames of the recording), their shares of the draws.
+
+    Recordings shorter than `min_frames` are left out. Raises WearcapError for one of another rate than `fps`, and
+    where no window is left.
+    """
+    paths: list[Path] = []
+    starts, weights = [], []
+    for source in sources:
+        store = RecordingStore.open(source.root)
+        rows = [
+            (store.root / store.entries[name].file, store.entries[name].frames)
+            for name in _usable(store, split, fps, min_frames)
+        ]
+        counts = [max(0, frames - window) // stride + 1 for _, frames in rows]
+        total = sum(count**balance for count in counts)
+        for (path, frames), count in zip(rows, counts):
+            starts += [(len(paths), k * stride, frames) for k in range(count)]
+            weights += [source.weight * count ** (balance - 1) / total] * count
+            paths.append(path)
+    if not starts:
+        raise WearcapError(f"no windows in split {split!r}", where=", ".join(s.root for s in sources),
+                           expected=f"recordings of at least {min_frames} frames")  # fmt: skip
+    return paths, torch.tensor(starts), torch.tensor(weights, dtype=torch.float64)
+
+
+def _usable(store: RecordingStore, split: str, fps: float, min_frames: int) -> Iterator[str]:
+    for name in store.names(split):
+        entry = store.entries[name]
+        if abs(entry.fps - fps) > 0.01 * fps:
+            raise WearcapError(f"recording {name!r} has {entry.fps} frames per second", where=store.root,
+                               expected=f"{fps}", fix="Prepare the data set at that rate.")  # fmt: skip
+        if entry.frames >= min_frames:
+            yield name
+
+
 class WindowDataset(Dataset):
     """Windows of one split of one or more data sets. An item is asked for by (window, seed), or by its window alone."""
 
@@ -62,34 +109,9 @@ class WindowDataset(Dataset):
         1 draws all windows alike, 0 all recordings.
         """
         self.window, self.stride, self.fps, self.mirror = window, stride, fps, mirror
-        self.paths: list[Path] = []
-        starts, weights = [], []
-        for source in sources:
-            store = RecordingStore.open(source.root)
-            rows = [
-                (store.root / store.entries[name].file, store.entries[name].frames)
-                for name in self._usable(store, split, min_frames)
-            ]
-            counts = [max(0, frames - window) // stride + 1 for _, frames in rows]
-            total = sum(count**balance for count in counts)
-            for (path, frames), count in zip(rows, counts):
-                starts += [(len(self.paths), k * stride, frames) for k in range(count)]
-                weights += [source.weight * count ** (balance - 1) / total] * count
-                self.paths.append(path)
-        if not starts:
-            raise WearcapError(f"no windows in split {split!r}", where=", ".join(s.root for s in sources),
-                               expected=f"recordings of at least {min_frames} frames")  # fmt: skip
-        self.starts = torch.tensor(starts)
-        self.weights = torch.tensor(weights, dtype=torch.float64)
-
-    def _usable(self, store: RecordingStore, split: str, min_frames: int) -> Iterator[str]:
-        for name in store.names(split):
-            entry = store.entries[name]
-            if abs(entry.fps - self.fps) > 0.01 * self.fps:
-                raise WearcapError(f"recording {name!r} has {entry.fps} frames per second", where=store.root,
-                                   expected=f"{self.fps}", fix="Prepare the data set at that rate.")  # fmt: skip
-            if entry.frames >= min_frames:
-                yield name
+        self.paths, self.starts, self.weights = share_out(
+            sources, split, window=window, stride=stride, fps=fps, balance=balance, min_frames=min_frames
+        )
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -167,15 +189,25 @@ def read_window(file: RecordingFile, start: int, length: int, random: torch.Gene
 
 def mirror_window(window: Window, skeleton: Skeleton) -> Window:
     """The same motion seen in a mirror that swaps left and right."""
-    flip = torch.tensor([1.0, -1.0, 1.0])
-    flip_R = torch.outer(flip, flip)
-    twin = [skeleton.index(mirrored_name(name)) for name in skeleton.joint_names]
+    flip = torch.tensor(_FLIP)
     return window._replace(
-        R_parent_joint=window.R_parent_joint[:, twin] * flip_R,
-        R_world_head=window.R_world_head * flip_R,
+        R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton),
+        R_world_head=window.R_world_head * torch.outer(flip, flip),
         t_world_head=window.t_world_head * flip,
-        t_parent_joint=window.t_parent_joint[twin] * flip,
+        t_parent_joint=window.t_parent_joint[_twins(skeleton)] * flip,
     )
+
+
+def mirrored_rotations(
+    R_parent_joint: Float[Tensor, "*batch joint 3 3"], skeleton: Skeleton
+) -> Float[Tensor, "*batch joint 3 3"]:
+    """A pose seen in a mirror that swaps left and right."""
+    flip = R_parent_joint.new_tensor(_FLIP)
+    return R_parent_joint[..., _twins(skeleton), :, :] * torch.outer(flip, flip)
+
+
+def _twins(skeleton: Skeleton) -> list[int]:
+    return [skeleton.index(mirrored_name(name)) for name in skeleton.joint_names]
 
 
 def mirrored_name(name: str) -> str:

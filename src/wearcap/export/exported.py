@@ -73,3 +73,11 @@ def _first_line(error: Exception) -> str:
 
 
 RUN_BY_FORMAT: dict[str, Callable[[str | Path], Run]] = {"onnx": open_onnx, "pt2": open_pt2}
+
+
+def open_exported(path: str | Path) -> Run:
+    """An exported network of either format, known by the file's ending."""
+    format = Path(path).suffix.removeprefix(".")
+    if format not in RUN_BY_FORMAT:
+        raise WearcapError("not an exported model", where=path, expected="a file that ends in .onnx or .pt2")
+    return RUN_BY_FORMAT[format](path)

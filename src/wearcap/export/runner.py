@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from wearcap.data.features import HeadFeatures
 from wearcap.errors import WearcapError
-from wearcap.export.exported import RUN_BY_FORMAT, Run
+from wearcap.export.exported import Run, open_exported
 from wearcap.export.sidecar import SCHEDULES, read_sidecar, skeleton_from_json
 from wearcap.models.denoiser import MotionDenoiser, Normalizer
 from wearcap.pipelines.hmd2 import HMD2
@@ -50,11 +50,8 @@ def load_exported(path: str | Path) -> HMD2:
 
     Raises WearcapError when either is missing, unreadable, or does not belong to the other.
     """
-    format = Path(path).suffix.removeprefix(".")
-    if format not in RUN_BY_FORMAT:
-        raise WearcapError("not an exported model", where=path, expected="a file that ends in .onnx or .pt2")
-    run = RUN_BY_FORMAT[format](path)
-    about = read_sidecar(path)
+    run = open_exported(path)
+    about = read_sidecar(path, "denoiser")
     normalizer = Normalizer(len(about["motion_mean"]))
     normalizer.set(torch.tensor(about["motion_mean"]), torch.tensor(about["motion_scale"]))
     schedule = dict(about["schedule"])

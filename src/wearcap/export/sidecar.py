@@ -10,11 +10,12 @@ from wearcap.body.skeleton import Site, Skeleton
 from wearcap.data.features import HeadFeatures
 from wearcap.diffusion.schedule import CosineSchedule, LinearSchedule
 from wearcap.errors import WearcapError
-from wearcap.export.denoiser import ExportReport, export_denoiser
+from wearcap.export.network import ExportReport, export_network
 from wearcap.files import sha256_of, write_text
 from wearcap.pipelines.hmd2 import HMD2
 
 VERSION = 1
+MAX_ERROR = 1e-4
 SCHEDULES = {cls.__name__: cls for cls in (CosineSchedule, LinearSchedule)}
 ROT6D = tuple(f"{column}{axis}" for column in "xy" for axis in "xyz")
 """First two columns of a rotation matrix, one after the other."""
@@ -23,7 +24,7 @@ ROT6D = tuple(f"{column}{axis}" for column in "xy" for axis in "xyz")
 def export_hmd2(pipeline: HMD2, path: str | Path, format: str) -> ExportReport:
     """Write the pipeline's denoiser as `path` (.onnx or .pt2) and its sidecar as the same name with .json.
 
-    Raises what `export_denoiser` raises.
+    Raises what `export_network` raises.
     """
     net, random = pipeline.net, torch.Generator().manual_seed(0)
     level = torch.rand(2, net.window, generator=random)
@@ -34,13 +35,17 @@ def export_hmd2(pipeline: HMD2, path: str | Path, format: str) -> ExportReport:
         2, net.window, len(scale), generator=random
     )
     example = {"x_t": x_t, "level": level, "condition": condition, "valid": valid}
-    report = export_denoiser(net, example, path, format)
-    write_text(sidecar_path(path), json.dumps(describe(pipeline, report), indent=1) + "\n")
+    report = export_network(net, example, path, format, MAX_ERROR)
+    write_sidecar(path, describe(pipeline, report))
     return report
 
 
 def sidecar_path(path: str | Path) -> Path:
     return Path(path).with_suffix(".json")
+
+
+def write_sidecar(path: str | Path, about: dict) -> None:
+    write_text(sidecar_path(path), json.dumps(about, indent=1) + "\n")
 
 
 def describe(pipeline: HMD2, report: ExportReport) -> dict:
@@ -50,8 +55,7 @@ def describe(pipeline: HMD2, report: ExportReport) -> dict:
         raise WearcapError(f"schedule {type(schedule).__name__} cannot be exported",
                            expected=f"one of {', '.join(SCHEDULES)}")  # fmt: skip
     return {
-        "wearcap_export": VERSION,
-        "model": {"file": Path(report.path).name, "sha256": sha256_of(report.path), **asdict(report)},
+        **header("denoiser", report),
         "window": net.window,
         "fps": pipeline.fps,
         "sampler": {"steps": pipeline.steps, "stride": pipeline.advance, "eta": pipeline.eta},
@@ -64,6 +68,12 @@ def describe(pipeline: HMD2, report: ExportReport) -> dict:
         "condition_size": net.condition_size,
         "skeleton": skeleton_to_json(pipeline.skeleton),
     }
+
+
+def header(network: str, report: ExportReport) -> dict:
+    """What the sidecar of every kind of network begins with."""
+    model = {"file": Path(report.path).name, "sha256": sha256_of(report.path), **asdict(report)}
+    return {"wearcap_export": VERSION, "network": network, "model": model}
 
 
 def condition_channels(features: HeadFeatures) -> list[str]:
@@ -92,8 +102,8 @@ def skeleton_from_json(tree: dict) -> Skeleton:
     )  # fmt: skip
 
 
-def read_sidecar(path: str | Path) -> dict:
-    """The sidecar of a model file. Raises WearcapError when it is missing, foreign, or of another model file."""
+def read_sidecar(path: str | Path, network: str) -> dict:
+    """The sidecar of a model file. Raises WearcapError when it is missing, foreign, or of another network or file."""
     sidecar = sidecar_path(path)
     try:
         tree = json.loads(sidecar.read_text(encoding="utf-8"))
@@ -104,6 +114,9 @@ def read_sidecar(path: str | Path) -> dict:
         raise WearcapError(f"not a readable sidecar ({error})", where=sidecar) from error
     if not isinstance(tree, dict) or tree.get("wearcap_export") != VERSION:
         raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
+    # The first sidecars did not say: all were denoisers'.
+    if (kind := tree.get("network", "denoiser")) != network:
+        raise WearcapError(f"a {kind} network", where=path, expected=f"a {network} network")
     if tree["model"]["sha256"] != sha256_of(path):
         raise WearcapError(
             "its sidecar belongs to another model file", where=path, fix="Export the model again."

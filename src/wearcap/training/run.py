@@ -6,19 +6,24 @@ import json
 import platform
 import subprocess
 from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import lightning
 import torch
 
-from wearcap.data.datamodule import MotionWindows
+from wearcap.data.datamodule import SeededWindows
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.training.motion_diffusion import MotionDiffusion
 
 
-def fit(
-    system: MotionDiffusion, data: MotionWindows, trainer: lightning.Trainer, resume: Path | None = None
-) -> None:
+@runtime_checkable
+class System(Protocol):
+    """A LightningModule that normalises its inputs by what its training windows hold."""
+
+    def set_statistics(self, dataset: Any) -> None: ...
+
+
+def fit(system: System, data: SeededWindows, trainer: lightning.Trainer, resume: Path | None = None) -> None:
     """Train from scratch or go on from a checkpoint; a run that was killed repeats nothing and misses nothing."""
     if resume is None:
         system.set_statistics(data.dataset("train"))

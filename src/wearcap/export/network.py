@@ -1,4 +1,4 @@
-"""A denoiser written as ONNX or as a torch.export archive, and compared with the eager network before it counts."""
+"""A network written as ONNX or as a torch.export archive, and compared with the eager network before it counts."""
 
 import contextlib
 import copy
@@ -17,7 +17,6 @@ from wearcap.errors import WearcapError
 from wearcap.export.exported import RUN_BY_FORMAT
 from wearcap.files import atomic_path
 
-MAX_ERROR = 1e-4
 TIMED_RUNS = 5
 
 
@@ -35,13 +34,13 @@ class ExportReport:
     eager_latency_ms: float
 
 
-def export_denoiser(
-    net: nn.Module, example: dict[str, Tensor], path: str | Path, format: str
+def export_network(
+    net: nn.Module, example: dict[str, Tensor], path: str | Path, format: str, max_error: float
 ) -> ExportReport:
     """Write `net` in a format, "onnx" or "pt2" (a torch.export archive), with a dynamic batch axis.
 
     example: the network's arguments by name, each with a leading batch axis of at least 2; all other axes become
-    fixed. The file appears under its name only if its outputs differ from eager's by less than 1e-4.
+    fixed. The file appears under its name only if its outputs differ from eager's by less than `max_error`.
     Raises WearcapError when they differ more, when the format is unknown, or when its libraries are missing.
     """
     _require_libraries(format)
@@ -59,10 +58,10 @@ def export_denoiser(
             torch.onnx.export(program, (), temporary, kwargs=example, dynamo=True, external_data=False)
         run = RUN_BY_FORMAT[format](temporary)
         error = max(_difference(net, run, example, batch) for batch in (1, 3))
-        if not error < MAX_ERROR:
+        if not error < max_error:
             raise WearcapError(
                 f"the exported network differs from the eager one by {error:.2e}", where=path,
-                expected=f"less than {MAX_ERROR:.0e}", fix="Try the other format and report this model.",
+                expected=f"less than {max_error:.0e}", fix="Try the other format and report this model.",
             )  # fmt: skip
         window = _batch_of(example, 1)
         latency, eager = _milliseconds(run, window), _milliseconds(lambda **inputs: net(**inputs), window)

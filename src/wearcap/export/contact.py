@@ -1,0 +1,75 @@
+"""Contact networks as ONNX or torch.export, with a sidecar, and back as detectors without the network's code."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from wearcap.data.contact_features import FEATURES
+from wearcap.export.exported import Run, open_exported
+from wearcap.export.network import ExportReport, export_network
+from wearcap.export.sidecar import header, read_sidecar, write_sidecar
+from wearcap.geometry import rotation
+from wearcap.models.contact import FRAMES, ContactNetwork
+from wearcap.pipelines.contact_prediction import ContactDetector
+from wearcap.recording.interactions import HANDS
+
+MAX_ERROR = 1e-5
+
+
+class _MiddleFrame(nn.Module):
+    """61 poses' features to the calibrated probabilities of the middle one."""
+
+    def __init__(self, net: ContactNetwork):
+        super().__init__()
+        self.net = net
+
+    def forward(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch hand class"]:
+        return self.net.probability(pose)[:, 0]
+
+
+def export_contact(detector: ContactDetector, path: str | Path, format: str) -> ExportReport:
+    """Write a detector's network as `path` (.onnx or .pt2) and its sidecar as the same name with .json.
+
+    It takes `pose` "batch 61 feature" and gives probabilities "batch hand class". Raises what `export_network` raises.
+    """
+    skeleton, random = detector.features.skeleton, torch.Generator().manual_seed(0)
+    turns = 0.3 * torch.randn(3, FRAMES, len(skeleton), 3, generator=random)
+    example = {"pose": detector.features.encode(rotation.exp(turns))}
+    report = export_network(_MiddleFrame(detector.net), example, path, format, MAX_ERROR)
+    about = {
+        "features": {"name": type(detector.features).__name__, **asdict(detector.features)},
+        "feature_size": detector.features.size, "skeleton": list(skeleton.joint_names), "frames": FRAMES,
+        "fps": detector.fps, "classes": list(detector.classes), "hands": list(HANDS),
+    }  # fmt: skip
+    write_sidecar(path, header("contact", report) | about)
+    return report
+
+
+class ExportedContact(ContactNetwork):
+    """A contact network whose weights live in an exported file, run on the CPU: 61 frames in, one answer out."""
+
+    frames_per_pass = 1000
+
+    def __init__(self, run: Run, classes: int):
+        super().__init__(classes)
+        self._run = (run,)
+
+    def probability(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch out hand class"]:
+        windows = pose.unfold(1, FRAMES, 1).transpose(-1, -2)
+        return self._run[0](pose=windows.flatten(0, 1)).unflatten(0, windows.shape[:2])
+
+
+def load_exported_contact(path: str | Path) -> ContactDetector:
+    """The detector of an exported model (.onnx or .pt2) and the sidecar beside it.
+
+    Raises WearcapError when either is missing, unreadable, or does not belong to the other.
+    """
+    run, about = open_exported(path), read_sidecar(path, "contact")
+    features = dict(about["features"])
+    return ContactDetector(
+        ExportedContact(run, len(about["classes"])), FEATURES[features.pop("name")](**features),
+        tuple(about["classes"]), about["fps"],
+    )  # fmt: skip

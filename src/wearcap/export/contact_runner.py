@@ -1,0 +1,52 @@
+"""Running exported contact networks on a recording frame by frame, without Lightning, Hydra or the networks' code.
+
+    python -m wearcap.export.contact_runner MODEL.onnx RECORDING.safetensors CONTACT.csv
+
+Poses come one by one and wait for the 30 that follow; the state is the last 61 frames.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+
+from wearcap.data.contact_features import pose_frames
+from wearcap.errors import WearcapError
+from wearcap.export.contact import load_exported_contact
+from wearcap.files import write_text
+from wearcap.pipelines.contact_prediction import ContactStream
+from wearcap.recording.interactions import HANDS
+from wearcap.recording.store import RecordingFile
+
+
+def main(arguments: list[str]) -> None:
+    """Tell hand contact in one recording with an exported model and write it as a table."""
+    parser = argparse.ArgumentParser(prog="python -m wearcap.export.contact_runner", description=main.__doc__)
+    parser.add_argument("model", type=Path, help="exported .onnx or .pt2 file, its .json beside it")
+    parser.add_argument("recording", type=Path, help="recording (.safetensors) with a suit, or a motion")
+    parser.add_argument("output", type=Path, help="where to write times and probabilities (.csv)")
+    options = parser.parse_args(arguments)
+    detector = load_exported_contact(options.model)
+    recording = RecordingFile(options.recording).load()
+    motion = recording.suit or recording.motion
+    if motion is None:
+        raise WearcapError("this recording has no poses", where=options.recording,
+                           expected="a suit, or a motion")  # fmt: skip
+    times, R = pose_frames(motion, detector.features.skeleton, detector.fps)
+    stream = ContactStream((detector,), detector.features.skeleton)
+    answers = [answer for frame in R if (answer := stream.push(frame)) is not None] + stream.finish()
+    header = ["time_s", *(f"{hand}_{name}" for name in detector.classes for hand in HANDS)]
+    rows = [
+        [f"{time:.6f}", *(f"{p:.7f}" for p in torch.cat([answer[name] for name in detector.classes]).tolist())]
+        for time, answer in zip(times.tolist(), answers)
+    ]  # fmt: skip
+    write_text(options.output, "".join(",".join(row) + "\n" for row in [header, *rows]))
+    print(f"{len(rows)} frames at {detector.fps:.0f} Hz: {options.output}")
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except WearcapError as error:
+        sys.exit(f"error: {error}")

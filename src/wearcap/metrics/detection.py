@@ -1,0 +1,67 @@
+"""How well probabilities tell yes from no: average precision, precision, recall, accuracy, calibration (thesis Table 5.3)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+class DetectionScores(NamedTuple):
+    """Shares (0…1); NaN where they are not defined, such as recall without a positive."""
+
+    average_precision: float
+    precision: float
+    recall: float
+    accuracy: float
+    calibration_error: float
+
+
+def detection_scores(
+    prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"], threshold: float = 0.5
+) -> DetectionScores:
+    """Scores of one detector; precision, recall and accuracy with probabilities above `threshold` as yes."""
+    found = prob > threshold
+    hits = float((found & truth).sum())
+    return DetectionScores(
+        average_precision(prob, truth),
+        _share(hits, float(found.sum())),
+        _share(hits, float(truth.sum())),
+        _share(float((found == truth).sum()), len(truth)),
+        calibration_error(prob, truth),
+    )
+
+
+def mean_detection_scores(
+    prob: Float[Tensor, "sample hand"], truth: Bool[Tensor, "sample hand"], threshold: float = 0.5
+) -> DetectionScores:
+    """Means of each hand's scores, as the document reports them; hands without a score are left out of its mean."""
+    hands = torch.tensor([detection_scores(prob[:, h], truth[:, h], threshold) for h in range(prob.shape[1])])
+    return DetectionScores(*hands.nanmean(0).tolist())
+
+
+def average_precision(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"]) -> float:
+    """Σ (R_n - R_(n-1)) P_n over falling thresholds, samples of equal probability together (as scikit-learn defines it)."""
+    order = prob.argsort(descending=True, stable=True)
+    hits = truth[order].double().cumsum(0)
+    if not len(hits) or not hits[-1]:
+        return float("nan")
+    # A threshold lies behind the last of equal probabilities.
+    ends = torch.cat([prob[order].diff() != 0, torch.ones(1, dtype=torch.bool, device=prob.device)])
+    hits, count = hits[ends], torch.arange(1, len(order) + 1, device=prob.device)[ends]
+    gained = hits.diff(prepend=hits.new_zeros(1))
+    return float((gained * hits / count).sum() / hits[-1])
+
+
+def calibration_error(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"], bins: int = 10) -> float:
+    """Mean distance between probability and frequency over equal bins, weighted by their samples (Guo et al. 2017)."""
+    if not len(prob):
+        return float("nan")
+    place = (prob * bins).long().clamp(0, bins - 1)
+    excess = torch.zeros(bins, dtype=torch.float64, device=prob.device)
+    excess.index_add_(0, place, prob.double() - truth.double())
+    return float(excess.abs().sum() / len(prob))
+
+
+def _share(part: float, whole: float) -> float:
+    return part / whole if whole else float("nan")

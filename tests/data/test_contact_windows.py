@@ -1,0 +1,159 @@
+"""Windows for contact detection: what they hold, how they are varied, and what the networks see of them."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from contact_motion import CLASSES, bending, bending_dataset, bending_recording
+from wearcap.body.skeleton import xsens23
+from wearcap.body.skeletons import smpl24, smplh52
+from wearcap.data.contact_features import HandViews, SmplAngles, in_skeleton, pose_frames, worn
+from wearcap.data.contact_windows import Augmentation, ContactDataset, interpolated, pose_errors
+from wearcap.data.windows import Source, mirrored_rotations
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.recording import RecordingStore
+
+QUIET = Augmentation(mirror=False, noise_deg=0.0, stretch=1.0, drop=0.0)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return bending_dataset(tmp_path_factory.mktemp("contact")).root
+
+
+def dataset(root, augmentation=QUIET, skeleton=None, **more):
+    settings = {"window": 120, "stride": 40, "fps": 60.0, "classes": CLASSES} | more
+    return ContactDataset(
+        [Source(str(root))], "train", skeleton=skeleton or xsens23(), augmentation=augmentation, **settings
+    )
+
+
+def test_a_plain_window_is_the_recordings_own(root):
+    windows = dataset(root)
+    motion, interactions = bending(900, 0)
+    window = windows[(1, 5)]
+    assert torch.equal(window.R_parent_joint, motion.R_parent_joint[40:160])
+    for index, name in enumerate(CLASSES):
+        assert torch.equal(
+            window.contact[..., index], interactions.hand_contact(motion.timestamps[40:160], name)
+        )
+    assert window.contact.any()
+    assert not window.error.any()
+
+
+def test_content_is_a_function_of_the_seed(root):
+    windows = dataset(root, Augmentation())
+    first, again, other = windows[(2, 7)], windows[(2, 7)], windows[(2, 8)]
+    assert all(torch.equal(a, b) for a, b in zip(first, again))
+    assert not torch.equal(first.R_parent_joint, other.R_parent_joint)
+    assert first.error.norm(dim=-1).mean() < math.radians(5)
+
+
+def test_a_mirrored_window_swaps_hands_and_sides(root):
+    plain, turned = dataset(root), dataset(root, replace(QUIET, mirror=True), stride=1)
+    seen = [turned[(0, seed)] for seed in range(20)]
+    swapped = [window.contact.any(0)[0].any() != plain[(0, 0)].contact.any(0)[0].any() for window in seen]
+    assert 3 < sum(swapped) < 17
+    one = seen[swapped.index(True)]
+    torch.testing.assert_close(
+        mirrored_rotations(one.R_parent_joint, xsens23()), plain[(0, 0)].R_parent_joint, atol=1e-6, rtol=0
+    )
+    assert torch.equal(one.contact.flip(1), plain[(0, 0)].contact)
+
+
+def test_stretched_windows_keep_poses_and_truth_together(root):
+    """Bent elbows are contacts, at any speed and with frames lost."""
+    windows = dataset(root, Augmentation(mirror=False, noise_deg=0.0, stretch=1.2, drop=0.3))
+    body = xsens23()
+    for seed in range(6):
+        window = windows[(seed, seed)]
+        elbows = window.R_parent_joint[:, body.indices("left_elbow", "right_elbow")]
+        bent = rotation.log(elbows)[..., 2].abs()
+        contact = window.contact.any(-1)
+        assert bent[contact].median() > 1.0
+        assert bent[~contact].median() < 0.5
+        torch.testing.assert_close(elbows @ elbows.mT, torch.eye(3).expand_as(elbows), atol=1e-5, rtol=0)
+
+
+def test_lost_frames_are_bridged():
+    motion = bending(30)[0]
+    kept = torch.ones(30, dtype=torch.bool)
+    kept[[7, 8, 15]] = False
+    R = interpolated(motion.R_parent_joint, kept, torch.arange(29) * 1.0)
+    assert torch.equal(R[kept[:29]], rotation.matrix_from_rot6d(rotation.rot6d_from_matrix(motion.R_parent_joint[:29]))[kept[:29]])  # fmt: skip
+    assert rotation.geodesic(R, motion.R_parent_joint[:29]).max() < math.radians(3)
+
+
+def test_errors_have_the_size_that_was_asked_for():
+    random = torch.Generator().manual_seed(0)
+    sizes = [pose_errors(300, 23, 5.0, random).square().sum(-1).mean().sqrt() for _ in range(200)]
+    assert max(sizes) < math.radians(5.6)
+    assert sum(sizes) / len(sizes) == pytest.approx(math.radians(2.5), rel=0.15)
+
+
+def test_another_skeleton_and_rate_are_converted(tmp_path):
+    store = RecordingStore(tmp_path)
+    recording = bending_recording(400, "slow")
+    assert recording.suit is not None
+    half = replace(
+        recording.suit, timestamps=recording.suit.timestamps[::2], R_parent_joint=recording.suit.R_parent_joint[::2],
+        t_world_root=recording.suit.t_world_root[::2],
+    )  # fmt: skip
+    store.add(replace(recording, suit=half), split="train", config_hash="test")
+    window = dataset(tmp_path, skeleton=smpl24())[(0, 0)]
+    expected = in_skeleton(xsens23(), worn(xsens23(), smpl24()), recording.suit.R_parent_joint[:120])
+    assert rotation.geodesic(window.R_parent_joint, expected).max() < math.radians(2)
+
+
+def test_recordings_without_truth_or_suit_are_named(tmp_path):
+    store = RecordingStore(tmp_path)
+    store.add(replace(bending_recording(400, "a"), interactions=None), split="train", config_hash="test")
+    store.add(replace(bending_recording(400, "b"), suit=None), split="val", config_hash="test")
+    with pytest.raises(WearcapError, match="a.safetensors: this recording has no interactions"):
+        dataset(tmp_path)[(0, 0)]
+    with pytest.raises(WearcapError, match="no suit"):
+        ContactDataset([Source(str(tmp_path))], "val", window=120, stride=40, fps=60.0, classes=CLASSES, skeleton=xsens23())[(0, 0)]  # fmt: skip
+    with pytest.raises(WearcapError, match='expected.*"suit" or "motion"|"suit" or "motion"'):
+        dataset(tmp_path, stream="watch")
+
+
+def test_angles_are_smpls_in_its_own_axes():
+    rotvec = torch.zeros(2, 24, 3)
+    rotvec[0, smpl24().index("left_knee")] = torch.tensor(
+        [0.1, 0.5, 0.2]
+    )  # ours: about x forward, y left, z up
+    angles = SmplAngles().encode(rotation.exp(rotvec))
+    assert angles.shape == (2, 69)
+    knee = smpl24().index("left_knee") - 1
+    torch.testing.assert_close(angles[0].view(23, 3)[knee], torch.tensor([0.5, 0.2, 0.1]))
+    fingers = SmplAngles(fingers=True)
+    seen = fingers.encode(rotation.exp(0.1 * torch.ones(1, len(smplh52()), 3)))[0]
+    assert seen.shape == (fingers.size,) == (159,)
+    assert not seen[63:69].any()
+    assert seen[69:].min() > 0.09
+
+
+def test_views_know_neither_place_nor_heading_and_swap_in_a_mirror():
+    views, R = HandViews(), bending(60)[0].R_parent_joint
+    seen = views.encode(R)
+    assert seen.shape == (60, views.size)
+    turned = R.clone()
+    turned[:, 0] = rotation.about_axis("z", torch.tensor(1.3)) @ R[:, 0]
+    torch.testing.assert_close(views.encode(turned), seen, atol=1e-5, rtol=0)
+    tipped = R.clone()
+    tipped[:, 0] = rotation.about_axis("y", torch.tensor(0.3)) @ R[:, 0]
+    assert (views.encode(tipped) - seen).abs().max() > 0.1
+    left, right = seen.chunk(2, -1)
+    mirrored = views.encode(mirrored_rotations(R, views.skeleton))
+    torch.testing.assert_close(mirrored, torch.cat([right, left], -1), atol=1e-5, rtol=0)
+
+
+def test_poses_that_are_not_numbers_are_named():
+    motion = bending(60)[0]
+    broken = motion.R_parent_joint.clone()
+    broken[7, 3] = math.nan
+    with pytest.raises(WearcapError, match="1 of 60 poses are not numbers, first frame 7"):
+        pose_frames(replace(motion, R_parent_joint=broken), xsens23(), 60.0)

@@ -1,0 +1,143 @@
+"""Contact detection end to end: experiments run, resume changes nothing, checkpoints predict and export."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from contact_motion import CLASSES, bending_dataset
+from wearcap.cli import export, train
+from wearcap.cli.conf import compose, conf_dir
+from wearcap.cli.load import load_pipeline, load_system
+from wearcap.errors import WearcapError
+from wearcap.metrics.detection import average_precision
+from wearcap.models.checkpoint import read_checkpoint
+from wearcap.pipelines.contact_prediction import ContactPredictor
+from wearcap.recording import RecordingStore
+
+EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("contact_*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return bending_dataset(tmp_path_factory.mktemp("data")).root
+
+
+def arguments(data: Path, run: Path, experiment: str, *more: str) -> list[str]:
+    return [
+        f"experiment={experiment}", f"data.sources.simulated.root={data}", f"hydra.run.dir={run}",
+        f"paths.outputs={run.parent}", "trainer.accelerator=cpu", "trainer.log_every_n_steps=1",
+        "trainer.enable_progress_bar=false", "callbacks.progress=null", "logger.csv.flush_logs_every_n_steps=1", *more,
+    ]  # fmt: skip
+
+
+def fast(data: Path, run: Path, experiment: str, *more: str) -> Path:
+    train.main(arguments(data, run, experiment, "debug=fast", *more))
+    return run / "checkpoints" / "last.ckpt"
+
+
+def logged(run: Path, name: str) -> dict[int, str]:
+    with open(run / "metrics.csv") as file:
+        return {int(row["step"]): row[name] for row in csv.DictReader(file) if row.get(name)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_contact_experiment_takes_a_step(experiment, data, tmp_path):
+    checkpoint = fast(data, tmp_path / "run", experiment)
+    classes = read_checkpoint(checkpoint)[0]["model"]["classes"]
+    assert set(ContactPredictor.load(checkpoint).classes) == set(classes)
+    for name in classes:
+        assert logged(tmp_path / "run", f"val/{name}_average_precision")
+
+
+@pytest.fixture(scope="module")
+def learned(data, tmp_path_factory) -> Path:
+    """Ours, for long enough to tell bent elbows."""
+    run = tmp_path_factory.mktemp("runs") / "run"
+    more = [
+        "trainer.max_steps=80",
+        "data.steps_per_epoch=40",
+        "data.batch_size=8",
+        "data.window=120",
+        "data.stride=30",
+    ]
+    train.main(arguments(data, run, "contact_sequence", *more, "callbacks.average.decay=0.9"))
+    return run / "checkpoints" / "last.ckpt"
+
+
+def test_what_was_learned_is_told_of_a_recording(learned, data):
+    recording = RecordingStore.open(data).load("b3")
+    assert recording.suit is not None
+    assert recording.interactions is not None
+    prob = ContactPredictor.load(learned)(recording.suit)
+    for name in CLASSES:
+        truth = recording.interactions.hand_contact(recording.suit.timestamps, name)
+        assert average_precision(prob[name].flatten(), truth.flatten()) > 0.9
+
+
+def test_the_checkpoint_carries_its_temperatures(learned):
+    _, state = read_checkpoint(learned)
+    assert (state["net.temperature"] != 1.0).all()
+    system, config = load_system(learned)
+    assert torch.equal(system.net.temperature, state["net.temperature"])
+    assert config["name"] == "contact_sequence"
+
+
+def test_resumed_equals_straight_through(data, tmp_path):
+    more = ["data.steps_per_epoch=2", "data.batch_size=2", "data.window=90", "data.val_windows=4", "optimizer.scheduler.total=6"]  # fmt: skip
+    straight, first, second = (tmp_path / name for name in ("straight", "first", "second"))
+    train.main(arguments(data, straight, "contact_sequence", *more, "trainer.max_steps=6"))
+    train.main(arguments(data, first, "contact_sequence", *more, "trainer.max_steps=4"))
+    saved = torch.load(first / "checkpoints/last.ckpt", weights_only=True)["global_step"]
+    resume = f"resume={first}/checkpoints/last.ckpt"
+    train.main(arguments(data, second, "contact_sequence", *more, "trainer.max_steps=6", resume))
+    for name in ("train/loss", "val/loss"):
+        whole, rest = logged(straight, name), logged(second, name)
+        assert rest
+        assert rest == {step: value for step, value in whole.items() if step >= saved}
+    states = [read_checkpoint(run / "checkpoints/last.ckpt")[1] for run in (straight, second)]
+    assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format", ["onnx", "pt2"])
+def test_the_export_runs_on_a_recording_without_lightning(learned, data, tmp_path, format):
+    model, table = tmp_path / f"contact.{format}", tmp_path / "contact.csv"
+    export.main(
+        [f"checkpoint={learned}", f"format={format}", f"output={model}", f"hydra.run.dir={tmp_path}/x"]
+    )
+    assert json.loads(model.with_suffix(".json").read_text())["model"]["max_abs_error"] < 1e-5
+    program = (
+        "import sys; from wearcap.export.contact_runner import main; main(sys.argv[1:]); "
+        "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
+    )
+    source = RecordingStore.open(data).path_of("b3")
+    subprocess.run([sys.executable, "-c", program, model, source, table], check=True)
+    with open(table) as file:
+        rows = list(csv.DictReader(file))
+    suit = RecordingStore.open(data).load("b3").suit
+    assert suit is not None
+    prob = ContactPredictor.load(learned)(suit)
+    for name in CLASSES:
+        for hand, side in enumerate(("left", "right")):
+            told = torch.tensor([float(row[f"{side}_{name}"]) for row in rows])
+            torch.testing.assert_close(told, prob[name][:, hand], atol=1e-5, rtol=0)
+
+
+def test_a_contact_checkpoint_is_no_motion_denoiser(learned):
+    with pytest.raises(WearcapError, match="needs a motion denoiser"):
+        load_pipeline(learned, compose("capture", ["recording=x", "paths.run=x"]).pipeline, "cpu")
+
+
+def test_foreign_checkpoints_are_named(tmp_path, learned):
+    saved = torch.load(learned, weights_only=True)
+    config = json.loads(saved["wearcap"]["config"])
+    config["model"]["net"]["_target_"] = "somewhere.MotionDenoiser"
+    torch.save({**saved, "wearcap": {"config": json.dumps(config)}}, tmp_path / "other.ckpt")
+    with pytest.raises(WearcapError, match="a checkpoint of MotionDenoiser.*contact network"):
+        ContactPredictor.load(tmp_path / "other.ckpt")
