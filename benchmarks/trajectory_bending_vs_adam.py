@@ -1,11 +1,11 @@
 """Bending ten minutes of path at 30 Hz to camera positions: our second-order solver against Adam, same energy.
 
 The energy is the document's (thesis eq. 5.2, conf/bending/adam.yaml): camera positions, 7 cm off, at every frame; a
-path whose heading drifts by 0.6°/√s. Adam takes the best of three learning rates (by its energy after 200
-iterations) and stops where its energy is within 0.1 % of ours, which costs it less than to reach ours; where it has
-not got there after 2000 iterations, the time until then counts. The benchmark fails when Adam finds less than ours.
-value and baseline: ms. ratio = baseline / value, to be at least `goal`. A second figure (no goal) is the document's
-run of 1000 iterations, whatever energy it ends with.
+path whose heading drifts by 0.6°/√s. Adam runs at three learning rates, each for at most the document's 1000
+iterations, and may stop within 0.1 % of our energy, which costs it less than to reach it. The rate that is there
+first counts; where none gets there, the time that the best one took so far, so that the ratio is a lower bound. The
+benchmark fails when Adam finds less than ours. value and baseline: ms. ratio = baseline / value, to be at least
+`goal`.
 """
 
 import time
@@ -18,7 +18,7 @@ from wearcap.cli.conf import compose
 from wearcap.optimize.trajectory import BendingProblem, BentPath, bend_adam, bending_problem
 from wearcap.optimize.trajectory_banded import bend_banded
 
-RATES, TRIED, LONGEST, WITHIN = (1e-3, 3e-3, 1e-2), 200, 2000, 1.001
+RATES, LONGEST, WITHIN = (1e-3, 3e-3, 1e-2), 1000, 1.001
 FPS = 30
 
 
@@ -30,25 +30,25 @@ def measure(duration_s: float = 600.0, longest: int = LONGEST, repeats: int = 5)
         solved = bend_banded(problem)
     value = 1000 * (time.perf_counter() - begin) / repeats
     ours = least(solved)
-    rate = min(RATES, key=lambda rate: least(bend_adam(problem, TRIED, rate)))
+    baseline, reached, after = min(
+        (adam(problem, rate, longest, WITHIN * ours) for rate in RATES),
+        key=lambda run: (max(run[1], WITHIN * ours), run[0]),
+    )
+    if reached < ours:
+        raise SystemExit(f"error: Adam's energy {reached:.4f} is below ours {ours:.4f}")
+    return [{"name": "trajectory_bending_vs_adam", "value": value,
+             "unit": f"ms (energy {ours:.2f} against {reached:.2f} after {after} iterations)",
+             "baseline": baseline, "ratio": baseline / value, "goal": 20.0}]  # fmt: skip
+
+
+def adam(problem: BendingProblem, rate: float, longest: int, enough: float) -> tuple[float, float, int]:
+    """Time (ms) until an energy is enough or iterations are over, the least energy by then, and iterations."""
     begin = time.perf_counter()
-    adam = bend_adam(problem, longest, rate)
-    each = 1000 * (time.perf_counter() - begin) / len(adam.history)
-    if least(adam) < ours:
-        raise SystemExit(f"error: Adam's energy {least(adam):.4f} is below ours {ours:.4f}")
-    there = [k for k, entry in enumerate(adam.history) if entry["total"] <= WITHIN * ours]
-    took, fixed = there[0] if there else longest, min(1000, longest)
-    reached = adam.history[took]["total"]
-    ended = min(entry["total"] for entry in adam.history[: fixed + 1])
-    return [
-        figure("", value, f"energy {ours:.2f} against {reached:.2f} after {took}, rate {rate:g}", each * took, 20.0),
-        figure("_document", value, f"energy {ours:.2f} against {ended:.2f} after {fixed}", each * fixed, None),
-    ]  # fmt: skip
-
-
-def figure(which: str, value: float, what: str, baseline: float, goal: float | None) -> dict:
-    return {"name": f"trajectory_bending_vs_adam{which}", "value": value, "unit": f"ms ({what} iterations)",
-            "baseline": baseline, "ratio": baseline / value, "goal": goal}  # fmt: skip
+    solved = bend_adam(problem, longest, rate)
+    each = 1000 * (time.perf_counter() - begin) / len(solved.history)
+    energies = [entry["total"] for entry in solved.history]
+    after = next((k for k, energy in enumerate(energies) if energy <= enough), longest)
+    return each * after, min(energies[: after + 1]), after
 
 
 def least(solved: BentPath) -> float:
