@@ -1,6 +1,5 @@
 """An interactive flat while somebody lives in it: where everything stands now, and what was moved when."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,24 +8,13 @@ from jaxtyping import Float
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording.interactions import HANDS, Interactions
+from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Motion
+from wearcap.simulation.handling import Handling, interactions_of, object_motion
 from wearcap.simulation.interactive_flat import InteractiveFlat, obstacle
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.things import Thing
 from wearcap.simulation.world import World, WorldObject
-
-Poses = Callable[[Float[np.ndarray, "time"]], Rigid]
-"""Of a thing at times within the stretch in which it is moved (s)."""
-
-
-@dataclass(frozen=True)
-class Use:
-    """A stretch of time in which hands hold something."""
-
-    start_s: float
-    stop_s: float
-    hands: tuple[str, ...]
-    name: str
 
 
 @dataclass
@@ -38,9 +26,8 @@ class House:
     """How far each openable is from its initial pose (rad or m)."""
     poses: dict[str, Rigid] = field(default_factory=dict)
     """Where each thing stands."""
-    uses: list[Use] = field(default_factory=list)
-    moves: list[tuple[float, float, str, Poses]] = field(default_factory=list)
-    """(start, stop, name, poses) in the order of time."""
+    handlings: list[Handling] = field(default_factory=list)
+    """What was held and moved, in the order of time."""
 
     def __post_init__(self):
         self.values = {item.name: 0.0 for item in self.flat.openables}
@@ -68,38 +55,24 @@ class House:
         now.__dict__["navigation"] = grid
         return now
 
-    def record(self, start_s: float, stop_s: float, hands: tuple[str, ...], name: str) -> None:
-        """Enter that hands hold something for a while."""
-        self.uses.append(Use(start_s, stop_s, hands, name))
-
     def interactions(self, until_s: float) -> Interactions:
         """What was held when, up to the end of a recording (s)."""
-        classes = {
-            item.name: item.object.freedom.contact_class for item in (*self.flat.things, *self.flat.openables)
-        }
-        uses = sorted((use for use in self.uses if use.start_s < until_s), key=lambda use: use.start_s)
+        rows = interactions_of(self.handlings)
+        kept = torch.nonzero(rows.start_s < until_s)[:, 0]
+        pick = lambda names: tuple(names[k] for k in kept.tolist())  # noqa: E731
         return Interactions(
-            torch.tensor([use.start_s for use in uses], dtype=torch.float64),
-            torch.tensor([min(use.stop_s, until_s) for use in uses], dtype=torch.float64),
-            torch.tensor([[hand in use.hands for hand in HANDS] for use in uses]).reshape(-1, len(HANDS)),
-            tuple(use.name for use in uses), tuple(classes[use.name] for use in uses),
+            rows.start_s[kept], rows.stop_s[kept].clamp(max=until_s), rows.hands[kept], pick(rows.objects),
+            pick(rows.classes),
         )  # fmt: skip
 
-    def object_motion(self, times: Float[np.ndarray, "time"]) -> dict[str, Trajectory]:
-        """Poses of everything that can be moved at rising times (s); it stays where it was left."""
-        stamps, tracks = torch.from_numpy(times), {}
-        for item in (*self.flat.things, *self.flat.openables):
-            first = item.object.T_world_object.to(torch.float64)
-            R, t = first.R.repeat(len(times), 1, 1), first.t.repeat(len(times), 1)
-            for start, stop, name, poses in self.moves:
-                begin, end = np.searchsorted(times, (start, stop))
-                if name == item.name and begin < len(times):
-                    span = np.append(times[begin:end], stop)
-                    moved = poses(span)
-                    R[begin:end], t[begin:end] = moved.R[:-1].double(), moved.t[:-1].double()
-                    R[end:], t[end:] = moved.R[-1].double(), moved.t[-1].double()
-            tracks[item.name] = Trajectory(stamps, R.float(), t.float())
-        return tracks
+    def object_motion(self, motion: Motion) -> dict[str, Trajectory]:
+        """Poses of everything that can be moved on a motion's timestamps; it stays where it was left."""
+        return {
+            item.name: object_motion(
+                item.object.T_world_object, [h for h in self.handlings if h.name == item.name], motion
+            )
+            for item in (*self.flat.things, *self.flat.openables)
+        }
 
 
 def _beside(

@@ -10,6 +10,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.actions import approach
 from wearcap.simulation.grips import drawn_grip
+from wearcap.simulation.handling import handling_of
 from wearcap.simulation.house import House
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.outline import distance_to_convex
@@ -101,16 +102,14 @@ def plan_turn(
     )  # fmt: skip
     walkable = world.navigation.node_points[:, :2]
     walkable = walkable[np.linalg.norm(walkable - way[0, :2], axis=1) < 2.0]
-    found = {side: find_stances(replace(task, sign=LEFT_SIGN[side]), walkable, rng) for side in SIDES}
-    able = sorted((side for side in SIDES if found[side] is not None), key=lambda side: found[side].cost)
+    found = [(side, find_stances(replace(task, sign=LEFT_SIGN[side]), walkable, rng)) for side in SIDES]
+    able = [(stances.cost, side, stances) for side, stances in found if stances is not None]
     if not able:
         return None
-    side = (
-        able[-1]
-        if rng.random() < OTHER_HAND and found[able[-1]].cost < found[able[0]].cost + 8.0
-        else able[0]
-    )
-    return Turn(item, start, value, handle, side, seconds, found[side])
+    able.sort(key=lambda option: option[0])
+    other = rng.random() < OTHER_HAND and able[-1][0] < able[0][0] + 8.0
+    _, side, stances = able[-1 if other else 0]
+    return Turn(item, start, value, handle, side, seconds, stances)
 
 
 def _beyond(item: Openable, handle: int) -> tuple[Float[np.ndarray, "2"], float] | None:
@@ -156,18 +155,21 @@ def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> 
         pose = poses(at)
         about = rotation.about_axis("z", torch.from_numpy(np.interp(at, times, yaw)))
         point = torch.tensor(item.handles[turn.handle].point, dtype=torch.float64)
-        R = about @ pose.R
-        return Rigid(R, pose @ point - (R @ point[:, None])[..., 0])
+        R, palm = about @ pose.R, (pose.R @ point[:, None])[..., 0] + pose.t
+        return Rigid(R, palm - (R @ point[:, None])[..., 0])
 
     grip = drawn_grip(item.handles[turn.handle], moves, touch, release, rng, plan.style.briskness)
-    plan.grip(turn.side, replace(grip, reach_s=touch - start))
+    grip = replace(grip, reach_s=touch - start)
+    plan.grip(turn.side, grip)
     plan.gaze_point.move(start, start, item.handle(turn.handle, np.array(turn.start)))
     plan.gaze_weight.move(start, start + 0.45, 0.8)
     plan.gaze_weight.move(begin + 0.5 * turn.seconds, begin + 0.5 * turn.seconds + 0.6, 0.0)
     body = lambda at: np.stack([np.interp(at, times, column) for column in way.T], 1)  # noqa: E731
     shuffle(plan, rng, body, begin - 0.1, stop)
-    house.moves.append((begin, stop, item.name, poses))
-    house.record(touch, release, (turn.side,), item.name)
+    contact_class = item.object.freedom.contact_class
+    house.handlings.append(
+        handling_of(item.name, contact_class, lambda at, chest: poses(at), [(turn.side, grip)])
+    )
     house.values[item.name] = turn.stop
     plan.time = max(plan.time, release)
 

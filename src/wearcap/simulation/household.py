@@ -1,0 +1,240 @@
+"""A stretch of life in an interactive flat: what is done next, getting through doors, and ordinary activities."""
+
+import numpy as np
+from jaxtyping import Float
+
+from wearcap.simulation.actions import ACTIVITIES, follow, start_place
+from wearcap.simulation.house import House
+from wearcap.simulation.openables import Openable
+from wearcap.simulation.opening import operate
+from wearcap.simulation.outline import distance_to_convex
+from wearcap.simulation.plan import Plan
+from wearcap.simulation.rearranging import floor_place, rearrange
+from wearcap.simulation.things import Thing
+from wearcap.simulation.wearer import TAIL_S, Wearer
+
+WEIGHTS = {"door": 2.5, "window": 1.0, "drawer": 1.2, "cabinet_door": 0.8, "sofa": 1.2, "table": 1.0, "chair": 1.4,
+           "room": 0.7, "again": 2.5}  # fmt: skip
+"""How often each kind of thing is gone for; "room": several things of one room, "again": what was used last."""
+ORDINARY = ("stand", "look_around", "turn", "walk", "hold", "gesture", "carry", "reach", "sit", "crouch")
+HELD_SHARE = 0.42
+"""Of the time in which hands hold something is aimed at."""
+CLOSE_BEHIND = 0.35
+"""How often a door is closed after walking through."""
+PARTLY = 0.25
+"""How often something is opened only partly, or closed not quite."""
+BEYOND_M = 0.95
+"""Behind a door, where one goes through it."""
+REACHED_M = 0.4
+NEAR_M = 1.5
+"""Things so much further off are gone for a third as often."""
+IN_ROOM = 4
+"""Most things that are moved when a room is rearranged."""
+
+
+class Household:
+    """Plans one thing after the other; what is in the house changes with it."""
+
+    def __init__(self, house: House, person: Wearer, rng: np.random.Generator):
+        self.house, self.rng = house, rng
+        static = house.flat.static
+        worlds = [house.world(point) for point in static.sample_floor(rng, 6)]
+        largest = max(worlds, key=lambda world: int(world.navigation.walkable.sum()))
+        position, heading = start_place(largest, rng)
+        self.plan = Plan(person.skeleton, person.style, position, heading, static.floor_height)
+        self.plan.time = 0.3
+        self.openables = {item.name: item for item in house.flat.openables}
+        self.things = {item.name: item for item in house.flat.things}
+        self.last: str | None = None
+
+    def live(self, duration_s: float) -> None:
+        """Plan until a time (s) is full, and a little beyond."""
+        while self.plan.time < duration_s + TAIL_S:
+            start = self.plan.time
+            held = sum(stop - begin for h in self.house.handlings for begin, stop, _ in h.rows)
+            eager = 0.5 + 3.0 * (HELD_SHARE - held / max(start, 10.0))
+            name = self.interact() if self.rng.random() < np.clip(eager, 0.1, 0.92) else self.do_ordinary()
+            if self.plan.time < start + 0.05:
+                ACTIVITIES["stand"].act(self.plan, self.house.flat.static, self.rng)
+                name = "stand"
+            self.plan.label(start, name)
+
+    def do_ordinary(self) -> str:
+        """One of the activities that need nothing to be moved."""
+        weights = np.array([ACTIVITIES[name].weight for name in ORDINARY])
+        name = str(self.rng.choice(ORDINARY, p=weights / weights.sum()))
+        if name == "walk" and self.rng.random() < 0.5:
+            points = self.house.flat.static.navigation.node_points
+            return "walk" if self.go(points[self.rng.integers(len(points))]) else "stand"
+        ACTIVITIES[name].act(self.plan, self.house.world(self.plan.position), self.rng)
+        return name
+
+    def interact(self) -> str:
+        """Use something, after going through whatever doors lie on the way."""
+        kind = str(self.rng.choice(list(WEIGHTS), p=np.array([*WEIGHTS.values()]) / sum(WEIGHTS.values())))
+        if kind == "room":
+            return self.rearrange_room()
+        if kind == "again" and self.last is not None:
+            return self.use(self.last)
+        names = [name for name, item in (self.openables | self.things).items() if item.category == kind]
+        return self.use(names[self._near(names)]) if names else "stand"
+
+    def use(self, name: str) -> str:
+        """Open, close or move one thing; says what was done."""
+        done = self._act(name)
+        if not done and self.go(self.place_of(name), stop_m=1.0):
+            done = self._act(name)
+        if done:
+            self.last = name
+        verb = "move" if name in self.things else "turn"
+        return f"{verb} {(self.openables | self.things)[name].category}" if done else "walk"
+
+    def _act(self, name: str) -> bool:
+        return self.move(self.things[name]) if name in self.things else self.turn(self.openables[name])
+
+    def rearrange_room(self) -> str:
+        """Move several things near each other, one after another."""
+        names = [name for name, thing in self.things.items() if thing.category != "box"]
+        if not names:
+            return "stand"
+        first = names[self._near(names)]
+        middle = self.place_of(first)
+        names.sort(key=lambda name: float(np.linalg.norm(self.place_of(name) - middle)))
+        count = int(self.rng.integers(2, IN_ROOM + 1))
+        for name in names[:count]:
+            if np.linalg.norm(self.place_of(name) - middle) < 3.5:
+                self.use(name)
+        return "rearrange"
+
+    def move(self, thing: Thing) -> bool:
+        return thing.category != "box" and rearrange(self.plan, self.house, self.rng, thing)
+
+    def turn(self, item: Openable) -> bool:
+        """Open what is closed, close what is open; at times something between."""
+        at, full = self.house.values[item.name], item.openness(item.opened)
+        if item.openness(at) > 0.3 * full:
+            share = self.rng.uniform(0.0, 0.4) if self.rng.random() < PARTLY else 0.0
+        else:
+            share = self.rng.uniform(0.3, 0.7) if self.rng.random() < PARTLY else self.rng.uniform(0.7, 0.98)
+        value = item.closed + share * (item.opened - item.closed)
+        if abs(value - at) < 0.12 * full:
+            return False
+        return operate(self.plan, self.house, self.rng, item, value, self._side(item))
+
+    def go(self, goal: Float[np.ndarray, "3"], stop_m: float = 0.0) -> bool:
+        """Walk to a floor point (m), or within `stop_m` of it, opening closed doors on the way; False where that fails."""
+        for _ in range(4):
+            world = self.house.world(self.plan.position)
+            points = world.navigation.node_points
+            away = np.linalg.norm(points[:, :2] - goal[:2], axis=1)
+            if (
+                len(points)
+                and away.min() < max(REACHED_M, stop_m)
+                and self._same_side(points[away.argmin()], goal)
+            ):
+                near = np.flatnonzero(away < max(away.min() + 0.15, stop_m))
+                target = points[
+                    near[np.linalg.norm(points[near, :2] - self.plan.position[:2], axis=1).argmin()]
+                ]
+                path = world.plan_path(self.plan.position, target, self.rng)
+                if path is None:
+                    return False
+                follow(self.plan, world, self.rng, path)
+                return True
+            door = self._door_between(goal)
+            if door is None or not self.go_through(door):
+                return False
+        return False
+
+    def go_through(self, door: Openable) -> bool:
+        """Open a door, walk through it, and sometimes close it behind."""
+        start = self.plan.time
+        width = door.openness(door.opened)
+        share = float(self.rng.uniform(np.deg2rad(66.0), width)) / width
+        value = door.closed + share * (door.opened - door.closed)
+        side = self._side(door)
+        if not operate(self.plan, self.house, self.rng, door, value, side):
+            return False
+        self.last = door.name
+        self.plan.label(start, "open door")
+        target = self._beyond(door, 1 - side)
+        world = self.house.world(self.plan.position)
+        path = world.plan_path(self.plan.position, target, self.rng)
+        if path is None or np.linalg.norm(path[-1, :2] - target[:2]) > REACHED_M:
+            return False
+        start = self.plan.time
+        follow(self.plan, world, self.rng, path)
+        self.plan.label(start, "walk")
+        if self.rng.random() < CLOSE_BEHIND:
+            operate(self.plan, self.house, self.rng, door, door.closed, 1 - side)
+        return True
+
+    def place_of(self, name: str) -> Float[np.ndarray, "3"]:
+        """Floor point at a thing, or before an openable's handle (m)."""
+        floor = float(self.plan.position[2])
+        if name in self.things:
+            return np.append(floor_place(self.house, self.things[name])[:2], floor)
+        item = self.openables[name]
+        if item.category == "door":
+            return self._beyond(item, self._side(item), 0.6)
+        place = item.handle(0, np.array(item.closed))
+        out = -(item.pose(item.closed).R.numpy() @ np.array(item.handles[0].fingers))[:2]
+        return np.append(place[:2] + 0.7 * out / np.linalg.norm(out), floor)
+
+    def _near(self, names: list[str]) -> int:
+        """One of some things, rather one that is near."""
+        away = np.array([np.linalg.norm(self.place_of(name)[:2] - self.plan.position[:2]) for name in names])
+        weights = np.exp(-away / NEAR_M)
+        return int(self.rng.choice(len(names), p=weights / weights.sum()))
+
+    def _side(self, door: Openable) -> int:
+        """Handle on the side where one stands: 0 where the leaf opens to."""
+        if len(door.handles) == 1:
+            return 0
+        return 0 if self._across(door, self.plan.position) > 0 else 1
+
+    def _across(self, door: Openable, point: Float[np.ndarray, "3"]) -> float:
+        """How far a point is before a door's plane, positive where the leaf opens to (m)."""
+        pose = door.pose(door.closed)
+        local = pose.R.numpy().T @ (np.array([*point[:2], 0.0]) - np.array([*pose.t[:2].tolist(), 0.0]))
+        return float(local[1]) * door.way
+
+    def _beyond(self, door: Openable, side: int, far_m: float = BEYOND_M) -> Float[np.ndarray, "3"]:
+        """Floor point before a door's middle on a side (m)."""
+        pose = door.pose(door.closed)
+        width = float(door.outline[:, 0].max())
+        way = door.way if side == 0 else -door.way
+        point = pose.R.numpy() @ np.array([width / 2, way * far_m, 0.0]) + pose.t.numpy()
+        return np.array([point[0], point[1], self.plan.position[2]])
+
+    def _same_side(self, point: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"]) -> bool:
+        """Whether no wall or closed door stands between two points near each other."""
+        between = goal[:2] + np.linspace(0.0, 1.0, 9)[:, None] * (point[:2] - goal[:2])
+        walls = [
+            item.footprint
+            for item in self.house.flat.static.objects
+            if item.kind == "wall" and item.z_range[0] < 1.0
+        ]
+        walls += [
+            door.footprint(self.house.values[door.name])
+            for door in self.house.flat.openables
+            if door.category == "door"
+        ]
+        return min(float(distance_to_convex(between, wall).min()) for wall in walls) > 0.01
+
+    def _door_between(self, goal: Float[np.ndarray, "3"]) -> Openable | None:
+        """The first door in the way to a point that is not open enough."""
+        shut = [door for door in self.house.flat.openables if door.blocks(self.house.values[door.name])]
+        if not shut:
+            return None
+        world = self.house.world(self.plan.position, without=tuple(door.name for door in shut))
+        way = world.navigation.shortest(self.plan.position, goal, 1.0)
+        if way is None:
+            return None
+        first = {}
+        for door in shut:
+            gap = door.footprint(door.closed)
+            near = np.flatnonzero(distance_to_convex(way[:, :2], gap) < 0.12)
+            if len(near):
+                first[door.name] = int(near[0])
+        return self.openables[min(first, key=lambda name: first[name])] if first else None

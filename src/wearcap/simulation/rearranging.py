@@ -1,0 +1,171 @@
+"""Finding new places for things in a flat, and ways on which neither they nor who moves them touch anything."""
+
+from itertools import islice
+
+import numpy as np
+from jaxtyping import Float
+
+from wearcap.simulation.actions import approach
+from wearcap.simulation.house import House
+from wearcap.simulation.interactive_flat import obstacle
+from wearcap.simulation.openables import Openable
+from wearcap.simulation.outline import distance_to_convex, rectangle, turn
+from wearcap.simulation.plan import Plan
+from wearcap.simulation.sliding import Slide, slide, slide_options
+from wearcap.simulation.things import Thing, floor_pose
+from wearcap.simulation.world import World
+
+TRIES, OPTIONS = 24, 4
+APART_M, BODY_M = 0.04, 0.22
+"""Room kept from other things by what is moved, and by the middle of who moves it."""
+REACHED_M = 0.35
+"""The place to stand is no further than this from where one can walk freely."""
+FAR_M = {"sofa": (0.3, 1.6), "table": (0.3, 1.8), "chair": (0.25, 2.2)}
+"""How far things are moved."""
+TURN_SHARE = 0.4
+BEFORE_M = 0.45
+"""Kept free before what opens, beyond its sweep."""
+WAY_SHARE = 0.85
+KEYS = np.linspace(0.0, 1.0, 9)
+
+
+def rearrange(plan: Plan, house: House, rng: np.random.Generator, thing: Thing) -> bool:
+    """Slide a thing to another place nearby; False, with nothing done, where none is found or one cannot get to it."""
+    world = house.world(plan.position)
+    choice = choose_slide(plan, house, world, rng, thing)
+    if choice is None:
+        return False
+    x, y, heading = choice.stand
+    goal = np.array([x, y, plan.position[2]])
+    if np.linalg.norm(goal[:2] - plan.position[:2]) > 0.25 and not approach(
+        plan, world, rng, goal, float(heading)
+    ):
+        return False
+    house.handlings.append(slide(plan, choice, rng, float(plan.position[2])))
+    house.poses[thing.name] = floor_pose(choice.stop, float(house.poses[thing.name].t[2]))
+    return True
+
+
+def choose_slide(
+    plan: Plan, house: House, world: World, rng: np.random.Generator, thing: Thing
+) -> Slide | None:
+    """A new place for a thing and a way to bring it there; None where none was found."""
+    start, points = floor_place(house, thing), world.navigation.node_points[:, :2]
+    if np.linalg.norm(points - start[:2], axis=1).min() > max(thing.half_size) + 1.0:
+        return None
+    near = [
+        item for item in world.objects
+        if item.name != thing.name and item.z_range[0] < 1.9 and item.z_range[1] > 0.1
+        and distance_to_convex(start[:2], item.footprint) < 5.0
+    ]  # fmt: skip
+    low = [item.footprint for item in near if item.z_range[0] < thing.height]
+    solid, zones = (
+        [item.footprint for item in near],
+        [zone for zone in kept_free(house) if _meets(zone, start)],
+    )
+    for _ in range(TRIES):
+        stop = _drawn_stop(thing, start, rng)
+        outline = rectangle((0.0, 0.0), (2 * thing.half_size[0], 2 * thing.half_size[1]))
+        if not _apart(_outlines(outline, stop[None]), low, APART_M) or not _apart(
+            _outlines(outline, stop[None]), zones, 0.0
+        ):
+            continue
+        for choice in islice(slide_options(plan, thing, start, stop, rng), OPTIONS):
+            if not _apart(_outlines(outline, choice.thing_at(KEYS)), low, 0.5 * APART_M):
+                continue
+            body = choice.body_at(KEYS)[:, :2]
+            free = min(distance_to_convex(body, footprint).min() for footprint in solid)
+            reached = np.linalg.norm(points - choice.stand[:2], axis=1).min() < REACHED_M
+            if free > BODY_M and reached and _leaves_way(house, world, choice):
+                return choice
+    return None
+
+
+def _leaves_way(house: House, world: World, choice: Slide) -> bool:
+    """Whether one who has moved a thing still gets to most of the floor that one got to before."""
+    end = np.append(choice.body_at(np.ones(1))[0, :2], float(house.poses[choice.thing.name].t[2]))
+    placed = obstacle(choice.thing, floor_pose(choice.stop, end[2]))
+    grid = house.flat.static.navigation.barred((*house.obstacles((choice.thing.name,)), placed), end)
+    away = np.linalg.norm(grid.node_points[:, :2] - end[:2], axis=1)
+    enough = grid.walkable.sum() > WAY_SHARE * world.navigation.walkable.sum()
+    return bool(enough) and float(away.min()) < REACHED_M
+
+
+def floor_place(house: House, thing: Thing) -> Float[np.ndarray, "3"]:
+    """Where a thing stands: x, y (m) and heading (rad)."""
+    pose = house.poses[thing.name]
+    return np.array([*pose.t[:2].tolist(), float(np.arctan2(pose.R[1, 0], pose.R[0, 0]))])
+
+
+def kept_free(house: House) -> list[Float[np.ndarray, "4 2"]]:
+    """Outlines of the floor before doors, windows and cabinets."""
+    zones = []
+    for item in house.flat.openables:
+        if item.hinged:
+            zones.append(_swept(item))
+        else:
+            depth = abs(item.opened - item.closed) + BEFORE_M
+            front = item.object.T_world_object
+            half = float(item.outline[:, 1].max())
+            zones.append(_local(front, np.array([[0.0, -half], [depth, -half], [depth, half], [0.0, half]])))
+    return zones
+
+
+def _swept(item: Openable) -> Float[np.ndarray, "4 2"]:
+    """A square over a leaf's quarter circle and, for a door, the floor on the wall's other side."""
+    width, sign = float(item.outline[:, 0].max()), item.way
+    behind = -0.9 if item.category == "door" else 0.0
+    low, high = sorted((sign * (width + 0.1), sign * behind))
+    return _local(
+        item.pose(item.closed),
+        np.array([[0.0, low], [width + BEFORE_M, low], [width + BEFORE_M, high], [0.0, high]]),
+    )
+
+
+def _local(pose, corners: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "4 2"]:
+    return corners @ pose.R[:2, :2].double().numpy().T + pose.t[:2].double().numpy()
+
+
+def _meets(zone: Float[np.ndarray, "4 2"], start: Float[np.ndarray, "3"]) -> bool:
+    """Whether a zone matters for what stands at `start`: it is near, and not where the thing is already."""
+    distance = float(distance_to_convex(start[:2], zone))
+    return distance < 4.0
+
+
+def _drawn_stop(
+    thing: Thing, start: Float[np.ndarray, "3"], rng: np.random.Generator
+) -> Float[np.ndarray, "3"]:
+    """Somewhere else, mostly along the thing's own axes, now and then turned."""
+    low, high = FAR_M[thing.category]
+    along = rng.choice(4) * np.pi / 2 + start[2] if rng.random() < 0.7 else rng.uniform(-np.pi, np.pi)
+    angle = float(along + rng.normal(0.0, 0.15))
+    far = float(rng.uniform(low, high))
+    spin = 0.0
+    if rng.random() < TURN_SHARE:
+        spin = float(rng.choice([-1.0, 1.0]) * (np.pi / 2 if rng.random() < 0.3 else rng.uniform(0.25, 1.2)))
+        far *= rng.uniform(0.2, 1.0)
+    return start + np.array([far * np.cos(angle), far * np.sin(angle), spin])
+
+
+def _outlines(
+    outline: Float[np.ndarray, "4 2"], places: Float[np.ndarray, "key 3"]
+) -> Float[np.ndarray, "key 4 2"]:
+    return np.stack([outline @ turn(heading).T + np.array([x, y]) for x, y, heading in places])
+
+
+def _apart(
+    outlines: Float[np.ndarray, "key 4 2"], others: list[Float[np.ndarray, "corner 2"]], least_m: float
+) -> bool:
+    """Whether outlines keep off others: neither's border comes near the other."""
+    share = np.linspace(0.0, 1.0, 7)[:-1, None]
+    border = lambda corners: np.concatenate(  # noqa: E731
+        [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0))]
+    )
+    points = np.concatenate([border(corners) for corners in outlines])
+    for other in others:
+        if distance_to_convex(points, other).min() <= least_m:
+            return False
+        rim = border(other)
+        if min(distance_to_convex(rim, corners).min() for corners in outlines) <= least_m:
+            return False
+    return True
