@@ -10,10 +10,9 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics, site_positions
 from wearcap.body.retarget import fit_offsets, retarget
-from wearcap.body.skeleton import Skeleton, xsens23
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
 from wearcap.body.skeletons import smpl24, smplh52
 from wearcap.data.prepare.clean import resampled
-from wearcap.data.windows import mirrored_rotations
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
@@ -60,6 +59,12 @@ class SmplAngles:
         return torch.cat([body, torch.zeros_like(body[..., :6]), hands], -1)
 
 
+_POINT, _ROT6D = (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
+_SIDE_SIGNS = (*_POINT * 4, *_ROT6D, 1.0)
+_MIDDLE_SIGNS = (*_POINT * 2, *_ROT6D, 1.0)
+"""What a mirror does to the entries: y changes sign, and the second column of a rotation once more."""
+
+
 @dataclass(frozen=True)
 class HandViews:
     """Ours: the pose as each hand sees it, the right hand's in a mirror, so that one network serves both.
@@ -78,35 +83,36 @@ class HandViews:
         return self.encode(torch.eye(3).expand(len(self.skeleton), 3, 3)).shape[-1]
 
     def encode(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch feature"]:
-        """Poses of `skeleton`; the left hand's view, then the right hand's."""
-        return torch.cat(
-            [
-                self._left_view(R_parent_joint),
-                self._left_view(mirrored_rotations(R_parent_joint, self.skeleton)),
-            ],
-            -1,
-        )
+        """Poses of `skeleton`; the left hand's view (its side, the other side, the middle), then the right hand's."""
+        sides, middle = self._seen(R_parent_joint)
+        mirror = lambda x, signs: x * x.new_tensor(signs)  # noqa: E731
+        own, other = sides.unbind(-2)
+        flipped = mirror(other, _SIDE_SIGNS), mirror(own, _SIDE_SIGNS), mirror(middle, _MIDDLE_SIGNS)
+        return torch.cat([own, other, middle, *flipped], -1)
 
-    def _left_view(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch view"]:
-        index, body = self.skeleton.index, self.skeleton
-        root = R_parent_joint[..., 0, :, :]
+    def _seen(
+        self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]
+    ) -> tuple[Float[Tensor, "*batch side 19"], Float[Tensor, "*batch 13"]]:
+        """What is told of each side, left and right, and of the middle of the body."""
+        body, root = self.skeleton, R_parent_joint[..., 0, :, :]
         R_root = rotation.about_axis("z", -rotation.yaw_of(root)) @ root
         R = torch.cat([R_root[..., None, :, :], R_parent_joint[..., 1:, :, :]], -3)
         T = forward_kinematics(body, R, torch.zeros_like(R[..., 0, 0, :]))
-        palms = site_positions(body, T, ("left_palm", "right_palm"))
-        soles = site_positions(body, T, ("left_heel", "left_toe_tip", "right_heel", "right_toe_tip"))
-        floor = soles[..., 2].amin(-1, keepdim=True)
-        chest, ankles = T.t[..., [index("t8")], :], T.t[..., body.indices("left_ankle", "right_ankle"), :]
-        elbows = T.t[..., body.indices("left_elbow", "right_elbow"), :]
-        turned = T.R[..., body.indices("left_wrist", "right_wrist", "t8"), :, :]
-        ahead = T.R[..., body.indices("head", "left_ankle", "right_ankle"), :, 0]
-        return torch.cat(
-            [
-                (palms - chest).flatten(-2), (elbows - chest).flatten(-2), ankles.flatten(-2),
-                rotation.rot6d_from_matrix(turned).flatten(-2), ahead.flatten(-2), R_root[..., 2],
-                palms[..., 2] - floor, -floor,
-            ], -1,
-        )  # fmt: skip
+        soles = site_positions(body, T, FOOT_PATCHES)
+        floor = soles[..., 2].amin(-1)[..., None, None]
+        chest, head = body.index("t8"), body.index("head")
+        elbows, wrists, ankles = (
+            body.indices(f"left_{joint}", f"right_{joint}") for joint in ("elbow", "wrist", "ankle")
+        )
+        palms, origin = site_positions(body, T, ("left_palm", "right_palm")), T.t[..., [chest], :]
+        sides = [
+            palms - origin, T.t[..., elbows, :] - origin, T.t[..., ankles, :], T.R[..., ankles, :, 0],
+            rotation.rot6d_from_matrix(T.R[..., wrists, :, :]), palms[..., 2:] - floor,
+        ]  # fmt: skip
+        middle = [
+            T.R[..., head, :, 0], R_root[..., 2], rotation.rot6d_from_matrix(T.R[..., chest, :, :]), -floor[..., 0],
+        ]  # fmt: skip
+        return torch.cat(sides, -1), torch.cat(middle, -1)
 
 
 FEATURES = {cls.__name__: cls for cls in (SmplAngles, HandViews)}
