@@ -84,8 +84,8 @@ class Grip:
             torch.tensor(v, dtype=torch.float64)
             for v in (self.place.point, self.place.normal, self.place.fingers)
         )
-        before = (self.touch_s - times) / (0.55 * self.reach_s)
-        after = (times - self.release_s) / (0.55 * self.return_s)
+        before = (self.touch_s - times) / (0.7 * self.reach_s)
+        after = (times - self.release_s) / (0.7 * self.return_s)
         off = torch.from_numpy(self.hover_m * (ease(before) + ease(after)))
         out = T.R @ normal
         return Hold(T.t + T.R @ point + off[:, None] * out, out, T.R @ fingers)
