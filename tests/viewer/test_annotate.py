@@ -400,6 +400,10 @@ def test_editing_by_keys_and_mouse(dataset, tmp_path):
         (start, stop), = spans(browser, "left")  # fmt: skip
         assert stop - start == pytest.approx(1 / FPS)
         browser.key("z")
+        x, y = browser.evaluate("annotator.lanePosition('left', 6.0)")
+        browser.drag([(x, y), (1090, y)])
+        assert spans(browser, "left") == [[5.0, CLOCK.stop_s]], "an end can be taken away again"
+        browser.key("z")
 
         before = browser.evaluate("annotator.view.yaw")
         x, y = browser.evaluate(
@@ -464,6 +468,17 @@ def test_unsaved_labels_come_back_when_the_browser_was_closed(dataset, tmp_path)
         browser.key("l")
         browser.go("about:blank")  # at once, before the save that waits
         browser.poll(lambda: len(on_disk(tmp_path, "right")) == 1, 10)
+
+        browser.go(server.url)
+        settled(browser)
+        browser.evaluate(f"localStorage.setItem(annotator.saver.key, {json.dumps(json.dumps(kept))})")
+        browser.go("about:blank")
+        browser.go(server.url)  # the file has changed since these were kept
+        settled(browser)
+        browser.poll(lambda: "never saved" in browser.text())
+        assert len(spans(browser, "right")) == 1
+        browser.click(*browser.element("document.getElementById('mine')"))
+        browser.poll(lambda: on_disk(tmp_path, "right") == [])
 
 
 @pytest.mark.browser

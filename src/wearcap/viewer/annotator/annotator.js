@@ -34,7 +34,9 @@ class Annotator {
   }
 
   async open(index) {
-    if (this.opening || index < 0 || index >= this.recordings.length) return;
+    if (index < 0 || index >= this.recordings.length) return;
+    this.wished = index;
+    if (this.opening) return; // comes next
     this.opening = true;
     try {
       this.player.stop();
@@ -45,13 +47,15 @@ class Annotator {
       [$("recordings").value, $("previous").disabled, $("next").disabled] = [index, index === 0, index === this.recordings.length - 1];
       history.replaceState(null, "", `#${encodeURIComponent(this.recordings[index].name)}`);
       this.tell("");
+      this.showSaved("", "opening …");
       this.take = await fetchTake(index);
       this.begin();
     } catch (error) {
-      [$("saved").className, $("saved").textContent] = ["failed", "not opened"];
+      this.showSaved("failed", "not opened");
       this.tell(error.message, true);
     }
     this.opening = false;
+    if (this.wished !== index) await this.open(this.wished);
   }
 
   begin() {

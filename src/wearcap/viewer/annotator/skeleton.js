@@ -26,7 +26,7 @@ export class SkeletonView {
     this.frame = 0;
     const {points, bones} = take.header;
     const side = name => name.startsWith("left_") ? LEFT : name.startsWith("right_") ? RIGHT : MIDDLE;
-    this.bones = bones.map(([a, b]) => ({a, b, color: side(points[b])}));
+    this.bones = bones.filter(([, b]) => points[b] !== "nose").map(([a, b]) => ({a, b, color: side(points[b])}));
     this.yaw = take.heading(0) + 0.55;
     this.stale = true;
   }
@@ -172,10 +172,16 @@ export class SkeletonView {
     const top = crown < 0 ? places[head] : places[crown];
     const [x, y, depth] = this.project(places[head].map((value, axis) => 0.45 * value + 0.55 * top[axis]));
     if (depth < 0.1) return;
-    this.context.fillStyle = MIDDLE;
-    this.context.beginPath();
-    this.context.arc(x, y, 0.095 * this.focal / depth, 0, 2 * Math.PI);
-    this.context.fill();
+    const nose = names.includes("nose") ? this.project(places[names.indexOf("nose")]) : null;
+    const shapes = [[x, y, depth, 0.095, MIDDLE]];
+    if (nose) shapes.push([...nose, 0.028, "#4d555c"]);
+    // The nose hides behind the head when the wearer looks away.
+    for (const [u, v, far, radius, color] of shapes.sort((p, q) => q[2] - p[2])) {
+      this.context.fillStyle = color;
+      this.context.beginPath();
+      this.context.arc(u, v, radius * this.focal / Math.max(far, 0.1), 0, 2 * Math.PI);
+      this.context.fill();
+    }
   }
 
   drawHand({hand, x, y, depth, radius}, contact) {

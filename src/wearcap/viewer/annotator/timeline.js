@@ -81,8 +81,9 @@ export class Timeline {
     } else if (this.drag.kind === "map") {
       this.moveMap(x);
     } else if (this.drag.state || Math.abs(x - this.drag.pressed) > 2) {
-      const {hand, place, which} = this.drag, step = 0.5 / this.take.fps;
-      this.drag.state = this.labels.withEdge(hand, place, which, this.take.frameAt(this.timeAt(x) + step));
+      const {hand, place, which} = this.drag, time = this.timeAt(x) + 0.5 / this.take.fps;
+      const frame = time < this.take.header.stop_s ? this.take.frameAt(time) : this.take.times.length;
+      this.drag.state = this.labels.withEdge(hand, place, which, frame);
       const moved = this.drag.state[hand][place];
       this.seek(moved[which]);
       this.stale = true;
