@@ -20,6 +20,8 @@ BEFORE_CHEST_M = (0.17, 0.22)
 """Between the chest's joint and the near face of what is carried."""
 BELOW_CHEST = (0.16, 0.30)
 """Of the palms, as a share of the hips' height."""
+BESIDE = (-0.02, 0.42, -0.74, 0.5, 0.0, 0.0)
+"""Hand's pose channel (`HandScore.pose`): out to the side and back."""
 DEEP = 0.30
 """Crouches deeper than this share of the hips' height lift the heels."""
 
@@ -118,6 +120,7 @@ def lift(plan: Plan, choice: Carry, rng: np.random.Generator) -> Lifted:
     begin = touch + float(rng.uniform(0.1, 0.5))
     rise = float((0.9 + 1.2 * bend) * rng.uniform(0.9, 1.3) / plan.style.briskness)
     _bow(plan, start, touch, bend, lean)
+    _spread(plan, (start, start + 0.45 * down), (touch, begin + rise))
     plan.gaze_point.move(
         start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.thing.height)
     )
@@ -139,6 +142,7 @@ def put_down(plan: Plan, lifted: Lifted, rng: np.random.Generator) -> Handling:
     rise = float((0.8 + 1.0 * bend) * rng.uniform(0.9, 1.2) / plan.style.briskness)
     _bow(plan, start, start + down, bend, lean)
     _bow(plan, release, release + rise, 0.0, 0.0)
+    _spread(plan, (start, start + down), (release + 0.3 * rise, release + rise))
     plan.gaze_point.move(start, start, np.append(choice.stop[:2], choice.stop[3]))
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(release, release + 0.6, 0.0)
@@ -179,6 +183,15 @@ def _bow(plan: Plan, start: float, stop: float, crouch: float, lean: float) -> N
     for side in SIDES:
         first, last = (start + 0.3 * (stop - start), stop) if heels else (start, stop - 0.4 * (stop - start))
         plan.heel_lift[side].move(first, last, heels)
+
+
+def _spread(plan: Plan, out: tuple[float, float], back: tuple[float, float]) -> None:
+    """Who bends over a box keeps the hands that do not hold it beside it."""
+    for side in SIDES:
+        hand = plan.hands[side]
+        hand.pose.move(out[0], out[0], BESIDE)
+        hand.pose_weight.move(*out, 1.0)
+        hand.pose_weight.move(*back, 0.0)
 
 
 @dataclass(frozen=True)
