@@ -203,6 +203,13 @@ def test_a_footprint_is_the_rectangle_it_came_from(yaw, seed):
     assert (ends[:, 2] == 0.5).all()
 
 
+def test_hinges_of_an_odd_shape_stay_within_its_extent():
+    apart = np.concatenate([grid((0, 0, 0), (1, 1, 0.1), 0.1), grid((3, 3, 0), (3.1, 3.1, 0.1), 0.1)])
+    places = hinge_places(apart, 0.0)
+    assert places[:, :2].min() >= 0.0
+    assert places[:, :2].max() <= 3.1 + 1e-9
+
+
 def test_places_snap_within_reach_only():
     places = np.array([[0.0, 0.0, 0.1], [1.0, 0.0, 0.1]])
     np.testing.assert_array_equal(snapped(np.array([0.95, 0.05, 2.0]), places, 0.1), [1.0, 0.0, 0.1])

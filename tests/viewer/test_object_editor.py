@@ -16,6 +16,7 @@ from wearcap.geometry import rotation
 from wearcap.io.environment import read_environment, write_environment
 from wearcap.scene.editing import points_world
 from wearcap.scene.environment import Environment
+from wearcap.scene.placing import hinge_places
 from wearcap.scene.scan import Scan
 from wearcap.scene.selection import Box
 from wearcap.viewer.object_editor import ObjectEditor
@@ -264,6 +265,7 @@ def test_a_door_is_cut_out_and_hung_in_chromium(page, tmp_path):
         browser.poll(lambda: page._tried is None)
         browser.poll(lambda: "saved in environment.json" in browser.text())
         check_door(page.file)
+        drag_hinge(browser, page, size)
         paint_in(browser, page, size)
         assert not browser.exceptions
 
@@ -278,6 +280,23 @@ def check_door(file: Path) -> None:
     leaf = (abs(points - [DOOR_X, DOOR_Y, 1.02]) < [0.44, 0.03, 1.01]).all(1)
     assert leaf.mean() > 0.8
     assert points[leaf].max(0) - points[leaf].min(0) == pytest.approx([0.86, 0.04, 2.0], abs=0.08)
+
+
+def drag_hinge(browser: Chromium, page: ObjectEditor, size: tuple[int, int]) -> None:
+    """The handle at the hinge's foot, pulled by its arrow toward the leaf's other end, where it snaps."""
+    before = page._item().freedom.pivot
+    to_the_other_end = np.sign(DOOR_X - before[0])
+    browser.key("h")
+    browser.poll(lambda: page.view.freedom_handle.visible)
+    browser.screenshot()  # waits until the handle is drawn
+    grip = np.add(before, [0.28, 0.0, 0.0])
+    goal = np.add(grip, [0.9 * to_the_other_end, 0.0, 0.0])
+    way = [on_screen(page, grip + share * (goal - grip), size) for share in np.linspace(0, 1, 8)]
+    browser.drag(way, pause_s=0.3)
+    browser.poll(lambda: page._item().freedom.pivot != before)
+    assert page._item().freedom.pivot[0] == pytest.approx(before[0] + 0.9 * to_the_other_end, abs=0.06)
+    places = hinge_places(points_world(page._item()), 0.0)
+    assert np.linalg.norm(places[:, :2] - page._item().freedom.pivot[:2], axis=1).min() < 1e-6, "snapped"
 
 
 def paint_in(browser: Chromium, page: ObjectEditor, size: tuple[int, int]) -> None:

@@ -74,7 +74,8 @@ def hinge_places(points: Float[np.ndarray, "point 3"], floor: float) -> Float[np
     plan = footprint(points)
     ends, sides = plan.half_length * plan.long, plan.half_width * plan.short
     offsets = [-ends, ends, sides - ends, -sides - ends, ends + sides, ends - sides, sides, -sides]
-    places = plan.center + np.array(offsets)
+    # A corner of the rectangle may stand far off what is not rectangular: never outside of its extent.
+    places = np.clip(plan.center + np.array(offsets), points[:, :2].min(0), points[:, :2].max(0))
     return np.concatenate([places, np.full((len(places), 1), floor)], 1)
 
 

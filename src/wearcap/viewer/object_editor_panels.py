@@ -118,13 +118,13 @@ class ObjectPanel:
             low, high = np.rad2deg(_limits(freedom, np.pi))
             _write(self.least_deg, round(low))
             _write(self.greatest_deg, round(high))
-            self.try_deg.min, self.try_deg.max = float(min(low, -1e-3)), float(max(high, 1e-3))
+            self.try_deg.min, self.try_deg.max = float(low), float(max(high, low + 1.0))
         if freedom.axis is not None:
             low, high = _limits(freedom, 2.0)
             _write(self.least_m, round(low, 3))
             _write(self.greatest_m, round(high, 3))
             _write(self.direction, round(float(np.rad2deg(np.arctan2(freedom.axis[1], freedom.axis[0])))))
-            self.try_m.min, self.try_m.max = float(min(low, -1e-3)), float(max(high, 1e-3))
+            self.try_m.min, self.try_m.max = float(low), float(max(high, low + 0.01))
 
 
 def _limits(freedom: Freedom, widest: float) -> tuple[float, float]:

@@ -60,7 +60,7 @@ class EditorView:
         self.box_handle = self.scene.add_transform_controls("/box_handle", scale=0.45, disable_rotations=True)
         self.brush = self.scene.add_icosphere("/brush", 1.0, BRUSH_COLOR, opacity=0.35, visible=False)
         self.freedom_handle = self.scene.add_transform_controls(
-            "/freedom_handle", scale=0.35, disable_rotations=True, visible=False, depth_test=False
+            "/freedom_handle", scale=0.5, disable_rotations=True, visible=False, depth_test=False
         )
         self.try_handle = self.scene.add_transform_controls(
             "/try_handle", scale=0.6, active_axes=(True, True, False), visible=False, depth_test=False
@@ -77,7 +77,7 @@ class EditorView:
         """Densely, and a little larger than the scan's own points, so that they cover those."""
         shown = selected[:: max(1, -(-len(selected) // SHOWN_SELECTED))]
         colors = np.broadcast_to(np.array(SELECTED_COLOR, np.uint8), (len(shown), 3))
-        self._add_cloud("/selection", self.scan.points[shown], colors, 1.35 * self.point_m)
+        self._add_cloud("/selection", self.scan.points[shown], colors, 1.8 * self.point_m)
 
     def _add_cloud(
         self,
