@@ -1,6 +1,7 @@
 """Every term of HPS: its derivative, its value by hand, and the compiled system against autograd (float64)."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -117,6 +118,16 @@ def test_terms_are_the_means_of_the_equations():
     )
     assert 0.015 < whole < 0.035
     assert half == pytest.approx(whole / 2, rel=0.2)  # divided by frames times parts, not by contacts
+
+
+def test_a_wall_beside_a_gap_in_the_floor_carries_no_foot():
+    data = still_data(4)
+    rng = np.random.default_rng(1)
+    wall = rng.uniform(-1, 1, (40_000, 3)) * [0.0005, 1, 0.5] + [0.75, 0, 0.5]
+    beside_wall = replace(data, surface=SurfaceIndex.build(wall.astype(np.float32)))
+    energy = HpsEnergy({"contact_plane": 1.0})
+    assert energy_terms(energy, beside_wall, data.start)["contact_plane"].item() == 0.0
+    assert energy_terms(energy, data, data.start)["contact_plane"].item() > 0.0
 
 
 def test_the_whole_mesh_gives_the_patches_energy():

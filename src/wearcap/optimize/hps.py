@@ -23,6 +23,8 @@ TERMS = (
 
 SURFACE_REACH_M = 0.5
 """A foot further than this from every scanned point has no scene beneath it."""
+LEAST_UPRIGHT = 0.7
+"""What leans more than 45° carries no foot: a wall beside a gap in the scanned floor."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
             torch.from_numpy, data.surface.plane(queries, reach_m=SURFACE_REACH_M)
         )
         origin, normal = where[:, patch], up[:, patch]
-        found *= normal.isfinite().all(-1)
+        found *= normal[..., 2] > LEAST_UPRIGHT  # not where there is none: NaN is no greater
     parts = (point.nan_to_num(), origin.nan_to_num(), normal.nan_to_num(), found)
     return Ground(*(part.to(dtype) for part in parts))
 
