@@ -47,6 +47,8 @@ class SimulatedInteractions:
     environment: Environment
     world: World
     """What stays where it is, with what can be moved at its initial pose."""
+    static: World
+    """The first alone."""
 
 
 def flat_number(split: str, index: int) -> int:
@@ -92,4 +94,4 @@ def simulate_interactions(
         activity=", ".join(sorted(seconds, key=lambda key: -seconds[key])), source="wearcap simulation",
         license="MIT (generated)",
     )  # fmt: skip
-    return SimulatedInteractions(recording, flat.environment, flat.world)
+    return SimulatedInteractions(recording, flat.environment, flat.world, flat.static)

@@ -43,15 +43,17 @@ class Scanner:
 
 
 def scan_world(
-    scenery: Scenery, spacing_m: float, rng: np.random.Generator, scanner: Scanner = Scanner()
-) -> Scan:
+    scenery: Scenery, spacing_m: float, rng: np.random.Generator, scanner: Scanner = Scanner(),
+    walked: World | None = None,
+) -> Scan:  # fmt: skip
     """The scan of a world: points about `spacing_m` apart on what some station sees, in the world's axes (m).
 
+    Stations stand where one can walk in the world, or in `walked`: the same with its doors taken out.
     Raises WearcapError for a spacing that is not positive.
     """
     if not spacing_m > 0:
         raise WearcapError(f"points {spacing_m} m apart", expected="a positive spacing")
-    stations = place_stations(scenery.world, scanner.station_m, scanner.clearance_m)
+    stations = place_stations(walked or scenery.world, scanner.station_m, scanner.clearance_m)
     stations[:, 2] += scanner.height_m
     near = _near_stations(scenery.vertices, stations, scanner)
     survey = (stations, *near, _surroundings(scenery, stations, scanner.view_px))

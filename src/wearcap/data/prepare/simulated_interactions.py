@@ -55,7 +55,8 @@ class SimulatedInteractionsTask:
         files = (folder / CLOUD, folder / FILE_NAME)
         if note.is_file() and note.read_text(encoding="utf-8") == wanted and all(f.is_file() for f in files):
             return
-        scan = scan_world(Scenery.of(simulated.world), self.spacing_m, np.random.default_rng(12))
+        rng = np.random.default_rng(12)
+        scan = scan_world(Scenery.of(simulated.world), self.spacing_m, rng, walked=simulated.static)
         write_ply(Ply(scan.points, scan.colors), folder / CLOUD)
         write_environment(simulated.environment, folder / FILE_NAME)
         write_text(note, wanted)
