@@ -17,10 +17,14 @@ from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.cli.annotate import main as annotate
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.mesh import Mesh
 from wearcap.io.contact_labels import Label, LabelClock, annotation_of, read_contact_labels
+from wearcap.io.environment import write_environment
 from wearcap.io.motion_npz import write_motion
 from wearcap.recording import CameraStream, Motion, Recording, RecordingStore
 from wearcap.recording.interactions import Interactions
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.viewer.annotate import Desk, take_of
 from wearcap.viewer.annotate_server import AnnotationServer, byte_range
 from wearcap.viewer.annotation_file import AnnotationFile, Conflict
@@ -271,6 +275,17 @@ def test_recordings_that_cannot_be_annotated(dataset, tmp_path):
     assert "r0.mp4 is not there" in take_of(r0, tmp_path).notice
     suit = Recording("suit", suit=swaying_motion(30, skeleton=xsens23()))
     assert take_of(suit, tmp_path).clock.frames == 30
+
+
+def test_objects_of_the_environment_can_be_named(tmp_path):
+    triangle = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), np.full(3, 0.5, np.float32))
+    door = SceneObject(
+        "door_1", "door", triangle, torch.eye(3), torch.zeros(3), Freedom("hinge", (0.0, 0.0, 0.0))
+    )
+    write_environment(Environment((door,)), tmp_path / "environment.json")
+    recording = replace(recording_of(swaying_motion(30), "r"), environment="environment.json")
+    seen = replace(recording, interactions=held([0.1], [0.2], [[True, False]], "sofa"))
+    assert take_of(seen, tmp_path).objects == {"door_1": "hinged", "sofa": "sliding"}
 
 
 # The page itself.
