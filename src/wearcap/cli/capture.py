@@ -9,7 +9,7 @@ from rich.console import Console
 
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import load_pipeline, staged
+from wearcap.cli.load import environment_of, load_pipeline, staged
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.bvh import write_bvh
@@ -23,6 +23,7 @@ from wearcap.pipelines.hps_stream import follow
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.locate import load_recording
+from wearcap.viewer.objects import with_objects
 from wearcap.viewer.video import write_video
 
 HELP = "turn a recording into motion: wearcap capture recording=DATASET/NAME, checkpoint=… or pipeline=hps"
@@ -62,8 +63,15 @@ def _write(motion: Motion, recording: Recording, folder: Path, config: DictConfi
     body = anny_body(motion.skeleton, recording.shape or None) if config.body else None
     write_glb(motion, folder / "motion.glb", body=body)
     if config.video:
-        shown = {"truth": recording.motion} if recording.motion is not None else {}
-        write_video(folder / "motion.mp4", shown | {"capture": motion}, max_seconds=config.video_seconds)
+        truth = with_objects(recording)
+        shown = {"truth": truth} if truth is not None else {}
+        environment = None
+        if motion.object_motion is not None:
+            environment = environment_of(recording, config.recording, config.pipeline.get("environment"))
+        write_video(
+            folder / "motion.mp4", shown | {"capture": motion}, environment=environment,
+            max_seconds=config.video_seconds,
+        )  # fmt: skip
 
 
 def _live(pipeline: object, config: DictConfig, folder: Path) -> None:

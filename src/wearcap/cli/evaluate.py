@@ -12,8 +12,10 @@ from wearcap.cli.load import load_pipeline, staged, trained_on
 from wearcap.errors import WearcapError
 from wearcap.metrics.table import Row, Scores, aggregate, rich_table, write_scores
 from wearcap.pipelines.baselines import MeanPose, NearestWindow
-from wearcap.pipelines.evaluation import Pipeline, evaluate
+from wearcap.pipelines.evaluation import Measure, Pipeline, evaluate, score
 from wearcap.pipelines.hmd2 import HMD2
+from wearcap.pipelines.ireplica import IReplica
+from wearcap.pipelines.ireplica_evaluation import with_interactions
 from wearcap.recording import RecordingStore
 
 HELP = "score a checkpoint: wearcap evaluate checkpoint=… [dataset=DIR] [split=test], or pipeline=hps dataset=DIR"
@@ -23,7 +25,9 @@ def run(config: DictConfig) -> Scores:
     """Evaluate the checkpoint(s) and baselines, or a pipeline that needs none; prints and saves the table."""
     given = config.checkpoint
     checkpoints = list(given) if isinstance(given, ListConfig) else [given]
-    pipeline = load_pipeline(checkpoints[0], config.pipeline, config.device)
+    pipeline = load_pipeline(
+        given if given is None else [str(path) for path in checkpoints], config.pipeline, config.device
+    )
     with Progress(transient=True) as progress:
         if isinstance(pipeline, HMD2):
             store, scores = _learned(checkpoints, config, progress)
@@ -32,7 +36,8 @@ def run(config: DictConfig) -> Scores:
                 raise WearcapError("dataset has no value", fix="Give it on the command line: dataset=DIR.")
             store = RecordingStore.open(config.dataset)
             capture = staged(pipeline, config, store.root, progress.console)
-            rows = _rows(capture, store, list(config.seeds)[:1], config, progress, pipeline.name)
+            measure = with_interactions(pipeline, store.root) if isinstance(pipeline, IReplica) else score
+            rows = _rows(capture, store, list(config.seeds)[:1], config, progress, pipeline.name, measure)
             scores = {pipeline.name: aggregate(list(rows))}
     about = {"dataset": str(store.root), "split": config.split, "checkpoint": ", ".join(map(str, checkpoints))}  # fmt: skip
     show(rich_table(f"{store.root.name}, {config.split} split", scores))
@@ -66,10 +71,11 @@ def _rows(
     config: DictConfig,
     progress: Progress,
     title: str,
+    measure: Measure = score,
 ) -> Iterable[Row]:
     names = store.names(config.split)
     return progress.track(
-        evaluate(pipeline, store, names, seeds, config.lanes),
+        evaluate(pipeline, store, names, seeds, config.lanes, measure),
         total=len(names) * len(seeds),
         description=title,
     )

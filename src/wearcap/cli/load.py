@@ -1,5 +1,6 @@
 """From a checkpoint to the system its own config describes, and from a config to a pipeline, around it or without one."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,14 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from wearcap.errors import WearcapError
+from wearcap.io.environment import read_environment
 from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
+from wearcap.pipelines.contact_prediction import ContactPredictor
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.stages import StagedCapture, StagedPipeline
 from wearcap.recording.locate import dataset_folder
+from wearcap.recording.recording import Recording
+from wearcap.scene.environment import Environment
 from wearcap.training.contact_detection import ContactDetection
 from wearcap.training.motion_diffusion import MotionDiffusion
 
@@ -24,22 +29,28 @@ def load_system(checkpoint: str | Path) -> tuple[MotionDiffusion | ContactDetect
     return system.eval(), config
 
 
-def load_pipeline(checkpoint: str | Path | None, pipeline: DictConfig, device: str) -> HMD2 | StagedPipeline:
+def load_pipeline(
+    checkpoint: str | Path | Sequence[str] | None, pipeline: DictConfig, device: str
+) -> HMD2 | StagedPipeline:
     """The pipeline of a config group: around a checkpoint's network where it is learned (`_partial_`), else by itself.
 
-    Raises WearcapError for a learned pipeline without a checkpoint, and for a checkpoint that nothing is to be done with.
+    iReplica takes several checkpoints of contact networks, one per class. Raises WearcapError for a learned pipeline
+    without a checkpoint, and for a checkpoint that nothing is to be done with.
     """
     learned, name = bool(pipeline.get("_partial_")), pipeline._target_.rpartition(".")[2]
-    if not learned and checkpoint is not None:
-        raise WearcapError(f"a checkpoint, but {name} has no network", where=checkpoint, fix="Leave checkpoint=… out, or choose another pipeline=….")  # fmt: skip
+    given = [checkpoint] if isinstance(checkpoint, str | Path) else list(checkpoint or ())
+    if not learned and given:
+        raise WearcapError(f"a checkpoint, but {name} has no network", where=given[0], fix="Leave checkpoint=… out, or choose another pipeline=….")  # fmt: skip
     made = instantiate(pipeline, _convert_="all")
     if not learned:
         return made
-    if checkpoint is None:
+    if not given:
         raise WearcapError(f"no checkpoint, but {name} needs a trained network", fix="Give checkpoint=…, or a pipeline without one, such as pipeline=hps.")  # fmt: skip
-    system, _ = load_system(checkpoint)
+    if name == "IReplica":
+        return made(predictor=ContactPredictor.load(*given))
+    system, _ = load_system(given[0])
     if not isinstance(system, MotionDiffusion):
-        raise WearcapError(f"{name} needs a motion denoiser", where=checkpoint, expected="a checkpoint of one, not of a contact network")  # fmt: skip
+        raise WearcapError(f"{name} needs a motion denoiser", where=given[0], expected="a checkpoint of one, not of a contact network")  # fmt: skip
     return made(
         net=system.net, features=system.features, schedule=system.schedule, skeleton=system.skeleton,
         fps=system.fps, device=device,
@@ -58,3 +69,11 @@ def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:
     sources = [source["root"] for source in data["sources"].values() if source]
     validated = [source["root"] for source in (data["val_sources"] or data["sources"]).values() if source]
     return sources, validated[0]
+
+
+def environment_of(recording: Recording, data: str | Path, given: str | Path | None) -> Environment | None:
+    """The objects of a file, or those that a recording of DATASET/NAME names, where its file is there; else None."""
+    if given is not None:
+        return read_environment(given)
+    path = dataset_folder(data) / recording.environment if recording.environment else None
+    return read_environment(path) if path is not None and path.is_file() else None

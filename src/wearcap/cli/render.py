@@ -7,12 +7,14 @@ import numpy as np
 from rich import print as show
 
 from wearcap.body.anny_body import anny_body
+from wearcap.cli.load import environment_of
 from wearcap.errors import WearcapError
 from wearcap.io.motion_npz import read_motion
 from wearcap.recording.locate import load_recording
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.viewer.head_path import draw_head_path
+from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
 from wearcap.viewer.video import write_video
 
@@ -36,6 +38,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--fps", type=float, default=30.0, help="frame rate of a video (default 30)")
     parser.add_argument("--size", default="", help="WIDTHxHEIGHT of a panel in pixels, such as 480x400")
     parser.add_argument("--sticks", action="store_true", help="bones instead of a body surface")
+    parser.add_argument("--environment", help="objects to draw (default: what the recording names)")
     options = parser.parse_args(arguments)
     recording = load_recording(options.recording)
     out = options.out or Path(f"{recording.name}.png")
@@ -52,19 +55,24 @@ def main(arguments: list[str]) -> None:
     else:
         skeleton = next(iter(motions.values())).skeleton
         body = None if options.sticks else anny_body(skeleton, recording.shape or None)
+        shown = size | {
+            "body": body,
+            "environment": environment_of(recording, options.recording, options.environment),
+        }
         if out.suffix == ".mp4":
-            write_video(out, motions, fps=options.fps, body=body, **size)
+            write_video(out, motions, fps=options.fps, **shown)
         else:
             last = min(map(len, motions.values())) - 1
             frames = np.linspace(0, last, min(options.frames, last + 1)).round().astype(int).tolist()
-            save_png(out, contact_sheet(motions, frames, body=body, **size))
+            save_png(out, contact_sheet(motions, frames, **shown))
     show(f"wrote {out}")
 
 
 def _motions(
     recording: Recording, captured: str | None, start_s: float, stop_s: float | None
 ) -> dict[str, Motion]:
-    motions = {"truth": recording.motion} if recording.motion is not None else {}
+    truth = with_objects(recording)
+    motions = {"truth": truth} if truth is not None else {}
     if captured:
         motions["capture"] = read_motion(captured)
     return {label: _between(motion, start_s, stop_s) for label, motion in motions.items()}

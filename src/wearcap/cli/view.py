@@ -20,10 +20,12 @@ def main(arguments: list[str]) -> None:
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to serve on (default: this machine only)"
     )
+    parser.add_argument("--environment", help="objects to show (default: what the recording names)")
     options = parser.parse_args(arguments)
     if not 0 < options.port < 65536:
         raise WearcapError(f"port {options.port}", expected="1 to 65535")
 
+    from wearcap.cli.load import environment_of
     from wearcap.io.motion_npz import read_motion
     from wearcap.recording.locate import dataset_folder, load_recording
     from wearcap.viewer.page import Page
@@ -33,8 +35,9 @@ def main(arguments: list[str]) -> None:
     recording = load_recording(options.recording)
     motion = read_motion(options.motion) if options.motion else None
     page = Page(
-        recording, motion, folder=dataset_folder(options.recording), host=options.host, port=options.port
-    )
+        recording, motion, folder=dataset_folder(options.recording), host=options.host, port=options.port,
+        environment=environment_of(recording, options.recording, options.environment),
+    )  # fmt: skip
     print(f"{recording.name}: open {page.url} (Ctrl+C ends; space plays, J and L jump by a second)")
     try:
         page.run()

@@ -1,6 +1,6 @@
 """Score a pipeline on whole recordings, never cut, over several seeds."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -23,6 +23,10 @@ class Pipeline(Protocol):
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]: ...
 
 
+Measure = Callable[[Motion, Recording, str, int], Row]
+"""Scores of a motion that was captured from a recording, by the recording's name and a seed."""
+
+
 def evaluate(
     pipeline: Pipeline, store: RecordingStore, names: Iterable[str], seeds: Sequence[int], lanes: int = 16
 ) -> Iterator[Row]:
@@ -37,7 +41,7 @@ def evaluate(
         recordings = {name: store.load(name) for name, _ in batch}
         motions = pipeline.capture([recordings[name] for name, _ in batch], [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):
-            yield score(motion, recordings[name], name, seed)
+            yield (measure or score)(motion, recordings[name], name, seed)
 
 
 def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:

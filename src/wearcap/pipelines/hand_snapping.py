@@ -42,7 +42,8 @@ class HandSnapping:
     ) -> tuple[Float64[Tensor, "time 3"], Float64[Tensor, "time"]]:
         """How far the palm is from its point of the object, at the frames at which it holds on."""
         targets, weights = torch.zeros_like(palm), torch.zeros_like(palm[:, 0])
-        before, point = None, palm.new_zeros(3)
+        before: Held | None = None
+        point = palm.new_zeros(3)
         for row in held:
             if not row.interval.hands[hand]:
                 continue
@@ -50,7 +51,8 @@ class HandSnapping:
             on = before is not None and before.interval.stop == start and before.thing is row.thing
             if not on:
                 _, nearest = environment.distance(row.thing.name, palm[[start]], row.state.T_world_object)
-                point = row.T_world_object[0].to(torch.float64).inverse() @ nearest[0]
+                start_pose = row.T_world_object[0].to(torch.float64)
+                point = start_pose.R.mT @ (nearest[0] - start_pose.t)
             T = row.T_world_object.to(torch.float64)
             missing = (T.R @ point) + T.t - palm[frames]
             length = missing.norm(dim=-1, keepdim=True).clamp(min=1e-9)

@@ -5,6 +5,7 @@ Nothing is aligned before it is measured.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,9 +19,14 @@ from wearcap.data.prepare.clean import at_times
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.metrics.interaction import Handling, contact_mean, handlings, object_error
+from wearcap.io.environment import read_environment
+from wearcap.metrics.interaction import Handling, contact_mean, handlings, object_error, summary
 from wearcap.metrics.position import mpjpe_cm
+from wearcap.metrics.table import Row
+from wearcap.pipelines.evaluation import Measure, score
+from wearcap.pipelines.ireplica import IReplica
 from wearcap.pipelines.object_tracker import PALMS
+from wearcap.pipelines.stages import Source
 from wearcap.recording import Motion, Recording
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
@@ -66,6 +72,20 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
     return InteractionScores(
         tuple(scored), joints, body, things, _false_moves(environment, held.objects, found)
     )
+
+
+def with_interactions(pipeline: IReplica, folder: Path) -> Measure:
+    """The common scores of a motion, and the means over its handlings where the recording's interactions are known."""
+
+    def measure(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
+        row = score(motion, recording, name, seed)
+        if recording.interactions is None:
+            return row
+        environment = read_environment(pipeline.environment_file(Source(recording, folder)))
+        scores = score_interactions(motion, recording, environment)
+        return replace(row, scores=row.scores | summary(scores.handlings))
+
+    return measure
 
 
 def poses_at(track: Trajectory | None, thing: SceneObject, timestamps: Float64[Tensor, "time"]) -> Rigid:
