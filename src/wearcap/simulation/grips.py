@@ -18,6 +18,9 @@ Moves = Callable[[Float[np.ndarray, "time"], Rigid], Rigid]
 """Pose of a thing in the world at rising times (s), given the chest's pose at these times, which only what is
 carried needs."""
 
+SETTLED, DESCENT = 0.2, 0.5
+"""Shares of the way there, at its end: the hand is off its place along the normal, and comes down on it."""
+
 
 @dataclass(frozen=True)
 class GripPlace:
@@ -74,7 +77,8 @@ class Grip:
 
     def weight(self, times: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time"]:
         """How far the hand is led by the grip: 1 while it holds, minimum jerk before and after."""
-        there, back = (times - self.start_s) / self.reach_s, (times - self.release_s) / self.return_s
+        there = (times - self.start_s) / self.reach_s / (1.0 - SETTLED)
+        back = 1.0 - (self.stop_s - times) / self.return_s / (1.0 - SETTLED)
         return ease(there) - ease(back)
 
     def hold(self, times: Float[np.ndarray, "time"], T_world_chest: Rigid) -> Hold:
@@ -84,8 +88,8 @@ class Grip:
             torch.tensor(v, dtype=torch.float64)
             for v in (self.place.point, self.place.normal, self.place.fingers)
         )
-        before = (self.touch_s - times) / (0.7 * self.reach_s)
-        after = (times - self.release_s) / (0.7 * self.return_s)
+        before = (self.touch_s - times) / (DESCENT * self.reach_s)
+        after = (times - self.release_s) / (DESCENT * self.return_s)
         off = torch.from_numpy(self.hover_m * (ease(before) + ease(after)))
         out = T.R @ normal
         return Hold(T.t + T.R @ point + off[:, None] * out, out, T.R @ fingers)

@@ -103,7 +103,7 @@ def slide_options(
     """
     start = np.asarray(start, np.float64)
     stop = np.append(np.asarray(stop, np.float64)[:2], start[2] + wrap(stop[2] - start[2]))
-    turns = abs(stop[2] - start[2]) > TURN_FREE
+    turns = bool(abs(stop[2] - start[2]) > TURN_FREE)
     if not turns:
         stop[2] = start[2]
     way = stop[:2] - start[:2]
@@ -137,7 +137,7 @@ def _drawn(
     speed = float(rng.uniform(low, high)) * plan.style.briskness**0.5
     seconds = max((length + TURN_LEVER_M * turned) / speed, 1.2)
     pause = float(rng.uniform(0.5, 1.6)) if seconds > 3.0 and rng.random() < 0.25 else 0.0
-    hands = _hand_sets(both, turned > 0, seconds, rng)
+    hands = _hand_sets(both, bool(turned > 0), seconds, rng)
     used = sorted({side for group in hands for side in group})
     wide = 2.0 * float(
         plan.skeleton.t_parent_joint[plan.skeleton.indices("left_collar", "left_shoulder"), 1].sum()

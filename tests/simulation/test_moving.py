@@ -1,0 +1,143 @@
+"""Things that are pushed, pulled, turned and carried, and what only looks like it."""
+
+import numpy as np
+import pytest
+import torch
+from handled import assert_natural, level_world, palm_errors, performed, plan_at
+
+from wearcap.geometry import rotation
+from wearcap.simulation.carrying import carry_options, lift, put_down
+from wearcap.simulation.distractors import bend_over, gesture_at, hover, squat_by
+from wearcap.simulation.handling import hand_rows, interactions_of, object_motion
+from wearcap.simulation.outline import distance_to_convex, rectangle
+from wearcap.simulation.person import draw_person
+from wearcap.simulation.plan import SIDES
+from wearcap.simulation.sliding import slide, slide_options
+from wearcap.simulation.things import THINGS, floor_pose, make_thing
+from wearcap.simulation.walking import turn_to, walk_along
+
+
+@pytest.fixture(scope="module")
+def floor():
+    return level_world()
+
+
+def slid(floor, category, target, seed, hands=None):
+    """A thing slid from the origin to a target by a wearer who stands where it begins."""
+    rng = np.random.default_rng(seed)
+    person = draw_person("p", rng)
+    thing = make_thing(category, f"{category}_1", rng)
+    plan = plan_at(person, floor, 0.0, 0.0, 0.0)
+    options = slide_options(plan, thing, np.zeros(3), np.array(target), rng)
+    choice = next(option for option in options if hands is None or len(option.places) == hands)
+    x, y, heading = choice.stand
+    plan = plan_at(person, floor, x - 0.1, y, heading + 0.2)
+    handling = slide(plan, choice, rng)
+    simulated = performed(plan, floor, rng)
+    track = object_motion(thing.object.T_world_object, [handling], simulated.motion)
+    return plan, choice, handling, simulated, track
+
+
+@pytest.mark.parametrize(
+    ("category", "target", "hands"),
+    [("sofa", (0.9, 0.1, 0.0), 2), ("table", (0.2, 0.3, 1.3), 2), ("chair", (-0.7, 0.1, 0.0), 1)],
+)
+def test_a_thing_goes_where_it_should_with_the_hands_on_it(floor, category, target, hands):
+    plan, choice, handling, simulated, track = slid(floor, category, target, 3, hands)
+    assert palm_errors(plan, simulated.motion).max() < 0.003
+    assert_natural(simulated)
+    assert (track.t_world_body[-1, :2] - torch.tensor(target[:2])).abs().max() < 1e-4
+    assert rotation.yaw_of(track.R_world_body)[-1].item() == pytest.approx(target[2], abs=1e-4)
+    moving = track.t_world_body.diff(dim=0).norm(dim=-1) > 1e-5
+    held = interactions_of([handling]).hand_contact(simulated.motion.timestamps)
+    assert held[1:][moving].any(1).all(), "it moves only while it is held"
+    half_deep, half_wide = choice.thing.half_size
+    for frame in range(0, len(track), 5):
+        x, y, _ = track.t_world_body[frame].tolist()
+        outline = rectangle(
+            (x, y), (2 * half_deep, 2 * half_wide), float(rotation.yaw_of(track.R_world_body[frame]))
+        )
+        pelvis = simulated.motion.t_world_root[frame : frame + 1, :2].double().numpy()
+        assert distance_to_convex(pelvis, outline).min() > 0.2
+
+
+def test_one_hand_only_translates(floor):
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        plan = plan_at(draw_person("p", rng), floor, 0.0, 0.0, 0.0)
+        for category in ("table", "chair"):
+            thing = make_thing(category, category, rng)
+            for option in slide_options(plan, thing, np.zeros(3), np.array([0.5, 0.2, 0.8]), rng):
+                assert option.hands == (SIDES,)
+            for option in slide_options(plan, thing, np.zeros(3), np.array([0.5, 0.2, 0.02]), rng):
+                assert np.ptp(option.thing_at(np.linspace(0, 1, 9))[:, 2]) == 0.0
+
+
+def test_rows_are_split_where_the_hands_change():
+    rows = hand_rows([("left", 1.0, 4.0), ("right", 2.0, 6.0), ("left", 7.0, 8.0)])
+    assert rows == [
+        (1.0, 2.0, (True, False)), (2.0, 4.0, (True, True)), (4.0, 6.0, (False, True)), (7.0, 8.0, (True, False)),
+    ]  # fmt: skip
+
+
+def test_a_box_is_lifted_carried_and_put_down(floor):
+    rng = np.random.default_rng(2)
+    person = draw_person("p", rng)
+    thing = make_thing("box", "box_1", rng)
+    plan = plan_at(person, floor, 0.0, 0.0, 0.0)
+    start, stop = np.array([0.0, 0.0, 0.3, 0.0]), np.array([2.0, 1.5, 1.0, 0.7])
+    choice = next(carry_options(plan, thing, start, stop, rng))
+    x, y, heading = choice.stand
+    plan = plan_at(person, floor, x, y, heading)
+    lifted = lift(plan, choice, rng)
+    walk_along(plan, np.stack([plan.position, [*choice.goal[:2], 0.0]]), rng, 1.0)
+    turn_to(plan, choice.goal[2], rng)
+    handling = put_down(plan, lifted, rng)
+    simulated = performed(plan, floor, rng)
+    assert palm_errors(plan, simulated.motion).max() < 0.01
+    assert_natural(simulated)
+    track = object_motion(floor_pose(start[:3], start[3]), [handling], simulated.motion)
+    assert np.abs(track.t_world_body[-1].numpy() - stop[[0, 1, 3]]).max() < 1e-4
+    carried = (track.timestamps > lifted.lifted_s) & (track.timestamps < lifted.lifted_s + 2.0)
+    level = track.t_world_body[carried, 2] + choice.places["left"].point[2]
+    assert 0.8 < level.mean() < 1.3
+    assert handling.rows[0][2] == (True, True)
+
+
+@pytest.mark.parametrize("category", ["table", "box"])
+def test_distractors_stay_off_the_thing(floor, category):
+    rng = np.random.default_rng(6)
+    person = draw_person("p", rng)
+    thing = make_thing(category, category, rng)
+    plan = plan_at(person, floor, 0.0, 0.0, 0.0)
+    if category == "box":
+        choice = next(carry_options(plan, thing, np.zeros(4), np.zeros(4), rng))
+    else:
+        choice = next(slide_options(plan, thing, np.zeros(3), np.array([1.0, 0.0, 0.0]), rng))
+    plan = plan_at(person, floor, *choice.stand)
+    pose = thing.object.T_world_object
+    hover(plan, choice.places, pose, rng)
+    for act in (gesture_at, bend_over, squat_by):
+        act(plan, pose, thing.height, rng)
+    simulated = performed(plan, floor, rng)
+    assert_natural(simulated)
+    low, high = thing.object.mesh.vertices.min(0), thing.object.mesh.vertices.max(0)
+    for side in SIDES:
+        wrist = simulated.motion.joint(f"{side}_wrist").t.numpy()
+        outside = np.maximum(np.maximum(low - wrist, wrist - high), 0.0)
+        assert np.linalg.norm(outside, axis=1).min() > 0.01
+
+
+@pytest.mark.parametrize("category", sorted(THINGS))
+def test_hands_lie_on_the_things_surface(category):
+    for seed in range(3):
+        thing = make_thing(category, category, np.random.default_rng(seed))
+        low, high = thing.object.mesh.vertices.min(0), thing.object.mesh.vertices.max(0)
+        assert np.allclose(high[:2], thing.half_size, atol=0.02)
+        places = [rail.at(share * rail.length) for rail in thing.rails for share in (0.0, 0.4, 1.0)]
+        places += [place for left, right, _ in thing.sides for place in (left, right)]
+        assert places
+        for place in places:
+            point = np.array(place.point)
+            assert ((point > low - 0.011) & (point < high + 0.011)).all()
+            assert np.abs(np.dot(place.normal, place.fingers)) < 1e-6 or category == "box"
