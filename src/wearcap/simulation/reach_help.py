@@ -17,8 +17,8 @@ EASY = np.array([0.36, 0.10, 0.24, 0.04, 0.09, 0.06])
 LOW_EASY, LOW_M, LOW_BY_M = 0.13, 0.78, 0.40
 """Knees bend more readily (m) for goals that are lower above the floor than the first by up to the second (m)."""
 MOST = np.array([0.9, 0.3, 0.6, 0.45, 0.30, 0.20])
-ENVELOPE_S = 0.22
-ROUNDS, EAGER = 7, 1.25
+ENVELOPE_S = 0.30
+ROUNDS, SMOOTH_ROUNDS, EAGER = 6, 3, 1.2
 
 
 def reach_help(
@@ -30,26 +30,34 @@ def reach_help(
 ) -> Float[np.ndarray, "time 6"] | None:
     """What the trunk adds to the plan, columns as `HELP`, smooth; None where nothing is held.
 
-    The lack of reach is covered by a smooth curve that nowhere lies below it, and shared among the trunk's ways
-    to move by least squares (each weighed by how readily it is used); since that is linear, in rounds.
+    Each moment's lack of reach is shared among the trunk's ways to move by least squares (each weighed by how
+    readily it is used), in rounds, since reach is not linear; that is covered by smooth curves, and what these
+    leave open by a few rounds more, whose lacks are smooth themselves.
     """
     if not any(plan.grips.values()):
         return None
-    wanted = help_ = np.zeros((len(times), len(HELP)))
+    wanted = np.zeros((len(times), len(HELP)))
     crouch = plan.crouch.sample(times)[:, 0]
     easy = np.tile(EASY, (len(times), 1))
     easy[:, 3] += LOW_EASY * _low(plan, feet, stance, times, fps)
-    for _ in range(ROUNDS):
-        trunk = trunk_motion(plan, feet, stance, times, fps, help_)
+    for number in range(ROUNDS + SMOOTH_ROUNDS):
+        if number == ROUNDS:
+            wanted = _over(np.maximum(wanted, 0.0), fps) - _over(np.maximum(-wanted, 0.0), fps)
+        trunk = trunk_motion(plan, feet, stance, times, fps, MOST * np.tanh(wanted / MOST))
         spine = spine_motion(plan.skeleton, trunk)
-        lacks, ways = zip(*(_lack(plan, side, spine, trunk, times, fps) for side in SIDES))
-        if max(float(lack.max()) for lack in lacks) < 1e-4:
+        smooth = number >= ROUNDS
+        lacks, ways = zip(*(_lack(plan, side, spine, trunk, times, fps, smooth) for side in SIDES))
+        if smooth and max(float(lack.max()) for lack in lacks) < 1e-4:
             break
         step = _shared(np.stack(lacks, 1), np.stack(ways, 1), easy)
         step[:, 3] = np.maximum(step[:, 3], -crouch - wanted[:, 3])
         wanted = wanted + EAGER * step
-        help_ = MOST * np.tanh(wanted / MOST)
-    return help_
+    return MOST * np.tanh(wanted / MOST)
+
+
+def _over(need: Float[np.ndarray, "time column"], fps: float) -> Float[np.ndarray, "time column"]:
+    """Smooth curves that nowhere lie below the needs."""
+    return np.stack([-lower_envelope(-column, ENVELOPE_S, fps) for column in need.T], 1)
 
 
 def _low(
@@ -67,7 +75,7 @@ def _low(
 
 
 def _lack(
-    plan: Plan, side: str, spine: Spine, trunk: Trunk, times: np.ndarray, fps: float
+    plan: Plan, side: str, spine: Spine, trunk: Trunk, times: np.ndarray, fps: float, smooth: bool
 ) -> tuple[Float[np.ndarray, "time"], Float[np.ndarray, "time 6"]]:
     """How far a hand's goal is out of reach (m), and by how much each way to help brings the shoulder nearer."""
     bones = arm_bones(plan.skeleton, side)
@@ -77,7 +85,8 @@ def _lack(
     distance = offset.norm(dim=-1)
     lack = ((distance - REACH * bones.length).clamp(min=0) * held.weight).numpy()
     toward = (offset / distance[:, None].clamp(min=1e-6)).numpy()
-    lack = -lower_envelope(-lack, ENVELOPE_S, fps)
+    if smooth:
+        lack = _over(lack[:, None], fps)[:, 0]
     # a hand that lacks nothing should weigh little on what the other one asks
     counts = held.near.numpy() * (0.12 + 0.88 * ease(lack / 0.06))
     return counts * lack, counts[:, None] * _gains(plan, spine, trunk, girdle.at_shoulder, toward)
