@@ -1,6 +1,6 @@
 """iReplica (thesis ch. 5): the wearer of HPS moves doors, sofas and tables, told by contact from pose alone.
 
-The document's steps in order, each a stage: those of HPS → contacts → interact.
+The document's steps in order, each a stage: those of the registration (HPS) → contacts → interact.
 """
 
 from collections.abc import Callable
@@ -14,9 +14,8 @@ from torch import Tensor
 from wearcap.data.prepare.clean import resampled
 from wearcap.errors import WearcapError
 from wearcap.io.environment import read_environment
-from wearcap.pipelines.hps import HPS
 from wearcap.pipelines.object_tracker import ObjectTracker
-from wearcap.pipelines.stages import Source, Stage, run_stages
+from wearcap.pipelines.stages import Source, Stage, StagedPipeline, run_stages
 from wearcap.recording import Motion, Recording
 from wearcap.scene.environment import Environment
 from wearcap.scene.scan import Scan
@@ -29,7 +28,8 @@ Predictor = Callable[[Motion], dict[str, Float[Tensor, "time hand"]]]
 class IReplica:
     """Captures the wearer and the objects that the wearer moves."""
 
-    hps: HPS
+    registration: StagedPipeline
+    """HPS, or another that puts the wearer into the scene."""
     predictor: Predictor
     tracker: ObjectTracker
     environment: str | Path | None = None
@@ -44,19 +44,21 @@ class IReplica:
         return results["interact"]
 
     def stages(self, source: Source) -> list[Stage]:
-        """HPS' steps, then contacts and interactions. Raises WearcapError as HPS does, and without an environment."""
+        """HPS' steps, then contacts and interactions. Raises WearcapError as those do, and without an environment."""
         path = self.environment_file(source)
         environment = read_environment(path)
         suit = source.recording.suit
+        before = self.registration.stages(source)
         return [
-            *self.hps.stages(source),
+            *before,
             Stage(
                 "contacts", lambda done: self.contacts(suit), lambda: (self.predictor, suit, self.fps), (),
                 ("pipelines/contact_prediction.py", "models", "data", "body", "geometry"),
             ),
             Stage(
-                "interact", lambda done: self.interact(self.hps.motion_of(done), done["contacts"], environment),
-                lambda: (path, *sorted(path.parent.glob("objects/*.ply")), self.tracker, self.fps), ("optimize", "initialize", "contacts"),
+                "interact", lambda done: self.interact(self.registration.motion_of(done), done["contacts"], environment),
+                lambda: (path, *sorted(path.parent.glob("objects/*.ply")), self.tracker, self.fps),
+                (*(stage.name for stage in before), "contacts"),
                 ("pipelines/object_tracker.py", "pipelines/attachment.py", "pipelines/snapping.py", "optimize", "scene",
                  "body", "geometry"),
             ),
@@ -73,12 +75,12 @@ class IReplica:
         return source.folder / source.recording.environment
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
-        """With objects after the last stage; before it, HPS' motion."""
-        return results["interact"] if "interact" in results else self.hps.motion_of(results)
+        """With objects after the last stage; before it, the registration's."""
+        return results["interact"] if "interact" in results else self.registration.motion_of(results)
 
     def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
-        """HPS' report, and what was held when."""
-        about = self.hps.report(source, results)
+        """The registration's report, and what was held when."""
+        about = self.registration.report(source, results)
         if "interact" in results:
             held = results["interact"].interactions
             rows = zip(held.start_s.tolist(), held.stop_s.tolist(), held.hands.tolist(), held.objects)
@@ -89,9 +91,9 @@ class IReplica:
         return about
 
     def registered(self, source: Source) -> Motion:
-        """The wearer's motion in the scene by HPS alone. Raises WearcapError as HPS does."""
-        results, _ = run_stages(self.hps.stages(source))
-        motion = self.hps.motion_of(results)
+        """The wearer's motion in the scene, objects at rest. Raises WearcapError as the registration does."""
+        results, _ = run_stages(self.registration.stages(source))
+        motion = self.registration.motion_of(results)
         assert motion is not None
         return motion
 

@@ -1,0 +1,75 @@
+"""iReplica's own registration as documented (thesis §5.3.1): the suit's path is bent to the camera's positions."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from wearcap.data.prepare.clean import resampled
+from wearcap.geometry import rotation
+from wearcap.geometry.trajectory import interpolate
+from wearcap.optimize.trajectory import BentPath
+from wearcap.pipelines.hps import mount, require, required
+from wearcap.pipelines.hps_camera import (
+    Localize,
+    MapLocalization,
+    Synchronization,
+    camera_report,
+    camera_stages,
+    on_one_clock,
+)
+from wearcap.pipelines.stages import Source, Stage
+from wearcap.recording import Motion, Recording
+from wearcap.sensors.alignment import align_suit, body_camera, inliers
+
+
+@dataclass(frozen=True)
+class BentSuit:
+    """The suit's motion along its own path, bent in the ground plane; pose and height stay the suit's."""
+
+    bend: Callable[..., BentPath]
+    """`optimize.trajectory.bend` with its settings and solver."""
+    fps: float = 30.0
+    name: str = "bent_suit"
+    synchronization: Synchronization = field(default_factory=Synchronization)
+    localization: Localize = field(default_factory=MapLocalization)
+
+    def stages(self, source: Source) -> list[Stage]:
+        """HPS' first two, then the path is bent. Raises WearcapError as HPS does."""
+        recording = source.recording
+        require(recording, "suit", "camera")
+        return [
+            *camera_stages(source, self.synchronization, self.localization),
+            Stage(
+                "bend", lambda done: self.place(on_one_clock(recording, done)),
+                lambda: (self.fps, self.bend, recording.suit, *mount(recording)), ("synchronize", "localize"),
+                ("pipelines/bent_suit.py", "optimize", "sensors/alignment.py", "data/prepare/clean.py", "geometry", "body"),
+            ),
+        ]  # fmt: skip
+
+    def motion_of(self, results: dict[str, Any]) -> Motion | None:
+        """The motion, once its path is bent."""
+        return results.get("bend")
+
+    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
+        """Clock and share localised."""
+        return camera_report(results)
+
+    def place(self, recording: Recording) -> Motion:
+        """F_tr(l, p) of eq. 5.2, p the root beneath each localised camera, outliers left out."""
+        suit, localization, T_head_cam = required(recording)
+        motion = align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
+        first, last = motion.timestamps[0], motion.timestamps[-1]
+        use = inliers(localization) & (localization.timestamps >= first) & (localization.timestamps <= last)
+        times = localization.timestamps[use].contiguous()
+        carried = body_camera(motion, T_head_cam.t) - motion.t_world_root
+        points = localization.t_world_cam[use] - interpolate(motion.timestamps, carried, times)
+        path = motion.t_world_root[:, :2].double()
+        bent = self.bend(
+            path, motion.timestamps, times, points[:, :2].double(), localization.confidence[use].double()
+        )
+        R = motion.R_parent_joint.clone()
+        R[:, 0] = rotation.about_axis("z", bent.frame_turn.to(R)) @ R[:, 0]
+        root = torch.cat([bent.path.to(motion.t_world_root), motion.t_world_root[:, 2:]], 1)
+        return replace(motion, R_parent_joint=R, t_world_root=root, provenance={"pipeline": self.name})
