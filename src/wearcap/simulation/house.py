@@ -1,5 +1,6 @@
 """An interactive flat while somebody lives in it: where everything stands now, and what was moved when."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,11 +11,16 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.interactions import Interactions
 from wearcap.recording.motion import Motion
+from wearcap.simulation.grips import GripPlace
 from wearcap.simulation.handling import Handling, interactions_of, object_motion
 from wearcap.simulation.interactive_flat import InteractiveFlat, obstacle
 from wearcap.simulation.openables import Openable
+from wearcap.simulation.plan import Plan
 from wearcap.simulation.things import Thing
 from wearcap.simulation.world import World, WorldObject
+
+Seem = Callable[[Plan, dict[str, GripPlace], Rigid, float, np.random.Generator], None]
+"""What looks like handling a thing: given places for the hands, the thing's pose and its height (m)."""
 
 
 @dataclass

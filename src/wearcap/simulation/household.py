@@ -1,21 +1,33 @@
 """A stretch of life in an interactive flat: what is done next, getting through doors, and ordinary activities."""
 
+from collections import Counter
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
+from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.actions import ACTIVITIES, follow, start_place
-from wearcap.simulation.house import House
+from wearcap.simulation.distractors import bend_over, gesture_at, hover, linger, squat_by
+from wearcap.simulation.grips import GripPlace
+from wearcap.simulation.house import House, Seem
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.opening import operate
 from wearcap.simulation.outline import distance_to_convex
 from wearcap.simulation.plan import Plan
-from wearcap.simulation.rearranging import floor_place, rearrange
+from wearcap.simulation.rearranging import floor_place, rearrange, relocate
 from wearcap.simulation.things import Thing
 from wearcap.simulation.wearer import TAIL_S, Wearer
 
-WEIGHTS = {"door": 2.5, "window": 1.0, "drawer": 1.2, "cabinet_door": 0.8, "sofa": 1.2, "table": 1.0, "chair": 1.4,
-           "room": 0.7, "again": 2.5}  # fmt: skip
-"""How often each kind of thing is gone for; "room": several things of one room, "again": what was used last."""
+WEIGHTS = {
+    "door": 2.0, "window": 1.0, "drawer": 1.2, "cabinet_door": 0.8, "sofa": 2.0, "table": 1.5, "chair": 1.5, "box": 1.5
+}  # fmt: skip
+"""How often things of a kind are gone for, all of them together."""
+AGAIN, ROOM = 0.35, 0.10
+"""How often it is what was used last, and several things of one room."""
+TRIES = 5
+SEEM_SHARE = 0.14
+"""How often hands do something before a thing without touching it."""
 ORDINARY = ("stand", "look_around", "turn", "walk", "hold", "gesture", "carry", "reach", "sit", "crouch")
 HELD_SHARE = 0.42
 """Of the time in which hands hold something is aimed at."""
@@ -28,8 +40,26 @@ BEYOND_M = 0.95
 REACHED_M = 0.4
 NEAR_M = 1.5
 """Things so much further off are gone for a third as often."""
-IN_ROOM = 4
+IN_ROOM, SAME_ROOM_M = 4, 3.5
 """Most things that are moved when a room is rearranged."""
+
+
+def seem_to_handle(
+    plan: Plan, places: dict[str, GripPlace], T_world_thing: Rigid, height_m: float, rng: np.random.Generator
+) -> None:
+    """One of the things that look like handling, before something of a height."""
+    low = float(T_world_thing.t[2]) + height_m < 0.95
+    chance = rng.random()
+    if low and chance < 0.18:
+        bend_over(plan, T_world_thing, height_m, rng)
+    elif low and chance < 0.32:
+        squat_by(plan, T_world_thing, height_m, rng)
+    elif chance < 0.45:
+        gesture_at(plan, T_world_thing, height_m, rng)
+    elif chance < 0.55:
+        linger(plan, rng)
+    else:
+        hover(plan, places, T_world_thing, rng)
 
 
 class Household:
@@ -70,46 +100,47 @@ class Household:
         return name
 
     def interact(self) -> str:
-        """Use something, after going through whatever doors lie on the way."""
-        kind = str(self.rng.choice(list(WEIGHTS), p=np.array([*WEIGHTS.values()]) / sum(WEIGHTS.values())))
-        if kind == "room":
+        """Use something, after going through whatever doors lie on the way; "stand" where nothing could be done."""
+        chance = self.rng.random()
+        if chance < AGAIN and self.last is not None and (done := self.use(self.last)) != "stand":
+            return done
+        if chance > 1.0 - ROOM:
             return self.rearrange_room()
-        if kind == "again" and self.last is not None:
-            return self.use(self.last)
-        names = [name for name, item in (self.openables | self.things).items() if item.category == kind]
-        return self.use(names[self._near(names)]) if names else "stand"
+        for _ in range(TRIES):
+            if (done := self.use(self._drawn(self.openables | self.things))) != "stand":
+                return done
+        return "stand"
 
     def use(self, name: str) -> str:
-        """Open, close or move one thing; says what was done."""
-        done = self._act(name)
+        """Open, close or move one thing; says what was done: "walk" when one only got there, "stand" for nothing."""
+        start, done = self.plan.time, self._act(name)
         if not done and self.go(self.place_of(name), stop_m=1.0):
             done = self._act(name)
-        if done:
-            self.last = name
+        if not done:
+            return "walk" if self.plan.time > start else "stand"
+        self.last = name
         verb = "move" if name in self.things else "turn"
-        return f"{verb} {(self.openables | self.things)[name].category}" if done else "walk"
+        return f"{verb} {(self.openables | self.things)[name].category}"
 
     def _act(self, name: str) -> bool:
-        return self.move(self.things[name]) if name in self.things else self.turn(self.openables[name])
+        seem = seem_to_handle if self.rng.random() < SEEM_SHARE else None
+        if name in self.openables:
+            return self.turn(self.openables[name], seem)
+        thing = self.things[name]
+        act = relocate if thing.category == "box" else rearrange
+        return act(self.plan, self.house, self.rng, thing, seem)
 
     def rearrange_room(self) -> str:
         """Move several things near each other, one after another."""
-        names = [name for name, thing in self.things.items() if thing.category != "box"]
-        if not names:
-            return "stand"
-        first = names[self._near(names)]
+        start, first = self.plan.time, self._drawn(self.things)
         middle = self.place_of(first)
-        names.sort(key=lambda name: float(np.linalg.norm(self.place_of(name) - middle)))
-        count = int(self.rng.integers(2, IN_ROOM + 1))
-        for name in names[:count]:
-            if np.linalg.norm(self.place_of(name) - middle) < 3.5:
-                self.use(name)
-        return "rearrange"
+        away = {name: float(np.linalg.norm(self.place_of(name) - middle)) for name in self.things}
+        names = sorted((name for name in away if away[name] < SAME_ROOM_M), key=lambda name: away[name])
+        for name in names[: int(self.rng.integers(2, IN_ROOM + 1))]:
+            self.use(name)
+        return "rearrange" if self.plan.time > start else "stand"
 
-    def move(self, thing: Thing) -> bool:
-        return thing.category != "box" and rearrange(self.plan, self.house, self.rng, thing)
-
-    def turn(self, item: Openable) -> bool:
+    def turn(self, item: Openable, seem: Seem | None = None) -> bool:
         """Open what is closed, close what is open; at times something between."""
         at, full = self.house.values[item.name], item.openness(item.opened)
         if item.openness(at) > 0.3 * full:
@@ -119,7 +150,7 @@ class Household:
         value = item.closed + share * (item.opened - item.closed)
         if abs(value - at) < 0.12 * full:
             return False
-        return operate(self.plan, self.house, self.rng, item, value, self._side(item))
+        return operate(self.plan, self.house, self.rng, item, value, self._side(item), seem)
 
     def go(self, goal: Float[np.ndarray, "3"], stop_m: float = 0.0) -> bool:
         """Walk to a floor point (m), or within `stop_m` of it, opening closed doors on the way; False where that fails."""
@@ -181,11 +212,13 @@ class Household:
         out = -(item.pose(item.closed).R.numpy() @ np.array(item.handles[0].fingers))[:2]
         return np.append(place[:2] + 0.7 * out / np.linalg.norm(out), floor)
 
-    def _near(self, names: list[str]) -> int:
-        """One of some things, rather one that is near."""
-        away = np.array([np.linalg.norm(self.place_of(name)[:2] - self.plan.position[:2]) for name in names])
-        weights = np.exp(-away / NEAR_M)
-        return int(self.rng.choice(len(names), p=weights / weights.sum()))
+    def _drawn(self, items: Mapping[str, Thing | Openable]) -> str:
+        """The name of something to use next, rather of what is near."""
+        kinds = Counter(item.category for item in items.values())
+        away = [np.linalg.norm(self.place_of(name)[:2] - self.plan.position[:2]) for name in items]
+        weights = np.exp(-np.array(away) / NEAR_M)
+        weights *= [WEIGHTS[item.category] / kinds[item.category] for item in items.values()]
+        return str(self.rng.choice(list(items), p=weights / weights.sum()))
 
     def _side(self, door: Openable) -> int:
         """Handle on the side where one stands: 0 where the leaf opens to."""

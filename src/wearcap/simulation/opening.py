@@ -11,7 +11,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.actions import approach
 from wearcap.simulation.grips import drawn_grip
 from wearcap.simulation.handling import handling_of
-from wearcap.simulation.house import House
+from wearcap.simulation.house import House, Seem
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.outline import distance_to_convex
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan, wrap
@@ -52,9 +52,13 @@ class Turn:
 
 
 def operate(
-    plan: Plan, house: House, rng: np.random.Generator, item: Openable, value: float, handle: int = 0
-) -> bool:
-    """Go to an openable and bring it to a value by one of its handles; False, with nothing done, where one cannot."""
+    plan: Plan, house: House, rng: np.random.Generator, item: Openable, value: float, handle: int = 0,
+    seem: Seem | None = None,
+) -> bool:  # fmt: skip
+    """Go to an openable and bring it to a value by one of its handles; False, with nothing done, where one cannot.
+
+    With `seem`, that is done there instead, and nothing is touched.
+    """
     world = house.world(plan.position)
     turn = plan_turn(plan, house, world, rng, item, value, handle)
     if turn is None:
@@ -64,7 +68,12 @@ def operate(
     far = np.linalg.norm(goal[:2] - plan.position[:2]) > 0.1 or abs(wrap(first[2] - plan.heading)) > 0.3
     if far and not approach(plan, world, rng, goal, float(first[2])):
         return False
-    _perform(plan, house, turn, rng)
+    if seem is not None:
+        seem(
+            plan, {turn.side: item.handles[handle]}, item.pose(turn.start), item.handles[handle].point[2], rng
+        )
+    else:
+        _perform(plan, house, turn, rng)
     return True
 
 

@@ -6,11 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 from wearcap.simulation.actions import approach
-from wearcap.simulation.house import House
+from wearcap.simulation.carrying import Carry, carry_options, lift, put_down
+from wearcap.simulation.house import House, Seem
 from wearcap.simulation.interactive_flat import obstacle
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.outline import distance_to_convex, rectangle, turn
 from wearcap.simulation.plan import Plan
+from wearcap.simulation.shuffling import step_to
 from wearcap.simulation.sliding import Slide, slide, slide_options
 from wearcap.simulation.things import Thing, floor_pose
 from wearcap.simulation.world import World
@@ -22,6 +24,7 @@ REACHED_M = 0.35
 """The place to stand is no further than this from where one can walk freely."""
 FAR_M = {"sofa": (0.3, 1.6), "table": (0.3, 1.8), "chair": (0.25, 2.2)}
 """How far things are moved."""
+CARRIED_M = 5.0
 TURN_SHARE = 0.4
 BEFORE_M = 0.45
 """Kept free before what opens, beyond its sweep."""
@@ -29,18 +32,32 @@ WAY_SHARE = 0.85
 KEYS = np.linspace(0.0, 1.0, 9)
 
 
-def rearrange(plan: Plan, house: House, rng: np.random.Generator, thing: Thing) -> bool:
-    """Slide a thing to another place nearby; False, with nothing done, where none is found or one cannot get to it."""
+def rearrange(
+    plan: Plan, house: House, rng: np.random.Generator, thing: Thing, seem: Seem | None = None
+) -> bool:
+    """Slide a thing to another place nearby; False, with nothing done, where none is found or one cannot get to it.
+
+    With `seem`, that is done there instead, and nothing is touched.
+    """
     world = house.world(plan.position)
     choice = choose_slide(plan, house, world, rng, thing)
     if choice is None:
         return False
     x, y, heading = choice.stand
     goal = np.array([x, y, plan.position[2]])
-    if np.linalg.norm(goal[:2] - plan.position[:2]) > 0.25 and not approach(
-        plan, world, rng, goal, float(heading)
-    ):
+    far = np.linalg.norm(goal[:2] - plan.position[:2]) > 0.25
+    if far and not approach(plan, world, rng, goal, float(heading)):
         return False
+    if seem is not None:
+        step_to(plan, rng, choice.stand[:2], float(heading))
+        seem(
+            plan,
+            {side: choice.places[side] for side in choice.hands[0]},
+            house.poses[thing.name],
+            thing.height,
+            rng,
+        )
+        return True
     house.handlings.append(slide(plan, choice, rng, float(plan.position[2])))
     house.poses[thing.name] = floor_pose(choice.stop, float(house.poses[thing.name].t[2]))
     return True
@@ -77,6 +94,60 @@ def choose_slide(
             free = min(distance_to_convex(body, footprint).min() for footprint in solid)
             reached = np.linalg.norm(points - choice.stand[:2], axis=1).min() < REACHED_M
             if free > BODY_M and reached and _leaves_way(house, world, choice):
+                return choice
+    return None
+
+
+def relocate(
+    plan: Plan, house: House, rng: np.random.Generator, thing: Thing, seem: Seem | None = None
+) -> bool:
+    """Carry a box to another place on the floor; False, with nothing done, where none is found or one cannot get there.
+
+    With `seem`, that is done before it instead, and nothing is touched.
+    """
+    world = house.world(plan.position)
+    choice = choose_carry(plan, house, world, rng, thing)
+    floor = float(plan.position[2])
+    if choice is None:
+        return False
+    x, y, heading = choice.stand
+    if not approach(plan, world, rng, np.array([x, y, floor]), float(heading)):
+        return False
+    if seem is not None:
+        step_to(plan, rng, choice.stand[:2], float(heading))
+        seem(plan, choice.places, house.poses[thing.name], thing.height, rng)
+        return True
+    lifted = lift(plan, choice, rng)
+    there = house.world(plan.position, without=(thing.name,))
+    x, y, heading = choice.goal
+    approach(plan, there, rng, np.array([x, y, floor]), float(heading))
+    house.handlings.append(put_down(plan, lifted, rng))
+    house.poses[thing.name] = floor_pose(choice.stop[:3], float(choice.stop[3]))
+    return True
+
+
+def choose_carry(
+    plan: Plan, house: House, world: World, rng: np.random.Generator, thing: Thing
+) -> Carry | None:
+    """A free place on the floor for a box and a way to hold it; None where none was found."""
+    place, level = floor_place(house, thing), float(house.poses[thing.name].t[2])
+    points = world.navigation.node_points[:, :2]
+    if np.linalg.norm(points - place[:2], axis=1).min() > 1.0:
+        return None
+    others = [item.footprint for item in world.objects if item.name != thing.name and item.z_range[0] < 1.5]
+    outline = rectangle((0.0, 0.0), (2 * thing.half_size[0], 2 * thing.half_size[1]))
+    zones = kept_free(house)
+    for _ in range(TRIES):
+        spot = points[rng.integers(len(points))] + rng.uniform(-0.3, 0.3, 2)
+        stop = np.array([*spot, rng.uniform(-np.pi, np.pi)])
+        apart = 0.8 < np.linalg.norm(spot - place[:2]) < CARRIED_M
+        if not apart or not _apart(_outlines(outline, stop[None]), [*others, *zones], APART_M):
+            continue
+        for choice in carry_options(plan, thing, np.append(place, level), np.append(stop, level), rng):
+            ends = np.stack([choice.stand[:2], choice.goal[:2]])
+            free = min(distance_to_convex(ends, footprint).min() for footprint in others)
+            away = np.linalg.norm(ends[:, None] - points[None], axis=-1).min(1)
+            if free > BODY_M and (away < REACHED_M).all():
                 return choice
     return None
 
