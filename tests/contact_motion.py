@@ -1,4 +1,4 @@
-"""Recordings in which a bent elbow means that the hand holds something: a table's edge or, turned inwards, a door."""
+"""Recordings in which a bent elbow means that the hand holds something: a table's edge or, with the arm raised, a door."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,9 +25,9 @@ def bending(frames: int, seed: int = 0, skeleton: Skeleton | None = None) -> tup
     for s, h, k in zip(start.tolist(), hand.tolist(), kind.tolist()):
         side, sign = ("left", "right")[h], (1.0, -1.0)[h]
         rise = ((motion.timestamps - s) / 0.1).clamp(0, 1) * ((s + 1.0 - motion.timestamps) / 0.1).clamp(0, 1)
-        elbow, wrist = motion.skeleton.indices(f"{side}_elbow", f"{side}_wrist")
+        elbow, shoulder = motion.skeleton.indices(f"{side}_elbow", f"{side}_shoulder")
         R[:, elbow] = R[:, elbow] @ rotation.about_axis("z", -1.4 * sign * rise.float())
-        R[:, wrist] = R[:, wrist] @ rotation.about_axis("y", 0.9 * k * rise.float())
+        R[:, shoulder] = R[:, shoulder] @ rotation.about_axis("x", 1.2 * k * sign * rise.float())
     interactions = Interactions(
         start, start + 1.0, torch.nn.functional.one_hot(hand, 2).bool(), ("thing",) * len(start),
         tuple(CLASSES[k] for k in kind.tolist()),
@@ -40,9 +40,9 @@ def bending_recording(frames: int, name: str, seed: int = 0) -> Recording:
     return replace(recording_of(motion, name), suit=motion, interactions=interactions)
 
 
-def bending_dataset(root: Path, frames: int = 900) -> RecordingStore:
-    """Recordings b0 … b3: three to train, one to validate."""
+def bending_dataset(root: Path, frames: int = 900, train: int = 3) -> RecordingStore:
+    """Recordings b0, b1 …, some to train and the last one to validate."""
     store = RecordingStore(root)
-    for seed, split in enumerate(("train", "train", "train", "val")):
+    for seed, split in enumerate(("train",) * train + ("val",)):
         store.add(bending_recording(frames, f"b{seed}", seed), split=split, config_hash="test")
     return store
