@@ -135,6 +135,8 @@ def _drawn(
     length, turned = float(np.linalg.norm(change[:2])), abs(change[2])
     low, high = SPEEDS[thing.category]
     speed = float(rng.uniform(low, high)) * plan.style.briskness**0.5
+    if PUSH < abs(angle) < PULL:
+        speed *= 0.75
     seconds = max((length + TURN_LEVER_M * turned) / speed, 1.2)
     pause = float(rng.uniform(0.5, 1.6)) if seconds > 3.0 and rng.random() < 0.25 else 0.0
     hands = _hand_sets(both, bool(turned > 0), seconds, rng)

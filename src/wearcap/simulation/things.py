@@ -148,7 +148,7 @@ def _box(name: str, rng: np.random.Generator) -> Thing:
     piece = Piece(
         "box", (depth, width), (0.0, height), (Part((0, 0, height / 2), (depth, width, height), color),)
     )
-    level, up = float(rng.uniform(0.35, 0.6)) * height, (0.0, 0.0, 1.0)
+    level, up = float(rng.uniform(0.35, 0.6) + 0.6 * max(height - 0.3, 0.0)) * height, (0.0, 0.0, 1.0)
     sides = []
     for facing, half in (
         (0.0, width / 2),
