@@ -114,19 +114,19 @@ def lift(plan: Plan, choice: Carry, rng: np.random.Generator) -> Lifted:
     """Bend down, take hold, and lift; the wearer stands at or near `choice.stand`. `plan.time` becomes the end."""
     _arrive(plan, choice.stand, rng)
     start, low = plan.time, choice.palm_height(choice.start) - plan.position[2]
-    bend, lean = _depth(plan, low, rng)
+    bend, lean = bend_for(plan, low, rng)
     down = float((0.75 + 1.1 * bend) * rng.uniform(0.9, 1.25) / plan.style.briskness)
     touch = start + down
     begin = touch + float(rng.uniform(0.1, 0.5))
     rise = float((0.9 + 1.2 * bend) * rng.uniform(0.9, 1.3) / plan.style.briskness)
-    _bow(plan, start, touch, bend, lean)
-    _spread(plan, (start, start + 0.45 * down), (touch, begin + rise))
+    bow(plan, start, touch, bend, lean)
+    spread(plan, (start, start + 0.45 * down), (touch, begin + rise))
     plan.gaze_point.move(
         start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.thing.height)
     )
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(begin + 0.3 * rise, begin + rise, 0.0)
-    _bow(plan, begin, begin + rise, 0.0, float(rng.normal(-0.04, 0.03)))
+    bow(plan, begin, begin + rise, 0.0, float(rng.normal(-0.04, 0.03)))
     plan.time = begin + rise + float(rng.uniform(0.0, 0.3))
     return Lifted(choice, start, touch, begin, begin + rise)
 
@@ -136,13 +136,13 @@ def put_down(plan: Plan, lifted: Lifted, rng: np.random.Generator) -> Handling:
     choice = lifted.choice
     _arrive(plan, choice.goal, rng)
     start, low = plan.time + 0.1, choice.palm_height(choice.stop) - plan.position[2]
-    bend, lean = _depth(plan, low, rng)
+    bend, lean = bend_for(plan, low, rng)
     down = float((1.0 + 1.2 * bend) * rng.uniform(0.9, 1.3) / plan.style.briskness)
     release = start + down + float(rng.uniform(0.05, 0.4))
     rise = float((0.8 + 1.0 * bend) * rng.uniform(0.9, 1.2) / plan.style.briskness)
-    _bow(plan, start, start + down, bend, lean)
-    _bow(plan, release, release + rise, 0.0, 0.0)
-    _spread(plan, (start, start + down), (release + 0.3 * rise, release + rise))
+    bow(plan, start, start + down, bend, lean)
+    bow(plan, release, release + rise, 0.0, 0.0)
+    spread(plan, (start, start + down), (release + 0.3 * rise, release + rise))
     plan.gaze_point.move(start, start, np.append(choice.stop[:2], choice.stop[3]))
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(release, release + 0.6, 0.0)
@@ -166,7 +166,7 @@ def _arrive(plan: Plan, place: Float[np.ndarray, "3"], rng: np.random.Generator)
         step_to(plan, rng, place[:2], place[2])
 
 
-def _depth(plan: Plan, low: float, rng: np.random.Generator) -> tuple[float, float]:
+def bend_for(plan: Plan, low: float, rng: np.random.Generator) -> tuple[float, float]:
     """How far knees (m) and trunk (rad) bend for palms at a height above the floor (m)."""
     drop = max(1.52 * plan.hip_height - low - 0.62 * plan.arm_length, 0.0)
     knees = float(np.clip(rng.normal(0.50, 0.08), 0.32, 0.66))
@@ -175,7 +175,7 @@ def _depth(plan: Plan, low: float, rng: np.random.Generator) -> tuple[float, flo
     )
 
 
-def _bow(plan: Plan, start: float, stop: float, crouch: float, lean: float) -> None:
+def bow(plan: Plan, start: float, stop: float, crouch: float, lean: float) -> None:
     """Bring knees and trunk to a bend between two times."""
     plan.crouch.move(start, stop, crouch)
     plan.lean.move(start, stop, (lean, 0.0, 0.0))
@@ -185,7 +185,7 @@ def _bow(plan: Plan, start: float, stop: float, crouch: float, lean: float) -> N
         plan.heel_lift[side].move(first, last, heels)
 
 
-def _spread(plan: Plan, out: tuple[float, float], back: tuple[float, float]) -> None:
+def spread(plan: Plan, out: tuple[float, float], back: tuple[float, float]) -> None:
     """Who bends over a box keeps the hands that do not hold it beside it."""
     for side in SIDES:
         hand = plan.hands[side]
