@@ -66,22 +66,24 @@ class Openable:
 
     def openness(self, value: float) -> float:
         """How far it is open (rad or m)."""
-        return abs(value - self.closed)
+        return float(abs(value - self.closed))
 
-    def footprint(self, values: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 4 2"]:
+    def footprint(self, values: float | Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 4 2"]:
         """Outline in the world, counter-clockwise (m)."""
         pose = self.pose(values)
         R, t = pose.R[..., :2, :2].numpy(), pose.t[..., :2].numpy()
         return np.einsum("...ij,cj->...ci", R, self.outline) + t[..., None, :]
 
-    def handle(self, number: int, values: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 3"]:
+    def handle(
+        self, number: int, values: float | Float[np.ndarray, "*batch"]
+    ) -> Float[np.ndarray, "*batch 3"]:
         """Where the palm lies on a handle, in the world (m)."""
         pose = self.pose(values)
         return pose.t.numpy() + pose.R.numpy() @ np.array(self.handles[number].point)
 
     def blocks(self, value: float) -> bool:
         """Whether one cannot walk through: a door that is not open enough."""
-        return self.category == "door" and self.openness(value) < PASSABLE
+        return self.category == "door" and bool(self.openness(value) < PASSABLE)
 
 
 def hook(point: tuple[float, float, float], inwards: tuple[float, float]) -> GripPlace:

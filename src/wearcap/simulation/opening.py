@@ -106,7 +106,7 @@ def plan_turn(
     ]
     task = Task(
         way, footprint, tuple(other.footprint for other in solid), tuple(other.footprint for other in high), 1.0,
-        floor + shoulder, plan.arm_length + PALM_M, low=item.z_range[1] < way[0, 2] + 0.2,
+        floor + shoulder, plan.arm_length + PALM_M, low=bool(item.z_range[1] < way[0, 2] + 0.2),
         beyond=_beyond(item, handle),
     )  # fmt: skip
     walkable = world.navigation.node_points[:, :2]

@@ -1,0 +1,98 @@
+"""Whoever opens something has a hand on its handle and is not in its way."""
+
+import numpy as np
+import pytest
+
+from wearcap.body.kinematics import site_positions
+from wearcap.recording.interactions import HANDS
+from wearcap.simulation.house import House
+from wearcap.simulation.interactive_flat import build_interactive_flat
+from wearcap.simulation.opening import operate
+from wearcap.simulation.outline import distance_to_convex
+from wearcap.simulation.plan import Plan
+from wearcap.simulation.wearer import TAIL_S, perform
+
+FPS = 30.0
+CASES = [("door", 0), ("door", 1), ("window", 0), ("drawer", 0), ("cabinet_door", 0)]
+
+
+def opened_and_closed(category, handle, person, seeds=range(8)):
+    """The first flat in which something of a category can be opened by a handle and closed again."""
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        flat = build_interactive_flat(rng, "flat")
+        house = House(flat)
+        for item in (item for item in flat.openables if item.category == category and item.closed == 0.0):
+            out = -(item.pose(0.0).R.numpy() @ np.array(item.handles[handle].fingers))[:2]
+            start = item.handle(handle, np.array(0.0))[:2] + 0.8 * out / np.linalg.norm(out)
+            plan = Plan(person.skeleton, person.style, np.array([*start, 0.0]), 0.0, flat.static.floor_height)
+            plan.time = 0.3
+            if not operate(plan, house, rng, item, 0.85 * item.opened, handle):
+                continue
+            if operate(plan, house, rng, item, item.closed, handle):
+                stop = plan.time + 0.5
+                plan.time = stop + TAIL_S
+                return flat, house, item, perform(plan, flat.static, rng, stop, FPS).motion
+    pytest.fail(f"no {category} was opened and closed")
+
+
+@pytest.fixture(scope="module", params=CASES, ids=lambda case: f"{case[0]}-{case[1]}")
+def case(request, person):
+    return request.param[1], *opened_and_closed(*request.param, person)
+
+
+def test_the_palm_stays_on_the_handle(case):
+    handle, _, house, item, motion = case
+    rows, track = house.interactions(1e3), house.object_motion(motion)[item.name]
+    assert len(rows) == 2
+    assert rows.objects == (item.name,) * 2
+    assert set(rows.classes) == {"hinged" if item.category != "drawer" else "sliding"}
+    palms = site_positions(motion.skeleton, motion.T_world_joint, ("left_palm", "right_palm")).double()
+    point = (
+        track.T_world_body.R.double().numpy() @ np.array(item.handles[handle].point)
+    ) + track.t_world_body.numpy()
+    held = rows.hand_contact(motion.timestamps).numpy()
+    assert held.sum(1).max() == 1
+    for side in range(len(HANDS)):
+        away = np.linalg.norm(palms[:, side].numpy() - point, axis=1)
+        assert (away[held[:, side]] < 0.01).all()
+    assert held.sum() > 2 * 1.0 * FPS
+
+
+def test_the_thing_moves_only_in_a_hand_and_within_its_limits(case):
+    _, _, house, item, motion = case
+    track = house.object_motion(motion)[item.name]
+    held = house.interactions(1e3).hand_contact(motion.timestamps).any(1)
+    moved = (track.t_world_body.diff(dim=0).norm(dim=-1) > 1e-5) | (
+        track.R_world_body.diff(dim=0).norm(dim=(-1, -2)) > 1e-5
+    )
+    assert not (moved & ~(held[1:] | held[:-1])).any()
+    home = item.object.T_world_object
+    assert (track.t_world_body[-1] - home.t).norm() < 1e-4, "closed again"
+    if item.hinged:
+        R = home.R.transpose(0, 1) @ track.R_world_body
+        angle = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+        assert np.abs(angle).max() > 0.8 * abs(item.opened)
+        assert (angle >= item.object.freedom.limits[0] - 1e-3).all()
+        assert (angle <= item.object.freedom.limits[1] + 1e-3).all()
+    else:
+        way = (track.t_world_body - home.t) @ track.t_world_body.new_tensor(item.object.freedom.axis)
+        assert way.max() > 0.8 * item.opened
+        assert way.min() > -1e-4
+    assert (motion.timestamps.diff() > 0).all()
+
+
+def test_the_body_keeps_off_the_thing_and_the_walls(case):
+    _, flat, house, item, motion = case
+    track = house.object_motion(motion)[item.name]
+    held = house.interactions(1e3).hand_contact(motion.timestamps).any(1).numpy()
+    R, t = track.R_world_body.double().numpy(), track.t_world_body.double().numpy()
+    for joint in ("pelvis", "t8"):
+        place = motion.joint(joint).t.double().numpy()
+        local = np.einsum("tji,tj->ti", R, place - t)[:, :2]
+        level = held & (place[:, 2] < item.z_range[1])  # one bends over a low drawer
+        if level.any():
+            assert distance_to_convex(local[level], item.outline).min() > 0.12
+        for other in flat.static.objects:
+            if other.z_range[0] < 1.0 and other.z_range[1] > 0.9:
+                assert distance_to_convex(place[held, :2], other.footprint).min() > 0.12, other.name
