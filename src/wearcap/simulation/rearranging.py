@@ -233,7 +233,10 @@ def _apart(
         [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0))]
     )
     points = np.concatenate([border(corners) for corners in outlines])
+    low, high = points.min(0) - least_m, points.max(0) + least_m
     for other in others:
+        if (other.min(0) > high).any() or (other.max(0) < low).any():
+            continue
         if distance_to_convex(points, other).min() <= least_m:
             return False
         rim = border(other)

@@ -120,11 +120,23 @@ def _arm_hits(
     for share in np.linspace(0.25, 1.0, 7):
         along = shoulder + share * last * arm
         for key, outline in enumerate(task.footprint if not task.low else ()):
-            hits[key] |= distance_to_convex(along[key], outline) < (0.01 if share == 1.0 else ARM_M)
+            hits[key] |= _within(along[key], outline, 0.01 if share == 1.0 else ARM_M)
         if share < 0.9:
             for outline in task.high:
-                hits |= distance_to_convex(along, outline) < ARM_M
+                hits |= _within(along, outline, ARM_M)
     return hits
+
+
+def _within(
+    points: Float[np.ndarray, "*batch 2"], outline: Float[np.ndarray, "corner 2"], margin: float
+) -> Bool[np.ndarray, "*batch"]:
+    """Whether points lie in a convex counter-clockwise outline whose sides are moved outwards by a margin (m)."""
+    inside = np.ones(points.shape[:-1], bool)
+    x, y = points[..., 0], points[..., 1]
+    for start, end in zip(outline, np.roll(outline, -1, axis=0)):
+        edge = end - start
+        inside &= edge[0] * (y - start[1]) - edge[1] * (x - start[0]) > -margin * np.hypot(*edge)
+    return inside
 
 
 def _cheapest(
