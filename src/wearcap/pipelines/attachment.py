@@ -7,18 +7,19 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.pipelines.contact_intervals import ContactInterval, ContactSettings, active, contact_intervals
 from wearcap.recording.interactions import Interactions
 from wearcap.scene.environment import Environment
-from wearcap.scene.object_motion import ObjectState, follow_hands
+from wearcap.scene.object_motion import ANCHORS, ObjectState, follow_hands
 from wearcap.scene.objects import CONTACT_CLASSES, SceneObject
 
 
 @dataclass(frozen=True)
 class AttachmentSettings:
-    """How objects are taken and carried."""
+    """How objects are taken and carried. Raises WearcapError for an unknown anchor or a reach that is not positive."""
 
     reach_m: float = 0.5
     """A contact with no object of its class so near to the hand is a false positive (thesis §5.3.1)."""
@@ -26,8 +27,16 @@ class AttachmentSettings:
     """What carries an object held by two hands: "right" (document) or "middle" (ours)."""
     one_class: bool = True
     """A hand holds by its more probable class alone; False: both networks work in parallel (document)."""
+    settle_s: float = 0.4
+    """Up to so much of an interval's beginning and end is approach and retreat, and cut off where hands are slowest;
+    0: nothing is (document)."""
     keep_object: bool = True
     """When hands join or leave without a pause, the object stays the same; False: it is looked for anew (document)."""
+
+    def __post_init__(self):
+        if self.anchor not in ANCHORS or not self.reach_m > 0:
+            raise WearcapError(f"anchor {self.anchor!r}, reach {self.reach_m} m",
+                               expected=f"one of {', '.join(ANCHORS)}, and a positive distance")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -145,9 +154,9 @@ def object_trajectories(
 
 def interactions_of(held: Sequence[Held], timestamps: Float64[Tensor, "time"]) -> Interactions:
     """What was held when, as a recording keeps it."""
-    step = float(timestamps.diff().median()) if len(timestamps) > 1 else 0.0
-    start = [float(timestamps[row.interval.start]) for row in held]
-    stop = [float(timestamps[row.interval.stop - 1]) + step for row in held]
+    edges = torch.cat([timestamps, timestamps[-1:] + (timestamps.diff().median() if len(timestamps) > 1 else 0.0)])
+    start = [float(edges[row.interval.start]) for row in held]
+    stop = [float(edges[row.interval.stop]) for row in held]
     hands = torch.tensor([row.interval.hands for row in held], dtype=torch.bool).reshape(-1, 2)
     return Interactions(
         torch.tensor(start, dtype=torch.float64), torch.tensor(stop, dtype=torch.float64), hands,

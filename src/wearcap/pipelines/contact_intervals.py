@@ -69,15 +69,15 @@ class ContactStream:
     _waiting: deque = field(default_factory=deque)
     """Undecided frames from the oldest on: (number, time, above)."""
     _last: list[float] = field(default_factory=lambda: [-float("inf")] * 2)
+    _now_s: float = -float("inf")
     _count: int = 0
     _open: tuple[int, tuple[bool, bool]] | None = None
 
     def push(self, contact_prob: Float[Tensor, "hand"], time_s: float) -> list[ContactInterval]:
         """Take one frame's probabilities; intervals that are over by now. Raises WearcapError when time stands."""
-        if self._waiting and time_s <= self._waiting[-1][1]:
-            raise WearcapError(
-                f"a frame at {time_s} s after one at {self._waiting[-1][1]} s", expected="rising times"
-            )
+        if not time_s > self._now_s:
+            raise WearcapError(f"a frame at {time_s} s after one at {self._now_s} s", expected="rising times")
+        self._now_s = time_s
         above = [bool(p >= self.settings.threshold) for p in contact_prob.tolist()]
         for hand in range(2):
             if above[hand]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
 from wearcap.data.prepare.clean import at_times
+from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import interpolate
 from wearcap.pipelines.attachment import (
     AttachmentSettings,
@@ -20,6 +21,7 @@ from wearcap.pipelines.attachment import (
 )
 from wearcap.pipelines.contact_intervals import ContactInterval, ContactSettings
 from wearcap.pipelines.hand_snapping import HandSnapping
+from wearcap.pipelines.settling import settled
 from wearcap.recording import Motion
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
@@ -74,6 +76,7 @@ class ObjectTracker:
         }  # fmt: skip
         palms = site_positions(motion.skeleton, motion.T_world_joint, PALMS).double()
         spans = class_intervals(prob, motion.timestamps, self.contact, self.attachment.one_class)
+        spans = settled(spans, palms, motion.timestamps, self.attachment.settle_s)
         held = self._held(motion, palms, spans, environment)
         offset = palms.new_zeros(len(motion), 2) if self.correction is None else self.correction.finish(held)
         shift = torch.nn.functional.pad(offset, (0, 1))
@@ -89,10 +92,13 @@ class ObjectTracker:
         self, motion: Motion, palms: Float64[Tensor, "time hand 3"], spans: list[tuple[ContactInterval, str]],
         environment: Environment,
     ) -> list[Held]:  # fmt: skip
-        room, held = Room(environment, self.attachment), []
+        room, held, busy_until = Room(environment, self.attachment), [], [0, 0]
         if self.correction is not None:
             self.correction.start(palms, motion)
-        for contact, contact_class in spans:
+        for span, contact_class in spans:
+            contact = once_free(span, busy_until) if self.attachment.one_class else span
+            if contact.start >= contact.stop:
+                continue
             before = self._kept(held, contact, contact_class)
             thing = before or room.nearest(palms[contact.start], contact_class, contact)
             if thing is None:
@@ -103,7 +109,8 @@ class ObjectTracker:
                 offset = self.correction.offset(contact, thing, points, before is not None)
                 frames[..., :2] += offset[:, None]
             held.append(room.take(contact, contact_class, thing, points, before is not None, frames))
-        return held
+            busy_until = [contact.stop if on else until for on, until in zip(contact.hands, busy_until)]
+        return sorted(held, key=lambda row: row.interval.start)
 
     def _kept(self, held: list[Held], contact: ContactInterval, contact_class: str) -> SceneObject | None:
         """What the hands hold already when only the set of hands changes."""
@@ -116,8 +123,19 @@ class ObjectTracker:
         return None
 
 
+def once_free(contact: ContactInterval, busy_until: list[int]) -> ContactInterval:
+    """The interval from the frame on at which none of its hands holds anything else; it may be empty."""
+    busy = [until for on, until in zip(contact.hands, busy_until) if on]
+    return replace(contact, start=max(contact.start, *busy))
+
+
 def within(registered: Motion, timestamps: Float64[Tensor, "time"]) -> Motion:
-    """The registered motion at the contacts' frames, as far as it reaches."""
+    """The registered motion at the contacts' frames, as far as it reaches. Raises WearcapError where it reaches none."""
     first, last = registered.timestamps[0], registered.timestamps[-1]
     inside = (timestamps >= first) & (timestamps <= last)
+    if not inside.any():
+        raise WearcapError(
+            f"a motion in the scene from {first.item():.3f} to {last.item():.3f} s and contacts at other times",
+            expected="both on one clock",
+        )
     return at_times(registered, timestamps[inside].contiguous())

@@ -76,15 +76,15 @@ def carried(start: Rigid, held: Float[Tensor, "time held 3"], anchor: str) -> Ri
 
 
 def turned(vectors: Float[Tensor, "hand time 2"]) -> Float[Tensor, "hand time"]:
-    """Signed angle (rad) from the first vector to each one, unwrapped over time; short vectors keep the last angle."""
-    before, after = vectors[:, :-1], vectors[:, 1:]
-    cross = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
+    """Signed angle (rad) from the first vector to each one, unwrapped over time; short vectors keep the last angle.
+
+    Before the first vector that is long enough the angle is 0.
+    """
     long = vectors.norm(dim=-1) > LEAST_APART_M
-    if bool(long.all()):
-        step = torch.atan2(cross, (before * after).sum(-1))
-        return torch.nn.functional.pad(step, (1, 0)).cumsum(-1)
-    frame = torch.where(long, torch.arange(vectors.shape[1]), 0).cummax(-1).values  # last frame that tells
+    first = long.long().argmax(-1, keepdim=True)
+    frame = torch.where(long, torch.arange(vectors.shape[1]), first).cummax(-1).values  # last frame that tells
     kept = vectors.gather(1, frame[..., None].expand_as(vectors))
-    return turned(
-        torch.where(kept.norm(dim=-1, keepdim=True) > LEAST_APART_M, kept, vectors.new_tensor([1.0, 0.0]))
-    )
+    before, after = kept[:, :-1], kept[:, 1:]
+    cross = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
+    step = torch.atan2(cross, (before * after).sum(-1))
+    return torch.nn.functional.pad(step, (1, 0)).cumsum(-1)
