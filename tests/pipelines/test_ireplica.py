@@ -7,18 +7,25 @@ import torch
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import xsens23
+from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rotation import about_axis
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.contact_labels import LabelClock, labels_of
+from wearcap.io.environment import write_environment
+from wearcap.metrics.interaction import summary
 from wearcap.optimize.contact_correction import OffsetSettings
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.pipelines.attachment import AttachmentSettings
+from wearcap.pipelines.digest import digest
 from wearcap.pipelines.hand_snapping import HandSnapping
+from wearcap.pipelines.ireplica import IReplica
 from wearcap.pipelines.ireplica_baselines import held_when_near, interpolated_objects, static_objects
 from wearcap.pipelines.ireplica_evaluation import score_interactions
 from wearcap.pipelines.object_tracker import PALMS, ObjectTracker
 from wearcap.pipelines.snapping import BendCorrection, HingeFit, SnapCorrection, fit_about_hinge
+from wearcap.pipelines.stages import Source
 from wearcap.recording import Motion, Recording
 from wearcap.recording.interactions import Interactions
 from wearcap.scene.environment import Environment
@@ -88,7 +95,7 @@ def held_of(motion: Motion) -> Interactions:
 
 
 def tracker(**settings) -> ObjectTracker:
-    return ObjectTracker(None, attachment=AttachmentSettings(**settings))
+    return ObjectTracker(None, attachment=AttachmentSettings(**{"settle_s": 0.0} | settings))
 
 
 def test_what_is_held_goes_along_and_stays_where_it_is_left(scene, way):
@@ -131,6 +138,106 @@ def test_the_less_probable_class_gives_way(scene):
     assert held_of(tracker()(motion, contacts, environment)).objects == ("door",)
     together = tracker(one_class=False)(motion, contacts, environment)
     assert "door" in held_of(together).objects
+
+
+def test_a_hand_holds_one_thing_at_a_time(scene):
+    """The class flickers: the gap in the one is filled, and the other does not take the hand meanwhile."""
+    motion, environment = scene
+    sliding = held_left()
+    hinged = torch.zeros(FRAMES, 2)
+    hinged[120:140, 0] = 0.95
+    left = site_positions(motion.skeleton, motion.T_world_joint, PALMS)[120, 0]
+    door = cube("left_door", left, Freedom("hinge", pivot=tuple((left + 0.4).tolist())))
+    contacts = {"timestamps": motion.timestamps, "sliding": sliding, "hinged": hinged}
+    captured = tracker(settle_s=0.0)(motion, contacts, Environment((*environment.objects, door)))
+    assert held_of(captured).objects == ("near",)
+    labels_of(held_of(captured), LabelClock.of("r", motion.timestamps))
+
+
+def test_captured_interactions_are_labels_on_an_uneven_clock(scene):
+    motion, environment = scene
+    uneven = motion.timestamps + 0.003 * torch.rand(FRAMES, generator=torch.Generator().manual_seed(0))
+    motion = replace(motion, timestamps=uneven)
+    both = held_left()
+    both[120:180, 1] = 0.9
+    held = held_of(tracker()(motion, {"timestamps": uneven, "sliding": both}, environment))
+    assert len(held) == 3
+    assert (held.stop_s[:-1] == held.start_s[1:]).all()
+    labels = labels_of(held, LabelClock.of("r", uneven))
+    assert [len(labels[hand]) for hand in ("left", "right")] == [1, 1]
+
+
+def test_what_cannot_be_tracked_is_said(scene):
+    motion, environment = scene
+    contacts = {"timestamps": motion.timestamps + 1e4, "sliding": held_left()}
+    with pytest.raises(WearcapError, match="contacts at other times"):
+        tracker()(motion, contacts, environment)
+    for settings in ({"anchor": "left"}, {"reach_m": 0.0}):
+        with pytest.raises(WearcapError, match="anchor"):
+            AttachmentSettings(**settings)
+
+
+def test_a_room_without_objects_and_a_motion_of_one_frame(scene):
+    motion, environment = scene
+    contacts = {"timestamps": motion.timestamps, "sliding": torch.ones(FRAMES, 2)}
+    empty = ObjectTracker(SnapCorrection(), hands=HandSnapping())(motion, contacts, Environment(()))
+    assert (len(held_of(empty)), objects_of(empty)) == (0, {})
+    assert torch.equal(empty.t_world_root, motion.t_world_root)
+    one = {name: value[:1] for name, value in contacts.items()}
+    assert len(ObjectTracker(SnapCorrection(), hands=HandSnapping())(motion, one, environment)) == 1
+    throughout = ObjectTracker(SnapCorrection(), hands=HandSnapping())(motion, contacts, environment)
+    assert throughout.t_world_root.isfinite().all()
+    assert held_of(throughout).stop_s[-1] == pytest.approx(FRAMES / FPS, abs=0.5)
+
+
+def test_handlings_outside_of_the_capture_spoil_no_mean(scene, way):
+    """A handling before the capture's first frame is not measured at its last one."""
+    motion, environment = scene
+    track = Trajectory(motion.timestamps, torch.eye(3).repeat(FRAMES, 1, 1), torch.zeros(FRAMES, 3))
+    spans = torch.tensor([[0.1, 0.3], [2.0, 3.0]]).double()
+    held = Interactions(spans[:, 0].contiguous(), spans[:, 1].contiguous(), torch.tensor([[True, False]] * 2),
+                        ("far", "near"), ("sliding",) * 2)  # fmt: skip
+    truth = Recording("r", motion=motion, interactions=held, object_motion={"near": track})
+    late = static_objects(motion.sliced(60, FRAMES), environment)
+    far = late.object_motion["far"]  # pyright: ignore[reportOptionalSubscript]
+    far.t_world_body[-1] += 5.0
+    scores = score_interactions(late, truth, environment)
+    assert scores.handlings[0].end_cm == pytest.approx(0.0, abs=0.1)
+    assert np.isnan(scores.handlings[0].hand_object_cm)
+    assert np.isfinite(list(summary(scores.handlings).values())).all()
+    assert np.isnan(summary([])["end_cm"])
+
+
+class Registered:
+    """A registration without steps."""
+
+    name = "registered"
+
+    def stages(self, source):
+        return []
+
+    def motion_of(self, results):
+        return None
+
+    def report(self, source, results):
+        return {}
+
+
+def test_objects_are_tracked_again_when_a_mesh_changes_wherever_it_lies(scene, tmp_path):
+    motion, environment = scene
+    pipeline = IReplica(
+        Registered(), dict, tracker(), environment=tmp_path
+    )  # the folder, too, names the file
+    keys = []
+    for size in (1.0, 2.0):
+        near, *others = environment.objects
+        larger = replace(near, mesh=replace(near.mesh, vertices=size * near.mesh.vertices))
+        write_environment(Environment((larger, *others)), tmp_path)
+        (tmp_path / "objects").rename(tmp_path / f"meshes{size:.0f}")
+        file = tmp_path / "environment.json"
+        file.write_text(file.read_text().replace("objects/", f"meshes{size:.0f}/"))
+        keys.append(digest(*pipeline.stages(Source(Recording("r", suit=motion)))[-1].reads()))
+    assert keys[0] != keys[1]
 
 
 def test_scores_tell_the_perfect_capture_from_the_static_one(scene, way):
@@ -186,8 +293,10 @@ def test_corrections_move_the_wearer_to_the_object_and_back(scene):
     motion, environment = scene
     off = replace(motion, t_world_root=motion.t_world_root + torch.tensor([0.0, -0.3, 0.0]))
     contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
-    plain = ObjectTracker(None)(off, contacts, environment)
-    snapped = ObjectTracker(SnapCorrection(OffsetSettings(transition_s=0.8)))(off, contacts, environment)
+    plain = tracker()(off, contacts, environment)
+    snapped = replace(tracker(), correction=SnapCorrection(OffsetSettings(transition_s=0.8)))(
+        off, contacts, environment
+    )
     shift = (snapped.t_world_root - off.t_world_root)[:, 1]
     torch.testing.assert_close(shift[TAKE:LEAVE], torch.full((LEAVE - TAKE,), 0.1), atol=3e-3, rtol=0)
     assert shift[[0, -1]].abs().max() < 0.03
@@ -207,7 +316,7 @@ def test_the_documents_correction_runs_on_the_same_contacts(scene):
     correction = BendCorrection(
         partial(bend, settings=Bending(rigidity=1.0, held_headings=True), solver=bend_banded)
     )
-    captured = ObjectTracker(correction)(off, contacts, environment)
+    captured = replace(tracker(), correction=correction)(off, contacts, environment)
     assert held_of(captured).objects == ("near",)
     assert captured.t_world_root.isfinite().all()
 
@@ -218,8 +327,8 @@ def test_hands_are_put_onto_what_they_hold_by_the_arms_alone(scene):
     bent[:, motion.skeleton.index("left_elbow")] = about_axis("z", torch.tensor(-0.6))
     motion = replace(motion, R_parent_joint=bent)
     contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
-    plain = ObjectTracker(None)(motion, contacts, environment)
-    snapped = ObjectTracker(None, hands=HandSnapping())(motion, contacts, environment)
+    plain = tracker()(motion, contacts, environment)
+    snapped = replace(tracker(), hands=HandSnapping())(motion, contacts, environment)
     thing = environment.by_name("near")
     T = objects_of(snapped)[thing.name].T_world_body[TAKE:LEAVE]
     apart = []
