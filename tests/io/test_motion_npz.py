@@ -19,6 +19,12 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.motion_npz import read_motion, write_motion
 from wearcap.io.npz import read_npz, require
 from wearcap.recording import Motion
+from wearcap.recording.interactions import Interactions
+
+HELD = Interactions(
+    torch.tensor([1e3, 1e3 + 0.1]).double(), torch.tensor([1e3 + 0.1, 1e3 + 0.2]).double(),
+    torch.tensor([[True, False], [True, True]]), ("door", ""), ("hinged", ""),
+)  # fmt: skip
 
 
 def sample(frames: int = 6) -> Motion:
@@ -31,6 +37,7 @@ def sample(frames: int = 6) -> Motion:
         torch.arange(frames, dtype=torch.float64) / 30 + 1e3, xsens23(),
         rotation.exp(torch.randn(frames, 23, 3, generator=generator)), torch.randn(frames, 3, generator=generator),
         contact_prob=torch.rand(frames, 4, generator=generator), object_motion={"door": door},
+        hand_contact_prob=torch.rand(frames, 2, generator=generator), interactions=HELD,
         provenance={"pipeline": "hmd2", "config": "ä"},
     )  # fmt: skip
 
@@ -38,11 +45,12 @@ def sample(frames: int = 6) -> Motion:
 def same(a: Motion, b: Motion) -> bool:
     assert a.object_motion is not None
     assert b.object_motion is not None
-    pairs = [(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a)]
-    pairs += [(getattr(a.object_motion["door"], f.name), getattr(b.object_motion["door"], f.name))
-              for f in dataclasses.fields(Trajectory)]  # fmt: skip
-    return all(x.dtype == y.dtype and torch.equal(x, y) if isinstance(x, torch.Tensor) else isinstance(x, dict) or x == y
-               for x, y in pairs)  # fmt: skip
+    parts = [(a, b), (a.object_motion["door"], b.object_motion["door"]), (a.interactions, b.interactions)]
+    pairs = [(getattr(x, f.name), getattr(y, f.name)) for x, y in parts for f in dataclasses.fields(x)]
+    return all(
+        x.dtype == y.dtype and torch.equal(x, y) if isinstance(x, torch.Tensor) else isinstance(x, dict | Interactions) or x == y
+        for x, y in pairs
+    )  # fmt: skip
 
 
 def test_round_trip_is_exact_and_bytes_repeat(tmp_path):
@@ -57,11 +65,14 @@ def test_round_trip_is_exact_and_bytes_repeat(tmp_path):
 
 
 def test_a_bare_motion_comes_back_bare(tmp_path):
-    motion = dataclasses.replace(sample(1), contact_prob=None, object_motion=None, provenance={})
+    bare = {"contact_prob": None, "hand_contact_prob": None, "object_motion": None, "interactions": None}
+    motion = dataclasses.replace(sample(1), **bare, provenance={})
     write_motion(motion, tmp_path / "a.npz")
     back = read_motion(tmp_path / "a.npz")
     assert back.contact_prob is None
     assert back.object_motion is None
+    assert back.hand_contact_prob is None
+    assert back.interactions is None
     assert back.provenance == {}
     assert torch.equal(back.R_parent_joint, motion.R_parent_joint)
 
@@ -112,6 +123,14 @@ FAULTS = {
     "loose site": (
         lambda p: described(p, lambda t: t["motion"]["skeleton"]["sites"]["crown"].update(joint="tail")), "tail"
     ),
+    "three hands": (lambda p: rewritten(p, hand_contact_prob=np.zeros((6, 3), np.float32)), "hand_contact_prob"),
+    "hands of other frames": (lambda p: rewritten(p, hand_contact_prob=np.zeros((5, 2), np.float32)), "hand_contact_prob"),
+    "interactions of NaN": (lambda p: rewritten(p, **{"interactions.stop_s": np.full(2, np.nan)}), "stop_s"),
+    "ends of other interactions": (lambda p: rewritten(p, **{"interactions.stop_s": np.zeros(3)}), "stop_s"),
+    "hands that are numbers": (lambda p: rewritten(p, **{"interactions.hands": np.ones((2, 2))}), "damaged"),
+    "an object too many": (
+        lambda p: described(p, lambda t: t["motion"]["interactions"]["objects"]["$tuple"].append("a")), "2 interactions"),
+    "no interactions": (lambda p: described(p, lambda t: t["motion"].update(interactions=[1])), "damaged"),
     "empty file": (lambda p: p.write_bytes(b""), "readable .npz"),
     "garbage": (lambda p: p.write_bytes(bytes(range(256)) * 30), "readable .npz"),
     "truncated": (lambda p: p.write_bytes(p.read_bytes()[:3000]), "readable .npz"),

@@ -68,3 +68,11 @@ def test_settings_and_times_that_make_no_sense_are_refused():
     stream.push(torch.tensor([0.0, 0.0]), 1.1)
     with pytest.raises(WearcapError, match="rising"):
         stream.push(torch.tensor([0.0, 0.0]), 1.1)
+
+
+def test_a_frame_that_goes_back_is_refused_when_nothing_waits():
+    stream = ContactStream()
+    stream.push(torch.ones(2), 1.0)
+    for time in (1.0, 0.5, float("nan")):
+        with pytest.raises(WearcapError, match="rising"):
+            stream.push(torch.ones(2), time)

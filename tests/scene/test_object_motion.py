@@ -43,7 +43,7 @@ def test_one_hand_only_shifts_and_the_plane_keeps_its_height():
     palms[:, 0] = torch.linspace(0, 1, 50)[:, None].double() * torch.tensor([1.0, -2.0, 0.3]).double()
     found, _ = follow_hands(sofa, ObjectState(sofa.T_world_object), palms, LEFT)
     torch.testing.assert_close(found.t[-1], torch.tensor([2.0, 0.0, 0.0]).double())
-    assert (found.R == torch.eye(3).double()).all()
+    assert (torch.eye(3).double() == found.R).all()
     box = thing(Freedom("free"))
     lifted, _ = follow_hands(box, ObjectState(box.T_world_object), palms, LEFT)
     assert lifted.t[-1, 2].item() == pytest.approx(0.3)
@@ -87,3 +87,12 @@ def test_hands_that_meet_keep_the_last_angle():
     found, _ = follow_hands(sofa, ObjectState(sofa.T_world_object), palms, BOTH)
     assert np.isfinite(found.R.numpy()).all()
     torch.testing.assert_close(found.R, torch.eye(3).double().expand(85, 3, 3))
+
+
+def test_hands_that_begin_together_turn_nothing_until_they_part():
+    sofa = thing(Freedom("plane"))
+    apart = torch.linspace(0.0, 0.5, 60).double()
+    palms = torch.zeros(60, 2, 3).double()
+    palms[:, 0, 1], palms[:, 1, 1] = apart / 2, -apart / 2  # along y: not the direction of any default
+    found, _ = follow_hands(sofa, ObjectState(sofa.T_world_object), palms, BOTH)
+    torch.testing.assert_close(found.R, torch.eye(3).double().expand(60, 3, 3))

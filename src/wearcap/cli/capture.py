@@ -43,7 +43,6 @@ def run(config: DictConfig) -> Motion | None:
         if config.until is not None or config.cache is not None:
             raise WearcapError(f"until={config.until} cache={config.cache}", expected="a pipeline with stages, such as pipeline=hps")  # fmt: skip
         motion = pipeline(recording, seed=config.seed)
-        motion.provenance.update(checkpoint=str(config.checkpoint))
     else:
         captured = staged(pipeline, config, config.recording, Console(stderr=True)).run(
             recording, config.until
@@ -51,6 +50,8 @@ def run(config: DictConfig) -> Motion | None:
         write_text(folder / "report.json", json.dumps(captured.report, indent=1) + "\n")
         motion = captured.motion
     if motion is not None:
+        if config.checkpoint is not None:
+            motion.provenance.update(checkpoint=str(config.checkpoint))
         motion.provenance.update(recording=str(config.recording))
         _write(motion, recording, folder, config)
     show(f"{'motion' if motion is not None else 'report'}: {folder}")

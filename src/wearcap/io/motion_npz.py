@@ -17,6 +17,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.frame_grid import nominal_fps
 from wearcap.io.npz import read_npz, require
+from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.recording.motion import Motion
 from wearcap.recording.serialize import dumps, flatten, unflatten
 
@@ -75,6 +76,13 @@ def _check(motion: Motion, path: str | Path) -> None:
     }  # fmt: skip
     if motion.contact_prob is not None:
         arrays["contact_prob"], shapes["contact_prob"] = motion.contact_prob, ("time", "patch")
+    if motion.hand_contact_prob is not None:
+        arrays["hand_contact_prob"], shapes["hand_contact_prob"] = (
+            motion.hand_contact_prob,
+            ("time", len(HANDS)),
+        )
+    if motion.interactions is not None:
+        _check_interactions(motion.interactions, path)
     for name, track in (motion.object_motion or {}).items():
         if not isinstance(track, Trajectory):
             raise TypeError(f"object {name!r} has no trajectory")
@@ -94,3 +102,25 @@ def _check(motion: Motion, path: str | Path) -> None:
             raise ValueError("a site without a finite position")
     if not all(isinstance(item, str) for pair in motion.provenance.items() for item in pair):
         raise TypeError("provenance that is no text")
+
+
+def _check_interactions(held: Interactions, path: str | Path) -> None:
+    if not isinstance(held, Interactions) or held.hands.dtype != torch.bool:
+        raise TypeError("interactions that are none")
+    arrays = {
+        "start_s": held.start_s.numpy(),
+        "stop_s": held.stop_s.numpy(),
+        "hands": held.hands.numpy().astype(np.uint8),
+    }
+    count = require(
+        arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS))
+    )["interval"]
+    if {held.start_s.dtype, held.stop_s.dtype} != {torch.float64}:
+        raise TypeError("times of interactions of another number type")
+    for names in (held.objects, held.classes):
+        if (
+            not isinstance(names, tuple)
+            or len(names) != count
+            or not all(isinstance(name, str) for name in names)
+        ):
+            raise ValueError(f"names that do not match {count} interactions")

@@ -57,11 +57,9 @@ MEASURES = ("end_cm", "end_deg", "hand_object_cm", "hand_cm", "object_cm", "obje
 
 
 def summary(rows: Sequence[Handling]) -> dict[str, float]:
-    """Mean of every measure over handlings; NaN without any."""
-    return {
-        name: sum(getattr(row, name) for row in rows) / len(rows) if rows else float("nan")
-        for name in MEASURES
-    }
+    """Mean of every measure over the handlings that have it; NaN without any."""
+    values = torch.tensor([[getattr(row, name) for name in MEASURES] for row in rows], dtype=torch.float64)
+    return dict(zip(MEASURES, values.reshape(-1, len(MEASURES)).nanmean(0).tolist()))
 
 
 def contact_mean(value: Float[Tensor, "time hand"], contact: Bool[Tensor, "time hand"]) -> Float[Tensor, ""]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from wearcap.data.prepare.clean import resampled
 from wearcap.errors import WearcapError
-from wearcap.io.environment import read_environment
+from wearcap.io.environment import FILE_NAME, read_environment
 from wearcap.pipelines.object_tracker import ObjectTracker
 from wearcap.pipelines.stages import Source, Stage, StagedPipeline, run_stages
 from wearcap.recording import Motion, Recording
@@ -45,8 +45,7 @@ class IReplica:
 
     def stages(self, source: Source) -> list[Stage]:
         """HPS' steps, then contacts and interactions. Raises WearcapError as those do, and without an environment."""
-        path = self.environment_file(source)
-        environment = read_environment(path)
+        environment = read_environment(self.environment_file(source))
         suit = source.recording.suit
         before = self.registration.stages(source)
         return [
@@ -57,9 +56,10 @@ class IReplica:
             ),
             Stage(
                 "interact", lambda done: self.interact(self.registration.motion_of(done), done["contacts"], environment),
-                lambda: (path, *sorted(path.parent.glob("objects/*.ply")), self.tracker, self.fps),
+                lambda: (environment, self.tracker, self.fps),
                 (*(stage.name for stage in before), "contacts"),
-                ("pipelines/object_tracker.py", "pipelines/attachment.py", "pipelines/snapping.py", "optimize", "scene",
+                ("pipelines/object_tracker.py", "pipelines/contact_intervals.py", "pipelines/settling.py",
+                 "pipelines/attachment.py", "pipelines/snapping.py", "pipelines/hand_snapping.py", "optimize", "scene",
                  "body", "geometry"),
             ),
         ]  # fmt: skip
@@ -67,7 +67,8 @@ class IReplica:
     def environment_file(self, source: Source) -> Path:
         """Where the objects are described. Raises WearcapError where neither pipeline nor recording says it."""
         if self.environment is not None:
-            return Path(self.environment)
+            path = Path(self.environment)
+            return path / FILE_NAME if path.is_dir() else path
         if source.recording.environment is None:
             raise WearcapError("no objects that can be moved", where=source.recording.name,
                                expected="a recording that names its environment, or pipeline.environment=FILE",

@@ -107,7 +107,7 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     name, start, stop = row
     thing = environment.by_name(name)
     again = min((a for n, a, _ in rows if n == name and a > start), default=float("inf"))
-    end = int(torch.searchsorted(timestamps, min(stop + SETTLED_S, again))) - 1
+    end = max(int(torch.searchsorted(timestamps, min(stop + SETTLED_S, again))) - 1, 0)
     begin = int(torch.searchsorted(timestamps, start).clamp(max=len(timestamps) - 1))
     middle = middle_of(thing)
     left = object_error(found[name][end], real[name][end], middle)

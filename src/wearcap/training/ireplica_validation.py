@@ -1,6 +1,7 @@
 """iReplica with the current weights during validation: what a contact network in training is worth to the objects."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import lightning
 import torch
@@ -20,7 +21,8 @@ class IReplicaValidation(Callback):
     """Every n-th validation epoch tracks objects through recordings of the validation split; logs Tables 5.1 and 5.2.
 
     HPS has no part in the training: its motions are made once. Stands before the weight averaging in the list of
-    callbacks, so that it sees the averaged weights. Recordings without an environment are left out.
+    callbacks, so that it sees the averaged weights. Recordings that HPS cannot register, or whose objects and
+    interactions are not known, are left out; without any other nothing is logged.
     """
 
     def __init__(self, pipeline: Callable[..., IReplica], recordings: int = 2, every_n_epochs: int = 10):
@@ -44,7 +46,7 @@ class IReplicaValidation(Callback):
                 for handling in self._tracked(pipeline, recording, source, motion)
             ]
         pl_module.train(training)
-        for name, value in summary(rows).items():
+        for name, value in summary(rows).items() if rows else ():
             pl_module.log(f"ireplica/{name}", value, rank_zero_only=True)
 
     def _motions(self, pipeline: IReplica, store: RecordingStore) -> list[tuple[Recording, Source, Motion]]:
@@ -52,8 +54,10 @@ class IReplicaValidation(Callback):
         if self._registered is None:
             self._registered = []
             for name in store.names("val"):
+                if len(self._registered) == self.recordings:
+                    break
                 recording = store.load(name)
-                if recording.environment is None or len(self._registered) == self.recordings:
+                if not fit(recording, store.root):
                     continue
                 scan = store.root / recording.scene if recording.scene else None
                 source = Source(recording, store.root, scan)
@@ -66,3 +70,12 @@ class IReplicaValidation(Callback):
         assert recording.suit is not None
         captured = pipeline.interact(motion, pipeline.contacts(recording.suit), environment)
         return score_interactions(captured, recording, environment).handlings
+
+
+def fit(recording: Recording, folder: Path) -> bool:
+    """Whether a recording has what the tracker takes, and the truth that it is measured against."""
+    files = recording.environment, recording.scene
+    sensed = recording.suit, recording.camera, recording.localization
+    true = recording.motion, recording.interactions
+    known = None not in sensed and None not in true and bool(recording.object_motion)
+    return known and all(name is not None and (folder / name).is_file() for name in files)
