@@ -20,10 +20,10 @@ from wearcap.simulation.things import Thing
 from wearcap.simulation.wearer import TAIL_S, Wearer
 
 WEIGHTS = {
-    "door": 2.0, "window": 1.0, "drawer": 1.2, "cabinet_door": 0.8, "sofa": 2.0, "table": 1.5, "chair": 1.5, "box": 1.5
+    "door": 1.5, "window": 2.2, "drawer": 2.2, "cabinet_door": 1.8, "sofa": 2.5, "table": 1.2, "chair": 1.2, "box": 0.8
 }  # fmt: skip
 """How often things of a kind are gone for, all of them together."""
-AGAIN, ROOM = 0.35, 0.10
+AGAIN, ROOM = 0.25, 0.10
 """How often it is what was used last, and several things of one room."""
 TRIES = 5
 SEEM_SHARE = 0.14
@@ -38,7 +38,7 @@ PARTLY = 0.25
 BEYOND_M = 0.95
 """Behind a door, where one goes through it."""
 REACHED_M = 0.4
-NEAR_M = 1.5
+NEAR_M = 2.5
 """Things so much further off are gone for a third as often."""
 IN_ROOM, SAME_ROOM_M = 4, 3.5
 """Most things that are moved when a room is rearranged."""
