@@ -16,9 +16,13 @@ import torch
 from wearcap.cli import main as cli
 from wearcap.cli import train
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.mesh import Mesh
 from wearcap.io.bvh import write_bvh
+from wearcap.io.environment import write_environment
 from wearcap.io.motion_npz import write_motion
 from wearcap.recording import CameraStream, ImuStream, Localization, RecordingStore
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Freedom, SceneObject
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 SMALL = ["debug=fast", "data.window=60", "trainer.accelerator=cpu", "model.net.width=32", "model.net.layers=1",
@@ -416,3 +420,69 @@ def test_no_clap_is_said(tmp_path, capsys):
     assert ["no clap found" in finding["what"] for finding in findings if finding["check"] == "claps"] == [
         True
     ]
+
+
+# Objects that can be moved, and contact labels -----------------------------------------------------------------------
+
+
+def spoiled_environment(folder: Path, change) -> Path:
+    """The file of one door, with something changed in it."""
+    corners = np.array([[x, y, z] for x in (0.0, 0.8) for y in (0.0, 0.04) for z in (0.0, 2.0)], np.float32)
+    mesh = Mesh(corners, np.zeros((0, 3), np.int32), np.ones(3, np.float32))
+    door = SceneObject(
+        "door", "door", mesh, torch.eye(3), torch.zeros(3), Freedom("hinge", pivot=(0.0, 0.0, 0.0))
+    )
+    write_environment(Environment((door,)), folder)
+    path = folder / "environment.json"
+    content = json.loads(path.read_text())
+    change(content["objects"][0])
+    path.write_text(json.dumps(content))
+    return path
+
+
+OBJECTS = {
+    "an object without degrees of freedom": (lambda row: row.pop("freedom"), "no degree of freedom"),
+    "a hinge far from its mesh": (lambda row: row["freedom"].update(pivot=[9.0, 0.0, 0.0]), "8.20 m from its mesh"),
+    "a missing mesh": (lambda row: row.update(mesh="objects/none.ply"), "its mesh objects/none.ply is missing"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("row", OBJECTS)
+def test_an_environments_fault_is_one_error(row, tmp_path, capsys):
+    change, message = OBJECTS[row]
+    path = spoiled_environment(tmp_path, change)
+    before = {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)}
+    assert exit_code(["doctor", "--json", str(path)]) == 1
+    found = next(iter(json.loads(capsys.readouterr().out)["findings"].values()))
+    errors = [finding for finding in found if finding["severity"] == "error"]
+    assert len(errors) == 1
+    assert message in errors[0]["what"]
+    assert errors[0]["fix"]
+    assert {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)} == before
+
+
+LABELS = {
+    "overlapping labels": ({"contacts": {"left_hand": [[0.1, 0.6], [0.4, 0.8]], "right_hand": []}}, "labels of left_hand overlap"),
+    "an end before the start, and more": (
+        {"contacts": {"left_hand": [[0.5, 0.2], [0.6, 0.8]], "right_hand": []}}, "an end before its start means"),
+    "an empty label": ({"contacts": {"left_hand": [], "right_hand": [[0.5, 0.5]]}}, "right_hand label 0 is empty"),
+    "another recording": (
+        {"schema_version": 1, "recording": {"name": "other", "frames": 9, "start_s": 0.0, "stop_s": 9.0},
+         "contacts": {"left_hand": [], "right_hand": []}}, "labels of recording 'other'"),
+    "longer than the recording": ({"contacts": {"left_hand": [[0.1, 60.0]], "right_hand": []}}, "outside the recording"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("row", LABELS)
+def test_labels_that_cannot_be_are_refused_and_kept(row, tmp_path, capsys):
+    content, message = LABELS[row]
+    data, output = suited(tmp_path / "data"), tmp_path / "labels"
+    output.mkdir()
+    file = output / "r.contacts.json"
+    file.write_text(json.dumps(content))
+    assert exit_code(["annotate", f"{data}/r", "--output", str(output), "--no-browser"]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+    assert len(told) == 1
+    assert message in told[0]
+    assert json.loads(file.read_text()) == content
+    assert files_in(output) == {file.name}
