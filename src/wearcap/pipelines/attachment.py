@@ -154,7 +154,9 @@ def object_trajectories(
 
 def interactions_of(held: Sequence[Held], timestamps: Float64[Tensor, "time"]) -> Interactions:
     """What was held when, as a recording keeps it."""
-    edges = torch.cat([timestamps, timestamps[-1:] + (timestamps.diff().median() if len(timestamps) > 1 else 0.0)])
+    edges = torch.cat(
+        [timestamps, timestamps[-1:] + (timestamps.diff().median() if len(timestamps) > 1 else 0.0)]
+    )
     start = [float(edges[row.interval.start]) for row in held]
     stop = [float(edges[row.interval.stop]) for row in held]
     hands = torch.tensor([row.interval.hands for row in held], dtype=torch.bool).reshape(-1, 2)

@@ -82,7 +82,7 @@ def turned(vectors: Float[Tensor, "hand time 2"]) -> Float[Tensor, "hand time"]:
     """
     long = vectors.norm(dim=-1) > LEAST_APART_M
     first = long.long().argmax(-1, keepdim=True)
-    frame = torch.where(long, torch.arange(vectors.shape[1]), first).cummax(-1).values  # last frame that tells
+    frame = torch.where(long, torch.arange(vectors.shape[1]), first).cummax(-1).values
     kept = vectors.gather(1, frame[..., None].expand_as(vectors))
     before, after = kept[:, :-1], kept[:, 1:]
     cross = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
