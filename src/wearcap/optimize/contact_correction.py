@@ -47,21 +47,6 @@ class OffsetSettings:
         return (self.transition_s / SETTLED) ** 4 / 4
 
 
-def contact_targets(
-    hands: Float[Tensor, "time hand 3"],
-    wanted: Float[Tensor, "time hand 3"],
-    contact: Float[Tensor, "time hand"],
-) -> tuple[Float[Tensor, "time 3"], Float[Tensor, "time"]]:
-    """Offsets (m) that bring the hands where they shall be, the mean of those in contact, and weights (0…1).
-
-    `contact` weighs hands (0: not touching, whatever `wanted` says there).
-    """
-    missing = torch.where(contact[..., None] > 0, wanted - hands, 0.0)
-    total = contact.sum(1)
-    mean = (missing * contact[..., None]).sum(1) / torch.where(total > 0, total, 1.0)[:, None]
-    return mean, total.clamp(max=1.0)
-
-
 def offset_for(
     targets: Float[Tensor, "time axis"],
     weights: Float[Tensor, "time"],
@@ -139,10 +124,3 @@ def bend_contacts(
         gone = (timestamps[window] - times[0]).clamp(min=0) / (times[1] - times[0]).clamp(min=1e-9)
         new[window] = piece + gone[:, None] * (new[final] - piece[-1])
     return new - path
-
-
-def added_speed(
-    offset: Float[Tensor, "time axis"], timestamps: Float64[Tensor, "time"]
-) -> Float[Tensor, "pair"]:
-    """Speed (m/s) that an offset adds to the root from frame to frame; feet that stand slide by as much."""
-    return offset.diff(dim=0).norm(dim=1) / timestamps.diff()
