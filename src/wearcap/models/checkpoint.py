@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -35,3 +36,14 @@ def load_checkpoint(system: nn.Module, state: dict[str, Tensor], path: str | Pat
         raise WearcapError(f"{len(wrong)} weights do not fit this model, such as {wrong[0]!r}", where=path,
                            expected="a checkpoint of the same model", fix="Check which model it was trained for.")  # fmt: skip
     system.load_state_dict(state)
+
+
+def share_checkpoint(source: str | Path, target: str | Path) -> None:
+    """Write what of a run's checkpoint others need: averaged weights, the model's config, and nothing of the machine.
+
+    Raises WearcapError for a source that `read_checkpoint` refuses.
+    """
+    config, state = read_checkpoint(source)
+    kept = {name: config[name] for name in ("name", "model") if name in config}
+    with atomic_path(target) as temporary:
+        torch.save({"wearcap": {"config": json.dumps(kept)}, "state_dict": state}, temporary)
