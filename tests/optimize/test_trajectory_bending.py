@@ -332,16 +332,3 @@ def test_every_config_bends(choice):
     few = {"solver": functools.partial(bend_adam, iterations=20)} if choice == "adam" else {}
     solved = instantiate(config)(imu, timestamps, timestamps, path, **few)
     assert (solved.path - path).norm(dim=1).mean() < (imu - path).norm(dim=1).mean()
-
-
-@pytest.mark.parametrize("choice", ["offset", "bending"])
-def test_every_config_corrects_contacts(choice):
-    correct = instantiate(
-        compose("capture", ["recording=none", f"+contact_correction={choice}"]).contact_correction
-    )
-    path, timestamps = stroll(400, halts=False)
-    targets, weights = torch.zeros(400, 2).double(), torch.zeros(400)
-    targets[200], weights[200] = torch.tensor([0.01, 0.01]), 1.0
-    given = (path,) if choice == "bending" else ()
-    offset = correct(targets, weights, timestamps, *given)
-    assert (offset[200] - targets[200]).norm() < 1e-3

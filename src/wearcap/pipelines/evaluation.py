@@ -28,11 +28,12 @@ Measure = Callable[[Motion, Recording, str, int], Row]
 
 
 def evaluate(
-    pipeline: Pipeline, store: RecordingStore, names: Iterable[str], seeds: Sequence[int], lanes: int = 16
-) -> Iterator[Row]:
+    pipeline: Pipeline, store: RecordingStore, names: Iterable[str], seeds: Sequence[int], lanes: int = 16,
+    measure: Measure | None = None,
+) -> Iterator[Row]:  # fmt: skip
     """Capture every recording with every seed, hang the body from the true head, and score it.
 
-    `lanes` recordings share a batch. Raises WearcapError when a recording has no true motion.
+    `lanes` recordings share a batch; `measure` takes the place of `score`. Raises WearcapError when a recording has no true motion.
     """
     names = sorted(names, key=lambda name: store.entries[name].frames)
     jobs = [(name, seed) for name in names for seed in seeds]

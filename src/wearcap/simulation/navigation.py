@@ -172,7 +172,8 @@ class NavigationGrid:
 def _window(outline: np.ndarray, origin: np.ndarray, cell: float, shape: tuple, margin: float) -> tuple:
     low = np.floor((outline.min(0) - margin - origin) / cell).astype(int)
     high = np.ceil((outline.max(0) + margin - origin) / cell).astype(int) + 1
-    return tuple(slice(max(a, 0), min(b, size)) for a, b, size in zip(low, high, shape))
+    # beside the grid nothing is left: a negative end would count from the other side
+    return tuple(slice(max(a, 0), max(min(b, size), 0)) for a, b, size in zip(low, high, shape))
 
 
 def _drop_distance(height: np.ndarray, cell: float) -> np.ndarray:
