@@ -31,19 +31,23 @@ class HingeFit:
     iterations: int = 6
 
 
-@dataclass(eq=False)
-class BendCorrection:
-    """The document's: the path is bent once more, with the touched point as the only control point (eq. 5.2)."""
-
-    bend: Callable[..., BentPath]
-    """`optimize.trajectory.bend` with its settings and solver."""
-    transition_s: float = 1.5
+class _Targets:
+    """What both corrections gather: an offset (m) and a weight for each frame."""
 
     def start(self, palms_world: Float[Tensor, "time hand 3"], motion: Motion) -> None:
         self._palms, self._timestamps = palms_world, motion.timestamps
         self._path = motion.t_world_root[:, :2].double()
         self._targets = palms_world.new_zeros(len(palms_world), 2)
         self._weights = palms_world.new_zeros(len(palms_world))
+
+
+@dataclass(eq=False)
+class BendCorrection(_Targets):
+    """The document's: the path is bent once more, with the touched point as the only control point (eq. 5.2)."""
+
+    bend: Callable[..., BentPath]
+    """`optimize.trajectory.bend` with its settings and solver."""
+    transition_s: float = 1.5
 
     def offset(
         self,
@@ -74,7 +78,7 @@ class BendCorrection:
 
 
 @dataclass(eq=False)
-class SnapCorrection:
+class SnapCorrection(_Targets):
     """Ours: the wearer is moved as a whole by one offset per interaction, and smoothly from one to the next.
 
     While an object is held the offset stays, so that errors of a touch do not become motion of the object. About a
@@ -85,11 +89,6 @@ class SnapCorrection:
     hinge: HingeFit | None = field(default_factory=HingeFit)
     most_m: float = 0.3
     """No interaction moves the wearer by more: farther off, it is not the wearer that errs."""
-
-    def start(self, palms_world: Float[Tensor, "time hand 3"], motion: Motion) -> None:
-        self._palms, self._timestamps = palms_world, motion.timestamps
-        self._targets = palms_world.new_zeros(len(palms_world), 2)
-        self._weights = palms_world.new_zeros(len(palms_world))
 
     def offset(
         self,
