@@ -18,7 +18,10 @@ from wearcap.localization.point_map import PointMapper
 from wearcap.optimize.banded import BandedSettings, solve_banded
 from wearcap.optimize.costs import Loss
 from wearcap.optimize.hps import HpsEnergy
+from wearcap.optimize.trajectory import Bending, bend
+from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.pipelines import hps as hps_module
+from wearcap.pipelines.bent_suit import BentSuit
 from wearcap.pipelines.evaluation import evaluate
 from wearcap.pipelines.hps import HPS, at_frames
 from wearcap.pipelines.hps_baselines import HpsBaseline
@@ -153,6 +156,17 @@ def test_it_is_scored_in_the_world_and_hung(walk, tmp_path):
     assert ours["world_root_cm"] < imu["world_root_cm"]
     assert ours["mpjpe_cm"] < 5
     assert ours["world_mpjpe_cm"] == pytest.approx(ours["world_root_cm"], rel=0.5)
+
+
+def test_a_path_bent_to_the_camera_is_nearer_than_the_suits_own(walk, tmp_path):
+    store = hps_dataset(tmp_path, walk)
+    bent = BentSuit(functools.partial(bend, settings=Bending(100.0, free_start=True), solver=bend_banded))
+    imu, ours = (
+        next(evaluate(StagedCapture(p, tmp_path), store, ["walk"], [0])).scores
+        for p in (HpsBaseline("imu"), bent)
+    )
+    assert ours["world_root_cm"] < imu["world_root_cm"]
+    assert bent(walk).provenance["pipeline"] == "bent_suit"
 
 
 def test_rarely_localised_orientations_are_carried_by_the_suit(walk):

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 
@@ -10,22 +9,15 @@ from wearcap.data.prepare.clean import resampled
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import interpolate
 from wearcap.optimize.trajectory import BentPath
-from wearcap.pipelines.hps import mount, require, required
-from wearcap.pipelines.hps_camera import (
-    Localize,
-    MapLocalization,
-    Synchronization,
-    camera_report,
-    camera_stages,
-    on_one_clock,
-)
-from wearcap.pipelines.stages import Source, Stage
+from wearcap.pipelines.hps import required
+from wearcap.pipelines.hps_baselines import PlacedSuit
+from wearcap.pipelines.hps_camera import Localize, MapLocalization, Synchronization
 from wearcap.recording import Motion, Recording
 from wearcap.sensors.alignment import align_suit, body_camera, inliers
 
 
 @dataclass(frozen=True)
-class BentSuit:
+class BentSuit(PlacedSuit):
     """The suit's motion along its own path, bent in the ground plane; pose and height stay the suit's."""
 
     bend: Callable[..., BentPath]
@@ -35,26 +27,9 @@ class BentSuit:
     synchronization: Synchronization = field(default_factory=Synchronization)
     localization: Localize = field(default_factory=MapLocalization)
 
-    def stages(self, source: Source) -> list[Stage]:
-        """HPS' first two, then the path is bent. Raises WearcapError as HPS does."""
-        recording = source.recording
-        require(recording, "suit", "camera")
-        return [
-            *camera_stages(source, self.synchronization, self.localization),
-            Stage(
-                "bend", lambda done: self.place(on_one_clock(recording, done)),
-                lambda: (self.fps, self.bend, recording.suit, *mount(recording)), ("synchronize", "localize"),
-                ("pipelines/bent_suit.py", "optimize", "sensors/alignment.py", "data/prepare/clean.py", "geometry", "body"),
-            ),
-        ]  # fmt: skip
-
-    def motion_of(self, results: dict[str, Any]) -> Motion | None:
-        """The motion, once its path is bent."""
-        return results.get("bend")
-
-    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
-        """Clock and share localised."""
-        return camera_report(results)
+    @property
+    def placing(self) -> Callable[..., BentPath]:
+        return self.bend
 
     def place(self, recording: Recording) -> Motion:
         """F_tr(l, p) of eq. 5.2, p the root beneath each localised camera, outliers left out."""

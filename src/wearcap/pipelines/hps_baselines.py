@@ -1,5 +1,6 @@
 """What the documents compare HPS with (thesis §4.5.1): the suit alone, and the suit carried by the camera."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,51 @@ from wearcap.sensors.alignment import align_suit, body_camera, inliers
 KINDS = ("imu", "imu_cam", "imu_cam_filtered")
 
 
+class PlacedSuit(ABC):
+    """A pipeline that puts the suit's motion into the scene in one step behind HPS' first two."""
+
+    fps: float
+    synchronization: Synchronization
+    localization: Localize
+
+    @property
+    @abstractmethod
+    def placing(self) -> Any:
+        """What decides the step, beside the recording and the rate."""
+
+    @abstractmethod
+    def place(self, recording: Recording) -> Motion:
+        """The suit's motion in the scene."""
+
+    def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
+        """The placed motion. Raises WearcapError as `stages`."""
+        return run_stages(self.stages(Source(recording, folder, scan)))[0]["place"]
+
+    def stages(self, source: Source) -> list[Stage]:
+        """HPS' first two, then the suit is placed. Raises WearcapError as HPS does."""
+        recording = source.recording
+        require(recording, "suit", "camera")
+        return [
+            *camera_stages(source, self.synchronization, self.localization),
+            Stage(
+                "place", lambda done: self.place(on_one_clock(recording, done)),
+                lambda: (self.placing, self.fps, recording.suit, *mount(recording)), ("synchronize", "localize"),
+                ("pipelines/hps_baselines.py", "pipelines/bent_suit.py", "optimize", "sensors/alignment.py",
+                 "data/prepare/clean.py", "geometry", "body"),
+            ),
+        ]  # fmt: skip
+
+    def motion_of(self, results: dict[str, Any]) -> Motion | None:
+        """The motion, once it is placed."""
+        return results.get("place")
+
+    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
+        """Clock and share localised."""
+        return camera_report(results)
+
+
 @dataclass(frozen=True)
-class HpsBaseline:
+class HpsBaseline(PlacedSuit):
     """A row of the documents' tables: "imu", "imu_cam" or "imu_cam_filtered"; all are aligned at the start."""
 
     kind: str
@@ -41,30 +85,9 @@ class HpsBaseline:
     def name(self) -> str:
         return self.kind
 
-    def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
-        """The suit's pose, placed by the suit itself, by the camera, or by its path without outliers."""
-        return run_stages(self.stages(Source(recording, folder, scan)))[0]["place"]
-
-    def stages(self, source: Source) -> list[Stage]:
-        """HPS' first two, then the suit is placed. Raises WearcapError as HPS does."""
-        recording = source.recording
-        require(recording, "suit", "camera")
-        return [
-            *camera_stages(source, self.synchronization, self.localization),
-            Stage(
-                "place", lambda done: self.place(on_one_clock(recording, done)),
-                lambda: (self.kind, self.fps, recording.suit, *mount(recording)), ("synchronize", "localize"),
-                ("pipelines/hps_baselines.py", "sensors/alignment.py", "data/prepare/clean.py", "geometry", "body"),
-            ),
-        ]  # fmt: skip
-
-    def motion_of(self, results: dict[str, Any]) -> Motion | None:
-        """The motion, once it is placed."""
-        return results.get("place")
-
-    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
-        """Clock and share localised."""
-        return camera_report(results)
+    @property
+    def placing(self) -> str:
+        return self.kind
 
     def place(self, recording: Recording) -> Motion:
         """The suit's motion in the scene."""
