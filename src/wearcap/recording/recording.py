@@ -67,7 +67,10 @@ class CameraStream:
     video: str | None = None
     """Video file, relative to the data set's directory, whose n-th frame belongs to the n-th timestamp."""
     embedding: Float[Tensor, "time feature"] | None = None
+    embedding_mirrored: Float[Tensor, "time feature"] | None = None
+    """Of the pictures flipped left to right, for training on mirrored motions."""
     embedding_name: str | None = None
+    """The encoder's."""
 
 
 @dataclass(frozen=True)
