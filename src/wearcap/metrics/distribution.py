@@ -1,0 +1,52 @@
+"""How a set of motions is distributed, beside another: in the latent space of a motion autoencoder (Guo et al. 2020)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+
+DIVERSITY_SAMPLES = 300
+"""Size of each of the two subsets between which diversity is measured."""
+
+
+def frechet_distance(
+    latent: Float[Tensor, "sample feature"], latent_true: Float[Tensor, "other feature"]
+) -> Float[Tensor, ""]:
+    """FID: Fréchet distance between Gaussians fitted to both sets, ‖μ−μ'‖² + tr(C + C' − 2(CC')^½), in float64.
+
+    The trace of the last root is the sum of the singular values of C^½ C'^½: no root of a matrix that is not
+    symmetric has to be found, and sets that fill only part of the space do no harm. Raises WearcapError for sets of
+    fewer than two samples and for values that are not finite.
+    """
+    (mean, root), (mean_true, root_true) = (_gaussian(value) for value in (latent, latent_true))
+    cross = torch.linalg.svdvals(root @ root_true).sum()
+    spread = root.square().sum() + root_true.square().sum()
+    return ((mean - mean_true).square().sum() + spread - 2 * cross).clamp(min=0)
+
+
+def _gaussian(
+    latent: Float[Tensor, "sample feature"],
+) -> tuple[Float[Tensor, "feature"], Float[Tensor, "feature feature"]]:
+    """Mean, and the symmetric root of the (unbiased) covariance."""
+    if len(latent) < 2 or not latent.isfinite().all():
+        raise WearcapError(f"no distribution in {len(latent)} samples", expected="two at least, all finite")
+    values, vectors = torch.linalg.eigh(torch.cov(latent.double().T).reshape(latent.shape[1], -1))
+    return latent.double().mean(0), (vectors * values.clamp(min=0).sqrt()) @ vectors.T
+
+
+def diversity(
+    latent: Float[Tensor, "sample feature"], size: int = DIVERSITY_SAMPLES, seed: int = 0
+) -> Float[Tensor, ""]:
+    """Mean distance between two random subsets of `size` samples each, none in both, pair by pair.
+
+    The subsets follow from seed and number of samples, so that two sets of equal number are compared at the same
+    places. Raises WearcapError for fewer than twice as many samples.
+    """
+    if len(latent) < 2 * size:
+        raise WearcapError(
+            f"{len(latent)} samples for two subsets of {size}", expected=f"{2 * size} at least"
+        )
+    order = torch.randperm(len(latent), generator=torch.Generator().manual_seed(seed))
+    first, second = latent[order[: 2 * size].to(latent.device)].double().chunk(2)
+    return (first - second).norm(dim=-1).mean()
