@@ -1,0 +1,115 @@
+"""Embeddings of a head camera's pictures, made once per file and encoder."""
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path, sha256_of
+from wearcap.io.video import read_frames, read_image
+from wearcap.models.image_encoder import ImageEncoder
+from wearcap.recording.recording import CameraStream
+
+BATCH = 64
+_KEYS = ("embedding", "embedding_mirrored")
+
+
+def embedding_name(encoder: ImageEncoder) -> str:
+    """What a camera stream calls its embeddings: the encoder's name and fingerprint, as different weights do not mix."""
+    return f"{encoder.name}-{encoder.fingerprint}"
+
+
+def embed_camera(
+    camera: CameraStream, folder: Path, encoder: ImageEncoder, cache: Path | None = None
+) -> CameraStream:
+    """The stream with `embedding`, `embedding_mirrored` (float16) and `embedding_name`.
+
+    `folder` is the data set's. Embeddings are kept in `cache` (default: `folder`/cache) below
+    `embeddings-<name>-<fingerprint>`, named by the content of the pictures' files. Raises WearcapError for a stream
+    without pictures, files that are missing or damaged, and another number of pictures than of timestamps.
+    """
+    files = _files(camera, folder)
+    name = embedding_name(encoder)
+    kept = (cache or folder / "cache") / f"embeddings-{name}" / f"{_content(files)}.safetensors"
+    embeddings = _read(kept, encoder.size)
+    if embeddings is None:
+        embeddings = _embed(pictures(camera, folder), encoder)
+        with atomic_path(kept) as temporary:
+            save_file(embeddings, temporary)
+    count = len(embeddings["embedding"])
+    if count != len(camera.timestamps):
+        raise WearcapError(f"{count} pictures for {len(camera.timestamps)} timestamps", where=files[0],
+                           expected="a picture for each timestamp of the camera",
+                           fix="The video was cut or belongs to another recording: prepare the data set again.")  # fmt: skip
+    return replace(camera, **embeddings, embedding_name=name)
+
+
+def pictures(camera: CameraStream, folder: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """A stream's pictures in order, from its video or its image files. Raises WearcapError as `embed_camera` does."""
+    files = _files(camera, folder)
+    if camera.video is not None:
+        yield from (frame for _, frame in read_frames(files[0]))
+    else:
+        yield from (read_image(file) for file in files)
+
+
+def _files(camera: CameraStream, folder: Path) -> list[Path]:
+    """The video, or the image files. Raises WearcapError where there is none, or one is missing."""
+    names = [camera.video] if camera.video is not None else list(camera.image_files or ())
+    if not names:
+        raise WearcapError("this camera stream has no pictures", where=folder, expected="a video or image files",
+                           fix="Prepare the data set with its camera.")  # fmt: skip
+    files = [folder / name for name in names]
+    if missing := [file for file in files if not file.is_file()]:
+        raise WearcapError(
+            "no such video" if camera.video is not None else f"{len(missing)} of {len(files)} pictures are missing",
+            where=missing[0], expected="the files that the recording names, below the data set's folder",
+        )  # fmt: skip
+    return files
+
+
+def _content(files: list[Path]) -> str:
+    return hashlib.sha256("".join(map(sha256_of, files)).encode()).hexdigest()[:32]
+
+
+def _read(path: Path, size: int) -> dict[str, Tensor] | None:
+    """What is kept; None where there is nothing, or nothing whole."""
+    try:
+        tensors = load_file(path)
+    except (FileNotFoundError, SafetensorError, OSError):
+        return None
+    whole = set(tensors) == set(_KEYS) and all(value.shape[1:] == (size,) for value in tensors.values())
+    return tensors if whole else None
+
+
+def _embed(
+    frames: Iterator[UInt8[np.ndarray, "height width 3"]], encoder: ImageEncoder
+) -> dict[str, Float[Tensor, "time feature"]]:
+    parts = [
+        torch.stack([encoder.embed(batch), encoder.embed(batch.flip(2))]).half().cpu()
+        for batch in _batches(frames)
+    ]
+    both = torch.cat(parts, 1) if parts else torch.zeros(2, 0, encoder.size).half()
+    return dict(zip(_KEYS, both.contiguous().unbind()))
+
+
+def _batches(
+    frames: Iterator[UInt8[np.ndarray, "height width 3"]],
+) -> Iterator[UInt8[Tensor, "batch height width 3"]]:
+    """Neighbours of one size together."""
+    batch: list[np.ndarray] = []
+    for frame in frames:
+        if batch and (len(batch) == BATCH or frame.shape != batch[0].shape):
+            yield torch.from_numpy(np.stack(batch))
+            batch = []
+        batch.append(frame)
+    if batch:
+        yield torch.from_numpy(np.stack(batch))

@@ -1,0 +1,129 @@
+"""Pictures to embeddings: what an image encoder is, and our own small one for a head camera's frames."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from wearcap.errors import WearcapError
+from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
+
+
+@runtime_checkable
+class ImageEncoder(Protocol):
+    """What embeddings are made with."""
+
+    name: str
+    size: int
+    """Length of an embedding."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Changes (8 hex digits) when the same picture would get another embedding."""
+        ...
+
+    def embed(self, frames: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch feature"]:
+        """Embeddings of RGB pictures of any size, on the encoder's device."""
+        ...
+
+
+def letterboxed(
+    frames: UInt8[Tensor, "batch height width 3"], width: int, height: int, mean: Sequence[float], std: Sequence[float]
+) -> Float[Tensor, "batch 3 new_height new_width"]:  # fmt: skip
+    """Pictures normalised by channel (`mean`, `std` of values in 0…1) and resized, whole and undistorted, into the
+    middle of width x height pixels; the rest is 0."""
+    x = frames.movedim(-1, 1).float()
+    scale = min(width / x.shape[3], height / x.shape[2])
+    rows, columns = max(1, round(scale * x.shape[2])), max(1, round(scale * x.shape[3]))
+    if (rows, columns) != x.shape[2:]:
+        x = F.interpolate(x, (rows, columns), mode="bicubic", antialias=True).clamp(0, 255)
+    x = (x - 255 * x.new_tensor(mean)[:, None, None]) / (255 * x.new_tensor(std)[:, None, None])
+    left, top = (width - columns) // 2, (height - rows) // 2
+    return F.pad(x, (left, width - columns - left, top, height - rows - top))
+
+
+def fingerprint_of(network: nn.Module, *settings: object) -> str:
+    """8 hex digits of a network's weights and of settings (by their repr)."""
+    digest = hashlib.sha256(repr(settings).encode())
+    for key, value in sorted(network.state_dict().items()):
+        digest.update(key.encode())
+        digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()[:8]
+
+
+class _Block(nn.Module):
+    """x + two 3x3 convolutions."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.first_norm = nn.BatchNorm2d(channels)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.second_norm = nn.BatchNorm2d(channels)
+
+    def forward(self, x: Float[Tensor, "batch c h w"]) -> Float[Tensor, "batch c h w"]:
+        y = F.relu(self.first_norm(self.first(x)))
+        return F.relu(x + self.second_norm(self.second(y)))
+
+
+class EgoViewEncoder(nn.Module):
+    """A small residual network over 96x72 pixels of a head camera; where things are is kept up to the bottleneck.
+
+    Embeddings have zero mean and unit variance over their features. Its name says what it is not: a stand-in for a
+    large pretrained encoder, trained on where a wearer's own limbs are seen (training/egoview.py).
+    """
+
+    name = "egoview"
+    mean, std = (0.45, 0.45, 0.45), (0.25, 0.25, 0.25)
+
+    def __init__(
+        self, size: int = 64, width: int = 96, height: int = 72, channels: tuple[int, ...] | list[int] = (24, 48, 96),
+        squeezed: int = 24,
+    ):  # fmt: skip
+        super().__init__()
+        self.size, self.width, self.height = size, width, height
+        stages: list[nn.Module] = []
+        inputs = 12  # 2x2 pixels side by side
+        for outputs in channels:
+            stages += [nn.Conv2d(inputs, outputs, 3, 2, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(), _Block(outputs)]  # fmt: skip
+            inputs = outputs
+        self.stages = nn.Sequential(*stages, nn.Conv2d(inputs, squeezed, 1), nn.ReLU())
+        reduction = 2 ** (1 + len(channels))
+        cells = -(-height // reduction) * -(-width // reduction)
+        self.bottleneck = nn.Linear(squeezed * cells, size)
+
+    def forward(self, pictures: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch feature"]:
+        """Embeddings of pictures that are normalised and of the network's own size."""
+        x = F.pixel_unshuffle(pictures, 2).contiguous(memory_format=torch.channels_last)
+        x = self.bottleneck(self.stages(x).flatten(1))
+        return F.layer_norm(x, x.shape[-1:])
+
+    @property
+    def fingerprint(self) -> str:
+        return fingerprint_of(self, self.name, self.width, self.height, self.mean, self.std)
+
+    @torch.inference_mode()
+    def embed(self, frames: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch feature"]:
+        frames = frames.to(self.bottleneck.weight.device)
+        return self(letterboxed(frames, self.width, self.height, self.mean, self.std))
+
+    @classmethod
+    def load(cls, checkpoint: str | Path) -> "EgoViewEncoder":
+        """From a checkpoint of `wearcap train experiment=egoview`. Raises WearcapError for any other file."""
+        config, state = read_checkpoint(checkpoint)
+        settings = dict(config.get("model", {}).get("net", {}))
+        kind = str(settings.pop("_target_", "")).rpartition(".")[2]
+        if kind != cls.__name__:
+            raise WearcapError(f"a checkpoint of {kind or 'another model'}", where=checkpoint,
+                               expected="one of `wearcap train experiment=egoview`")  # fmt: skip
+        encoder = cls(**settings)
+        weights = {
+            name.removeprefix("net."): value for name, value in state.items() if name.startswith("net.")
+        }
+        load_checkpoint(encoder, weights, checkpoint)
+        return encoder.eval()
