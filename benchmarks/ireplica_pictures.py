@@ -31,7 +31,7 @@ WANTED = {
 }
 
 
-def draw(dataset: Path, split: str, checkpoint: Path, folder: Path) -> None:
+def draw(dataset: Path, split: str, checkpoint: str, folder: Path) -> None:
     """One sheet per kind of object, of its longest handling; sofas by two hands."""
     pipeline, best = pipeline_of("ireplica", (checkpoint,)), {}
     for name in RecordingStore.open(dataset).names(split):
@@ -82,4 +82,4 @@ def surroundings(environment: Environment, thing: str) -> Environment:
 
 
 if __name__ == "__main__":
-    draw(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), Path(sys.argv[4]))
+    draw(Path(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4]))

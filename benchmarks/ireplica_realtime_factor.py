@@ -15,7 +15,7 @@ from wearcap.errors import WearcapError
 from wearcap.recording import RecordingStore
 
 DATASET = Path("datasets/simulated_interactions")
-CHECKPOINT = Path("checkpoints/contact_sequence.ckpt")
+CHECKPOINT = "contact_sequence"
 GOAL = 10.0
 
 

@@ -45,8 +45,8 @@ GAPS_S = (0.0, 0.25, 0.5, 1.0, 2.0)
 class Networks:
     """Checkpoints of contact networks."""
 
-    ours: tuple[Path, ...]
-    published: tuple[Path, ...]
+    ours: tuple[str, ...]
+    published: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Case:
         return cls(recording, environment, Source(recording, store.root, store.root / recording.scene))
 
 
-def pipeline_of(name: str, checkpoints: tuple[Path, ...], jobs: int = 1) -> IReplica:
+def pipeline_of(name: str, checkpoints: tuple[str, ...], jobs: int = 1) -> IReplica:
     """A pipeline config of the command line around contact networks."""
     config = compose("capture", [f"pipeline={name}", "checkpoint=null", "recording=null"]).pipeline
     if "jobs" in config.registration.get("solver", ()):

@@ -49,7 +49,6 @@ KINDS = {
     "table": ("table", "coffee_table"), "chair": ("chair",), "box": ("box",),
 }  # fmt: skip
 """Columns of the tables, and the categories that they gather."""
-NETWORKS = Path("checkpoints")
 WIDTH = 170
 
 
@@ -58,10 +57,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="made by `wearcap prepare simulated_interactions preset=standard`")  # fmt: skip
     parser.add_argument("--split", default="test", help="whose people and objects: train, val or test")
     parser.add_argument("--seeds", type=int, default=5, help="groups of recordings (2 when quick)")
-    parser.add_argument("--ours", type=Path, nargs="+", default=[NETWORKS / "contact_sequence.ckpt"],
+    parser.add_argument("--ours", nargs="+", default=["contact_sequence"],
                         help="checkpoint(s) of our contact network")  # fmt: skip
-    parser.add_argument("--published", type=Path, nargs="+",
-                        default=[NETWORKS / f"contact_transformer_{name}.ckpt" for name in CONTACT_CLASSES],
+    parser.add_argument("--published", nargs="+",
+                        default=[f"contact_transformer_{name}" for name in CONTACT_CLASSES],
                         help="checkpoints of the published networks, one per class")  # fmt: skip
     parser.add_argument("--no-robustness", action="store_true", help="leave out the runs with worse sensors")
     parser.add_argument("--jobs", type=int, default=2, help="recordings at a time")

@@ -1,5 +1,7 @@
-"""The one exception that users are meant to read."""
+"""The one exception that users are meant to read, and a typo's nearest valid neighbours."""
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 
 
@@ -25,3 +27,12 @@ class WearcapError(Exception):
 
 def _rebuild(cls: type[WearcapError], what: str, where, expected: str, fix: str) -> WearcapError:
     return cls(what, where=where, expected=expected, fix=fix)
+
+
+def nearest(wrong: str, valid: Iterable[str]) -> str:
+    """A sentence that names the valid words nearest to a wrong one, or all of them when none is near."""
+    valid = sorted(valid)
+    near = difflib.get_close_matches(wrong, valid, n=3, cutoff=0.5)
+    if near:
+        return f"Did you mean {' or '.join(repr(word) for word in near)}?"
+    return f"Expected one of {', '.join(valid[:40])}." if valid else ""

@@ -1,4 +1,4 @@
-"""Writing files so that a reader sees the old one or the new one, never half of one."""
+"""Writing files so that a reader sees the old one or the new one, never half of one; files that come with the package."""
 
 import errno
 import hashlib
@@ -49,3 +49,12 @@ def sha256_of(path: str | Path) -> str:
     """Hex digest of a file's bytes."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def resource(in_checkout: str, in_wheel: str) -> Path:
+    """A folder of the checkout when the package is imported from one, else the copy that the wheel carries."""
+    package = Path(__file__).resolve().parent
+    checkout = package.parents[1]
+    if (checkout / "pyproject.toml").is_file() and (checkout / in_checkout).is_dir():
+        return checkout / in_checkout
+    return package / "_resources" / in_wheel

@@ -1,6 +1,5 @@
 """Configs: where they lie, how Hydra composes them, and a typo's nearest valid neighbour."""
 
-import difflib
 import functools
 import os
 import re
@@ -23,25 +22,18 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from wearcap.errors import WearcapError
-
-
-def _resource(in_checkout: str, in_wheel: str) -> Path:
-    package = Path(__file__).resolve().parents[1]
-    checkout = package.parents[1]
-    if (checkout / "pyproject.toml").is_file() and (checkout / in_checkout).is_dir():
-        return checkout / in_checkout
-    return package / "_resources" / in_wheel
+from wearcap.errors import WearcapError, nearest
+from wearcap.files import resource
 
 
 def conf_dir() -> Path:
     """The checkout's `conf/` when the package is imported from one, else the copy that the wheel carries."""
-    return _resource("conf", "conf")
+    return resource("conf", "conf")
 
 
 def splits_dir() -> Path:
     """The committed split lists, of the checkout or of the wheel."""
-    return _resource("data_prep/splits", "splits")
+    return resource("data_prep/splits", "splits")
 
 
 def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
@@ -87,15 +79,6 @@ class _Guarded:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
             self.refused = error
-
-
-def nearest(wrong: str, valid: Iterable[str]) -> str:
-    """A sentence that names the valid words nearest to a wrong one, or all of them when none is near."""
-    valid = sorted(valid)
-    near = difflib.get_close_matches(wrong, valid, n=3, cutoff=0.5)
-    if near:
-        return f"Did you mean {' or '.join(repr(word) for word in near)}?"
-    return f"Expected one of {', '.join(valid[:40])}." if valid else ""
 
 
 @contextmanager

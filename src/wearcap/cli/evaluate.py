@@ -48,7 +48,8 @@ def run(config: DictConfig) -> Scores:
 
 def _learned(checkpoints: list[str], config: DictConfig, progress: Progress) -> tuple[RecordingStore, Scores]:
     """The data set, and the checkpoints' scores beside the baselines'."""
-    sources, validated = trained_on(checkpoints[0])
+    told = bool(config.dataset) and not config.baselines
+    sources, validated = ([], None) if told else trained_on(checkpoints[0])
     store = RecordingStore.open(config.dataset or validated)
     rows: list[Row] = []
     for index, checkpoint in enumerate(checkpoints):

@@ -1,4 +1,4 @@
-"""`wearcap export`: a checkpoint's network as ONNX or torch.export, checked against eager."""
+"""`wearcap export`: a checkpoint's network as ONNX or torch.export, checked against eager, or the checkpoint to be shared."""
 
 from omegaconf import DictConfig
 from rich import print as show
@@ -9,15 +9,23 @@ from wearcap.errors import WearcapError
 from wearcap.export.contact import export_contact
 from wearcap.export.network import ExportReport
 from wearcap.export.sidecar import export_hmd2
+from wearcap.models.checkpoint import share_checkpoint
 from wearcap.pipelines.contact_prediction import load_detector
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.training.contact_detection import ContactDetection
 
-HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2"
+HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2|safetensors"
 
 
-def run(config: DictConfig) -> ExportReport:
-    """Export the network with its sidecar; prints the error against eager and both latencies."""
+def run(config: DictConfig) -> ExportReport | None:
+    """Export the network with its sidecar; prints the error against eager and both latencies.
+
+    format=safetensors writes the checkpoint itself: averaged weights and config, to be shared.
+    """
+    if config.format == "safetensors":
+        share_checkpoint(config.checkpoint, config.output, config.dtype)
+        show(f"checkpoint: {config.output}")
+        return None
     if isinstance(load_system(config.checkpoint)[0], ContactDetection):
         report = export_contact(load_detector(config.checkpoint), config.output, config.format)
     else:

@@ -64,10 +64,16 @@ def staged(pipeline: StagedPipeline, config: DictConfig, data: str | Path, conso
 
 
 def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:
-    """(folders of the training data sets, folder of the one it was validated on)."""
-    data = read_checkpoint(checkpoint)[0]["data"]
+    """(folders of the training data sets, folder of the one it was validated on).
+
+    Raises WearcapError for a checkpoint that was shared without them.
+    """
+    data = read_checkpoint(checkpoint)[0].get("data", {})
+    if not data.get("sources"):
+        raise WearcapError("this checkpoint does not name the data it was trained on", where=checkpoint,
+                           fix="Give dataset=DIR and baselines=false.")  # fmt: skip
     sources = [source["root"] for source in data["sources"].values() if source]
-    validated = [source["root"] for source in (data["val_sources"] or data["sources"]).values() if source]
+    validated = [source["root"] for source in (data.get("val_sources") or data["sources"]).values() if source]
     return sources, validated[0]
 
 

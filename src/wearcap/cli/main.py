@@ -7,7 +7,7 @@ import sys
 import traceback
 
 from wearcap import __version__
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, nearest
 
 VERBS = (
     "train", "evaluate", "capture", "export", "prepare", "view", "render", "annotate", "scene", "calibrate",
@@ -79,8 +79,6 @@ def main(arguments: list[str] | None = None) -> None:
         print(usage())
         sys.exit(0 if arguments else USER_ERROR)
     elif verb not in available():
-        from wearcap.cli.conf import nearest
-
         print(f"wearcap: no verb {verb!r}. {nearest(verb, available())}", file=sys.stderr)
         sys.exit(USER_ERROR)
     else:

@@ -1,0 +1,198 @@
+"""Shared checkpoints: written, stored in half the width, found by name, and refused when they are not what they should be."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from wearcap.errors import WearcapError
+from wearcap.models import checkpoint as module
+from wearcap.models.checkpoint import load_checkpoint, read_checkpoint, share_checkpoint
+
+MODEL = {
+    "_target_": "wearcap.training.contact_detection.ContactDetection",
+    "net": {"_target_": "wearcap.models.contact_sequence.ContactSequence", "_partial_": True, "width": 40},
+    "skeleton": {"_target_": "wearcap.body.skeleton.xsens23"},
+    "optimizer": {"_target_": "torch.optim.AdamW", "lr": 1e-3},
+    "scheduler": {"_target_": "wearcap.training.schedules.warmup_cosine", "_partial_": True},
+    "parts": [{"_target_": "wearcap.diffusion.schedule.CosineSchedule"}],
+}
+SOURCES = {"cmu": {"root": "datasets/cmu", "weight": 1.0}, "simulated": None}
+
+
+class Net(nn.Module):
+    """A weight, a bias, a statistic, a count, and one weight under two names."""
+
+    def __init__(self, size: int = 6):
+        super().__init__()
+        self.first, self.second = nn.Linear(4, size), nn.Linear(4, size, bias=False)
+        self.second.weight = self.first.weight
+        self.register_buffer("mean", torch.full((4,), 1 / 3))
+        self.register_buffer("count", torch.tensor([2**40 + 1]))
+
+
+def run_file(path: Path, state: dict | None = None, **config) -> Path:
+    """A run's checkpoint, as `wearcap train` saves it."""
+    torch.manual_seed(0)
+    config = {"name": "toy", "model": MODEL, "paths": {"run": "/home/someone"}} | config
+    torch.save(
+        {"wearcap": {"config": json.dumps(config)}, "state_dict": state or Net().state_dict(), "epoch": 3},
+        path,
+    )
+    return path
+
+
+def shared_file(path: Path, state: dict | None = None, config: object = None, **metadata: str) -> Path:
+    """A shared checkpoint, or what somebody calls one."""
+    told = metadata or {"wearcap_checkpoint": json.dumps(config or {"name": "toy", "model": MODEL})}
+    save_file(state or {"first.weight": torch.zeros(2, 2)}, path, told)
+    return path
+
+
+def test_a_shared_checkpoint_is_the_weights_and_what_others_need_of_the_config(tmp_path):
+    source = run_file(tmp_path / "run.ckpt", data={"sources": SOURCES, "val_sources": None, "workers": 3})
+    share_checkpoint(source, tmp_path / "shared.safetensors")
+    config, state = read_checkpoint(tmp_path / "shared.safetensors")
+    assert config == {"name": "toy", "model": MODEL, "data": {"sources": {"cmu": {"root": "datasets/cmu"}}}}
+    original = read_checkpoint(source)[1]
+    assert state.keys() == original.keys()
+    assert all(torch.equal(state[name], value) for name, value in original.items())
+    assert b"/home" not in (tmp_path / "shared.safetensors").read_bytes()
+    load_checkpoint(Net(), state, "shared")
+    share_checkpoint(tmp_path / "shared.safetensors", tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "shared.safetensors").read_bytes()
+
+
+def test_folders_of_a_machine_stay_at_home(tmp_path):
+    source = run_file(tmp_path / "run.ckpt", data={"sources": {"own": {"root": "/home/someone/data"}}})
+    share_checkpoint(source, tmp_path / "shared.safetensors")
+    assert set(read_checkpoint(tmp_path / "shared.safetensors")[0]) == {"name", "model"}
+
+
+@pytest.mark.parametrize(("dtype", "off"), [("bfloat16", 2**-8), ("float16", 2**-11)])
+def test_weights_are_stored_in_half_the_width_and_statistics_are_not(dtype, off, tmp_path):
+    source = run_file(
+        tmp_path / "run.ckpt", {"net.weight": torch.randn(300, 200), "net.mean": torch.rand(200)}
+    )
+    share_checkpoint(source, tmp_path / "whole.safetensors")
+    share_checkpoint(source, tmp_path / "half.safetensors", dtype)
+    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("half", "whole")]
+    assert 0.5 < sizes[0] / sizes[1] < 0.52
+    before, after = (
+        read_checkpoint(tmp_path / name)[1] for name in ("whole.safetensors", "half.safetensors")
+    )
+    assert torch.equal(after["net.mean"], before["net.mean"])
+    assert after["net.weight"].dtype == torch.float32
+    torch.testing.assert_close(after["net.weight"], before["net.weight"], rtol=off, atol=1e-6)
+    assert not torch.equal(after["net.weight"], before["net.weight"])
+
+
+def test_weights_that_are_too_large_for_a_type_are_not_shared_in_it(tmp_path):
+    source = run_file(tmp_path / "run.ckpt", {"net.weight": torch.tensor([[1e5]])})
+    with pytest.raises(WearcapError, match=r"'net.weight' is not finite as float16"):
+        share_checkpoint(source, tmp_path / "half.safetensors", "float16")
+    share_checkpoint(source, tmp_path / "half.safetensors", "bfloat16")
+    broken = run_file(tmp_path / "nan.ckpt", {"net.weight": torch.tensor([[float("nan")]])})
+    with pytest.raises(WearcapError, match=r"nan.ckpt: weight 'net.weight' is not finite"):
+        share_checkpoint(broken, tmp_path / "nan.safetensors")
+    assert not (tmp_path / "nan.safetensors").exists()
+
+
+def test_what_cannot_be_shared_so_is_said(tmp_path):
+    source = run_file(tmp_path / "run.ckpt")
+    with pytest.raises(WearcapError, match=r"Expected NAME\.safetensors"):
+        share_checkpoint(source, tmp_path / "other.ckpt")
+    with pytest.raises(WearcapError, match=r"no dtype 'bfloat'.*Did you mean 'bfloat16'"):
+        share_checkpoint(source, tmp_path / "shared.safetensors", "bfloat")
+
+
+def test_a_bare_name_is_a_checkpoint_of_the_project_unless_a_file_has_it(tmp_path, monkeypatch):
+    share_checkpoint(run_file(tmp_path / "run.ckpt"), tmp_path / "comes_with/walker.safetensors")
+    monkeypatch.setattr(module, "resource", lambda *_: tmp_path / "comes_with")
+    monkeypatch.chdir(tmp_path)
+    assert read_checkpoint("walker")[0]["name"] == "toy"
+    assert read_checkpoint(Path("walker"))[0]["name"] == "toy"
+    with pytest.raises(
+        WearcapError, match=r"^walkr: no such checkpoint\. Expected .*Did you mean 'walker'\?$"
+    ):
+        read_checkpoint("walkr")
+    with pytest.raises(WearcapError, match=r"Expected one of walker\."):
+        read_checkpoint("zzz")
+    for path in ("walker.ckpt", "sub/walker", "walker.safetensors", ""):
+        with pytest.raises(WearcapError, match="no such checkpoint"):
+            read_checkpoint(path)
+    run_file(tmp_path / "walker", name="of the folder")
+    assert read_checkpoint("walker")[0]["name"] == "of the folder"
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(WearcapError) as raised:
+        read_checkpoint(path)
+    assert str(raised.value).startswith(str(path))
+    return str(raised.value)
+
+
+def test_a_shared_checkpoint_cut_anywhere_is_refused(tmp_path):
+    whole = shared_file(tmp_path / "whole.safetensors").read_bytes()
+    path = tmp_path / "cut.safetensors"
+    for length in (*range(0, len(whole), 7), len(whole) - 1):
+        path.write_bytes(whole[:length])
+        assert "not a readable checkpoint" in refusal(path)
+    for junk in (b"\xff" * 64, b"\x00" * 64, whole + b"more", b"PK\x03\x04" + whole):
+        path.write_bytes(junk)
+        assert "not a readable checkpoint" in refusal(path)
+
+
+def test_files_that_are_no_checkpoints_are_named(tmp_path):
+    path = tmp_path / "x.safetensors"
+    save_file({"a": torch.zeros(2)}, path)
+    assert "not a checkpoint of wearcap" in refusal(path)
+    assert "not a checkpoint of wearcap" in refusal(shared_file(path, wearcap="{}", format="pt"))
+    assert "config cannot be read" in refusal(shared_file(path, wearcap_checkpoint="{"))
+    for config in ("[]", "3", "{}", '{"model": null}', '{"model": "x"}'):
+        assert "without its model's config" in refusal(shared_file(path, wearcap_checkpoint=config))
+    run_file(path)  # a pickle under this name is not opened
+    assert "not a readable checkpoint" in refusal(path)
+    path = tmp_path / "x.ckpt"
+    for content in ({"wearcap": 3, "state_dict": {}}, {"wearcap": {"config": "{"}, "state_dict": {}},
+                    {"wearcap": {"config": "{}"}}, [1, 2], torch.zeros(3)):  # fmt: skip
+        torch.save(content, path)
+        assert "not of wearcap" in refusal(path)
+    path.unlink()
+    path.mkdir()
+    assert "no such checkpoint" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    "target",
+    ["os.system", "builtins.eval", "torch.load", "torch.hub.load", "torch.optim.os.system",
+     "wearcap.models.checkpoint.torch.hub.load", "wearcap.models.checkpoint.pickle.loads", "wearcap.files.write_text",
+     "wearcap.models.checkpoint.share_checkpoint", "wearcap.training.run.record_run", "wearcap.cli.main.main",
+     "wearcap.models.checkpoint.Path", "wearcap.models.nothing.Net", "wearcap.models", "", "wearcap.models..x.Y"],
+)  # fmt: skip
+@pytest.mark.parametrize("kind", ["ckpt", "safetensors"])
+def test_a_config_that_asks_for_anything_but_our_models_is_refused(kind, target, tmp_path):
+    model = MODEL | {
+        "net": {"_target_": "wearcap.models.denoiser.MotionDenoiser", "x": [{"_target_": target}]}
+    }
+    path = tmp_path / f"bad.{kind}"
+    if kind == "ckpt":
+        run_file(path, model=model)
+    else:
+        shared_file(path, config={"model": model})
+    assert f"to be made of {target!r}" in refusal(path)
+
+
+def test_weights_that_do_not_fit_are_named(tmp_path):
+    config = {"model": MODEL}
+    state = {name: value.clone() for name, value in Net(5).state_dict().items()}
+    _, read = read_checkpoint(shared_file(tmp_path / "x.safetensors", state, config))
+    with pytest.raises(WearcapError, match=r"3 weights do not fit this model, such as 'first.weight'"):
+        load_checkpoint(Net(), read, "x")
+    del state["mean"]
+    _, read = read_checkpoint(shared_file(tmp_path / "x.safetensors", state, config))
+    with pytest.raises(WearcapError, match=r"1 weights do not fit this model, such as 'mean'"):
+        load_checkpoint(Net(5), read, "x")
