@@ -1,6 +1,7 @@
 """Shared checkpoints: written, stored in half the width, found by name, and refused when they are not what they should be."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ MODEL = {
     "scheduler": {"_target_": "wearcap.training.schedules.warmup_cosine", "_partial_": True},
     "parts": [{"_target_": "wearcap.diffusion.schedule.CosineSchedule"}],
 }
+CONF = Path(__file__).parents[2] / "conf"
 SOURCES = {"cmu": {"root": "datasets/cmu", "weight": 1.0}, "simulated": None}
 
 
@@ -184,6 +186,19 @@ def test_a_config_that_asks_for_anything_but_our_models_is_refused(kind, target,
     else:
         shared_file(path, config={"model": model})
     assert f"to be made of {target!r}" in refusal(path)
+
+
+def test_every_model_that_can_be_trained_can_be_shared(tmp_path):
+    """A class or function that a new config names for its model has to be one that `read_checkpoint` knows."""
+    targets = {
+        target
+        for group in ("model", "features", "optimizer")
+        for path in (CONF / group).glob("*.yaml")
+        for target in re.findall(r"_target_: ([\w.]+)", path.read_text(encoding="utf-8"))
+    }
+    assert len(targets) > 8
+    for target in sorted(targets):
+        read_checkpoint(shared_file(tmp_path / "x.safetensors", config={"model": {"_target_": target}}))
 
 
 def test_weights_that_do_not_fit_are_named(tmp_path):
