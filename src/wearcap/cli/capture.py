@@ -20,6 +20,7 @@ from wearcap.io.scene_folder import cloud_file
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.hps import HPS
 from wearcap.pipelines.hps_stream import follow
+from wearcap.pipelines.pose_regressor import PoseRegressorCapture
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.locate import load_recording
@@ -39,7 +40,7 @@ def run(config: DictConfig) -> Motion | None:
     if config.live:
         return _live(pipeline, config, folder)
     recording = load_recording(config.recording)
-    if isinstance(pipeline, HMD2):
+    if isinstance(pipeline, HMD2 | PoseRegressorCapture):
         if config.until is not None or config.cache is not None:
             raise WearcapError(f"until={config.until} cache={config.cache}", expected="a pipeline with stages, such as pipeline=hps")  # fmt: skip
         motion = pipeline(recording, seed=config.seed)

@@ -16,6 +16,7 @@ from wearcap.pipelines.evaluation import Measure, Pipeline, evaluate, score
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.ireplica import IReplica
 from wearcap.pipelines.ireplica_evaluation import with_interactions
+from wearcap.pipelines.pose_regressor import PoseRegressorCapture
 from wearcap.recording import RecordingStore
 
 HELP = "score a checkpoint: wearcap evaluate checkpoint=… [dataset=DIR] [split=test], or pipeline=hps dataset=DIR"
@@ -29,7 +30,7 @@ def run(config: DictConfig) -> Scores:
         given if given is None else [str(path) for path in checkpoints], config.pipeline, config.device
     )
     with Progress(transient=True) as progress:
-        if isinstance(pipeline, HMD2):
+        if isinstance(pipeline, HMD2 | PoseRegressorCapture):
             store, scores = _learned(checkpoints, config, progress)
         else:
             if config.dataset is None:
@@ -54,7 +55,7 @@ def _learned(checkpoints: list[str], config: DictConfig, progress: Progress) -> 
     rows: list[Row] = []
     for index, checkpoint in enumerate(checkpoints):
         pipeline = load_pipeline(checkpoint, config.pipeline, config.device)
-        assert isinstance(pipeline, HMD2)
+        assert isinstance(pipeline, HMD2 | PoseRegressorCapture)
         seeds = [index * 1000 + seed for seed in config.seeds]
         rows += _rows(pipeline, store, seeds, config, progress, Path(checkpoint).parts[-3:][0])
     scores: Scores = {"wearcap": aggregate(rows)}

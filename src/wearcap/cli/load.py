@@ -13,15 +13,20 @@ from wearcap.io.environment import read_environment
 from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
 from wearcap.pipelines.contact_prediction import ContactPredictor
 from wearcap.pipelines.hmd2 import HMD2
+from wearcap.pipelines.pose_regressor import PoseRegressorCapture
 from wearcap.pipelines.stages import StagedCapture, StagedPipeline
 from wearcap.recording.locate import dataset_folder
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
 from wearcap.training.contact_detection import ContactDetection
 from wearcap.training.motion_diffusion import MotionDiffusion
+from wearcap.training.pose_regression import PoseRegression
 
 
-def load_system(checkpoint: str | Path) -> tuple[MotionDiffusion | ContactDetection, dict[str, Any]]:
+System = MotionDiffusion | ContactDetection | PoseRegression
+
+
+def load_system(checkpoint: str | Path) -> tuple[System, dict[str, Any]]:
     """The trained system (averaged weights, evaluation mode) and the config it was trained with."""
     config, state = read_checkpoint(checkpoint)
     system = instantiate(config["model"], _convert_="all")
@@ -31,7 +36,7 @@ def load_system(checkpoint: str | Path) -> tuple[MotionDiffusion | ContactDetect
 
 def load_pipeline(
     checkpoint: str | Path | Sequence[str] | None, pipeline: DictConfig, device: str
-) -> HMD2 | StagedPipeline:
+) -> HMD2 | PoseRegressorCapture | StagedPipeline:
     """The pipeline of a config group: around a checkpoint's network where it is learned (`_partial_`), else by itself.
 
     iReplica takes several checkpoints of contact networks, one per class. Raises WearcapError for a learned pipeline
@@ -49,8 +54,12 @@ def load_pipeline(
     if name == "IReplica":
         return made(predictor=ContactPredictor.load(*given))
     system, _ = load_system(given[0])
+    if name == "PoseRegressorCapture":
+        if not isinstance(system, PoseRegression):
+            raise WearcapError(f"{name} needs a pose regressor", where=given[0], expected="a checkpoint of experiment=pose_regressor_head or pose_regressor_hands")  # fmt: skip
+        return made(**system.pipeline_parts(), device=device)
     if not isinstance(system, MotionDiffusion):
-        raise WearcapError(f"{name} needs a motion denoiser", where=given[0], expected="a checkpoint of one, not of a contact network")  # fmt: skip
+        raise WearcapError(f"{name} needs a motion denoiser", where=given[0], expected="a checkpoint of one, not of another network")  # fmt: skip
     return made(
         net=system.net, features=system.features, schedule=system.schedule, skeleton=system.skeleton,
         fps=system.fps, device=device,

@@ -1,0 +1,123 @@
+"""What a pose regressor sees: a head, and hands where they are tracked too, as AvatarPoser describes them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.skeleton import Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+
+
+@dataclass(frozen=True)
+class TrackedPoints:
+    """Per point: rotation (6D), its change, position and velocity (Jiang et al. 2022: 18 numbers).
+
+    Each frame is told in its own head's heading, with no place in the world (ours; AvatarPoser's world frame would
+    make a stride depend on where it is taken): horizontal positions are seen from the head. height "stature": heights
+    over the floor, and positions, as shares of the head's height in the rest pose; "floor": over the floor (m);
+    "world": AvatarPoser's own, heights in the world (m).
+    """
+
+    points: Sequence[str] = ("head",)
+    """Joints, the head first."""
+    height: str = "stature"
+
+    def __post_init__(self):
+        if not self.points or self.points[0] != "head":
+            raise WearcapError(f"tracked points {', '.join(self.points) or '(none)'}",
+                               expected="the head, then what else is tracked")  # fmt: skip
+        if self.height not in ("stature", "floor", "world"):
+            raise WearcapError(f"tracked points have no height {self.height!r}", expected="one of stature, floor, world")  # fmt: skip
+
+    @property
+    def size(self) -> int:
+        return 18 * len(self.points)
+
+    def poses(
+        self,
+        skeleton: Skeleton,
+        T_world_head: Rigid,
+        R_parent_joint: Float[Tensor, "*batch joint 3 3"] | None = None,
+        t_parent_joint: Float[Tensor, "*#batch joint 3"] | None = None,
+    ) -> Rigid:
+        """Poses "*batch point" of the points: the measured head's, and those of a true body hung from it.
+
+        The true pose is needed where more than the head is tracked.
+        """
+        if len(self.points) == 1:
+            return Rigid(T_world_head.R[..., None, :, :], T_world_head.t[..., None, :])
+        assert R_parent_joint is not None
+        body = forward_kinematics(skeleton, R_parent_joint, torch.zeros_like(T_world_head.t), t_parent_joint)
+        rest = list(skeleton.indices(*self.points[1:]))
+        t_head_point = body.t[..., rest, :] - body.t[..., [skeleton.index("head")], :]
+        t_head = T_world_head.t[..., None, :]
+        return Rigid(
+            torch.cat([T_world_head.R[..., None, :, :], body.R[..., rest, :, :]], -3),
+            torch.cat([t_head, t_head + t_head_point], -2),
+        )
+
+    def encode(
+        self,
+        R_world_point: Float[Tensor, "batch time point 3 3"],
+        t_world_point: Float[Tensor, "batch time point 3"],
+        floor_height: Float[Tensor, "batch time"],
+        stature: Float[Tensor, "batch"],
+        fps: float,
+    ) -> Float[Tensor, "batch time feature"]:
+        """Features of the points' paths. Changes are against the frame before (per second), the first frame's zero."""
+        R_heading_world = _heading(R_world_point[:, :, 0]).mT[:, :, None]
+        R_heading_point = R_heading_world @ R_world_point
+        step = R_world_point[:, :-1].mT @ R_world_point[:, 1:] - torch.eye(3).to(R_world_point)
+        velocity = (R_heading_world[:, 1:] @ t_world_point.diff(dim=1)[..., None])[..., 0]
+        origin = t_world_point[:, :, :1] * t_world_point.new_tensor([1.0, 1.0, 0.0])
+        if self.height != "world":
+            origin = origin + floor_height[..., None, None] * origin.new_tensor([0.0, 0.0, 1.0])
+        position = (R_heading_world @ (t_world_point - origin)[..., None])[..., 0]
+        if self.height == "stature":
+            position = position / stature[:, None, None, None]
+        parts = [
+            rotation.rot6d_from_matrix(R_heading_point), _after_first(rotation.rot6d_from_matrix(step) * fps),
+            position, _after_first(velocity * fps),
+        ]  # fmt: skip
+        return torch.cat(parts, -1).flatten(-2)
+
+
+def encode_pose(
+    R_parent_joint: Float[Tensor, "*batch joint 3 3"], R_world_head: Float[Tensor, "*batch 3 3"]
+) -> Float[Tensor, "*batch motion"]:
+    """Local rotations as 6D, the root's seen from where the head points."""
+    R_root = _heading(R_world_head).mT @ R_parent_joint[..., 0, :, :]
+    R = torch.cat([R_root[..., None, :, :], R_parent_joint[..., 1:, :, :]], -3)
+    return rotation.rot6d_from_matrix(R).flatten(-2)
+
+
+def decode_pose(
+    motion: Float[Tensor, "*batch motion"], R_world_head: Float[Tensor, "*batch 3 3"]
+) -> Float[Tensor, "*batch joint 3 3"]:
+    """The inverse of `encode_pose`: R_parent_joint, the root's entry in the world."""
+    R = rotation.matrix_from_rot6d(motion.unflatten(-1, (-1, 6)))
+    R_root = _heading(R_world_head) @ R[..., 0, :, :]
+    return torch.cat([R_root[..., None, :, :], R[..., 1:, :, :]], -3)
+
+
+def _heading(R_world_head: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    return rotation.about_axis("z", rotation.yaw_of(R_world_head))
+
+
+def _after_first(change: Float[Tensor, "batch step point value"]) -> Float[Tensor, "batch time point value"]:
+    return torch.nn.functional.pad(change, (0, 0, 0, 0, 1, 0))
+
+
+def pasts(
+    features: Float[Tensor, "batch time feature"], ends: Int64[Tensor, "batch end"], window: int
+) -> tuple[Float[Tensor, "batch end window feature"], Bool[Tensor, "batch end window"]]:
+    """The `window` frames up to and with each end, and which of them exist (not before the first frame)."""
+    frames = ends[..., None] + torch.arange(1 - window, 1, device=ends.device)
+    rows = torch.arange(len(features), device=ends.device)[:, None, None]
+    return features[rows, frames.clamp_min(0)], frames >= 0

@@ -1,0 +1,139 @@
+"""Training the baselines: the regressor learns, its losses vanish for the truth, and every experiment runs."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from wearcap.body.skeleton import xsens23
+from wearcap.cli import evaluate, train
+from wearcap.cli.load import load_system
+from wearcap.data.statistics import collate
+from wearcap.data.tracked_points import TrackedPoints, encode_pose
+from wearcap.data.windows import Source, WindowDataset
+from wearcap.errors import WearcapError
+from wearcap.models.pose_regressor import PoseRegressor
+from wearcap.training.pose_regression import PoseRegression
+from wearcap_testing import small_dataset
+
+SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
+HANDS = ("head", "left_wrist", "right_wrist")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return small_dataset(tmp_path_factory.mktemp("data")).root
+
+
+def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
+    return [
+        f"experiment={experiment}", f"data.sources.simulated.root={data}", "debug=fast", "~callbacks.capture", f"hydra.run.dir={run}",
+        f"paths.outputs={run.parent}", "trainer.accelerator=cpu", "trainer.precision=32-true", "data.workers=0", "data.window=60",
+        "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "callbacks.progress=null", *SMALL, *more,
+    ]  # fmt: skip
+
+
+def system(points: tuple[str, ...] = HANDS, net=PoseRegressor) -> PoseRegression:
+    weights = {"root": 0.05, "rotation": 1.0, "joints": 1.0}
+    return PoseRegression(
+        lambda **sizes: net(**sizes, window=20, width=32, layers=1, heads=4, feedforward=32, dropout=0.0),
+        TrackedPoints(points), xsens23(), 60.0, weights, torch.optim.AdamW, per_window=4,
+    )  # fmt: skip
+
+
+def batch(data: Path, split: str = "train", mirror: bool = False):
+    windows = WindowDataset([Source(str(data))], split, window=60, stride=30, fps=60.0, mirror=mirror)
+    return collate([windows[(i % len(windows), i)] for i in range(16)])
+
+
+class Oracle(nn.Module):
+    """Says the poses that it was told."""
+
+    window = 20
+
+    def __init__(self, **sizes):
+        super().__init__()
+
+    def forward(self, features, valid):
+        return self.answer
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_the_truth_costs_nothing_and_another_pose_does(data, mirror):
+    module, windows = system(net=Oracle).eval(), batch(data, mirror=mirror)
+    ends = module._asked(windows)
+    assert ends[0].tolist() == [7, 22, 37, 52]
+    rows = torch.arange(16)[:, None]
+    truth = encode_pose(windows.R_parent_joint[rows, ends], windows.R_world_head[rows, ends]).flatten(0, 1)
+    module.net.answer = truth
+    assert all(term < 1e-5 for term in module.terms(windows).values())
+    module.net.answer = truth + 0.2 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
+    assert all(term > 0.01 for term in module.terms(windows).values())
+
+
+def test_padding_is_no_lesson(data):
+    """The recording of 90 frames ends within a window of 120: what is said behind its end costs nothing."""
+    windows = WindowDataset([Source(str(data))], "train", window=120, stride=30, fps=60.0)
+    short = next(i for i, row in enumerate(windows.starts.tolist()) if row[2] == 90)
+    one = collate([windows[(short, 0)]])
+    module = system(net=Oracle).eval()
+    ends = module._asked(one)
+    assert one.valid[0, ends[0]].tolist() == [True, True, True, False]
+    answer = encode_pose(one.R_parent_joint[:, ends[0]], one.R_world_head[:, ends[0]])[0]
+    answer[3] += 1.0
+    module.net.answer = answer
+    assert all(term < 1e-5 for term in module.terms(one).values())
+
+
+def test_it_learns_and_hands_help(data):
+    """A body that sways: after some steps the error of held-out frames has halved, and hands lower it."""
+    errors = {}
+    for points in (("head",), HANDS):
+        torch.manual_seed(0)
+        module, windows = system(points), batch(data, mirror=True)
+        module.set_statistics(WindowDataset([Source(str(data))], "train", window=60, stride=30, fps=60.0), 16)
+        optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
+        before = module.eval().terms(windows)["joints"].item()
+        for _ in range(60):
+            module.train()
+            loss = sum(module.loss_weights[name] * term for name, term in module.terms(windows).items())
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        errors[points] = module.eval().terms(windows)["joints"].item()
+        assert errors[points] < 0.5 * before
+    assert errors[HANDS] < errors[("head",)]
+
+
+def test_trained_evaluated_and_refused(data, tmp_path):
+    run = tmp_path / "run"
+    train.main(arguments("pose_regressor_hands", data, run))
+    checkpoint = run / "checkpoints" / "last.ckpt"
+    loaded, config = load_system(checkpoint)
+    assert isinstance(loaded, PoseRegression)
+    assert loaded.points.size == 54
+    assert config["model"]["points"]["points"] == list(HANDS)
+    with open(run / "metrics.csv") as file:
+        assert [row["train/joints"] for row in csv.DictReader(file) if row["train/joints"]]
+    common = [f"checkpoint={checkpoint}", f"hydra.run.dir={tmp_path}/e", "seeds=[0]", "baselines=false"]
+    evaluate.main([*common, "pipeline=pose_regressor", f"output={tmp_path}/table.json"])
+    scores = json.loads((tmp_path / "table.json").read_text())["methods"]["wearcap"]
+    assert 0 < scores["hand_pe_cm"]["mean"] < scores["mpjpe_cm"]["mean"] + 10
+    with pytest.raises(WearcapError, match="HMD2 needs a motion denoiser"):
+        evaluate.main([*common, "pipeline=hmd2"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", ["pose_regressor_head", "egoego_style"])
+def test_the_other_experiments_take_a_step(experiment, data, tmp_path):
+    run = tmp_path / "run"
+    more = ["data.batch_size=2"] if experiment == "pose_regressor_head" else ["data.batch_size=2", "optimizer.scheduler.warmup=1"]  # fmt: skip
+    command = arguments(experiment, data, run, *more)
+    train.main(command)
+    pipeline = ["pipeline=pose_regressor"] if experiment != "egoego_style" else ["pipeline=egoego_style", "pipeline.steps=2", "pipeline.stride=50"]  # fmt: skip
+    evaluate.main([f"checkpoint={run}/checkpoints/last.ckpt", f"hydra.run.dir={tmp_path}/e", "seeds=[0]",
+                   "baselines=false", *pipeline, f"output={tmp_path}/table.json"])  # fmt: skip
+    assert json.loads((tmp_path / "table.json").read_text())["methods"]["wearcap"]["mpjpe_cm"]["mean"] > 0
