@@ -39,6 +39,7 @@ SOFT_M = (0.05, 0.08)
 """So far thighs and buttocks may press into a seat: first try, and where nothing fits."""
 ON_STEP = {"foot": 0.05, "hand": 0.05, "shin": 0.02}
 """So far (m) feet may reach into a step (captured soles are centimetres off), hands into what they hold on to."""
+NEAR_SEAT = {"hand": 0.08, "foot": 0.03, "shin": 0.02}
 SEATS = ("chair", "bench", "armchair", "sofa", "bed", "stool", "stool", "pedestal")
 THICK_M = 0.04
 """Of boards and rungs."""
@@ -168,7 +169,7 @@ def build_seat(
                 continue
             piece, about = _of_height(piece, factor), sit.heading - heading
             position = np.array([*(sit.place[:2] - turn(about) @ np.array([x, y])), 0.0])
-            if not meets(body, piece, position, about, 0.0, {"seat": soft, "hand": 0.08}):
+            if not meets(body, piece, position, about, 0.0, {"seat": soft, **NEAR_SEAT}):
                 place = np.array([*builder.from_world(position[:2]), 0.0])
                 builder.place(piece, tuple(place.tolist()), about - builder.heading)
                 return piece, place, about - builder.heading
