@@ -1,5 +1,7 @@
 """Embeddings of head camera pictures: right rows, mirrored ones, kept by content, clear about what is wrong."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -8,10 +10,16 @@ import pytest
 import torch
 from PIL import Image
 
+from wearcap.cli import prepare
 from wearcap.data.embeddings import embed_camera, embedding_name
+from wearcap.data.prepare import embeddings
+from wearcap.data.prepare.embeddings import embed_dataset
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
+from wearcap.models.image_encoder import EgoViewEncoder
+from wearcap.recording import RecordingStore, serialize
 from wearcap.recording.recording import CameraStream
+from wearcap_testing import small_dataset
 
 WIDTH, HEIGHT = 96, 72
 
@@ -37,7 +45,7 @@ def write_video(path: Path, frames: int) -> np.ndarray:
     level = np.linspace(20, 220, frames).astype(np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"crf": "10"})
+        stream = container.add_stream("libx264", rate=30, options={"crf": "10", "preset": "ultrafast"})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         for value in level:
             picture = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
@@ -120,3 +128,97 @@ def test_missing_and_damaged_files_are_named(pictures, message, tmp_path):
     with pytest.raises(WearcapError, match=message):
         embed_camera(stream(3, **pictures), tmp_path, Corners())
     assert not list(tmp_path.glob("cache/*/*"))
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory) -> Path:
+    store = small_dataset(tmp_path_factory.mktemp("film"), frames=(60,) * 6)
+    for number, name in enumerate(store.names()):
+        if name != "r2":
+            write_video(store.root / f"videos/{name}.mp4", 28 + number)
+            camera = stream(28 + number, video=f"videos/{name}.mp4")
+            store.add(
+                replace(store.load(name), camera=camera), split=store.entries[name].split, config_hash="made"
+            )
+    return store.root
+
+
+@pytest.fixture
+def filmed(film, tmp_path) -> RecordingStore:
+    """Recordings r0 to r5, all but r2 with a video."""
+    return RecordingStore.open(shutil.copytree(film, tmp_path / "filmed"))
+
+
+def test_a_data_set_gets_embeddings_and_keeps_everything_else(filmed):
+    before = {name: filmed.load(name) for name in filmed.names()}
+    report = embed_dataset(filmed.root, Corners(), progress=False)
+    assert report.written == ["r0", "r1", "r3", "r4", "r5"]
+    assert report.notes == {"r2": "no head camera's pictures"}
+    store = RecordingStore.open(filmed.root)
+    assert all(wrong is None for _, wrong in store.verify())
+    for name in report.written:
+        entry, recording = store.entries[name], store.load(name)
+        assert (entry.split, entry.config_hash) == (filmed.entries[name].split, "made")
+        assert recording.camera is not None
+        assert recording.camera.embedding is not None
+        assert recording.camera.embedding_name == "corners-00000000"
+        plain = replace(recording.camera, embedding=None, embedding_mirrored=None, embedding_name=None)
+        assert serialize.dumps(serialize.flatten(replace(recording, camera=plain))[0]) == serialize.dumps(
+            serialize.flatten(before[name])[0]
+        )
+
+
+def test_a_second_run_does_nothing_and_a_killed_one_goes_on(filmed, monkeypatch):
+    class Killed(BaseException): ...
+
+    register = RecordingStore.register
+
+    def dies(self, entries):
+        raise Killed
+
+    # Files are written, the manifest never learns of them.
+    monkeypatch.setattr(embeddings, "REGISTER_EVERY_S", 1000)
+    monkeypatch.setattr(RecordingStore, "register", dies)
+    with pytest.raises(Killed):
+        embed_dataset(filmed.root, Corners(), progress=False)
+    monkeypatch.setattr(RecordingStore, "register", register)
+    encoder = Corners()
+    assert len(embed_dataset(filmed.root, encoder, progress=False).written) == 5
+    assert encoder.seen == 0  # all from the cache
+    assert all(wrong is None for _, wrong in RecordingStore.open(filmed.root).verify())
+    assert len(embed_dataset(filmed.root, encoder, progress=False).current) == 5
+    other = Corners()
+    other.fingerprint = "11111111"
+    assert len(embed_dataset(filmed.root, other, progress=False).written) == 5
+
+
+def test_what_cannot_be_embedded_stays_in_its_data_set(filmed):
+    (filmed.root / "videos/r1.mp4").unlink()
+    (filmed.root / "videos/r3.mp4").write_bytes((filmed.root / "videos/r4.mp4").read_bytes())
+    report = embed_dataset(filmed.root, Corners(), progress=False)
+    assert set(report.failed) == {"r1", "r3"}
+    assert "no such video" in report.failed["r1"]
+    assert "32 pictures for 31 timestamps" in report.failed["r3"]
+    store = RecordingStore.open(filmed.root)
+    assert store.names() == filmed.names()
+    assert all(wrong is None for _, wrong in store.verify())
+    with pytest.raises(WearcapError, match="no recording has a head camera's pictures"):
+        embed_dataset(small_dataset(filmed.root / "more", frames=(60,)).root, Corners(), progress=False)
+
+
+def test_the_command_embeds_by_a_checkpoint(filmed, tmp_path, capsys):
+    torch.manual_seed(0)
+    encoder = EgoViewEncoder(size=8, channels=[4, 4, 4])
+    net = {"_target_": "wearcap.models.image_encoder.EgoViewEncoder", "size": 8, "channels": [4, 4, 4]}
+    state = {f"net.{key}": value for key, value in encoder.state_dict().items()}
+    torch.save(
+        {"wearcap": {"config": json.dumps({"model": {"net": net}})}, "state_dict": state}, tmp_path / "e.ckpt"
+    )
+    prepare.main(["embeddings", f"dataset={filmed.root}", f"checkpoint={tmp_path}/e.ckpt"])
+    assert "5 written, 0 current, 0 failed" in capsys.readouterr().out
+    camera = RecordingStore.open(filmed.root).load("r0").camera
+    assert camera is not None
+    assert camera.embedding is not None
+    assert camera.embedding.shape == (28, 8)
+    with pytest.raises(WearcapError, match="encoder"):
+        prepare.main(["embeddings", f"dataset={filmed.root}", "encoder=egoveiw"])

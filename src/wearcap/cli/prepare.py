@@ -16,7 +16,11 @@ HELP = "make a data set: wearcap prepare simulated, wearcap prepare cmu source=D
 
 
 def run(config: DictConfig) -> Report:
-    """Prepare what the config describes."""
+    """Prepare what the config describes: recordings by `tasks`, or by `rework` a change to a data set that stands."""
+    if "rework" in config:
+        report = instantiate(config.rework, _convert_="all")
+        _tell(report, RecordingStore.open(config.output))
+        return report
     listed = splits_dir() / config.splits
     splits = read_splits(listed if listed.is_file() else Path(config.splits))
     tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits)

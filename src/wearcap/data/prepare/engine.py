@@ -90,13 +90,13 @@ def prepare(
         raise WearcapError("0 jobs", expected="a number of jobs, or -1 for one per core")
     store = RecordingStore(output)
     store.register({})  # no permission or no space is better known now than after the first hour
-    _remove_leftovers(store.root)
+    remove_leftovers(store.root)
     todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
     report = Report(current=sorted(names - {task.name for task in todo}))
     waiting: dict[str, Entry] = {}
     written_at = time.monotonic()
     try:
-        with _progress(len(tasks), len(report.current), progress) as advance:
+        with progress_bar(len(tasks), len(report.current), progress) as advance:
             for name, outcome, note in _outcomes(todo, store.root, jobs, backend, scheduler):
                 if isinstance(outcome, Entry):
                     waiting[name] = outcome
@@ -127,7 +127,7 @@ def _is_current(store: RecordingStore, task: Task) -> bool:
     return path.is_file() and path.stat().st_size == entry.bytes and sha256_of(path) == entry.sha256
 
 
-def _remove_leftovers(root: Path) -> None:
+def remove_leftovers(root: Path) -> None:
     """Temporary files of a run that was killed."""
     for folder in (root, root / "recordings"):
         for path in folder.glob(".*.tmp-*"):
@@ -209,7 +209,8 @@ def _backend(backend: str, jobs: int, scheduler: str | None) -> Iterator[bool]:
 
 
 @contextmanager
-def _progress(total: int, done: int, visible: bool) -> Iterator[Callable[[], None]]:
+def progress_bar(total: int, done: int, visible: bool) -> Iterator[Callable[[], None]]:
+    """A bar of recordings on stderr; call what it yields for each one that is done."""
     columns = (TextColumn("recordings"), BarColumn(), MofNCompleteColumn(), TextColumn("left:"),
                TimeRemainingColumn())  # fmt: skip
     with Progress(*columns, console=Console(stderr=True), disable=not visible) as bar:
