@@ -10,12 +10,14 @@ from hypothesis import strategies as st
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
+from wearcap.io import csv_table
 from wearcap.io.aria_mps import (
     R_CPF_DEVICE,
     head_stream,
     nominal_T_aria_cpf,
     read_closed_loop,
     read_mps,
+    read_mps_points,
     read_points,
     turn_up,
 )
@@ -155,6 +157,39 @@ def test_points_are_kept_by_their_certainty(tmp_path):
     assert cloud.points_world.tolist() == [[1, 2, 3], [0, 1, 2]]
     assert cloud.confidence is not None
     assert cloud.confidence.tolist() == pytest.approx([0.8, 0.2], abs=1e-6)
+
+
+POINTS = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std\n"
+SEEN = "uid,frame_tracking_timestamp_us,camera_serial,u,v\n"
+
+
+def test_points_know_when_they_were_first_seen(tmp_path, monkeypatch):
+    """Rows in any order, more than one piece of the file, ids beyond 2^53; the unsure and the unseen are left out."""
+    big = 2**60 + 1
+    (tmp_path / "semidense_points.csv").write_text(
+        POINTS
+        + f"9,g,1,0,0,0.001,0.001\n{big},g,2,0,0,0.001,0.001\n4,g,3,0,0,0.1,0.001\n7,g,4,0,0,0.001,0.001\n"
+    )
+    rows = [(big, 30), (9, 50), (4, 10), (big + 1, 1), (9, 20), (big, 40), (123, 5)]
+    with gzip.open(tmp_path / "semidense_observations.csv.gz", "wt") as file:
+        file.write(SEEN + "".join(f"{uid},{time}000000,0072510f,1.5,2.5\n" for uid, time in rows))
+    monkeypatch.setattr(csv_table.iter_columns, "__kwdefaults__", {"text": (), "whole": (), "rows": 3})
+    cloud = read_mps_points(tmp_path)
+    assert cloud is not None
+    assert cloud.first_seen is not None
+    assert cloud.points_world[:, 0].tolist() == [1, 2]
+    assert cloud.first_seen.tolist() == [20.0, 30.0]
+
+
+def test_observations_of_another_recording_and_damaged_ones_are_named(tmp_path):
+    points, seen = tmp_path / "p.csv", tmp_path / "seen.csv"
+    points.write_text(POINTS + "9,g,1,0,0,0.001,0.001\n")
+    for rows, message in (("8,1,c,1,1\n", "names none of the points"), ("", "no rows"), ("9,x,c,1,1\n", "not a table of numbers"),
+                          ("9,1.5,c,1,1\n", "not a table of numbers"), ("9\n", "not a table of numbers")):  # fmt: skip
+        seen.write_text(SEEN + rows)
+        with pytest.raises(WearcapError, match=message) as error:
+            read_points(points, observations=seen)
+        assert str(seen) in str(error.value)
 
 
 def test_folder_without_trajectory(tmp_path):

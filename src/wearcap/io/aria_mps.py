@@ -16,7 +16,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.io.csv_table import read_columns
+from wearcap.io.csv_table import iter_columns, read_columns
 from wearcap.io.poses import check_finite, checked_trajectory
 from wearcap.recording import HeadStream, PointCloud, Recording
 
@@ -32,6 +32,7 @@ R_CPF_DEVICE = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 _SUFFIXES = ("", ".gz", ".xz")
 _TRAJECTORY = ("closed_loop_trajectory.csv",)
 _POINTS = ("semidense_points.csv", "global_points.csv")
+_OBSERVATIONS = ("semidense_observations.csv",)
 _SUBFOLDERS = (".", "slam", "trajectory", "mps/slam", "mps/trajectory")
 
 
@@ -147,19 +148,45 @@ def read_points(
     max_inv_dist_std: float = MAX_INV_DIST_STD,
     max_dist_std: float = MAX_DIST_STD,
     up: str = "z",
+    observations: str | Path | None = None,
 ) -> PointCloud:
     """Semi-dense points that MPS is sure of; confidence 1 - inv_dist_std / max_inv_dist_std (ours), 0 … 1.
 
-    Raises WearcapError for missing columns or NaN positions.
+    `observations` is the file that says when points were seen (`semidense_observations.csv`, tens of millions of rows,
+    read in pieces): `first_seen` comes from it, and points that it does not name are left out.
+    Raises WearcapError for missing columns or NaN positions, and for the observations of another recording.
     """
     position = [f"p{axis}_world" for axis in "xyz"]
-    table = read_columns(path, [*position, "inv_dist_std", "dist_std"])
+    table = read_columns(path, [*position, "inv_dist_std", "dist_std"], whole=["uid"] if observations else [])
     points = np.stack([table[name] for name in position], 1)
     check_finite({"position": points}, path)
     keep = (table["inv_dist_std"] < max_inv_dist_std) & (table["dist_std"] < max_dist_std)
+    first_seen = None
+    if observations is not None:
+        seen = _first_seen(observations, table["uid"])
+        keep &= np.isfinite(seen)
+        first_seen = torch.from_numpy(seen[keep])
     confidence = 1 - table["inv_dist_std"][keep] / max_inv_dist_std
     points_world = torch.tensor(points[keep], dtype=torch.float32) @ turn_up(up).T
-    return PointCloud(points_world, torch.tensor(confidence, dtype=torch.float32))
+    return PointCloud(points_world, torch.tensor(confidence, dtype=torch.float32), first_seen)
+
+
+def _first_seen(path: str | Path, uid: np.ndarray) -> np.ndarray:
+    """When each point was first observed (s, the device's clock); infinite for points without an observation."""
+    order = np.argsort(uid, kind="stable")
+    known = uid[order]
+    first_us = np.full(len(uid), np.iinfo(np.int64).max)
+    for rows in iter_columns(path, [], whole=["uid", "frame_tracking_timestamp_us"]):
+        place = np.minimum(np.searchsorted(known, rows["uid"]), len(known) - 1)
+        named = known[place] == rows["uid"]
+        np.minimum.at(first_us, place[named], rows["frame_tracking_timestamp_us"][named])
+    if (first_us == np.iinfo(np.int64).max).all():
+        raise WearcapError(
+            "names none of the points", where=path, expected="the observations of the same recording"
+        )
+    seen = np.empty(len(uid))
+    seen[order] = np.where(first_us < np.iinfo(np.int64).max, first_us * 1e-6, np.inf)
+    return seen
 
 
 def find_mps_file(folder: str | Path, names: tuple[str, ...]) -> Path | None:
@@ -187,8 +214,20 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
         raise WearcapError("no closed_loop_trajectory.csv (plain, .gz or .xz)", where=folder,
                            expected="the output folder of Aria's MPS")  # fmt: skip
     head = head_stream(read_closed_loop(path).T_world_aria, fps=fps, T_aria_cpf=T_aria_cpf)
-    points = find_mps_file(folder, _POINTS)
     return Recording(
-        name=Path(folder).resolve().name, head=head, points=read_points(points) if points else None,
-        source="Aria MPS",
-    )  # fmt: skip
+        name=Path(folder).resolve().name, head=head, points=read_mps_points(folder), source="Aria MPS"
+    )
+
+
+def read_mps_points(folder: str | Path) -> PointCloud | None:
+    """Points of an MPS output folder, with the time of their first observation where that file is there, too."""
+    points = find_mps_file(folder, _POINTS)
+    if points is None:
+        return None
+    return read_points(points, observations=find_mps_file(folder, _OBSERVATIONS))
+
+
+def mps_files(folder: str | Path) -> list[Path]:
+    """The files that `read_mps` reads of a folder."""
+    found = (find_mps_file(folder, names) for names in (_TRAJECTORY, _POINTS, _OBSERVATIONS))
+    return [path for path in found if path is not None]

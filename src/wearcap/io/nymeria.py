@@ -20,7 +20,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate
 from wearcap.io.amass import PELVIS_SMPLH, A
-from wearcap.io.aria_mps import T_HEAD_DEVICE, find_mps_file, head_stream, read_closed_loop, read_points
+from wearcap.io.aria_mps import T_HEAD_DEVICE, find_mps_file, head_stream, read_closed_loop, read_mps_points
 from wearcap.io.head_alignment import align_head, clock_offset
 from wearcap.io.npz import read_npz, require
 from wearcap.recording import ContactTrack, HeadStream, Motion, Recording
@@ -155,11 +155,10 @@ def read_nymeria(folder: str | Path, *, fps: float = 60.0, clock_offset_s: float
         motion, contact, head = _on_device(suit, contacts, device, fps, clock_offset_s)
     except WearcapError as error:
         raise WearcapError(error.what, where=folder, expected=error.expected, fix=error.fix) from error
-    points = find_mps_file(slam, ("semidense_points.csv",))
     about = read_metadata(folder)
     return Recording(
         name=folder.resolve().name, head=head, motion=motion, contacts=contact, skeleton=motion.skeleton,
-        points=read_points(points) if points else None, source="Nymeria", license="Nymeria dataset licence", **about,
+        points=read_mps_points(slam), source="Nymeria", license="Nymeria dataset licence", **about,
     )  # fmt: skip
 
 

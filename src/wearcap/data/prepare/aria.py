@@ -6,10 +6,10 @@ from pathlib import Path
 from wearcap.data.prepare.engine import Task, content_hash
 from wearcap.data.prepare.splits import Splits
 from wearcap.errors import WearcapError
-from wearcap.io.aria_mps import is_mps_folder, read_mps
+from wearcap.io.aria_mps import is_mps_folder, mps_files, read_mps
 from wearcap.recording.recording import Recording
 
-VERSION = 1
+VERSION = 2
 """Raised when the same source and settings would give another recording."""
 
 
@@ -31,19 +31,27 @@ class AriaRecording:
 def aria_tasks(
     source: str | Path, splits: Splits, subject: str, fps: float | int, license: str
 ) -> list[Task]:
-    """One task per folder with a closed-loop trajectory, at or below `source`, named after the folder."""
+    """One task per closed-loop trajectory at or below `source`, named after its recording's folder."""
     source = Path(source)
     if not source.is_dir():
         raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
-    folders = sorted(path for path in [source, *source.rglob("*")] if path.is_dir() and is_mps_folder(path))
-    if not folders:
+    recordings = _recordings(source)
+    if not recordings:
         raise WearcapError("no MPS output", where=source, expected="folders with closed_loop_trajectory.csv")
     tasks = []
-    for folder in folders:
+    for folder in recordings:
         name = folder.resolve().name
-        files = sorted(path for path in folder.glob("*.csv*") if path.is_file())
-        digest = content_hash(name, subject, float(fps), VERSION, *files)
+        digest = content_hash(name, subject, float(fps), VERSION, *mps_files(folder))
         tasks.append(
             Task(name, AriaRecording(folder, name, subject, float(fps), license), splits.of(subject), digest)
         )
     return tasks
+
+
+def _recordings(source: Path) -> list[Path]:
+    """The outermost folder of each trajectory: REC of REC/slam and REC/mps/slam, too."""
+    folders: dict[Path, Path] = {}
+    for folder in sorted([source, *(path for path in source.rglob("*") if path.is_dir())]):
+        if is_mps_folder(folder):
+            folders.setdefault(mps_files(folder)[0], folder)
+    return list(folders.values())

@@ -6,10 +6,11 @@ from pathlib import Path
 from wearcap.data.prepare.engine import Task, content_hash
 from wearcap.data.prepare.splits import Splits
 from wearcap.errors import WearcapError
+from wearcap.io.aria_mps import mps_files
 from wearcap.io.nymeria import is_nymeria, read_metadata, read_nymeria
 from wearcap.recording.recording import Recording
 
-VERSION = 1
+VERSION = 2
 """Raised when the same source and settings would give another recording."""
 
 
@@ -27,7 +28,7 @@ class NymeriaSequence:
 
 
 def nymeria_tasks(source: str | Path, splits: Splits, fps: float | int, license: str) -> list[Task]:
-    """One task per sequence folder (with `body/xdata.npz`) below `source`; hashed by its motion and head path."""
+    """One task per sequence folder (with `body/xdata.npz`) below `source`; hashed by its motion, head path and points."""
     source = Path(source)
     if not source.is_dir():
         raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
@@ -38,7 +39,7 @@ def nymeria_tasks(source: str | Path, splits: Splits, fps: float | int, license:
     for folder in folders:
         name = folder.resolve().name
         about = read_metadata(folder)
-        paths = sorted((folder / "recording_head" / "mps" / "slam").glob("closed_loop_trajectory.csv*"))
+        paths = mps_files(folder / "recording_head")
         sequence = NymeriaSequence(folder, name, fps, license)
         settings_hash = content_hash(name, float(fps), VERSION, about, folder / "body" / "xdata.npz", *paths)
         tasks.append(Task(name, sequence, splits.of(about["subject"]), settings_hash))
