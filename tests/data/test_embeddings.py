@@ -1,6 +1,7 @@
 """Embeddings of head camera pictures: right rows, mirrored ones, kept by content, clear about what is wrong."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
