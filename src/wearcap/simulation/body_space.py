@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
-import torch
 from jaxtyping import Float, Int
 
 from wearcap.body.kinematics import site_positions
@@ -22,7 +21,10 @@ _SIDE = (
     ("shoulder", "elbow", 0.055, 0.027, "arm"), ("elbow", "wrist", 0.045, 0.016, "arm"),
     ("wrist", "fingertip", 0.035, 0.006, "hand"),
 )  # fmt: skip
-LIMBS = (*_MIDDLE, *((f"{side}_{a}", f"{side}_{b}", *rest) for side in ("left", "right") for a, b, *rest in _SIDE))
+LIMBS = (
+    *_MIDDLE,
+    *((f"{side}_{a}", f"{side}_{b}", *rest) for side in ("left", "right") for a, b, *rest in _SIDE),
+)
 """Capsules of an adult: joint or site at either end, radius (m), share of the body's mass (after de Leva), part."""
 
 PARTS = ("seat", "trunk", "shin", "foot", "arm", "hand")
@@ -55,7 +57,7 @@ class BodySpace:
             longest = float(np.linalg.norm(end - start, axis=1).max())
             share = np.linspace(0.0, 1.0, max(2, int(np.ceil(longest / SPACING_M)) + 1))[:, None, None]
             points = (start + share * (end - start)).reshape(-1, 3)
-            points = points + [0.0, 0.0, SOLE_M if part == "foot" else 0.0]
+            points[:, 2] += SOLE_M if part == "foot" else 0.0
             groups.setdefault((radius, PARTS.index(part)), []).append(points)
         thinned = {kind: _thinned(np.concatenate(points)) for kind, points in groups.items()}
         counts = [len(points) for points in thinned.values()]
@@ -141,7 +143,9 @@ class SweptFloor:
         clear = np.full((len(TOPS_M), *shape), np.inf)
         for radius in np.unique(size):
             lowest = np.full(shape, np.inf)
-            np.minimum.at(lowest, tuple(c[size == radius] for c in cell), body.points[size == radius, 2] - radius)
+            np.minimum.at(
+                lowest, tuple(c[size == radius] for c in cell), body.points[size == radius, 2] - radius
+            )
             for layer, top in zip(clear, TOPS_M):
                 if (taken := lowest < top).any():
                     away = np.asarray(scipy.ndimage.distance_transform_edt(~taken)) * CELL_M

@@ -43,6 +43,7 @@ NEAR_SEAT = {"hand": 0.08, "foot": 0.03, "shin": 0.02}
 SEATS = ("chair", "bench", "armchair", "sofa", "bed", "stool", "stool", "pedestal")
 THICK_M = 0.04
 """Of boards and rungs."""
+POST_M = 0.035
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,13 +108,17 @@ def find_treads(motion: Motion, sits: list[Sit]) -> list[Tread]:
     flying = np.gradient(np.gradient(smooth, step_s), step_s) < FLYING
     seated = np.zeros(len(feet), bool)
     for sit in sits:
-        near = np.linalg.norm(motion.t_world_root.double().numpy() - sit.place - [0, 0, PELVIS_OVER_SEAT_M], axis=1)
+        near = np.linalg.norm(
+            motion.t_world_root.double().numpy() - sit.place - [0, 0, PELVIS_OVER_SEAT_M], axis=1
+        )
         seated |= near < 0.15
     soles = feet.reshape(len(feet), 2, 2, 3)
     patch = soles[..., 2].argmin(2)
     lowest = np.take_along_axis(soles, patch[..., None, None], 2)[:, :, 0]
     resting = np.stack([_speed(motion, lowest[:, side]) for side in (0, 1)], 1) < RESTING
-    above = (lowest[..., 2] > LOWEST_STEP_M) & (motion.t_world_root.double().numpy()[:, None, 2] > lowest[..., 2] + 0.3)
+    above = (lowest[..., 2] > LOWEST_STEP_M) & (
+        motion.t_world_root.double().numpy()[:, None, 2] > lowest[..., 2] + 0.3
+    )
     lower = lowest[..., 2] <= lowest[..., 2].min(1, keepdims=True) + 0.02
     stands = resting & above & lower & ~flying[:, None] & ~seated[:, None]
     rests = resting & above & seated[:, None]
@@ -141,7 +146,9 @@ def _merged(soles: Float[np.ndarray, "time 2 2 3"], spans: list[tuple[int, int, 
         new = Tread(xy.min(0) - SOLE_WIDTH_M / 2, xy.max(0) + SOLE_WIDTH_M / 2, z, heading)
         for other in [t for t in treads if _one_step(t, new)]:
             treads.remove(other)
-            new = Tread(np.minimum(new.low, other.low), np.maximum(new.high, other.high), min(z, other.z), heading)
+            new = Tread(
+                np.minimum(new.low, other.low), np.maximum(new.high, other.high), min(z, other.z), heading
+            )
         treads.append(new)
     return sorted(treads, key=lambda tread: tread.z)
 
@@ -181,13 +188,20 @@ def meets(
     may_touch: dict[str, float] | None = None,
 ) -> bool:  # fmt: skip
     """Whether a body comes nearer than `margin` (m) to a piece at a place in the world, as `BodySpace.meets`."""
-    body = body.around(position, float(np.hypot(*piece.size)) / 2 + 4.0)
+    corners = np.array([np.abs(part.center) + np.array(box_size(part)) / 2 for part in piece.parts])
+    reach = float(np.linalg.norm(corners.max(0)))
+    body = body.around(position, reach + margin)
     for part in piece.parts:
-        size = np.array(part.size if part.sides == 4 else (part.size[0], part.size[0], part.size[2]))
-        center = position + [*(turn(heading) @ np.array(part.center[:2])), part.center[2]]
+        size = np.array(box_size(part))
+        center = position + np.append(turn(heading) @ np.array(part.center[:2]), part.center[2])
         if body.meets(center, size, heading, margin, may_touch):
             return True
     return False
+
+
+def box_size(part: Part) -> tuple[float, float, float]:
+    """Of the box around a part of a piece (m)."""
+    return part.size if part.sides == 4 else (part.size[0], part.size[0], part.size[2])
 
 
 def _stool(rng: np.random.Generator) -> Piece:
@@ -229,7 +243,9 @@ def _of_height(piece: Piece, factor: float) -> Piece:
     return replace(piece, parts=parts, seats=seats, z_range=(factor * low, factor * high), reaches=())
 
 
-def build_tread(builder: WorldBuilder, body: BodySpace, tread: Tread, rng: np.random.Generator) -> Tread | None:
+def build_tread(
+    builder: WorldBuilder, body: BodySpace, tread: Tread, rng: np.random.Generator
+) -> Tread | None:
     """Build a step down to the floor, else a board or a rung, as large as the body leaves room for.
 
     Returns what was built (`heading` and corners of the world); None where not even a rung fits.
@@ -242,7 +258,7 @@ def build_tread(builder: WorldBuilder, body: BodySpace, tread: Tread, rng: np.ra
         small = replace(tread, low=low, high=high, z=tread.z - lower)
         if _clear(body, small, solid):
             grown = _grown(body, small, solid, rng)
-            _add_step(builder, grown, solid, rng)
+            _add_step(builder, body, grown, solid, rng)
             return grown
     return None
 
@@ -259,7 +275,11 @@ def _clear(body: BodySpace, tread: Tread, solid: bool) -> bool:
 
 def _grown(body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator) -> Tread:
     """The tread widened on all sides while nothing of the body is in the way, up to a drawn size."""
-    most = np.array([rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)]) if solid else np.array([0.0, rng.uniform(0.45, 0.6)])
+    most = (
+        np.array([rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)])
+        if solid
+        else np.array([0.0, rng.uniform(0.45, 0.6)])
+    )
     open_sides = [(axis, way) for axis in (1, 0) for way in (-1, 1)]
     while open_sides:
         for axis, way in list(open_sides):
@@ -273,15 +293,24 @@ def _grown(body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator)
     return tread
 
 
-def _add_step(builder: WorldBuilder, tread: Tread, solid: bool, rng: np.random.Generator) -> None:
+def _add_step(
+    builder: WorldBuilder, body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator
+) -> None:
+    """The step, and for a board the posts that carry it where the body leaves room."""
     heading = tread.heading - builder.heading
     middle = builder.from_world(tread.center)
     shade = rng.uniform(0.8, 1.1)
-    color = tuple(shade * c for c in (0.5, 0.425, 0.35))
+    color = (0.5 * shade, 0.425 * shade, 0.35 * shade)
     outline = rectangle(tuple(middle.tolist()), tuple(tread.size.tolist()), heading)
+    thick = tread.z if solid else THICK_M
     builder.add_surface(
-        "stairs_step", outline, color, plane=(0.0, 0.0, tread.z), texture=8.0, thickness=tread.z if solid else THICK_M
+        "stairs_step", outline, color, plane=(0.0, 0.0, tread.z), texture=12.0, thickness=thick
     )
+    for side in () if solid else (-1, 1):
+        end = tread.center + turn(tread.heading) @ np.array([0.0, side * (tread.size[1] / 2 + POST_M / 2)])
+        center, size = np.array([*end, tread.z / 2]), np.array([POST_M, POST_M, tread.z])
+        if not body.meets(center, size, tread.heading, 0.0, ON_STEP):
+            builder.add_box((*builder.from_world(end), tread.z / 2), size, color, 8.0, heading)
 
 
 def _thigh_angle(motion: Motion) -> Float[np.ndarray, "time"]:

@@ -16,9 +16,9 @@ from wearcap.simulation.flat import before_door
 from wearcap.simulation.furnish import ROOM_KINDS, Box, Plan
 from wearcap.simulation.furniture import MAKERS, wood
 from wearcap.simulation.outdoor import PAVEMENT_THINGS, SQUARE_THINGS, put_somewhere
-from wearcap.simulation.outline import rectangle, turn
+from wearcap.simulation.outline import rectangle
 from wearcap.simulation.street import barrier, build_facade, slab
-from wearcap.simulation.supports import build_seat, build_tread, find_sits, find_treads, meets
+from wearcap.simulation.supports import box_size, build_seat, build_tread, find_sits, find_treads, meets
 from wearcap.simulation.walls import HEIGHT, Wall, build_wall
 from wearcap.simulation.world import Room, World
 
@@ -32,17 +32,39 @@ BEYOND_M = 7.0
 """Of floor around the body that are looked at."""
 FAST, TALL_M = 2.0, HEIGHT - 0.25
 """Whoever travels faster (m/s), or reaches higher, is mostly, or always, outdoors."""
-NEAR_INDOORS = ("table", "chair", "coffee_table", "armchair", "plant", "lamp", "cabinet", "desk", "shelf", "sofa")
-NEAR_OUTDOORS = ("bench", "bin", "bollard", "planter", "bush", "street_lamp", "low_wall", "tree", "letter_box", "board")
+NEAR_INDOORS = (
+    "table",
+    "chair",
+    "coffee_table",
+    "armchair",
+    "plant",
+    "lamp",
+    "cabinet",
+    "desk",
+    "shelf",
+    "sofa",
+)
+NEAR_OUTDOORS = (
+    "bench",
+    "bin",
+    "bollard",
+    "planter",
+    "bush",
+    "street_lamp",
+    "low_wall",
+    "tree",
+    "letter_box",
+    "board",
+)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class FreePlan(Plan):
     """A plan that also keeps off the space that a moving body takes."""
 
-    body: BodySpace = None  # type: ignore[assignment]
+    body: BodySpace
     """In the world."""
-    swept: SweptFloor = None  # type: ignore[assignment]
+    swept: SweptFloor
     """In the builder's frame."""
 
     def distance(self, piece: Piece, x: float, y: float, heading: float) -> float:
@@ -53,9 +75,15 @@ class FreePlan(Plan):
         if self.distance(piece, x, y, heading) < MARGIN_M:
             return False
         place = np.array([*self.builder.to_world(np.array([x, y])), self.z])
-        if meets(self.body, piece, place, heading + self.builder.heading, MARGIN_M):
+        if _overhangs(piece) and meets(self.body, piece, place, heading + self.builder.heading, MARGIN_M):
             return False
         return super().try_place(piece, x, y, heading, front)
+
+
+def _overhangs(piece: Piece) -> bool:
+    """Whether parts reach beyond the piece's outline, or above its height, as the crown of a tree does."""
+    room = np.array([*piece.size, 2 * piece.z_range[1]]) / 2 + 0.03
+    return any((np.abs(part.center) + np.array(box_size(part)) / 2 > room).any() for part in piece.parts)
 
 
 def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
@@ -135,7 +163,9 @@ def _room(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generator)
             _passage(builder, wall, color, rng)
         elif rng.uniform() < 0.7:
             count = max(1, int(wall.length / 3.0))
-            wall.windows += [(wall.length * (k + 0.5) / count, float(rng.uniform(0.9, 1.4))) for k in range(count)]
+            wall.windows += [
+                (wall.length * (k + 0.5) / count, float(rng.uniform(0.9, 1.4))) for k in range(count)
+            ]
         build_wall(builder, wall, color, rng)
     plan.room = (box[0] + 0.07, box[1] + 0.07, box[2] - 0.07, box[3] - 0.07)
     plan.kept_free += [before_door(builder, door) for door in builder.doors]
@@ -167,7 +197,9 @@ def _beside(plan: FreePlan, kinds: tuple[str, ...], way: np.ndarray, rng: np.ran
         for _ in range(40):
             angle, reach = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 2.2)
             x, y = way[rng.integers(len(way))] + reach * np.array([np.cos(angle), np.sin(angle)])
-            heading = float(rng.integers(4) * np.pi / 2 + (rng.normal(0.0, 0.3) if piece.kind == "chair" else 0.0))
+            heading = float(
+                rng.integers(4) * np.pi / 2 + (rng.normal(0.0, 0.3) if piece.kind == "chair" else 0.0)
+            )
             near = plan.distance(piece, float(x), float(y), heading)
             if NEAR_M[0] <= near <= NEAR_M[1] and plan.try_place(piece, float(x), float(y), heading):
                 break
@@ -180,7 +212,15 @@ def _street(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generato
     box = (reach[0] - ends[0], reach[1] - across, reach[2] + ends[1], reach[3] + front)
     light = rng.uniform(0.32, 0.7)
     warm = 1.0 + rng.uniform(0.0, 0.12)
-    slab(builder, "floor", box, 0.0, 0.05, (light * warm, light, light * 0.98), float(rng.choice([3.0, 5.0, 6.0])))
+    slab(
+        builder,
+        "floor",
+        box,
+        0.0,
+        0.05,
+        (light * warm, light, light * 0.98),
+        float(rng.choice([3.0, 5.0, 6.0])),
+    )
     middle, size = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), (box[2] - box[0], box[3] - box[1])
     builder.rooms.append(Room("street", builder.to_world(rectangle(middle, size)), 0.0, open_air=True))
     builder.add_box((*middle, -0.11), (size[0] + 24.0, size[1] + 24.0, 0.1), (0.42, 0.52, 0.32), 1.0)
