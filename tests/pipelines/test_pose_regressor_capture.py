@@ -18,7 +18,7 @@ HANDS = ("head", "left_wrist", "right_wrist")
 
 def pipeline(points: tuple[str, ...] = ("head",), **changes) -> PoseRegressorCapture:
     torch.manual_seed(0)
-    tracked = TrackedPoints(points)
+    tracked = TrackedPoints(points, "world")  # a floor told by the whole path would say what comes
     net = PoseRegressor(tracked.size, 138, 40, 32, 2, 4, 64, frames_per_token=4)
     # Bends of some degrees about the rest pose, as a trained one tells them.
     net.motion_normalizer.set(encode_pose(torch.eye(3).expand(23, 3, 3), torch.eye(3)), torch.full((138,), 0.2))  # fmt: skip

@@ -8,7 +8,7 @@ from wearcap.models.denoiser import Normalizer
 
 
 class _Layer(nn.Module):
-    """Attention and MLP, each after a layer norm; only the last `wanted` tokens ask and come out."""
+    """Attention and MLP, each after a layer norm; with `last` only the last token asks and comes out."""
 
     def __init__(self, width: int, heads: int, feedforward: int, dropout: float):
         super().__init__()
@@ -19,13 +19,11 @@ class _Layer(nn.Module):
         )
 
     def forward(
-        self, x: Float[Tensor, "batch token width"], valid: Bool[Tensor, "batch token"], wanted: int
-    ) -> Float[Tensor, "batch wanted width"]:
+        self, x: Float[Tensor, "batch token width"], valid: Bool[Tensor, "batch token"], last: bool
+    ) -> Float[Tensor, "batch out width"]:
         seen = self.norm_attention(x)
-        attended, _ = self.attention(
-            seen[:, -wanted:], seen, seen, key_padding_mask=~valid, need_weights=False
-        )
-        x = x[:, -wanted:] + attended
+        asking, x = (seen[:, -1:], x[:, -1:]) if last else (seen, x)
+        x = x + self.attention(asking, seen, seen, key_padding_mask=~valid, need_weights=False)[0]
         return x + self.mlp(self.norm_mlp(x))
 
 
@@ -73,6 +71,6 @@ class PoseRegressor(nn.Module):
         x = self.embed(frames.unflatten(1, (-1, self.frames_per_token)).flatten(2)) + self.position
         token_valid = valid.unflatten(1, (-1, self.frames_per_token)).any(-1)
         for index, layer in enumerate(self.layers):
-            x = layer(x, token_valid, 1 if index == len(self.layers) - 1 else x.shape[1])
+            x = layer(x, token_valid, last=index == len(self.layers) - 1)
         last = self.norm(x[:, -1])
         return self.motion_normalizer.inverse(torch.cat([self.root(last), self.joints(last)], -1))
