@@ -18,7 +18,7 @@ def paths(clip: Clip, walking: bool) -> Float[Tensor, "window frame channel"]:
     R_head = windows_of(clip.R_world_head)[chosen]
     t_head = windows_of(clip.joints["head"])[chosen]
     floor = windows_of(clip.floor)[chosen]
-    stature = torch.full((len(t_head),), clip.stature)
+    stature = torch.full((len(t_head), 1), clip.stature)
     head = HeadFeatures().condition(R_head, t_head, floor, stature, float(FPS))
     R_heading_world = rotation.about_axis("z", -rotation.yaw_of(R_head))
     channels = [head]

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from wearcap.data.features import HeadFeatures
+from wearcap.body.skeleton import xsens23
+from wearcap.data.features import HeadFeatures, body_size
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 
@@ -15,7 +16,7 @@ def path(batch: int = 2, time: int = 20):
     heading = rotation.about_axis("z", torch.linspace(0, 1.5, time).expand(batch, time))
     R = heading @ rotation.exp(0.2 * torch.randn(batch, time, 3))
     t = torch.cumsum(0.02 * torch.randn(batch, time, 3), 1) + torch.tensor([1.0, 2.0, 1.6])
-    return R, t, torch.zeros(batch, time), torch.full((batch,), 1.6)
+    return R, t, torch.zeros(batch, time), torch.full((batch, 4), 1.6)
 
 
 @pytest.mark.parametrize("frame", ["heading", "window"])
@@ -47,7 +48,7 @@ def test_velocities_are_per_second_and_in_the_heading():
     R = rotation.about_axis("z", yaw)
     left = R[..., 1]
     t = torch.cumsum(1.2 / FPS * left, 1)
-    condition = HeadFeatures(height="floor").condition(R, t, torch.zeros(1, 30), torch.ones(1), FPS)
+    condition = HeadFeatures(height="floor").condition(R, t, torch.zeros(1, 30), torch.ones(1, 4), FPS)
     assert torch.allclose(condition[0, 5:, 7:10], torch.tensor([0.0, 1.2, 0.0]), atol=0.02)
     assert torch.allclose(condition[0, 5:, 10:13], torch.tensor([0.0, 0.0, 0.5]), atol=1e-3)
 
@@ -57,9 +58,32 @@ def test_poses_round_trip(frame):
     features = HeadFeatures(frame)
     R_head, *_ = path()
     R = rotation.exp(torch.randn(2, 20, 23, 3))
-    motion = features.encode(R, R_head)
+    contact = torch.rand(2, 20, 2)
+    motion = features.encode(R, R_head, contact)
     assert motion.shape[-1] == features.motion_size
-    assert torch.allclose(features.decode(motion, R_head), R, atol=1e-5)
+    decoded, none = features.decode(motion, R_head)
+    assert torch.allclose(decoded, R, atol=1e-5)
+    assert not none.any()
+
+
+def test_contacts_round_trip_and_are_probabilities():
+    features = HeadFeatures(contacts=True)
+    R_head, *_ = path()
+    contact = torch.rand(2, 20, 2)
+    motion = features.encode(rotation.exp(torch.randn(2, 20, 23, 3)), R_head, contact)
+    assert motion.shape[-1] == features.motion_size == 140
+    assert torch.allclose(features.decode(motion, R_head)[1], contact, atol=1e-6)
+    assert features.decode(3 * motion, R_head)[1].amax() <= 1
+
+
+def test_the_condition_tells_the_body_where_asked_to():
+    R, t, floor, _ = path()
+    size = body_size(xsens23()).expand(2, -1)
+    plain, told = (HeadFeatures(body=body).condition(R, t, floor, size, FPS) for body in (False, True))
+    assert torch.equal(told[..., : plain.shape[-1]], plain)
+    assert torch.equal(told[0, 3, plain.shape[-1] :], size[0])
+    assert 0.7 < size[0, 1] < 1.0
+    assert size[0, 0] > size[0, 1] > size[0, 2] > 0.4
 
 
 def test_unknown_choices_are_named():

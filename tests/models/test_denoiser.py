@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from wearcap.models.denoiser import MotionDenoiser, Normalizer
+from wearcap.models.denoiser import Conditions, MotionDenoiser, Normalizer
 
 
 def small(**changes) -> MotionDenoiser:
@@ -12,6 +12,18 @@ def small(**changes) -> MotionDenoiser:
     for parameter in net.parameters():  # zero-initialised gates would hide what the blocks do
         torch.nn.init.normal_(parameter, std=0.1)
     return net.eval()
+
+
+def told(head: torch.Tensor, points: int = 0, image: int = 0) -> Conditions:
+    """Conditions of a head alone, or with random points and pictures everywhere."""
+    batch, time, _ = head.shape
+    there = torch.ones(batch, time, dtype=torch.bool)
+    return Conditions(head, torch.randn(batch, time, points), there, torch.randn(batch, time, image), there)
+
+
+def denoise(net: MotionDenoiser, x_t, level, condition, valid) -> torch.Tensor:
+    """x̂0 from a head's condition alone."""
+    return net(x_t, level, net.encode(told(condition), valid), valid)
 
 
 def inputs(time: int = 16):
@@ -29,22 +41,22 @@ def test_padding_changes_nothing_on_the_frames_that_exist(frames_per_token):
     net = small(frames_per_token=frames_per_token)
     x_t, level, condition, valid = inputs()
     valid[:, 8:] = False
-    out = net(x_t, level, condition, valid)
+    out = denoise(net, x_t, level, condition, valid)
     x_t[:, 8:], condition[:, 8:] = 99.0, -99.0
-    assert torch.allclose(net(x_t, level, condition, valid)[:, :8], out[:, :8], atol=1e-5)
+    assert torch.allclose(denoise(net, x_t, level, condition, valid)[:, :8], out[:, :8], atol=1e-5)
 
 
 def test_a_window_without_any_frame_is_finite():
     x_t, level, condition, valid = inputs()
-    assert small()(x_t, level, condition, valid & False).isfinite().all()
+    assert denoise(small(), x_t, level, condition, valid & False).isfinite().all()
 
 
 def test_level_per_frame_equals_level_per_window_when_all_are_the_same():
     net = small(frames_per_token=4)
     x_t, level, condition, valid = inputs()
     assert torch.allclose(
-        net(x_t, level, condition, valid),
-        net(x_t, level.expand(2, 16).contiguous(), condition, valid),
+        denoise(net, x_t, level, condition, valid),
+        denoise(net, x_t, level.expand(2, 16).contiguous(), condition, valid),
         atol=1e-5,
     )
 
@@ -52,10 +64,12 @@ def test_level_per_frame_equals_level_per_window_when_all_are_the_same():
 def test_level_condition_and_order_of_frames_matter():
     net = small()
     x_t, level, condition, valid = inputs()
-    out = net(x_t, level, condition, valid)
-    assert not torch.allclose(net(x_t, 1 - level, condition, valid), out, atol=1e-3)
-    assert not torch.allclose(net(x_t, level, condition + 1, valid), out, atol=1e-3)
-    assert not torch.allclose(net(x_t.flip(1), level, condition.flip(1), valid).flip(1), out, atol=1e-3)
+    out = denoise(net, x_t, level, condition, valid)
+    assert not torch.allclose(denoise(net, x_t, 1 - level, condition, valid), out, atol=1e-3)
+    assert not torch.allclose(denoise(net, x_t, level, condition + 1, valid), out, atol=1e-3)
+    assert not torch.allclose(
+        denoise(net, x_t.flip(1), level, condition.flip(1), valid).flip(1), out, atol=1e-3
+    )
 
 
 def test_window_must_split_into_tokens():
@@ -77,12 +91,44 @@ def test_blending_is_smoother_and_never_mixes_in_padding():
     x_t, level, condition, valid = inputs()
     valid[:, 10:] = False
     blended = small(blend=5)
-    out = blended(x_t, level, condition, valid)
+    out = denoise(blended, x_t, level, condition, valid)
     x_t[:, 10:] = 50.0
-    assert torch.allclose(blended(x_t, level, condition, valid)[:, :10], out[:, :10], atol=1e-5)
+    assert torch.allclose(denoise(blended, x_t, level, condition, valid)[:, :10], out[:, :10], atol=1e-5)
     plain = blended.blend
     blended.blend = None
-    rough = blended(x_t, level, condition, valid)[:, :10]
+    rough = denoise(blended, x_t, level, condition, valid)[:, :10]
     assert out[:, :10].diff(dim=1).square().mean() < 0.5 * rough.diff(dim=1).square().mean()
     constant = torch.ones(2, 16, 12)
     assert torch.allclose(plain(constant, valid)[:, :10], constant[:, :10])
+
+
+def test_a_missing_modality_is_null_whatever_its_numbers_are():
+    net = small(points_size=3, image_size=4)
+    _, _, head, valid = inputs()
+    whole = told(head, 3, 4)
+    blind = whole._replace(points_valid=valid & False, image_valid=valid & False)
+    other = blind._replace(points=blind.points + 5, image=blind.image * torch.inf)
+    assert torch.equal(net.encode(blind, valid), net.encode(other, valid))
+    for part in ("points", "image"):
+        changed = whole._replace(**{part: getattr(whole, part) + 1})
+        assert not torch.allclose(net.encode(changed, valid), net.encode(whole, valid), atol=1e-3)
+        gone = whole._replace(**{f"{part}_valid": valid & False})
+        assert not torch.allclose(net.encode(gone, valid), net.encode(whole, valid), atol=1e-3)
+
+
+def test_a_scene_at_the_null_vector_is_not_taken_for_a_missing_one():
+    net = small(points_size=3, frames_per_token=4)
+    _, _, head, valid = inputs()
+    points = net.condition_encoder.points
+    at_null = told(head, 3)._replace(points=points.normalizer.inverse(points.null).expand(2, 16, 3))
+    gone = at_null._replace(points_valid=valid & False)
+    assert not torch.allclose(net.encode(at_null, valid), net.encode(gone, valid), atol=1e-3)
+
+
+def test_self_conditioning_listens_to_the_last_answer():
+    net = small(self_conditioning=True)
+    x_t, level, head, valid = inputs()
+    encoded = net.encode(told(head), valid)
+    first = net(x_t, level, encoded, valid)
+    assert torch.equal(net(x_t, level, encoded, valid, torch.zeros_like(x_t)), first)
+    assert not torch.allclose(net(x_t, level, encoded, valid, first), first, atol=1e-3)

@@ -18,10 +18,13 @@ class Spy(nn.Module):
 
     def __init__(self, net: MotionDenoiser, answer: torch.Tensor):
         super().__init__()
-        self.motion_normalizer, self.condition_normalizer = net.motion_normalizer, net.condition_normalizer
+        self.motion_normalizer, self.self_conditioning = net.motion_normalizer, False
         self.answer = answer
 
-    def forward(self, x_t, level, condition, valid):
+    def encode(self, conditions, valid):
+        return conditions.head
+
+    def forward(self, x_t, level, encoded, valid):
         self.level = level
         return self.answer
 
@@ -29,9 +32,9 @@ class Spy(nn.Module):
 def system(batch, level_tilt: float) -> MotionDiffusion:
     features = HeadFeatures()
 
-    def net(motion_size, condition_size):
+    def net(motion_size, condition_size, points_size, image_size):
         plain = MotionDenoiser(motion_size, condition_size, 60, 32, 1, 4, 32, 0.0, 4)
-        return Spy(plain, features.encode(batch.R_parent_joint, batch.R_world_head))
+        return Spy(plain, features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact))
 
     weights = {"motion": 1.0, "joints": 1.0, "velocity": 1.0}
     return MotionDiffusion(net, features, CosineSchedule(), xsens23(), 60.0, weights, torch.optim.AdamW,

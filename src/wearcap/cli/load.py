@@ -60,10 +60,7 @@ def load_pipeline(
         return made(**system.pipeline_parts(), device=device)
     if not isinstance(system, MotionDiffusion):
         raise WearcapError(f"{name} needs a motion denoiser", where=given[0], expected="a checkpoint of one, not of another network")  # fmt: skip
-    return made(
-        net=system.net, features=system.features, schedule=system.schedule, skeleton=system.skeleton,
-        fps=system.fps, device=device,
-    )  # fmt: skip
+    return made(**system.pipeline_parts(), device=device)
 
 
 def staged(pipeline: StagedPipeline, config: DictConfig, data: str | Path, console: Console) -> StagedCapture:

@@ -65,7 +65,7 @@ class ContactDataset(Dataset):
         self.window, self.stride, self.fps, self.classes = window, stride, fps, classes
         self.skeleton, self.stream, self.augmentation = skeleton, stream, augmentation
         self.longest = math.ceil(window * augmentation.stretch) + 1
-        self.paths, self.starts, self.weights = share_out(
+        self.recordings, self.starts, self.weights = share_out(
             sources, split, window=window, stride=stride, fps=fps, balance=balance, min_frames=self.longest
         )
 
@@ -76,7 +76,8 @@ class ContactDataset(Dataset):
         index, seed = item if isinstance(item, tuple) else (item, item)
         random = torch.Generator().manual_seed(seed)
         recording, start, _ = self.starts[index].tolist()
-        poses = _poses(self.paths[recording], self.stream, self.skeleton.name, self.fps)
+        store, name = self.recordings[recording]
+        poses = _poses(store.path_of(name), self.stream, self.skeleton.name, self.fps)
         shift, mirrored, speed = torch.rand(3, generator=random).tolist()
         if self.augmentation != NONE:
             start += int(shift * self.stride)

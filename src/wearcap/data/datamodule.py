@@ -10,7 +10,9 @@ from torch.utils.data import DataLoader
 from wearcap.data.contact_features import PoseFeatures
 from wearcap.data.contact_windows import NONE, Augmentation, ContactDataset
 from wearcap.data.statistics import collate
+from wearcap.data.surroundings import NOTHING, Surroundings
 from wearcap.data.windows import FixedSampler, SeededSampler, Source, WindowDataset
+from wearcap.recording.store import RecordingStore
 
 
 @runtime_checkable
@@ -96,18 +98,27 @@ class MotionWindows(SeededWindows):
         augment: bool = True,
         balance: float = 1.0,
         val_sources: dict[str, dict | None] | None = None,
+        surroundings: Surroundings = NOTHING,
+        beginnings: float = 0.0,
     ):
-        """See `SeededWindows`; `balance`: see `WindowDataset`, for training alone."""
+        """See `SeededWindows`; `balance` and `beginnings`: see `WindowDataset`, for training alone."""
         super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
         self.window, self.stride, self.fps = window, stride, fps
         self.augment, self.balance = augment, balance
+        self.surroundings, self.beginnings = surroundings, beginnings
 
     def dataset(self, split: str) -> WindowDataset:
-        """Windows of a split; the training split is jittered and mirrored."""
+        """Windows of a split; the training split is jittered and mirrored. Codes of points are made where they lack."""
         train = split == "train"
+        sources = self.sources if train else self.val_sources
+        if self.surroundings.places is not None:
+            for source in sources:
+                store = RecordingStore.open(source.root)
+                self.surroundings.places.prepare(store, store.names(split))
         return WindowDataset(
-            self.sources if train else self.val_sources, split, window=self.window, stride=self.stride, fps=self.fps,
-            mirror=self.augment and train, balance=self.balance if train else 1.0,
+            sources, split, window=self.window, stride=self.stride, fps=self.fps, mirror=self.augment and train,
+            balance=self.balance if train else 1.0, surroundings=self.surroundings,
+            beginnings=self.beginnings if train else 0.0,
         )  # fmt: skip
 
 

@@ -1,32 +1,144 @@
-"""The floor beneath the wearer, from the best that a recording has."""
+"""The floor beneath the wearer, as sensed: from points of the surroundings, or from the head's path alone."""
 
+from collections import defaultdict, deque
+
+import numpy as np
 import torch
 from jaxtyping import Float, Float64
+from scipy.ndimage import percentile_filter
 from torch import Tensor
 
-from wearcap.recording import Recording
-from wearcap.scene.floor import EYE_HEIGHT_OF_STATURE, estimate_floor, floor_from_head
+from wearcap.errors import WearcapError
+from wearcap.recording import PointCloud
+from wearcap.scene.floor import estimate_floor
 
 MIN_POINTS = 500
 """Fewer points than this say nothing about a floor."""
+UPRIGHT_WITHIN_S = 30.0
+"""Someone stands or walks upright for a tenth of any such stretch."""
+_LOOK_EVERY_S = 0.25
+LOOK_FRAMES = 10
+"""A tracked floor is looked at once in so many frames."""
+RECENT_S = 6.0
+"""Stretch of the path that a tracked floor is found for."""
+_TILE_M = 2.5
 
 
-def floor_beneath(
-    recording: Recording,
+def floor_from_path(
+    timestamps: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"], stature: float
+) -> Float[Tensor, "time"]:
+    """Floor height (m) beneath each head position from the head alone: its usual height within half a minute, less
+    `stature`, the head joint's height in the rest pose (m). Stairs are followed late, long sits mistaken for steps.
+    """
+    every = torch.arange(timestamps[0].item(), timestamps[-1].item() + _LOOK_EVERY_S, _LOOK_EVERY_S).double()
+    seen = interpolate(timestamps, t_world_head[:, 2], every).numpy()
+    upright = percentile_filter(seen, 90, size=int(UPRIGHT_WITHIN_S / _LOOK_EVERY_S), mode="nearest")
+    return interpolate(every, torch.from_numpy(np.asarray(upright) - stature).float(), timestamps)
+
+
+def floor_from_points(
+    cloud: PointCloud | None, t_world_head: Float[Tensor, "time 3"], stature: float
+) -> Float[Tensor, "time"] | None:
+    """Floor height (m) beneath each head position from points; None where there are too few.
+
+    `stature` is the head joint's height in the rest pose (m).
+    """
+    if cloud is None:
+        return None
+    points = cloud.points_world[cloud.points_world.isfinite().all(-1)]
+    if len(points) < MIN_POINTS:
+        return None
+    return estimate_floor(points, t_world_head, stature).height
+
+
+class FloorTracker:
+    """The floor beneath a moving head from what has been seen so far, for captures that run while things happen.
+
+    It looks again once in `LOOK_FRAMES` frames, at the last metres of the path and the points around them.
+    """
+
+    def __init__(self, stature: float, fps: float):
+        """`stature` is the head joint's height in the rest pose (m); `fps` the rate of the poses to come."""
+        self.stature = stature
+        self._heights: deque[float] = deque(maxlen=int(UPRIGHT_WITHIN_S * fps / LOOK_FRAMES))
+        self._path: deque[np.ndarray] = deque(maxlen=int(RECENT_S * fps / LOOK_FRAMES))
+        self._tiles: defaultdict[tuple[int, int], list[np.ndarray]] = defaultdict(list)
+        self._frames, self._height = 0, 0.0
+
+    def see(self, points_world: Float[Tensor, "point 3"]) -> None:
+        """Take in points (m); those that are not finite are left out."""
+        points = points_world.detach().cpu().numpy()
+        points = points[np.isfinite(points).all(1)]
+        tiles, which = np.unique(
+            np.floor(points[:, :2] / _TILE_M).astype(np.int64), axis=0, return_inverse=True
+        )
+        for number, (x, y) in enumerate(tiles.tolist()):
+            self._tiles[x, y].append(points[which.reshape(-1) == number])
+
+    def follow(self, t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
+        """Floor height (m) beneath the next head positions."""
+        floor = torch.empty(len(t_world_head))
+        done = 0
+        while done < len(floor):
+            if self._frames % LOOK_FRAMES == 0:
+                self._look(t_world_head[done].double().numpy())
+            ready = min(len(floor) - done, LOOK_FRAMES - self._frames % LOOK_FRAMES)
+            floor[done : done + ready] = self._height
+            done, self._frames = done + ready, self._frames + ready
+        return floor
+
+    def _look(self, head: np.ndarray) -> None:
+        self._heights.append(float(head[2]))
+        self._path.append(head)
+        points = self._around()
+        if len(points) >= MIN_POINTS:
+            path, cloud = torch.from_numpy(np.array(self._path)), torch.from_numpy(points)
+            try:
+                self._height = float(estimate_floor(cloud, path, self.stature).height[-1])
+            except WearcapError:  # none of them lies beneath the path: the last answer stands
+                pass
+        else:
+            self._height = float(np.percentile(self._heights, 90)) - self.stature
+
+    def _around(self) -> np.ndarray:
+        """Points in the tiles that the recent path crosses, and next to them."""
+        crossed = np.unique(np.floor(np.array(self._path)[:, :2] / _TILE_M).astype(np.int64), axis=0)
+        near = {(x + i, y + j) for x, y in crossed.tolist() for i in (-1, 0, 1) for j in (-1, 0, 1)}
+        parts = []
+        for tile in sorted(near & self._tiles.keys()):
+            if len(self._tiles[tile]) > 1:
+                self._tiles[tile] = [np.concatenate(self._tiles[tile])]
+            parts += self._tiles[tile]
+        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+
+
+def tracked_floor(
+    cloud: PointCloud | None,
     timestamps: Float64[Tensor, "time"],
     t_world_head: Float[Tensor, "time 3"],
     stature: float,
+    fps: float,
 ) -> Float[Tensor, "time"]:
-    """Floor height (m) under each head position: the recording's own track, else from its points and head path.
+    """Floor height (m) beneath each head position from what had been seen by then: what `FloorTracker` says.
 
-    `stature` is the head joint's height in the rest pose (m): without track and points, the head of someone who
-    mostly stands tells where the floor is.
+    Points without a time count from the beginning.
     """
-    if recording.floor is not None:
-        return interpolate(recording.floor.timestamps, recording.floor.height, timestamps)
-    if recording.points is not None and len(recording.points.points_world) >= MIN_POINTS:
-        return estimate_floor(recording.points.points_world, t_world_head, stature).height
-    return floor_from_head(t_world_head, stature / EYE_HEIGHT_OF_STATURE).height
+    tracker = FloorTracker(stature, fps)
+    points, seen = torch.zeros(0, 3), torch.zeros(0, dtype=torch.float64)
+    if cloud is not None and cloud.first_seen is None:
+        tracker.see(cloud.points_world)
+    elif cloud is not None and cloud.first_seen is not None:
+        seen, order = cloud.first_seen.sort(stable=True)
+        points = cloud.points_world[order]
+    floor = torch.empty(len(timestamps))
+    taken = 0
+    for start in range(0, len(timestamps), LOOK_FRAMES):
+        until = int(torch.searchsorted(seen, timestamps[start], right=True))
+        if until > taken:
+            tracker.see(points[taken:until])
+            taken = until
+        floor[start : start + LOOK_FRAMES] = tracker.follow(t_world_head[start : start + LOOK_FRAMES])
+    return floor
 
 
 def interpolate(

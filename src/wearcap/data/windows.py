@@ -11,12 +11,18 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-from wearcap.body.skeleton import Skeleton
-from wearcap.data.floor import floor_beneath
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
+from wearcap.data.features import FEET, body_size
+from wearcap.data.floor import floor_from_path, floor_from_points
+from wearcap.data.surroundings import NOTHING, Surroundings
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
+from wearcap.metrics import physics
+from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 
+MIN_FRAMES = 10
+"""Shortest beginning of a capture that is trained on."""
 _FLIP = (1.0, -1.0, 1.0)
 
 
@@ -27,13 +33,30 @@ class Window(NamedTuple):
     R_world_head: Float[Tensor, "*batch time 3 3"]
     t_world_head: Float[Tensor, "*batch time 3"]
     floor_height: Float[Tensor, "*batch time"]
+    """Floor beneath the head (m), from points where there are any."""
+    floor_from_head: Float[Tensor, "*batch time"]
+    """The same as the head's path alone tells it."""
     valid: Bool[Tensor, "*batch time"]
     t_parent_joint: Float[Tensor, "*batch joint 3"]
-    stature: Float[Tensor, "*batch"]
-    """Height of the head joint in the rest pose (m)."""
+    size: Float[Tensor, "*batch limb"]
+    """`body_size` of the wearer (m)."""
+    foot_contact: Float[Tensor, "*batch time foot"]
+    """1 where heel or toes of the left and right foot touch the floor."""
+    points: Float[Tensor, "*batch time point_feature"]
+    points_valid: Bool[Tensor, "*batch time"]
+    image: Float[Tensor, "*batch time image_feature"]
+    image_valid: Bool[Tensor, "*batch time"]
+    """See `Surroundings`; no columns where a modality is left out."""
     noise: Float[Tensor, "*batch time motion"]
     level: Float[Tensor, "*batch 1"]
-    """Diffusion noise and level, drawn here so that they depend on seed and step and not on the process."""
+    chance: Float[Tensor, "*batch 3"]
+    """Diffusion noise and level, and chances to drop modalities and to condition on oneself, drawn here so that they
+    depend on seed and step and not on the process."""
+
+    @property
+    def stature(self) -> Float[Tensor, "*batch"]:
+        """Height of the head joint in the rest pose (m)."""
+        return self.size[..., 0]
 
 
 @dataclass(frozen=True)
@@ -53,30 +76,28 @@ def share_out(
     fps: float,
     balance: float = 1.0,
     min_frames: int = 30,
-) -> tuple[list[Path], Int64[Tensor, "window 3"], Float64[Tensor, "window"]]:
-    """Recordings of a split, its windows as (recording, first frame, frames of the recording), their shares of the draws.
+) -> tuple[list[tuple[RecordingStore, str]], Int64[Tensor, "window 3"], Float64[Tensor, "window"]]:
+    """Recordings of a split (data set and name), its windows as (recording, first frame, frames of the recording), and
+    the windows' shares of the draws.
 
     Recordings shorter than `min_frames` are left out. Raises WearcapError for one of another rate than `fps`, and
     where no window is left.
     """
-    paths: list[Path] = []
+    recordings: list[tuple[RecordingStore, str]] = []
     starts, weights = [], []
     for source in sources:
         store = RecordingStore.open(source.root)
-        rows = [
-            (store.root / store.entries[name].file, store.entries[name].frames)
-            for name in _usable(store, split, fps, min_frames)
-        ]
+        rows = [(name, store.entries[name].frames) for name in _usable(store, split, fps, min_frames)]
         counts = [max(0, frames - window) // stride + 1 for _, frames in rows]
         total = sum(count**balance for count in counts)
-        for (path, frames), count in zip(rows, counts):
-            starts += [(len(paths), k * stride, frames) for k in range(count)]
+        for (name, frames), count in zip(rows, counts):
+            starts += [(len(recordings), k * stride, frames) for k in range(count)]
             weights += [source.weight * count ** (balance - 1) / total] * count
-            paths.append(path)
+            recordings.append((store, name))
     if not starts:
         raise WearcapError(f"no windows in split {split!r}", where=", ".join(s.root for s in sources),
                            expected=f"recordings of at least {min_frames} frames")  # fmt: skip
-    return paths, torch.tensor(starts), torch.tensor(weights, dtype=torch.float64)
+    return recordings, torch.tensor(starts), torch.tensor(weights, dtype=torch.float64)
 
 
 def _usable(store: RecordingStore, split: str, fps: float, min_frames: int) -> Iterator[str]:
@@ -103,15 +124,20 @@ class WindowDataset(Dataset):
         mirror: bool = False,
         balance: float = 1.0,
         min_frames: int = 30,
+        surroundings: Surroundings = NOTHING,
+        beginnings: float = 0.0,
     ):
         """A recording's share of the draws grows with its number of windows to the power of `balance`.
 
-        1 draws all windows alike, 0 all recordings.
+        1 draws all windows alike, 0 all recordings. `beginnings` is the share of windows that end before they are full,
+        as the first ones of a capture do.
         """
         self.window, self.stride, self.fps, self.mirror = window, stride, fps, mirror
-        self.paths, self.starts, self.weights = share_out(
+        self.surroundings, self.beginnings = surroundings, beginnings
+        self.recordings, self.starts, self.weights = share_out(
             sources, split, window=window, stride=stride, fps=fps, balance=balance, min_frames=min_frames
         )
+        self.image_size = surroundings.image_size([RecordingStore.open(source.root) for source in sources])
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -121,13 +147,40 @@ class WindowDataset(Dataset):
         index, seed = item if isinstance(item, tuple) else (item, item)
         random = torch.Generator().manual_seed(seed)
         recording, start, frames = self.starts[index].tolist()
-        shift, mirrored = torch.rand(2, generator=random).tolist()
+        shift, mirrored, cut, end = torch.rand(4, generator=random).tolist()
         if self.mirror:
             start = min(start + int(shift * self.stride), max(frames - self.window, 0))
-        window = read_window(_open(self.paths[recording]), start, self.window, random)
-        return (
-            mirror_window(window, _part(self.paths[recording])) if self.mirror and mirrored < 0.5 else window
+        length = self.window if cut >= self.beginnings else MIN_FRAMES + int(end * (self.window - MIN_FRAMES))
+        return self._read(*self.recordings[recording], start, length, self.mirror and mirrored < 0.5, random)
+
+    def _read(
+        self,
+        store: RecordingStore,
+        name: str,
+        start: int,
+        length: int,
+        mirrored: bool,
+        random: torch.Generator,
+    ) -> Window:
+        """Frames start…start+length-1 of a recording, the last one repeated as padding up to a whole window."""
+        file = _open(store.path_of(name))
+        constants = _constants(file.path)
+        stop = min(start + length, file.length("motion.timestamps"))
+        take = torch.arange(self.window).clamp_max(stop - start - 1)
+        T_world_device = Rigid(
+            file.window("head.R_world_device", start, stop), file.window("head.t_world_device", start, stop)
         )
+        T_world_head = (T_world_device @ constants.T_device_head)[take]
+        seen = self.surroundings.read(store, name, start, stop, mirrored, self.image_size)
+        joints = len(constants.skeleton)
+        window = Window(
+            file.window("motion.R_parent_joint", start, stop)[take], T_world_head.R, T_world_head.t,
+            constants.floor_height[start:stop][take], constants.floor_from_head[start:stop][take], torch.arange(self.window) < stop - start,
+            constants.skeleton.t_parent_joint, constants.size, constants.foot_contact[start:stop][take],
+            *(part[take] for part in seen), torch.randn(self.window, 6 * joints + FEET, generator=random),
+            torch.rand(1, generator=random), torch.rand(3, generator=random),
+        )  # fmt: skip
+        return mirror_window(window, constants.skeleton) if mirrored else window
 
 
 @cache
@@ -136,65 +189,58 @@ def _open(path: Path) -> RecordingFile:
     return RecordingFile(path)
 
 
-@cache
-def _part(path: Path) -> Skeleton:
-    return _open(path).part("motion").skeleton
+@dataclass(frozen=True)
+class _Constants:
+    """What is the same for all windows of a recording, or cheap to keep whole."""
+
+    skeleton: Skeleton
+    T_device_head: Rigid
+    size: Float[Tensor, "limb"]
+    floor_height: Float[Tensor, "time"]
+    floor_from_head: Float[Tensor, "time"]
+    foot_contact: Float[Tensor, "time foot"]
 
 
 @cache
-def _constants(path: Path) -> tuple[Tensor, Tensor, Rigid]:
-    """Offsets, stature and T_device_head of a recording."""
-    file, skeleton = _open(path), _part(path)
-    stature = torch.tensor(skeleton.height_of("head"))
-    mount = Rigid(file.tensor("head.R_head_device"), file.tensor("head.t_head_device"))
+def _constants(path: Path) -> _Constants:
+    file = _open(path)
     if file.length("head.timestamps") != file.length("motion.timestamps"):
         raise WearcapError("head and motion have different lengths", where=path,
                            expected="both on one clock", fix="Prepare the recording again.")  # fmt: skip
-    return skeleton.t_parent_joint, stature, mount.inverse()
+    recording = file.load()
+    head, motion = recording.head, recording.motion
+    assert head is not None
+    assert motion is not None
+    stature, t_world_head = motion.skeleton.height_of("head"), head.T_world_head.t
+    blind = floor_from_path(head.timestamps, t_world_head, stature)
+    seen = floor_from_points(recording.points, t_world_head, stature)
+    mount = Rigid(head.R_head_device, head.t_head_device)
+    return _Constants(
+        motion.skeleton, mount.inverse(), body_size(motion.skeleton), blind if seen is None else seen, blind,
+        true_foot_contact(recording).float(),
+    )  # fmt: skip
 
 
-@cache
-def _floor(path: Path) -> Tensor:
-    """Floor height beneath every frame, as the pipelines find it."""
-    recording = _open(path).load()
-    assert recording.head is not None
-    return floor_beneath(
-        recording, recording.head.timestamps, recording.head.T_world_head.t, _part(path).height_of("head")
-    )
-
-
-def read_window(file: RecordingFile, start: int, length: int, random: torch.Generator) -> Window:
-    """Frames start…start+length-1 of a recording, the last frame repeated as padding behind its end."""
-    offsets, stature, T_device_head = _constants(file.path)
-    stop = min(start + length, file.length("motion.timestamps"))
-    take = torch.arange(length).clamp_max(stop - start - 1)
-    T_world_device = Rigid(
-        file.window("head.R_world_device", start, stop), file.window("head.t_world_device", start, stop)
-    )
-    T_world_head = (T_world_device @ T_device_head)[take]
-    floor = _floor(file.path)[start:stop][take]
-    R_parent_joint = file.window("motion.R_parent_joint", start, stop)[take]
-    return Window(
-        R_parent_joint=R_parent_joint,
-        R_world_head=T_world_head.R,
-        t_world_head=T_world_head.t,
-        floor_height=floor,
-        valid=torch.arange(length) < stop - start,
-        t_parent_joint=offsets,
-        stature=stature,
-        noise=torch.randn(length, 6 * len(offsets), generator=random),
-        level=torch.rand(1, generator=random),
-    )
+def true_foot_contact(recording: Recording) -> Bool[Tensor, "time foot"]:
+    """Contact of the left and right foot at the motion's frames: as recorded, else judged from the true motion."""
+    motion, track = recording.motion, recording.contacts
+    assert motion is not None
+    if track is not None and set(FOOT_PATCHES) <= set(track.parts) and len(track.contact) == len(motion):
+        return physics.foot_contact(track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]])
+    pose = motion.T_world_joint
+    points = physics.foot_points(motion.skeleton, pose)
+    return physics.contact_from_motion(points, physics.local_floor(pose.t, motion.fps), motion.fps)
 
 
 def mirror_window(window: Window, skeleton: Skeleton) -> Window:
-    """The same motion seen in a mirror that swaps left and right."""
+    """The same motion seen in a mirror that swaps left and right; its surroundings are read as mirrored already."""
     flip = torch.tensor(_FLIP)
     return window._replace(
         R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton),
         R_world_head=window.R_world_head * torch.outer(flip, flip),
         t_world_head=window.t_world_head * flip,
         t_parent_joint=window.t_parent_joint[_twins(skeleton)] * flip,
+        foot_contact=window.foot_contact.flip(-1),
     )
 
 

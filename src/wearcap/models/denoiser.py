@@ -1,5 +1,7 @@
 """The conditional motion denoiser of HMD² (thesis §6.2): a DiT/EDGE-like transformer that predicts x0."""
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -52,26 +54,67 @@ class TemporalBlend(nn.Module):
         return band @ (x * mask) / (band @ mask).clamp_min(1e-3)
 
 
-class ConditionEncoder(nn.Module):
-    """Narrows the conditions to one vector per token by an MLP (thesis §6.2).
+class Conditions(NamedTuple):
+    """What a window is told, raw. Frames without points or picture hold any finite numbers where "valid" is False."""
 
-    It sees `context` frames before the token's own and as many behind them (ours): a stride shows in half a second of
-    a head's sway, not in one frame.
+    head: Float[Tensor, "batch time head_feature"]
+    points: Float[Tensor, "batch time point_feature"]
+    """Code of the points around the body (`VoxelAutoencoder`); no columns for a network without points."""
+    points_valid: Bool[Tensor, "batch time"]
+    image: Float[Tensor, "batch time image_feature"]
+    """Embedding of the head camera's picture; no columns for a network without images."""
+    image_valid: Bool[Tensor, "batch time"]
+
+
+class OptionalInput(nn.Module):
+    """A modality that may be missing: standardised, or a learned null vector on the frames that lack it."""
+
+    def __init__(self, size: int, width: int, frames_per_token: int):
+        super().__init__()
+        self.normalizer = Normalizer(size)
+        self.null = nn.Parameter(torch.zeros(size))
+        self.widen = nn.Conv1d(size + 1, width, frames_per_token, frames_per_token, bias=False)
+
+    def forward(
+        self, x: Float[Tensor, "batch time feature"], valid: Bool[Tensor, "batch time"]
+    ) -> Float[Tensor, "batch width token"]:
+        there = valid[..., None]
+        # The flag beside the vector lets the network tell null from a scene that looks like it.
+        frames = torch.where(there, self.normalizer(x), self.null)
+        return self.widen(torch.cat([frames, there.to(x.dtype)], -1).transpose(1, 2))
+
+
+class ConditionEncoder(nn.Module):
+    """Concatenates a frame's conditions and narrows them to one vector per token by an MLP (thesis §6.2).
+
+    The MLP's first layer is written as one product per modality, their sum: that is what a layer on the concatenation
+    is. Of the head it sees `context` frames before the token's own and as many behind them (ours): a stride shows in
+    half a second of a head's sway, not in one frame.
     """
 
-    def __init__(self, size: int, width: int, frames_per_token: int, context: int):
+    def __init__(
+        self, head_size: int, points_size: int, image_size: int, width: int, frames_per_token: int, context: int
+    ):  # fmt: skip
         super().__init__()
         # One more channel says which frames exist: padding would else look like the mean condition.
         span = frames_per_token + 2 * context
-        self.widen = nn.Conv1d(size + 1, 2 * width, span, frames_per_token, context)
+        self.normalizer = Normalizer(head_size)
+        self.widen = nn.Conv1d(head_size + 1, 2 * width, span, frames_per_token, context)
+        self.points = OptionalInput(points_size, 2 * width, frames_per_token) if points_size else None
+        self.image = OptionalInput(image_size, 2 * width, frames_per_token) if image_size else None
         self.narrow = nn.Linear(2 * width, width)
 
     def forward(
-        self, condition: Float[Tensor, "batch time condition"], valid: Bool[Tensor, "batch time"]
+        self, conditions: Conditions, valid: Bool[Tensor, "batch time"]
     ) -> Float[Tensor, "batch token width"]:
-        mask = valid[..., None].to(condition.dtype)
-        frames = torch.cat([condition * mask, mask], -1)
-        return self.narrow(F.gelu(self.widen(frames.transpose(1, 2))).transpose(1, 2))
+        mask = valid[..., None].to(conditions.head.dtype)
+        frames = torch.cat([self.normalizer(conditions.head) * mask, mask], -1)
+        wide = self.widen(frames.transpose(1, 2))
+        if self.points is not None:
+            wide = wide + self.points(conditions.points, conditions.points_valid & valid)
+        if self.image is not None:
+            wide = wide + self.image(conditions.image, conditions.image_valid & valid)
+        return self.narrow(F.gelu(wide).transpose(1, 2))
 
 
 class MotionEncoder(nn.Module):
@@ -104,9 +147,10 @@ class MotionDenoiser(nn.Module):
     """x̂0 = D(x_t, c, level): one token per frame (or per few frames) through adaptive transformer blocks.
 
     A token is the sum of what the condition and x_t say about its frames; where x_t joins the conditions the document
-    leaves open. `frames_per_token` > 1 is ours: neighbouring frames share a token, which cuts the cost of a window
-    about as many times; `blend` > 0 (ours too) mixes that many neighbouring frames of x̂0, which removes the seams
-    between tokens and most of an unfinished network's jitter.
+    leaves open. The condition's part, `encode`, is the same in every step of sampling and computed once.
+    `frames_per_token` > 1 is ours: neighbouring frames share a token, which cuts the cost of a window about as many
+    times; `blend` > 0 (ours too) mixes that many neighbouring frames of x̂0, which removes the seams between tokens and
+    most of an unfinished network's jitter. `self_conditioning` (Chen et al. 2023) shows the network its last x̂0.
     """
 
     def __init__(
@@ -122,16 +166,25 @@ class MotionDenoiser(nn.Module):
         frames_per_token: int = 1,
         blend: int = 0,
         context: int = 14,
+        points_size: int = 0,
+        image_size: int = 0,
+        self_conditioning: bool = False,
     ):
+        """`points_size` and `image_size` 0 leave a modality out; else one network runs with and without it."""
         super().__init__()
         if window % frames_per_token:
             raise ValueError(f"a window of {window} frames does not split into tokens of {frames_per_token}")
         self.window, self.frames_per_token = window, frames_per_token
         self.motion_size, self.condition_size = motion_size, condition_size
+        self.points_size, self.image_size = points_size, image_size
+        self.self_conditioning = self_conditioning
         self.motion_normalizer = Normalizer(motion_size)
-        self.condition_normalizer = Normalizer(condition_size)
-        self.condition_encoder = ConditionEncoder(condition_size, width, frames_per_token, context)
-        self.motion_encoder = MotionEncoder(motion_size, width, frames_per_token)
+        self.condition_encoder = ConditionEncoder(
+            condition_size, points_size, image_size, width, frames_per_token, context
+        )
+        self.motion_encoder = MotionEncoder(
+            motion_size * (2 if self_conditioning else 1), width, frames_per_token
+        )
         self.level = LevelEmbedding(width)
         self.blocks = nn.ModuleList(
             AdaptiveBlock(width, heads, feedforward, window // frames_per_token, dropout)
@@ -143,21 +196,32 @@ class MotionDenoiser(nn.Module):
         nn.init.zeros_(self.head.bias)
         self.blend = TemporalBlend(blend) if blend else None
 
+    def encode(
+        self, conditions: Conditions, valid: Bool[Tensor, "batch time"]
+    ) -> Float[Tensor, "batch token width"]:
+        """The conditions' part of every token; `valid` is False on padding."""
+        return self.condition_encoder(conditions, valid)
+
     def forward(
         self,
         x_t: Float[Tensor, "batch time motion"],
         level: Float[Tensor, "batch #time"],
-        condition: Float[Tensor, "batch time condition"],
+        encoded: Float[Tensor, "batch token width"],
         valid: Bool[Tensor, "batch time"],
+        last: Float[Tensor, "batch time motion"] | None = None,
     ) -> Float[Tensor, "batch time motion"]:
-        """x̂0 in normalised motion space; `condition` is raw, `valid` is False on padding."""
+        """x̂0 in normalised motion space from x_t and what `encode` said.
+
+        last: with self-conditioning, the x̂0 of the step before (None: there is none yet).
+        """
         batch, time, _ = x_t.shape
         k = self.frames_per_token
         token_valid = valid.view(batch, time // k, k).any(-1)
         token_level = level if level.shape[1] == 1 else level.view(batch, time // k, k).mean(-1)
         embedded = self.level(token_level)
-        token = self.condition_encoder(self.condition_normalizer(condition), valid)
-        token = token + self.motion_encoder(x_t, embedded, valid)
+        if self.self_conditioning:
+            x_t = torch.cat([x_t, torch.zeros_like(x_t) if last is None else last], -1)
+        token = encoded + self.motion_encoder(x_t, embedded, valid)
         for block in self.blocks:
             token = block(token, embedded, token_valid)
         x0_hat = self.head(self.norm(token)).reshape(batch, time, -1)

@@ -235,7 +235,7 @@ def _describe(
     """Head features (thesis §6.1) of windows of one path, every `sample`-th frame of each."""
     frames = (starts[:, None] + torch.arange(window)).clamp_max(len(path.timestamps) - 1)
     features = HeadFeatures(frame="window", height="stature")
-    stature = torch.full((len(starts),), path.stature)
+    stature = torch.full((len(starts), 1), path.stature)
     T_world_head = path.T_world_head[frames]
     channels = features.condition(
         T_world_head.R, T_world_head.t, path.floor_height[frames], stature, _fps_of(path)

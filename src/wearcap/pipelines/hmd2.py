@@ -1,10 +1,8 @@
-"""HMD² (thesis ch. 6): full-body motion from a head-mounted device by conditional motion diffusion.
-
-Here with the head path alone, the thesis' ablation row "without points, without images".
-"""
+"""HMD² (thesis ch. 6): environment-aware full-body motion from a head-mounted device by conditional motion diffusion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -12,26 +10,40 @@ from torch import Tensor
 
 from wearcap.body.hang import hang
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.features import HeadFeatures
-from wearcap.data.floor import floor_beneath
+from wearcap.data.features import HeadFeatures, body_size
+from wearcap.data.floor import floor_from_path, floor_from_points, tracked_floor
 from wearcap.data.prepare.check import MIN_DURATION_S
-from wearcap.diffusion.sampler import sample
+from wearcap.data.surroundings import latest_before
+from wearcap.diffusion.sampler import Denoise
 from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.models.denoiser import MotionDenoiser
+from wearcap.models.denoiser import Conditions, MotionDenoiser
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.pipelines.hmd2_windows import Frames, Poses, WindowSampler, advance
 from wearcap.recording import Motion, Recording
+from wearcap.scene.voxels import voxelize
+
+MODALITIES = ("points", "images")
+MAX_GAP_S = 0.5
+"""Head poses further apart than this say nothing of what was between: the capture begins anew behind the gap."""
+MAX_SPEED_M_S = 12.0
+"""No head moves faster (sprinters do not): a step that asks for more is a jump of the tracking."""
 
 
 @dataclass(frozen=True)
 class HeadPath:
-    """What the model is told about one recording, at the model's frame rate."""
+    """What the model is told about one recording's head, at the model's frame rate."""
 
     timestamps: Float64[Tensor, "time"]
     T_world_head: Rigid
+    T_world_device: Rigid
     floor_height: Float[Tensor, "time"]
     skeleton: Skeleton
+    stretches: tuple[tuple[int, int], ...]
+    """Frames (start, stop) between gaps and jumps of the tracking; poses in the gaps are interpolated."""
 
     @property
     def stature(self) -> float:
@@ -49,11 +61,24 @@ class HMD2:
     skeleton: Skeleton
     """For recordings that do not say whose body it is."""
     fps: float
+    place_encoder: VoxelAutoencoder | None = None
+    image_encoder: str | None = None
+    """Name of the encoder whose embeddings the network was trained on."""
+    use: Sequence[str] = MODALITIES
+    """Modalities that are listened to, of those that the network knows and a recording has."""
     steps: int = 20
     stride: int | None = None
     """Frames by which windows advance; None: three quarters of a window (180 of the document's 240)."""
     eta: float = 1.0
+    guidance: float = 1.0
+    """Classifier-free guidance by points and images (Ho & Salimans 2022; ours): 1 leaves it out."""
+    live: bool = False
+    """Whether even the floor is told only from what has been sensed by then, as it must be in a stream."""
     device: str = "cpu"
+
+    def __post_init__(self):
+        if unknown := set(self.use) - set(MODALITIES):
+            raise WearcapError(f"no modality {min(unknown)!r}", expected=f"some of {', '.join(MODALITIES)}")
 
     @property
     def advance(self) -> int:
@@ -71,95 +96,197 @@ class HMD2:
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
         """One motion per (recording, seed); recordings share batches, which changes nothing but the time."""
         self.net.to(self.device).eval()
+        # 1. head path and floor; 2. points around the body as codes; 3. pictures as embeddings
         paths = [head_path(recording, self.skeleton, self.fps) for recording in recordings]
-        rotations = self._sample_windows(paths, seeds)
-        return [hang_from_head(self._motion(path, R), path.T_world_head) for path, R in zip(paths, rotations)]
+        frames = [self.sense(recording, path) for recording, path in zip(recordings, paths)]
+        # 4. windows of the diffusion model, each stretch of a path by itself
+        poses = self._windows(paths, frames, seeds)
+        # 5. the body hangs from the measured head
+        return [
+            self.motion(path.timestamps, path.skeleton, path.T_world_head, said)
+            for path, said in zip(paths, poses)
+        ]
 
-    def _sample_windows(self, paths: list[HeadPath], seeds: Sequence[int]) -> list[Tensor]:
-        """R_parent_joint of every path: window after window, each holding on to what the last one said."""
-        window, advance, joints = self.net.window, self.advance, self.features.joints
-        lengths = [len(path.timestamps) for path in paths]
-        done = [torch.zeros(length, joints, 3, 3) for length in lengths]
-        random = [torch.Generator().manual_seed(seed) for seed in seeds]
-        for start in range(0, max(lengths), advance):
-            first = start == 0
-            lanes = [i for i, n in enumerate(lengths) if first or start + window - advance < n]
-            if not lanes:
-                break
-            batch = [_cut(paths[i], start, window) for i in lanes]
-            overlap = 0 if first else window - advance
-            held = [done[i][start : start + overlap] for i in lanes]
-            noise = torch.stack(
-                [
-                    torch.randn(self.steps, window, self.features.motion_size, generator=random[i])
-                    for i in lanes
-                ],
-                1,
-            )
-            predicted = self._sample_batch(batch, held, noise)
-            for lane, i in enumerate(lanes):
-                new = slice(start + overlap, min(start + window, lengths[i]))
-                done[i][new] = predicted[lane, overlap : overlap + new.stop - new.start]
-        return done
+    def sense(self, recording: Recording, path: HeadPath) -> Frames:
+        """Everything that the network is told of a recording, as one lane.
 
-    def _sample_batch(
-        self, batch: list[tuple[HeadPath, Bool[Tensor, "time"]]], held: list[Tensor], noise: Tensor
-    ) -> Tensor:
-        R_head = torch.stack([path.T_world_head.R for path, _ in batch])
-        t_head = torch.stack([path.T_world_head.t for path, _ in batch])
-        floor = torch.stack([path.floor_height for path, _ in batch])
-        stature = torch.tensor([path.stature for path, _ in batch])
-        valid = torch.stack([valid for _, valid in batch]).to(self.device)
-        condition = self.features.condition(R_head, t_head, floor, stature, self.fps).to(self.device)
-        overlap = held[0].shape[0]
-        known = torch.zeros(noise.shape[1:])
-        if overlap:
-            # Re-expressed in this window's frame, which may have moved since the last one.
-            R_known = torch.stack(held)
-            encoded = self.features.encode(_padded(R_known, noise.shape[2]), R_head)
-            known = self.net.motion_normalizer(encoded.to(self.device)).cpu()
-        is_known = (torch.arange(noise.shape[2]) < overlap).expand(len(batch), -1)
-        x0 = sample(
-            lambda x_t, level: self.net(x_t, level, condition, valid),
-            noise.to(self.device), self.schedule, eta=self.eta,
-            known=known.to(self.device), is_known=is_known.to(self.device),
+        Raises WearcapError for embeddings that the network does not know.
+        """
+        count = len(path.timestamps)
+        points, points_valid = self._points(recording, path)
+        image, image_valid = torch.zeros(count, self.net.image_size), torch.zeros(count, dtype=torch.bool)
+        camera = recording.camera
+        if (
+            self.net.image_size
+            and "images" in self.use
+            and camera is not None
+            and camera.embedding is not None
+        ):
+            size = camera.embedding.shape[1]
+            if (camera.embedding_name, size) != (self.image_encoder, self.net.image_size):
+                raise WearcapError(
+                    f"embeddings of {camera.embedding_name!r} with {size} features", where=recording.name,
+                    expected=f"{self.net.image_size} of {self.image_encoder!r}, which the network was trained on",
+                    fix="Prepare its embeddings with that encoder, or leave images out: pipeline.use=[points].",
+                )  # fmt: skip
+            number, image_valid = latest_before(camera.timestamps, path.timestamps)
+            image = camera.embedding[number].float()
+            image_valid &= image.isfinite().all(-1)
+            image = image.nan_to_num(0.0, 0.0, 0.0)
+        lane = Frames(
+            path.T_world_head.R, path.T_world_head.t, self._floor(recording, path), points, points_valid,
+            image, image_valid, torch.ones(count, dtype=torch.bool),
         )  # fmt: skip
-        return self.features.decode(self.net.motion_normalizer.inverse(x0).float().cpu(), R_head)
+        return Frames(*(part[None] for part in lane))
 
-    def _motion(self, path: HeadPath, R_parent_joint: Tensor) -> Motion:
+    def _listens_to_points(self, recording: Recording) -> bool:
+        return bool(self.net.points_size) and "points" in self.use and recording.points is not None
+
+    def _points(
+        self, recording: Recording, path: HeadPath
+    ) -> tuple[Float[Tensor, "time feature"], Bool[Tensor, "time"]]:
+        """Codes of the points around the body at every frame, of those that had been seen by then."""
+        count, cloud = len(path.timestamps), recording.points
+        if not self._listens_to_points(recording) or self.place_encoder is None or cloud is None:
+            return torch.zeros(count, self.net.points_size), torch.zeros(count, dtype=torch.bool)
+        grid = voxelize(
+            cloud.points_world,
+            path.T_world_device,
+            self.place_encoder.grid,
+            cloud.first_seen,
+            path.timestamps,
+        )
+        code = torch.cat([self.place_encoder.encode(part) for part in grid.split(2048)])
+        return code, torch.ones(count, dtype=torch.bool)
+
+    def _floor(self, recording: Recording, path: HeadPath) -> Float[Tensor, "time"]:
+        """Floor beneath the head: from points that are listened to, else from the head's path."""
+        cloud = recording.points if self._listens_to_points(recording) else None
+        if self.live:
+            return tracked_floor(cloud, path.timestamps, path.T_world_head.t, path.stature, self.fps)
+        floor = floor_from_points(cloud, path.T_world_head.t, path.stature)
+        return path.floor_height if floor is None else floor
+
+    def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "lane time"]) -> Denoise:
+        """x̂0 of a window as a function of x_t and its level; what the conditions say is computed once."""
+        encoded = self.net.encode(conditions, valid)
+        blind = None
+        if self.guidance != 1.0:
+            nothing = torch.zeros_like(valid)
+            blind = self.net.encode(conditions._replace(points_valid=nothing, image_valid=nothing), valid)
+        last: Tensor | None = None
+
+        def denoise(x_t: Tensor, level: Tensor) -> Tensor:
+            nonlocal last
+            x0_hat = self.net(x_t, level, encoded, valid, last)
+            if blind is not None:
+                plain = self.net(x_t, level, blind, valid, last)
+                x0_hat = plain + self.guidance * (x0_hat - plain)
+            last = x0_hat if self.net.self_conditioning else None
+            return x0_hat
+
+        return denoise
+
+    def _windows(self, paths: list[HeadPath], frames: list[Frames], seeds: Sequence[int]) -> list[Poses]:
+        """Poses of every path: its stretches side by side, window after window."""
+        stride, joints = self.advance, self.features.joints
+        done = [
+            Poses(
+                torch.eye(3).repeat(len(path.timestamps), joints, 1, 1), torch.zeros(len(path.timestamps), 2)
+            )
+            for path in paths
+        ]
+        lanes = [
+            (i, start, stop, self.sampler(path.skeleton, seeds[i], start))
+            for i, path in enumerate(paths)
+            for start, stop in path.stretches
+        ]
+        passed = 0
+        while lanes:
+            fresh = [_cut(frames[i], start + passed, stop, stride) for i, start, stop, _ in lanes]
+            said = advance([sampler for *_, sampler in lanes], fresh)
+            for (i, start, stop, _), given in zip(lanes, said):
+                new = slice(start + passed, min(start + passed + stride, stop))
+                for whole, part in zip(done[i], given):
+                    whole[new] = part[0, : new.stop - new.start]
+            passed += stride
+            lanes = [lane for lane in lanes if lane[1] + passed < lane[2]]
+        return [_bridged(poses, path.stretches) for poses, path in zip(done, paths)]
+
+    def sampler(self, skeleton: Skeleton, seed: int, start: int) -> WindowSampler:
+        """Windows of a stretch that begins at frame `start`; stretches of one recording have noise of their own."""
+        return WindowSampler(self, body_size(skeleton), seed + 1_000_003 * start)
+
+    def motion(
+        self, timestamps: Float64[Tensor, "time"], skeleton: Skeleton, T_world_head: Rigid, poses: Poses
+    ) -> Motion:
+        """Step 5: poses without the lane axis as a motion that hangs from the measured head."""
         settings = {
             "pipeline": "hmd2",
             "steps": str(self.steps),
             "stride": str(self.advance),
             "eta": str(self.eta),
         }
-        return Motion(
-            path.timestamps, path.skeleton, R_parent_joint, torch.zeros(len(path.timestamps), 3),
+        contact = poses.foot_contact.repeat_interleave(2, -1) if self.features.contacts else None
+        motion = Motion(
+            timestamps,
+            skeleton,
+            poses.R_parent_joint,
+            torch.zeros(len(timestamps), 3),
+            contact,
             provenance=settings,
-        )  # fmt: skip
+        )
+        return hang_from_head(motion, T_world_head)
 
 
 def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
-    """Step 1: the head joint's path at `fps`, and the floor beneath it.
+    """Step 1: the head joint's path at `fps`, and the floor beneath it as the path tells it. Poses that are not finite count as missing.
 
-    Raises WearcapError when the recording has no head stream, or hardly one.
+    Raises WearcapError when the recording has no head stream, or hardly one, and for timestamps that do not grow.
     """
     if recording.head is None:
         raise WearcapError("no head poses in this recording", where=recording.name,
                            expected="a recording with a `head` stream")  # fmt: skip
     head = recording.head
-    if head.timestamps[-1] - head.timestamps[0] < MIN_DURATION_S:
-        raise WearcapError(f"head poses of {len(head.timestamps)} frames", where=recording.name,
+    known = head.R_world_device.isfinite().all(-1).all(-1) & head.t_world_device.isfinite().all(-1)
+    times = head.timestamps[known]
+    if len(times) < 2 or times[-1] - times[0] < MIN_DURATION_S:
+        raise WearcapError(f"head poses of {len(times)} frames", where=recording.name,
                            expected=f"at least {MIN_DURATION_S} s")  # fmt: skip
+    if not (times.diff() > 0).all():
+        raise WearcapError("head poses whose timestamps do not grow", where=recording.name,
+                           fix="Sort the head stream by time and leave repeated poses out.")  # fmt: skip
     skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
-    T_world_head = head.T_world_head
-    trajectory = Trajectory(head.timestamps, T_world_head.R, T_world_head.t)
-    count = int((head.timestamps[-1] - head.timestamps[0]).item() * fps + 1e-3) + 1
-    timestamps = head.timestamps[0] + torch.arange(count, dtype=torch.float64) / fps
-    if count != len(head.timestamps) or (timestamps - head.timestamps).abs().max() > 1e-4:
-        trajectory = resample(trajectory, timestamps.clamp_max(head.timestamps[-1].item()))
-    floor = floor_beneath(recording, timestamps, trajectory.t_world_body, skeleton.height_of("head"))
-    return HeadPath(timestamps, trajectory.T_world_body, floor, skeleton)
+    trajectory = Trajectory(times, head.R_world_device[known], head.t_world_device[known])
+    breaks = _breaks(trajectory)
+    count = int((times[-1] - times[0]).item() * fps + 1e-3) + 1
+    timestamps = times[0] + torch.arange(count, dtype=torch.float64) / fps
+    if count != len(times) or (timestamps - times).abs().max() > 1e-4:
+        trajectory = resample(trajectory, timestamps.clamp_max(times[-1].item()))
+    T_device_head = Rigid(head.R_head_device, head.t_head_device).inverse()
+    T_world_head = trajectory.T_world_body @ T_device_head
+    floor = floor_from_path(timestamps, T_world_head.t, skeleton.height_of("head"))
+    stretches, first = [], 0
+    for before, after in breaks:
+        stretches.append((first, int(torch.searchsorted(timestamps, before + 1e-6))))
+        first = int(torch.searchsorted(timestamps, after - 1e-6))
+    stretches.append((first, count))
+    return HeadPath(
+        timestamps, T_world_head, trajectory.T_world_body, floor, skeleton,
+        tuple((start, stop) for start, stop in stretches if stop > start),
+    )  # fmt: skip
+
+
+def _breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
+    """Times (last before, first behind) of gaps and of jumps."""
+    step = trajectory.timestamps.diff()
+    speed = trajectory.t_world_body.diff(dim=0).norm(dim=-1) / step
+    turn = rotation.geodesic(trajectory.R_world_body[:-1], trajectory.R_world_body[1:]) / step
+    broken = (step > MAX_GAP_S) | (speed > MAX_SPEED_M_S) | (turn > 60.0)
+    return [
+        (trajectory.timestamps[i].item(), trajectory.timestamps[i + 1].item())
+        for i in broken.nonzero()[:, 0].tolist()
+    ]
 
 
 def hang_from_head(motion: Motion, T_world_head: Rigid) -> Motion:
@@ -168,17 +295,20 @@ def hang_from_head(motion: Motion, T_world_head: Rigid) -> Motion:
     return replace(motion, R_parent_joint=R_parent_joint, t_world_root=T_world_joint.t[:, 0])
 
 
-def _cut(path: HeadPath, start: int, length: int) -> tuple[HeadPath, Bool[Tensor, "time"]]:
-    """Frames from `start`, the last one repeated behind the end, and which of them are real."""
-    count = len(path.timestamps)
+def _cut(frames: Frames, start: int, stop: int, length: int) -> Frames:
+    """`length` frames from `start`; behind `stop` the last one is repeated as not valid."""
     take = torch.arange(start, start + length)
-    valid = take < count
-    take = take.clamp_max(count - 1)
-    return HeadPath(
-        path.timestamps[take], path.T_world_head[take], path.floor_height[take], path.skeleton
-    ), valid
+    there = take < stop
+    cut = Frames(*(part[:, take.clamp_max(stop - 1)] for part in frames))
+    return cut._replace(valid=cut.valid & there)
 
 
-def _padded(R: Float[Tensor, "batch time joint 3 3"], length: int) -> Float[Tensor, "batch length joint 3 3"]:
-    """Repeat the last frame up to `length`."""
-    return R[:, torch.arange(length).clamp_max(R.shape[1] - 1)]
+def _bridged(poses: Poses, stretches: tuple[tuple[int, int], ...]) -> Poses:
+    """Frames between stretches turn from the pose before to the pose behind."""
+    for (_, before), (after, _) in pairwise(stretches):
+        if after > before:
+            R = poses.R_parent_joint
+            share = torch.linspace(0, 1, after - before + 2)[1:-1]
+            turn = rotation.log(R[before - 1].transpose(-1, -2) @ R[after])
+            R[before:after] = R[before - 1] @ rotation.exp(share[:, None, None] * turn)
+    return poses

@@ -40,10 +40,7 @@ class CaptureValidation(Callback):
         due = last or (trainer.current_epoch + 1) % self.every_n_epochs == 0
         if trainer.sanity_checking or not trainer.is_global_zero or not due:
             return
-        pipeline = self.pipeline(
-            net=pl_module.net, features=pl_module.features, schedule=pl_module.schedule,
-            skeleton=pl_module.skeleton, fps=pl_module.fps, device=str(pl_module.device),
-        )  # fmt: skip
+        pipeline = self.pipeline(**pl_module.pipeline_parts(), device=str(pl_module.device))
         recordings = self._recordings(trainer.datamodule.val_sources[0].root)  # pyright: ignore[reportAttributeAccessIssue]
         motions = pipeline.capture(recordings, [0] * len(recordings))
         rows = [score(m, r, r.name, 0) for m, r in zip(motions, recordings)]

@@ -44,3 +44,15 @@ def joint_velocity(
     """Squared difference of joint velocities (m²/s²; ours)."""
     error = (prediction - target).diff(dim=1) * fps
     return masked_mean(error.square().sum(-1).mean(-1), valid[:, 1:])
+
+
+def foot_skate(
+    feet: Float[Tensor, "batch time foot point 3"],
+    contact: Float[Tensor, "batch time foot"],
+    valid: Bool[Tensor, "batch time"],
+    fps: float,
+) -> Float[Tensor, ""]:
+    """Squared speed (m²/s²) of the slowest point of a foot while the truth says that the foot touches (ours)."""
+    speed = (feet.diff(dim=1) * fps).square().sum(-1).amin(-1)
+    stands = contact[:, 1:] * contact[:, :-1]
+    return masked_mean((speed * stands).mean(-1), valid[:, 1:])

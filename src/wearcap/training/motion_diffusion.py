@@ -9,21 +9,24 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.features import HeadFeatures
+from wearcap.data.features import FEET, HeadFeatures
 from wearcap.data.statistics import feature_statistics
 from wearcap.data.windows import Window, WindowDataset
 from wearcap.diffusion.process import add_noise
 from wearcap.diffusion.schedule import Schedule
-from wearcap.models.denoiser import MotionDenoiser
+from wearcap.errors import WearcapError
+from wearcap.models.denoiser import Conditions, MotionDenoiser
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.training import losses
 
 
 class MotionDiffusion(lightning.LightningModule):
     """x0-prediction under one noise level per window; loss terms are weighed by `loss_weights`.
 
-    "motion" is the document's plain MSE; "joints" and "velocity" are ours (0 leaves them out). Levels are drawn with a
-    density that grows with the level to the power of `level_tilt`: 0 draws them uniformly, as the document does; more
-    (ours) trains what sampling in few steps depends on, the way from noise to a first guess.
+    "motion" is the document's plain MSE; "joints", "velocity" and "skate" are ours (0 leaves them out). Levels are drawn
+    with a density that grows with the level to the power of `level_tilt`: 0 draws them uniformly, as the document does;
+    more (ours) trains what sampling in few steps depends on, the way from noise to a first guess. Points and images are
+    each replaced by their null token in a share `drop` of the windows, so that one checkpoint runs with any of them.
     """
 
     def __init__(
@@ -37,44 +40,97 @@ class MotionDiffusion(lightning.LightningModule):
         optimizer: Callable[..., torch.optim.Optimizer],
         scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
         level_tilt: float = 0.0,
+        drop: float = 0.0,
+        place_encoder: VoxelAutoencoder | None = None,
+        image_encoder: str | None = None,
+        image_size: int = 0,
         seed: int = 0,
         compile: bool = False,
     ):
+        """`place_encoder` (frozen, thesis §6.2) makes the points' codes, the encoder of the name `image_encoder` the
+        embeddings of `image_size`; None leaves that modality out."""
         super().__init__()
-        self.net = net(motion_size=features.motion_size, condition_size=features.condition_size)
+        self.net = net(
+            motion_size=features.motion_size, condition_size=features.condition_size,
+            points_size=place_encoder.size if place_encoder else 0, image_size=image_size if image_encoder else 0,
+        )  # fmt: skip
+        self.place_encoder = None if place_encoder is None else place_encoder.requires_grad_(False).eval()
+        self.image_encoder, self.drop = image_encoder, drop
         self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
         self.loss_weights, self.level_tilt, self.seed = dict(loss_weights), level_tilt, seed
         self._optimizer, self._scheduler = optimizer, scheduler
+        self._feet = [
+            skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")
+        ]
         self._denoise = torch.compile(self.net) if compile else self.net
+        self._encode = torch.compile(self.net.encode) if compile else self.net.encode
 
     def set_statistics(self, dataset: WindowDataset) -> None:
         """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        _require_same_inputs(self, dataset)
         statistics = feature_statistics(dataset, self.features)
         self.net.motion_normalizer.set(*statistics["motion"])
-        self.net.condition_normalizer.set(*statistics["condition"])
+        encoder = self.net.condition_encoder
+        encoder.normalizer.set(*statistics["head"])
+        for name, optional in (("points", encoder.points), ("image", encoder.image)):
+            if optional is not None:
+                optional.normalizer.set(*statistics[name])
+        if self.place_encoder is not None and dataset.surroundings.places is not None:
+            self.place_encoder.load_state_dict(dataset.surroundings.places.encoder.state_dict())
+
+    def pipeline_parts(self) -> dict[str, Any]:
+        """What `HMD2` is built around."""
+        return {
+            "net": self.net, "features": self.features, "schedule": self.schedule, "skeleton": self.skeleton,
+            "fps": self.fps, "place_encoder": self.place_encoder, "image_encoder": self.image_encoder,
+        }  # fmt: skip
+
+    def train(self, mode: bool = True) -> "MotionDiffusion":
+        """The encoder of places stays as it is."""
+        super().train(mode)
+        if self.place_encoder is not None:
+            self.place_encoder.eval()
+        return self
 
     def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:
         """Dropout, too, is a function of seed and step, so that a resumed run repeats it."""
         torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
+    def conditions(self, batch: Window) -> Conditions:
+        """What the network is told of a batch, modalities dropped by the windows' chances."""
+        kept = batch.chance[:, None] >= self.drop
+        points_valid, image_valid = batch.points_valid & kept[..., 0], batch.image_valid & kept[..., 1]
+        # Points tell where the floor is, too.
+        floor = torch.where(points_valid, batch.floor_height, batch.floor_from_head)
+        head = self.features.condition(batch.R_world_head, batch.t_world_head, floor, batch.size, self.fps)
+        return Conditions(head, batch.points, points_valid, batch.image, image_valid)
+
+    def _predicted(self, batch: Window, x0: Tensor) -> Tensor:
+        """x̂0 of a batch in normalised motion space; with self-conditioning, after a first guess in half the windows."""
+        encoded = self._encode(self.conditions(batch), batch.valid)
+        level = batch.level ** (1 / (1 + self.level_tilt))
+        x_t = add_noise(x0, batch.noise[..., : x0.shape[-1]], level, self.schedule)
+        if not self.net.self_conditioning:
+            return self._denoise(x_t, level, encoded, batch.valid)
+        with torch.no_grad():
+            guess = self._denoise(x_t, level, encoded, batch.valid)
+        told = guess * (batch.chance[:, 2] < 0.5)[:, None, None]
+        return self._denoise(x_t, level, encoded, batch.valid, told)
+
     def terms(self, batch: Window) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
-        motion = self.features.encode(batch.R_parent_joint, batch.R_world_head)
+        motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
         x0 = self.net.motion_normalizer(motion)
-        condition = self.features.condition(
-            batch.R_world_head, batch.t_world_head, batch.floor_height, batch.stature, self.fps
-        )
-        level = batch.level ** (1 / (1 + self.level_tilt))
-        x_t = add_noise(x0, batch.noise, level, self.schedule)
-        x0_hat = self._denoise(x_t, level, condition, batch.valid)
+        x0_hat = self._predicted(batch, x0)
         terms = {"motion": losses.motion_mse(x0_hat, x0, batch.valid)}
-        if self.loss_weights.get("joints") or self.loss_weights.get("velocity"):
-            R_hat = self.features.decode(
-                self.net.motion_normalizer.inverse(x0_hat.float()), batch.R_world_head
-            )
+        if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate")):
+            motion_hat = self.net.motion_normalizer.inverse(x0_hat.float())
+            R_hat, _ = self.features.decode(motion_hat, batch.R_world_head)
             predicted, true = self._from_head(R_hat, batch), self._from_head(batch.R_parent_joint, batch)
             terms["joints"] = losses.joint_position(predicted, true, batch.valid)
             terms["velocity"] = losses.joint_velocity(predicted, true, batch.valid, self.fps)
+            feet = predicted[:, :, self._feet].unflatten(2, (FEET, -1)) + batch.t_world_head[:, :, None, None]
+            terms["skate"] = losses.foot_skate(feet, batch.foot_contact, batch.valid, self.fps)
         return terms
 
     def _from_head(self, R_parent_joint: Tensor, batch: Window) -> Tensor:
@@ -107,3 +163,17 @@ class MotionDiffusion(lightning.LightningModule):
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
         }
+
+
+def _require_same_inputs(system: MotionDiffusion, dataset: WindowDataset) -> None:
+    """Raise WearcapError unless the windows carry what the model takes in."""
+    net, places = system.net, dataset.surroundings.places
+    points_size = 0 if places is None else places.size
+    if (net.points_size, net.image_size) != (points_size, dataset.image_size):
+        raise WearcapError(
+            f"windows with points of {points_size} and images of {dataset.image_size} features",
+            expected=f"{net.points_size} and {net.image_size}, as the model has",
+            fix="Set data.surroundings and model.{place_encoder,image_encoder,image_size} alike.",
+        )  # fmt: skip
+    if system.image_encoder != dataset.surroundings.images and net.image_size:
+        raise WearcapError(f"embeddings of {dataset.surroundings.images!r}", expected=system.image_encoder)

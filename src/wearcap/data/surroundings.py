@@ -1,0 +1,119 @@
+"""What the windows of a recording tell beside the head's path: the points around the body, the head camera's pictures."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import safetensors
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from torch import Tensor
+
+from wearcap.data.place_codes import PlaceCodes
+from wearcap.errors import WearcapError
+from wearcap.recording.store import RecordingFile, RecordingStore
+
+MAX_PICTURE_AGE_S = 0.2
+"""A picture older than this says nothing of a frame any more."""
+
+
+class Seen(NamedTuple):
+    """Points and pictures of some frames, and on which of them there are any."""
+
+    points: Float[Tensor, "*batch time point_feature"]
+    points_valid: Bool[Tensor, "*batch time"]
+    image: Float[Tensor, "*batch time image_feature"]
+    image_valid: Bool[Tensor, "*batch time"]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Which modalities windows carry: None leaves one out (no columns)."""
+
+    places: PlaceCodes | None = None
+    images: str | None = None
+    """Name of the encoder whose embeddings are read from the recordings' cameras."""
+
+    def image_size(self, stores: list[RecordingStore]) -> int:
+        """Dimension of the embeddings, as the data has it.
+
+        Raises WearcapError when no recording has any of this encoder, or when their dimensions differ.
+        """
+        if self.images is None:
+            return 0
+        sizes = {
+            file.tensor("camera.embedding").shape[1]
+            for store in stores
+            for name in store.names()
+            if (file := _open(store.path_of(name))) and _pictured(file.path) == self.images
+        }
+        if len(sizes) != 1:
+            raise WearcapError(
+                f"embeddings of {sorted(sizes)} dimensions" if sizes else f"no recording has embeddings of {self.images!r}",
+                where=", ".join(str(store.root) for store in stores), expected=f"embeddings of {self.images!r}",
+                fix=f"Run: wearcap prepare embeddings dataset=DIR encoder={self.images}",
+            )  # fmt: skip
+        return sizes.pop()
+
+    def read(
+        self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int
+    ) -> Seen:
+        """Frames start…stop-1 on the head stream's clock; `mirrored`: as a mirror that swaps left and right shows them.
+
+        Raises what `PlaceCodes.file_of` raises.
+        """
+        path, count = store.path_of(name), stop - start
+        points, points_valid = torch.zeros(count, 0), torch.zeros(count, dtype=torch.bool)
+        if self.places is not None:
+            points = torch.zeros(count, self.places.size)
+            codes = _codes(self.places.file_of(store.root, store.entries[name]))
+            rows = codes.get_slice("code_mirrored" if mirrored else "code")
+            if rows.get_shape()[0]:
+                points, points_valid = rows[start:stop].float(), torch.ones(count, dtype=torch.bool)
+        image, image_valid = torch.zeros(count, image_size), torch.zeros(count, dtype=torch.bool)
+        key = "camera.embedding_mirrored" if mirrored else "camera.embedding"
+        if self.images is not None and _pictured(path) == self.images and key in _open(path).keys:
+            picture, image_valid = (part[start:stop] for part in _latest(path))
+            if image_valid.any():
+                first, last = picture[image_valid][[0, -1]].tolist()
+                shown = _open(path).window(key, first, last + 1).float()
+                image = shown[(picture - first).clamp(0, len(shown) - 1)]
+        return Seen(points, points_valid, image, image_valid)
+
+
+NOTHING = Surroundings()
+
+
+@cache
+def _open(path: Path) -> RecordingFile:
+    return RecordingFile(path)
+
+
+@cache
+def _codes(path: Path):
+    return safetensors.safe_open(str(path), framework="pt")
+
+
+@cache
+def _pictured(path: Path) -> str | None:
+    """Name of the encoder whose embeddings a recording has."""
+    file = _open(path)
+    return file.part("camera").embedding_name if "camera.embedding" in file.keys else None
+
+
+@cache
+def _latest(path: Path) -> tuple[Int64[Tensor, "time"], Bool[Tensor, "time"]]:
+    file = _open(path)
+    return latest_before(file.tensor("camera.timestamps"), file.tensor("head.timestamps"))
+
+
+def latest_before(
+    timestamps: Float64[Tensor, "picture"], wanted: Float64[Tensor, "time"]
+) -> tuple[Int64[Tensor, "time"], Bool[Tensor, "time"]]:
+    """Number of the newest picture at each time (30 Hz pictures serve two frames at 60 Hz), and whether it is fresh."""
+    if not len(timestamps):
+        return torch.zeros(len(wanted), dtype=torch.long), torch.zeros(len(wanted), dtype=torch.bool)
+    newest = torch.searchsorted(timestamps.contiguous(), wanted + 1e-4, right=True) - 1
+    number = newest.clamp_min(0)
+    return number, (newest >= 0) & (wanted - timestamps[number] < MAX_PICTURE_AGE_S)

@@ -1,0 +1,153 @@
+"""What windows carry of the surroundings: the right codes and pictures at the right frames, also in the mirror."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from wearcap.data.floor import floor_from_path, floor_from_points, tracked_floor
+from wearcap.data.surroundings import Surroundings, latest_before
+from wearcap.data.windows import Source, WindowDataset
+from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+from wearcap.recording import CameraStream, PointCloud, RecordingStore
+from wearcap_testing import recording_of, swaying_motion
+
+SIZE = 5
+
+
+class CountedCodes:
+    """Codes that count the frames, and count down from zero in the mirror."""
+
+    size = 3
+
+    def file_of(self, root, entry):
+        path = root / f"{entry.sha256}.codes"
+        if not path.exists():
+            code = torch.arange(entry.frames).half()[:, None].repeat(1, 3)
+            save_file({"code": code, "code_mirrored": -code}, str(path))
+        return path
+
+
+@pytest.fixture
+def store(tmp_path) -> RecordingStore:
+    """Two recordings of 300 frames, the second without pictures."""
+    store = RecordingStore(tmp_path)
+    for name, seed in (("a", 0), ("b", 1)):
+        recording = recording_of(swaying_motion(300, seed), name)
+        if name == "a":
+            picture = torch.arange(150).half()[:, None].repeat(1, SIZE)
+            camera = CameraStream(
+                recording.head.timestamps[::2], Camera("pinhole", 8, 6, 4.0, 4.0, 3.5, 2.5), torch.eye(3),
+                torch.zeros(3), embedding=picture, embedding_mirrored=-picture, embedding_name="toy",
+            )  # fmt: skip
+            recording = replace(recording, camera=camera)
+        store.add(recording, split="train", config_hash="test")
+    return store
+
+
+def dataset(store: RecordingStore, **changes) -> WindowDataset:
+    surroundings = object.__new__(Surroundings)  # codes without a network
+    object.__setattr__(surroundings, "places", CountedCodes())
+    object.__setattr__(surroundings, "images", "toy")
+    settings = {"window": 120, "stride": 60, "fps": 60.0, "surroundings": surroundings} | changes
+    return WindowDataset([Source(str(store.root))], "train", **settings)
+
+
+def first_of(windows: WindowDataset, name: str, start: int) -> int:
+    return next(
+        index
+        for index, (recording, first, _) in enumerate(windows.starts.tolist())
+        if windows.recordings[recording][1] == name and first == start
+    )
+
+
+def test_codes_and_pictures_are_those_of_the_windows_frames(store):
+    windows = dataset(store)
+    assert windows.image_size == SIZE
+    window = windows[first_of(windows, "a", 60)]
+    frames = torch.arange(60, 180)
+    assert torch.equal(window.points[:, 0], frames.float())
+    assert torch.equal(window.image[:, 0], (frames // 2).float()), "each picture serves two frames"
+    assert window.points_valid.all()
+    assert window.image_valid.all()
+
+
+def test_a_recording_without_pictures_says_so(store):
+    windows = dataset(store)
+    window = windows[first_of(windows, "b", 0)]
+    assert window.image.shape == (120, SIZE)
+    assert not window.image_valid.any()
+    assert window.points_valid.all()
+
+
+def test_the_mirror_reads_what_the_mirror_shows(store):
+    windows = dataset(store, mirror=True)
+    index = first_of(windows, "a", 60)
+    seen = [windows[(index, seed)] for seed in range(12)]
+    signs = {(w.points[:, 0].sign().sum().item(), w.image[:, 0].sign().sum().item()) for w in seen}
+    assert signs == {(120.0, 120.0), (-120.0, -120.0)}
+
+
+def test_beginnings_are_cut_short(store):
+    whole, cut = dataset(store), dataset(store, beginnings=1.0)
+    lengths = {int(cut[(0, seed)].valid.sum()) for seed in range(20)}
+    assert whole[(0, 0)].valid.all()
+    assert min(lengths) >= 10
+    assert max(lengths) < 120
+    assert len(lengths) > 10
+    window = cut[(0, 3)]
+    last = int(window.valid.sum()) - 1
+    assert torch.equal(window.points[last:], window.points[last : last + 1].expand(120 - last, -1))
+
+
+def test_data_without_the_encoders_embeddings_is_refused(store):
+    surroundings = Surroundings(None, "clip")
+    with pytest.raises(WearcapError, match="no recording has embeddings of 'clip'.*prepare embeddings"):
+        WindowDataset(
+            [Source(str(store.root))], "train", window=120, stride=60, fps=60.0, surroundings=surroundings
+        )
+
+
+def test_the_newest_picture_counts_while_it_is_fresh():
+    number, valid = latest_before(torch.tensor([1.0, 1.1, 2.0]).double(), torch.tensor([0.9, 1.05, 1.1, 1.25, 1.5, 2.1]).double())  # fmt: skip
+    assert number.tolist() == [0, 0, 1, 1, 1, 2]
+    assert valid.tolist() == [False, True, True, True, False, True]
+    assert not latest_before(torch.zeros(0).double(), torch.zeros(3).double())[1].any()
+
+
+def test_the_floor_follows_a_storey_from_the_head_and_a_step_from_points():
+    time = torch.arange(0, 120, 1 / 60).double()
+    floor = torch.where(time < 60, 0.0, 2.7)
+    sitting = ((time % 20) > 14).float()
+    head = torch.stack([time * 0.05, 0 * time, floor + 1.6 - 0.5 * sitting], -1).float()
+    found = floor_from_path(time, head, 1.6)
+    away = (time - 60).abs() > 30
+    assert (found - floor)[away].abs().max() < 0.02
+    random = torch.Generator().manual_seed(0)
+    x = 6 * torch.rand(20_000, generator=random)
+    points = torch.stack([x, 2 * torch.rand(20_000, generator=random) - 1, torch.where(x < 3, 0.0, 2.7)], -1)
+    points[:50] = torch.nan
+    seen = floor_from_points(PointCloud(points), head, 1.6)
+    assert (seen - floor)[(time - 60).abs() > 10].abs().max() < 0.03
+    assert floor_from_points(PointCloud(points[:100]), head, 1.6) is None
+    assert floor_from_points(None, head, 1.6) is None
+
+
+def test_a_tracked_floor_knows_nothing_of_what_comes():
+    random = torch.Generator().manual_seed(0)
+    time = torch.arange(0, 20, 1 / 60).double()
+    head = torch.stack([0.2 * time, 0 * time, 0.3 + 1.6 + 0 * time], -1).float()
+    points = torch.rand(9000, 3, generator=random) * torch.tensor([6.0, 3.0, 0.02]) - torch.tensor(
+        [1.0, 1.5, -0.29]
+    )
+    seen = 20 * torch.rand(9000, generator=random).double()
+    whole = tracked_floor(PointCloud(points, None, seen), time, head, 1.6, 60.0)
+    assert (whole - 0.3).abs().max() < 0.02
+    early = seen < 10
+    until = time < 10
+    first = tracked_floor(PointCloud(points[early], None, seen[early]), time[until], head[until], 1.6, 60.0)
+    assert torch.equal(whole[until], first)
+    blind = tracked_floor(None, time, head + torch.tensor([0.0, 0.0, 0.1]), 1.6, 60.0)
+    assert (blind - 0.4).abs().max() < 1e-3
