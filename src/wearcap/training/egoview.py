@@ -1,0 +1,158 @@
+"""Training of our small image encoder: where a wearer's own limbs are in a head camera's frame."""
+
+from collections.abc import Callable
+
+import lightning
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from wearcap.data.ego_frames import HANDS, POINTS, EgoFrame, EgoFrames
+from wearcap.metrics.detection import average_precision
+from wearcap.models.denoiser import Normalizer
+from wearcap.models.image_encoder import EgoViewEncoder, letterboxed
+
+LEAST_SPREAD_M = 0.02
+_SWAPPED = [index ^ 1 for index in range(len(POINTS))]
+"""Left for right: they alternate in `POINTS`."""
+
+
+class EgoView(lightning.LightningModule):
+    """Linear heads on the embedding tell which of `POINTS` are in the picture, and where they are.
+
+    The loss is their binary cross-entropy plus the Huber loss of places in standard deviations; a point outside of the
+    picture counts `hidden_weight` there. Linear, so that it is the embedding that carries what is known.
+    """
+
+    def __init__(
+        self,
+        net: EgoViewEncoder,
+        optimizer: Callable[..., torch.optim.Optimizer],
+        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        hidden_weight: float = 0.1,
+        augment: bool = True,
+        seed: int = 0,
+    ):
+        super().__init__()
+        self.net, self.heads = net, nn.Linear(net.size, 4 * len(POINTS))
+        self.normalizer = Normalizer(3 * len(POINTS))
+        self.hidden_weight, self.augment, self.seed = hidden_weight, augment, seed
+        self._optimizer, self._scheduler = optimizer, scheduler
+        self._validated: list[tuple[Tensor, Tensor, EgoFrame]] = []
+
+    def set_statistics(self, dataset: EgoFrames) -> None:
+        """Mean and deviation of every point's place, over the frames where it is in the picture."""
+        weight = dataset.visible.double()[..., None]
+        count = weight.sum(0).clamp_min(1)
+        mean = (weight * dataset.point_cam).sum(0) / count
+        spread = ((weight * (dataset.point_cam - mean) ** 2).sum(0) / count).sqrt().clamp_min(LEAST_SPREAD_M)
+        self.normalizer.set(mean.flatten().float(), spread.flatten().float())
+
+    def forward(
+        self, pictures: Float[Tensor, "batch 3 height width"]
+    ) -> tuple[Float[Tensor, "batch point"], Float[Tensor, "batch point 3"]]:
+        """Logits of being in the picture, and places (m)."""
+        logits, places = self.heads(self.net(pictures)).split([len(POINTS), 3 * len(POINTS)], -1)
+        return logits, self.normalizer.inverse(places).unflatten(-1, (len(POINTS), 3))
+
+    def _pictures(self, batch: EgoFrame) -> Float[Tensor, "batch 3 height width"]:
+        return letterboxed(batch.picture, self.net.width, self.net.height, self.net.mean, self.net.std)
+
+    def loss(self, pictures: Float[Tensor, "batch 3 height width"], batch: EgoFrame) -> Tensor:
+        logits, places = self(pictures)
+        spread = self.normalizer.scale.unflatten(-1, (len(POINTS), 3))
+        miss = F.smooth_l1_loss(places / spread, batch.point_cam / spread, reduction="none").mean(-1)
+        weight = torch.where(batch.visible, 1.0, self.hidden_weight)
+        seen = F.binary_cross_entropy_with_logits(logits, batch.visible.to(logits.dtype))
+        return seen + (weight * miss).sum() / weight.sum()
+
+    def on_train_batch_start(self, batch: EgoFrame, batch_idx: int) -> None:
+        """Augmentation is a function of seed and step, so that a resumed run repeats it."""
+        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
+
+    def training_step(self, batch: EgoFrame, batch_idx: int) -> Tensor:
+        pictures = self._pictures(batch)
+        if self.augment:
+            pictures, batch = half_mirrored(relit(pictures), batch)
+        loss = self.loss(pictures, batch)
+        self.log("train/loss", loss, batch_size=len(batch.picture), prog_bar=True)
+        return loss
+
+    def validation_step(self, batch: EgoFrame, batch_idx: int) -> None:
+        pictures = self._pictures(batch)
+        self.log("val/loss", self.loss(pictures, batch), batch_size=len(pictures), sync_dist=True)
+        self._validated.append((*self(pictures), batch))
+
+    def on_validation_epoch_end(self) -> None:
+        logits, places = (torch.cat([part[k] for part in self._validated]) for k in range(2))
+        truth = EgoFrame(*(torch.cat(field) for field in zip(*(part[2] for part in self._validated))))
+        mean = self.normalizer.mean.unflatten(-1, (len(POINTS), 3)).expand_as(places)
+        for name, value in view_scores(
+            logits.sigmoid(), places, mean, truth.point_cam, truth.visible
+        ).items():
+            self.log(f"val/{name}", value)
+        self._validated.clear()
+
+    def configure_optimizers(self):
+        optimizer = self._optimizer(self.parameters())
+        if self._scheduler is None:
+            return optimizer
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
+        }
+
+
+def view_scores(
+    prob: Float[Tensor, "frame point"],
+    places: Float[Tensor, "frame point 3"],
+    mean_places: Float[Tensor, "frame point 3"],
+    point_cam: Float[Tensor, "frame point 3"],
+    visible: Bool[Tensor, "frame point"],
+) -> dict[str, float]:
+    """Average precision of telling which hands are in the picture, and the mean error (cm) of those that are, by side's
+    mean; beside each what it is for someone who knows the training split's share and mean place alone. The same error
+    for all points."""
+    left, right = (POINTS.index(name) for name in HANDS)
+    errors = {"": places, "_of_mean": mean_places}
+    scores = {
+        "hand_average_precision": _mean(
+            [average_precision(prob[:, k], visible[:, k]) for k in (left, right)]
+        ),
+        "hand_share": float(visible[:, [left, right]].double().mean()),
+    }
+    for suffix, guess in errors.items():
+        error = 100 * (guess - point_cam).norm(dim=-1)
+        by_point = [float(error[visible[:, k], k].mean()) for k in range(len(POINTS))]
+        scores[f"hand_error_cm{suffix}"] = _mean([by_point[left], by_point[right]])
+        scores[f"point_error_cm{suffix}"] = _mean(by_point)
+    return scores
+
+
+def _mean(values: list[float]) -> float:
+    """Of those that are defined."""
+    return float(torch.tensor(values).nanmean())
+
+
+def relit(pictures: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 3 height width"]:
+    """Other light, other colours, other noise, picture by picture; values in normalised grey levels."""
+    like = pictures[:, :1, :1, :1]
+    gain = (0.25 * torch.randn_like(like)).exp() * (0.08 * torch.randn_like(pictures[:, :, :1, :1])).exp()
+    shift = 0.3 * torch.randn_like(like) + 0.1 * torch.randn_like(pictures[:, :, :1, :1])
+    grey = pictures.mean(1, keepdim=True)
+    coloured = grey + (0.4 * torch.randn_like(like)).exp() * (pictures - grey)
+    noise = 0.15 * torch.rand_like(like) * torch.randn_like(pictures)
+    return (gain * coloured + shift + noise).clamp(-2.0, 2.4)
+
+
+def half_mirrored(
+    pictures: Float[Tensor, "batch 3 height width"], batch: EgoFrame
+) -> tuple[Float[Tensor, "batch 3 height width"], EgoFrame]:
+    """Half of the pictures flipped left to right, with left hands for right ones."""
+    flip = torch.rand(len(pictures), device=pictures.device) < 0.5
+    across = batch.point_cam.new_tensor([-1.0, 1.0, 1.0])
+    point_cam = torch.where(flip[:, None, None], batch.point_cam[:, _SWAPPED] * across, batch.point_cam)
+    visible = torch.where(flip[:, None], batch.visible[:, _SWAPPED], batch.visible)
+    pictures = torch.where(flip[:, None, None, None], pictures.flip(-1), pictures)
+    return pictures, EgoFrame(batch.picture, point_cam, visible)
