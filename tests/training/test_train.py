@@ -51,10 +51,13 @@ def test_every_experiment_takes_a_step(experiment, data, tmp_path):
 
 
 def test_every_experiment_is_tried_by_a_test():
-    """Those of contact detection in test_contact_detection, baselines in test_pose_regression."""
+    """Those of contact detection in test_contact_detection, baselines in test_pose_regression, ours of pictures in
+    test_egoview."""
     named = {path.stem for path in (conf_dir() / "experiment").glob("*.yaml")}
     assert named == {
-        name for name in named if name.startswith(("motion_", "contact_", "pose_regressor_", "egoego_"))
+        name
+        for name in named
+        if name.startswith(("motion_", "contact_", "pose_regressor_", "egoego_", "egoview"))
     }
 
 
