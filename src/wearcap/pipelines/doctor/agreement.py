@@ -9,7 +9,7 @@ from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.pipelines.doctor.inertial import offset_finding
 from wearcap.pipelines.doctor.report import Finding
 from wearcap.pipelines.doctor.signals import lag_between, quantile, spin_of
-from wearcap.recording import CameraStream, FloorTrack, HeadStream, Motion, PointCloud
+from wearcap.recording import CameraStream, Cue, FloorTrack, HeadStream, Motion, PointCloud
 from wearcap.scene.floor import estimate_floor
 
 
@@ -69,6 +69,26 @@ def _seat(T_head_device: Rigid, head: HeadStream) -> Finding:
     severity = "warning" if shift > 0.06 or turn > 12 else "ok"
     return Finding(severity, check, "the device moves on the head" if severity == "warning" else "constant", evidence,
                    "A drifting alignment or a slipping device." if severity == "warning" else "")  # fmt: skip
+
+
+def check_head_cue(head: HeadStream, cue: Cue) -> list[Finding]:
+    """A head joint that another system tracked rides on the device: same clock, same world, same wearer."""
+    check = "head against cues"
+    inside = (cue.timestamps >= head.timestamps[0]) & (cue.timestamps <= head.timestamps[-1])
+    inside &= (cue.confidence > 0) & cue.points.isfinite().all(-1)
+    if cue.points.shape[-1] != 3 or inside.sum() < 2:
+        return [Finding("error", check, "hardly overlap in time", f"{int(inside.sum())} shared keypoints", "Bring both to one clock.")]  # fmt: skip
+    track = Trajectory(head.timestamps, head.R_world_device, head.t_world_device)
+    at = resample(track, cue.timestamps[inside])
+    t_device_joint = (at.R_world_body.mT @ (cue.points[inside] - at.t_world_body)[..., None])[..., 0]
+    mean = t_device_joint.median(0).values
+    shift = quantile((t_device_joint - mean).norm(dim=-1), 0.9)
+    evidence = (f"90 % of the time within {100 * shift:.2g} cm of a constant place, "
+                f"({', '.join(f'{v:.3f}' for v in mean.tolist())}) m of the device")  # fmt: skip
+    if shift > 0.1 or mean.norm() > 0.4:
+        return [Finding("error", check, "the tracked head does not ride with the device", evidence,
+                        "They are in different worlds, on different clocks, or of different people.")]  # fmt: skip
+    return [Finding("ok", check, "the tracked head rides with the device", evidence)]
 
 
 def check_points(points: PointCloud, head: HeadStream | None) -> list[Finding]:

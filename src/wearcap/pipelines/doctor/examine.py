@@ -11,6 +11,7 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.pipelines.doctor.agreement import (
     check_camera,
     check_head_against_body,
+    check_head_cue,
     check_points,
     floor_beneath,
 )
@@ -100,6 +101,8 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
     body = bodies.get("motion", bodies.get("suit"))
     if head is not None and body is not None:
         findings += check_head_against_body(head, body)
+    if head is not None and "head" in recording.cues:
+        findings += check_head_cue(head, recording.cues["head"])
     for name, imu in recording.imu.items():
         if f"imu {name}" in usable:
             findings += check_imu(f"imu {name}", imu, _joint_path(imu.joint, body, head))

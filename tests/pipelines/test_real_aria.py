@@ -1,0 +1,128 @@
+"""Real Project Aria recordings through surroundings, pictures, alignment and comparison."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from wearcap.body.hang import hang
+from wearcap.body.skeleton import xsens23
+from wearcap.geometry import rotation
+from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.io.adt import read_adt
+from wearcap.io.aria_mps import read_mps
+from wearcap.metrics.cues import cue_errors_cm
+from wearcap.pipelines.doctor import examine
+from wearcap.recording import HeadStream, Motion, PointCloud, Recording
+from wearcap.scene.floor import estimate_floor
+from wearcap.scene.voxels import VoxelGrid, VoxelMap, voxelize
+from wearcap.viewer.head_path import draw_head_path
+
+
+@pytest.fixture(scope="module")
+def living_room(real_data) -> tuple[Recording, HeadStream, PointCloud]:
+    """Somebody walks past a table with sofas around it and sits down."""
+    recording = read_mps(real_data / "aria_mps")
+    assert recording.head is not None
+    assert recording.points is not None
+    return recording, recording.head, recording.points
+
+
+@pytest.fixture(scope="module")
+def grids(living_room) -> torch.Tensor:
+    _, head, points = living_room
+    return voxelize(points.points_world, head.T_world_device)
+
+
+@pytest.mark.real
+def test_grids_are_the_distances_of_real_points(living_room, grids):
+    """Against a search tree over the same points, turned and shifted by hand."""
+    _, head, points = living_room
+    assert grids.shape == (684, 10, 10, 10)
+    centre = (torch.arange(10) + 0.5) * 0.2 - 1
+    cells = torch.stack(torch.meshgrid(centre, centre, centre, indexing="ij"), -1).reshape(-1, 3)
+    tree = cKDTree(points.points_world.numpy())
+    for frame in (0, 321, 683):
+        forward = head.R_world_device[frame, :2, 0]
+        x = torch.tensor([*(forward / forward.norm()).tolist(), 0.0])
+        R = torch.stack([x, torch.tensor([-x[1], x[0], 0.0]), torch.tensor([0.0, 0.0, 1.0])], 1)
+        world = cells @ R.T + head.t_world_device[frame] - torch.tensor([0.0, 0.0, 1.0])
+        expected = np.minimum(tree.query(world.numpy())[0], 0.1).reshape(10, 10, 10)
+        assert np.abs(grids[frame].numpy() - expected).max() < 1e-4
+
+
+@pytest.mark.real
+def test_grids_show_the_room(living_room, grids):
+    """Floor at the wearer's feet, hardly anything below it, sofas and table above, free way where the wearer walks."""
+    _, head, points = living_room
+    floor = estimate_floor(points.points_world, head.t_world_device).height
+    above = head.t_world_device[:, 2] - floor
+    assert above[:120].min() > 1.4, "walks upright"
+    assert above[-60:].max() < 1.2, "and sits in the end"
+    layer = ((2 - above) / 0.2).long()
+    count = (grids < VoxelGrid().clip_m).double().sum((1, 2))
+    k = torch.arange(10)
+    assert count[k < layer[:, None] - 1].sum() < 0.01 * count.sum()
+    assert count[(k - layer[:, None]).abs() <= 1].sum() > 0.4 * count.sum()
+    assert count[k > layer[:, None] + 1].sum() > 0.4 * count.sum()
+    walking = (grids < VoxelGrid().clip_m)[:120]
+    assert walking[:, 4:6, 4:6, 5:].double().mean() < 0.4 * walking[:, :, :, 5:].double().mean() + 0.01
+
+
+@pytest.mark.real
+def test_a_map_that_grows_while_walking_ends_up_the_same(living_room, grids):
+    _, head, points = living_room
+    growing = VoxelMap()
+    for part in points.points_world.split(5000):
+        growing.add(part)
+        growing.voxelize(head.T_world_device[:1])
+    assert torch.equal(growing.voxelize(head.T_world_device), grids)
+
+
+@pytest.mark.real
+def test_a_picture_of_the_way_through_the_room(living_room):
+    picture = draw_head_path(living_room[0], (160, 130))
+    assert picture.shape == (130, 320, 3)
+    orange = (picture[..., 0].astype(int) - picture[..., 2]) > 100
+    assert 20 < orange.sum() < 3000, "the path"
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 200, "among many points"
+
+
+@pytest.mark.real
+def test_a_true_skeleton_rides_with_the_real_head(real_data):
+    """ADT: device and skeleton come from different systems; the head joint holds its place on the glasses to a millimetre."""
+    folder = real_data / "aria_adt_sample" / "raw"
+    found = {finding.check: finding for finding in examine(folder).findings["raw"]}
+    assert found["head against cues"].severity == "ok"
+    recording = read_adt(folder)
+    head, cue = recording.head, recording.cues["head"]
+    assert head is not None
+    track = Trajectory(head.timestamps, head.R_world_device, head.t_world_device)
+    inside = cue.timestamps <= head.timestamps[-1]
+    place = resample(track, cue.timestamps[inside]).T_world_body.inverse() @ cue.points[inside]
+    assert place.std(0).max() < 1e-3
+    assert place.mean(0)[0] < -0.1, "behind the pupils"
+    assert (place.mean(0) + head.t_head_device).norm() < 0.1, "the assumed seat is near"
+    late = {name: type(cue)(cue.timestamps + 60, cue.joint, cue.points, cue.confidence) for name, cue in recording.cues.items()}  # fmt: skip
+    findings = examine(Recording("late", head=head, cues=late)).findings["late"]
+    assert [f.severity for f in findings if f.check == "head against cues"] == ["error"]
+
+
+@pytest.mark.real
+def test_a_body_hung_from_the_real_head_beside_the_true_one(real_data):
+    """The wearer stands, bends the head over a bowl and holds it: legs are where a standing body has them, hands are not."""
+    recording = read_adt(real_data / "aria_adt_sample" / "raw")
+    head = recording.head
+    assert head is not None
+    skeleton, T_world_head = xsens23(), head.T_world_head
+    yaw = rotation.about_axis("z", rotation.yaw_of(T_world_head.R))
+    R = torch.eye(3).repeat(len(yaw), len(skeleton), 1, 1)
+    R[:, 0] = yaw
+    R, T_world_joint = hang(skeleton, R, T_world_head)
+    motion = Motion(head.timestamps, skeleton, R, T_world_joint.t[:, 0])
+    errors = cue_errors_cm(motion, recording.cues)
+    assert set(errors) == set(recording.cues), "every tracked joint has its like"
+    mean = {name: error.mean().item() for name, error in errors.items()}
+    assert all(mean[f"{side}_{name}"] < 20 for side in ("left", "right") for name in ("hip", "knee", "ankle"))
+    assert all(mean[f"{side}_wrist"] > 50 for side in ("left", "right")), "a T-pose holds no bowl"
+    assert mean["head"] < 10
