@@ -1,18 +1,35 @@
 """What a motion autoencoder sees of a window: a body's movement, wherever it is and whichever way it faces."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.metrics.physics import CONTACT_SPEED_M_S, local_floor
+from wearcap.recording import Motion
 
-CONTACT_SPEED_M_S = 0.3
-CONTACT_HEIGHT_M = {"ankle": 0.14, "toe": 0.07}
-"""About 5 cm above where ankle and toe joint are when the foot is flat on the floor."""
+CONTACT_HEIGHT_M = {"ankle": 0.12, "toe": 0.05}
+"""About 5 cm above where ankle and toe joint are when the foot is flat; the floor here is where toe joints get."""
+
+
+class Movement(NamedTuple):
+    """A body in the world, at the frames that are looked at; or windows of one, with leading axes."""
+
+    joints: Float[Tensor, "*window frame joint 3"]
+    R_world_root: Float[Tensor, "*window frame 3 3"]
+    floor_height: Float[Tensor, "*window frame"]
+
+    def windows(self, length: int, stride: int) -> "Movement":
+        """All whole windows of a movement, in one more leading axis."""
+        count = max(0, len(self.floor_height) - length) // stride + (len(self.floor_height) >= length)
+        frames = stride * torch.arange(count)[:, None] + torch.arange(length)
+        return Movement(*(part[frames] for part in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +38,8 @@ class MotionFeatures:
 
     In this order: yaw rate (rad/s), the root's horizontal velocity (m/s) and height over the floor (m); the other
     joints' positions (m), seen from where the root stands on the floor; all joints' velocities (m/s); whether
-    ankles and toes stand on the floor (0 or 1; low and slow). Every `every`-th frame counts: 20 per second of 60.
+    ankles and toes stand on the floor (0 or 1; low and slow). Of a motion at `fps` only every `every`-th frame is
+    looked at: 20 of 60 in a second. Bodies keep their size.
     """
 
     skeleton: Skeleton
@@ -32,27 +50,32 @@ class MotionFeatures:
     def size(self) -> int:
         return 6 * len(self.skeleton) + 5
 
-    def frames(self, window: int) -> int:
-        """How many frames are left of a window. Raises WearcapError when `every` does not divide it."""
-        if window % self.every:
-            raise WearcapError(f"every {self.every}rd frame of a window of {window}", expected="a multiple")
-        return window // self.every
+    def movement(self, motion: Motion, floor_height: Float[Tensor, "frame"] | None = None) -> Movement:
+        """A whole motion at the frames that are looked at, by default over its own local floor (`local_floor`).
 
-    def encode(
-        self,
-        joints: Float[Tensor, "window time joint 3"],
-        R_world_root: Float[Tensor, "window time 3 3"],
-        floor_height: Float[Tensor, "window time"],
-    ) -> Float[Tensor, "window frame feature"]:
-        """Features of joint positions in the world (m)."""
-        joints, R_world_root = joints[:, :: self.every], R_world_root[:, :: self.every]
+        Raises WearcapError for a motion of other joints, or at another rate than `fps`.
+        """
+        if motion.skeleton.joint_names != self.skeleton.joint_names:
+            raise WearcapError(f"a motion of skeleton {motion.skeleton.name!r}", expected=f"the joints of {self.skeleton.name!r}")  # fmt: skip
+        if len(motion) > 1 and abs(motion.fps - self.fps) > 0.01 * self.fps:
+            raise WearcapError(f"a motion of {motion.fps:.2f} frames per second", expected=f"{self.fps}",
+                               fix="Resample it first.")  # fmt: skip
+        seen = slice(None, None, self.every)
+        R = motion.R_parent_joint[seen]
+        joints = forward_kinematics(motion.skeleton, R, motion.t_world_root[seen]).t
+        if floor_height is None:
+            floor_height = local_floor(joints, self.fps / self.every)
+        return Movement(joints, R[:, 0], floor_height)
+
+    def encode(self, movement: Movement) -> Float[Tensor, "window frame feature"]:
+        """Features of windows."""
+        joints, R_world_root, floor_height = movement
         rate = self.fps / self.every
         yaw = rotation.yaw_of(R_world_root)
         R_heading_world = rotation.about_axis("z", -yaw)[:, :, None]
-        ground = torch.cat([joints[:, :, 0, :2], floor_height[:, :: self.every, None]], -1)[:, :, None]
+        ground = torch.cat([joints[:, :, 0, :2], floor_height[..., None]], -1)[:, :, None]
         local = (R_heading_world @ (joints - ground)[..., None])[..., 0]
-        velocity_world = _difference(joints) * rate
-        velocity = (R_heading_world @ velocity_world[..., None])[..., 0]
+        velocity = (R_heading_world @ (_difference(joints) * rate)[..., None])[..., 0]
         yaw_rate = rotation.wrap_angle(_difference(yaw)) * rate
         contact = self._contact(local[..., 2], velocity.norm(dim=-1))
         root = [yaw_rate[..., None], velocity[:, :, 0, :2], local[:, :, 0, 2:]]

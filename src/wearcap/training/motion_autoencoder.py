@@ -4,17 +4,14 @@ from collections.abc import Callable
 
 import lightning
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from wearcap.body.hang import hang
-from wearcap.data.motion_features import MotionFeatures
+from wearcap.data.motion_features import MotionFeatures, Movement
+from wearcap.data.motion_windows import MovementDataset
 from wearcap.data.statistics import collate
-from wearcap.data.windows import Window, WindowDataset
-from wearcap.geometry.rigid import Rigid
+from wearcap.metrics.position import mpjpe_cm
 from wearcap.models.motion_autoencoder import MotionAutoencoder
-from wearcap.training.losses import masked_mean
 
 MIN_SCALE = 0.02
 """No feature is stretched more than this: what hardly varies would otherwise be mostly noise."""
@@ -33,46 +30,33 @@ class MotionEncoding(lightning.LightningModule):
     ):
         super().__init__()
         self.features, self.window = features, window
-        self.net = net(size=features.size, frames=features.frames(window))
+        self.net = net(size=features.size, frames=window // features.every)
         self._optimizer, self._scheduler = optimizer, scheduler
 
-    def set_statistics(self, dataset: WindowDataset, limit: int = 1000) -> None:
+    def set_statistics(self, dataset: MovementDataset, limit: int = 1000) -> None:
         """Take normalisation from a training split; a resumed run brings its own with the weights."""
         random = torch.Generator().manual_seed(0)
         drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
-        parts = []
-        for start in range(0, limit, 50):
-            batch = collate([dataset[item] for item in zip(drawn[start : start + 50], range(start, limit))])
-            parts.append(self.encode(batch)[batch.valid[:, :: self.features.every]])
-        rows = torch.cat(parts)
-        self.net.normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
+        features = self.features.encode(collate([dataset[item] for item in zip(drawn, range(limit))]))
+        mean, scale = features.mean((0, 1)), features.std((0, 1)).clamp_min(MIN_SCALE)
+        self.net.normalizer.set(mean, scale)
 
-    def encode(self, batch: Window) -> Float[Tensor, "window frame feature"]:
-        """Features of the true bodies, hung from their heads."""
-        head = Rigid(batch.R_world_head, batch.t_world_head)
-        offsets = batch.t_parent_joint[:, None]
-        R, T_world_joint = hang(self.features.skeleton, batch.R_parent_joint, head, offsets)
-        return self.features.encode(T_world_joint.t, R[:, :, 0], batch.floor_height)
-
-    def _loss(self, batch: Window, stage: str) -> Tensor:
-        features = self.encode(batch)
-        valid = batch.valid[:, :: self.features.every]
+    def _loss(self, batch: Movement, stage: str) -> Tensor:
+        features = self.features.encode(batch)
         rebuilt = self.net(features)
-        error = F.smooth_l1_loss(rebuilt, self.net.normalizer(features), reduction="none")
-        loss = masked_mean(error.mean(-1), valid)
+        loss = F.smooth_l1_loss(rebuilt, self.net.normalizer(features))
         joints = self.features.joints(self.net.normalizer.inverse(rebuilt))
-        distance = (joints - self.features.joints(features)).norm(dim=-1).mean(-1)
+        error = mpjpe_cm(joints, self.features.joints(features))
         self.log_dict(
-            {f"{stage}/loss": loss, f"{stage}/joints_cm": 100 * distance[valid].mean()},
-            batch_size=len(valid), prog_bar=stage == "train", sync_dist=stage == "val",
-            on_step=stage == "train", on_epoch=stage == "val",
+            {f"{stage}/loss": loss, f"{stage}/joints_cm": error}, batch_size=len(features),
+            prog_bar=stage == "train", sync_dist=stage == "val", on_step=stage == "train", on_epoch=stage == "val",
         )  # fmt: skip
         return loss
 
-    def training_step(self, batch: Window, batch_idx: int) -> Tensor:
+    def training_step(self, batch: Movement, batch_idx: int) -> Tensor:
         return self._loss(batch, "train")
 
-    def validation_step(self, batch: Window, batch_idx: int) -> None:
+    def validation_step(self, batch: Movement, batch_idx: int) -> None:
         self._loss(batch, "val")
 
     def configure_optimizers(self):
