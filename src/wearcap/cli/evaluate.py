@@ -8,16 +8,20 @@ from rich import print as show
 from rich.progress import Progress
 
 from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import load_pipeline, staged, trained_on
+from wearcap.cli.load import load_pipeline, load_realism, staged, trained_on
 from wearcap.errors import WearcapError
-from wearcap.metrics.table import Row, Scores, aggregate, rich_table, write_scores
+from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, write_scores
 from wearcap.pipelines.baselines import MeanPose, NearestWindow
 from wearcap.pipelines.evaluation import Measure, Pipeline, evaluate, score
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.ireplica import IReplica
 from wearcap.pipelines.ireplica_evaluation import with_interactions
 from wearcap.pipelines.pose_regressor import PoseRegressorCapture
+from wearcap.pipelines.realism import Realism
 from wearcap.recording import RecordingStore
+
+OURS = "wearcap"
+"""Name of the checkpoint's method in the table."""
 
 HELP = "score a checkpoint: wearcap evaluate checkpoint=… [dataset=DIR] [split=test], or pipeline=hps dataset=DIR"
 
@@ -52,18 +56,34 @@ def _learned(checkpoints: list[str], config: DictConfig, progress: Progress) -> 
     told = bool(config.dataset) and not config.baselines
     sources, validated = ([], None) if told else trained_on(checkpoints[0])
     store = RecordingStore.open(config.dataset or validated)
+    realism = None if config.realism is None else load_realism(config.realism)
     rows: list[Row] = []
     for index, checkpoint in enumerate(checkpoints):
         pipeline = load_pipeline(checkpoint, config.pipeline, config.device)
         assert isinstance(pipeline, HMD2 | PoseRegressorCapture)
         seeds = [index * 1000 + seed for seed in config.seeds]
-        rows += _rows(pipeline, store, seeds, config, progress, Path(checkpoint).parts[-3:][0])
-    scores: Scores = {"wearcap": aggregate(rows)}
+        title, measure = Path(checkpoint).parts[-3:][0], _beside(realism, OURS)
+        rows += _rows(pipeline, store, seeds, config, progress, title, measure)
+    scores: Scores = {OURS: _summaries(rows, realism, OURS)}
     if config.baselines:
         for name, method in (("mean pose", MeanPose), ("nearest window", NearestWindow)):
             baseline = method.fit([RecordingStore.open(source) for source in sources])
-            scores[name] = aggregate(list(_rows(baseline, store, [0], config, progress, name)))
+            rows = list(_rows(baseline, store, [0], config, progress, name, _beside(realism, name)))
+            scores[name] = _summaries(rows, realism, name)
     return store, scores
+
+
+def _beside(realism: Realism | None, method: str) -> Measure:
+    return score if realism is None else realism.beside(score, method)
+
+
+def _summaries(rows: list[Row], realism: Realism | None, method: str) -> dict[str, Summary]:
+    """A method's scores, and what its motions are like as a whole, if that is asked for."""
+    if realism is None:
+        return aggregate(rows)
+    if notice := realism.notice(method):
+        show(f"[yellow]{notice}[/yellow]")
+    return aggregate(rows) | realism.scores(method)
 
 
 def _rows(

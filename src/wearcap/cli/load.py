@@ -14,16 +14,17 @@ from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
 from wearcap.pipelines.contact_prediction import ContactPredictor
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.pose_regressor import PoseRegressorCapture
+from wearcap.pipelines.realism import Realism
 from wearcap.pipelines.stages import StagedCapture, StagedPipeline
 from wearcap.recording.locate import dataset_folder
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
 from wearcap.training.contact_detection import ContactDetection
+from wearcap.training.motion_autoencoder import MotionEncoding
 from wearcap.training.motion_diffusion import MotionDiffusion
 from wearcap.training.pose_regression import PoseRegression
 
-
-System = MotionDiffusion | ContactDetection | PoseRegression
+System = MotionDiffusion | ContactDetection | PoseRegression | MotionEncoding
 
 
 def load_system(checkpoint: str | Path) -> tuple[System, dict[str, Any]]:
@@ -61,6 +62,14 @@ def load_pipeline(
     if not isinstance(system, MotionDiffusion):
         raise WearcapError(f"{name} needs a motion denoiser", where=given[0], expected="a checkpoint of one, not of another network")  # fmt: skip
     return made(**system.pipeline_parts(), device=device)
+
+
+def load_realism(checkpoint: str | Path) -> Realism:
+    """What gathers FID and Diversity, in the latent space of a motion autoencoder."""
+    system, _ = load_system(checkpoint)
+    if not isinstance(system, MotionEncoding):
+        raise WearcapError("realism needs a motion autoencoder", where=checkpoint, expected="a checkpoint of experiment=motion_autoencoder")  # fmt: skip
+    return Realism(system.net, system.features)
 
 
 def staged(pipeline: StagedPipeline, config: DictConfig, data: str | Path, console: Console) -> StagedCapture:

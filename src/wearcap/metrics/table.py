@@ -148,7 +148,7 @@ def aggregate(rows: list[Row]) -> dict[str, Summary]:
         name: [_weighted_mean(name, list(recordings.values())) for recordings in by_seed.values()]
         for name in names
     }
-    return {name: _summary(values) for name, values in per_seed.items()}
+    return {name: summarize(values) for name, values in per_seed.items()}
 
 
 def _weighted_mean(name: str, rows: list[Row]) -> float:
@@ -158,7 +158,8 @@ def _weighted_mean(name: str, rows: list[Row]) -> float:
     return sum(score * weight for score, weight in known) / total if total else math.nan
 
 
-def _summary(values: list[float]) -> Summary:
+def summarize(values: list[float]) -> Summary:
+    """Mean and spread of one score over seeds."""
     mean = sum(values) / len(values)
     if len(values) == 1:
         return Summary(mean, None, 1)

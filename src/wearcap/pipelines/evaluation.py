@@ -51,18 +51,28 @@ def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
     Both are hung from the true head, but for `world_root_cm` and `world_mpjpe_cm`: these are measured where the capture
     put the body in the world.
     """
+    hung, truth, contact = comparable(motion, recording, name)
+    scores = evaluate_motion(hung, truth, contact)
+    joints, joints_true = motion.T_world_joint.t, truth.T_world_joint.t
+    scores["world_root_cm"] = root_error_cm(joints[:, 0], joints_true[:, 0]).item()
+    scores["world_mpjpe_cm"] = mpjpe_cm(joints, joints_true).item()
+    return Row(name, seed, len(truth), scores)
+
+
+def comparable(
+    motion: Motion, recording: Recording, name: str
+) -> tuple[Motion, Motion, Bool[Tensor, "time patch"] | None]:
+    """A capture hung from the true head, the truth at the capture's frames, and the true contact of its feet.
+
+    Raises WearcapError when the recording has no true motion.
+    """
     truth, contact = recording.motion, _foot_contact(recording)
     if truth is None:
         raise WearcapError("no true motion to compare with", where=name, expected="a recording with `motion`")
     if _within(motion, truth):
         frame = _nearest_frames(truth, motion.timestamps)
         truth, contact = at_times(truth, motion.timestamps), None if contact is None else contact[frame]
-    hung = hang_from_head(motion, truth.joint("head"))
-    scores = evaluate_motion(hung, truth, contact)
-    joints, joints_true = motion.T_world_joint.t, truth.T_world_joint.t
-    scores["world_root_cm"] = root_error_cm(joints[:, 0], joints_true[:, 0]).item()
-    scores["world_mpjpe_cm"] = mpjpe_cm(joints, joints_true).item()
-    return Row(name, seed, len(truth), scores)
+    return hang_from_head(motion, truth.joint("head")), truth, contact
 
 
 def _within(motion: Motion, truth: Motion) -> bool:
