@@ -64,12 +64,12 @@ def load_pipeline(
     return made(**system.pipeline_parts(), device=device)
 
 
-def load_realism(checkpoint: str | Path) -> Realism:
-    """What gathers FID and Diversity, in the latent space of a motion autoencoder."""
+def load_realism(checkpoint: str | Path, stride_s: float = 1.0) -> Realism:
+    """What gathers FID and Diversity of windows so far apart, in the latent space of a motion autoencoder."""
     system, _ = load_system(checkpoint)
     if not isinstance(system, MotionEncoding):
         raise WearcapError("realism needs a motion autoencoder", where=checkpoint, expected="a checkpoint of experiment=motion_autoencoder")  # fmt: skip
-    return Realism(system.net, system.features)
+    return Realism(system.net, system.features, stride_s)
 
 
 def staged(pipeline: StagedPipeline, config: DictConfig, data: str | Path, console: Console) -> StagedCapture:

@@ -1,0 +1,79 @@
+"""One row of HMD²'s tables: a method captures recordings of a data set with every seed, and is scored."""
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from wearcap.cli.conf import compose
+from wearcap.cli.load import load_pipeline, load_realism
+from wearcap.metrics.table import Row, Summary, aggregate
+from wearcap.pipelines.baselines import MeanPose, NearestWindow
+from wearcap.pipelines.evaluation import evaluate, score
+from wearcap.recording import RecordingStore
+
+BASELINES = {"mean pose": MeanPose, "nearest window": NearestWindow}
+STRIDE_S = 0.5
+"""Windows of FID and Diversity are this far apart."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row: what captures, and how. Without checkpoint, one of `BASELINES`."""
+
+    name: str
+    checkpoint: str | None = None
+    pipeline: tuple[str, ...] = ("pipeline=hmd2",)
+    """Overrides of conf/evaluate.yaml."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a row is measured on; picklable."""
+
+    dataset: Path
+    names: tuple[str, ...]
+    seeds: tuple[int, ...]
+    training: tuple[str, ...]
+    """Data sets whose training splits the baselines learn from."""
+    realism: str | None
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class Result:
+    """Scores of a row over seeds: of all recordings, and by what was mostly done in them."""
+
+    method: str
+    scores: dict[str, Summary]
+    activities: dict[str, dict[str, Summary]]
+
+
+def run_method(method: Method, case: Case) -> Result:
+    """Capture and score. Raises what the verbs of wearcap raise."""
+    torch.set_num_threads(1)
+    store = RecordingStore.open(case.dataset)
+    if method.checkpoint is None:
+        pipeline = BASELINES[method.name].fit([RecordingStore.open(root) for root in case.training])
+        seeds = case.seeds[:1]
+    else:
+        config = compose("evaluate", [*method.pipeline, "checkpoint=none"])
+        pipeline, seeds = load_pipeline(method.checkpoint, config.pipeline, case.device), case.seeds
+        if "pipeline=pose_regressor" in method.pipeline:
+            seeds = seeds[:1]
+    realism = None if case.realism is None else load_realism(case.realism, STRIDE_S)
+    measure = score if realism is None else realism.beside(score, method.name)
+    rows = list(evaluate(pipeline, store, case.names, seeds, lanes=8, measure=measure))
+    scores = aggregate(rows)
+    if realism is not None:
+        scores |= realism.scores(method.name)
+    return Result(method.name, scores, _by_activity(rows, store))
+
+
+def _by_activity(rows: list[Row], store: RecordingStore) -> dict[str, dict[str, Summary]]:
+    """Scores by what was done longest in a recording (thesis Tables 6.8–6.10)."""
+    groups: defaultdict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        groups[store.entries[row.recording].activity.partition(",")[0] or "unnamed"].append(row)
+    return {activity: aggregate(group) for activity, group in sorted(groups.items())}
