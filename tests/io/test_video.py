@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from wearcap.errors import WearcapError
-from wearcap.io.video import read_frames, read_image
+from wearcap.io.video import read_frames, read_image, write_frames
 
 
 def write_video(path, count: int = 12, rate: int = 25) -> None:
@@ -61,3 +61,21 @@ def test_pictures_are_not_turned_by_what_their_exif_says(tmp_path):
     (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:60])
     with pytest.raises(WearcapError, match="not a readable picture"):
         read_image(tmp_path / "b.png")
+
+
+def test_written_pictures_come_back(tmp_path):
+    shades = [np.full((32, 48, 3), 20 * k, np.uint8) for k in range(9)]
+    assert write_frames(tmp_path / "a.mp4", iter(shades), 29.97) == 9
+    times, pictures = zip(*read_frames(tmp_path / "a.mp4"))
+    np.testing.assert_allclose(times, np.arange(9) / 29.97, atol=1e-3)
+    np.testing.assert_allclose([picture.mean() for picture in pictures], 20 * np.arange(9), atol=4)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [([], "no pictures"), ([(31, 48)], "48x31 pixels"), ([(32, 48), (32, 50)], "50x32 pixels")],
+)
+def test_pictures_that_make_no_video_are_named(shapes, message, tmp_path):
+    with pytest.raises(WearcapError, match=f"a.mp4.*{message}"):
+        write_frames(tmp_path / "a.mp4", (np.zeros((*shape, 3), np.uint8) for shape in shapes), 30.0)
+    assert not list(tmp_path.iterdir())

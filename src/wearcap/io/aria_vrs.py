@@ -3,18 +3,21 @@
 Timestamps are the device's clock, the one that MPS trajectories carry. Frames as in io/aria_mps.py.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float64, UInt8
 from PIL import Image
+from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.aria_mps import R_CPF_DEVICE, T_HEAD_DEVICE
+from wearcap.io.video import write_frames
 from wearcap.recording import CameraStream, ImuStream
 
 try:
@@ -93,35 +96,83 @@ def extract_images(
     Files are named `<label>/<index>.jpg` under `folder`, and so in the stream. Raises WearcapError as `read_device`
     does, and for a camera that the recording lacks.
     """
-    provider, device = _open(path), read_device(path)
-    stream = provider.get_stream_id_from_label(label)
-    if stream is None or label not in device.T_aria_sensor:
-        raise WearcapError(
-            f"no camera {label!r}", where=path, expected=f"one of {', '.join(device.T_aria_sensor)}"
-        )
-    original = provider.get_device_calibration().get_camera_calib(label)
-    pinhole = aria_calibration.get_linear_camera_calibration(
-        size, size, focal, label, original.get_transform_device_camera()
-    )
-    upright = aria_calibration.rotate_camera_calib_cw90deg(pinhole)
+    view = _UprightView(path, label, size, focal)
     (Path(folder) / label).mkdir(parents=True, exist_ok=True)
-    times, names = [], []
-    for i in range(provider.get_num_data(stream)):
-        image, record = provider.get_image_data_by_index(stream, i)
-        flat = aria_calibration.distort_by_calibration(image.to_numpy_array(), pinhole, original)
+    times, names = view.times(), []
+    for i in range(len(times)):
         names.append(f"{label}/{i:06d}.jpg")
-        times.append(record.capture_timestamp_ns * 1e-9)
         with atomic_path(Path(folder) / names[-1]) as temporary:
-            Image.fromarray(np.ascontiguousarray(np.rot90(flat, -1))).save(temporary, quality=92)
-    T_head_aria = (
-        (T_head_device or T_HEAD_DEVICE) @ Rigid(R_CPF_DEVICE.T, torch.zeros(3)) @ device.T_aria_cpf.inverse()
-    )
-    T_head_cam = T_head_aria @ _rigid(upright.get_transform_device_camera())
-    (fx, fy), (cx, cy) = upright.get_focal_lengths(), upright.get_principal_point()
-    camera = Camera("pinhole", size, size, float(fx), float(fy), float(cx), float(cy))
-    return CameraStream(
-        torch.tensor(times, dtype=torch.float64), camera, T_head_cam.R, T_head_cam.t, tuple(names)
-    )
+            Image.fromarray(view.picture(i)).save(temporary, quality=92)
+    return replace(view.stream(times, T_head_device), image_files=tuple(names))
+
+
+def extract_video(
+    path: str | Path,
+    file: Path,
+    *,
+    between: tuple[float, float] | None = None,
+    label: str = "camera-rgb",
+    size: int = 256,
+    focal: float = 140.0,
+    T_head_device: Rigid | None = None,
+) -> CameraStream:
+    """As `extract_images`, but into one MP4, which the stream names by its folder's name and its own.
+
+    `between` keeps the frames from one device time to another (s). Raises WearcapError as `extract_images` does, and
+    when fewer than two frames are left.
+    """
+    view = _UprightView(path, label, size, focal, finer=4)
+    times = view.times()
+    first, stop = 0, len(times)
+    if between is not None:
+        first, stop = np.searchsorted(times.numpy(), between).tolist()
+    if stop - first < 2:
+        raise WearcapError(f"{stop - first} pictures of {label!r} in the time that is wanted", where=path,
+                           expected="a recording of the same time")  # fmt: skip
+    fps = 1 / times[first:stop].diff().median().item()
+    write_frames(file, (view.picture(i) for i in range(first, stop)), fps)
+    return replace(view.stream(times[first:stop], T_head_device), video=f"{file.parent.name}/{file.name}")
+
+
+class _UprightView:
+    """A camera's pictures, undistorted to a square pinhole and turned upright: Aria's sensors are mounted on their side."""
+
+    def __init__(self, path: str | Path, label: str, size: int, focal: float, finer: int = 1):
+        """`finer`: pictures are drawn so many times larger and then averaged, against aliasing where they are small."""
+        self.provider, self.device, self.label, self.size = _open(path), read_device(path), label, size
+        self.source = self.provider.get_stream_id_from_label(label)
+        if self.source is None or label not in self.device.T_aria_sensor:
+            raise WearcapError(
+                f"no camera {label!r}", where=path, expected=f"one of {', '.join(self.device.T_aria_sensor)}"
+            )
+        self.original = self.provider.get_device_calibration().get_camera_calib(label)
+        self.pinhole, self._drawn = (
+            aria_calibration.get_linear_camera_calibration(
+                size * scale, size * scale, focal * scale, label, self.original.get_transform_device_camera()
+            )
+            for scale in (1, finer)
+        )
+        self._finer = finer
+
+    def times(self) -> Float64[Tensor, "time"]:
+        """When each picture was taken (s, the device's clock)."""
+        stamps = self.provider.get_timestamps_ns(self.source, TimeDomain.DEVICE_TIME)
+        return torch.tensor(stamps, dtype=torch.int64).double() * 1e-9
+
+    def picture(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
+        image, _ = self.provider.get_image_data_by_index(self.source, index)
+        flat = aria_calibration.distort_by_calibration(image.to_numpy_array(), self._drawn, self.original)
+        upright = Image.fromarray(np.ascontiguousarray(np.rot90(flat, -1))).convert("RGB")
+        return np.asarray(upright.reduce(self._finer))
+
+    def stream(self, times: Float64[Tensor, "time"], T_head_device: Rigid | None) -> CameraStream:
+        """The upright camera on the head joint, without pictures."""
+        upright = aria_calibration.rotate_camera_calib_cw90deg(self.pinhole)
+        T_device_aria = Rigid(R_CPF_DEVICE.T, torch.zeros(3)) @ self.device.T_aria_cpf.inverse()
+        T_head_cam = (T_head_device or T_HEAD_DEVICE) @ T_device_aria @ _rigid(upright.get_transform_device_camera())  # fmt: skip
+        (fx, fy), (cx, cy) = upright.get_focal_lengths(), upright.get_principal_point()
+        camera = Camera("pinhole", self.size, self.size, float(fx), float(fy), float(cx), float(cy))
+        return CameraStream(times, camera, T_head_cam.R, T_head_cam.t)
 
 
 def timecode_offset_s(path: str | Path) -> float:

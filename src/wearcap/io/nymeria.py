@@ -21,6 +21,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate
 from wearcap.io.amass import PELVIS_SMPLH, A
 from wearcap.io.aria_mps import T_HEAD_DEVICE, find_mps_file, head_stream, read_closed_loop, read_mps_points
+from wearcap.io.aria_vrs import extract_video
 from wearcap.io.head_alignment import align_head, clock_offset
 from wearcap.io.npz import read_npz, require
 from wearcap.recording import ContactTrack, HeadStream, Motion, Recording
@@ -35,6 +36,11 @@ MAX_RESIDUAL_M = 0.25
 def is_nymeria(folder: str | Path) -> bool:
     """Whether a folder is a Nymeria sequence with body motion."""
     return (Path(folder) / "body" / "xdata.npz").is_file()
+
+
+def head_vrs(folder: str | Path) -> Path:
+    """Where the head device's own recording lies, if it was downloaded."""
+    return Path(folder) / "recording_head" / "data" / "data.vrs"
 
 
 def read_xdata(path: str | Path) -> tuple[Motion, ContactTrack | None]:
@@ -136,12 +142,15 @@ def read_smpl_neutral(path: str | Path) -> Motion:
     return Motion(timestamps, smpl24(), R.float(), t_root.float(), provenance={"source": Path(path).name})
 
 
-def read_nymeria(folder: str | Path, *, fps: float = 60.0, clock_offset_s: float | None = None) -> Recording:
+def read_nymeria(
+    folder: str | Path, *, fps: float = 60.0, clock_offset_s: float | None = None, video: Path | None = None
+) -> Recording:
     """Recording of one sequence folder: head stream, points, and the suit's motion in the head device's world and clock.
 
     All streams at `fps` (Hz) on the device's clock, cut to what suit and device share. `clock_offset_s` is added to the
     suit's (time code) timestamps; by default it is found by correlating head turns, to a few milliseconds.
-    Raises WearcapError when a part is missing or suit and device cannot be aligned.
+    With `video`, the head's colour camera (`recording_head/data/data.vrs`) is written there as an MP4, undistorted and
+    upright; that needs projectaria-tools. Raises WearcapError when a part is missing or suit and device cannot be aligned.
     """
     folder = Path(folder)
     slam = folder / "recording_head" / "mps" / "slam"
@@ -156,8 +165,12 @@ def read_nymeria(folder: str | Path, *, fps: float = 60.0, clock_offset_s: float
     except WearcapError as error:
         raise WearcapError(error.what, where=folder, expected=error.expected, fix=error.fix) from error
     about = read_metadata(folder)
+    camera = None if video is None else extract_video(
+        head_vrs(folder), video, between=(head.timestamps[0].item(), head.timestamps[-1].item()),
+        T_head_device=Rigid(head.R_head_device, head.t_head_device),
+    )  # fmt: skip
     return Recording(
-        name=folder.resolve().name, head=head, motion=motion, contacts=contact, skeleton=motion.skeleton,
+        name=folder.resolve().name, head=head, motion=motion, contacts=contact, camera=camera, skeleton=motion.skeleton,
         points=read_mps_points(slam), source="Nymeria", license="Nymeria dataset licence", **about,
     )  # fmt: skip
 

@@ -1,7 +1,8 @@
-"""Pictures as RGB arrays: single image files, and the frames of a video with their times."""
+"""Pictures as RGB arrays: single image files, and the frames of a video with their times; writing a small video."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -10,6 +11,7 @@ from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
 from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
@@ -84,3 +86,31 @@ def video_info(path: str | Path) -> VideoInfo:
         raise WearcapError("no such video", where=path) from error
     except (av.FFmpegError, OSError) as error:
         raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error
+
+
+def write_frames(
+    path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 3"]], fps: float, crf: int = 18
+) -> int:
+    """Write pictures of one even size as an MP4 (H.264 where PyAV has it, else MPEG-4); returns how many.
+
+    `crf` is H.264's quality, smaller is better. Raises WearcapError for odd or changing sizes, and for no frames.
+    """
+    count = 0
+    with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
+        codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
+        options = {"crf": str(crf), "preset": "veryfast", "threads": "1"}
+        stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001), options=options)
+        assert isinstance(stream, av.VideoStream)
+        size = (0, 0)
+        for count, frame in enumerate(frames, 1):
+            if count == 1:
+                size = (frame.shape[1], frame.shape[0])
+                stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+            if (frame.shape[1], frame.shape[0]) != size or size[0] % 2 or size[1] % 2:
+                raise WearcapError(f"a picture of {frame.shape[1]}x{frame.shape[0]} pixels", where=path,
+                                   expected="even sizes, all alike")  # fmt: skip
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        if not count:
+            raise WearcapError("no pictures to write", where=path)
+        container.mux(stream.encode(None))
+    return count

@@ -7,7 +7,7 @@ from wearcap.data.prepare.engine import Task, content_hash
 from wearcap.data.prepare.splits import Splits
 from wearcap.errors import WearcapError
 from wearcap.io.aria_mps import mps_files
-from wearcap.io.nymeria import is_nymeria, read_metadata, read_nymeria
+from wearcap.io.nymeria import head_vrs, is_nymeria, read_metadata, read_nymeria
 from wearcap.recording.recording import Recording
 
 VERSION = 2
@@ -22,13 +22,25 @@ class NymeriaSequence:
     name: str
     fps: float | int
     license: str
+    video: Path | None = None
 
     def __call__(self) -> Recording:
-        return replace(read_nymeria(self.folder, fps=float(self.fps)), name=self.name, license=self.license)
+        recording = read_nymeria(self.folder, fps=float(self.fps), video=self.video)
+        return replace(recording, name=self.name, license=self.license)
 
 
-def nymeria_tasks(source: str | Path, splits: Splits, fps: float | int, license: str) -> list[Task]:
-    """One task per sequence folder (with `body/xdata.npz`) below `source`; hashed by its motion, head path and points."""
+def nymeria_tasks(
+    source: str | Path,
+    splits: Splits,
+    fps: float | int,
+    license: str,
+    camera: bool = False,
+    output: str = ".",
+) -> list[Task]:
+    """One task per sequence folder (with `body/xdata.npz`) below `source`; hashed by its motion, head path and points.
+
+    With `camera`, what the head's colour camera saw goes to `output`/videos, for sequences with `data.vrs`.
+    """
     source = Path(source)
     if not source.is_dir():
         raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
@@ -40,7 +52,10 @@ def nymeria_tasks(source: str | Path, splits: Splits, fps: float | int, license:
         name = folder.resolve().name
         about = read_metadata(folder)
         paths = mps_files(folder / "recording_head")
-        sequence = NymeriaSequence(folder, name, fps, license)
-        settings_hash = content_hash(name, float(fps), VERSION, about, folder / "body" / "xdata.npz", *paths)
+        vrs = head_vrs(folder)
+        video = Path(output) / "videos" / f"{name}.mp4" if camera and vrs.is_file() else None
+        sequence = NymeriaSequence(folder, name, fps, license, video)
+        settings_hash = content_hash(name, float(fps), VERSION, about, folder / "body" / "xdata.npz", *paths,
+                                     vrs.stat().st_size if video else 0)  # fmt: skip
         tasks.append(Task(name, sequence, splits.of(about["subject"]), settings_hash))
     return tasks
