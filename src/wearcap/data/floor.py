@@ -63,7 +63,24 @@ class FloorTracker:
         self._heights: deque[float] = deque(maxlen=int(UPRIGHT_WITHIN_S * fps / LOOK_FRAMES))
         self._path: deque[np.ndarray] = deque(maxlen=int(RECENT_S * fps / LOOK_FRAMES))
         self._tiles: defaultdict[tuple[int, int], list[np.ndarray]] = defaultdict(list)
-        self._frames, self._height = 0, 0.0
+        self.frames = 0
+        """Followed so far."""
+        self._height = 0.0
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything but the points, which are to be shown again."""
+        return {
+            "heights": torch.tensor(list(self._heights), dtype=torch.float64),
+            "path": torch.from_numpy(np.array(self._path).reshape(-1, 3)),
+            "now": torch.tensor([self.frames, self._height], dtype=torch.float64),
+        }
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on from what `state` gave."""
+        self._heights.extend(state["heights"].tolist())
+        self._path.extend(state["path"].numpy())
+        frames, self._height = state["now"].tolist()
+        self.frames = int(frames)
 
     def see(self, points_world: Float[Tensor, "point 3"]) -> None:
         """Take in points (m); those that are not finite are left out."""
@@ -80,11 +97,11 @@ class FloorTracker:
         floor = torch.empty(len(t_world_head))
         done = 0
         while done < len(floor):
-            if self._frames % LOOK_FRAMES == 0:
+            if self.frames % LOOK_FRAMES == 0:
                 self._look(t_world_head[done].double().numpy())
-            ready = min(len(floor) - done, LOOK_FRAMES - self._frames % LOOK_FRAMES)
+            ready = min(len(floor) - done, LOOK_FRAMES - self.frames % LOOK_FRAMES)
             floor[done : done + ready] = self._height
-            done, self._frames = done + ready, self._frames + ready
+            done, self.frames = done + ready, self.frames + ready
         return floor
 
     def _look(self, head: np.ndarray) -> None:

@@ -258,7 +258,7 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
                            fix="Sort the head stream by time and leave repeated poses out.")  # fmt: skip
     skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
     trajectory = Trajectory(times, head.R_world_device[known], head.t_world_device[known])
-    breaks = _breaks(trajectory)
+    broken = breaks(trajectory)
     count = int((times[-1] - times[0]).item() * fps + 1e-3) + 1
     timestamps = times[0] + torch.arange(count, dtype=torch.float64) / fps
     if count != len(times) or (timestamps - times).abs().max() > 1e-4:
@@ -267,7 +267,7 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
     T_world_head = trajectory.T_world_body @ T_device_head
     floor = floor_from_path(timestamps, T_world_head.t, skeleton.height_of("head"))
     stretches, first = [], 0
-    for before, after in breaks:
+    for before, after in broken:
         stretches.append((first, int(torch.searchsorted(timestamps, before + 1e-6))))
         first = int(torch.searchsorted(timestamps, after - 1e-6))
     stretches.append((first, count))
@@ -277,7 +277,7 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
     )  # fmt: skip
 
 
-def _breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
+def breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
     """Times (last before, first behind) of gaps and of jumps."""
     step = trajectory.timestamps.diff()
     speed = trajectory.t_world_body.diff(dim=0).norm(dim=-1) / step

@@ -1,0 +1,308 @@
+"""HMD² as a stream: the same poses as in one go, whatever happens on the way, in bounded memory."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+
+from wearcap.body.skeleton import xsens23
+from wearcap.data.features import HeadFeatures
+from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
+from wearcap.models.denoiser import MotionDenoiser
+from wearcap.pipelines.hmd2 import HMD2
+from wearcap.pipelines.hmd2_places import Memory
+from wearcap.pipelines.hmd2_stream import Sensed, Session, Wearer
+from wearcap.recording import CameraStream, Motion, PointCloud, Recording
+from wearcap_testing import recording_of, swaying_motion
+
+WINDOW, IMAGE = 60, 8
+
+
+@pytest.fixture(scope="module")
+def places() -> VoxelAutoencoder:
+    torch.manual_seed(1)
+    return VoxelAutoencoder().eval()
+
+
+@pytest.fixture
+def pipeline(places):
+    """Makes small pipelines with random weights that do say something."""
+
+    def make(stride: int = 10, points: bool = True, seed: int = 0, **changes) -> HMD2:
+        torch.manual_seed(seed)
+        features = HeadFeatures(contacts=True, body=True)
+        net = MotionDenoiser(
+            features.motion_size, features.condition_size, WINDOW, 32, 1, 4, 64, 0.0, 4, blend=5,
+            points_size=places.size if points else 0, image_size=IMAGE if points else 0,
+        )  # fmt: skip
+        for parameter in net.parameters():
+            torch.nn.init.normal_(parameter, std=0.05)
+        told = {"steps": 3, "place_encoder": places, "image_encoder": "eyes", "live": True} | changes
+        return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, stride=stride, **told)
+
+    return make
+
+
+def surrounded(frames: int, seed: int = 0) -> Recording:
+    """A walk on a floor of points that are seen on the way, with embeddings at 30 Hz."""
+    recording = recording_of(swaying_motion(frames, seed), f"r{seed}")
+    random = torch.Generator().manual_seed(seed)
+    count = 40 * frames
+    points = 4 * torch.rand(count, 3, generator=random) - 2
+    points[: count // 2, 2] = 0.0
+    times = recording.head.timestamps
+    first_seen = times[torch.randint(0, frames, (count,), generator=random)].sort().values
+    first_seen[0] = times[0]
+    shown = times[::2]
+    camera = CameraStream(
+        shown, Camera.pinhole(32, 32, 90.0), torch.eye(3), torch.zeros(3),
+        embedding=torch.randn(len(shown), IMAGE, generator=random), embedding_name="eyes",
+    )  # fmt: skip
+    return replace(recording, points=PointCloud(points, first_seen=first_seen), camera=camera)
+
+
+def moments(recording: Recording) -> list[Sensed]:
+    """A recording as it was sensed, moment by moment."""
+    head, points, camera = recording.head, recording.points, recording.camera
+    told = []
+    for i, time in enumerate(head.timestamps.tolist()):
+        new = points.points_world[points.first_seen == time] if points is not None else None
+        shown = camera is not None and i % 2 == 0
+        told.append(Sensed(time, head.T_world_device[i], new, camera.embedding[i // 2] if shown else None))
+    return told
+
+
+def wearer(recording: Recording) -> Wearer:
+    return Wearer(recording.skeleton, recording.head.R_head_device, recording.head.t_head_device)
+
+
+def stream(session: Session, *told: list[Sensed], ended: bool = True) -> list[Motion]:
+    """One motion per wearer, from one moment of each per push."""
+    said = [[] for _ in told]
+    for i in range(max(len(part) for part in told)):
+        for parts, motion in zip(said, session.push([part[i : i + 1] for part in told])):
+            parts += [] if motion is None else [motion]
+    for parts, motion in zip(said, session.flush() if ended else [None] * len(told)):
+        parts += [] if motion is None else [motion]
+    return [together(parts) for parts in said]
+
+
+def together(parts: list[Motion]) -> Motion:
+    return replace(
+        parts[0], timestamps=torch.cat([part.timestamps for part in parts]),
+        R_parent_joint=torch.cat([part.R_parent_joint for part in parts]),
+        t_world_root=torch.cat([part.t_world_root for part in parts]),
+        contact_prob=torch.cat([part.contact_prob for part in parts]),
+    )  # fmt: skip
+
+
+def assert_same(motion: Motion, other: Motion, atol: float = 1e-5) -> None:
+    assert torch.allclose(motion.timestamps, other.timestamps, atol=1e-9)
+    for name in ("R_parent_joint", "t_world_root", "contact_prob"):
+        torch.testing.assert_close(getattr(motion, name), getattr(other, name), atol=atol, rtol=0)
+
+
+@pytest.mark.parametrize(("stride", "frames"), [(10, 133), (45, 150), (60, 121)])
+def test_streaming_equals_the_capture_of_the_whole(pipeline, stride, frames):
+    recording, hmd2 = surrounded(frames), pipeline(stride)
+    streamed = stream(Session(hmd2, [wearer(recording)], [3]), moments(recording))[0]
+    assert len(streamed) == frames
+    assert_same(streamed, hmd2(recording, seed=3))
+
+
+def test_poses_wait_for_the_stride(pipeline):
+    session = Session(pipeline(), [Wearer(xsens23())], [0])
+    said = [session.push([[moment]])[0] for moment in moments(surrounded(25))]
+    assert [i for i, motion in enumerate(said) if motion is not None] == [9, 19]
+    assert [len(motion) for motion in said if motion is not None] == [10, 10]
+    rest = session.flush()[0]
+    assert len(rest) == 5
+    assert session.flush() == [None]
+
+
+def test_the_head_is_where_it_was_measured(pipeline):
+    recording = surrounded(50)
+    motion = stream(Session(pipeline(), [wearer(recording)], [0]), moments(recording))[0]
+    assert torch.allclose(motion.joint("head").t, recording.head.T_world_head.t, atol=1e-4)
+    assert torch.allclose(motion.joint("head").R, recording.head.T_world_head.R, atol=1e-4)
+
+
+def test_several_wearers_are_as_alone(pipeline):
+    """One starts later and has a clock of their own; they share batches where both are ready."""
+    hmd2, recordings = pipeline(), [surrounded(90, 1), surrounded(80, 2)]
+    late = [Sensed(1e4, None)] * 0 + [
+        moment._replace(timestamp=moment.timestamp + 500.0) for moment in moments(recordings[1])
+    ]
+    session = Session(hmd2, [wearer(recording) for recording in recordings], [5, 6])
+    early = moments(recordings[0])
+    said = [[], []]
+    for i in range(90):
+        now = session.push([[early[i]], late[i - 10 : i - 9] if i >= 10 else []])
+        for parts, motion in zip(said, now):
+            parts += [] if motion is None else [motion]
+    first, second = (together(parts) for parts in said)
+    assert_same(first, hmd2(recordings[0], seed=5))
+    assert_same(replace(second, timestamps=second.timestamps - 500.0), hmd2(recordings[1], seed=6))
+
+
+def test_saved_and_restored_it_goes_on_bit_for_bit(pipeline, tmp_path):
+    recording, hmd2 = surrounded(120), pipeline()
+    told = moments(recording)
+    whole, first = (Session(hmd2, [wearer(recording)], [4]) for _ in range(2))
+    stream(first, told[:57], ended=False)
+    first.save(tmp_path / "session.safetensors")
+    again = Session.load(tmp_path / "session.safetensors", hmd2)
+    expected = stream(whole, told)[0]
+    resumed = stream(again, told[57:])[0]
+    for name in ("timestamps", "R_parent_joint", "t_world_root", "contact_prob"):
+        assert torch.equal(getattr(resumed, name), getattr(expected, name)[50:])
+
+
+def test_a_session_is_loaded_with_its_own_pipeline_alone(pipeline, tmp_path):
+    path = tmp_path / "session.safetensors"
+    Session(pipeline(), [Wearer(xsens23())], [0]).save(path)
+    with pytest.raises(WearcapError, match="a session with stride 10, not 20"):
+        Session.load(path, pipeline(20))
+    path.write_bytes(b"nothing")
+    with pytest.raises(WearcapError, match="not a saved session"):
+        Session.load(path, pipeline())
+
+
+@pytest.mark.parametrize("missing", [range(33, 37), range(20, 29), range(0)])
+def test_missing_poses_within_a_chunk_are_interpolated(pipeline, missing):
+    recording, hmd2 = surrounded(75), pipeline(points=False)
+    told = [
+        moment._replace(T_world_device=None) if i in missing else moment
+        for i, moment in enumerate(moments(recording))
+    ]
+    keep = [i for i in range(75) if i not in missing]
+    known = replace(recording, head=head_of(recording, keep))
+    assert_same(stream(Session(hmd2, [wearer(recording)], [2]), told)[0], hmd2(known, seed=2), 5e-5)
+
+
+def test_poses_that_are_missing_at_a_chunks_end_are_held_and_put_right(pipeline):
+    recording = surrounded(70)
+    told = moments(recording)
+    told[38], told[39] = (moment._replace(T_world_device=None) for moment in told[38:40])
+    session = Session(pipeline(), [wearer(recording)], [2])
+    motion = stream(session, told)[0]
+    head = motion.joint("head").t
+    assert len(motion) == 70
+    assert torch.allclose(head[38:40], head[37].expand(2, 3), atol=1e-4)
+    assert torch.allclose(head[40:], recording.head.T_world_head.t[40:], atol=1e-4)
+    window = session._lanes[0].sampler.frames.t_world_head[0]
+    true = recording.head.T_world_head.t[70 - 60 : 70]
+    assert torch.allclose(window[:60], true, atol=2e-4)
+
+
+def test_moments_out_of_order_are_sorted_in_and_late_ones_dropped(pipeline):
+    recording, hmd2 = surrounded(60), pipeline()
+    told = moments(recording)
+    mixed = [*told[:12], told[14], told[13], told[12], *told[15:]]
+    session = Session(hmd2, [wearer(recording)], [1])
+    assert_same(stream(session, mixed)[0], hmd2(recording, seed=1))
+    assert session.dropped == [0]
+    late = [*told[:15], *told[16:], told[15], told[59]]
+    session = Session(hmd2, [wearer(recording)], [1])
+    assert len(stream(session, late)[0]) == 60
+    assert session.dropped == [2]
+
+
+@pytest.mark.parametrize("fps", [90.0, 47.0])
+def test_other_rates_are_brought_to_the_pipelines(pipeline, fps):
+    motion = swaying_motion(120, fps=fps)
+    recording, hmd2 = recording_of(motion, "a"), pipeline(points=False)
+    assert_same(
+        stream(Session(hmd2, [wearer(recording)], [1]), moments(recording))[0], hmd2(recording, seed=1)
+    )
+
+
+@pytest.mark.parametrize("broken", ["gap", "jump"])
+def test_after_gaps_and_jumps_it_begins_anew_as_offline(pipeline, broken):
+    recording, hmd2 = surrounded(150), pipeline(points=False)
+    hmd2.features = replace(hmd2.features, height="relative")
+    keep = [i for i in range(150) if broken == "jump" or not 44 <= i < 90]
+    head = head_of(recording, keep)
+    if broken == "jump":
+        head = replace(
+            head,
+            t_world_device=head.t_world_device + torch.tensor([3.0, 0, 0]) * (head.timestamps > 0.8)[:, None],
+        )
+    recording = replace(recording, head=head, points=None, camera=None)
+    whole = hmd2(recording, seed=7)
+    motion = stream(Session(hmd2, [wearer(recording)], [7]), moments(recording))[0]
+    said = torch.tensor([i for i in range(150) if broken == "jump" or not 44 <= i < 90])
+    kept = replace(
+        whole, timestamps=whole.timestamps[said], R_parent_joint=whole.R_parent_joint[said],
+        t_world_root=whole.t_world_root[said], contact_prob=whole.contact_prob[said],
+    )  # fmt: skip
+    assert_same(motion, kept)
+
+
+def test_what_is_not_finite_counts_as_missing(pipeline):
+    recording, hmd2 = surrounded(60), pipeline()
+    told = moments(recording)
+    nan = Rigid(torch.full((3, 3), torch.nan), torch.zeros(3))
+    told[22] = told[22]._replace(
+        T_world_device=nan, embedding=torch.full((IMAGE,), torch.inf), floor_height=torch.nan
+    )
+    told[31] = told[31]._replace(points_world=torch.full((5, 3), torch.nan))
+    told.insert(40, Sensed(float("nan"), Rigid.identity()))
+    session = Session(hmd2, [wearer(recording)], [1])
+    motion = stream(session, told)[0]
+    assert len(motion) == 60
+    assert motion.R_parent_joint.isfinite().all()
+    assert session.dropped == [2]
+
+
+def test_embeddings_of_another_length_are_refused(pipeline):
+    with pytest.raises(WearcapError, match="an embedding of 9 features at 0.500 s"):
+        Session(pipeline(), [Wearer(xsens23())], [0]).push(
+            [[Sensed(0.5, Rigid.identity(), None, torch.zeros(9))]]
+        )
+
+
+def test_a_floor_that_is_told_is_believed(pipeline):
+    recording = surrounded(40)
+    session = Session(pipeline(), [wearer(recording)], [0])
+    stream(session, [moment._replace(floor_height=0.01 * i) for i, moment in enumerate(moments(recording))])
+    assert torch.allclose(
+        session._lanes[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5
+    )
+
+
+def test_points_beyond_the_memory_are_forgotten(pipeline):
+    session = Session(pipeline(), [Wearer(xsens23())], [0], Memory(radius_m=5.0, max_points=2000))
+    random = torch.Generator().manual_seed(0)
+    for i in range(120):
+        at = torch.tensor([0.1 * i, 0.0, 1.6])
+        points = at + 8 * torch.rand(100, 3, generator=random) - 4
+        session.push([[Sensed(i / 60, Rigid(torch.eye(3), at), points)]])
+    places = session._lanes[0].places
+    kept = torch.cat([points for points, _ in places._known + places._new])
+    assert len(kept) == len(places._map) <= 2000 + 1000
+    assert (kept - at)[:, :2].norm(dim=-1).min() < 1.0
+
+
+def test_a_long_stream_needs_no_more_than_a_short_one(pipeline, tmp_path):
+    """A minute in which the map is full after a few seconds: what would be saved does not grow."""
+    session = Session(pipeline(60, steps=1), [Wearer(xsens23())], [0], Memory(5.0, 1000))
+    told, sizes = moments(surrounded(120))[::6], []
+    for lap in range(30):
+        session.push([[moment._replace(timestamp=moment.timestamp + 2 * lap) for moment in told]])
+        if lap % 5 == 4:
+            session.save(tmp_path / "session.safetensors")
+            sizes.append((tmp_path / "session.safetensors").stat().st_size)
+    assert max(sizes[3:]) <= 1.02 * max(sizes[:3])
+
+
+def head_of(recording: Recording, take):
+    head = recording.head
+    return replace(
+        head, timestamps=head.timestamps[take], R_world_device=head.R_world_device[take],
+        t_world_device=head.t_world_device[take],
+    )  # fmt: skip
