@@ -35,7 +35,7 @@ SPACING_M = 0.04
 """Between the points that stand for a capsule."""
 VOXEL_M = 0.02
 """Points in one such cube are one point."""
-CELL_M = 0.05
+CELL_M = 0.06
 TOPS_M = (0.12, 0.25, 0.35, 0.5, 0.65, 0.8, 0.95, 1.1, 1.4, 1.7, 2.1, 2.6, np.inf)
 """Up to which height the floor's cells are looked at."""
 
@@ -146,10 +146,15 @@ class SweptFloor:
             np.minimum.at(
                 lowest, tuple(c[size == radius] for c in cell), body.points[size == radius, 2] - radius
             )
+            away, count = np.full(shape, np.inf), 0
             for layer, top in zip(clear, TOPS_M):
-                if (taken := lowest < top).any():
-                    away = np.asarray(scipy.ndimage.distance_transform_edt(~taken)) * CELL_M
-                    np.minimum(layer, away - radius - _CELL_ERROR_M, out=layer)
+                taken = lowest < top
+                if taken.sum() > count:
+                    away, count = (
+                        np.asarray(scipy.ndimage.distance_transform_edt(~taken)) * CELL_M,
+                        taken.sum(),
+                    )
+                np.minimum(layer, away - radius - _CELL_ERROR_M, out=layer)
         return cls(origin, clear)
 
     def distance(
@@ -163,7 +168,7 @@ class SweptFloor:
         return float(layer[np.clip(i, 0, layer.shape[0] - 1), np.clip(j, 0, layer.shape[1] - 1)].min())
 
 
-_SIZES = np.array([0.03, 0.055, 0.08, 0.11, 0.14])
+_SIZES = np.array([0.055, 0.08, 0.14])
 """Radii (m) that are told apart: each limb's, or a little more."""
 _CELL_ERROR_M = CELL_M
 """Bound on how far points lie from the cells' middles they are rounded to, at both ends of a distance."""

@@ -308,9 +308,10 @@ def _add_step(
     )
     for side in () if solid else (-1, 1):
         end = tread.center + turn(tread.heading) @ np.array([0.0, side * (tread.size[1] / 2 + POST_M / 2)])
-        center, size = np.array([*end, tread.z / 2]), np.array([POST_M, POST_M, tread.z])
-        if not body.meets(center, size, tread.heading, 0.0, ON_STEP):
-            builder.add_box((*builder.from_world(end), tread.z / 2), size, color, 8.0, heading)
+        size = (POST_M, POST_M, tread.z)
+        if not body.meets(np.array([*end, tread.z / 2]), np.array(size), tread.heading, 0.0, ON_STEP):
+            x, y = builder.from_world(end).tolist()
+            builder.add_box((x, y, tread.z / 2), size, color, 8.0, heading)
 
 
 def _thigh_angle(motion: Motion) -> Float[np.ndarray, "time"]:

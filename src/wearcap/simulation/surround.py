@@ -28,7 +28,7 @@ NEAR_M = (0.3, 0.8)
 """How far from the body stands what is put beside its way."""
 WALL_M = (0.6, 3.0)
 """From the body to walls."""
-BEYOND_M = 7.0
+BEYOND_M = 5.0
 """Of floor around the body that are looked at."""
 FAST, TALL_M = 2.0, HEIGHT - 0.25
 """Whoever travels faster (m/s), or reaches higher, is mostly, or always, outdoors."""
