@@ -22,7 +22,7 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.store import RecordingFile, RecordingStore
 
-POINTS = tuple(f"{side}_{part}" for part in ("palm", "wrist", "elbow", "knee", "toe_tip") for side in ("left", "right"))  # fmt: skip
+POINTS = tuple(f"{side}_{part}" for part in ("palm", "fingertip", "wrist", "elbow", "knee", "toe_tip") for side in ("left", "right"))  # fmt: skip
 """Joints and sites whose places in the camera's frame are learned; left and right alternate."""
 HANDS = tuple(f"{side}_palm" for side in ("left", "right"))
 
@@ -60,10 +60,11 @@ class EgoFrames(Dataset):
     """Every `every`-th frame of the recordings of one split that have a motion and a head camera's pictures.
 
     Pictures are decoded once, into arrays below each data set's `cache`, and read from the memory map. An item is asked
-    for by (frame, seed), or by frame.
+    for by (frame, seed), or by frame. By their weights, frames that show a hand make up `hand_share` of the draws
+    (0: their own share).
     """
 
-    def __init__(self, sources: list[Source], split: str, every: int):
+    def __init__(self, sources: list[Source], split: str, every: int, hand_share: float = 0.0):
         self._pictures, self.weights = list[UInt8[np.ndarray, "time height width 3"]](), torch.empty(0)
         points, visible, weights = [], [], []
         for source in sources:
@@ -87,6 +88,10 @@ class EgoFrames(Dataset):
             raise WearcapError(f"no head camera's pictures in split {split!r}", where=", ".join(s.root for s in sources),
                                fix="Prepare a data set with them: wearcap prepare simulated camera=true")  # fmt: skip
         self.point_cam, self.visible, self.weights = torch.cat(points), torch.cat(visible), torch.cat(weights)
+        shown = self.visible[:, [POINTS.index(name) for name in HANDS]].any(-1)
+        if hand_share and shown.any() and not shown.all():
+            own = self.weights[shown].sum() / self.weights.sum()
+            self.weights = self.weights * torch.where(shown, hand_share / own, (1 - hand_share) / (1 - own))
         self._first = np.cumsum([0, *(len(frames) for frames in self._pictures)])
 
     def __len__(self) -> int:
@@ -128,13 +133,14 @@ def decoded(camera: CameraStream, root: Path, every: int) -> UInt8[np.ndarray, "
 
 
 class EgoViewFrames(SeededWindows):
-    """Frames for the image encoder's training; see `SeededWindows`, with single frames for windows."""
+    """Frames for the image encoder's training; see `EgoFrames` and `SeededWindows`, with single frames for windows."""
 
     def __init__(
         self,
         sources: dict[str, dict | None],
         every: int,
         batch_size: int,
+        hand_share: float = 0.0,
         steps_per_epoch: int | None = None,
         val_windows: int | None = None,
         workers: int = 0,
@@ -142,7 +148,10 @@ class EgoViewFrames(SeededWindows):
         val_sources: dict[str, dict | None] | None = None,
     ):
         super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
-        self.every = every
+        self.every, self.hand_share = every, hand_share
 
     def dataset(self, split: str) -> EgoFrames:
-        return EgoFrames(self.sources if split == "train" else self.val_sources, split, self.every)
+        """Frames of a split; those of the training split are drawn more often where they show a hand."""
+        if split == "train":
+            return EgoFrames(self.sources, split, self.every, self.hand_share)
+        return EgoFrames(self.val_sources, split, self.every)
