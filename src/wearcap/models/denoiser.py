@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from wearcap.models.layers import AdaptiveBlock, LevelEmbedding
+from wearcap.models.layers import AdaptiveBlock, LevelEmbedding, attention_mask
 
 
 class Normalizer(nn.Module):
@@ -132,15 +132,26 @@ class MotionEncoder(nn.Module):
         nn.init.zeros_(self.worth.weight)
         nn.init.zeros_(self.worth.bias)
 
+    def plan(self, level: Float[Tensor, "batch #token width"]) -> Float[Tensor, "batch #token width"]:
+        """What x_t is worth at a level, per channel."""
+        return 1 + self.worth(F.silu(level))
+
     def forward(
         self,
         x_t: Float[Tensor, "batch time motion"],
-        level: Float[Tensor, "batch #token width"],
+        worth: Float[Tensor, "#batch #token width"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch token width"]:
         batch, time, _ = x_t.shape
         tokens = (x_t * valid[..., None]).reshape(batch, time // self.frames_per_token, -1)
-        return self.linear(tokens) * (1 + self.worth(F.silu(level)))
+        return self.linear(tokens) * worth
+
+
+class LevelPlan(NamedTuple):
+    """What of a step depends on its noise level alone; with a level per step, the same for all windows."""
+
+    worth: Float[Tensor, "batch #token width"]
+    blocks: tuple[Float[Tensor, "batch #token modulation"], ...]
 
 
 class MotionDenoiser(nn.Module):
@@ -214,15 +225,32 @@ class MotionDenoiser(nn.Module):
 
         last: with self-conditioning, the x̂0 of the step before (None: there is none yet).
         """
-        batch, time, _ = x_t.shape
+        return self.step(x_t, self.plan(level), encoded, valid, last)
+
+    def plan(self, level: Float[Tensor, "batch #time"]) -> LevelPlan:
+        """The levels' part of a step; sampling computes it once for all windows."""
         k = self.frames_per_token
-        token_valid = valid.view(batch, time // k, k).any(-1)
-        token_level = level if level.shape[1] == 1 else level.view(batch, time // k, k).mean(-1)
+        token_level = level if level.shape[1] == 1 else level.unflatten(1, (-1, k)).mean(-1)
         embedded = self.level(token_level)
+        return LevelPlan(
+            self.motion_encoder.plan(embedded), tuple(block.plan(embedded) for block in self.blocks)
+        )
+
+    def step(
+        self,
+        x_t: Float[Tensor, "batch time motion"],
+        plan: LevelPlan,
+        encoded: Float[Tensor, "batch token width"],
+        valid: Bool[Tensor, "batch time"],
+        last: Float[Tensor, "batch time motion"] | None = None,
+    ) -> Float[Tensor, "batch time motion"]:
+        """`forward` with what `plan` said of the level, of which one may serve the whole batch."""
+        batch, time, _ = x_t.shape
+        mask = attention_mask(valid.unflatten(1, (-1, self.frames_per_token)).any(-1))
         if self.self_conditioning:
             x_t = torch.cat([x_t, torch.zeros_like(x_t) if last is None else last], -1)
-        token = encoded + self.motion_encoder(x_t, embedded, valid)
-        for block in self.blocks:
-            token = block(token, embedded, token_valid)
+        token = encoded + self.motion_encoder(x_t, plan.worth, valid)
+        for block, modulation in zip(self.blocks, plan.blocks):
+            token = block(token, modulation, mask)
         x0_hat = self.head(self.norm(token)).reshape(batch, time, -1)
         return x0_hat if self.blend is None else self.blend(x0_hat, valid)

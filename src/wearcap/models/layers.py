@@ -48,14 +48,17 @@ class RotaryAttention(nn.Module):
         return torch.cat([first * cos - second * sin, first * sin + second * cos], -1)
 
     def forward(
-        self, x: Float[Tensor, "batch token width"], valid: Bool[Tensor, "batch token"]
+        self, x: Float[Tensor, "batch token width"], mask: Bool[Tensor, "batch 1 token token"]
     ) -> Float[Tensor, "batch token width"]:
         batch, tokens, width = x.shape
         q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
-        # A row with nothing to attend to would be NaN: padding may always see itself.
-        mask = valid[:, None, None, :] | torch.eye(tokens, dtype=torch.bool, device=x.device)
         attended = F.scaled_dot_product_attention(self._rotate(q), self._rotate(k), v, mask)
         return self.out(attended.transpose(1, 2).reshape(batch, tokens, width))
+
+
+def attention_mask(valid: Bool[Tensor, "batch token"]) -> Bool[Tensor, "batch 1 token token"]:
+    """Who may see whom: all see what is valid. A row with nothing to see would be NaN: padding may always see itself."""
+    return valid[:, None, None, :] | torch.eye(valid.shape[1], dtype=torch.bool, device=valid.device)
 
 
 class AdaptiveBlock(nn.Module):
@@ -73,12 +76,16 @@ class AdaptiveBlock(nn.Module):
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
 
+    def plan(self, level: Float[Tensor, "batch #token width"]) -> Float[Tensor, "batch #token modulation"]:
+        """Shifts, scales and gates: what of the block depends on the level alone."""
+        return self.modulation(F.silu(level))
+
     def forward(
         self,
         x: Float[Tensor, "batch token width"],
-        level: Float[Tensor, "batch #token width"],
-        valid: Bool[Tensor, "batch token"],
+        plan: Float[Tensor, "#batch #token modulation"],
+        mask: Bool[Tensor, "batch 1 token token"],
     ) -> Float[Tensor, "batch token width"]:
-        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = self.modulation(F.silu(level)).chunk(6, -1)
-        x = x + gate_a * self.attention(self.norm_attention(x) * (1 + scale_a) + shift_a, valid)
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = plan.chunk(6, -1)
+        x = x + gate_a * self.attention(self.norm_attention(x) * (1 + scale_a) + shift_a, mask)
         return x + gate_m * self.mlp(self.norm_mlp(x) * (1 + scale_m) + shift_m)
