@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.utils import instantiate
 from torch import nn
 
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import evaluate, train
+from wearcap.cli.conf import compose
 from wearcap.cli.load import load_system
 from wearcap.data.statistics import collate
 from wearcap.data.tracked_points import TrackedPoints, encode_pose
@@ -89,7 +91,7 @@ def test_padding_is_no_lesson(data):
 
 
 def test_it_learns_and_hands_help(data):
-    """A body that sways: after some steps the error of held-out frames has halved, and hands lower it."""
+    """A body that sways: after some steps the error of held-out frames has fallen by a third, and hands lower it."""
     errors = {}
     for points in (("head",), HANDS):
         torch.manual_seed(0)
@@ -97,14 +99,14 @@ def test_it_learns_and_hands_help(data):
         module.set_statistics(WindowDataset([Source(str(data))], "train", window=60, stride=30, fps=60.0), 16)
         optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
         before = module.eval().terms(windows)["joints"].item()
-        for _ in range(60):
+        for _ in range(40):
             module.train()
             loss = sum(module.loss_weights[name] * term for name, term in module.terms(windows).items())
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
         errors[points] = module.eval().terms(windows)["joints"].item()
-        assert errors[points] < 0.5 * before
+        assert errors[points] < 0.67 * before
     assert errors[HANDS] < errors[("head",)]
 
 
@@ -124,6 +126,15 @@ def test_trained_evaluated_and_refused(data, tmp_path):
     assert 0 < scores["hand_pe_cm"]["mean"] < scores["mpjpe_cm"]["mean"] + 10
     with pytest.raises(WearcapError, match="HMD2 needs a motion denoiser"):
         evaluate.main([*common, "pipeline=hmd2"])
+
+
+@pytest.mark.parametrize(("experiment", "inputs"), [("pose_regressor_head_full", 18), ("pose_regressor_hands_full", 54)])  # fmt: skip
+def test_the_full_size_is_avatarposers(experiment, inputs):
+    """4.12 M parameters (Jiang et al. 2022), with their 22 joints for our 23."""
+    config = compose("train", [f"experiment={experiment}", "paths.run=x", "trainer.max_steps=4"])
+    full = instantiate(config.model, _convert_="all")
+    assert full.points.size == inputs
+    assert abs(sum(parameter.numel() for parameter in full.net.parameters()) / 4.12e6 - 1) < 0.02
 
 
 @pytest.mark.slow

@@ -72,7 +72,7 @@ class PoseRegression(lightning.LightningModule):
         poses = self.points.poses(
             self.skeleton, T_world_head, batch.R_parent_joint, batch.t_parent_joint[:, None]
         )
-        return self.points.encode(poses.R, poses.t, batch.floor_height, batch.stature, self.fps)
+        return self.points.encode(poses.R, poses.t, batch.floor_from_head, batch.stature, self.fps)
 
     def _asked(self, batch: Window) -> Int64[Tensor, "batch end"]:
         """Frames spread evenly over each window, in training shifted by chance."""
