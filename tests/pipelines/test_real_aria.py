@@ -1,16 +1,21 @@
 """Real Project Aria recordings through surroundings, pictures, alignment and comparison."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.spatial import cKDTree
 
 from wearcap.body.hang import hang
 from wearcap.body.skeleton import xsens23
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, interpolate, resample
 from wearcap.io.adt import read_adt
-from wearcap.io.aria_mps import read_mps
+from wearcap.io.aria_mps import read_closed_loop, read_mps
 from wearcap.metrics.cues import cue_errors_cm
 from wearcap.pipelines.doctor import examine
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording
@@ -126,3 +131,33 @@ def test_a_body_hung_from_the_real_head_beside_the_true_one(real_data):
     assert all(mean[f"{side}_{name}"] < 20 for side in ("left", "right") for name in ("hip", "knee", "ankle"))
     assert all(mean[f"{side}_wrist"] > 50 for side in ("left", "right")), "a T-pose holds no bowl"
     assert mean["head"] < 10
+
+
+@pytest.mark.real
+def test_true_joints_lie_on_the_wearers_arm_in_the_real_frames(real_data):
+    """Head pose, skeleton and camera model of three files meet in a picture: elbow to wrist runs along a black sleeve."""
+    folder = real_data / "aria_adt_sample"
+    cues = read_adt(folder / "raw").cues
+    T_world_aria = read_closed_loop(folder / "raw" / "aria_trajectory.csv", up="y").T_world_aria
+    meta = json.loads((folder / "extracted" / "meta.json").read_text())
+    about = meta["cameras"]["camera-slam-left"]
+    focal, cx, cy, *lens = about["projection_params"]
+    camera = Camera("fisheye624", *about["image_size_wh"], focal, focal, cx, cy, tuple(lens))
+    T_aria_cam = Rigid.from_matrix(torch.tensor(about["T_device_camera"]))
+    frames = [frame for frame in meta["frames"] if frame["camera"] == "camera-slam-left"]
+    assert len(frames) == 3
+    for frame in frames:
+        time = torch.tensor([frame["timestamp_ns"] * 1e-9], dtype=torch.float64)
+        T_cam_world = (resample(T_world_aria, time).T_world_body[0] @ T_aria_cam).inverse()
+        joints = [interpolate(cues[name].timestamps, cues[name].points, time)[0] for name in ("left_elbow", "left_wrist")]  # fmt: skip
+        pixels, valid = camera.project(torch.stack([T_cam_world @ joint for joint in joints]))
+        assert valid.all()
+        along = torch.linspace(0.1, 0.9, 30)[:, None]
+        sleeve = (1 - along) * pixels[0] + along * pixels[1]
+        across = torch.nn.functional.normalize(
+            (pixels[1] - pixels[0]).flip(0) * torch.tensor([1.0, -1.0]), dim=0
+        )
+        picture = np.asarray(Image.open(folder / "extracted" / frame["image"]).convert("L"))
+        shades = [picture[tuple((sleeve + shift * across).round().long().flip(1).T.numpy())].mean() for shift in (0, 60, -60)]  # fmt: skip
+        assert shades[0] < 30, "a black sleeve"
+        assert min(shades[1:]) > 1.3 * shades[0], "and something else beside it"
