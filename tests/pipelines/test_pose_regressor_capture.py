@@ -48,6 +48,17 @@ def test_no_frame_depends_on_a_later_one(points):
     assert torch.allclose(whole.R_parent_joint[:60], prefix.R_parent_joint, atol=1e-4)
 
 
+def test_behind_a_jump_of_the_tracking_a_new_past_begins():
+    recording = recording_of(swaying_motion(120), "jumps")
+    shift = torch.zeros(120, 3)
+    shift[70:, 0] = 5.0
+    head = replace(recording.head, t_world_device=recording.head.t_world_device + shift)
+    jumped = pipeline()(replace(recording, head=head))
+    behind = pipeline()(recording_of(swaying_motion(120).sliced(70, 120), "behind"))
+    assert torch.allclose(jumped.R_parent_joint[70:], behind.R_parent_joint, atol=1e-4)
+    assert torch.allclose(jumped.joint("head").t[70:], behind.joint("head").t + shift[70:], atol=1e-4)
+
+
 def test_passes_and_company_change_nothing():
     recordings = [recording_of(swaying_motion(n, n), f"r{n}") for n in (150, 20)]
     assert isinstance(pipeline(), Pipeline)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -48,12 +49,19 @@ class PoseRegressorCapture:
         path = head_path(recording, self.skeleton, self.fps)
         tracked = self._tracked(recording, path)
         stature = torch.tensor([path.stature])
-        features = self.points.encode(tracked.R[None], tracked.t[None], path.floor_height[None], stature, self.fps)  # fmt: skip
-        R_parent_joint = decode_pose(self._regressed(features), path.T_world_head.R)
-        origin = torch.zeros(len(path.timestamps), 3)
-        motion = Motion(path.timestamps, path.skeleton, R_parent_joint, origin, provenance=self._settings())
-        motion = hang_from_head(motion, path.T_world_head)
-        return self._reaching(motion, tracked) if self.reach else motion
+        # Behind a gap or a jump of the tracking a new past begins.
+        count = len(path.timestamps)
+        begins = [0, *(start for start, _ in path.stretches[1:]), count]
+        features = (
+            self.points.encode(tracked.R[None, a:b], tracked.t[None, a:b], path.floor_height[None, a:b], stature, self.fps)
+            for a, b in pairwise(begins)
+        )  # fmt: skip
+        motion = torch.cat([self._regressed(part) for part in features])
+        R_parent_joint = decode_pose(motion, path.T_world_head.R)
+        origin = torch.zeros(count, 3)
+        captured = Motion(path.timestamps, path.skeleton, R_parent_joint, origin, provenance=self._settings())
+        hung = hang_from_head(captured, path.T_world_head)
+        return self._reaching(hung, tracked) if self.reach else hung
 
     def _tracked(self, recording: Recording, path: HeadPath) -> Rigid:
         """Poses "time point" of the tracked points; those of the hands are the truth's."""
