@@ -1,0 +1,150 @@
+"""Autoencoders of voxel grids: the points around the body as one short vector (thesis §6.2.1, §6.4)."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from wearcap.errors import WearcapError
+from wearcap.scene.voxels import VoxelGrid
+
+_KERNELS = 4 * 2
+"""Cells by which four convolutions of kernel 3 shorten an axis."""
+_SEEN = 1e-4
+"""A cell whose nearness exceeds this holds a point."""
+
+
+class VoxelAutoencoder(nn.Module):
+    """Grids of truncated distances (m) to codes and back, by `layers` of one of two kinds.
+
+    "convolutions": the document's. "sparse": ours, which takes a grid as what it is, a few points in much emptiness.
+    """
+
+    def __init__(
+        self,
+        cells: int = 10,
+        size_m: float = 2.0,
+        below_m: float = 1.0,
+        clip_m: float = 0.1,
+        size: int = 128,
+        layers: str = "sparse",
+    ):
+        """The grid's settings (see `VoxelGrid`), and the code's `size`. Raises WearcapError for layers of another name."""
+        super().__init__()
+        self.grid, self.size = VoxelGrid(cells, size_m, below_m, clip_m), size
+        kinds = {"convolutions": ConvolutionLayers, "sparse": SparseLayers}
+        if layers not in kinds:
+            raise WearcapError(f"no layers {layers!r}", expected=f"one of {', '.join(kinds)}")
+        self.layers = kinds[layers](cells, size)
+
+    def encode(self, grids: Float[Tensor, "*batch x y z"]) -> Float[Tensor, "*batch feature"]:
+        """Codes of grids (m)."""
+        flat = self._nearness(grids).reshape(-1, *grids.shape[-3:])
+        return self.layers.encode(flat).reshape(*grids.shape[:-3], self.size)
+
+    def decode(self, code: Float[Tensor, "*batch feature"]) -> Float[Tensor, "*batch x y z"]:
+        """Grids (m) of codes, between 0 and `clip_m`, which is where there is no point."""
+        nearness = self.layers.decode(code.reshape(-1, self.size)).clamp(0, 1)
+        return self.grid.clip_m * (1 - nearness).reshape(*code.shape[:-1], *[self.grid.cells] * 3)
+
+    def loss(self, grids: Float[Tensor, "batch x y z"]) -> Float[Tensor, ""]:
+        """How far grids are from what their codes tell."""
+        return self.layers.loss(self._nearness(grids))
+
+    def start_from(self, grids: Float[Tensor, "batch x y z"]) -> None:
+        """Take first weights from some grids of a training split."""
+        self.layers.start_from(self._nearness(grids))
+
+    def _nearness(self, grids: Tensor) -> Tensor:
+        """1 where a point lies in the cell's centre, 0 where there is none."""
+        return 1 - grids / self.grid.clip_m
+
+
+class ConvolutionLayers(nn.Module):
+    """Four convolutions, averaged into one vector; as many transposed ones back; plain squared error (thesis §6.4).
+
+    No padding: 10 cells become 8, 6, 4 and 2 a side, which is what is averaged and what decoding starts from.
+    """
+
+    def __init__(self, cells: int, size: int):
+        super().__init__()
+        left = cells - _KERNELS
+        if left < 1:
+            raise WearcapError(
+                f"{cells} cells are too few for four convolutions", expected=f"at least {_KERNELS + 1}"
+            )
+        widths = [1, *(max(1, size >> shift) for shift in (3, 2, 1, 0))]
+        down, up = [], []
+        for narrow, wide in zip(widths, widths[1:]):
+            down += [nn.Conv3d(narrow, wide, 3), nn.ReLU()]
+            up = [nn.ConvTranspose3d(wide, narrow, 3), nn.ReLU(), *up]
+        self.encoder = nn.Sequential(*down[:-1], nn.AvgPool3d(left), nn.Flatten())
+        self.decoder = nn.Sequential(
+            nn.Unflatten(1, (size, 1, 1, 1)), nn.Upsample(scale_factor=left), *up[:-1], nn.Flatten(1, 2)
+        )
+
+    def encode(self, nearness: Float[Tensor, "batch x y z"]) -> Float[Tensor, "batch feature"]:
+        return self.encoder(nearness[:, None])
+
+    def decode(self, code: Float[Tensor, "batch feature"]) -> Float[Tensor, "batch x y z"]:
+        return self.decoder(code)
+
+    def loss(self, nearness: Float[Tensor, "batch x y z"]) -> Float[Tensor, ""]:
+        return F.mse_loss(self.decode(self.encode(nearness)), nearness)
+
+    def start_from(self, nearness: Float[Tensor, "batch x y z"]) -> None:
+        """Its weights are drawn."""
+
+
+class SparseLayers(nn.Module):
+    """A linear code, and the sparse grid that explains it, found in a few learned steps (LISTA, Gregor & LeCun 2010).
+
+    Of 1000 cells some tens hold a point. That many can be found from 128 sums over all cells by thresholded gradient
+    steps on the codes' difference. Sums, steps and thresholds are learned: binary cross-entropy says which
+    cells hold a point, squared error how near it is. The sums begin as principal components.
+    """
+
+    def __init__(self, cells: int, size: int, steps: int = 6, nearness_weight: float = 5.0):
+        super().__init__()
+        self.cells, self.nearness_weight = cells, nearness_weight
+        count = cells**3
+        sums = torch.empty(size, count)
+        nn.init.orthogonal_(sums)
+        self.sums, self.back = (
+            nn.Parameter(sums),
+            nn.Parameter(sums.T.clone(memory_format=torch.contiguous_format)),
+        )
+        self.step = nn.Parameter(torch.full((steps,), 3.0))
+        self.threshold = nn.Parameter(torch.full((steps, count), 0.05))
+        self.sharpness = nn.Parameter(torch.tensor(10.0))
+        self.border = nn.Parameter(torch.full((count,), 0.1))
+        self.scale, self.shift = nn.Parameter(torch.tensor(1.0)), nn.Parameter(torch.tensor(0.0))
+
+    def encode(self, nearness: Float[Tensor, "batch x y z"]) -> Float[Tensor, "batch feature"]:
+        return nearness.flatten(1) @ self.sums.T
+
+    def decode(self, code: Float[Tensor, "batch feature"]) -> Float[Tensor, "batch x y z"]:
+        logits, nearness = self._explained(code)
+        return torch.where(logits > 0, nearness, 0).reshape(-1, *[self.cells] * 3)
+
+    def _explained(self, code: Tensor) -> tuple[Float[Tensor, "batch cell"], Float[Tensor, "batch cell"]]:
+        """Logits of cells' holding a point, and its nearness if so."""
+        found = guess = self.step[0] * code @ self.back.T
+        for step, threshold in zip(self.step[1:], self.threshold):
+            found = F.relu(guess - threshold)
+            guess = found + step * ((code - found @ self.sums.T) @ self.back.T)
+        return self.sharpness * (guess - self.border), self.scale * guess + self.shift
+
+    def loss(self, nearness: Float[Tensor, "batch x y z"]) -> Float[Tensor, ""]:
+        logits, found = self._explained(self.encode(nearness))
+        true = nearness.flatten(1)
+        held: Bool[Tensor, "batch cell"] = true > _SEEN
+        which = F.binary_cross_entropy_with_logits(logits, held.to(logits.dtype), reduction="sum")
+        return (which + self.nearness_weight * ((found - true).square() * held).sum()) / len(true)
+
+    @torch.no_grad()
+    def start_from(self, nearness: Float[Tensor, "batch x y z"]) -> None:
+        centered = nearness.flatten(1) - nearness.flatten(1).mean(0)
+        components = torch.linalg.eigh(centered.T @ centered)[1].flip(1)[:, : len(self.sums)]
+        self.sums.copy_(components.T)
+        self.back.copy_(components)
