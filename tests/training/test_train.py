@@ -17,7 +17,7 @@ from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap_testing import small_dataset
 
-EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("motion_*.yaml"))
+EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("motion_diffusion*.yaml"))
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 
 
@@ -51,8 +51,8 @@ def test_every_experiment_takes_a_step(experiment, data, tmp_path):
 
 
 def test_every_experiment_is_tried_by_a_test():
-    """Those of contact detection in test_contact_detection, baselines in test_pose_regression, ours of pictures in
-    test_egoview."""
+    """Each kind in a module of its own: contact detection in test_contact_detection, baselines in test_pose_regression,
+    the autoencoder of FID in test_motion_autoencoder_training, ours of pictures in test_egoview."""
     named = {path.stem for path in (conf_dir() / "experiment").glob("*.yaml")}
     assert named == {
         name

@@ -16,6 +16,9 @@ from wearcap.recording import Motion
 
 CONTACT_HEIGHT_M = {"ankle": 0.12, "toe": 0.05}
 """About 5 cm above where ankle and toe joint are when the foot is flat; the floor here is where toe joints get."""
+FLOOR_WINDOW_S = 1.0
+"""The floor is the lowest true joint this near in time: ten seconds, as for floor penetration, span a flight of stairs,
+and heights over its foot say nothing of a pose."""
 
 
 class Movement(NamedTuple):
@@ -51,7 +54,7 @@ class MotionFeatures:
         return 6 * len(self.skeleton) + 5
 
     def movement(self, motion: Motion, floor_height: Float[Tensor, "frame"] | None = None) -> Movement:
-        """A whole motion at the frames that are looked at, by default over its own local floor (`local_floor`).
+        """A whole motion at the frames that are looked at, by default over its own floor (the lowest joint around).
 
         Raises WearcapError for a motion of other joints, or at another rate than `fps`.
         """
@@ -64,7 +67,7 @@ class MotionFeatures:
         R = motion.R_parent_joint[seen]
         joints = forward_kinematics(motion.skeleton, R, motion.t_world_root[seen]).t
         if floor_height is None:
-            floor_height = local_floor(joints, self.fps / self.every)
+            floor_height = local_floor(joints, self.fps / self.every, FLOOR_WINDOW_S)
         return Movement(joints, R[:, 0], floor_height)
 
     def encode(self, movement: Movement) -> Float[Tensor, "window frame feature"]:
