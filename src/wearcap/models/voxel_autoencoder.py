@@ -1,5 +1,7 @@
 """Autoencoders of voxel grids: the points around the body as one short vector (thesis §6.2.1, §6.4)."""
 
+from itertools import pairwise
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -75,7 +77,7 @@ class ConvolutionLayers(nn.Module):
             )
         widths = [1, *(max(1, size >> shift) for shift in (3, 2, 1, 0))]
         down, up = [], []
-        for narrow, wide in zip(widths, widths[1:]):
+        for narrow, wide in pairwise(widths):
             down += [nn.Conv3d(narrow, wide, 3), nn.ReLU()]
             up = [nn.ConvTranspose3d(wide, narrow, 3), nn.ReLU(), *up]
         self.encoder = nn.Sequential(*down[:-1], nn.AvgPool3d(left), nn.Flatten())
@@ -115,7 +117,7 @@ class SparseLayers(nn.Module):
             nn.Parameter(sums.T.clone(memory_format=torch.contiguous_format)),
         )
         self.step = nn.Parameter(torch.full((steps,), 3.0))
-        self.threshold = nn.Parameter(torch.full((steps, count), 0.05))
+        self.threshold = nn.Parameter(torch.full((steps - 1, count), 0.05))
         self.sharpness = nn.Parameter(torch.tensor(10.0))
         self.border = nn.Parameter(torch.full((count,), 0.1))
         self.scale, self.shift = nn.Parameter(torch.tensor(1.0)), nn.Parameter(torch.tensor(0.0))
