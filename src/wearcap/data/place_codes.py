@@ -1,0 +1,102 @@
+"""Codes of the points around the body at every frame of a recording, made once per encoder and kept beside the data."""
+
+import hashlib
+from collections.abc import Iterable
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from jaxtyping import Float16
+from rich.progress import track
+from safetensors.torch import save_file
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
+from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.recording import HeadStream, PointCloud
+from wearcap.recording.store import Entry, RecordingStore
+from wearcap.scene.voxels import VoxelMap, mirrored
+
+_AT_ONCE = 2048
+"""Grids that are encoded at a time."""
+
+
+class PlaceCodes:
+    """What a trained autoencoder's encoder says of the points around the body (thesis §6.2)."""
+
+    def __init__(self, checkpoint: str | Path):
+        """`checkpoint`: path or name of one of experiment=voxel_autoencoder."""
+        self.checkpoint = checkpoint
+
+    @cached_property
+    def encoder(self) -> VoxelAutoencoder:
+        """The network, in evaluation mode. Raises WearcapError when the checkpoint is missing or another network's."""
+        config, state = read_checkpoint(self.checkpoint)
+        if "voxel" not in config["model"].get("_target_", ""):
+            raise WearcapError("codes of points need a voxel autoencoder", where=self.checkpoint,
+                               expected="a checkpoint of experiment=voxel_autoencoder")  # fmt: skip
+        settings = {key: value for key, value in config["model"]["net"].items() if key[0] != "_"}
+        net = VoxelAutoencoder(**settings)
+        own = {name.removeprefix("net."): value for name, value in state.items() if name.startswith("net.")}
+        load_checkpoint(net, own, self.checkpoint)
+        return net.requires_grad_(False).eval()
+
+    @property
+    def size(self) -> int:
+        return self.encoder.size
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Changes when the weights or the grid do (16 digits)."""
+        digest = hashlib.sha256(repr(self.encoder.grid).encode())
+        for name, value in sorted(self.encoder.state_dict().items()):
+            digest.update(name.encode() + value.contiguous().numpy().tobytes())
+        return digest.hexdigest()[:16]
+
+    def file_of(self, root: Path, entry: Entry) -> Path:
+        """File of a recording's codes, made if it is not there yet: `code` and, of the surroundings seen in a mirror that
+        swaps left and right, `code_mirrored` ("time feature", float16) on the head stream's timestamps; no rows where a
+        recording has no points."""
+        path = root / "cache" / f"places-{self.fingerprint}" / f"{entry.sha256}.safetensors"
+        if not path.is_file():
+            self._make(path, root, entry)
+        return path
+
+    def prepare(self, store: RecordingStore, names: Iterable[str]) -> None:
+        """Make the codes of recordings that lack them."""
+        folder = store.root / "cache" / f"places-{self.fingerprint}"
+        todo = [
+            name for name in names if not (folder / f"{store.entries[name].sha256}.safetensors").is_file()
+        ]
+        for name in track(todo, f"points of {store.root.name}", disable=not todo):
+            self.file_of(store.root, store.entries[name])
+
+    def _make(self, path: Path, root: Path, entry: Entry) -> None:
+        file = RecordingStore.open(root).open_file(Path(entry.file).stem)
+        code, code_mirrored = place_codes(file.part("points"), file.part("head"), self.encoder)
+        with atomic_path(path) as temporary:
+            save_file({"code": code, "code_mirrored": code_mirrored}, str(temporary))
+
+
+@torch.inference_mode()
+def place_codes(
+    cloud: PointCloud | None, head: HeadStream, encoder: VoxelAutoencoder
+) -> tuple[Float16[Tensor, "time feature"], Float16[Tensor, "time feature"]]:
+    """Codes of the points that had been seen by each of the head's frames, and of the same seen in a mirror.
+
+    No rows without points.
+    """
+    known = cloud is not None and len(cloud.points_world) > 0
+    code = torch.zeros(len(head.timestamps) if known else 0, encoder.size, dtype=torch.float16)
+    code_mirrored = code.clone()
+    if cloud is None or not known:
+        return code, code_mirrored
+    surroundings = VoxelMap(encoder.grid)
+    surroundings.add(cloud.points_world, cloud.first_seen)
+    for start in range(0, len(code), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        grids = surroundings.voxelize(head.T_world_device[part], head.timestamps[part])
+        code[part], code_mirrored[part] = encoder.encode(grids), encoder.encode(mirrored(grids))
+    return code, code_mirrored
