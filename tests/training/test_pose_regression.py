@@ -39,10 +39,10 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
 
 
 def system(points: tuple[str, ...] = HANDS, net=PoseRegressor) -> PoseRegression:
-    weights = {"root": 0.05, "rotation": 1.0, "joints": 1.0}
+    weights = {"root": 0.05, "rotation": 1.0, "joints": 1.0, "velocity": 0.05}
     return PoseRegression(
         lambda **sizes: net(**sizes, window=20, width=32, layers=1, heads=4, feedforward=32, dropout=0.0),
-        TrackedPoints(points), xsens23(), 60.0, weights, torch.optim.AdamW, per_window=4,
+        TrackedPoints(points), xsens23(), 60.0, weights, torch.optim.AdamW, pairs=2,
     )  # fmt: skip
 
 
@@ -67,7 +67,7 @@ class Oracle(nn.Module):
 def test_the_truth_costs_nothing_and_another_pose_does(data, mirror):
     module, windows = system(net=Oracle).eval(), batch(data, mirror=mirror)
     ends = module._asked(windows)
-    assert ends[0].tolist() == [7, 22, 37, 52]
+    assert ends[0].tolist() == [14, 15, 44, 45]
     rows = torch.arange(16)[:, None]
     truth = encode_pose(windows.R_parent_joint[rows, ends], windows.R_world_head[rows, ends]).flatten(0, 1)
     module.net.answer = truth

@@ -15,14 +15,15 @@ from wearcap.data.tracked_points import TrackedPoints, decode_pose, encode_pose,
 from wearcap.data.windows import Window, WindowDataset
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.pose_regressor import PoseRegressor
-from wearcap.training.losses import masked_mean
+from wearcap.training.losses import joint_velocity, masked_mean
 
 
 class PoseRegression(lightning.LightningModule):
-    """Regression of single frames from their pasts: `per_window` frames of every training window are asked for.
+    """Regression of single frames from their pasts: `pairs` of neighbouring frames of every window are asked for.
 
     Loss terms, weighed by `loss_weights`, are mean absolute errors: "root" and "rotation" of 6D rotations, "joints" of
-    positions with both bodies hung from the same head (m).
+    positions with both bodies hung from the same head (m). "velocity" is HMD²'s: without it (as AvatarPoser is) single
+    frames answer to every tremor of the head, with a jitter of ten times people's.
     """
 
     def __init__(
@@ -34,13 +35,13 @@ class PoseRegression(lightning.LightningModule):
         loss_weights: dict[str, float],
         optimizer: Callable[..., torch.optim.Optimizer],
         scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
-        per_window: int = 8,
+        pairs: int = 4,
         seed: int = 0,
     ):
         super().__init__()
         self.net = net(feature_size=points.size, motion_size=6 * len(skeleton))
         self.points, self.skeleton, self.fps = points, skeleton, fps
-        self.loss_weights, self.per_window, self.seed = dict(loss_weights), per_window, seed
+        self.loss_weights, self.pairs, self.seed = dict(loss_weights), pairs, seed
         self._optimizer, self._scheduler = optimizer, scheduler
 
     def pipeline_parts(self) -> dict[str, Any]:
@@ -75,12 +76,12 @@ class PoseRegression(lightning.LightningModule):
         return self.points.encode(poses.R, poses.t, batch.floor_from_head, batch.stature, self.fps)
 
     def _asked(self, batch: Window) -> Int64[Tensor, "batch end"]:
-        """Frames spread evenly over each window, in training shifted by chance."""
+        """Pairs of neighbouring frames, spread evenly over each window and in training shifted by chance."""
         count, time = batch.valid.shape
-        places = torch.arange(self.per_window, device=batch.valid.device)
-        shift = torch.rand(count, self.per_window) if self.training else torch.full((count, 1), 0.5)
-        ends = (places + shift.to(places.device)) * time / self.per_window
-        return ends.long().clamp_max(time - 1).expand(count, -1)
+        places = torch.arange(self.pairs, device=batch.valid.device)
+        shift = torch.rand(count, self.pairs) if self.training else torch.full((count, 1), 0.5)
+        last = ((places + shift.to(places.device)) * time / self.pairs).long().clamp(1, time - 1)
+        return torch.stack([last - 1, last], -1).flatten(1).expand(count, -1)
 
     def terms(self, batch: Window) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
@@ -90,11 +91,14 @@ class PoseRegression(lightning.LightningModule):
         motion = self.net(features.flatten(0, 1), exists.flatten(0, 1)).unflatten(0, ends.shape).float()
         R_true, R_head, valid = batch.R_parent_joint[rows, ends], batch.R_world_head[rows, ends], batch.valid[rows, ends]  # fmt: skip
         error = (motion - encode_pose(R_true, R_head)).abs()
-        joints = self._from_head(decode_pose(motion, R_head), batch) - self._from_head(R_true, batch)
+        said, true = self._from_head(decode_pose(motion, R_head), batch), self._from_head(R_true, batch)
         return {
             "root": masked_mean(error[..., :6].mean(-1), valid),
             "rotation": masked_mean(error[..., 6:].mean(-1), valid),
-            "joints": masked_mean(joints.abs().mean((-1, -2)), valid),
+            "joints": masked_mean((said - true).abs().mean((-1, -2)), valid),
+            "velocity": joint_velocity(
+                *(x.reshape(-1, 2, *x.shape[2:]) for x in (said, true, valid)), self.fps
+            ),
         }
 
     def _from_head(
