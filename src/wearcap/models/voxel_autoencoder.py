@@ -110,20 +110,21 @@ class SparseLayers(nn.Module):
         super().__init__()
         self.cells, self.nearness_weight = cells, nearness_weight
         count = cells**3
-        sums = torch.empty(size, count)
-        nn.init.orthogonal_(sums)
-        self.sums, self.back = (
-            nn.Parameter(sums),
-            nn.Parameter(sums.T.clone(memory_format=torch.contiguous_format)),
-        )
+        if size > count:
+            raise WearcapError(f"a code of {size} numbers for {count} cells", expected=f"at most {count}")
+        self.sums = nn.Parameter(nn.init.orthogonal_(torch.empty(size, count)))
+        self.back = nn.Parameter(self.sums.detach().T.contiguous().clone())
         self.step = nn.Parameter(torch.full((steps,), 3.0))
         self.threshold = nn.Parameter(torch.full((steps - 1, count), 0.05))
         self.sharpness = nn.Parameter(torch.tensor(10.0))
         self.border = nn.Parameter(torch.full((count,), 0.1))
+        self.register_buffer("unit", torch.ones(size))
+        self.unit: Tensor
+        """Deviation of each sum at the start: codes are about 1."""
         self.scale, self.shift = nn.Parameter(torch.tensor(1.0)), nn.Parameter(torch.tensor(0.0))
 
     def encode(self, nearness: Float[Tensor, "batch x y z"]) -> Float[Tensor, "batch feature"]:
-        return nearness.flatten(1) @ self.sums.T
+        return nearness.flatten(1) @ self.sums.T / self.unit
 
     def decode(self, code: Float[Tensor, "batch feature"]) -> Float[Tensor, "batch x y z"]:
         logits, nearness = self._explained(code)
@@ -131,10 +132,11 @@ class SparseLayers(nn.Module):
 
     def _explained(self, code: Tensor) -> tuple[Float[Tensor, "batch cell"], Float[Tensor, "batch cell"]]:
         """Logits of cells' holding a point, and its nearness if so."""
-        found = guess = self.step[0] * code @ self.back.T
+        sums = code * self.unit
+        found = guess = self.step[0] * sums @ self.back.T
         for step, threshold in zip(self.step[1:], self.threshold):
             found = F.relu(guess - threshold)
-            guess = found + step * ((code - found @ self.sums.T) @ self.back.T)
+            guess = found + step * ((sums - found @ self.sums.T) @ self.back.T)
         return self.sharpness * (guess - self.border), self.scale * guess + self.shift
 
     def loss(self, nearness: Float[Tensor, "batch x y z"]) -> Float[Tensor, ""]:
@@ -150,3 +152,4 @@ class SparseLayers(nn.Module):
         components = torch.linalg.eigh(centered.T @ centered)[1].flip(1)[:, : len(self.sums)]
         self.sums.copy_(components.T)
         self.back.copy_(components)
+        self.unit.copy_((centered @ components).std(0).clamp_min(1e-3))
