@@ -1,6 +1,7 @@
 """One simulated recording: a world, a person, what they do, and what their sensors say of it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from wearcap.sensors.head import SlamNoise, head_stream
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.slam import semidense_points
 from wearcap.sensors.suit import SuitNoise, suit_motion
+from wearcap.simulation.ego_view import write_ego_video
 from wearcap.simulation.flat import build_flat
 from wearcap.simulation.outdoor import build_outdoor
 from wearcap.simulation.person import Person, draw_person
@@ -45,6 +47,8 @@ class SimulationConfig:
     suit: SuitNoise | None = field(default_factory=SuitNoise)
     """None: no suit is worn."""
     world: str | None = None
+    camera: bool = False
+    """Film what a camera on the head sees."""
 
     def __post_init__(self):
         if self.world is not None and self.world not in WORLDS:
@@ -53,8 +57,16 @@ class SimulationConfig:
             )
 
 
-def simulate_recording(config: SimulationConfig, name: str, split: str, seed: int) -> Recording:
-    """The recording of a seed: subject and location are drawn from the split's own pools."""
+def simulate_recording(
+    config: SimulationConfig, name: str, split: str, seed: int, folder: Path | None = None
+) -> Recording:
+    """The recording of a seed: subject and location are drawn from the split's own pools.
+
+    The camera's video goes to `folder`/videos. All else is the same with a camera and without. Raises WearcapError
+    for a camera without a folder.
+    """
+    if config.camera and folder is None:
+        raise WearcapError("no folder for the head camera's video", expected="one for the data set")
     rng = np.random.default_rng([seed, sum(map(ord, split))])
     subjects, locations = POOLS[split]
     person = person_of(split, int(rng.integers(subjects)))
@@ -62,7 +74,12 @@ def simulate_recording(config: SimulationConfig, name: str, split: str, seed: in
     world = world_of(split, number, config.world or kind)
     activities = list(config.activities) if config.activities else None
     simulated = simulate_motion(world, person, rng, config.duration_s, config.fps, activities)
-    return sense(config, name, world, person, simulated, rng)
+    recording = sense(config, name, world, person, simulated, rng)
+    if not config.camera or folder is None:
+        return recording
+    file, film = folder / "videos" / f"{name}.mp4", np.random.default_rng([31, sum(map(ord, split)), seed])
+    camera = write_ego_video(file, world, simulated.motion, person.shape, person.t_head_device, film)
+    return replace(recording, camera=camera)
 
 
 def person_of(split: str, number: int) -> Person:

@@ -21,23 +21,26 @@ class Simulated:
     name: str
     split: str
     seed: int
+    root: Path
 
     def __call__(self) -> Recording:
-        return simulate_recording(self.config, self.name, self.split, self.seed)
+        return simulate_recording(self.config, self.name, self.split, self.seed, self.root)
 
 
 def simulated_tasks(
     splits: Splits, recordings: dict[str, int], duration_s: float | int, fps: float | int, points: bool,
-    activities: list[str] | None, seed: int, world: str | None = None,
+    activities: list[str] | None, seed: int, world: str | None = None, camera: bool = False, output: str = ".",
 ) -> list[Task]:  # fmt: skip
     """`recordings[split]` recordings of `duration_s` each; people and places of the splits never meet.
+
+    With `camera`, what a head camera sees goes to `output`/videos.
 
     The hash covers the simulator's own source, so that a better simulator makes its recordings again.
     `world` is "flat", "outdoor" or None (drawn). Raises WearcapError for an unknown split or world, or when a
     simulated person's name belongs to another split's list.
     """
     config = SimulationConfig(duration_s=float(duration_s), fps=float(fps), points=points,
-                              activities=tuple(activities) if activities else None, world=world)  # fmt: skip
+                              activities=tuple(activities) if activities else None, world=world, camera=camera)  # fmt: skip
     if not config.duration_s > 0 or not config.fps > 0:
         raise WearcapError(f"recordings of {duration_s} s at {fps} Hz", expected="positive numbers")
     if unknown := set(recordings) - set(SPLITS):
@@ -51,7 +54,7 @@ def simulated_tasks(
             )
         for index in range(count):
             name = f"sim-{split}-{seed}-{index:04d}"
-            make = Simulated(config, name, split, seed * 1_000_000 + index)
+            make = Simulated(config, name, split, seed * 1_000_000 + index, Path(output))
             tasks.append(Task(name, make, split, content_hash(asdict(config), make.seed, split, simulator)))
     return tasks
 
