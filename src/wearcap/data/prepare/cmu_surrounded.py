@@ -14,13 +14,16 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording.recording import HeadStream, PointCloud, Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
-from wearcap.sensors.slam import semidense_points
+from wearcap.sensors.slam import SlamPoints, semidense_points
 from wearcap.simulation.ego_view import write_ego_video
 from wearcap.simulation.surround import surround
 from wearcap.simulation.world import World
 
-VIEWS, VIEW_S = 12, 0.25
-"""In so many steps, of so long each, a wearer turns round before the recording begins."""
+TURNS, DOWN_DEG, VIEW_S = 12, (0.0, 38.0), 0.25
+"""Before the recording begins a wearer turns round in so many steps, looking ahead and then down, so long each."""
+MAX_CANDIDATES = 200_000
+DENSEST = 1500.0
+"""Points per m² at most."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,7 @@ class Surrounded:
     root: Path
     camera: bool
     look_round: bool
+    density: float
     seed: int
 
     def __call__(self) -> Recording:
@@ -44,7 +48,7 @@ class Surrounded:
         seed = [self.seed, zlib.crc32(self.name.encode())]
         of_world, of_points, of_camera = (np.random.default_rng([number, *seed]) for number in (31, 32, 33))
         world = surround(motion, of_world, f"cmu-room-{self.name}")
-        points = seen_points(world, head, self.look_round, of_points)
+        points = seen_points(world, head, self.look_round, self.density, of_points)
         recording = replace(recording, points=points, location=world.name)
         if not self.camera:
             return recording
@@ -53,38 +57,57 @@ class Surrounded:
         return replace(recording, camera=camera)
 
 
-def seen_points(world: World, head: HeadStream, look_round: bool, rng: np.random.Generator) -> PointCloud:
-    """Semi-dense points along the head's path; with `look_round`, what the wearer saw from its start is known then."""
-    points = semidense_points(
-        world.mesh, world.face_texture, _turned_round(head) if look_round else head, rng
-    )
+def seen_points(
+    world: World, head: HeadStream, look_round: bool, density: float, rng: np.random.Generator
+) -> PointCloud:
+    """Semi-dense points along the head's path, `density` times as many as the world's textures say.
+
+    With `look_round`, what the wearer saw from where the path starts is known from its first moment.
+    """
+    texture = np.minimum(density * world.face_texture, DENSEST)
+    path, settings = (_turned_round(head) if look_round else head), SlamPoints(max_candidates=MAX_CANDIDATES)
+    points = semidense_points(world.mesh, texture, path, rng, settings)
     assert points.first_seen is not None
     return replace(points, first_seen=points.first_seen.clamp(min=head.timestamps[0].item()))
 
 
 def _turned_round(head: HeadStream) -> HeadStream:
-    """The path with a turn on the spot before it."""
-    angle = torch.arange(VIEWS) * (2 * torch.pi / VIEWS)
-    R = rotation.about_axis("z", angle).to(head.R_world_device.dtype) @ head.R_world_device[0]
-    before = head.timestamps[0] - VIEW_S * torch.arange(VIEWS, 0, -1, dtype=torch.float64)
+    """The path with two turns on the spot before it, level and looking down."""
+    ahead = head.R_world_device[0, :, 0]
+    yaw = torch.atan2(ahead[1], ahead[0]) + torch.arange(TURNS) * (2 * torch.pi / TURNS)
+    down = torch.tensor(DOWN_DEG).deg2rad().to(yaw.dtype)
+    R = (rotation.about_axis("z", yaw)[None] @ rotation.about_axis("y", down)[:, None]).flatten(0, 1)
+    before = head.timestamps[0] - VIEW_S * torch.arange(len(R), 0, -1, dtype=torch.float64)
     return replace(
-        head, timestamps=torch.cat([before, head.timestamps]), R_world_device=torch.cat([R, head.R_world_device]),
-        t_world_device=torch.cat([head.t_world_device[:1].expand(VIEWS, 3), head.t_world_device]),
+        head, timestamps=torch.cat([before, head.timestamps]),
+        R_world_device=torch.cat([R.to(head.R_world_device.dtype), head.R_world_device]),
+        t_world_device=torch.cat([head.t_world_device[:1].expand(len(R), 3), head.t_world_device]),
     )  # fmt: skip
 
 
 def cmu_surrounded_tasks(
-    source: str | Path, output: str | Path, splits: Splits, camera: bool, look_round: bool, seed: int
+    source: str | Path,
+    output: str | Path,
+    splits: Splits,
+    camera: bool,
+    look_round: bool,
+    density: float | int,
+    seed: int,
 ) -> list[Task]:
     """One task per recording of the data set `source`, which `wearcap prepare cmu` made (floors at z = 0).
 
     Videos of the head camera go to `output`/videos. The hash covers the recording and the simulator's own source.
+    Raises WearcapError for a density that is not positive.
     """
+    if not density > 0:
+        raise WearcapError(f"points of density {density}", expected="a positive number")
     store, simulator = RecordingStore.open(source), source_files()
     tasks = []
     for name in store.names():
         entry = store.entries[name]
-        make = Surrounded(store.root / entry.file, name, Path(output), camera, look_round, seed)
-        made = content_hash(entry.sha256, camera, look_round, seed, simulator)
+        make = Surrounded(
+            store.root / entry.file, name, Path(output), camera, look_round, float(density), seed
+        )
+        made = content_hash(entry.sha256, camera, look_round, float(density), seed, simulator)
         tasks.append(Task(name, make, splits.of(entry.subject), made))
     return tasks

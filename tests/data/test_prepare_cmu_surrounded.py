@@ -1,0 +1,107 @@
+"""`wearcap prepare cmu_surrounded`: the same recordings, with points and a head camera, the same bytes again."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import captured_motion as captured
+from wearcap.cli.conf import compose
+from wearcap.cli.prepare import run
+from wearcap.data.prepare.mocap import nominal_head
+from wearcap.errors import WearcapError
+from wearcap.recording import Recording, RecordingStore
+from wearcap.recording.serialize import flatten
+from wearcap.recording.store import entry_for, recording_path, save_recording
+
+MOTIONS = {"7_01": captured.walk(1.0), "35_02": captured.sit(0.5).sliced(60, 200)}
+
+
+def source(root, **changed) -> RecordingStore:
+    """A data set of a walk (train) and a sitter (test)."""
+    store = RecordingStore(root)
+    for name, motion in MOTIONS.items():
+        subject = name.split("_")[0]
+        recording = replace(
+            Recording(name, head=nominal_head(motion, [0.09, 0.0, 0.09]), motion=motion,
+                      skeleton=motion.skeleton, subject=subject, activity="walk"), **changed,
+        )  # fmt: skip
+        save_recording(recording, recording_path(root, name))
+        store.register({name: entry_for(recording, root, "train" if subject == "7" else "test", "0")})
+    return store
+
+
+def surrounded(root, output, *more: str):
+    settings = [f"source={root}", f"output={output}", "jobs=1", "backend=threading", *more]
+    return run(compose("prepare", ["prepare=cmu_surrounded", *settings]))
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """(source, report, prepared without a camera)."""
+    root = tmp_path_factory.mktemp("sets")
+    store = source(root / "cmu")
+    return store, surrounded(root / "cmu", root / "a", "camera=false"), RecordingStore.open(root / "a")
+
+
+def test_the_same_recordings_with_points(plain):
+    store, report, prepared = plain
+    assert report.failed == {}
+    assert [prepared.names(split) for split in ("train", "test")] == [["7_01"], ["35_02"]]
+    for name in MOTIONS:
+        before, after = store.load(name), prepared.load(name)
+        old, new = (flatten(recording)[1] for recording in (before, after))
+        assert all(torch.equal(tensor, new[key]) for key, tensor in old.items())
+        assert (after.subject, after.activity) == (before.subject, before.activity)
+        assert after.location == f"cmu-room-{name}"
+        assert after.points is not None
+        assert after.points.first_seen is not None
+        assert len(after.points.points_world) > 1000
+        assert after.points.first_seen.min() == before.motion.timestamps[0]
+        assert after.points.first_seen.max() <= before.motion.timestamps[-1]
+        beneath = (after.points.points_world[:, 2].abs() < 0.05).float().mean()
+        assert beneath > 0.02  # some of the floor was seen
+
+
+def test_again_is_current_and_elsewhere_the_same_bytes(plain, tmp_path):
+    store, _, prepared = plain
+    again = surrounded(store.root, prepared.root, "camera=false")
+    assert again.current == sorted(MOTIONS)
+    surrounded(store.root, tmp_path, "camera=false")
+    other = RecordingStore.open(tmp_path)
+    assert {n: e.sha256 for n, e in other.entries.items()} == {
+        n: e.sha256 for n, e in prepared.entries.items()
+    }
+
+
+def test_without_a_turn_less_is_known(plain, tmp_path):
+    store, _, prepared = plain
+    surrounded(store.root, tmp_path, "camera=false", "look_round=false")
+    known = [RecordingStore.open(root).load("7_01").points.points_world for root in (tmp_path, prepared.root)]
+    assert len(known[0]) < 0.8 * len(known[1])
+
+
+def test_a_density_of_nothing_is_refused(plain, tmp_path):
+    with pytest.raises(WearcapError, match="positive"):
+        surrounded(plain[0].root, tmp_path, "density=0")
+
+
+@pytest.mark.slow
+def test_the_camera_films_into_the_data_set(plain, tmp_path):
+    store, _, prepared = plain
+    report = surrounded(store.root, tmp_path)
+    assert report.failed == {}
+    filmed = RecordingStore.open(tmp_path)
+    recording = filmed.load("7_01")
+    assert recording.camera is not None
+    assert recording.camera.video == "videos/7_01.mp4"
+    assert (filmed.root / recording.camera.video).stat().st_size > 1000
+    assert torch.equal(recording.camera.timestamps, recording.motion.timestamps[::2])
+    assert torch.equal(recording.points.points_world, prepared.load("7_01").points.points_world)
+
+
+def test_a_recording_without_a_head_is_reported(tmp_path):
+    source(tmp_path / "cmu", head=None)
+    report = surrounded(tmp_path / "cmu", tmp_path / "a", "camera=false")
+    assert report.failed.keys() == MOTIONS.keys()
+    assert "no head path" in report.failed["7_01"]
