@@ -1,6 +1,7 @@
 """Real Project Aria recordings through surroundings, pictures, alignment and comparison."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,9 @@ from scipy.spatial import cKDTree
 
 from wearcap.body.hang import hang
 from wearcap.body.skeleton import xsens23
+from wearcap.data.features import HeadFeatures
+from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
@@ -17,11 +21,15 @@ from wearcap.geometry.trajectory import Trajectory, interpolate, resample
 from wearcap.io.adt import read_adt
 from wearcap.io.aria_mps import read_closed_loop, read_mps
 from wearcap.metrics.cues import cue_errors_cm
+from wearcap.models.denoiser import MotionDenoiser
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.pipelines.doctor import examine
+from wearcap.pipelines.hmd2 import HMD2
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording
 from wearcap.scene.floor import estimate_floor
 from wearcap.scene.voxels import VoxelGrid, VoxelMap, voxelize
 from wearcap.viewer.head_path import draw_head_path
+from wearcap.viewer.picture import contact_sheet
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +169,39 @@ def test_true_joints_lie_on_the_wearers_arm_in_the_real_frames(real_data):
         shades = [picture[tuple((sleeve + shift * across).round().long().flip(1).T.numpy())].mean() for shift in (0, 60, -60)]  # fmt: skip
         assert shades[0] < 30, "a black sleeve"
         assert min(shades[1:]) > 1.3 * shades[0], "and something else beside it"
+
+
+@pytest.fixture(scope="module")
+def hmd2() -> HMD2:
+    """The whole pipeline with random weights that listens to head and points."""
+    torch.manual_seed(0)
+    features, places = HeadFeatures(), VoxelAutoencoder()
+    net = MotionDenoiser(features.motion_size, features.condition_size, 60, 32, 1, 4, 64, 0.0, 4, points_size=places.size)  # fmt: skip
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, std=0.05)
+    return HMD2(
+        net, features, CosineSchedule(), xsens23(), 60.0, place_encoder=places.eval(), steps=2, stride=40
+    )
+
+
+@pytest.mark.real
+def test_a_real_recording_is_captured_with_its_points(living_room, hmd2, tmp_path):
+    recording, head, _ = living_room
+    motion = hmd2(recording)
+    assert torch.equal(motion.timestamps, head.timestamps)
+    assert torch.allclose(motion.joint("head").t, head.T_world_head.t, atol=1e-4), (
+        "no drift of body from head"
+    )
+    assert torch.allclose(motion.joint("head").R, head.T_world_head.R, atol=1e-4)
+    blind = hmd2(replace(recording, points=None))
+    assert not torch.allclose(motion.R_parent_joint, blind.R_parent_joint, atol=1e-3), (
+        "points are listened to"
+    )
+    sheet = contact_sheet({"capture": motion}, [0, 300, 683], size=(120, 100))
+    assert np.asarray(sheet).std() > 5, "a body is drawn"
+
+
+@pytest.mark.real
+def test_a_fifth_of_a_second_is_refused(real_data, hmd2):
+    with pytest.raises(WearcapError, match=r"raw: head poses of 6 frames.*at least 0.25 s"):
+        hmd2(read_adt(real_data / "aria_adt_sample" / "raw"))
