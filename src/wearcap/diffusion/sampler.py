@@ -15,22 +15,31 @@ Denoise = Callable[
 """x̂0 from x_t and its level."""
 
 
+def step_levels(steps: int, spacing: float = 1.0) -> Float[Tensor, "level"]:
+    """The levels from 1 to 0 between which `steps` steps lead: (1 - i / steps) to the power of `spacing`.
+
+    1 strides evenly, as the document does; more takes smaller steps where little noise is left, less where much is.
+    """
+    return torch.linspace(1, 0, steps + 1) ** spacing
+
+
 def sample(
     denoise: Denoise,
     noise: Float[Tensor, "draw batch time feature"],
     schedule: Schedule,
     *,
     eta: float = 1.0,
+    spacing: float = 1.0,
     known: Float[Tensor, "batch time feature"] | None = None,
     is_known: Bool[Tensor, "batch time"] | None = None,
 ) -> Float[Tensor, "batch time feature"]:
-    """Draw x0 in `draw` evenly strided steps from level 1 to 0; noise[0] is the start, the rest the steps' noise.
+    """Draw x0 in `draw` steps between the levels of `step_levels`; noise[0] is the start, the rest the steps' noise.
 
     Where `is_known`, every x̂0 is overwritten by `known` (autoregressive inpainting, thesis eq. 6.5).
     The same noise gives the same sample, so windows of several wearers can share a batch.
     """
     steps = len(noise)
-    levels = torch.linspace(1, 0, steps + 1, dtype=noise.dtype, device=noise.device)
+    levels = step_levels(steps, spacing).to(noise)
     x = noise[0]
     for step in range(steps):
         level, level_next = (levels[step + i].expand(x.shape[0], 1) for i in (0, 1))

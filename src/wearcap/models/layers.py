@@ -58,7 +58,8 @@ class RotaryAttention(nn.Module):
 
 def attention_mask(valid: Bool[Tensor, "batch token"]) -> Bool[Tensor, "batch 1 token token"]:
     """Who may see whom: all see what is valid. A row with nothing to see would be NaN: padding may always see itself."""
-    return valid[:, None, None, :] | torch.eye(valid.shape[1], dtype=torch.bool, device=valid.device)
+    number = torch.arange(valid.shape[1], device=valid.device)
+    return valid[:, None, None, :] | (number == number[:, None])
 
 
 class AdaptiveBlock(nn.Module):

@@ -1,7 +1,7 @@
 """HMD² (thesis ch. 6): environment-aware full-body motion from a head-mounted device by conditional motion diffusion."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import torch
@@ -14,13 +14,14 @@ from wearcap.data.features import HeadFeatures, body_size
 from wearcap.data.floor import floor_from_path, floor_from_points, tracked_floor
 from wearcap.data.prepare.check import MIN_DURATION_S
 from wearcap.data.surroundings import latest_before
-from wearcap.diffusion.sampler import Denoise
+from wearcap.diffusion.sampler import Denoise, step_levels
 from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.models.denoiser import Conditions, MotionDenoiser
+from wearcap.models.denoiser_runtime import StepRunner
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.pipelines.hmd2_windows import Frames, Poses, WindowSampler, advance
 from wearcap.recording import Motion, Recording
@@ -74,7 +75,14 @@ class HMD2:
     """Classifier-free guidance by points and images (Ho & Salimans 2022; ours): 1 leaves it out."""
     live: bool = False
     """Whether even the floor is told only from what has been sensed by then, as it must be in a stream."""
+    spacing: float = 1.0
+    """How the steps' levels are spaced (`diffusion.sampler.step_levels`)."""
+    runtime: str = "eager"
+    """What the steps run on (`models.denoiser_runtime.RUNTIMES`); all but eager take some seconds to begin."""
+    precision: str = "auto"
+    """Of the steps' products (`models.denoiser_runtime.PRECISIONS`)."""
     device: str = "cpu"
+    _steps: StepRunner | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self):
         if unknown := set(self.use) - set(MODALITIES):
@@ -92,10 +100,20 @@ class HMD2:
     def __call__(self, recording: Recording, seed: int = 0) -> Motion:
         return self.capture([recording], [seed])[0]
 
+    def prepare(self) -> None:
+        """Bring the network to its device and its steps into the form they run in, as every capture does first.
+
+        What is compiled or exported is made once, from the weights as they are then.
+        """
+        self.net.to(self.device).eval()
+        if self._steps is None or self.runtime == "eager":
+            levels = step_levels(self.steps, self.spacing)[:-1]
+            self._steps = StepRunner(self.net, levels, self.runtime, self.precision)
+
     @torch.inference_mode()
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
         """One motion per (recording, seed); recordings share batches, which changes nothing but the time."""
-        self.net.to(self.device).eval()
+        self.prepare()
         # 1. head path and floor; 2. points around the body as codes; 3. pictures as embeddings
         paths = [head_path(recording, self.skeleton, self.fps) for recording in recordings]
         frames = [self.sense(recording, path) for recording, path in zip(recordings, paths)]
@@ -168,21 +186,25 @@ class HMD2:
         return path.floor_height if floor is None else floor
 
     def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "lane time"]) -> Denoise:
-        """x̂0 of a window as a function of x_t and its level; what the conditions say is computed once."""
+        """x̂0 of a window as a function of x_t and its level, asked for at the levels of the steps, one after the other.
+
+        What the conditions say, and what the levels do, is computed once.
+        """
         encoded = self.net.encode(conditions, valid)
         blind = None
         if self.guidance != 1.0:
             nothing = torch.zeros_like(valid)
             blind = self.net.encode(conditions._replace(points_valid=nothing, image_valid=nothing), valid)
-        last: Tensor | None = None
+        steps, number, last = self._steps, 0, None
+        assert steps is not None
 
         def denoise(x_t: Tensor, level: Tensor) -> Tensor:
-            nonlocal last
-            x0_hat = self.net(x_t, level, encoded, valid, last)
+            nonlocal last, number
+            x0_hat = steps(number, x_t, encoded, valid, last)
             if blind is not None:
-                plain = self.net(x_t, level, blind, valid, last)
+                plain = steps(number, x_t, blind, valid, last)
                 x0_hat = plain + self.guidance * (x0_hat - plain)
-            last = x0_hat if self.net.self_conditioning else None
+            last, number = x0_hat if self.net.self_conditioning else None, number + 1
             return x0_hat
 
         return denoise

@@ -168,7 +168,7 @@ class Session:
             raise WearcapError(
                 f"{len(seeds)} seeds for {len(wearers)} wearers", expected="one for each wearer"
             )
-        pipeline.net.to(pipeline.device).eval()
+        pipeline.prepare()
         self.pipeline, self.memory = pipeline, memory or Memory()
         self._lanes = [_Lane(pipeline, wearer, seed, self.memory) for wearer, seed in zip(wearers, seeds)]
 
@@ -271,7 +271,7 @@ def _settings(pipeline: HMD2) -> dict[str, float | str]:
     net = pipeline.net
     return {
         "window": net.window, "stride": pipeline.advance, "steps": pipeline.steps, "fps": pipeline.fps,
-        "motion_size": net.motion_size, "points_size": net.points_size, "image_size": net.image_size,
+        "eta": pipeline.eta, "spacing": pipeline.spacing, "motion_size": net.motion_size, "points_size": net.points_size, "image_size": net.image_size,
         "features": str(pipeline.features),
     }  # fmt: skip
 

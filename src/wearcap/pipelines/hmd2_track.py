@@ -89,14 +89,14 @@ class HeadTrack:
         """The next chunk, once all its frames' times have passed; `ended`: nothing more will come."""
         while self._poses:
             start = self._poses[0][0] if self._start is None else self._start
-            known = self._known()
             first = self._next
             if not self._inside:
-                first = max(first, math.ceil((known.timestamps[0].item() - 1e-6 - start) * self.fps))
+                first = max(first, math.ceil((self._poses[0][0] - 1e-6 - start) * self.fps))
+            if not ended and start + (first + self.stride - 1) / self.fps > self._newest + _SAME_S:
+                return None
+            known = self._known()
             stop = self._stop(known, start, ended)
             count = self.stride if stop is None else min(stop - first, self.stride)
-            if stop is None and start + (first + count - 1) / self.fps > self._newest + _SAME_S:
-                return None
             chunk = None
             if count > 0:
                 chunk = self._chunk(known, start, first, count)

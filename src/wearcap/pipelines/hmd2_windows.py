@@ -48,6 +48,7 @@ class Model(Protocol):
     fps: float
     steps: int
     eta: float
+    spacing: float
     device: str
 
     def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "lane time"]) -> Denoise: ...
@@ -153,7 +154,7 @@ def _sample(samplers: Sequence[WindowSampler], lanes: list[tuple[Frames, Poses, 
     noise = torch.stack([sampler.noise() for sampler in samplers], 1).to(device)
     x0 = sample(
         pipeline.denoiser(conditions, valid.to(device)), noise, pipeline.schedule,
-        eta=pipeline.eta, known=known, is_known=is_known.to(device),
+        eta=pipeline.eta, spacing=pipeline.spacing, known=known, is_known=is_known.to(device),
     )  # fmt: skip
     motion = net.motion_normalizer.inverse(x0.float()).cpu()
     poses = Poses(*features.decode(motion, frames.R_world_head))
