@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 
 from wearcap.body.skeleton import xsens23
 from wearcap.data.features import HeadFeatures
@@ -13,6 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.denoiser import MotionDenoiser
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.hmd2_places import Memory
 from wearcap.pipelines.hmd2_stream import Sensed, Session, Wearer
