@@ -1,0 +1,130 @@
+"""Codes of points and grids drawn from recordings: the frames' own, once per encoder, by seed alone."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from wearcap.data.place_codes import PlaceCodes
+from wearcap.data.voxel_windows import PlaceDataset
+from wearcap.data.windows import Source
+from wearcap.errors import WearcapError
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.recording import PointCloud, RecordingStore
+from wearcap.scene.voxels import VoxelGrid, mirrored, voxelize
+from wearcap_testing import recording_of, swaying_motion
+
+
+def cloud(seed: int) -> PointCloud:
+    random = torch.Generator().manual_seed(seed)
+    points = torch.rand(2000, 3, generator=random) * torch.tensor([6.0, 6.0, 2.0]) - torch.tensor(
+        [3.0, 3.0, 0.0]
+    )
+    return PointCloud(points, first_seen=2 * torch.rand(2000, generator=random, dtype=torch.float64))
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> RecordingStore:
+    """Two recordings with points, one without, one with an empty cloud."""
+    store = RecordingStore(tmp_path_factory.mktemp("places"))
+    empty = PointCloud(torch.zeros(0, 3))
+    for seed, points in enumerate((cloud(0), cloud(1), None, empty)):
+        recording = recording_of(swaying_motion(130, seed), f"r{seed}")
+        store.add(dataclasses.replace(recording, points=points), split="train", config_hash="test")
+    return store
+
+
+def checkpoint(path, seed: int, **settings):
+    torch.manual_seed(seed)
+    net = VoxelAutoencoder(**settings)
+    model = {"_target_": "wearcap.training.voxel_reconstruction.VoxelReconstruction",
+             "net": {"_target_": "wearcap.models.voxel_autoencoder.VoxelAutoencoder", **settings}}  # fmt: skip
+    state = {f"net.{name}": value for name, value in net.state_dict().items()}
+    torch.save({"wearcap": {"config": json.dumps({"model": model})}, "state_dict": state}, path)
+    return net.eval()
+
+
+def test_codes_are_those_of_the_frames_grids(store, tmp_path):
+    net = checkpoint(tmp_path / "a.ckpt", 0, size=32)
+    places, head, points = PlaceCodes(tmp_path / "a.ckpt"), store.load("r0").head, store.load("r0").points
+    assert places.size == 32
+    codes = load_file(places.file_of(store.root, store.entries["r0"]))
+    grids = voxelize(points.points_world, head.T_world_device, net.grid, points.first_seen, head.timestamps)
+    assert codes["code"].dtype == torch.float16
+    torch.testing.assert_close(codes["code"].float(), net.encode(grids).detach(), atol=5e-3, rtol=2e-3)
+    torch.testing.assert_close(
+        codes["code_mirrored"].float(), net.encode(mirrored(grids)).detach(), atol=5e-3, rtol=2e-3
+    )
+    assert not torch.equal(codes["code"], codes["code_mirrored"])
+
+
+@pytest.mark.parametrize("name", ["r2", "r3"])
+def test_no_rows_without_points(store, tmp_path, name):
+    checkpoint(tmp_path / "a.ckpt", 0, size=32)
+    codes = load_file(PlaceCodes(tmp_path / "a.ckpt").file_of(store.root, store.entries[name]))
+    assert codes["code"].shape == codes["code_mirrored"].shape == (0, 32)
+
+
+def test_made_once_per_encoder_and_recording(store, tmp_path):
+    checkpoint(tmp_path / "a.ckpt", 0, size=24)
+    checkpoint(tmp_path / "b.ckpt", 1, size=24)
+    checkpoint(tmp_path / "c.ckpt", 0, size=24, below_m=0.9)
+    first = PlaceCodes(tmp_path / "a.ckpt")
+    first.prepare(store, ["r0", "r1"])
+    files = [first.file_of(store.root, store.entries[name]) for name in ("r0", "r1")]
+    assert len({file.parent for file in files}) == 1
+    made = [file.stat().st_mtime_ns for file in files]
+    again = PlaceCodes(tmp_path / "a.ckpt")
+    again.prepare(store, store.names())
+    assert [again.file_of(store.root, store.entries[n]).stat().st_mtime_ns for n in ("r0", "r1")] == made
+    assert len(list(files[0].parent.iterdir())) == 4
+    others = [PlaceCodes(tmp_path / name).fingerprint for name in ("b.ckpt", "c.ckpt")]
+    assert len({first.fingerprint, *others}) == 3
+
+
+def test_another_networks_checkpoint_is_refused(tmp_path):
+    content = {"config": json.dumps({"model": {"_target_": "wearcap.training.egoview.EgoView"}})}
+    torch.save({"wearcap": content, "state_dict": {}}, tmp_path / "x.ckpt")
+    with pytest.raises(WearcapError, match="voxel autoencoder"):
+        _ = PlaceCodes(tmp_path / "x.ckpt").encoder
+
+
+def drawn(store, **changes) -> PlaceDataset:
+    settings = {"grid": VoxelGrid(), "window": 60, "frames": 5, "fps": 60.0} | changes
+    return PlaceDataset([Source(str(store.root))], "train", **settings)
+
+
+def test_drawn_grids_are_the_recordings_own(store):
+    dataset = drawn(store)
+    assert len(dataset) == 4  # two windows of each recording that has points
+    everything = []
+    for name in ("r0", "r1"):
+        recording = store.load(name)
+        everything.append(voxelize(recording.points.points_world, recording.head.T_world_device, VoxelGrid(),
+                                   recording.points.first_seen, recording.head.timestamps))  # fmt: skip
+    for index, (recording, start) in enumerate([(0, 0), (0, 60), (1, 0), (1, 60)]):
+        for grid in dataset[(index, 7)].grids:
+            own = everything[recording][start : start + 60]
+            assert (own == grid).flatten(1).all(1).any()
+
+
+def test_what_is_drawn_depends_on_the_seed_alone(store):
+    dataset = drawn(store, mirror=True)
+    assert torch.equal(dataset[(1, 5)].grids, drawn(store, mirror=True)[(1, 5)].grids)
+    assert not torch.equal(dataset[(1, 5)].grids, dataset[(1, 6)].grids)
+    plain = drawn(store)
+    kinds = {
+        (torch.equal(dataset[(1, seed)].grids, plain[(1, seed)].grids),
+         torch.equal(dataset[(1, seed)].grids, mirrored(plain[(1, seed)].grids)))
+        for seed in range(12)
+    }  # fmt: skip
+    assert kinds == {(True, False), (False, True)}
+
+
+def test_data_without_points_is_refused(tmp_path):
+    store = RecordingStore(tmp_path)
+    store.add(recording_of(swaying_motion(90), "r0"), split="train", config_hash="test")
+    with pytest.raises(WearcapError, match="has points"):
+        drawn(store)
