@@ -1,0 +1,130 @@
+"""Streams for benchmarks of HMD²: a checkpoint or its size with random weights, and moments of a walk among points."""
+
+import statistics
+import sys
+import time
+from dataclasses import replace
+
+import torch
+from hydra.utils import instantiate
+from planted import swinging
+
+from wearcap.body.skeleton import xsens23
+from wearcap.cli.conf import compose
+from wearcap.cli.load import load_pipeline
+from wearcap.data.features import HeadFeatures
+from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.geometry.rigid import Rigid
+from wearcap.models.checkpoint import shared_checkpoints
+from wearcap.models.denoiser import MotionDenoiser
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.pipelines.hmd2 import HMD2
+from wearcap.pipelines.hmd2_stream import Sensed, Session, Wearer
+
+EXPERIMENTS = {"small": "hmd2", "full": "hmd2_full"}
+"""Of the same name: configs, and checkpoints where they exist."""
+IMAGE = 64
+LAP_S = 20.0
+"""The walk leads there and back, over and over."""
+
+
+def pipeline_of(size: str, device: str = "cpu", **settings) -> HMD2:
+    """The online pipeline around a checkpoint of the project, or around random weights of that size, and says so."""
+    config = compose("capture", ["pipeline=hmd2_online", "recording=none"]).pipeline
+    if EXPERIMENTS[size] in shared_checkpoints():
+        pipeline = load_pipeline(EXPERIMENTS[size], config, device)
+        assert isinstance(pipeline, HMD2)
+    else:
+        given = {name: value for name, value in config.items() if not str(name).startswith("_")}
+        pipeline = HMD2(random_net(size), _FEATURES, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any",
+                        **given, device=device)  # fmt: skip
+        count = sum(parameter.numel() for parameter in pipeline.net.parameters()) / 1e6
+        print(
+            f"no checkpoint {EXPERIMENTS[size]!r}: random weights, {count:.1f} M parameters", file=sys.stderr
+        )
+    return replace(pipeline, **settings)
+
+
+_FEATURES = HeadFeatures(contacts=True, body=True)
+
+
+def random_net(size: str) -> MotionDenoiser:
+    """The network of an experiment's config, its weights drawn."""
+    torch.manual_seed(0)
+    config = compose("train", [f"experiment={EXPERIMENTS[size]}"])
+    net = instantiate(config.model.net)(
+        motion_size=_FEATURES.motion_size, condition_size=_FEATURES.condition_size,
+        points_size=VoxelAutoencoder().size, image_size=IMAGE,
+    )  # fmt: skip
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, std=0.02)
+    return net
+
+
+class Walk:
+    """A head's way there and back at 60 Hz, with an embedding every other frame, and points on the first lap or forever."""
+
+    def __init__(self, pipeline: HMD2, new_points: int = 40, forever: bool = False):
+        self.pipeline, self.new_points, self.forever = pipeline, new_points, forever
+        head = swinging("walk", LAP_S / 2, 0).head
+        assert head is not None
+        there = head.T_world_device
+        self.lap = Rigid(torch.cat([there.R, there.R.flip(0)]), torch.cat([there.t, there.t.flip(0)]))
+        self._random = torch.Generator().manual_seed(0)
+
+    def moment(self, number: int) -> Sensed:
+        place = number % len(self.lap.t)
+        pose = self.lap[place]
+        count = self.new_points if self.forever or number < len(self.lap.t) else 0
+        points = pose.t + 4 * torch.rand(count, 3, generator=self._random) - torch.tensor([2.0, 2.0, 3.0])
+        shown = torch.randn(self.pipeline.net.image_size, generator=self._random) if number % 2 == 0 else None
+        return Sensed(number / 60, pose, points, shown)
+
+
+class Streamed:
+    """A session that is fed a walk; seconds of work per push that gives poses."""
+
+    def __init__(self, pipeline: HMD2):
+        self.session, self.walk, self.number = Session(pipeline, [Wearer(xsens23())], [0]), Walk(pipeline), 0
+        self.stride, self.seconds = pipeline.advance, []
+
+    def step(self) -> None:
+        """One stride: everything from its first moment to its poses."""
+        moments = [self.walk.moment(self.number + i) for i in range(self.stride)]
+        self.number += self.stride
+        begin = time.perf_counter()
+        for moment in moments:
+            self.session.push([[moment]])
+        self.seconds.append(time.perf_counter() - begin)
+
+    def fill(self) -> "Streamed":
+        """Until windows are full, and what is compiled is."""
+        while self.number < self.session.pipeline.net.window + 3 * self.stride:
+            self.step()
+        self.seconds.clear()
+        return self
+
+    @property
+    def frames_per_second(self) -> float:
+        return self.stride / statistics.median(self.seconds)
+
+
+def frames_per_second(pipeline: HMD2, pushes: int = 40) -> float:
+    """Rate at which a full window advances by the pipeline's stride, everything included."""
+    stream = Streamed(pipeline).fill()
+    for _ in range(pushes):
+        stream.step()
+    return stream.frames_per_second
+
+
+def figure(name: str, value: float, baseline: float, goal: float) -> dict:
+    return {
+        "name": name, "value": value, "unit": "frames/s", "baseline": baseline, "ratio": value / baseline, "goal": goal,
+    }  # fmt: skip
+
+
+def without_cuda(name: str) -> bool:
+    """Whether a benchmark for a GPU has none; says so."""
+    if not torch.cuda.is_available():
+        print(f"{name}: left out, no CUDA device", file=sys.stderr)
+    return not torch.cuda.is_available()
