@@ -86,7 +86,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     for title, _, methods in jobs:
         found[title] = [result for result in results[: len(methods)] if result is not None]
         results = results[len(methods) :]
-        console.print(_table(f"{title} ({case.dataset.name}, {case.split})", found[title]))
+        console.print(_table(f"{title} ({case.dataset.name}, {options.split})", found[title]))
     console.print(_document())
     for metric, title in (
         ("mpjpe_cm", "MPJPE (cm)"),

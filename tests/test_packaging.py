@@ -81,7 +81,7 @@ def run(site: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess:
 @pytest.mark.slow
 def test_the_wheel_carries_every_config_and_split_list(unpacked, tmp_path):
     resources = unpacked / "wearcap" / "_resources"
-    for ours, theirs in (("conf", "conf"), ("data_prep/splits", "splits")):
+    for ours, theirs in (("checkpoints", "checkpoints"), ("conf", "conf"), ("data_prep/splits", "splits")):
         expected = {path.relative_to(ROOT / ours) for path in (ROOT / ours).rglob("*") if path.is_file()}
         assert expected
         assert expected == {
