@@ -15,12 +15,14 @@ from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.export import exported, network, runner, sidecar
 from wearcap.geometry import rotation
+from wearcap.geometry.camera import Camera
 from wearcap.models.denoiser import MotionDenoiser
-from wearcap.pipelines.hmd2 import HMD2
-from wearcap.recording import FloorTrack, HeadStream, Recording
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.pipelines.hmd2 import HMD2, head_path
+from wearcap.recording import CameraStream, HeadStream, PointCloud, Recording
 from wearcap.recording.store import RecordingFile, save_recording
 
-WINDOW = 24
+WINDOW, IMAGE = 24, 8
 FORMATS = ("onnx", "pt2")
 
 
@@ -39,18 +41,21 @@ def toy_example() -> dict[str, torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def pipeline() -> HMD2:
-    """A small pipeline with random weights that do say something."""
+    """A small pipeline with random weights that do say something, and that listens to everything."""
     torch.manual_seed(0)
-    features = HeadFeatures()
+    features, places = HeadFeatures(contacts=True, body=True), VoxelAutoencoder(size=16).eval()
     net = MotionDenoiser(
         features.motion_size, features.condition_size, WINDOW, width=32, layers=1, heads=2, feedforward=64,
-        frames_per_token=2, blend=5,
+        frames_per_token=2, blend=5, points_size=places.size, image_size=IMAGE, self_conditioning=True,
     )  # fmt: skip
     for parameter in net.parameters():
         nn.init.normal_(parameter, std=0.05)
-    net.motion_normalizer.set(torch.randn(138) * 0.1, torch.rand(138) + 0.5)
-    net.condition_normalizer.set(torch.randn(13) * 0.1, torch.rand(13) + 0.5)
-    return HMD2(net, features, CosineSchedule(), xsens23(), fps=60.0, steps=3, stride=16)
+    size = features.motion_size
+    net.motion_normalizer.set(torch.randn(size) * 0.1, torch.rand(size) + 0.5)
+    net.condition_encoder.normalizer.set(torch.randn(17) * 0.1, torch.rand(17) + 0.5)
+    return HMD2(
+        net, features, CosineSchedule(), xsens23(), 60.0, places, "eyes", steps=3, stride=16, guidance=1.5
+    )
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +65,18 @@ def recording() -> Recording:
     position = torch.stack([t, 0.1 * torch.sin(t), 1.6 + 0 * t], -1).float()
     R = rotation.about_axis("z", torch.linspace(0, 1, frames))
     head = HeadStream(t, R, position, torch.eye(3), torch.zeros(3))
-    return Recording("walk", head=head, floor=FloorTrack(t, torch.zeros(frames)), skeleton=xsens23())
+    random = torch.Generator().manual_seed(0)
+    points = PointCloud(torch.rand(400, 3, generator=random) * 2 - 0.5)
+    camera = CameraStream(
+        t[10:40:2], Camera.pinhole(32, 32, 90.0), torch.eye(3), torch.zeros(3),
+        embedding=torch.randn(15, IMAGE, generator=random), embedding_name="eyes",
+    )  # fmt: skip
+    return Recording("walk", head=head, points=points, camera=camera, skeleton=xsens23())
 
 
 @pytest.fixture(scope="module")
 def exports(pipeline, tmp_path_factory):
-    """The pipeline in both formats, each with its report."""
+    """The pipeline in both formats, each with its reports."""
     folder = tmp_path_factory.mktemp("export")
     return {
         format: (
@@ -91,12 +102,13 @@ def test_toy_network_agrees_at_other_batch_sizes(tmp_path, format):
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_pipeline_reports_small_error(exports, format):
-    path, report = exports[format]
-    assert 0 <= report.max_abs_error < 1e-4
+    path, reports = exports[format]
+    assert set(reports) == {"step", "conditions", "places"}
+    assert all(0 <= report.max_abs_error < 1e-5 for report in reports.values())
     about = json.loads(path.with_suffix(".json").read_text())
     assert about["window"] == WINDOW
-    assert len(about["condition_channels"]) == 13
-    assert len(about["motion_channels"]) == 138
+    assert len(about["condition_channels"]) == 17
+    assert len(about["motion_channels"]) == 140
     assert about["motion_channels"][6] == "l5.xx"
 
 
@@ -104,6 +116,7 @@ def test_pipeline_reports_small_error(exports, format):
 def test_runner_equals_the_eager_pipeline(pipeline, recording, exports, format):
     eager = pipeline(recording, seed=5)
     motion = runner.load_exported(exports[format][0])(recording, seed=5)
+    assert pipeline.sense(recording, head_path(recording, xsens23(), 60.0)).points_valid.any()
     torch.testing.assert_close(motion.R_parent_joint, eager.R_parent_joint, atol=1e-4, rtol=0)
     torch.testing.assert_close(motion.t_world_root, eager.t_world_root, atol=1e-4, rtol=0)
     other = runner.load_exported(exports[format][0])(recording, seed=6)
@@ -179,6 +192,9 @@ def test_hostile_model_files_are_named(tmp_path, exports, format):
     about["model"]["sha256"] = "0" * 64
     path.with_suffix(".json").write_text(json.dumps(about))
     with pytest.raises(WearcapError, match="belongs to another model"):
+        runner.load_exported(path)
+    path.with_suffix(".json").write_text(exports[format][0].with_suffix(".json").read_text())
+    with pytest.raises(WearcapError, match="a part of the exported model is missing"):
         runner.load_exported(path)
 
 

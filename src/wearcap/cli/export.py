@@ -17,24 +17,25 @@ from wearcap.training.contact_detection import ContactDetection
 HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2|safetensors"
 
 
-def run(config: DictConfig) -> ExportReport | None:
-    """Export the network with its sidecar; prints the error against eager and both latencies.
+def run(config: DictConfig) -> dict[str, ExportReport]:
+    """Export the networks with their sidecar; prints the errors against eager and both latencies.
 
     format=safetensors writes the checkpoint itself: averaged weights and config, to be shared.
     """
     if config.format == "safetensors":
         share_checkpoint(config.checkpoint, config.output, config.dtype)
         show(f"checkpoint: {config.output}")
-        return None
+        return {}
     if isinstance(load_system(config.checkpoint)[0], ContactDetection):
-        report = export_contact(load_detector(config.checkpoint), config.output, config.format)
+        reports = {"network": export_contact(load_detector(config.checkpoint), config.output, config.format)}
     else:
         pipeline = load_pipeline(config.checkpoint, config.pipeline, "cpu")
         if not isinstance(pipeline, HMD2):
-            raise WearcapError(f"{pipeline.name} has no network to export", expected="a learned pipeline, such as pipeline=hmd2")  # fmt: skip
-        report = export_hmd2(pipeline, config.output, config.format)
-    show(f"exported: {config.output}\n{report}")
-    return report
+            raise WearcapError("this pipeline has no network to export", where=config.checkpoint, expected="HMD²'s, such as pipeline=hmd2")  # fmt: skip
+        reports = export_hmd2(pipeline, config.output, config.format)
+    for name, report in reports.items():
+        show(f"exported {name}: {report.path}\n{report}")
+    return reports
 
 
 def main(arguments: list[str]) -> None:

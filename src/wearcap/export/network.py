@@ -1,12 +1,9 @@
 """A network written as ONNX or as a torch.export archive, and compared with the eager network before it counts."""
 
-import contextlib
 import copy
 import importlib.util
-import logging
 import time
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +13,7 @@ from torch import Tensor, nn
 from wearcap.errors import WearcapError
 from wearcap.export.exported import RUN_BY_FORMAT
 from wearcap.files import atomic_path
+from wearcap.models.denoiser_runtime import quiet
 
 TIMED_RUNS = 5
 
@@ -49,7 +47,7 @@ def export_network(
         raise WearcapError(f"a file of format {format} cannot end in {path.suffix!r}", where=path,
                            expected=f"a name that ends in .{format}")  # fmt: skip
     dynamic = {name: {0: torch.export.Dim("batch", min=1)} for name in example}
-    with atomic_path(path) as temporary, torch.inference_mode(), _quiet():
+    with atomic_path(path) as temporary, torch.inference_mode(), quiet():
         program = torch.export.export(net, (), example, dynamic_shapes=dynamic)
         if format == "pt2":
             program.example_inputs = None  # torch would pickle them into the archive
@@ -102,16 +100,3 @@ def _milliseconds(run: Callable[..., Tensor], inputs: dict[str, Tensor]) -> floa
         run(**inputs)
         times.append(time.perf_counter() - start)
     return sorted(times)[TIMED_RUNS // 2] * 1000
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """The exporters speak at length of optional libraries and of what they fold together."""
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(None):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(before)

@@ -16,51 +16,94 @@ from torch import Tensor, nn
 from wearcap.data.features import HeadFeatures
 from wearcap.errors import WearcapError
 from wearcap.export.exported import Run, open_exported
-from wearcap.export.sidecar import SCHEDULES, read_sidecar, skeleton_from_json
-from wearcap.models.denoiser import MotionDenoiser, Normalizer
+from wearcap.export.sidecar import SCHEDULES, part_path, read_sidecar, skeleton_from_json
+from wearcap.models.denoiser import Conditions, LevelPlan, MotionDenoiser, Normalizer
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, save_recording
+from wearcap.scene.voxels import VoxelGrid
 
 
 class ExportedDenoiser(MotionDenoiser):
-    """A `MotionDenoiser` whose weights live in an exported file, run on the CPU."""
+    """A `MotionDenoiser` whose weights live in exported files, run on the CPU."""
 
-    def __init__(self, run: Run, window: int, condition_size: int, motion_normalizer: Normalizer):
+    def __init__(self, step: Run, conditions: Run, about: dict):
+        """`about`: the sidecar."""
         nn.Module.__init__(self)  # no blocks of its own
-        self._run = (run,)
-        self.window, self.condition_size = window, condition_size
-        self.motion_size = len(motion_normalizer.mean)
-        self.motion_normalizer = motion_normalizer
+        self._run = step, conditions
+        self.window, self.condition_size = about["window"], about["condition_size"]
+        self.points_size, self.image_size = about["points_size"], about["image_size"]
+        self.self_conditioning = about["self_conditioning"]
+        self.motion_size = len(about["motion_mean"])
+        self.motion_normalizer = Normalizer(self.motion_size)
+        self.motion_normalizer.set(torch.tensor(about["motion_mean"]), torch.tensor(about["motion_scale"]))
 
-    def forward(
+    def encode(
+        self, conditions: Conditions, valid: Bool[Tensor, "batch time"]
+    ) -> Float[Tensor, "batch token width"]:
+        told = {"head": conditions.head, "valid": valid}
+        if self.points_size:
+            told |= {"points": conditions.points, "points_valid": conditions.points_valid}
+        if self.image_size:
+            told |= {"image": conditions.image, "image_valid": conditions.image_valid}
+        return self._run[1](**told)
+
+    def plan(self, level: Float[Tensor, "batch #time"]) -> LevelPlan:
+        """The exported step takes the level itself."""
+        return LevelPlan(level[..., None], ())
+
+    def step(
         self,
         x_t: Float[Tensor, "batch time motion"],
-        level: Float[Tensor, "batch #time"],
-        condition: Float[Tensor, "batch time condition"],
+        plan: LevelPlan,
+        encoded: Float[Tensor, "batch token width"],
         valid: Bool[Tensor, "batch time"],
+        last: Float[Tensor, "batch time motion"] | None = None,
     ) -> Float[Tensor, "batch time motion"]:
-        level = level.expand(valid.shape)
-        x0_hat = self._run[0](x_t=x_t.cpu(), level=level.cpu(), condition=condition.cpu(), valid=valid.cpu())
-        return x0_hat.to(x_t.device)
+        told = {
+            "x_t": x_t,
+            "level": plan.worth[..., 0].expand(len(x_t), 1),
+            "encoded": encoded,
+            "valid": valid,
+        }
+        if self.self_conditioning:
+            told["last"] = torch.zeros_like(x_t) if last is None else last
+        return self._run[0](**told)
+
+
+class ExportedPlaces(VoxelAutoencoder):
+    """The encoder of the points around the body, its weights in an exported file."""
+
+    def __init__(self, run: Run, grid: VoxelGrid, size: int):
+        nn.Module.__init__(self)
+        self._run, self.grid, self.size = run, grid, size
+
+    def encode(self, grids: Float[Tensor, "*batch x y z"]) -> Float[Tensor, "*batch feature"]:
+        flat = grids.reshape(-1, *grids.shape[-3:])
+        return self._run(grids=flat).reshape(*grids.shape[:-3], self.size)
 
 
 def load_exported(path: str | Path) -> HMD2:
-    """The pipeline of an exported model, from the model file (.onnx or .pt2) and the sidecar beside it.
+    """The pipeline of an exported model, from the step's file (.onnx or .pt2) and what was written beside it.
 
-    Raises WearcapError when either is missing, unreadable, or does not belong to the other.
+    Raises WearcapError when one of the files is missing, unreadable, or does not belong to the others.
     """
-    run = open_exported(path)
+    step = open_exported(path)
     about = read_sidecar(path, "denoiser")
-    normalizer = Normalizer(len(about["motion_mean"]))
-    normalizer.set(torch.tensor(about["motion_mean"]), torch.tensor(about["motion_scale"]))
+    parts = {name: open_exported(part_path(path, name)) for name in about["parts"]}
+    places = None
+    if "places" in parts:
+        places = ExportedPlaces(parts["places"], VoxelGrid(**about["grid"]), about["points_size"])
     schedule = dict(about["schedule"])
     return HMD2(
-        net=ExportedDenoiser(run, about["window"], about["condition_size"], normalizer),
+        net=ExportedDenoiser(step, parts["conditions"], about),
         features=HeadFeatures(**about["features"]),
         schedule=SCHEDULES[schedule.pop("name")](**schedule),
         skeleton=skeleton_from_json(about["skeleton"]),
         fps=about["fps"],
+        place_encoder=places,
+        image_encoder=about["image_encoder"],
         **about["sampler"],
     )
 
@@ -68,7 +111,9 @@ def load_exported(path: str | Path) -> HMD2:
 def main(arguments: list[str]) -> None:
     """Capture the motion of one recording with an exported model and write it as a recording."""
     parser = argparse.ArgumentParser(prog="python -m wearcap.export.runner", description=main.__doc__)
-    parser.add_argument("model", type=Path, help="exported .onnx or .pt2 file, its .json beside it")
+    parser.add_argument(
+        "model", type=Path, help="exported .onnx or .pt2 file, its .json and its parts beside it"
+    )
     parser.add_argument("recording", type=Path, help="recording (.safetensors) with a head stream")
     parser.add_argument("output", type=Path, help="where to write the motion (.safetensors)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the sampler's noise (default 0)")
