@@ -88,8 +88,8 @@ def encoded_per_second(encode: Rebuild, grids: Tensor, batch: int = 256) -> floa
 
 
 def slices(grids: dict[str, Tensor], clip_m: float, level: int = 5, pixels: int = 8) -> Tensor:
-    """A picture of each grid (columns) by each method (rows): from above, what is nearest in each column of cells,
-    above it the slice at half height across."""
+    """A picture of each grid (columns) by each method (rows): the nearest point of each column of cells seen from above
+    (ahead is up), and above that the upright slice through the middle; nearer points are brighter."""
     rows = []
     for given in grids.values():
         shades = [
@@ -124,7 +124,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     grid, share = VoxelGrid(), 8 if options.quick else 1
     train, val, test = (
         grids_of(options.data, split, count // share, grid)
-        for split, count in (("train", 40_000), ("val", 4_000), ("test", 8_000))
+        for split, count in (("train", 24_000), ("val", 1_000), ("test", 4_000))
     )
     rebuilds, encoders = methods(options, train)
     rows = {label: scored(rebuild, val, test, grid.clip_m) for label, rebuild in rebuilds.items()}

@@ -34,7 +34,7 @@ def data(tmp_path_factory) -> Path:
 def trained(experiment: str, data: Path, run: Path, *more: str) -> Path:
     train.main([
         f"experiment={experiment}", f"data.sources.simulated.root={data}", f"hydra.run.dir={run}",
-        f"paths.outputs={run.parent}", "data.window=20", "data.frames=4", "data.batch_size=8", "trainer.accelerator=cpu",
+        f"paths.outputs={run.parent}", "data.window=20", "data.frames=4", "data.batch_size=4", "trainer.accelerator=cpu",
         "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "callbacks.progress=null",
         "logger.csv.flush_logs_every_n_steps=1", *more,
     ])  # fmt: skip
@@ -60,6 +60,7 @@ def test_it_learns_and_its_checkpoint_encodes(experiment, data, tmp_path):
     assert not code.requires_grad
 
 
+@pytest.mark.slow
 def test_resuming_equals_training_straight_through(data, tmp_path):
     short = ("data.steps_per_epoch=3", "optimizer.scheduler.total=6", "optimizer.scheduler.warmup=2")
     straight = trained("voxel_autoencoder", data, tmp_path / "straight", "trainer.max_steps=6", *short)
