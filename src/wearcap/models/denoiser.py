@@ -66,6 +66,19 @@ class Conditions(NamedTuple):
     image_valid: Bool[Tensor, "batch time"]
 
 
+class Widening(nn.Conv1d):
+    """A convolution over frames that gives one vector per token, as one product: on the CPU several times faster."""
+
+    def __init__(self, size: int, width: int, frames_per_token: int, context: int = 0, bias: bool = True):
+        """Each token sees its own frames and `context` before and behind them."""
+        super().__init__(size, width, frames_per_token + 2 * context, frames_per_token, context, bias=bias)
+
+    def forward(self, frames: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch token width"]:
+        padded = F.pad(frames, (0, 0, self.padding[0], self.padding[0]))
+        seen = padded.unfold(1, self.kernel_size[0], self.stride[0])
+        return F.linear(seen.flatten(-2), self.weight.flatten(1), self.bias)
+
+
 class OptionalInput(nn.Module):
     """A modality that may be missing: standardised, or a learned null vector on the frames that lack it."""
 
@@ -73,15 +86,15 @@ class OptionalInput(nn.Module):
         super().__init__()
         self.normalizer = Normalizer(size)
         self.null = nn.Parameter(torch.zeros(size))
-        self.widen = nn.Conv1d(size + 1, width, frames_per_token, frames_per_token, bias=False)
+        self.widen = Widening(size + 1, width, frames_per_token, bias=False)
 
     def forward(
         self, x: Float[Tensor, "batch time feature"], valid: Bool[Tensor, "batch time"]
-    ) -> Float[Tensor, "batch width token"]:
+    ) -> Float[Tensor, "batch token width"]:
         there = valid[..., None]
         # The flag beside the vector lets the network tell null from a scene that looks like it.
         frames = torch.where(there, self.normalizer(x), self.null)
-        return self.widen(torch.cat([frames, there.to(x.dtype)], -1).transpose(1, 2))
+        return self.widen(torch.cat([frames, there.to(x.dtype)], -1))
 
 
 class ConditionEncoder(nn.Module):
@@ -97,9 +110,8 @@ class ConditionEncoder(nn.Module):
     ):  # fmt: skip
         super().__init__()
         # One more channel says which frames exist: padding would else look like the mean condition.
-        span = frames_per_token + 2 * context
         self.normalizer = Normalizer(head_size)
-        self.widen = nn.Conv1d(head_size + 1, 2 * width, span, frames_per_token, context)
+        self.widen = Widening(head_size + 1, 2 * width, frames_per_token, context)
         self.points = OptionalInput(points_size, 2 * width, frames_per_token) if points_size else None
         self.image = OptionalInput(image_size, 2 * width, frames_per_token) if image_size else None
         self.narrow = nn.Linear(2 * width, width)
@@ -109,12 +121,12 @@ class ConditionEncoder(nn.Module):
     ) -> Float[Tensor, "batch token width"]:
         mask = valid[..., None].to(conditions.head.dtype)
         frames = torch.cat([self.normalizer(conditions.head) * mask, mask], -1)
-        wide = self.widen(frames.transpose(1, 2))
+        wide = self.widen(frames)
         if self.points is not None:
             wide = wide + self.points(conditions.points, conditions.points_valid & valid)
         if self.image is not None:
             wide = wide + self.image(conditions.image, conditions.image_valid & valid)
-        return self.narrow(F.gelu(wide).transpose(1, 2))
+        return self.narrow(F.gelu(wide))
 
 
 class MotionEncoder(nn.Module):
