@@ -4,8 +4,11 @@
 
 Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables). Systems:
 
+    hmd2          HMD2 with points and pictures: its document's tables on held-out people and places
     hmd2_head     HMD2 on the head path alone: MPJPE and its parts, realism, beside trivial baselines
     hps           HPS on simulated sessions: its document's three tables, drift, outages of localisation
+    ireplica      iReplica on simulated interactions: its document's tables, robustness
+    voxels        codes of the points around the body: what they bring back
     simulation    how far simulated people differ from CMU's: gait statistics, and a discriminator
 
 Each system is a module tables_SYSTEM.py in this folder with `add_arguments(parser)` and

@@ -213,3 +213,12 @@ def test_guidance_of_one_is_none_and_more_is_farther_from_the_blind_answer():
         pipeline(steps=1, **how)(recording).R_parent_joint for how in ({"use": ()}, {}, {"guidance": 2.0})
     )
     assert (guided - blind).norm() > 1.3 * (plain - blind).norm()
+
+
+def test_scaled_rotations_and_clocks_of_another_unit_are_refused():
+    recording = seeing_recording(100)
+    head = recording.head
+    with pytest.raises(WearcapError, match="is no rotation"):
+        pipeline()(replace(recording, head=replace(head, R_world_device=1.1 * head.R_world_device)))
+    with pytest.raises(WearcapError, match=r"100 head poses over .* s.*in seconds"):
+        pipeline()(replace(recording, head=replace(head, timestamps=1e6 * head.timestamps)))

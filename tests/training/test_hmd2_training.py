@@ -61,11 +61,11 @@ def places(data, tmp_path_factory) -> Path:
     return run / "checkpoints" / "last.ckpt"
 
 
-def trained(experiment: str, data: Path, places: Path, run: Path, *more: str) -> Path:
+def trained(experiment: str, data: Path, places: Path | None, run: Path, *more: str) -> Path:
     train.main([
         f"experiment={experiment}", f"data.sources.simulated.root={data}", "data.sources.cmu=null", "debug=fast",
         f"hydra.run.dir={run}", f"paths.outputs={run.parent}", "data.window=60", "trainer.precision=32-true",
-        f"surroundings.places.checkpoint={places}", "model.net.width=32", "model.net.layers=1", "model.net.heads=4",
+        *([] if places is None else [f"surroundings.places.checkpoint={places}"]), "model.net.width=32", "model.net.layers=1", "model.net.heads=4",
         "model.net.feedforward=32", *QUIET, *more,
     ])  # fmt: skip
     return run / "checkpoints" / "last.ckpt"
@@ -120,8 +120,6 @@ def test_windows_and_model_must_see_the_same(data, places, tmp_path):
 @pytest.mark.parametrize("surroundings", ["points", "images", "head"])
 def test_rows_of_the_ablation_train_by_themselves(surroundings, data, places, tmp_path):
     more = ["callbacks.capture=null", f"surroundings={surroundings}"]
-    if surroundings in ("images", "head"):
-        places = "none"
-    run = trained("hmd2", data, places, tmp_path / "run", *more)
+    run = trained("hmd2", data, places if surroundings == "points" else None, tmp_path / "run", *more)
     net = load_system(run)[0].net
     assert (net.points_size > 0, net.image_size > 0) == (surroundings == "points", surroundings == "images")

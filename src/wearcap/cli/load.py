@@ -20,11 +20,13 @@ from wearcap.recording.locate import dataset_folder
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
 from wearcap.training.contact_detection import ContactDetection
+from wearcap.training.egoview import EgoView
 from wearcap.training.motion_autoencoder import MotionEncoding
 from wearcap.training.motion_diffusion import MotionDiffusion
 from wearcap.training.pose_regression import PoseRegression
+from wearcap.training.voxel_reconstruction import VoxelReconstruction
 
-System = MotionDiffusion | ContactDetection | PoseRegression | MotionEncoding
+System = MotionDiffusion | ContactDetection | PoseRegression | MotionEncoding | VoxelReconstruction | EgoView
 
 
 def load_system(checkpoint: str | Path) -> tuple[System, dict[str, Any]]:

@@ -30,6 +30,8 @@ from wearcap.scene.voxels import voxelize
 MODALITIES = ("points", "images")
 MAX_GAP_S = 0.5
 """Head poses further apart than this say nothing of what was between: the capture begins anew behind the gap."""
+MAX_FILL = 600
+"""Frames of the model's rate per head pose that a recording may have at most: what has more has another unit of time."""
 MAX_SPEED_M_S = 12.0
 """No head moves faster (sprinters do not): a step that asks for more is a jump of the tracking."""
 
@@ -264,7 +266,8 @@ class HMD2:
 def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
     """Step 1: the head joint's path at `fps`, and the floor beneath it as the path tells it. Poses that are not finite count as missing.
 
-    Raises WearcapError when the recording has no head stream, or hardly one, and for timestamps that do not grow.
+    Raises WearcapError when the recording has no head stream, or hardly one, for timestamps that do not grow, and for poses
+    that are no rotations or hardly any for their time.
     """
     if recording.head is None:
         raise WearcapError("no head poses in this recording", where=recording.name,
@@ -278,6 +281,7 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
     if not (times.diff() > 0).all():
         raise WearcapError("head poses whose timestamps do not grow", where=recording.name,
                            fix="Sort the head stream by time and leave repeated poses out.")  # fmt: skip
+    _require_plausible(head.R_world_device[known], times, fps, recording.name)
     skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
     trajectory = Trajectory(times, head.R_world_device[known], head.t_world_device[known])
     broken = breaks(trajectory)
@@ -297,6 +301,20 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
         timestamps, T_world_head, trajectory.T_world_body, floor, skeleton,
         tuple((start, stop) for start, stop in stretches if stop > start),
     )  # fmt: skip
+
+
+def _require_plausible(
+    R_world_device: Float[Tensor, "time 3 3"], times: Float64[Tensor, "time"], fps: float, name: str
+) -> None:
+    """Raise WearcapError for matrices that are no rotations, and for clocks that are none of seconds."""
+    skewed = (R_world_device.transpose(-1, -2) @ R_world_device - torch.eye(3)).abs().amax((-1, -2)) > 0.05
+    if skewed.any():
+        raise WearcapError(f"the head pose at {times[skewed][0].item():.3f} s is no rotation", where=name,
+                           expected="orthonormal matrices", fix="Run `wearcap doctor` on the recording.")  # fmt: skip
+    span = (times[-1] - times[0]).item()
+    if span * fps > MAX_FILL * len(times):
+        raise WearcapError(f"{len(times)} head poses over {span:.0f} s", where=name,
+                           expected=f"one in {MAX_FILL / fps:.0f} s at least", fix="Give timestamps in seconds, or cut the recording at its pauses.")  # fmt: skip
 
 
 def breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
