@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 
 from wearcap.body.skeleton import xsens23
 from wearcap.data.features import HeadFeatures
@@ -12,6 +11,7 @@ from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.models.denoiser import MotionDenoiser
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.pipelines.evaluation import evaluate
 from wearcap.pipelines.hmd2 import HMD2, hang_from_head
 from wearcap.recording import CameraStream, PointCloud, Recording

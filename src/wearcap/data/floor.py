@@ -1,6 +1,7 @@
 """The floor beneath the wearer, as sensed: from points of the surroundings, or from the head's path alone."""
 
 from collections import defaultdict, deque
+from contextlib import suppress
 
 import numpy as np
 import torch
@@ -110,10 +111,8 @@ class FloorTracker:
         points = self._around()
         if len(points) >= MIN_POINTS:
             path, cloud = torch.from_numpy(np.array(self._path)), torch.from_numpy(points)
-            try:
+            with suppress(WearcapError):  # none of them lies beneath the path: the last answer stands
                 self._height = float(estimate_floor(cloud, path, self.stature).height[-1])
-            except WearcapError:  # none of them lies beneath the path: the last answer stands
-                pass
         else:
             self._height = float(np.percentile(self._heights, 90)) - self.stature
 
