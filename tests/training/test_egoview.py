@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from wearcap.cli import train
+from wearcap.data.ego_augment import half_mirrored, relit, turned
 from wearcap.data.ego_frames import HANDS, POINTS, EgoFrame, EgoFrames, limb_points
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
@@ -20,7 +21,7 @@ from wearcap.models.image_encoder import EgoViewEncoder
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.recording import CameraStream
 from wearcap.sensors.slam import R_DEVICE_CAM
-from wearcap.training.egoview import half_mirrored, relit, view_scores
+from wearcap.training.egoview import view_scores
 from wearcap_testing import recording_of, swaying_motion
 
 CAMERA = Camera.pinhole(96, 72, 85)
@@ -78,7 +79,7 @@ def data(tmp_path_factory) -> Path:
 
 def arguments(data: Path, run: Path, *more: str) -> list[str]:
     return [
-        "experiment=egoview", f"data.sources.simulated.root={data}", f"hydra.run.dir={run}", f"paths.outputs={run.parent}",
+        "experiment=egoview", f"data.sources.simulated.root={data}", "data.sources.cmu=null", f"hydra.run.dir={run}", f"paths.outputs={run.parent}",
         "data.every=2", "trainer.accelerator=cpu", "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false",
         "callbacks.progress=null", "logger.csv.flush_logs_every_n_steps=1", *more,
     ]  # fmt: skip
@@ -137,16 +138,37 @@ def test_mirror_images_swap_the_sides(data):
     batch = EgoFrame(*(torch.stack(field) for field in zip(*(frames[k] for k in range(30)))))
     pictures = batch.picture.movedim(-1, 1).float()
     torch.manual_seed(0)
-    turned, mirrored = half_mirrored(pictures, batch)
-    flipped = (mirrored.point_cam != batch.point_cam).flatten(1).any(1)
+    flipped_pictures, points, visible = half_mirrored(pictures, batch.point_cam, batch.visible)
+    flipped = (points != batch.point_cam).flatten(1).any(1)
     assert 4 < flipped.sum() < 26
-    assert torch.equal(turned[flipped], pictures[flipped].flip(-1))
+    assert torch.equal(flipped_pictures[flipped], pictures[flipped].flip(-1))
     left, right = (POINTS.index(name) for name in HANDS)
-    before, after = CAMERA.project(batch.point_cam)[0], CAMERA.project(mirrored.point_cam)[0]
+    before, after = CAMERA.project(batch.point_cam)[0], CAMERA.project(points)[0]
     torch.testing.assert_close(after[flipped, left, 0], 95 - before[flipped, right, 0], atol=1e-3, rtol=0)
     torch.testing.assert_close(after[flipped, left, 1], before[flipped, right, 1])
-    assert torch.equal(mirrored.visible[flipped, right], batch.visible[flipped, left])
-    assert torch.equal(turned[~flipped], pictures[~flipped])
+    assert torch.equal(visible[flipped, right], batch.visible[flipped, left])
+    assert torch.equal(flipped_pictures[~flipped], pictures[~flipped])
+
+
+def test_a_turned_camera_sees_points_where_its_picture_shows_them():
+    lens = Camera("pinhole", 96, 72, 40.0, 38.0, 46.0, 36.5)
+    pixels = torch.tensor([30.0, 40.0]) + torch.rand(64, 2, generator=torch.Generator().manual_seed(1)) * 30
+    point = 0.7 * lens.unproject(pixels)[:, None]
+    y, x = torch.meshgrid(torch.arange(72.0), torch.arange(96.0), indexing="ij")
+    blob = torch.exp(-((torch.stack([x, y], -1) - pixels[:, None, None]) ** 2).sum(-1) / 8)
+    torch.manual_seed(0)
+    intrinsics = torch.tensor([lens.fx, lens.fy, lens.cx, lens.cy]).expand(64, 4)
+    seen = torch.ones(64, 1, dtype=torch.bool)
+    shown, moved, visible = turned(blob[:, None].repeat(1, 3, 1, 1), intrinsics, point, seen, 8.0)
+    place, inside = lens.project(moved[:, 0])
+    assert torch.equal(visible[:, 0], inside)
+    torch.testing.assert_close(moved.norm(dim=-1), point.norm(dim=-1))
+    assert (place - pixels).norm(dim=-1).mean() > 4
+    well = ((place > 8) & (place < torch.tensor([87.0, 63.0]))).all(-1)
+    weight = shown[well, 0] / shown[well, 0].sum((1, 2), keepdim=True)
+    found = torch.stack([(weight * x).sum((1, 2)), (weight * y).sum((1, 2))], -1)
+    assert well.sum() > 30
+    torch.testing.assert_close(found, place[well], atol=0.6, rtol=0)
 
 
 def test_other_light_keeps_the_picture_recognisable(data):

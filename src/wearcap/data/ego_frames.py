@@ -35,6 +35,8 @@ class EgoFrame(NamedTuple):
     """`POINTS` in the camera's axes (m)."""
     visible: Bool[Tensor, "*batch point"]
     """Within the picture; what stands before them is not looked at."""
+    intrinsics: Float[Tensor, "*batch 4"]
+    """fx, fy, cx, cy of the picture."""
 
 
 def limb_points(
@@ -66,7 +68,7 @@ class EgoFrames(Dataset):
 
     def __init__(self, sources: list[Source], split: str, every: int, hand_share: float = 0.0):
         self._pictures, self.weights = list[UInt8[np.ndarray, "time height width 3"]](), torch.empty(0)
-        points, visible, weights = [], [], []
+        points, visible, weights, intrinsics = [], [], [], []
         for source in sources:
             store = RecordingStore.open(source.root)
             for name in store.names(split):
@@ -83,11 +85,14 @@ class EgoFrames(Dataset):
                 points.append(of_all[0][::every])
                 visible.append(of_all[1][::every])
                 weights.append(torch.full((len(frames),), source.weight, dtype=torch.float64))
+                lens = camera.camera
+                intrinsics.append(torch.tensor([lens.fx, lens.fy, lens.cx, lens.cy]).expand(len(frames), 4))
                 self._pictures.append(frames)
         if not points:
             raise WearcapError(f"no head camera's pictures in split {split!r}", where=", ".join(s.root for s in sources),
                                fix="Prepare a data set with them: wearcap prepare simulated camera=true")  # fmt: skip
         self.point_cam, self.visible, self.weights = torch.cat(points), torch.cat(visible), torch.cat(weights)
+        self.intrinsics = torch.cat(intrinsics)
         shown = self.visible[:, [POINTS.index(name) for name in HANDS]].any(-1)
         if hand_share and shown.any() and not shown.all():
             own = self.weights[shown].sum() / self.weights.sum()
@@ -101,7 +106,12 @@ class EgoFrames(Dataset):
         index = item[0] if isinstance(item, tuple) else item
         recording = int(np.searchsorted(self._first, index, side="right")) - 1
         picture = self._pictures[recording][index - self._first[recording]]
-        return EgoFrame(torch.from_numpy(picture.copy()), self.point_cam[index], self.visible[index])
+        return EgoFrame(
+            torch.from_numpy(picture.copy()),
+            self.point_cam[index],
+            self.visible[index],
+            self.intrinsics[index],
+        )
 
 
 @cache

@@ -8,21 +8,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from wearcap.data.ego_augment import half_mirrored, relit, turned
 from wearcap.data.ego_frames import HANDS, POINTS, EgoFrame, EgoFrames
 from wearcap.metrics.detection import average_precision
 from wearcap.models.denoiser import Normalizer
 from wearcap.models.image_encoder import EgoViewEncoder, letterboxed
 
 LEAST_SPREAD_M = 0.02
-_SWAPPED = [index ^ 1 for index in range(len(POINTS))]
-"""Left for right: they alternate in `POINTS`."""
 
 
 class EgoView(lightning.LightningModule):
     """Linear heads on the embedding tell which of `POINTS` are in the picture, and where they are.
 
-    The loss is their binary cross-entropy plus the Huber loss of places in standard deviations; a point outside of the
-    picture counts `hidden_weight` there. Linear, so that it is the embedding that carries what is known.
+    The loss is their binary cross-entropy plus the Huber loss of the places, in standard deviations, of those that are.
+    Linear, so that it is the embedding that carries what is known. `turn_deg`: see `ego_augment.turned`.
     """
 
     def __init__(
@@ -30,14 +29,15 @@ class EgoView(lightning.LightningModule):
         net: EgoViewEncoder,
         optimizer: Callable[..., torch.optim.Optimizer],
         scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
-        hidden_weight: float = 0.1,
+        dropout: float = 0.0,
         augment: bool = True,
+        turn_deg: float = 5.0,
         seed: int = 0,
     ):
         super().__init__()
         self.net, self.heads = net, nn.Linear(net.size, 4 * len(POINTS))
         self.normalizer = Normalizer(3 * len(POINTS))
-        self.hidden_weight, self.augment, self.seed = hidden_weight, augment, seed
+        self.dropout, self.augment, self.turn_deg, self.seed = nn.Dropout(dropout), augment, turn_deg, seed
         self._optimizer, self._scheduler = optimizer, scheduler
         self._validated: list[tuple[Tensor, Tensor, EgoFrame]] = []
 
@@ -53,35 +53,55 @@ class EgoView(lightning.LightningModule):
         self, pictures: Float[Tensor, "batch 3 height width"]
     ) -> tuple[Float[Tensor, "batch point"], Float[Tensor, "batch point 3"]]:
         """Logits of being in the picture, and places (m)."""
-        logits, places = self.heads(self.net(pictures)).split([len(POINTS), 3 * len(POINTS)], -1)
+        logits, places = self.heads(self.dropout(self.net(pictures))).split(
+            [len(POINTS), 3 * len(POINTS)], -1
+        )
         return logits, self.normalizer.inverse(places).unflatten(-1, (len(POINTS), 3))
 
     def _pictures(self, batch: EgoFrame) -> Float[Tensor, "batch 3 height width"]:
         return letterboxed(batch.picture, self.net.width, self.net.height, self.net.mean, self.net.std)
 
-    def loss(self, pictures: Float[Tensor, "batch 3 height width"], batch: EgoFrame) -> Tensor:
+    def _intrinsics(self, batch: EgoFrame) -> Float[Tensor, "batch 4"]:
+        """Of the letterboxed pictures."""
+        height, width = batch.picture.shape[1:3]
+        scale = min(self.net.width / width, self.net.height / height)
+        margin = (torch.tensor([self.net.width, self.net.height]) - scale * torch.tensor([width, height])) / 2
+        centre = scale * (batch.intrinsics[:, 2:] + 0.5) - 0.5 + margin.to(batch.intrinsics)
+        return torch.cat([scale * batch.intrinsics[:, :2], centre], -1)
+
+    def loss(
+        self,
+        pictures: Float[Tensor, "batch 3 height width"],
+        point_cam: Float[Tensor, "batch point 3"],
+        visible: Bool[Tensor, "batch point"],
+    ) -> Tensor:
         logits, places = self(pictures)
         spread = self.normalizer.scale.unflatten(-1, (len(POINTS), 3))
-        miss = F.smooth_l1_loss(places / spread, batch.point_cam / spread, reduction="none").mean(-1)
-        weight = torch.where(batch.visible, 1.0, self.hidden_weight)
-        seen = F.binary_cross_entropy_with_logits(logits, batch.visible.to(logits.dtype))
-        return seen + (weight * miss).sum() / weight.sum()
+        miss = F.smooth_l1_loss(places / spread, point_cam / spread, reduction="none").mean(-1)
+        seen = F.binary_cross_entropy_with_logits(logits, visible.to(logits.dtype))
+        return seen + (miss * visible).sum() / visible.sum().clamp_min(1)
 
     def on_train_batch_start(self, batch: EgoFrame, batch_idx: int) -> None:
         """Augmentation is a function of seed and step, so that a resumed run repeats it."""
         torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def training_step(self, batch: EgoFrame, batch_idx: int) -> Tensor:
-        pictures = self._pictures(batch)
+        varied = self._pictures(batch), batch.point_cam, batch.visible
         if self.augment:
-            pictures, batch = half_mirrored(relit(pictures), batch)
-        loss = self.loss(pictures, batch)
+            pictures, *points = turned(varied[0], self._intrinsics(batch), *varied[1:], self.turn_deg)
+            varied = half_mirrored(relit(pictures), *points)
+        loss = self.loss(*varied)
         self.log("train/loss", loss, batch_size=len(batch.picture), prog_bar=True)
         return loss
 
     def validation_step(self, batch: EgoFrame, batch_idx: int) -> None:
         pictures = self._pictures(batch)
-        self.log("val/loss", self.loss(pictures, batch), batch_size=len(pictures), sync_dist=True)
+        self.log(
+            "val/loss",
+            self.loss(pictures, batch.point_cam, batch.visible),
+            batch_size=len(pictures),
+            sync_dist=True,
+        )
         self._validated.append((*self(pictures), batch))
 
     def on_validation_epoch_end(self) -> None:
@@ -133,26 +153,3 @@ def view_scores(
 def _mean(values: list[float]) -> float:
     """Of those that are defined."""
     return float(torch.tensor(values).nanmean())
-
-
-def relit(pictures: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 3 height width"]:
-    """Other light, other colours, other noise, picture by picture; values in normalised grey levels."""
-    like = pictures[:, :1, :1, :1]
-    gain = (0.25 * torch.randn_like(like)).exp() * (0.08 * torch.randn_like(pictures[:, :, :1, :1])).exp()
-    shift = 0.3 * torch.randn_like(like) + 0.1 * torch.randn_like(pictures[:, :, :1, :1])
-    grey = pictures.mean(1, keepdim=True)
-    coloured = grey + (0.4 * torch.randn_like(like)).exp() * (pictures - grey)
-    noise = 0.15 * torch.rand_like(like) * torch.randn_like(pictures)
-    return (gain * coloured + shift + noise).clamp(-2.0, 2.4)
-
-
-def half_mirrored(
-    pictures: Float[Tensor, "batch 3 height width"], batch: EgoFrame
-) -> tuple[Float[Tensor, "batch 3 height width"], EgoFrame]:
-    """Half of the pictures flipped left to right, with left hands for right ones."""
-    flip = torch.rand(len(pictures), device=pictures.device) < 0.5
-    across = batch.point_cam.new_tensor([-1.0, 1.0, 1.0])
-    point_cam = torch.where(flip[:, None, None], batch.point_cam[:, _SWAPPED] * across, batch.point_cam)
-    visible = torch.where(flip[:, None], batch.visible[:, _SWAPPED], batch.visible)
-    pictures = torch.where(flip[:, None, None, None], pictures.flip(-1), pictures)
-    return pictures, EgoFrame(batch.picture, point_cam, visible)
