@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
 from planted import swinging
 
 from wearcap.body.skeleton import xsens23
@@ -35,7 +36,7 @@ def pipeline_of(size: str, device: str = "cpu", **settings) -> HMD2:
         pipeline = load_pipeline(EXPERIMENTS[size], config, device)
         assert isinstance(pipeline, HMD2)
     else:
-        given = {name: value for name, value in config.items() if not str(name).startswith("_")}
+        given = {name: value for name, value in OmegaConf.to_container(config).items() if name[0] != "_"}
         pipeline = HMD2(random_net(size), _FEATURES, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any",
                         **given, device=device)  # fmt: skip
         count = sum(parameter.numel() for parameter in pipeline.net.parameters()) / 1e6
@@ -98,8 +99,13 @@ class Streamed:
         self.seconds.append(time.perf_counter() - begin)
 
     def fill(self) -> "Streamed":
-        """Until windows are full, and what is compiled is."""
-        while self.number < self.session.pipeline.net.window + 3 * self.stride:
+        """Until windows are full (a step each is enough for that), and what is compiled is."""
+        pipeline = self.session.pipeline
+        steps, pipeline.steps = pipeline.steps, 1
+        while self.number < pipeline.net.window:
+            self.step()
+        pipeline.steps = steps
+        for _ in range(3):
             self.step()
         self.seconds.clear()
         return self

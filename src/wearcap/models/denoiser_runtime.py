@@ -132,6 +132,8 @@ def _onnx_step(net: MotionDenoiser, precision: str) -> Step:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 3
+    # Threads that spin while they wait take the cores from everything else that runs beside the steps.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     with tempfile.TemporaryDirectory() as folder, quiet():
         path = Path(folder) / "step.onnx"
         _write_onnx(net, path)
