@@ -21,10 +21,11 @@ _SIDE = (
     ("shoulder", "elbow", 0.055, 0.027, "arm"), ("elbow", "wrist", 0.045, 0.016, "arm"),
     ("wrist", "fingertip", 0.035, 0.006, "hand"),
 )  # fmt: skip
-LIMBS = (
+LIMBS: tuple[tuple[str, str, float, float, str], ...] = (
     *_MIDDLE,
-    *((f"{side}_{a}", f"{side}_{b}", *rest) for side in ("left", "right") for a, b, *rest in _SIDE),
-)
+    *((f"{side}_{a}", f"{side}_{b}", radius, mass, part)
+      for side in ("left", "right") for a, b, radius, mass, part in _SIDE),
+)  # fmt: skip
 """Capsules of an adult: joint or site at either end, radius (m), share of the body's mass (after de Leva), part."""
 
 PARTS = ("seat", "trunk", "shin", "foot", "arm", "hand")
