@@ -10,7 +10,6 @@ from wearcap.cli.conf import compose
 from wearcap.cli.prepare import run
 from wearcap.data.prepare import cmu_surrounded
 from wearcap.data.prepare.mocap import nominal_head
-from wearcap.errors import WearcapError
 from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.serialize import flatten
@@ -83,11 +82,6 @@ def test_without_a_turn_less_is_known(plain, tmp_path):
     key = "points.points_world"
     known = [RecordingStore.open(root).open_file("7_01").length(key) for root in (tmp_path, prepared.root)]
     assert known[0] < 0.8 * known[1]
-
-
-def test_a_density_of_nothing_is_refused(plain, tmp_path):
-    with pytest.raises(WearcapError, match="positive"):
-        surrounded(plain[0].root, tmp_path, "density=0")
 
 
 def test_the_camera_films_into_the_data_set(plain, tmp_path, monkeypatch):

@@ -106,7 +106,7 @@ def ego_frames(
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """The picture at each timestamp of the stream, which must be timestamps of the motion."""
     scenery, body = Scenery.of(world), ego_body(motion.skeleton, shape, rng)
-    rows = torch.searchsorted(motion.timestamps, stream.timestamps)
+    rows = torch.searchsorted(motion.timestamps, stream.timestamps.contiguous())
     T_head_cam = Rigid(stream.R_head_cam, stream.t_head_cam)
     shot = Shot.drawn(len(rows), rng)
     for first in range(0, len(rows), _CHUNK):

@@ -14,16 +14,13 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording.recording import HeadStream, PointCloud, Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
-from wearcap.sensors.slam import SlamPoints, semidense_points
+from wearcap.sensors.slam import semidense_points
 from wearcap.simulation.ego_view import write_ego_video
 from wearcap.simulation.surround import surround
 from wearcap.simulation.world import World
 
 TURNS, DOWN_DEG, VIEW_S = 12, (0.0, 38.0), 0.25
 """Before the recording begins a wearer turns round in so many steps, looking ahead and then down, so long each."""
-MAX_CANDIDATES = 200_000
-DENSEST = 1500.0
-"""Points per m² at most."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,6 @@ class Surrounded:
     root: Path
     camera: bool
     look_round: bool
-    density: float
     seed: int
 
     def __call__(self) -> Recording:
@@ -48,7 +44,7 @@ class Surrounded:
         seed = [self.seed, zlib.crc32(self.name.encode())]
         of_world, of_points, of_camera = (np.random.default_rng([number, *seed]) for number in (31, 32, 33))
         world = surround(motion, of_world, f"cmu-room-{self.name}")
-        points = seen_points(world, head, self.look_round, self.density, of_points)
+        points = seen_points(world, head, self.look_round, of_points)
         recording = replace(recording, points=points, location=world.name)
         if not self.camera:
             return recording
@@ -57,16 +53,14 @@ class Surrounded:
         return replace(recording, camera=camera)
 
 
-def seen_points(
-    world: World, head: HeadStream, look_round: bool, density: float, rng: np.random.Generator
-) -> PointCloud:
-    """Semi-dense points along the head's path, `density` times as many as the world's textures say.
+def seen_points(world: World, head: HeadStream, look_round: bool, rng: np.random.Generator) -> PointCloud:
+    """Semi-dense points along the head's path.
 
     With `look_round`, what the wearer saw from where the path starts is known from its first moment.
     """
-    texture = np.minimum(density * world.face_texture, DENSEST)
-    path, settings = (_turned_round(head) if look_round else head), SlamPoints(max_candidates=MAX_CANDIDATES)
-    points = semidense_points(world.mesh, texture, path, rng, settings)
+    points = semidense_points(
+        world.mesh, world.face_texture, _turned_round(head) if look_round else head, rng
+    )
     assert points.first_seen is not None
     return replace(points, first_seen=points.first_seen.clamp(min=head.timestamps[0].item()))
 
@@ -91,23 +85,17 @@ def cmu_surrounded_tasks(
     splits: Splits,
     camera: bool,
     look_round: bool,
-    density: float | int,
     seed: int,
 ) -> list[Task]:
     """One task per recording of the data set `source`, which `wearcap prepare cmu` made (floors at z = 0).
 
     Videos of the head camera go to `output`/videos. The hash covers the recording and the simulator's own source.
-    Raises WearcapError for a density that is not positive.
     """
-    if not density > 0:
-        raise WearcapError(f"points of density {density}", expected="a positive number")
     store, simulator = RecordingStore.open(source), source_files()
     tasks = []
     for name in store.names():
         entry = store.entries[name]
-        make = Surrounded(
-            store.root / entry.file, name, Path(output), camera, look_round, float(density), seed
-        )
-        made = content_hash(entry.sha256, camera, look_round, float(density), seed, simulator)
+        make = Surrounded(store.root / entry.file, name, Path(output), camera, look_round, seed)
+        made = content_hash(entry.sha256, camera, look_round, seed, simulator)
         tasks.append(Task(name, make, splits.of(entry.subject), made))
     return tasks
