@@ -228,7 +228,9 @@ def test_help_tells_what_there_is(capsys):
     assert "source: ???" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("source", sorted(verb.sources()))
+@pytest.mark.parametrize(
+    "source", sorted(set(verb.sources()) - {"embeddings"})
+)  # that works on a data set that stands
 def test_every_source_composes_and_has_a_split_list(source):
     config = compose("prepare", [f"prepare={source}"])
     assert config.output == f"datasets/{source}"
