@@ -58,7 +58,9 @@ class Shot:
         turn, rise = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(35, 75))
         to_light = [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)]
         key = KEY * rng.uniform(0.6, 2.0)
-        light = np.array([*to_light, key, AMBIENT_BELOW - 0.5 * (key - KEY), AMBIENT_ABOVE - 0.5 * (key - KEY)])
+        light = np.array(
+            [*to_light, key, AMBIENT_BELOW - 0.5 * (key - KEY), AMBIENT_ABOVE - 0.5 * (key - KEY)]
+        )
         x, y = np.linspace(-1, 1, EGO_CAMERA.width), np.linspace(-1, 1, EGO_CAMERA.height)[:, None]
         corner = 1 - rng.uniform(0.05, 0.2) * (x**2 + y**2)
         gain = corner[..., None] * np.exp(0.05 * rng.standard_normal(3))
@@ -87,7 +89,9 @@ def write_ego_video(
     if len(times) < 2:
         raise WearcapError(f"a video of {len(times)} frames", where=motion.provenance.get("source"),
                            expected="two or more")  # fmt: skip
-    stream = CameraStream(times, EGO_CAMERA, *_mount(t_head_device, rng), video=f"{file.parent.name}/{file.name}")
+    stream = CameraStream(
+        times, EGO_CAMERA, *_mount(t_head_device, rng), video=f"{file.parent.name}/{file.name}"
+    )
     with atomic_path(file) as temporary, av.open(str(temporary), "w", format="mp4") as container:
         codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
         options = {"crf": str(_CRF), "preset": "veryfast", "threads": "1"}
