@@ -77,7 +77,7 @@ class Chromium:
             try:
                 if answer := ask():
                     return answer
-            except (OSError, IndexError):
+            except (OSError, IndexError):  # not there yet, or a page on its way
                 pass
             time.sleep(0.2)
         pytest.fail("the browser did not get there in time")
@@ -89,6 +89,8 @@ class Chromium:
         while (reply := json.loads(self.socket.recv(timeout=60))).get("id") != self.count:
             if reply.get("method") == "Runtime.exceptionThrown":
                 self.exceptions.append(reply["params"]["exceptionDetails"])
+        if "navigated or closed" in str(reply.get("error")):
+            raise ConnectionError(f"{method}: the page is on its way to another")
         assert "error" not in reply, f"{method}: {reply['error']}"
         return reply["result"]
 

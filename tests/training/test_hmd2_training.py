@@ -55,7 +55,7 @@ def places(data, tmp_path_factory) -> Path:
     """A voxel autoencoder of two steps."""
     run = tmp_path_factory.mktemp("places") / "run"
     train.main([
-        "experiment=voxel_autoencoder", f"data.sources.simulated.root={data}", f"hydra.run.dir={run}", "trainer.max_steps=2",
+        "experiment=voxel_autoencoder", f"data.sources.simulated.root={data}", "data.sources.cmu=null", f"hydra.run.dir={run}", "trainer.max_steps=2",
         f"paths.outputs={run.parent}", "data.window=20", "data.frames=4", "data.batch_size=4", "data.steps_per_epoch=2", *QUIET,
     ])  # fmt: skip
     return run / "checkpoints" / "last.ckpt"

@@ -33,7 +33,7 @@ def data(tmp_path_factory) -> Path:
 
 def trained(experiment: str, data: Path, run: Path, *more: str) -> Path:
     train.main([
-        f"experiment={experiment}", f"data.sources.simulated.root={data}", f"hydra.run.dir={run}",
+        f"experiment={experiment}", f"data.sources.simulated.root={data}", "data.sources.cmu=null", f"hydra.run.dir={run}",
         f"paths.outputs={run.parent}", "data.window=20", "data.frames=4", "data.batch_size=4", "trainer.accelerator=cpu",
         "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "callbacks.progress=null",
         "logger.csv.flush_logs_every_n_steps=1", *more,
