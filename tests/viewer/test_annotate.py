@@ -324,6 +324,10 @@ def shown_time(browser: Chromium) -> float:
 
 
 def click_hand(browser: Chromium, hand: str) -> None:
+    """Where the hand is once the frame that was asked for is drawn."""
+    browser.poll(
+        lambda: browser.evaluate("annotator.view.frame === annotator.player.frame && !annotator.view.stale")
+    )
     browser.click(*browser.evaluate(f"annotator.handPosition('{hand}')"))
 
 
