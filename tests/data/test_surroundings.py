@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import save_file
 
 from wearcap.data.floor import floor_from_path, floor_from_points, tracked_floor
-from wearcap.data.surroundings import Surroundings, latest_before
+from wearcap.data.surroundings import Surroundings, embeddings_of, latest_before
 from wearcap.data.windows import Source, WindowDataset
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
@@ -151,3 +151,15 @@ def test_a_tracked_floor_knows_nothing_of_what_comes():
     assert torch.equal(whole[until], first)
     blind = tracked_floor(None, time, head + torch.tensor([0.0, 0.0, 0.1]), 1.6, 60.0)
     assert (blind - 0.4).abs().max() < 1e-3
+
+
+def test_embeddings_are_found_by_their_encoders_name(store):
+    assert embeddings_of("toy", [store]) == ("toy", SIZE)
+    camera = store.load("a").camera
+    renamed = replace(camera, embedding_name="toy-1a2b3c4d")
+    store.add(replace(store.load("a"), name="c", camera=renamed), split="train", config_hash="test")
+    assert embeddings_of("toy-1a2b3c4d", [store]) == ("toy-1a2b3c4d", SIZE)
+    with pytest.raises(WearcapError, match="several kinds: toy with 5 features, toy-1a2b3c4d with 5"):
+        embeddings_of("toy", [store])
+    with pytest.raises(WearcapError, match="no recording has embeddings of 'clip'.*encoder=clip"):
+        embeddings_of("clip", [store])

@@ -31,7 +31,7 @@ def seeing(seed: int) -> Recording:
     shown = torch.randn(75, SIZE, generator=random).half()
     camera = CameraStream(
         recording.head.timestamps[::2], Camera("pinhole", 8, 6, 4.0, 4.0, 3.5, 2.5), torch.eye(3), torch.zeros(3),
-        embedding=shown, embedding_mirrored=-shown, embedding_name="egoview",
+        embedding=shown, embedding_mirrored=-shown, embedding_name="egoview-01234567",
     )  # fmt: skip
     return dataclasses.replace(recording, points=PointCloud(points), camera=camera)
 
@@ -121,5 +121,9 @@ def test_windows_and_model_must_see_the_same(data, places, tmp_path):
 def test_rows_of_the_ablation_train_by_themselves(surroundings, data, places, tmp_path):
     more = ["callbacks.capture=null", f"surroundings={surroundings}"]
     run = trained("hmd2", data, places if surroundings == "points" else None, tmp_path / "run", *more)
-    net = load_system(run)[0].net
-    assert (net.points_size > 0, net.image_size > 0) == (surroundings == "points", surroundings == "images")
+    system = load_system(run)[0]
+    sizes = (system.net.points_size > 0, system.net.image_size > 0)
+    assert sizes == (surroundings == "points", surroundings == "images")
+    assert system.image_encoder == ("egoview-01234567" if surroundings == "images" else None), (
+        "as the data names it"
+    )

@@ -10,6 +10,8 @@ from omegaconf import DictConfig, OmegaConf
 from rich import print as show
 
 from wearcap.cli.conf import hydra_main
+from wearcap.data.surroundings import embeddings_of
+from wearcap.recording.store import RecordingStore
 from wearcap.training.checkpoint import ConfigInCheckpoint
 from wearcap.training.run import fit, keep_freed_memory, record_run, resume_path
 
@@ -20,6 +22,7 @@ def train(config: DictConfig) -> float:
     """Train what the config describes; returns the last validation loss (what a sweep minimises)."""
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     keep_freed_memory()
+    _name_embeddings(config)
     # A run's folder is its own; what Lightning deprecates within itself is not the user's to mend.
     warnings.filterwarnings("ignore", "Experiment logs directory")
     warnings.filterwarnings("ignore", ".*LeafSpec")
@@ -42,6 +45,14 @@ def train(config: DictConfig) -> float:
     if trainer.is_global_zero:
         show(f"checkpoint: {run / 'checkpoints' / 'last.ckpt'}")
     return float(trainer.callback_metrics.get("val/loss", float("nan")))
+
+
+def _name_embeddings(config: DictConfig) -> None:
+    """Which weights made the embeddings, and their dimension, are as the data has them (`surroundings.images=clip`)."""
+    surroundings = config.get("surroundings")
+    if surroundings and surroundings.images and "surroundings" in config.data:
+        stores = [RecordingStore.open(source.root) for source in config.data.sources.values() if source]
+        surroundings.images, surroundings.image_size = embeddings_of(surroundings.images, stores)
 
 
 def main(arguments: list[str]) -> None:

@@ -40,21 +40,7 @@ class Surroundings:
 
         Raises WearcapError when no recording has any of this encoder, or when their dimensions differ.
         """
-        if self.images is None:
-            return 0
-        sizes = {
-            file.tensor("camera.embedding").shape[1]
-            for store in stores
-            for name in store.names()
-            if (file := _open(store.path_of(name))) and _pictured(file.path) == self.images
-        }
-        if len(sizes) != 1:
-            raise WearcapError(
-                f"embeddings of {sorted(sizes)} dimensions" if sizes else f"no recording has embeddings of {self.images!r}",
-                where=", ".join(str(store.root) for store in stores), expected=f"embeddings of {self.images!r}",
-                fix=f"Run: wearcap prepare embeddings dataset=DIR encoder={self.images}",
-            )  # fmt: skip
-        return sizes.pop()
+        return 0 if self.images is None else embeddings_of(self.images, stores)[1]
 
     def read(
         self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int
@@ -83,6 +69,27 @@ class Surroundings:
 
 
 NOTHING = Surroundings()
+
+
+def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]:
+    """Full name (`NAME-FINGERPRINT` of its weights) and dimension of the embeddings that data sets have of an encoder,
+    which is named by its full name or by NAME alone.
+
+    Raises WearcapError where there are none of it, or several kinds.
+    """
+    kinds: set[tuple[str, int]] = set()
+    for file in (_open(store.path_of(name)) for store in stores for name in store.names()):
+        full = _pictured(file.path)
+        if full is not None and (full == encoder or full.startswith(f"{encoder}-")):
+            kinds.add((full, file.tensor("camera.embedding").shape[1]))
+    if len(kinds) != 1:
+        found = ", ".join(f"{name} with {size} features" for name, size in sorted(kinds))
+        raise WearcapError(
+            f"embeddings of several kinds: {found}" if kinds else f"no recording has embeddings of {encoder!r}",
+            where=", ".join(str(store.root) for store in stores), expected=f"embeddings of one {encoder!r}",
+            fix=f"Run: wearcap prepare embeddings dataset=DIR encoder={encoder.split('-')[0]}",
+        )  # fmt: skip
+    return kinds.pop()
 
 
 @cache
