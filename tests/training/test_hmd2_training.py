@@ -13,6 +13,7 @@ from wearcap.cli.load import load_system
 from wearcap.data.place_codes import PlaceCodes
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
+from wearcap.io.motion_npz import read_motion
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
 from wearcap_testing import recording_of, swaying_motion
 
@@ -107,9 +108,12 @@ def test_one_checkpoint_is_scored_with_any_of_its_senses(checkpoint, data, tmp_p
 def test_a_capture_says_what_it_listened_to(checkpoint, data, tmp_path):
     capture.main([
         f"checkpoint={checkpoint}", f"recording={data}/r3", f"hydra.run.dir={tmp_path}", "pipeline.steps=2", "video=false",
-        "body=false",
+        "body=false", "samples=2",
     ])  # fmt: skip
-    assert (tmp_path / "motion.npz").is_file()
+    first, second = (read_motion(tmp_path / f"sample-{number}.npz") for number in range(2))
+    assert torch.equal(read_motion(tmp_path / "motion.npz").R_parent_joint, first.R_parent_joint)
+    assert not torch.allclose(second.R_parent_joint, first.R_parent_joint), "another draw"
+    assert (tmp_path / "samples.png").stat().st_size > 10_000
 
 
 def test_windows_and_model_must_see_the_same(data, places, tmp_path):

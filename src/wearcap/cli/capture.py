@@ -25,6 +25,7 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.locate import load_recording
 from wearcap.viewer.objects import with_objects
+from wearcap.viewer.picture import contact_sheet, save_png
 from wearcap.viewer.video import write_video
 
 HELP = "turn a recording into motion: wearcap capture recording=DATASET/NAME, checkpoint=… or pipeline=hps"
@@ -41,9 +42,16 @@ def run(config: DictConfig) -> Motion | None:
         return _live(pipeline, config, folder)
     recording = load_recording(config.recording)
     if isinstance(pipeline, HMD2 | PoseRegressorCapture):
+        if config.samples < 1:
+            raise WearcapError(f"samples={config.samples}", expected="at least 1")
         if config.until is not None or config.cache is not None:
             raise WearcapError(f"until={config.until} cache={config.cache}", expected="a pipeline with stages, such as pipeline=hps")  # fmt: skip
-        motion = pipeline(recording, seed=config.seed)
+        draws = pipeline.capture(
+            [recording] * config.samples, range(config.seed, config.seed + config.samples)
+        )
+        motion = draws[0]
+        if len(draws) > 1:
+            _write_samples(draws, recording, folder)
     else:
         captured = staged(pipeline, config, config.recording, Console(stderr=True)).run(
             recording, config.until
@@ -74,6 +82,16 @@ def _write(motion: Motion, recording: Recording, folder: Path, config: DictConfi
             folder / "motion.mp4", shown | {"capture": motion}, environment=environment,
             max_seconds=config.video_seconds,
         )  # fmt: skip
+
+
+def _write_samples(draws: list[Motion], recording: Recording, folder: Path) -> None:
+    """sample-0.npz, …, and samples.png: what one input leaves open (thesis Fig. 6.6)."""
+    shown = {f"sample {number}": motion for number, motion in enumerate(draws)}
+    for label, motion in shown.items():
+        write_motion(motion, folder / f"{label.replace(' ', '-')}.npz")
+    truth = {} if recording.motion is None else {"truth": recording.motion}
+    body = anny_body(draws[0].skeleton, recording.shape or None)
+    save_png(folder / "samples.png", contact_sheet(truth | shown, body=body))
 
 
 def _live(pipeline: object, config: DictConfig, folder: Path) -> None:
