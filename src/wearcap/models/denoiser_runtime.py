@@ -18,8 +18,8 @@ from wearcap.models.denoiser import LevelPlan, MotionDenoiser
 
 RUNTIMES = ("auto", "eager", "compile", "onnx")
 """auto: on a GPU compiled (CUDA graphs), elsewhere ONNX Runtime where it is installed, else eager."""
-PRECISIONS = ("auto", "float32", "bfloat16", "int8")
-"""auto: bfloat16 on a GPU, else float32. int8 (weights, and activations as they come) with ONNX Runtime alone."""
+PRECISIONS = ("auto", "narrowest", "float32", "bfloat16", "int8")
+"""auto: bfloat16 on a GPU, else float32. narrowest: int8 with ONNX Runtime, too. int8 (weights, and activations as they come) with ONNX Runtime alone."""
 _ONNX = ("onnx", "onnxscript", "onnxruntime")
 
 Step = Callable[[Tensor, LevelPlan, Tensor, Tensor, Tensor | None], Tensor]
@@ -59,6 +59,8 @@ class StepRunner:
         self.net = net
         device = net.motion_normalizer.mean.device
         runtime, precision = _chosen(runtime, precision, device)
+        self.runtime = runtime
+        """What was chosen."""
         with torch.inference_mode():
             self._plans = [net.plan(level.reshape(1, 1)) for level in levels.to(device)]
         self._step = _step_of(net, runtime, precision)
@@ -76,6 +78,17 @@ class StepRunner:
             last = torch.zeros_like(x_t)
         return self._step(x_t, self._plans[number], encoded, valid, last)
 
+    @contextlib.contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """For few small windows: PyTorch's threads, which wait by spinning, leave the cores to ONNX Runtime's."""
+        threads = torch.get_num_threads()
+        if self.runtime == "onnx":
+            torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(threads)
+
 
 def _chosen(runtime: str, precision: str, device: torch.device) -> tuple[str, str]:
     for what, value, known in (("runtime", runtime, RUNTIMES), ("precision", precision, PRECISIONS)):
@@ -87,8 +100,9 @@ def _chosen(runtime: str, precision: str, device: torch.device) -> tuple[str, st
     if runtime == "auto":
         plain = "eager" if missing or precision == "bfloat16" else "onnx"
         runtime = "compile" if device.type == "cuda" else plain
-    if precision == "auto":
-        precision = "bfloat16" if device.type == "cuda" else "float32"
+    if precision in ("auto", "narrowest"):
+        plain = "int8" if runtime == "onnx" and precision == "narrowest" else "float32"
+        precision = "bfloat16" if device.type == "cuda" else plain
     if (precision == "int8") > (runtime == "onnx") or (precision == "bfloat16" and runtime == "onnx"):
         raise WearcapError(f"no {precision} with runtime {runtime!r}", expected="int8 with onnx; bfloat16 with eager or compile")  # fmt: skip
     if runtime == "onnx" and (missing or device.type != "cpu"):
@@ -132,8 +146,8 @@ def _onnx_step(net: MotionDenoiser, precision: str) -> Step:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 3
-    # Threads that spin while they wait take the cores from everything else that runs beside the steps.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # Threads spin between the operations of a step; behind it they leave the cores to what else runs.
+    options.add_session_config_entry("session.force_spinning_stop", "1")
     with tempfile.TemporaryDirectory() as folder, quiet():
         path = Path(folder) / "step.onnx"
         _write_onnx(net, path)

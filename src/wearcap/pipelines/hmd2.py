@@ -1,6 +1,7 @@
 """HMD² (thesis ch. 6): environment-aware full-body motion from a head-mounted device by conditional motion diffusion."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -111,6 +112,11 @@ class HMD2:
         if self._steps is None or self.runtime == "eager":
             levels = step_levels(self.steps, self.spacing)[:-1]
             self._steps = StepRunner(self.net, levels, self.runtime, self.precision)
+
+    def undisturbed(self) -> AbstractContextManager[None]:
+        """For windows of few lanes, after `prepare`: nothing else takes the cores from the steps."""
+        assert self._steps is not None
+        return self._steps.undisturbed()
 
     @torch.inference_mode()
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:

@@ -199,7 +199,9 @@ class Session:
             chunks = {i: chunk for i, lane in enumerate(self._lanes) if (chunk := lane.track.next(ended))}
             if not chunks:
                 return [_joined(parts) for parts in said]
-            for i, motion in self._advance(chunks).items():
+            with self.pipeline.undisturbed():
+                motions = self._advance(chunks)
+            for i, motion in motions.items():
                 said[i].append(motion)
 
     @torch.inference_mode()
