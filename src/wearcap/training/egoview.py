@@ -58,7 +58,8 @@ class EgoView(lightning.LightningModule):
         )
         return logits, self.normalizer.inverse(places).unflatten(-1, (len(POINTS), 3))
 
-    def _pictures(self, batch: EgoFrame) -> Float[Tensor, "batch 3 height width"]:
+    def pictures(self, batch: EgoFrame) -> Float[Tensor, "batch 3 height width"]:
+        """The batch's pictures as the network takes them in."""
         return letterboxed(batch.picture, self.net.width, self.net.height, self.net.mean, self.net.std)
 
     def _intrinsics(self, batch: EgoFrame) -> Float[Tensor, "batch 4"]:
@@ -86,7 +87,7 @@ class EgoView(lightning.LightningModule):
         torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def training_step(self, batch: EgoFrame, batch_idx: int) -> Tensor:
-        varied = self._pictures(batch), batch.point_cam, batch.visible
+        varied = self.pictures(batch), batch.point_cam, batch.visible
         if self.augment:
             pictures, *points = turned(varied[0], self._intrinsics(batch), *varied[1:], self.turn_deg)
             varied = half_mirrored(relit(pictures), *points)
@@ -95,7 +96,7 @@ class EgoView(lightning.LightningModule):
         return loss
 
     def validation_step(self, batch: EgoFrame, batch_idx: int) -> None:
-        pictures = self._pictures(batch)
+        pictures = self.pictures(batch)
         self.log(
             "val/loss",
             self.loss(pictures, batch.point_cam, batch.visible),
