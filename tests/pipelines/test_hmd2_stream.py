@@ -37,11 +37,18 @@ def pipeline(places):
         features = HeadFeatures(contacts=True, body=True)
         net = MotionDenoiser(
             features.motion_size, features.condition_size, WINDOW, 32, 1, 4, 64, 0.0, 4, blend=5,
-            points_size=places.size if points else 0, image_size=IMAGE if points else 0,
+            points_size=places.size if points else 0, image_size=IMAGE if points else 0, past=True,
         )  # fmt: skip
         for parameter in net.parameters():
             torch.nn.init.normal_(parameter, std=0.05)
-        told = {"steps": 3, "place_encoder": places, "image_encoder": "eyes", "live": True} | changes
+        told = {
+            "steps": 3,
+            "place_encoder": places,
+            "image_encoder": "eyes",
+            "live": True,
+            "memory": 32,
+            "fade": 6,
+        } | changes
         return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, stride=stride, **told)
 
     return make

@@ -80,6 +80,10 @@ class HMD2:
     """Whether even the floor is told only from what has been sensed by then, as it must be in a stream."""
     spacing: float = 1.0
     """How the steps' levels are spaced (`diffusion.sampler.step_levels`)."""
+    memory: int | None = None
+    """Frames of what it has said that a window goes on from; None: all that it holds, as in the document."""
+    fade: int = 0
+    """Frames over which a window leaves what the one before it said (`diffusion.sampler.joined`)."""
     runtime: str = "eager"
     """What the steps run on (`models.denoiser_runtime.RUNTIMES`); all but eager take some seconds to begin."""
     precision: str = "auto"

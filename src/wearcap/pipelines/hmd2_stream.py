@@ -273,6 +273,7 @@ def _settings(pipeline: HMD2) -> dict[str, float | str]:
     net = pipeline.net
     return {
         "window": net.window, "stride": pipeline.advance, "steps": pipeline.steps, "fps": pipeline.fps,
+        "memory": str(pipeline.memory), "fade": pipeline.fade,
         "eta": pipeline.eta, "spacing": pipeline.spacing, "motion_size": net.motion_size, "points_size": net.points_size, "image_size": net.image_size,
         "features": str(pipeline.features),
     }  # fmt: skip

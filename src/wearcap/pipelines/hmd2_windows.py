@@ -49,6 +49,8 @@ class Model(Protocol):
     steps: int
     eta: float
     spacing: float
+    memory: int | None
+    fade: int
     device: str
 
     def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "lane time"]) -> Denoise: ...
@@ -144,17 +146,19 @@ def _sample(samplers: Sequence[WindowSampler], lanes: list[tuple[Frames, Poses, 
     head = features.condition(
         frames.R_world_head, frames.t_world_head, frames.floor_height, size, pipeline.fps
     )
-    conditions = Conditions(
-        *(part.to(device) for part in (head, frames.points, frames.points_valid, frames.image, frames.image_valid))
-    )  # fmt: skip
     # Re-expressed in this window's frame, which may have moved since the last one.
     known = net.motion_normalizer(
         features.encode(held.R_parent_joint, frames.R_world_head, held.foot_contact).to(device)
     )
+    memory = net.window if pipeline.memory is None else pipeline.memory
+    remembered = is_known & (number >= torch.tensor([[overlap - memory] for _, _, overlap in lanes]))
+    told = head, frames.points, frames.points_valid, frames.image, frames.image_valid, known, remembered
+    conditions = Conditions(*(part.to(device) for part in told))
     noise = torch.stack([sampler.noise() for sampler in samplers], 1).to(device)
     x0 = sample(
         pipeline.denoiser(conditions, valid.to(device)), noise, pipeline.schedule,
-        eta=pipeline.eta, spacing=pipeline.spacing, known=known, is_known=is_known.to(device),
+        eta=pipeline.eta, spacing=pipeline.spacing, known=known, is_known=remembered.to(device),
+        fade=pipeline.fade,
     )  # fmt: skip
     motion = net.motion_normalizer.inverse(x0.float()).cpu()
     poses = Poses(*features.decode(motion, frames.R_world_head))

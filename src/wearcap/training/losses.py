@@ -1,58 +1,58 @@
-"""Loss terms: pure functions of predictions and truth, averaged over frames, padding left out."""
+"""Loss terms: pure functions of predictions and truth, averaged over frames, which have weights: none for padding."""
 
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 EPSILON_M2 = 1e-6
 """Keeps the gradient of a distance finite where prediction and target meet."""
 
 
-def masked_mean(value: Float[Tensor, "batch time"], valid: Bool[Tensor, "batch time"]) -> Float[Tensor, ""]:
-    """Mean over all frames, padding counting as zero.
+def masked_mean(value: Float[Tensor, "batch time"], weight: Float[Tensor, "batch time"]) -> Float[Tensor, ""]:
+    """Mean over all frames, padding (no weight) counting as zero.
 
     Divided by the number of valid frames instead, the gradient would depend on how a batch is shared out among
     processes: each would weigh its own padding.
     """
-    return (value * valid).mean()
+    return (value * weight).mean()
 
 
 def motion_mse(
     prediction: Float[Tensor, "batch time motion"],
     target: Float[Tensor, "batch time motion"],
-    valid: Bool[Tensor, "batch time"],
+    weight: Float[Tensor, "batch time"],
 ) -> Float[Tensor, ""]:
     """Squared error of x̂0 in normalised motion space (thesis eq. 6.4)."""
-    return masked_mean((prediction - target).square().mean(-1), valid)
+    return masked_mean((prediction - target).square().mean(-1), weight)
 
 
 def joint_position(
     prediction: Float[Tensor, "batch time joint 3"],
     target: Float[Tensor, "batch time joint 3"],
-    valid: Bool[Tensor, "batch time"],
+    weight: Float[Tensor, "batch time"],
 ) -> Float[Tensor, ""]:
     """Distance of joints, both bodies hung from the same head (m; ours)."""
     distance = ((prediction - target).square().sum(-1) + EPSILON_M2).sqrt()
-    return masked_mean(distance.mean(-1), valid)
+    return masked_mean(distance.mean(-1), weight)
 
 
 def joint_velocity(
     prediction: Float[Tensor, "batch time joint 3"],
     target: Float[Tensor, "batch time joint 3"],
-    valid: Bool[Tensor, "batch time"],
+    weight: Float[Tensor, "batch time"],
     fps: float,
 ) -> Float[Tensor, ""]:
     """Squared difference of joint velocities (m²/s²; ours)."""
     error = (prediction - target).diff(dim=1) * fps
-    return masked_mean(error.square().sum(-1).mean(-1), valid[:, 1:])
+    return masked_mean(error.square().sum(-1).mean(-1), weight[:, 1:])
 
 
 def foot_skate(
     feet: Float[Tensor, "batch time foot point 3"],
     contact: Float[Tensor, "batch time foot"],
-    valid: Bool[Tensor, "batch time"],
+    weight: Float[Tensor, "batch time"],
     fps: float,
 ) -> Float[Tensor, ""]:
     """Squared speed (m²/s²) of the slowest point of a foot while the truth says that the foot touches (ours)."""
     speed = (feet.diff(dim=1) * fps).square().sum(-1).amin(-1)
     stands = contact[:, 1:] * contact[:, :-1]
-    return masked_mean((speed * stands).mean(-1), valid[:, 1:])
+    return masked_mean((speed * stands).mean(-1), weight[:, 1:])

@@ -5,7 +5,9 @@ from typing import Any
 
 import lightning
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
@@ -19,6 +21,11 @@ from wearcap.models.denoiser import Conditions, MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.training import losses
 
+_MOST_DOUBT = 0.5
+"""Of a past, in the normalised motion's deviations."""
+_ERROR_FRAMES = 40
+"""Its errors change over so many frames."""
+
 
 class MotionDiffusion(lightning.LightningModule):
     """x0-prediction under one noise level per window; loss terms are weighed by `loss_weights`.
@@ -27,6 +34,8 @@ class MotionDiffusion(lightning.LightningModule):
     with a density that grows with the level to the power of `level_tilt`: 0 draws them uniformly, as the document does;
     more (ours) trains what sampling in few steps depends on, the way from noise to a first guess. Points and images are
     each replaced by their null token in a share `drop` of the windows, so that one checkpoint runs with any of them.
+    A network that sees its past (ours) is shown one in a share `recall` of them, doubtful as its own will be, and what
+    is new behind it weighs more.
     """
 
     def __init__(
@@ -41,6 +50,7 @@ class MotionDiffusion(lightning.LightningModule):
         scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
         level_tilt: float = 0.0,
         drop: float = 0.0,
+        recall: float = 0.5,
         place_encoder: VoxelAutoencoder | None = None,
         image_encoder: str | None = None,
         image_size: int = 0,
@@ -56,13 +66,15 @@ class MotionDiffusion(lightning.LightningModule):
         )  # fmt: skip
         self.place_encoder = None if place_encoder is None else place_encoder.requires_grad_(False).eval()
         self.image_encoder, self.drop = image_encoder, drop
+        self.recall = recall if self.net.past else 0.0
         self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
         self.loss_weights, self.level_tilt, self.seed = dict(loss_weights), level_tilt, seed
         self._optimizer, self._scheduler = optimizer, scheduler
         self._feet = [
             skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")
         ]
-        self._denoise = torch.compile(self.net) if compile else self.net
+        # Methods, not modules, which would put every weight into checkpoints a second time.
+        self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
         self._encode = torch.compile(self.net.encode) if compile else self.net.encode
 
     def set_statistics(self, dataset: WindowDataset) -> None:
@@ -107,7 +119,13 @@ class MotionDiffusion(lightning.LightningModule):
 
     def _predicted(self, batch: Window, x0: Tensor) -> Tensor:
         """x̂0 of a batch in normalised motion space; with self-conditioning, after a first guess in half the windows."""
-        encoded = self._encode(self.conditions(batch), batch.valid)
+        conditions = self.conditions(batch)
+        if self.recall:
+            known, past = self._known(batch), _doubtful(x0, batch)
+            conditions = conditions._replace(past=past, past_valid=known)
+            # As in sampling, where x̂0 is overwritten by what is known.
+            x0 = torch.where(known[..., None], past, x0)
+        encoded = self._encode(conditions, batch.valid)
         level = batch.level ** (1 / (1 + self.level_tilt))
         x_t = add_noise(x0, batch.noise[..., : x0.shape[-1]], level, self.schedule)
         if not self.net.self_conditioning:
@@ -117,20 +135,40 @@ class MotionDiffusion(lightning.LightningModule):
         told = guess * (batch.chance[:, 2] < 0.5)[:, None, None]
         return self._denoise(x_t, level, encoded, batch.valid, told)
 
+    def _known(self, batch: Window) -> Bool[Tensor, "batch time"]:
+        """Which frames count as said already: up to a seam that is often late, in half the windows from a frame on."""
+        recall, seam, length = batch.chance[:, 3:6, None].unbind(1)
+        end = (batch.valid.sum(1, keepdim=True) * (1 - seam**2)).long()
+        begin = end - (end * (2 - 2 * length).clamp_max(1) ** 2).ceil().long()
+        number = torch.arange(batch.valid.shape[1], device=end.device)
+        return (recall < self.recall) & (number >= begin) & (number < end)
+
+    def _weight(self, batch: Window) -> Float[Tensor, "batch time"]:
+        """Of each frame in the loss: valid ones count, and more behind a seam, the fewer they are."""
+        valid = batch.valid.float()
+        if not self.recall:
+            return valid
+        known = self._known(batch)
+        number = torch.arange(known.shape[1], device=known.device)
+        new = batch.valid & (number > (number * known).amax(1, keepdim=True)) & known.any(1, keepdim=True)
+        share = new.sum(1, keepdim=True) / batch.valid.sum(1, keepdim=True).clamp_min(1)
+        return torch.where(new, share.clamp_min(1 / known.shape[1]).rsqrt(), valid)
+
     def terms(self, batch: Window) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
+        weight = self._weight(batch)
         motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
         x0 = self.net.motion_normalizer(motion)
         x0_hat = self._predicted(batch, x0)
-        terms = {"motion": losses.motion_mse(x0_hat, x0, batch.valid)}
+        terms = {"motion": losses.motion_mse(x0_hat, x0, weight)}
         if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate")):
             motion_hat = self.net.motion_normalizer.inverse(x0_hat.float())
             R_hat, _ = self.features.decode(motion_hat, batch.R_world_head)
             predicted, true = self._from_head(R_hat, batch), self._from_head(batch.R_parent_joint, batch)
-            terms["joints"] = losses.joint_position(predicted, true, batch.valid)
-            terms["velocity"] = losses.joint_velocity(predicted, true, batch.valid, self.fps)
+            terms["joints"] = losses.joint_position(predicted, true, weight)
+            terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.fps)
             feet = predicted[:, :, self._feet].unflatten(2, (FEET, -1)) + batch.t_world_head[:, :, None, None]
-            terms["skate"] = losses.foot_skate(feet, batch.foot_contact, batch.valid, self.fps)
+            terms["skate"] = losses.foot_skate(feet, batch.foot_contact, weight, self.fps)
         return terms
 
     def _from_head(self, R_parent_joint: Tensor, batch: Window) -> Tensor:
@@ -163,6 +201,14 @@ class MotionDiffusion(lightning.LightningModule):
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
         }
+
+
+def _doubtful(x0: Float[Tensor, "batch time motion"], batch: Window) -> Float[Tensor, "batch time motion"]:
+    """The true past off by what a capture's own is off by: slowly changing errors, and a little from frame to frame."""
+    noise = batch.noise[..., : x0.shape[-1]].flip(1)
+    knots = noise[:, ::_ERROR_FRAMES].transpose(1, 2)
+    slow = F.interpolate(knots, size=x0.shape[1], mode="linear", align_corners=True).transpose(1, 2)
+    return x0 + _MOST_DOUBT * batch.chance[:, 6, None, None] * (slow + 0.1 * noise)
 
 
 def _require_same_inputs(system: MotionDiffusion, dataset: WindowDataset) -> None:

@@ -89,7 +89,8 @@ class PoseRegression(lightning.LightningModule):
         rows = torch.arange(len(ends), device=ends.device)[:, None]
         features, exists = pasts(self._features(batch), ends, self.net.window)
         motion = self.net(features.flatten(0, 1), exists.flatten(0, 1)).unflatten(0, ends.shape).float()
-        R_true, R_head, valid = batch.R_parent_joint[rows, ends], batch.R_world_head[rows, ends], batch.valid[rows, ends]  # fmt: skip
+        R_true, R_head = batch.R_parent_joint[rows, ends], batch.R_world_head[rows, ends]
+        valid = batch.valid[rows, ends].float()
         error = (motion - encode_pose(R_true, R_head)).abs()
         said, true = self._from_head(decode_pose(motion, R_head), batch), self._from_head(R_true, batch)
         return {
