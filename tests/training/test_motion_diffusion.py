@@ -76,7 +76,7 @@ def test_pasts_end_late_are_doubtful_and_what_is_new_weighs_more(tmp_path):
 
     module = MotionDiffusion(net, features, CosineSchedule(), xsens23(), 60.0, {"motion": 1.0}, torch.optim.AdamW, recall=0.5)  # fmt: skip
     module.terms(batch)
-    conditions, x_t = seen
+    *_, conditions, x_t = seen
     known = conditions.past_valid
     has = known.any(1)
     assert 0.4 < has.float().mean() < 0.55
@@ -87,8 +87,9 @@ def test_pasts_end_late_are_doubtful_and_what_is_new_weighs_more(tmp_path):
     assert (end > 50).float().mean() > 0.3
     assert 0.35 < (first == 0).float().mean() < 0.7, "half of them from the beginning"
     truth = features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
-    off = (conditions.past - truth).square().mean((1, 2)).sqrt()
-    assert off.min() < 0.02 < 0.3 < off.max() < 0.7
+    # This network, which has learned nothing, says zero.
+    doubt = (1.5 * batch.chance[:, 6, None, None]).clamp_max(1)
+    assert torch.allclose(conditions.past, truth * (1 - doubt), atol=1e-6)
     weight = module._weight(batch)
     new = batch.valid[has] & (torch.arange(60) >= end[:, None])
     share = new.sum(1) / batch.valid[has].sum(1)

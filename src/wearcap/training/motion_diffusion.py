@@ -7,7 +7,6 @@ import lightning
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional as F
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
@@ -21,10 +20,8 @@ from wearcap.models.denoiser import Conditions, MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.training import losses
 
-_MOST_DOUBT = 0.5
-"""Of a past, in the normalised motion's deviations."""
-_ERROR_FRAMES = 40
-"""Its errors change over so many frames."""
+_OWN_LEVELS = (1.0, 0.5)
+"""Noise levels of the two steps in which a network makes up a past while it is trained."""
 
 
 class MotionDiffusion(lightning.LightningModule):
@@ -34,8 +31,8 @@ class MotionDiffusion(lightning.LightningModule):
     with a density that grows with the level to the power of `level_tilt`: 0 draws them uniformly, as the document does;
     more (ours) trains what sampling in few steps depends on, the way from noise to a first guess. Points and images are
     each replaced by their null token in a share `drop` of the windows, so that one checkpoint runs with any of them.
-    A network that sees its past (ours) is shown one in a share `recall` of them, doubtful as its own will be, and what
-    is new behind it weighs more.
+    A network that sees its past (ours) is shown one in a share `recall` of them, off by what its own answers are off
+    by, and what is new behind it weighs more.
     """
 
     def __init__(
@@ -121,7 +118,7 @@ class MotionDiffusion(lightning.LightningModule):
         """x̂0 of a batch in normalised motion space; with self-conditioning, after a first guess in half the windows."""
         conditions = self.conditions(batch)
         if self.recall:
-            known, past = self._known(batch), _doubtful(x0, batch)
+            known, past = self._known(batch), self._past(batch, x0, conditions)
             conditions = conditions._replace(past=past, past_valid=known)
             # As in sampling, where x̂0 is overwritten by what is known.
             x0 = torch.where(known[..., None], past, x0)
@@ -142,6 +139,17 @@ class MotionDiffusion(lightning.LightningModule):
         begin = end - (end * (2 - 2 * length).clamp_max(1) ** 2).ceil().long()
         number = torch.arange(batch.valid.shape[1], device=end.device)
         return (recall < self.recall) & (number >= begin) & (number < end)
+
+    @torch.no_grad()
+    def _past(self, batch: Window, x0: Tensor, conditions: Conditions) -> Float[Tensor, "batch time motion"]:
+        """The true past led towards what the network says of the window in two steps, in a third of the windows all the
+        way: a past with any other errors is trusted too much, and captures in small strides drift."""
+        encoded, noise = self._encode(conditions, batch.valid), batch.noise[..., : x0.shape[-1]].flip(1)
+        said = noise
+        for level in _OWN_LEVELS:
+            level = torch.full_like(batch.level, level)
+            said = self._denoise(add_noise(said, noise, level, self.schedule), level, encoded, batch.valid)
+        return x0 + (1.5 * batch.chance[:, 6, None, None]).clamp_max(1) * (said - x0)
 
     def _weight(self, batch: Window) -> Float[Tensor, "batch time"]:
         """Of each frame in the loss: valid ones count, and more behind a seam, the fewer they are."""
@@ -201,14 +209,6 @@ class MotionDiffusion(lightning.LightningModule):
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
         }
-
-
-def _doubtful(x0: Float[Tensor, "batch time motion"], batch: Window) -> Float[Tensor, "batch time motion"]:
-    """The true past off by what a capture's own is off by: slowly changing errors, and a little from frame to frame."""
-    noise = batch.noise[..., : x0.shape[-1]].flip(1)
-    knots = noise[:, ::_ERROR_FRAMES].transpose(1, 2)
-    slow = F.interpolate(knots, size=x0.shape[1], mode="linear", align_corners=True).transpose(1, 2)
-    return x0 + _MOST_DOUBT * batch.chance[:, 6, None, None] * (slow + 0.1 * noise)
 
 
 def _require_same_inputs(system: MotionDiffusion, dataset: WindowDataset) -> None:
