@@ -31,9 +31,11 @@ Rebuild = Callable[[Tensor], Tensor]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", type=Path, default=Path("datasets/simulated"))
     parser.add_argument(
-        "--checkpoints", nargs="*", default=["outputs/train/voxel_autoencoder/reference/checkpoints/best.ckpt"],
+        "--data", type=Path, default=Path("datasets/simulated_camera"), help="prepared data set"
+    )
+    parser.add_argument(
+        "--checkpoints", nargs="*", default=["ours=voxel_autoencoder"],
         metavar="[LABEL=]PATH", help="voxel autoencoders to compare",
     )  # fmt: skip
 

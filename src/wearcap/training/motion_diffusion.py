@@ -143,7 +143,7 @@ class MotionDiffusion(lightning.LightningModule):
     @torch.no_grad()
     def _past(self, batch: Window, x0: Tensor, conditions: Conditions) -> Float[Tensor, "batch time motion"]:
         """The true past led towards what the network says of the window in two steps, in a third of the windows all the
-        way: a past with any other errors is trusted too much, and captures in small strides drift."""
+        way: one that was off by slow noise instead was trusted too much, and captures in small strides drifted."""
         encoded, noise = self._encode(conditions, batch.valid), batch.noise[..., : x0.shape[-1]].flip(1)
         said = noise
         for level in _OWN_LEVELS:
