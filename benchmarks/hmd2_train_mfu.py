@@ -81,5 +81,5 @@ def _windows(batch: int, time_steps: int = 240, joints: int = 23) -> Window:
         t_parent_joint=0.2 * torch.randn(batch, joints, 3), size=torch.ones(batch, len(LIMBS)),
         foot_contact=torch.rand(*shape, 2).round(), points=torch.randn(*shape, VoxelAutoencoder().size), points_valid=there,
         image=torch.randn(*shape, IMAGE), image_valid=there, noise=torch.randn(*shape, 6 * joints + 2),
-        level=torch.rand(batch, 1), chance=torch.rand(batch, 7),
+        level=torch.rand(batch, 1), chance=torch.rand(batch, 3),
     )  # fmt: skip

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from wearcap.diffusion.process import add_noise, posterior_step
-from wearcap.diffusion.sampler import joined, sample
+from wearcap.diffusion.sampler import sample
 from wearcap.diffusion.schedule import CosineSchedule, LinearSchedule
 
 SCHEDULES = [CosineSchedule(), LinearSchedule()]
@@ -94,20 +94,3 @@ def test_known_frames_come_out_as_given():
     )
     assert torch.allclose(drawn[:, :2], known[:, :2], atol=1e-6)
     assert not torch.allclose(drawn[:, 2:], known[:, 2:], atol=0.1)
-
-
-def test_what_is_new_goes_on_from_what_is_known_and_fades_into_what_is_said():
-    torch.manual_seed(0)
-    x0_hat, known = torch.randn(3, 30, 4), torch.randn(3, 30, 4)
-    number = torch.arange(30)
-    is_known = torch.stack([number < 0, number < 10, (number >= 6) & (number < 10)])
-    whole = joined(x0_hat, known, is_known, 8)
-    assert torch.equal(whole[is_known], known[is_known])
-    assert torch.equal(whole[0], x0_hat[0]), "nothing is known"
-    assert torch.equal(whole[2, :6], x0_hat[2, :6]), "what came before a memory is free"
-    step = (known - x0_hat)[1:, 9, None]
-    left = (whole - x0_hat)[1:, 10:] / step
-    assert torch.allclose(left[:, 8:], torch.zeros(()), atol=1e-6)
-    assert ((left[:, :7] > 0) & (left[:, :7] < 1)).all()
-    assert (left[:, 1:8] < left[:, :7]).all()
-    assert torch.equal(joined(x0_hat, known, is_known, 0), torch.where(is_known[..., None], known, x0_hat))

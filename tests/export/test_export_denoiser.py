@@ -46,7 +46,7 @@ def pipeline() -> HMD2:
     features, places = HeadFeatures(contacts=True, body=True), VoxelAutoencoder(size=16).eval()
     net = MotionDenoiser(
         features.motion_size, features.condition_size, WINDOW, width=32, layers=1, heads=2, feedforward=64,
-        frames_per_token=2, blend=5, points_size=places.size, image_size=IMAGE, self_conditioning=True, past=True,
+        frames_per_token=2, blend=5, points_size=places.size, image_size=IMAGE, self_conditioning=True,
     )  # fmt: skip
     for parameter in net.parameters():
         nn.init.normal_(parameter, std=0.05)
@@ -54,18 +54,7 @@ def pipeline() -> HMD2:
     net.motion_normalizer.set(torch.randn(size) * 0.1, torch.rand(size) + 0.5)
     net.condition_encoder.normalizer.set(torch.randn(17) * 0.1, torch.rand(17) + 0.5)
     return HMD2(
-        net,
-        features,
-        CosineSchedule(),
-        xsens23(),
-        60.0,
-        places,
-        "eyes",
-        steps=3,
-        stride=16,
-        guidance=1.5,
-        memory=6,
-        fade=3,
+        net, features, CosineSchedule(), xsens23(), 60.0, places, "eyes", steps=3, stride=16, guidance=1.5
     )
 
 

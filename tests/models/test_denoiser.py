@@ -132,18 +132,3 @@ def test_self_conditioning_listens_to_the_last_answer():
     first = net(x_t, level, encoded, valid)
     assert torch.equal(net(x_t, level, encoded, valid, torch.zeros_like(x_t)), first)
     assert not torch.allclose(net(x_t, level, encoded, valid, first), first, atol=1e-3)
-
-
-def test_a_past_counts_where_it_is_valid_and_may_be_missing():
-    net = small(frames_per_token=4, past=True)
-    x_t, level, condition, valid = inputs()
-    past, known = torch.randn(2, 16, 12), torch.arange(16).expand(2, -1) < 8
-
-    def answer(past, known) -> torch.Tensor:
-        conditions = told(condition)._replace(past=past, past_valid=known)
-        return net(x_t, level, net.encode(conditions, valid), valid)
-
-    said = answer(past, known)
-    assert torch.equal(answer(torch.where(known[..., None], past, 99.0), known), said)
-    assert not torch.allclose(answer(past + known[..., None], known), said, atol=1e-3)
-    assert torch.allclose(answer(None, None), answer(past, known & False), atol=1e-6)

@@ -31,9 +31,7 @@ def told(net: MotionDenoiser, batch: int, device: str = "cpu"):
         torch.randn(batch, 16, 5), torch.randn(batch, 16, 6), valid, torch.zeros(batch, 16, 0), valid
     )
     with torch.inference_mode():
-        encoded = net.encode(
-            Conditions(*(part.to(device) for part in conditions if part is not None)), valid.to(device)
-        )
+        encoded = net.encode(Conditions(*(part.to(device) for part in conditions)), valid.to(device))
     x_t, last = torch.randn(2, batch, 16, 12)
     return x_t.to(device), encoded, valid.to(device), last.to(device) if net.self_conditioning else None
 

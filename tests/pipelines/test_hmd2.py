@@ -75,7 +75,7 @@ def test_the_same_seed_repeats_and_another_differs():
 @pytest.mark.parametrize("frame", ["heading", "window"])
 def test_what_was_said_stays_said(frame):
     """Frames that a window has given out are not revised by the next: a longer recording begins the same."""
-    long, live = swaying_motion(140), pipeline(frame, live=True)
+    long, live = swaying_motion(140), pipeline(frame, live=True, lookahead=0)
     short = recording_of(long.sliced(0, 80), "short")
     captured, prefix = live(recording_of(long, "long")), live(short)
     assert torch.allclose(captured.R_parent_joint[:80], prefix.R_parent_joint, atol=1e-4)
@@ -126,7 +126,7 @@ def test_what_is_seen_later_changes_nothing_before():
         recording, points=PointCloud(cloud.points_world[known], None, cloud.first_seen[known]),
         camera=replace(camera, embedding=camera.embedding * later),
     )  # fmt: skip
-    whole, part = (pipeline(stride=25, live=True)(r).R_parent_joint for r in (recording, first))
+    whole, part = (pipeline(stride=25, live=True, lookahead=0)(r).R_parent_joint for r in (recording, first))
     assert torch.allclose(whole[:75], part[:75], atol=1e-5)
     assert not torch.allclose(whole[75:], part[75:], atol=1e-3)
 

@@ -37,18 +37,13 @@ def pipeline(places):
         features = HeadFeatures(contacts=True, body=True)
         net = MotionDenoiser(
             features.motion_size, features.condition_size, WINDOW, 32, 1, 4, 64, 0.0, 4, blend=5,
-            points_size=places.size if points else 0, image_size=IMAGE if points else 0, past=True,
+            points_size=places.size if points else 0, image_size=IMAGE if points else 0,
         )  # fmt: skip
         for parameter in net.parameters():
             torch.nn.init.normal_(parameter, std=0.05)
         told = {
-            "steps": 3,
-            "place_encoder": places,
-            "image_encoder": "eyes",
-            "live": True,
-            "memory": 32,
-            "fade": 6,
-        } | changes
+            "steps": 3, "place_encoder": places, "image_encoder": "eyes", "live": True, "fade": 6, "lookahead": 0,
+        } | changes  # fmt: skip
         return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, stride=stride, **told)
 
     return make
@@ -114,8 +109,9 @@ def assert_same(motion: Motion, other: Motion, atol: float = 1e-5) -> None:
 
 
 @pytest.mark.parametrize(("stride", "frames"), [(10, 133), (45, 150), (60, 121)])
-def test_streaming_equals_the_capture_of_the_whole(pipeline, stride, frames):
-    recording, hmd2 = surrounded(frames), pipeline(stride)
+@pytest.mark.parametrize("windows", [{"hold": True}, {}, {"lookahead": None}])
+def test_streaming_equals_the_capture_of_the_whole(pipeline, stride, frames, windows):
+    recording, hmd2 = surrounded(frames), pipeline(stride, **windows)
     streamed = stream(Session(hmd2, [wearer(recording)], [3]), moments(recording))[0]
     assert len(streamed) == frames
     assert_same(streamed, hmd2(recording, seed=3))
@@ -129,6 +125,18 @@ def test_poses_wait_for_the_stride(pipeline):
     rest = session.flush()[0]
     assert len(rest) == 5
     assert session.flush() == [None]
+
+
+def test_poses_wait_for_what_they_look_ahead_to(pipeline):
+    session = Session(pipeline(lookahead=13), [Wearer(xsens23())], [0])
+    said = [session.push([[moment]])[0] for moment in moments(surrounded(45))]
+    assert [(i, len(motion)) for i, motion in enumerate(said) if motion is not None] == [
+        (19, 7), (29, 10), (39, 10),
+    ]  # fmt: skip
+    rest = session.flush()[0]
+    assert len(rest) == 18
+    times = torch.cat([motion.timestamps for motion in [*said, rest] if motion is not None])
+    assert torch.allclose(times * 60, torch.arange(45, dtype=torch.float64))
 
 
 def test_the_head_is_where_it_was_measured(pipeline):
@@ -154,8 +162,9 @@ def test_several_wearers_are_as_alone(pipeline):
     assert_same(replace(second, timestamps=second.timestamps - 500.0), hmd2(recordings[1], seed=6), 1e-4)
 
 
-def test_saved_and_restored_it_goes_on_bit_for_bit(pipeline, tmp_path):
-    recording, hmd2 = surrounded(120), pipeline()
+@pytest.mark.parametrize(("lookahead", "given"), [(0, 50), (13, 37)])
+def test_saved_and_restored_it_goes_on_bit_for_bit(pipeline, tmp_path, lookahead, given):
+    recording, hmd2 = surrounded(120), pipeline(lookahead=lookahead)
     told = moments(recording)
     whole, first = (Session(hmd2, [wearer(recording)], [4]) for _ in range(2))
     stream(first, told[:57], ended=False)
@@ -164,7 +173,7 @@ def test_saved_and_restored_it_goes_on_bit_for_bit(pipeline, tmp_path):
     expected = stream(whole, told)[0]
     resumed = stream(again, told[57:])[0]
     for name in ("timestamps", "R_parent_joint", "t_world_root", "contact_prob"):
-        assert torch.equal(getattr(resumed, name), getattr(expected, name)[50:])
+        assert torch.equal(getattr(resumed, name), getattr(expected, name)[given:])
 
 
 def test_a_session_is_loaded_with_its_own_pipeline_alone(pipeline, tmp_path):
@@ -227,8 +236,9 @@ def test_other_rates_are_brought_to_the_pipelines(pipeline, fps):
 
 
 @pytest.mark.parametrize("broken", ["gap", "jump"])
-def test_after_gaps_and_jumps_it_begins_anew_as_offline(pipeline, broken):
-    recording, hmd2 = surrounded(150), pipeline(points=False)
+@pytest.mark.parametrize("lookahead", [0, 13])
+def test_after_gaps_and_jumps_it_begins_anew_as_offline(pipeline, broken, lookahead):
+    recording, hmd2 = surrounded(150), pipeline(points=False, lookahead=lookahead)
     hmd2.features = replace(hmd2.features, height="relative")
     keep = [i for i in range(150) if broken == "jump" or not 44 <= i < 90]
     head = head_of(recording, keep)

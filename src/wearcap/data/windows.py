@@ -49,9 +49,9 @@ class Window(NamedTuple):
     """See `Surroundings`; no columns where a modality is left out."""
     noise: Float[Tensor, "*batch time motion"]
     level: Float[Tensor, "*batch 1"]
-    chance: Float[Tensor, "*batch 7"]
-    """Diffusion noise and level, and chances (to drop points, images; to condition on oneself; to know a past, where it
-    ends, how long it is, how doubtful), drawn here so that they depend on seed and step and not on the process."""
+    chance: Float[Tensor, "*batch 3"]
+    """Diffusion noise and level, and chances to drop modalities and to condition on oneself, drawn here so that they
+    depend on seed and step and not on the process."""
 
     @property
     def stature(self) -> Float[Tensor, "*batch"]:
@@ -178,7 +178,7 @@ class WindowDataset(Dataset):
             constants.floor_height[start:stop][take], constants.floor_from_head[start:stop][take], torch.arange(self.window) < stop - start,
             constants.skeleton.t_parent_joint, constants.size, constants.foot_contact[start:stop][take],
             *(part[take] for part in seen), torch.randn(self.window, 6 * joints + FEET, generator=random),
-            torch.rand(1, generator=random), torch.rand(7, generator=random),
+            torch.rand(1, generator=random), torch.rand(3, generator=random),
         )  # fmt: skip
         return mirror_window(window, constants.skeleton) if mirrored else window
 

@@ -32,12 +32,10 @@ def sample(
     spacing: float = 1.0,
     known: Float[Tensor, "batch time feature"] | None = None,
     is_known: Bool[Tensor, "batch time"] | None = None,
-    fade: int = 0,
 ) -> Float[Tensor, "batch time feature"]:
     """Draw x0 in `draw` steps between the levels of `step_levels`; noise[0] is the start, the rest the steps' noise.
 
-    Where `is_known`, every x̂0 is overwritten by `known` (autoregressive inpainting, thesis eq. 6.5), and behind it led
-    back over `fade` frames (ours; see `joined`).
+    Where `is_known`, every x̂0 is overwritten by `known` (autoregressive inpainting, thesis eq. 6.5).
     The same noise gives the same sample, so windows of several wearers can share a batch.
     """
     steps = len(noise)
@@ -47,30 +45,7 @@ def sample(
         level, level_next = (levels[step + i].expand(x.shape[0], 1) for i in (0, 1))
         x0_hat = denoise(x, level)
         if known is not None and is_known is not None:
-            x0_hat = joined(x0_hat, known, is_known, fade)
+            x0_hat = torch.where(is_known[..., None], known, x0_hat)
         fresh = noise[step + 1] if step + 1 < steps else torch.zeros_like(x)
         x = posterior_step(x, x0_hat, level, level_next, fresh, schedule, eta)
     return x
-
-
-def joined(
-    x0_hat: Float[Tensor, "batch time feature"],
-    known: Float[Tensor, "batch time feature"],
-    is_known: Bool[Tensor, "batch time"],
-    fade: int,
-) -> Float[Tensor, "batch time feature"]:
-    """x̂0 overwritten where it is known; what the last known frame differs by fades out over the `fade` frames behind it.
-
-    0 leaves a step there, as large as that difference.
-    """
-    whole = torch.where(is_known[..., None], known, x0_hat)
-    if not fade:
-        return whole
-    number = torch.arange(x0_hat.shape[1], device=x0_hat.device)
-    seam = (number * is_known).amax(1)
-    row = torch.arange(len(seam), device=seam.device)
-    step = (known[row, seam] - x0_hat[row, seam]) * is_known.any(1, keepdim=True)
-    way = ((number - seam[:, None]) / fade).clamp(0, 1)[..., None]
-    # From one to zero, with no slope at either end.
-    carried = (1 - way**2 * (3 - 2 * way)) * step[:, None]
-    return torch.where(is_known[..., None], whole, whole + carried * (number > seam[:, None])[..., None])

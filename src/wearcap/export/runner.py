@@ -34,7 +34,7 @@ class ExportedDenoiser(MotionDenoiser):
         self._run = step, conditions
         self.window, self.condition_size = about["window"], about["condition_size"]
         self.points_size, self.image_size = about["points_size"], about["image_size"]
-        self.self_conditioning, self.past = about["self_conditioning"], about["past"]
+        self.self_conditioning = about["self_conditioning"]
         self.motion_size = len(about["motion_mean"])
         self.motion_normalizer = Normalizer(self.motion_size)
         self.motion_normalizer.set(torch.tensor(about["motion_mean"]), torch.tensor(about["motion_scale"]))
@@ -47,10 +47,6 @@ class ExportedDenoiser(MotionDenoiser):
             told |= {"points": conditions.points, "points_valid": conditions.points_valid}
         if self.image_size:
             told |= {"image": conditions.image, "image_valid": conditions.image_valid}
-        if self.past:
-            assert conditions.past is not None
-            assert conditions.past_valid is not None
-            told |= {"past": conditions.past, "past_valid": conditions.past_valid}
         return self._run[1](**told)
 
     def plan(self, level: Float[Tensor, "batch #time"]) -> LevelPlan:

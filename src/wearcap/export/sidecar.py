@@ -18,7 +18,7 @@ from wearcap.models.denoiser import Conditions, MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.pipelines.hmd2 import HMD2
 
-VERSION = 3
+VERSION = 4
 MAX_ERROR = 1e-4
 SCHEDULES = {cls.__name__: cls for cls in (CosineSchedule, LinearSchedule)}
 ROT6D = tuple(f"{column}{axis}" for column in "xy" for axis in "xyz")
@@ -40,13 +40,11 @@ class ConditionGraph(nn.Module):
         points_valid: Bool[Tensor, "batch time"] | None = None,
         image: Float[Tensor, "batch time image_feature"] | None = None,
         image_valid: Bool[Tensor, "batch time"] | None = None,
-        past: Float[Tensor, "batch time motion"] | None = None,
-        past_valid: Bool[Tensor, "batch time"] | None = None,
     ) -> Float[Tensor, "batch token width"]:
         none = head[..., :0]
         told = Conditions(
             head, none if points is None else points, valid if points_valid is None else points_valid,
-            none if image is None else image, valid if image_valid is None else image_valid, past, past_valid,
+            none if image is None else image, valid if image_valid is None else image_valid,
         )  # fmt: skip
         return self.net.encode(told, valid)
 
@@ -75,8 +73,7 @@ def export_hmd2(pipeline: HMD2, path: str | Path, format: str) -> dict[str, Expo
     normalizer = net.condition_encoder.normalizer
     noise = torch.randn(*shape, len(normalizer.scale), generator=random)
     conditions = {"head": normalizer.mean.cpu() + normalizer.scale.cpu() * noise, "valid": valid}
-    past_size = net.motion_size if net.past else 0
-    for name, size in (("points", net.points_size), ("image", net.image_size), ("past", past_size)):
+    for name, size in (("points", net.points_size), ("image", net.image_size)):
         if size:
             there = valid & (torch.rand(shape, generator=random) < 0.7)
             conditions |= {name: torch.randn(*shape, size, generator=random), f"{name}_valid": there}
@@ -135,8 +132,9 @@ def describe(pipeline: HMD2, reports: dict[str, ExportReport]) -> dict:
             "eta": pipeline.eta,
             "spacing": pipeline.spacing,
             "guidance": pipeline.guidance,
-            "memory": pipeline.memory,
+            "hold": pipeline.hold,
             "fade": pipeline.fade,
+            "lookahead": pipeline.lookahead,
             "live": pipeline.live,
             "use": list(pipeline.use),
         },
@@ -150,7 +148,6 @@ def describe(pipeline: HMD2, reports: dict[str, ExportReport]) -> dict:
         "points_size": net.points_size,
         "image_size": net.image_size,
         "self_conditioning": net.self_conditioning,
-        "past": net.past,
         "image_encoder": pipeline.image_encoder,
         "grid": None if pipeline.place_encoder is None else asdict(pipeline.place_encoder.grid),
         "skeleton": skeleton_to_json(pipeline.skeleton),

@@ -64,9 +64,6 @@ class Conditions(NamedTuple):
     image: Float[Tensor, "batch time image_feature"]
     """Embedding of the head camera's picture; no columns for a network without images."""
     image_valid: Bool[Tensor, "batch time"]
-    past: Float[Tensor, "batch time motion"] | None = None
-    """Motion that is said already, normalised; None for a network that does not look at it, or where there is none."""
-    past_valid: Bool[Tensor, "batch time"] | None = None
 
 
 class Widening(nn.Conv1d):
@@ -109,8 +106,7 @@ class ConditionEncoder(nn.Module):
     """
 
     def __init__(
-        self, head_size: int, points_size: int, image_size: int, past_size: int, width: int, frames_per_token: int,
-        context: int,
+        self, head_size: int, points_size: int, image_size: int, width: int, frames_per_token: int, context: int
     ):  # fmt: skip
         super().__init__()
         # One more channel says which frames exist: padding would else look like the mean condition.
@@ -118,7 +114,6 @@ class ConditionEncoder(nn.Module):
         self.widen = Widening(head_size + 1, 2 * width, frames_per_token, context)
         self.points = OptionalInput(points_size, 2 * width, frames_per_token) if points_size else None
         self.image = OptionalInput(image_size, 2 * width, frames_per_token) if image_size else None
-        self.past = OptionalInput(past_size, 2 * width, frames_per_token) if past_size else None
         self.narrow = nn.Linear(2 * width, width)
 
     def forward(
@@ -131,11 +126,6 @@ class ConditionEncoder(nn.Module):
             wide = wide + self.points(conditions.points, conditions.points_valid & valid)
         if self.image is not None:
             wide = wide + self.image(conditions.image, conditions.image_valid & valid)
-        if self.past is not None:
-            past, there = conditions.past, conditions.past_valid
-            if past is None or there is None:
-                past, there = self.past.null.expand(*valid.shape, -1), torch.zeros_like(valid)
-            wide = wide + self.past(past, there & valid)
         return self.narrow(F.gelu(wide))
 
 
@@ -183,8 +173,7 @@ class MotionDenoiser(nn.Module):
     leaves open. The condition's part, `encode`, is the same in every step of sampling and computed once.
     `frames_per_token` > 1 is ours: neighbouring frames share a token, which cuts the cost of a window about as many
     times; `blend` > 0 (ours too) mixes that many neighbouring frames of x̂0, which removes the seams between tokens and
-    most of an unfinished network's jitter; `past` shows it what earlier windows have said, beside the conditions, so that
-    it goes on from there instead of finding it among the noise. `self_conditioning` (Chen et al. 2023) shows the network its last x̂0.
+    most of an unfinished network's jitter. `self_conditioning` (Chen et al. 2023) shows the network its last x̂0.
     """
 
     def __init__(
@@ -203,7 +192,6 @@ class MotionDenoiser(nn.Module):
         points_size: int = 0,
         image_size: int = 0,
         self_conditioning: bool = False,
-        past: bool = False,
     ):
         """`points_size` and `image_size` 0 leave a modality out; else one network runs with and without it."""
         super().__init__()
@@ -212,16 +200,10 @@ class MotionDenoiser(nn.Module):
         self.window, self.frames_per_token = window, frames_per_token
         self.motion_size, self.condition_size = motion_size, condition_size
         self.points_size, self.image_size = points_size, image_size
-        self.self_conditioning, self.past = self_conditioning, past
+        self.self_conditioning = self_conditioning
         self.motion_normalizer = Normalizer(motion_size)
         self.condition_encoder = ConditionEncoder(
-            condition_size,
-            points_size,
-            image_size,
-            motion_size if past else 0,
-            width,
-            frames_per_token,
-            context,
+            condition_size, points_size, image_size, width, frames_per_token, context
         )
         self.motion_encoder = MotionEncoder(
             motion_size * (2 if self_conditioning else 1), width, frames_per_token

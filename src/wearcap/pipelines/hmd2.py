@@ -24,7 +24,7 @@ from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.models.denoiser import Conditions, MotionDenoiser
 from wearcap.models.denoiser_runtime import StepRunner
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.pipelines.hmd2_windows import Frames, Poses, WindowSampler, advance
+from wearcap.pipelines.hmd2_windows import Frames, Poses, WindowSampler, advance, unsaid
 from wearcap.recording import Motion, Recording
 from wearcap.scene.voxels import voxelize
 
@@ -72,7 +72,7 @@ class HMD2:
     """Modalities that are listened to, of those that the network knows and a recording has."""
     steps: int = 20
     stride: int | None = None
-    """Frames by which windows advance; None: three quarters of a window (180 of the document's 240)."""
+    """Frames by which windows advance; None: half a window, or with `hold` three quarters (the document's 180 of 240)."""
     eta: float = 1.0
     guidance: float = 1.0
     """Classifier-free guidance by points and images (Ho & Salimans 2022; ours): 1 leaves it out."""
@@ -80,10 +80,13 @@ class HMD2:
     """Whether even the floor is told only from what has been sensed by then, as it must be in a stream."""
     spacing: float = 1.0
     """How the steps' levels are spaced (`diffusion.sampler.step_levels`)."""
-    memory: int | None = None
-    """Frames of what it has said that a window goes on from; None: all that it holds, as in the document."""
-    fade: int = 0
-    """Frames over which a window leaves what the one before it said (`diffusion.sampler.joined`)."""
+    hold: bool = False
+    """Whether windows hold on to what was said before in every step (thesis eq. 6.5) or say it anew (ours)."""
+    fade: int = 20
+    """Frames over which what windows differ by fades out where one goes on from the other (without `hold`)."""
+    lookahead: int | None = None
+    """Frames that must follow a pose before it is final (ours): what comes next says what the feet are about to do.
+    None: half of what windows share, so that poses come from their middle; with `hold` none."""
     runtime: str = "eager"
     """What the steps run on (`models.denoiser_runtime.RUNTIMES`); all but eager take some seconds to begin."""
     precision: str = "auto"
@@ -98,11 +101,22 @@ class HMD2:
     @property
     def advance(self) -> int:
         """Frames by which windows advance. Raises WearcapError when the windows would not touch."""
-        advance = 3 * self.net.window // 4 if self.stride is None else self.stride
-        if not 0 < advance <= self.net.window:
-            raise WearcapError(f"windows of {self.net.window} frames cannot advance by {advance}",
-                               expected=f"a stride from 1 to {self.net.window}")  # fmt: skip
+        window = self.net.window
+        advance = (3 * window // 4 if self.hold else window // 2) if self.stride is None else self.stride
+        if not 0 < advance <= window:
+            raise WearcapError(f"windows of {window} frames cannot advance by {advance}",
+                               expected=f"a stride from 1 to {window}")  # fmt: skip
         return advance
+
+    @property
+    def waiting(self) -> int:
+        """Frames at a window's end that are said again. Raises WearcapError where windows do not share as many."""
+        shared = self.net.window - self.advance
+        waiting = (0 if self.hold else shared // 2) if self.lookahead is None else self.lookahead
+        if not 0 <= waiting <= shared:
+            raise WearcapError(f"windows that share {shared} frames cannot look {waiting} ahead",
+                               expected=f"a lookahead from 0 to {shared}")  # fmt: skip
+        return waiting
 
     def __call__(self, recording: Recording, seed: int = 0) -> Motion:
         return self.capture([recording], [seed])[0]
@@ -223,29 +237,29 @@ class HMD2:
 
     def _windows(self, paths: list[HeadPath], frames: list[Frames], seeds: Sequence[int]) -> list[Poses]:
         """Poses of every path: its stretches side by side, window after window."""
-        stride, joints = self.advance, self.features.joints
-        done = [
-            Poses(
-                torch.eye(3).repeat(len(path.timestamps), joints, 1, 1), torch.zeros(len(path.timestamps), 2)
-            )
-            for path in paths
-        ]
+        stride, waiting, passed = self.advance, self.waiting, 0
+        done = [unsaid(self, len(path.timestamps)) for path in paths]
         lanes = [
             (i, start, stop, self.sampler(path.skeleton, seeds[i], start))
             for i, path in enumerate(paths)
             for start, stop in path.stretches
         ]
-        passed = 0
         while lanes:
-            fresh = [_cut(frames[i], start + passed, stop, stride) for i, start, stop, _ in lanes]
-            said = advance([sampler for *_, sampler in lanes], fresh)
-            for (i, start, stop, _), given in zip(lanes, said):
-                new = slice(start + passed, min(start + passed + stride, stop))
-                for whole, part in zip(done[i], given):
-                    whole[new] = part[0, : new.stop - new.start]
+            advance(
+                [sampler for *_, sampler in lanes],
+                [_cut(frames[i], start + passed, stop, stride) for i, start, stop, _ in lanes],
+            )
             passed += stride
+            for i, start, stop, sampler in lanes:
+                ended = start + passed >= stop
+                left = 0 if ended else waiting
+                given, behind = sampler.give(left), min(start + passed, stop) - left
+                for whole, part in zip(done[i], given.poses):
+                    whole[0, behind - part.shape[1] : behind] = part[0]
             lanes = [lane for lane in lanes if lane[1] + passed < lane[2]]
-        return [_bridged(poses, path.stretches) for poses, path in zip(done, paths)]
+        return [
+            _bridged(Poses(*(part[0] for part in poses)), path.stretches) for poses, path in zip(done, paths)
+        ]
 
     def sampler(self, skeleton: Skeleton, seed: int, start: int) -> WindowSampler:
         """Windows of a stretch that begins at frame `start`; stretches of one recording have noise of their own."""
@@ -260,6 +274,7 @@ class HMD2:
             "steps": str(self.steps),
             "stride": str(self.advance),
             "eta": str(self.eta),
+            "lookahead": str(self.waiting),
         }
         contact = poses.foot_contact.repeat_interleave(2, -1) if self.features.contacts else None
         motion = Motion(

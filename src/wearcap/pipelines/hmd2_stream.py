@@ -68,6 +68,8 @@ class _Lane:
         grid = VoxelGrid() if pipeline.place_encoder is None else pipeline.place_encoder.grid
         self.places = Places(grid, wearer.skeleton.height_of("head"), pipeline.fps, memory)
         self.sampler: WindowSampler | None = None
+        self.times = torch.zeros(0, dtype=torch.float64)
+        """Of the frames that are said and not given yet."""
         self.pictures: list[tuple[float, Tensor]] = []
         """Time and embedding (NaN where it was not finite) of the newest that was used, and of those to come."""
         self.floors: list[tuple[float, float]] = []
@@ -122,12 +124,22 @@ class _Lane:
         self.floors = self.floors[_newest(known, times[-1].item()) :]
         return interpolate(known, height.float(), times)
 
+    def give(self, waiting: int) -> list[Motion]:
+        """The poses that wait, but for the last `waiting` frames; none or one motion."""
+        if self.sampler is None or len(self.times) <= waiting:
+            return []
+        poses, T_world_head = self.sampler.give(waiting)
+        times, self.times = self.times.tensor_split([len(T_world_head.t)])
+        poses = Poses(*(part[0] for part in poses))
+        return [self.pipeline.motion(times, self.wearer.skeleton, T_world_head, poses)]
+
     def state(self) -> dict[str, Tensor]:
         shown, pictures = zip(*self.pictures) if self.pictures else ((), ())
         parts = {
             "track": self.track.state(),
             "places": self.places.state(),
             "sampler": self.sampler.state() if self.sampler is not None else {},
+            "waiting": {"times": self.times},
             "pictures": {
                 "time": torch.tensor(shown, dtype=torch.float64),
                 "embedding": torch.stack(pictures)
@@ -145,6 +157,7 @@ class _Lane:
             parts.setdefault(part, {})[name] = value
         self.track.restore(parts["track"])
         self.places.restore(parts["places"])
+        self.times = parts["waiting"]["times"]
         if "sampler" in parts:
             self.sampler = WindowSampler.restored(self.pipeline, parts["sampler"])
         self.pictures = list(zip(parts["pictures"]["time"].tolist(), parts["pictures"]["embedding"]))
@@ -154,7 +167,8 @@ class _Lane:
 class Session:
     """A streaming capture of one or several wearers with one pipeline; each has a clock of their own.
 
-    Poses wait until `stride` frames have come. Moments may come late or out of order within those frames; later ones
+    Poses wait until `stride` frames, and the `waiting` ones behind them, have come; what waits at a gap is given with what
+    comes behind it. Moments may come late or out of order within those frames; later ones
     count as `dropped` (their points and pictures still serve). A pose that is missing or not finite is interpolated;
     at a chunk's end, where no newer one is known yet, the last is held, and put right for the windows that follow.
     After a gap or jump (`hmd2.MAX_GAP_S`, `MAX_SPEED_M_S`) the capture begins anew, and nothing is said of the gap.
@@ -195,36 +209,33 @@ class Session:
 
     def _run(self, ended: bool) -> list[Motion | None]:
         said: list[list[Motion]] = [[] for _ in self._lanes]
-        while True:
-            chunks = {i: chunk for i, lane in enumerate(self._lanes) if (chunk := lane.track.next(ended))}
-            if not chunks:
-                return [_joined(parts) for parts in said]
+        while chunks := {i: chunk for i, lane in enumerate(self._lanes) if (chunk := lane.track.next(ended))}:
+            for i, chunk in chunks.items():
+                if chunk.begins:
+                    said[i] += self._lanes[i].give(0)
             with self.pipeline.undisturbed():
-                motions = self._advance(chunks)
-            for i, motion in motions.items():
-                said[i].append(motion)
+                self._advance(chunks)
+            for i in chunks:
+                said[i] += self._lanes[i].give(self.pipeline.waiting)
+        for parts, lane in zip(said, self._lanes):
+            parts += lane.give(0) if ended else []
+        return [_joined(parts) for parts in said]
 
     @torch.inference_mode()
-    def _advance(self, chunks: dict[int, Chunk]) -> dict[int, Motion]:
-        """Poses of one chunk of some wearers, in one batch."""
-        samplers, fresh, heads = [], [], []
+    def _advance(self, chunks: dict[int, Chunk]) -> None:
+        """Say one chunk of some wearers, in one batch."""
+        samplers, fresh = [], []
         for i, chunk in chunks.items():
             lane = self._lanes[i]
             T_device_head = Rigid(lane.wearer.R_head_device, lane.wearer.t_head_device).inverse()
-            heads.append(chunk.T_world_device @ T_device_head)
-            fresh.append(lane.frames(chunk, heads[-1]))
+            fresh.append(lane.frames(chunk, chunk.T_world_device @ T_device_head))
+            lane.times = torch.cat([lane.times, chunk.timestamps])
             if chunk.begins or lane.sampler is None:
                 lane.sampler = self.pipeline.sampler(lane.wearer.skeleton, lane.seed, chunk.first)
             elif len(chunk.amended.t):
                 lane.sampler.amend(chunk.amended @ T_device_head)
             samplers.append(lane.sampler)
-        motions = {}
-        for (i, chunk), poses, T_world_head in zip(chunks.items(), advance(samplers, fresh), heads):
-            new = Poses(*(part[0, : len(chunk.timestamps)] for part in poses))
-            motions[i] = self.pipeline.motion(
-                chunk.timestamps, self._lanes[i].wearer.skeleton, T_world_head, new
-            )
-        return motions
+        advance(samplers, fresh)
 
     def save(self, path: str | Path) -> None:
         """Write everything that the poses to come depend on, but the pipeline (.safetensors)."""
@@ -273,7 +284,7 @@ def _settings(pipeline: HMD2) -> dict[str, float | str]:
     net = pipeline.net
     return {
         "window": net.window, "stride": pipeline.advance, "steps": pipeline.steps, "fps": pipeline.fps,
-        "memory": str(pipeline.memory), "fade": pipeline.fade,
+        "hold": pipeline.hold, "fade": pipeline.fade, "lookahead": pipeline.waiting,
         "eta": pipeline.eta, "spacing": pipeline.spacing, "motion_size": net.motion_size, "points_size": net.points_size, "image_size": net.image_size,
         "features": str(pipeline.features),
     }  # fmt: skip

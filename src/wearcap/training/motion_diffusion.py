@@ -20,8 +20,8 @@ from wearcap.models.denoiser import Conditions, MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.training import losses
 
-_OWN_LEVELS = (1.0, 0.5)
-"""Noise levels of the two steps in which a network makes up a past while it is trained."""
+_TAIL_FRAMES = 20
+"""Within which the weight of a window's last frames falls off."""
 
 
 class MotionDiffusion(lightning.LightningModule):
@@ -31,8 +31,7 @@ class MotionDiffusion(lightning.LightningModule):
     with a density that grows with the level to the power of `level_tilt`: 0 draws them uniformly, as the document does;
     more (ours) trains what sampling in few steps depends on, the way from noise to a first guess. Points and images are
     each replaced by their null token in a share `drop` of the windows, so that one checkpoint runs with any of them.
-    A network that sees its past (ours) is shown one in a share `recall` of them, off by what its own answers are off
-    by, and what is new behind it weighs more.
+    A window's last frames weigh up to 1 + `tail` in the loss (ours): in small strides they are what is said.
     """
 
     def __init__(
@@ -47,7 +46,7 @@ class MotionDiffusion(lightning.LightningModule):
         scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
         level_tilt: float = 0.0,
         drop: float = 0.0,
-        recall: float = 0.5,
+        tail: float = 0.0,
         place_encoder: VoxelAutoencoder | None = None,
         image_encoder: str | None = None,
         image_size: int = 0,
@@ -62,8 +61,7 @@ class MotionDiffusion(lightning.LightningModule):
             points_size=place_encoder.size if place_encoder else 0, image_size=image_size if image_encoder else 0,
         )  # fmt: skip
         self.place_encoder = None if place_encoder is None else place_encoder.requires_grad_(False).eval()
-        self.image_encoder, self.drop = image_encoder, drop
-        self.recall = recall if self.net.past else 0.0
+        self.image_encoder, self.drop, self.tail = image_encoder, drop, tail
         self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
         self.loss_weights, self.level_tilt, self.seed = dict(loss_weights), level_tilt, seed
         self._optimizer, self._scheduler = optimizer, scheduler
@@ -116,13 +114,7 @@ class MotionDiffusion(lightning.LightningModule):
 
     def _predicted(self, batch: Window, x0: Tensor) -> Tensor:
         """x̂0 of a batch in normalised motion space; with self-conditioning, after a first guess in half the windows."""
-        conditions = self.conditions(batch)
-        if self.recall:
-            known, past = self._known(batch), self._past(batch, x0, conditions)
-            conditions = conditions._replace(past=past, past_valid=known)
-            # As in sampling, where x̂0 is overwritten by what is known.
-            x0 = torch.where(known[..., None], past, x0)
-        encoded = self._encode(conditions, batch.valid)
+        encoded = self._encode(self.conditions(batch), batch.valid)
         level = batch.level ** (1 / (1 + self.level_tilt))
         x_t = add_noise(x0, batch.noise[..., : x0.shape[-1]], level, self.schedule)
         if not self.net.self_conditioning:
@@ -132,39 +124,14 @@ class MotionDiffusion(lightning.LightningModule):
         told = guess * (batch.chance[:, 2] < 0.5)[:, None, None]
         return self._denoise(x_t, level, encoded, batch.valid, told)
 
-    def _known(self, batch: Window) -> Bool[Tensor, "batch time"]:
-        """Which frames count as said already: up to a seam that is often late, in half the windows from a frame on."""
-        recall, seam, length = batch.chance[:, 3:6, None].unbind(1)
-        end = (batch.valid.sum(1, keepdim=True) * (1 - seam**2)).long()
-        begin = end - (end * (2 - 2 * length).clamp_max(1) ** 2).ceil().long()
-        number = torch.arange(batch.valid.shape[1], device=end.device)
-        return (recall < self.recall) & (number >= begin) & (number < end)
-
-    @torch.no_grad()
-    def _past(self, batch: Window, x0: Tensor, conditions: Conditions) -> Float[Tensor, "batch time motion"]:
-        """The true past led towards what the network says of the window in two steps, in a third of the windows all the
-        way: one that was off by slow noise instead was trusted too much, and captures in small strides drifted."""
-        encoded, noise = self._encode(conditions, batch.valid), batch.noise[..., : x0.shape[-1]].flip(1)
-        said = noise
-        for level in _OWN_LEVELS:
-            level = torch.full_like(batch.level, level)
-            said = self._denoise(add_noise(said, noise, level, self.schedule), level, encoded, batch.valid)
-        return x0 + (1.5 * batch.chance[:, 6, None, None]).clamp_max(1) * (said - x0)
-
-    def _weight(self, batch: Window) -> Float[Tensor, "batch time"]:
-        """Of each frame in the loss: valid ones count, and more behind a seam, the fewer they are."""
-        valid = batch.valid.float()
-        if not self.recall:
-            return valid
-        known = self._known(batch)
-        number = torch.arange(known.shape[1], device=known.device)
-        new = batch.valid & (number > (number * known).amax(1, keepdim=True)) & known.any(1, keepdim=True)
-        share = new.sum(1, keepdim=True) / batch.valid.sum(1, keepdim=True).clamp_min(1)
-        return torch.where(new, share.clamp_min(1 / known.shape[1]).rsqrt(), valid)
+    def _weight(self, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch time"]:
+        """Of each frame in the loss; none for padding."""
+        left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
+        return valid * (1 + self.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
 
     def terms(self, batch: Window) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
-        weight = self._weight(batch)
+        weight = self._weight(batch.valid)
         motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
         x0 = self.net.motion_normalizer(motion)
         x0_hat = self._predicted(batch, x0)

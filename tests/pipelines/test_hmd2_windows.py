@@ -1,0 +1,78 @@
+"""HMD²'s windows: noise belongs to frames, what is final stays, what differs fades out."""
+
+import pytest
+import torch
+from test_hmd2 import pipeline, seeing_recording
+
+from wearcap.errors import WearcapError
+from wearcap.pipelines.hmd2 import head_path
+from wearcap.pipelines.hmd2_windows import Frames, advance, joined
+
+
+def test_what_is_new_goes_on_from_what_is_known_and_fades_into_what_is_said():
+    torch.manual_seed(0)
+    x0_hat, known = torch.randn(3, 30, 4), torch.randn(3, 30, 4)
+    x0_hat[1], known[1] = 0.0, torch.arange(30.0)[:, None]
+    number = torch.arange(30)
+    is_known = torch.stack([number < 0, number < 10, number < 1])
+    whole = joined(x0_hat, known, is_known, 8)
+    assert torch.equal(whole[is_known], known[is_known])
+    assert torch.equal(whole[0], x0_hat[0]), "nothing is known"
+    assert torch.allclose(whole[:, 17:], x0_hat[:, 17:], atol=1e-6)
+    assert torch.allclose(whole[2, 8:], x0_hat[2, 8:], atol=1e-6), "one frame has no slope"
+    steps = whole[1, 8:19, 0].diff()
+    assert steps[0] == pytest.approx(1.0)
+    assert 0.3 < steps[1] < 1.0, "it goes on as it went, and turns back"
+    assert steps.diff().abs().max() < 1.1, "without a kink, on a way of nine in eight frames"
+    step = joined(x0_hat, known, is_known, 0)
+    assert torch.equal(step, torch.where(is_known[..., None], known, x0_hat))
+
+
+def windows(hmd2, frames: int, stride: int):
+    """The sampler of a recording, window after window."""
+    recording = seeing_recording(frames)
+    path = head_path(recording, hmd2.skeleton, hmd2.fps)
+    hmd2.prepare()
+    told, sampler = hmd2.sense(recording, path), hmd2.sampler(path.skeleton, 0, 0)
+    for start in range(0, frames, stride):
+        advance([sampler], [Frames(*(part[:, start : start + stride] for part in told))])
+        yield sampler
+
+
+def test_every_window_sees_the_same_noise_at_the_same_moment():
+    last = None
+    for sampler in windows(pipeline(), 120, 10):
+        assert sampler.count <= 60
+        if last is not None:
+            moved = last.shape[1] + 10 - sampler.count
+            assert torch.equal(sampler.noise[:, : last.shape[1] - moved], last[:, moved:])
+        last = sampler.noise
+    assert last is not None
+    assert last.std() == pytest.approx(1.0, abs=0.02)
+
+
+def test_what_is_final_stays_and_what_waits_is_said_again():
+    given, waited = [], []
+    for sampler in windows(pipeline(fade=8), 100, 10):
+        poses = sampler.give(20).poses.R_parent_joint[0]
+        if len(poses):
+            final = sampler.given
+            assert torch.equal(sampler.said.R_parent_joint[0, final - len(poses) : final], poses)
+            held = torch.cat([*given, poses])[-final:]
+            assert torch.equal(sampler.said.R_parent_joint[0, final - len(held) : final], held)
+        given.append(poses)
+        waited.append(sampler.said.R_parent_joint[0, sampler.given :])
+    assert len(torch.cat(given)) == 80
+    assert not torch.allclose(waited[-2][10:], waited[-1][:10], atol=1e-5)
+
+
+def test_windows_do_not_look_further_ahead_than_they_share():
+    with pytest.raises(WearcapError, match="windows that share 20 frames cannot look 21 ahead"):
+        pipeline(lookahead=21)(seeing_recording(80))
+
+
+def test_strides_and_lookahead_follow_from_the_window():
+    hmd2 = pipeline(hold=True, stride=None)
+    assert (hmd2.advance, hmd2.waiting) == (45, 0)
+    anew = pipeline(stride=None)
+    assert (anew.advance, anew.waiting) == (30, 15)
