@@ -11,7 +11,7 @@ from wearcap.cli.load import load_pipeline, load_realism
 from wearcap.metrics.table import Row, Summary, aggregate
 from wearcap.pipelines.baselines import MeanPose, NearestWindow
 from wearcap.pipelines.evaluation import evaluate, score
-from wearcap.recording import RecordingStore
+from wearcap.recording import Motion, Recording, RecordingStore
 
 BASELINES = {"mean pose": MeanPose, "nearest window": NearestWindow}
 STRIDE_S = 0.5
@@ -63,12 +63,37 @@ def run_method(method: Method, case: Case) -> Result:
         if "pipeline=pose_regressor" in method.pipeline:
             seeds = seeds[:1]
     realism = None if case.realism is None else load_realism(case.realism, STRIDE_S)
-    measure = score if realism is None else realism.beside(score, method.name)
+    measure = scored if realism is None else realism.beside(scored, method.name)
     rows = list(evaluate(pipeline, store, case.names, seeds, lanes=8, measure=measure))
     scores = aggregate(rows)
     if realism is not None:
         scores |= realism.scores(method.name)
     return Result(method.name, scores, _by_activity(rows, store))
+
+
+def scored(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
+    """`score`, and how much more it jerks where windows meet than elsewhere."""
+    row = score(motion, recording, name, seed)
+    if (ratio := seam_ratio(motion)) is not None:
+        row.scores["seam_ratio"] = ratio
+    return row
+
+
+def seam_ratio(motion: Motion) -> float | None:
+    """Third difference of joint positions where frames of two windows meet, as a share of that between; None without either.
+
+    The first four seconds, in which windows grow, are left out.
+    """
+    if "stride" not in motion.provenance:
+        return None
+    stride, waiting = (int(motion.provenance[key]) for key in ("stride", "lookahead"))
+    jerk = motion.T_world_joint.t.diff(dim=0, n=3).norm(dim=-1).mean(-1)
+    phase = (torch.arange(len(jerk)) + waiting) % stride
+    grown = torch.arange(len(jerk)) >= 240
+    seam = phase >= stride - 3
+    if stride < 6 or not (grown & seam).any():
+        return None
+    return (jerk[grown & seam].mean() / jerk[grown & ~seam].mean()).item()
 
 
 def _by_activity(rows: list[Row], store: RecordingStore) -> dict[str, dict[str, Summary]]:

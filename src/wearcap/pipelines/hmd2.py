@@ -70,7 +70,7 @@ class HMD2:
     """Name of the encoder whose embeddings the network was trained on."""
     use: Sequence[str] = MODALITIES
     """Modalities that are listened to, of those that the network knows and a recording has."""
-    steps: int = 20
+    steps: int = 5
     stride: int | None = None
     """Frames by which windows advance; None: half a window, or with `hold` three quarters (the document's 180 of 240)."""
     eta: float = 1.0
