@@ -99,13 +99,8 @@ class Streamed:
         self.seconds.append(time.perf_counter() - begin)
 
     def fill(self) -> "Streamed":
-        """Until windows are full (a step each is enough for that), and what is compiled is."""
-        pipeline = self.session.pipeline
-        steps, pipeline.steps = pipeline.steps, 1
-        while self.number < pipeline.net.window:
-            self.step()
-        pipeline.steps = steps
-        for _ in range(3):
+        """Until windows are full, and what is compiled is."""
+        while self.number < self.session.pipeline.net.window + 3 * self.stride:
             self.step()
         self.seconds.clear()
         return self

@@ -3,7 +3,8 @@
 In the document a window overwrites what was said already in every step of its denoising. In small strides its own errors
 then lead it astray. Ours (`hold` off) says the whole window anew from the same noise, which belongs to the frames and
 moves along with them: what windows say of the same moment agrees but for what they have learned since, and that
-difference fades out over a few frames. Captures of whole recordings and streaming captures both go through here, so that with the same noise they are the same.
+difference fades out over a few frames. Captures of whole recordings and streams both go through here, so that with the
+same noise they are the same.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
