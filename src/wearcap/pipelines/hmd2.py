@@ -140,9 +140,11 @@ class HMD2:
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
         """One motion per (recording, seed); recordings share batches, which changes nothing but the time."""
         self.prepare()
-        # 1. head path and floor; 2. points around the body as codes; 3. pictures as embeddings
-        paths = [head_path(recording, self.skeleton, self.fps) for recording in recordings]
-        frames = [self.sense(recording, path) for recording, path in zip(recordings, paths)]
+        # 1. head path and floor; 2. points around the body as codes; 3. pictures as embeddings; once for all seeds
+        once = {id(recording): recording for recording in recordings}
+        path_of = {key: head_path(recording, self.skeleton, self.fps) for key, recording in once.items()}
+        sensed = {key: self.sense(recording, path_of[key]) for key, recording in once.items()}
+        paths, frames = zip(*((path_of[id(recording)], sensed[id(recording)]) for recording in recordings))
         # 4. windows of the diffusion model, each stretch of a path by itself
         poses = self._windows(paths, frames, seeds)
         # 5. the body hangs from the measured head
@@ -235,7 +237,9 @@ class HMD2:
 
         return denoise
 
-    def _windows(self, paths: list[HeadPath], frames: list[Frames], seeds: Sequence[int]) -> list[Poses]:
+    def _windows(
+        self, paths: Sequence[HeadPath], frames: Sequence[Frames], seeds: Sequence[int]
+    ) -> list[Poses]:
         """Poses of every path: its stretches side by side, window after window."""
         stride, waiting, passed = self.advance, self.waiting, 0
         done = [unsaid(self, len(path.timestamps)) for path in paths]
