@@ -20,7 +20,7 @@ class _Loop(StepRunner):
     """A sampler's loop as one writes it first: the whole network at each step."""
 
     def __init__(self, net, levels):
-        self.net, self.levels = net, levels
+        self.net, self.levels, self.runtime = net, levels, "eager"
 
     def __call__(self, number, x_t, encoded, valid, last=None):
         return self.net(x_t, self.levels[number].expand(len(x_t), 1), encoded, valid, last)
