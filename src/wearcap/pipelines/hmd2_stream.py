@@ -177,13 +177,13 @@ class Session:
     def __init__(
         self, pipeline: HMD2, wearers: Sequence[Wearer], seeds: Sequence[int], memory: Memory | None = None
     ):
-        """Raises WearcapError when there is not one seed per wearer, or for a stride that the windows cannot have."""
+        """Raises WearcapError when there is not one seed per wearer, or for a stride or lookahead that the windows cannot have."""
         if len(wearers) != len(seeds) or not wearers:
             raise WearcapError(
                 f"{len(seeds)} seeds for {len(wearers)} wearers", expected="one for each wearer"
             )
         pipeline.prepare()
-        self.pipeline, self.memory = pipeline, memory or Memory()
+        self.pipeline, self.memory, self._waiting = pipeline, memory or Memory(), pipeline.waiting
         self._lanes = [_Lane(pipeline, wearer, seed, self.memory) for wearer, seed in zip(wearers, seeds)]
 
     @property
@@ -216,7 +216,7 @@ class Session:
             with self.pipeline.undisturbed():
                 self._advance(chunks)
             for i in chunks:
-                said[i] += self._lanes[i].give(self.pipeline.waiting)
+                said[i] += self._lanes[i].give(self._waiting)
         for parts, lane in zip(said, self._lanes):
             parts += lane.give(0) if ended else []
         return [_joined(parts) for parts in said]
