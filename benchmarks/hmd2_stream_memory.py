@@ -25,18 +25,8 @@ def measure(minutes: int = 60, settle: int = 10, max_points: int = 100_000) -> l
     features = HeadFeatures(contacts=True, body=True)
     net = MotionDenoiser(features.motion_size, features.condition_size, 240, 32, 1, 2, 64, frames_per_token=4,
                          points_size=VoxelAutoencoder().size, image_size=8)  # fmt: skip
-    pipeline = HMD2(
-        net,
-        features,
-        CosineSchedule(),
-        xsens23(),
-        60.0,
-        VoxelAutoencoder(),
-        "any",
-        steps=1,
-        stride=60,
-        lookahead=0,
-    )
+    pipeline = HMD2(net, features, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any",
+                    steps=1, stride=60, lookahead=0)  # fmt: skip
     session = Session(pipeline, [Wearer(xsens23())], [0], Memory(max_points=max_points))
     walk, early, said = Walk(pipeline, new_points=10, forever=True), 0.0, 0
     for second in range(60 * minutes):

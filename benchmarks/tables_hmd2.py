@@ -140,7 +140,7 @@ def _ours(options: argparse.Namespace, name: str, *overrides: str, pipeline: str
 def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
     """A stride of Table 6.5 as in the document, and as ours, in as many steps."""
     ahead = min(LOOKAHEAD, 240 - h)
-    both = (f"pipeline.stride={h}", "pipeline.steps=5", "pipeline.live=true", "pipeline.runtime=auto")
+    both = (f"pipeline.stride={h}", "pipeline.steps=5", "pipeline.live=true")
     return [
         _ours(options, f"h = {h}, the document's", *both, pipeline="hmd2_document"),
         _ours(options, f"h = {h}", *both, "pipeline.fade=10", "pipeline.lookahead=0"),

@@ -1,5 +1,6 @@
 """The training module: which noise levels the network sees, and what its losses compare."""
 
+import pytest
 import torch
 from torch import nn
 
@@ -54,3 +55,22 @@ def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_pat
         assert terms["motion"] < 1e-9
         assert terms["velocity"] < 1e-6
         assert terms["joints"] < 2e-3  # the distance's own smallest value
+
+
+def test_the_last_frames_that_exist_weigh_more_by_the_tail(tmp_path):
+    store = small_dataset(tmp_path)
+    windows = WindowDataset([Source(str(store.root))], "train", window=60, stride=30, fps=60.0)
+    batch = collate([windows[(0, 0)]])
+    batch = batch._replace(valid=torch.arange(60)[None] < 50)
+    module = system(batch, 0.0)
+    truth = module.net.answer
+
+    def cost(frame: int, tail: float) -> float:
+        module.tail = tail
+        module.net.answer = truth + 0.1 * (torch.arange(60) == frame)[None, :, None]
+        return module.terms(batch)["motion"].item()
+
+    assert cost(0, 0.0) == pytest.approx(cost(49, 0.0), rel=1e-4)
+    assert cost(49, 3.0) == pytest.approx(4 * cost(49, 0.0), rel=1e-4)
+    assert cost(0, 3.0) < 1.3 * cost(0, 0.0)
+    assert cost(55, 3.0) == pytest.approx(0.0, abs=1e-9)
