@@ -132,7 +132,7 @@ def test_the_export_runs_on_a_recording_without_lightning(learned, data, tmp_pat
 
 
 def test_a_contact_checkpoint_is_no_motion_denoiser(learned):
-    with pytest.raises(WearcapError, match="needs a motion denoiser"):
+    with pytest.raises(WearcapError, match="HMD2 cannot run ContactDetection"):
         load_pipeline(learned, compose("capture", ["recording=x", "paths.run=x"]).pipeline, "cpu")
 
 

@@ -58,7 +58,7 @@ def test_its_checkpoint_measures_realism_and_nothing_else(checkpoint):
     assert not realism.net.training
     assert (realism.net.frames, realism.stride) == (24, 20)
     config = compose("evaluate", ["pipeline=hmd2", "paths.run=x"])
-    with pytest.raises(WearcapError, match="needs a motion denoiser"):
+    with pytest.raises(WearcapError, match="HMD2 cannot run MotionEncoding"):
         load_pipeline(checkpoint, config.pipeline, "cpu")
 
 

@@ -124,7 +124,7 @@ def test_trained_evaluated_and_refused(data, tmp_path):
     evaluate.main([*common, "pipeline=pose_regressor", f"output={tmp_path}/table.json"])
     scores = json.loads((tmp_path / "table.json").read_text())["methods"]["wearcap"]
     assert 0 < scores["hand_pe_cm"]["mean"] < scores["mpjpe_cm"]["mean"] + 10
-    with pytest.raises(WearcapError, match="HMD2 needs a motion denoiser"):
+    with pytest.raises(WearcapError, match="HMD2 cannot run PoseRegression"):
         evaluate.main([*common, "pipeline=hmd2"])
 
 

@@ -1,4 +1,7 @@
-"""`wearcap calibrate`: a video or pictures of a checkerboard go in; a camera's intrinsics come out."""
+"""`wearcap calibrate`: a video or pictures of a checkerboard go in; a camera's intrinsics come out.
+
+`wearcap calibrate steps=watches` calibrates what MocapEvery's wearer has on: watches and head camera.
+"""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +16,10 @@ from wearcap.io.camera_json import write_camera
 from wearcap.io.pictures import read_pictures
 from wearcap.localization.checkerboard import Board, Calibration, calibrate_from_pictures
 
-HELP = "camera intrinsics from a checkerboard: wearcap calibrate source=VIDEO columns=9 rows=6 square_m=0.025"
+HELP = (
+    "camera intrinsics from a checkerboard: wearcap calibrate source=VIDEO columns=9 rows=6 square_m=0.025; "
+    "watches: wearcap calibrate steps=watches left=LEFT.csv right=RIGHT.csv --guide"
+)
 ENOUGH = 0.6
 """Coverage below which the user is told of it."""
 
@@ -67,4 +73,9 @@ def _tell(found: Calibration) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    hydra_main("calibrate", run, arguments)
+    if any(argument.startswith("steps=") for argument in arguments):
+        from wearcap.cli.calibrate_watches import main as watches
+
+        watches(arguments)
+    else:
+        hydra_main("calibrate", run, arguments)

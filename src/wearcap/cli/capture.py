@@ -8,19 +8,20 @@ from rich import print as show
 from rich.console import Console
 
 from wearcap.body.anny_body import anny_body
+from wearcap.body.retarget import retarget
+from wearcap.body.skeletons import smplh52
 from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import environment_of, load_pipeline, staged
+from wearcap.cli.load import LearnedPipeline, environment_of, load_pipeline, staged
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
+from wearcap.io.amass import write_amass
 from wearcap.io.bvh import write_bvh
 from wearcap.io.gltf import write_glb
 from wearcap.io.motion_npz import write_motion
 from wearcap.io.scan import read_scan
 from wearcap.io.scene_folder import cloud_file
-from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.hps import HPS
 from wearcap.pipelines.hps_stream import follow
-from wearcap.pipelines.pose_regressor import PoseRegressorCapture
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.locate import load_recording
@@ -41,7 +42,7 @@ def run(config: DictConfig) -> Motion | None:
     if config.live:
         return _live(pipeline, config, folder)
     recording = load_recording(config.recording)
-    if isinstance(pipeline, HMD2 | PoseRegressorCapture):
+    if isinstance(pipeline, LearnedPipeline):
         if config.samples < 1:
             raise WearcapError(f"samples={config.samples}", expected="at least 1")
         if config.until is not None or config.cache is not None:
@@ -70,6 +71,11 @@ def run(config: DictConfig) -> Motion | None:
 def _write(motion: Motion, recording: Recording, folder: Path, config: DictConfig) -> None:
     write_motion(motion, folder / "motion.npz")
     write_bvh(motion, folder / "motion.bvh")
+    if config.smpl:
+        target = smplh52()
+        R_parent_joint, root = retarget(motion.skeleton, target, motion.R_parent_joint, motion.t_world_root)
+        smpl = Motion(motion.timestamps, target, R_parent_joint, root)
+        write_amass(smpl, folder / "motion_smplh.npz")
     body = anny_body(motion.skeleton, recording.shape or None) if config.body else None
     write_glb(motion, folder / "motion.glb", body=body)
     if config.video:

@@ -8,15 +8,14 @@ from rich import print as show
 from rich.progress import Progress
 
 from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import load_pipeline, load_realism, staged, trained_on
+from wearcap.cli.load import LearnedPipeline, load_pipeline, load_realism, staged, trained_on
 from wearcap.errors import WearcapError
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, write_scores
 from wearcap.pipelines.baselines import MeanPose, NearestWindow
-from wearcap.pipelines.evaluation import Measure, Pipeline, evaluate, score
-from wearcap.pipelines.hmd2 import HMD2
+from wearcap.pipelines.evaluation import Measure, Pipeline, evaluate, score, score_in_world
 from wearcap.pipelines.ireplica import IReplica
 from wearcap.pipelines.ireplica_evaluation import with_interactions
-from wearcap.pipelines.pose_regressor import PoseRegressorCapture
+from wearcap.pipelines.mocap_every import MocapEvery
 from wearcap.pipelines.realism import Realism
 from wearcap.recording import RecordingStore
 
@@ -34,7 +33,7 @@ def run(config: DictConfig) -> Scores:
         given if given is None else [str(path) for path in checkpoints], config.pipeline, config.device
     )
     with Progress(transient=True) as progress:
-        if isinstance(pipeline, HMD2 | PoseRegressorCapture):
+        if isinstance(pipeline, LearnedPipeline):
             store, scores = _learned(checkpoints, config, progress)
         else:
             if config.dataset is None:
@@ -60,9 +59,10 @@ def _learned(checkpoints: list[str], config: DictConfig, progress: Progress) -> 
     rows: list[Row] = []
     for index, checkpoint in enumerate(checkpoints):
         pipeline = load_pipeline(checkpoint, config.pipeline, config.device)
-        assert isinstance(pipeline, HMD2 | PoseRegressorCapture)
+        assert isinstance(pipeline, LearnedPipeline)
         seeds = [index * 1000 + seed for seed in config.seeds]
-        title, measure = Path(checkpoint).parts[-3:][0], _beside(realism, OURS)
+        title = Path(checkpoint).parts[-3:][0]
+        measure = _beside(realism, OURS, score_in_world if isinstance(pipeline, MocapEvery) else score)
         rows += _rows(pipeline, store, seeds, config, progress, title, measure)
     scores: Scores = {OURS: _summaries(rows, realism, OURS)}
     if config.baselines:
@@ -73,8 +73,8 @@ def _learned(checkpoints: list[str], config: DictConfig, progress: Progress) -> 
     return store, scores
 
 
-def _beside(realism: Realism | None, method: str) -> Measure:
-    return score if realism is None else realism.beside(score, method)
+def _beside(realism: Realism | None, method: str, measure: Measure = score) -> Measure:
+    return measure if realism is None else realism.beside(measure, method)
 
 
 def _summaries(rows: list[Row], realism: Realism | None, method: str) -> dict[str, Summary]:

@@ -9,9 +9,11 @@ from wearcap.errors import WearcapError
 from wearcap.export.contact import export_contact
 from wearcap.export.network import ExportReport
 from wearcap.export.sidecar import export_hmd2
+from wearcap.export.watches import export_mocap_every
 from wearcap.models.checkpoint import share_checkpoint
 from wearcap.pipelines.contact_prediction import load_detector
 from wearcap.pipelines.hmd2 import HMD2
+from wearcap.pipelines.mocap_every import MocapEvery
 from wearcap.training.contact_detection import ContactDetection
 
 HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2|safetensors"
@@ -30,9 +32,12 @@ def run(config: DictConfig) -> dict[str, ExportReport]:
         reports = {"network": export_contact(load_detector(config.checkpoint), config.output, config.format)}
     else:
         pipeline = load_pipeline(config.checkpoint, config.pipeline, "cpu")
-        if not isinstance(pipeline, HMD2):
-            raise WearcapError("this pipeline has no network to export", where=config.checkpoint, expected="HMD²'s, such as pipeline=hmd2")  # fmt: skip
-        reports = export_hmd2(pipeline, config.output, config.format)
+        if isinstance(pipeline, HMD2):
+            reports = export_hmd2(pipeline, config.output, config.format)
+        elif isinstance(pipeline, MocapEvery):
+            reports = {"network": export_mocap_every(pipeline, config.output, config.format)}
+        else:
+            raise WearcapError("this pipeline has no network to export", where=config.checkpoint, expected="HMD²'s or MocapEvery's: pipeline=hmd2, pipeline=mocap_every")  # fmt: skip
     for name, report in reports.items():
         show(f"exported {name}: {report.path}\n{report}")
     return reports

@@ -11,11 +11,14 @@ from rich.console import Console
 from wearcap.errors import WearcapError
 from wearcap.io.environment import read_environment
 from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
+from wearcap.optimize.latent_motion import LatentSolver, LatentWeights
 from wearcap.pipelines.contact_prediction import ContactPredictor
 from wearcap.pipelines.hmd2 import HMD2
+from wearcap.pipelines.mocap_every import MocapEvery
 from wearcap.pipelines.pose_regressor import PoseRegressorCapture
 from wearcap.pipelines.realism import Realism
 from wearcap.pipelines.stages import StagedCapture, StagedPipeline
+from wearcap.pipelines.visual_cues import VisualCues
 from wearcap.recording.locate import dataset_folder
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
@@ -23,10 +26,29 @@ from wearcap.training.contact_detection import ContactDetection
 from wearcap.training.egoview import EgoView
 from wearcap.training.motion_autoencoder import MotionEncoding
 from wearcap.training.motion_diffusion import MotionDiffusion
+from wearcap.training.motion_manifold import ManifoldTraining
 from wearcap.training.pose_regression import PoseRegression
 from wearcap.training.voxel_reconstruction import VoxelReconstruction
+from wearcap.training.watch_regression import WatchRegression
 
-System = MotionDiffusion | ContactDetection | PoseRegression | MotionEncoding | VoxelReconstruction | EgoView
+System = (
+    MotionDiffusion
+    | ContactDetection
+    | PoseRegression
+    | WatchRegression
+    | MotionEncoding
+    | ManifoldTraining
+    | VoxelReconstruction
+    | EgoView
+)
+LearnedPipeline = HMD2 | PoseRegressorCapture | MocapEvery
+"""Pipelines around one network, whole recordings at a time."""
+NETWORKS: dict[str, tuple[type[System], str]] = {
+    "HMD2": (MotionDiffusion, "experiment=hmd2"),
+    "PoseRegressorCapture": (PoseRegression, "experiment=pose_regressor_head or pose_regressor_hands"),
+    "MocapEvery": (WatchRegression, "experiment=mocap_every"),
+}
+"""What a learned pipeline's checkpoint has to hold, and which experiment makes one."""
 
 
 def load_system(checkpoint: str | Path) -> tuple[System, dict[str, Any]]:
@@ -39,7 +61,7 @@ def load_system(checkpoint: str | Path) -> tuple[System, dict[str, Any]]:
 
 def load_pipeline(
     checkpoint: str | Path | Sequence[str] | None, pipeline: DictConfig, device: str
-) -> HMD2 | PoseRegressorCapture | StagedPipeline:
+) -> LearnedPipeline | StagedPipeline:
     """The pipeline of a config group: around a checkpoint's network where it is learned (`_partial_`), else by itself.
 
     iReplica takes several checkpoints of contact networks, one per class. Raises WearcapError for a learned pipeline
@@ -57,13 +79,23 @@ def load_pipeline(
     if name == "IReplica":
         return made(predictor=ContactPredictor.load(*given))
     system, _ = load_system(given[0])
-    if name == "PoseRegressorCapture":
-        if not isinstance(system, PoseRegression):
-            raise WearcapError(f"{name} needs a pose regressor", where=given[0], expected="a checkpoint of experiment=pose_regressor_head or pose_regressor_hands")  # fmt: skip
-        return made(**system.pipeline_parts(), device=device)
-    if not isinstance(system, MotionDiffusion):
-        raise WearcapError(f"{name} needs a motion denoiser", where=given[0], expected="a checkpoint of one, not of another network")  # fmt: skip
+    kind, experiment = NETWORKS[name]
+    if not isinstance(system, kind):
+        raise WearcapError(f"{name} cannot run {type(system).__name__}'s network", where=given[0], expected=f"a checkpoint of {experiment}")  # fmt: skip
     return made(**system.pipeline_parts(), device=device)
+
+
+def load_visual_cues(
+    manifold: str,
+    weights: LatentWeights | None = None,
+    solver: LatentSolver | None = None,
+    **settings: int | bool,
+) -> VisualCues:
+    """An editor in the manifold of a checkpoint of experiment=motion_manifold; see `VisualCues` for the settings."""
+    system, _ = load_system(manifold)
+    if not isinstance(system, ManifoldTraining):
+        raise WearcapError("cues need a motion manifold", where=manifold, expected="a checkpoint of experiment=motion_manifold")  # fmt: skip
+    return VisualCues(system.net, weights or LatentWeights(), solver or LatentSolver(), **settings)
 
 
 def load_realism(checkpoint: str | Path, stride_s: float = 1.0) -> Realism:

@@ -29,7 +29,7 @@ _NAME = re.compile(r"[\w-]+")
 _SUFFIX = ".safetensors"
 _KEY = "wearcap_checkpoint"
 _PARTS = re.compile(r"(wearcap\.(?:body|data|diffusion|models|scene|training)(?:\.[a-z]\w*)+)\.([A-Za-z]\w*)")
-_OPTIMIZERS = re.compile(r"torch\.optim\.(lr_scheduler\.)?[A-Z][A-Za-z]+")
+_OPTIMIZERS = re.compile(r"torch\.optim\.(lr_scheduler\.)?[A-Z][A-Za-z]+|prodigyopt\.Prodigy")
 _FUNCTIONS = ("wearcap.body.skeleton", "wearcap.body.skeletons", "wearcap.training.schedules")
 """Modules whose functions, too, may be parts of a model; of all others, classes alone."""
 

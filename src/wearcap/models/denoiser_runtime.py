@@ -1,13 +1,7 @@
 """The steps of a sampler by the fastest means at hand: the levels' part ready-made, the rest by PyTorch or ONNX Runtime."""
 
-import contextlib
-import copy
-import importlib.util
-import logging
-import tempfile
-import warnings
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,12 +9,12 @@ from torch import Tensor, nn
 
 from wearcap.errors import WearcapError, nearest
 from wearcap.models.denoiser import LevelPlan, MotionDenoiser
+from wearcap.models.onnx_runner import missing_libraries, onnx_runner, undisturbed
 
 RUNTIMES = ("auto", "eager", "compile", "onnx")
 """auto: on a GPU compiled (CUDA graphs), elsewhere ONNX Runtime where it is installed, else eager."""
 PRECISIONS = ("auto", "narrowest", "float32", "bfloat16", "int8")
 """auto: bfloat16 on a GPU, else float32. narrowest: int8 with ONNX Runtime, too. int8 (weights, and activations as they come) with ONNX Runtime alone."""
-_ONNX = ("onnx", "onnxscript", "onnxruntime")
 
 Step = Callable[[Tensor, LevelPlan, Tensor, Tensor, Tensor | None], Tensor]
 """x̂0 from x_t, its level's plan, what `encode` said, `valid`, and the last x̂0 (with self-conditioning)."""
@@ -78,16 +72,9 @@ class StepRunner:
             last = torch.zeros_like(x_t)
         return self._step(x_t, self._plans[number], encoded, valid, last)
 
-    @contextlib.contextmanager
-    def undisturbed(self) -> Iterator[None]:
-        """For few small windows: PyTorch's threads, which wait by spinning, leave the cores to ONNX Runtime's."""
-        threads = torch.get_num_threads()
-        if self.runtime == "onnx":
-            torch.set_num_threads(1)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(threads)
+    def undisturbed(self) -> AbstractContextManager[None]:
+        """For few small windows: nothing else takes the cores from the steps."""
+        return undisturbed(self.runtime == "onnx")
 
 
 def _chosen(runtime: str, precision: str, device: torch.device) -> tuple[str, str]:
@@ -96,7 +83,7 @@ def _chosen(runtime: str, precision: str, device: torch.device) -> tuple[str, st
             raise WearcapError(
                 f"no {what} {value!r}", expected=f"one of {', '.join(known)}", fix=nearest(value, known)
             )
-    missing = [name for name in _ONNX if importlib.util.find_spec(name) is None]
+    missing = missing_libraries()
     if runtime == "auto":
         plain = "eager" if missing or precision == "bfloat16" else "onnx"
         runtime = "compile" if device.type == "cuda" else plain
@@ -140,32 +127,7 @@ def _step_of(net: MotionDenoiser, runtime: str, precision: str) -> Step:
 
 
 def _onnx_step(net: MotionDenoiser, precision: str) -> Step:
-    """The step in ONNX Runtime, which keeps its weights packed and fuses what PyTorch does one by one."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
-    options.log_severity_level = 3
-    # Threads spin between the operations of a step; behind it they leave the cores to what else runs.
-    options.add_session_config_entry("session.force_spinning_stop", "1")
-    with tempfile.TemporaryDirectory() as folder, quiet():
-        path = Path(folder) / "step.onnx"
-        _write_onnx(net, path)
-        if precision == "int8":
-            path = _narrowed(path)
-        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    names = [entry.name for entry in session.get_inputs()]
-
-    def step(x_t: Tensor, plan: LevelPlan, encoded: Tensor, valid: Tensor, last: Tensor | None) -> Tensor:
-        told = (x_t, plan.worth, torch.stack(plan.blocks), encoded, valid, last)
-        arrays = {name: value.contiguous().numpy() for name, value in zip(names, told) if value is not None}
-        return torch.from_numpy(session.run(None, arrays)[0])
-
-    return step
-
-
-def _write_onnx(net: MotionDenoiser, path: Path) -> None:
-    graph = StepGraph(copy.deepcopy(net).cpu().eval())
+    """The step in ONNX Runtime."""
     batch, tokens, width = 2, net.window // net.frames_per_token, net.motion_encoder.linear.out_features
     x_t = torch.zeros(batch, net.window, net.motion_size)
     inputs = {
@@ -174,30 +136,9 @@ def _write_onnx(net: MotionDenoiser, path: Path) -> None:
     }  # fmt: skip
     if net.self_conditioning:
         inputs["last"] = x_t.clone()
-    lanes = {0: torch.export.Dim("batch", min=1)}
-    dynamic = {name: None if name in ("worth", "blocks") else lanes for name in inputs}
-    with torch.no_grad():
-        program = torch.export.export(graph, (), inputs, dynamic_shapes=dynamic)
-        torch.onnx.export(program, (), path, kwargs=inputs, dynamo=True, external_data=False)
+    run = onnx_runner(StepGraph(net), inputs, fixed=("worth", "blocks"), int8=precision == "int8")
 
+    def step(x_t: Tensor, plan: LevelPlan, encoded: Tensor, valid: Tensor, last: Tensor | None) -> Tensor:
+        return run(x_t, plan.worth, torch.stack(plan.blocks), encoded, valid, last)[0]
 
-def _narrowed(path: Path) -> Path:
-    """The same network with weights as int8 per channel; activations are scaled as they come."""
-    from onnxruntime.quantization import QuantType, quantize_dynamic
-
-    narrow = path.with_name("step8.onnx")
-    quantize_dynamic(path, narrow, weight_type=QuantType.QInt8, per_channel=True, reduce_range=True)
-    return narrow
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """The exporters speak at length of optional libraries and of what they fold together."""
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(None):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(before)
+    return step

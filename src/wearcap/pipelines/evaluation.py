@@ -59,10 +59,35 @@ def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
     return Row(name, seed, len(truth), scores)
 
 
+def score_in_world(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
+    """All metrics of one capture where it put the body in the world, nothing hung or aligned (MocapEvery §4.1).
+
+    Beside them `r_mpjpe_cm`, both bodies moved to one root (r.MPJPE), and `right_hand_pe_cm`.
+    """
+    truth, contact = truth_at(motion, recording, name)
+    scores = evaluate_motion(motion, truth, contact)
+    joints, joints_true = motion.T_world_joint.t, truth.T_world_joint.t
+    scores["r_mpjpe_cm"] = mpjpe_cm(joints - joints[:, :1], joints_true - joints_true[:, :1]).item()
+    hand = truth.skeleton.index("right_wrist")
+    scores["right_hand_pe_cm"] = mpjpe_cm(joints[:, [hand]], joints_true[:, [hand]]).item()
+    return Row(name, seed, len(truth), scores)
+
+
 def comparable(
     motion: Motion, recording: Recording, name: str
 ) -> tuple[Motion, Motion, Bool[Tensor, "time patch"] | None]:
     """A capture hung from the true head, the truth at the capture's frames, and the true contact of its feet.
+
+    Raises WearcapError when the recording has no true motion.
+    """
+    truth, contact = truth_at(motion, recording, name)
+    return hang_from_head(motion, truth.joint("head")), truth, contact
+
+
+def truth_at(
+    motion: Motion, recording: Recording, name: str
+) -> tuple[Motion, Bool[Tensor, "time patch"] | None]:
+    """The truth at the capture's frames, and the true contact of its feet.
 
     Raises WearcapError when the recording has no true motion.
     """
@@ -72,7 +97,7 @@ def comparable(
     if _within(motion, truth):
         frame = _nearest_frames(truth, motion.timestamps)
         truth, contact = at_times(truth, motion.timestamps), None if contact is None else contact[frame]
-    return hang_from_head(motion, truth.joint("head")), truth, contact
+    return truth, contact
 
 
 def _within(motion: Motion, truth: Motion) -> bool:

@@ -219,7 +219,7 @@ class Session:
                 said[i] += self._lanes[i].give(self._waiting)
         for parts, lane in zip(said, self._lanes):
             parts += lane.give(0) if ended else []
-        return [_joined(parts) for parts in said]
+        return [joined(parts) for parts in said]
 
     @torch.inference_mode()
     def _advance(self, chunks: dict[int, Chunk]) -> None:
@@ -295,7 +295,8 @@ def _newest(known: Float64[Tensor, "known"], time: float) -> int:
     return max(0, int(torch.searchsorted(known, time + 1e-4, right=True)) - 1)
 
 
-def _joined(parts: list[Motion]) -> Motion | None:
+def joined(parts: list[Motion]) -> Motion | None:
+    """Consecutive pieces of a motion as one; None for no piece."""
     if len(parts) < 2:
         return parts[0] if parts else None
     contacts = [part.contact_prob for part in parts if part.contact_prob is not None]

@@ -46,12 +46,12 @@ class HeadTrack:
         """The next frame to go out; whether it continues a stretch."""
         self._held = 0
         """Of the last frames, those that no pose was known for."""
-        self._newest = -math.inf
+        self.newest = -math.inf
         self._poses: list[tuple[float, Tensor, Tensor]] = []
 
     def state(self) -> dict[str, Tensor]:
         start = math.nan if self._start is None else self._start
-        numbers = [start, self._next, self._inside, self._held, self._newest, self.dropped]
+        numbers = [start, self._next, self._inside, self._held, self.newest, self.dropped]
         times, R, t = (
             zip(*self._poses) if self._poses else ((), (torch.zeros(0, 3, 3),), (torch.zeros(0, 3),))
         )
@@ -61,7 +61,7 @@ class HeadTrack:
         }  # fmt: skip
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        start, next_frame, inside, held, self._newest, dropped = state["numbers"].tolist()
+        start, next_frame, inside, held, self.newest, dropped = state["numbers"].tolist()
         self._start = None if math.isnan(start) else start
         self._next, self._inside, self._held, self.dropped = (
             int(next_frame),
@@ -73,7 +73,7 @@ class HeadTrack:
 
     def take(self, timestamp: float, T_world_device: Rigid | None) -> None:
         """Take in a moment, with the device's pose if it is known. It may come after later ones, until their chunk is out."""
-        self._newest = max(self._newest, timestamp)
+        self.newest = max(self.newest, timestamp)
         if T_world_device is None:
             return
         R, t = T_world_device.R.float().cpu(), T_world_device.t.float().cpu()
@@ -92,7 +92,7 @@ class HeadTrack:
             first = self._next
             if not self._inside:
                 first = max(first, math.ceil((self._poses[0][0] - 1e-6 - start) * self.fps))
-            if not ended and start + (first + self.stride - 1) / self.fps > self._newest + _SAME_S:
+            if not ended and start + (first + self.stride - 1) / self.fps > self.newest + _SAME_S:
                 return None
             known = self._known()
             stop = self._stop(known, start, ended)
@@ -124,7 +124,7 @@ class HeadTrack:
     def _stop(self, known: Trajectory, start: float, ended: bool) -> int | None:
         """Number of the frame behind the stretch's last, if the stretch is known to be over."""
         last = known.timestamps[-1].item()
-        if len(known) < len(self._poses) or self._newest - last > MAX_GAP_S:
+        if len(known) < len(self._poses) or self.newest - last > MAX_GAP_S:
             return math.ceil((last + 1e-6 - start) * self.fps)
         return int((last - start) * self.fps + 1e-3) + 1 if ended else None
 

@@ -35,7 +35,7 @@ class ImuNoise:
     clock_ppm: float = 0.0
 
 
-def acceleration(position: Float[Tensor, "time 3"], fps: float, n: int = 4) -> Float[Tensor, "time 3"]:
+def acceleration(position: Float[Tensor, "time axis"], fps: float, n: int = 4) -> Float[Tensor, "time axis"]:
     """(p[t-n] + p[t+n] - 2 p[t]) / (n Δt)² (MocapEvery eq. 8); the ends repeat the nearest frame that has both.
 
     Shorter recordings than 2n + 1 frames have none: zero.
@@ -44,7 +44,7 @@ def acceleration(position: Float[Tensor, "time 3"], fps: float, n: int = 4) -> F
         return torch.zeros_like(position)
     p = position.double()
     inner = (p[: -2 * n] + p[2 * n :] - 2 * p[n:-n]) * (fps / n) ** 2
-    return torch.cat([inner[:1].expand(n, 3), inner, inner[-1:].expand(n, 3)]).to(position.dtype)
+    return torch.cat([inner[:1].expand(n, -1), inner, inner[-1:].expand(n, -1)]).to(position.dtype)
 
 
 def mean_filter(value: Float[Tensor, "time feature"], window: int = 7) -> Float[Tensor, "time feature"]:

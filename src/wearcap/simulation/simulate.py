@@ -14,6 +14,7 @@ from wearcap.sensors.slam import semidense_points
 from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.ego_view import write_ego_video
 from wearcap.simulation.flat import build_flat
+from wearcap.simulation.hillside import build_hillside
 from wearcap.simulation.outdoor import build_outdoor
 from wearcap.simulation.person import Person, draw_person
 from wearcap.simulation.site import build_site
@@ -23,7 +24,12 @@ from wearcap.simulation.world import World
 POOLS = {"train": (200, 150), "val": (20, 15), "test": (40, 30)}
 """People and places of each split: (subjects, locations of each kind); no split shares any with another."""
 
-WORLDS = {"flat": (2, build_flat), "outdoor": (3, build_outdoor), "site": (4, build_site)}
+WORLDS = {
+    "flat": (2, build_flat),
+    "outdoor": (3, build_outdoor),
+    "site": (4, build_site),
+    "hillside": (5, build_hillside),
+}
 """Kinds of surroundings: a number for their seeds, and their builder."""
 
 OUTDOOR_SHARE = 0.3

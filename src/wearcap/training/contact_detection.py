@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import lightning
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -14,9 +13,10 @@ from wearcap.data.statistics import collate
 from wearcap.geometry import rotation
 from wearcap.metrics.detection import mean_detection_scores
 from wearcap.models.contact import REACH, ContactNetwork
+from wearcap.training.base import GivenOptimizer
 
 
-class ContactDetection(lightning.LightningModule):
+class ContactDetection(GivenOptimizer):
     """A contact network for some classes of interaction; what it is trained on and scored by are single frames."""
 
     def __init__(
@@ -82,12 +82,3 @@ class ContactDetection(lightning.LightningModule):
             for metric in ("average_precision", "precision", "recall", "accuracy"):
                 self.log(f"val/{name}_{metric}", getattr(scores, metric))
         self._validated.clear()
-
-    def configure_optimizers(self):
-        optimizer = self._optimizer(self.net.parameters())
-        if self._scheduler is None:
-            return optimizer
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
-        }

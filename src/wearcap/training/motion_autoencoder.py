@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import lightning
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -12,12 +11,13 @@ from wearcap.data.motion_windows import MovementDataset
 from wearcap.data.statistics import collate
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.models.motion_autoencoder import MotionAutoencoder
+from wearcap.training.base import Measured
 
 MIN_SCALE = 0.02
 """No feature is stretched more than this: what hardly varies would otherwise be mostly noise."""
 
 
-class MotionEncoding(lightning.LightningModule):
+class MotionEncoding(Measured):
     """Windows of true motion are compressed and rebuilt; the loss is the smooth L1 of normalised features."""
 
     def __init__(
@@ -41,29 +41,11 @@ class MotionEncoding(lightning.LightningModule):
         mean, scale = features.mean((0, 1)), features.std((0, 1)).clamp_min(MIN_SCALE)
         self.net.normalizer.set(mean, scale)
 
-    def _loss(self, batch: Movement, stage: str) -> Tensor:
+    def measure(self, batch: Movement) -> dict[str, Tensor]:
+        """The loss, and the mean error of rebuilt joints (cm)."""
         features = self.features.encode(batch)
         rebuilt = self.net(features)
         loss = F.smooth_l1_loss(rebuilt, self.net.normalizer(features))
         joints = self.features.joints(self.net.normalizer.inverse(rebuilt))
         error = mpjpe_cm(joints, self.features.joints(features))
-        self.log_dict(
-            {f"{stage}/loss": loss, f"{stage}/joints_cm": error}, batch_size=len(features),
-            prog_bar=stage == "train", sync_dist=stage == "val", on_step=stage == "train", on_epoch=stage == "val",
-        )  # fmt: skip
-        return loss
-
-    def training_step(self, batch: Movement, batch_idx: int) -> Tensor:
-        return self._loss(batch, "train")
-
-    def validation_step(self, batch: Movement, batch_idx: int) -> None:
-        self._loss(batch, "val")
-
-    def configure_optimizers(self):
-        optimizer = self._optimizer(self.net.parameters())
-        if self._scheduler is None:
-            return optimizer
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
-        }
+        return {"loss": loss, "joints_cm": error}

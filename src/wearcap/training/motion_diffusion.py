@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import lightning
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -19,12 +18,13 @@ from wearcap.errors import WearcapError
 from wearcap.models.denoiser import Conditions, MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.training import losses
+from wearcap.training.base import WeighedTerms
 
 _TAIL_FRAMES = 20
 """Within which the weight of a window's last frames falls off."""
 
 
-class MotionDiffusion(lightning.LightningModule):
+class MotionDiffusion(WeighedTerms):
     """x0-prediction under one noise level per window; loss terms are weighed by `loss_weights`.
 
     "motion" is the document's plain MSE; "joints", "velocity" and "skate" are ours (0 leaves them out). Levels are drawn
@@ -151,31 +151,6 @@ class MotionDiffusion(lightning.LightningModule):
         origin = torch.zeros_like(batch.t_world_head)
         joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
         return joints - joints[:, :, self.skeleton.index("head"), None]
-
-    def _loss(self, batch: Window, stage: str) -> Tensor:
-        terms = self.terms(batch)
-        loss = torch.stack([self.loss_weights.get(name, 0.0) * term for name, term in terms.items()]).sum()
-        log: dict[str, Any] = {f"{stage}/loss": loss} | {f"{stage}/{name}": v for name, v in terms.items()}
-        self.log_dict(
-            log, batch_size=len(batch.valid), prog_bar=stage == "train", sync_dist=stage == "val",
-            on_step=stage == "train", on_epoch=stage == "val",
-        )  # fmt: skip
-        return loss
-
-    def training_step(self, batch: Window, batch_idx: int) -> Tensor:
-        return self._loss(batch, "train")
-
-    def validation_step(self, batch: Window, batch_idx: int) -> None:
-        self._loss(batch, "val")
-
-    def configure_optimizers(self):
-        optimizer = self._optimizer(self.net.parameters())
-        if self._scheduler is None:
-            return optimizer
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
-        }
 
 
 def _require_same_inputs(system: MotionDiffusion, dataset: WindowDataset) -> None:

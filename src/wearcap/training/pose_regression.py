@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import lightning
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
@@ -15,10 +14,11 @@ from wearcap.data.tracked_points import TrackedPoints, decode_pose, encode_pose,
 from wearcap.data.windows import Window, WindowDataset
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.pose_regressor import PoseRegressor
+from wearcap.training.base import WeighedTerms
 from wearcap.training.losses import joint_velocity, masked_mean
 
 
-class PoseRegression(lightning.LightningModule):
+class PoseRegression(WeighedTerms):
     """Regression of single frames from their pasts: `pairs` of neighbouring frames of every window are asked for.
 
     Loss terms, weighed by `loss_weights`, are mean absolute errors: "root" and "rotation" of 6D rotations, "joints" of
@@ -109,28 +109,3 @@ class PoseRegression(lightning.LightningModule):
         origin = torch.zeros_like(R_parent_joint[:, :, 0, 0])
         joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
         return joints - joints[:, :, self.skeleton.index("head"), None]
-
-    def _loss(self, batch: Window, stage: str) -> Tensor:
-        terms = self.terms(batch)
-        loss = torch.stack([self.loss_weights[name] * term for name, term in terms.items()]).sum()
-        self.log_dict(
-            {f"{stage}/loss": loss} | {f"{stage}/{name}": term for name, term in terms.items()},
-            batch_size=len(batch.valid), prog_bar=stage == "train", sync_dist=stage == "val",
-            on_step=stage == "train", on_epoch=stage == "val",
-        )  # fmt: skip
-        return loss
-
-    def training_step(self, batch: Window, batch_idx: int) -> Tensor:
-        return self._loss(batch, "train")
-
-    def validation_step(self, batch: Window, batch_idx: int) -> None:
-        self._loss(batch, "val")
-
-    def configure_optimizers(self):
-        optimizer = self._optimizer(self.net.parameters())
-        if self._scheduler is None:
-            return optimizer
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
-        }

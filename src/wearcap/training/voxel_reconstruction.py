@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import lightning
 import torch
 from torch import Tensor
 
@@ -10,9 +9,10 @@ from wearcap.data.statistics import collate
 from wearcap.data.voxel_windows import PlaceDataset, Places
 from wearcap.metrics.occupancy import distance_mae_cm, held_distance_mae_cm, occupancy_iou
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.training.base import GivenOptimizer
 
 
-class VoxelReconstruction(lightning.LightningModule):
+class VoxelReconstruction(GivenOptimizer):
     """Grids are encoded and rebuilt; the loss is the network's own."""
 
     def __init__(
@@ -47,12 +47,3 @@ class VoxelReconstruction(lightning.LightningModule):
             "val/occupancy_iou": occupancy_iou(rebuilt, grids, clip_m),
         }
         self.log_dict(scores, batch_size=len(grids), sync_dist=True)
-
-    def configure_optimizers(self):
-        optimizer = self._optimizer(self.net.parameters())
-        if self._scheduler is None:
-            return optimizer
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
-        }

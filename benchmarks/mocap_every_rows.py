@@ -1,0 +1,153 @@
+"""What MocapEvery's tables capture: rows on recordings, heads as SLAM gives them, hands as a camera sees them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wearcap.body.kinematics import site_positions
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.cli.conf import compose
+from wearcap.cli.load import load_pipeline, load_visual_cues
+from wearcap.data.floor import interpolate
+from wearcap.geometry import rotation
+from wearcap.metrics.floor import floor_error_m, stood_on
+from wearcap.metrics.position import joint_error_cm
+from wearcap.metrics.table import Row, evaluate_motion
+from wearcap.optimize.latent_motion import LatentSolver
+from wearcap.pipelines.evaluation import score_in_world, truth_at
+from wearcap.pipelines.mocap_every import Captured, MocapEvery
+from wearcap.pipelines.visual_cues import at_frames
+from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
+from wearcap.sensors.noise import smooth_noise
+
+NEAR_M = 0.03
+SLAM_DEG, SLAM_M, SLAM_PERIOD_S = 2.4, 0.05, 4.0
+"""Deviation of camera-derived head poses (the document's Table 5: 2.1 and 2.7 degrees, 4.7 and 5.1 cm), all of it slow:
+what jumps is found by its acceleration."""
+DETECTOR_PX, MISSED = 4.0, 0.1
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row: a checkpoint, and how it captures."""
+
+    name: str
+    checkpoint: str
+    pipeline: tuple[str, ...] = ("pipeline=mocap_every",)
+    slam: bool = False
+    """Whether heads are as camera tracking gives them."""
+
+
+def pipeline_of(method: Method) -> MocapEvery:
+    pipeline = load_pipeline(method.checkpoint, compose("evaluate", list(method.pipeline)).pipeline, "cpu")
+    assert isinstance(pipeline, MocapEvery)
+    return pipeline
+
+
+def captures(
+    method: Method, store: RecordingStore, names: Sequence[str], step: Callable[[], None]
+) -> Iterator[tuple[Recording, Captured]]:
+    pipeline = pipeline_of(method)
+    for name in names:
+        recording = store.load(name)
+        worn = with_slam(recording) if method.slam else recording
+        yield recording, pipeline.run(worn)
+        step()
+
+
+def with_slam(recording: Recording) -> Recording:
+    """The recording with head poses that are off as in the document's Table 5."""
+    head = recording.head
+    assert head is not None
+    fps = 1 / head.timestamps.diff().median().item()
+    rng = np.random.default_rng([5, *recording.name.encode()])
+    noise = smooth_noise(rng, len(head.timestamps), 6, SLAM_PERIOD_S, fps) / np.sqrt(3)
+    turn = rotation.exp(np.deg2rad(SLAM_DEG) * noise[:, :3])
+    moved = head.t_world_device + SLAM_M * noise[:, 3:]
+    return replace(
+        recording, head=replace(head, R_world_device=head.R_world_device @ turn, t_world_device=moved)
+    )
+
+
+def body_row(recording: Recording, captured: Captured) -> Row:
+    """Scores in the world, the document's metrics among them."""
+    return score_in_world(captured.motion, recording, recording.name, 0)
+
+
+def floor_row(recording: Recording, captured: Captured) -> Row:
+    """Body and floor: where the floor is against the recording's, and against what is stood on."""
+    row = body_row(recording, captured)
+    assert recording.floor is not None
+    found = captured.floor
+    true = interpolate(recording.floor.timestamps, recording.floor.height, found.timestamps)
+    stood = floor_error_m(found.height, *_ground(recording, captured.motion))
+    smooth = floor_error_m(_smoothed(found.height, captured.motion.fps), *_ground(recording, captured.motion))
+    scores = row.scores | {
+        "floor_cm": 100 * (found.height - true).abs().mean().item(),
+        "floor_within_3cm": 100 * (stood < NEAR_M).float().mean().item(),
+        "floor_within_3cm_smoothed": 100 * (smooth < NEAR_M).float().mean().item(),
+    }
+    return replace(row, scores=scores)
+
+
+def _ground(recording: Recording, motion: Motion) -> tuple[Tensor, Tensor]:
+    truth, contact = truth_at(motion, recording, recording.name)
+    assert contact is not None
+    soles = site_positions(truth.skeleton, truth.T_world_joint, FOOT_PATCHES)[..., 2]
+    patches = torch.where(contact, soles, torch.inf).unflatten(-1, (2, 2)).amin(-1)
+    return stood_on(patches, contact.unflatten(-1, (2, 2)).any(-1))
+
+
+def _smoothed(height: Tensor, fps: float) -> Tensor:
+    """Averaged over half a second before and behind (Gaussian), as can be done when all is over."""
+    reach = torch.arange(-int(1.5 * fps), int(1.5 * fps) + 1)
+    kernel = torch.exp(-0.5 * (reach / (0.5 * fps)) ** 2)
+    padded = torch.nn.functional.pad(height[None, None], (len(reach) // 2,) * 2, mode="replicate")[0, 0]
+    return padded.unfold(0, len(reach), 1) @ (kernel / kernel.sum())
+
+
+def cue_row(
+    recording: Recording, pipeline: MocapEvery, manifold: str, solver: LatentSolver
+) -> tuple[Row, Row] | None:
+    """Scores at the frames that show the right wrist, before and after editing by it; None where none does."""
+    motion, head = recording.motion, recording.head
+    assert motion is not None
+    assert head is not None
+    camera = action_camera(head.timestamps)
+    rng = np.random.default_rng([6, *recording.name.encode()])
+    cues = seen_joints(
+        motion, camera_path(motion, camera), camera.camera, ["right_wrist"], DETECTOR_PX, MISSED, rng
+    )
+    if not cues:
+        return None
+    shown = replace(recording, camera=camera, cues=cues, imu={})
+    before = pipeline.run(shown).motion
+    seen = at_frames(cues["right_wrist"], before.timestamps).confidence > 0
+    if not seen.any():
+        return None
+    editor = load_visual_cues(manifold, solver=solver)
+    T_world_head = before.joint("head")
+    after, _ = editor.edit(before, shown, T_world_head)
+    truth, _ = truth_at(before, recording, recording.name)
+    return tuple(_at(motion, truth, seen, recording.name) for motion in (before, after))  # pyright: ignore[reportReturnType]
+
+
+def _at(motion: Motion, truth: Motion, seen: Tensor, name: str) -> Row:
+    skeleton = truth.skeleton
+    error = joint_error_cm(motion.T_world_joint.t, truth.T_world_joint.t)[seen].mean(0)
+    arm = skeleton.indices("right_shoulder", "right_elbow", "right_wrist")
+    upper = [
+        skeleton.index(j)
+        for j in skeleton.joint_names
+        if not any(p in j for p in ("hip", "knee", "ankle", "toe", "pelvis"))
+    ]
+    scores = {
+        "right_hand_cm": error[arm[-1]].item(), "right_arm_cm": error[arm].mean().item(),
+        "upper_cm": error[upper].mean().item(), "mpjpe_cm": error.mean().item(),
+        "jitter_m_s3": evaluate_motion(motion, truth)["jitter_m_s3"],
+    }  # fmt: skip
+    return Row(name, 0, int(seen.sum()), scores)

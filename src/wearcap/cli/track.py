@@ -1,0 +1,111 @@
+"""`wearcap track VIDEO`: a plain video goes in; the camera's path and points of its surroundings come out."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from rich import print as show
+from rich.console import Console
+from rich.progress import Progress
+
+from wearcap.cli.conf import hydra_main
+from wearcap.errors import WearcapError
+from wearcap.io.camera_json import read_camera
+from wearcap.io.colmap import read_colmap
+from wearcap.localization.structure import Advance
+from wearcap.localization.tracking import (
+    Track,
+    TrackSettings,
+    model_row,
+    picture_row,
+    track_of_model,
+    track_pictures,
+    write_track,
+)
+
+HELP = "a camera's path and points from its video: wearcap track VIDEO, or wearcap track --from-model COLMAP_MODEL"
+_WITH_VALUE = (
+    "--cfg",
+    "-c",
+    "--info",
+    "-i",
+    "--package",
+    "-p",
+    "--config-name",
+    "-cn",
+    "--config-dir",
+    "-cd",
+)
+"""Hydra's options that a value follows."""
+
+
+def run(config: DictConfig) -> Track:
+    """Track the config's source, or take the path from a COLMAP model, and write what was found."""
+    if config.source is None and config.from_model is None:
+        raise WearcapError("nothing to track", expected="wearcap track VIDEO, or from_model=DIR")
+    settings = instantiate(config.settings)
+    if not settings.fps > 0:
+        raise WearcapError(f"settings.fps={settings.fps}", expected="pictures a second, above 0")
+    named = config.from_model or config.source
+    output = Path(config.output or Path(config.paths.outputs) / "track" / Path(named).stem)
+    if config.from_model is not None:
+        found = _from_model(config, settings)
+    else:
+        camera = None if config.camera is None else read_camera(config.camera)
+        with _progress() as advance:
+            found = track_pictures(config.source, output, settings, camera, advance)
+    write_track(found, output, Path(named).name)
+    _tell(found, output)
+    return found
+
+
+def _from_model(config: DictConfig, settings: TrackSettings) -> Track:
+    model = read_colmap(config.from_model, config.source)
+    pictures = model_row(model, settings.fps) if config.source is None else picture_row(config.source, settings.fps)  # fmt: skip
+    return track_of_model(model, pictures, settings.max_gap_s, where=config.from_model)
+
+
+@contextmanager
+def _progress() -> Iterator[Advance]:
+    with Progress(console=Console(stderr=True)) as progress:
+        tasks = {}
+
+        def advance(step: str, done: int, total: int) -> None:
+            if step not in tasks:
+                tasks[step] = progress.add_task(step, total=total)
+            progress.update(tasks[step], completed=done, total=total)
+
+        yield advance
+
+
+def _tell(found: Track, output: Path) -> None:
+    show(f"{found.placed} of {found.pictures} pictures placed, {len(found.points_world)} points, reprojection "
+         f"{found.reprojection_px:.2f} px; scale and axes are arbitrary")  # fmt: skip
+    for start, stop, bridged in found.gaps_s:
+        show(f"[yellow]no place from {start:.2f} s to {stop:.2f} s: {'interpolated' if bridged else 'left out'}[/]")  # fmt: skip
+    show(f"trajectory.txt, points.ply, camera.json, report.json: {output}")
+
+
+def overrides(arguments: list[str]) -> list[str]:
+    """`VIDEO` and `--from-model DIR` as what they stand for in the config; Hydra's own options stay."""
+    given, rest = [], iter(arguments)
+    for argument in rest:
+        if argument == "--from-model":
+            given.append(f"from_model={_quoted(next(rest, ''))}")
+        elif argument in _WITH_VALUE:
+            given += [argument, next(rest, "")]
+        elif argument.startswith("-") or "=" in argument:
+            given.append(argument)
+        else:
+            given.append(f"source={_quoted(argument)}")
+    return given
+
+
+def _quoted(path: str) -> str:
+    return "'" + path.replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+
+def main(arguments: list[str]) -> None:
+    hydra_main("track", run, overrides(arguments))

@@ -1,0 +1,105 @@
+"""MocapEvery's estimator as ONNX or torch.export, with a sidecar, and back as a pipeline without the network's code.
+
+    python -m wearcap.export.watches MODEL.onnx RECORDING.safetensors MOTION.safetensors
+
+The file holds the network alone; frames, floor and windows are the pipeline's own.
+"""
+
+import argparse
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from wearcap.data.watch_features import WatchFeatures
+from wearcap.errors import WearcapError
+from wearcap.export.exported import Run, open_exported
+from wearcap.export.network import ExportReport, export_network
+from wearcap.export.sidecar import header, read_sidecar, skeleton_from_json, skeleton_to_json, write_sidecar
+from wearcap.models.watch_estimator import FEET, Estimate, TrainedEstimator, WatchEstimator
+from wearcap.pipelines.mocap_every import MocapEvery
+from wearcap.recording import Recording
+from wearcap.recording.store import RecordingFile, save_recording
+
+MAX_ERROR = 1e-4
+
+
+class _Joined(nn.Module):
+    """Motion and contact of the last frames, in one tensor."""
+
+    def __init__(self, net: WatchEstimator):
+        super().__init__()
+        self.net = net
+
+    def forward(self, features: Float[Tensor, "batch window feature"]) -> Float[Tensor, "batch said value"]:
+        said = self.net(features)
+        return torch.cat([said.motion, said.contact_logit], -1)
+
+
+def export_mocap_every(pipeline: MocapEvery, path: str | Path, format: str) -> ExportReport:
+    """Write the estimator as `path` (.onnx or .pt2) and its sidecar as the same name with .json.
+
+    It takes raw `features` "batch window feature" and gives motion and contact logits "batch said motion+2". Raises
+    what `export_network` raises.
+    """
+    net, features, random = pipeline.net, pipeline.features, torch.Generator().manual_seed(0)
+    if not isinstance(net, TrainedEstimator):
+        raise WearcapError("a network that is exported already", where=path, expected="one of a checkpoint")
+    normalizer = net.feature_normalizer
+    noise = torch.randn(2, net.window, features.size, generator=random)
+    example = {"features": normalizer.mean.cpu() + normalizer.scale.cpu() * noise}
+    report = export_network(_Joined(net), example, path, format, MAX_ERROR)
+    about = {
+        "features": asdict(features), "feature_size": features.size, "motion_size": features.motion_size,
+        "window": net.window, "fps": pipeline.fps, "skeleton": skeleton_to_json(pipeline.skeleton),
+        "stride": pipeline.stride, "lookahead": pipeline.lookahead, "floor": pipeline.floor, "hang": pipeline.hang,
+    }  # fmt: skip
+    write_sidecar(path, header("mocap_every", report) | about)
+    return report
+
+
+class ExportedEstimator(WatchEstimator):
+    """An estimator whose weights live in an exported file, run on the CPU."""
+
+    def __init__(self, run: Run, window: int):
+        super().__init__()
+        self._run, self.window = (run,), window
+
+    def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
+        said = self._run[0](features=features)
+        return Estimate(said[..., :-FEET], said[..., -FEET:], None)
+
+
+def load_exported_mocap_every(path: str | Path) -> MocapEvery:
+    """The pipeline of an exported model (.onnx or .pt2) and the sidecar beside it.
+
+    Raises WearcapError when either is missing, unreadable, or does not belong to the other.
+    """
+    run, about = open_exported(path), read_sidecar(path, "mocap_every")
+    return MocapEvery(
+        ExportedEstimator(run, about["window"]), WatchFeatures(**about["features"]), skeleton_from_json(about["skeleton"]),
+        about["fps"], about["stride"], about["lookahead"], about["floor"], about["hang"],
+    )  # fmt: skip
+
+
+def main(arguments: list[str]) -> None:
+    """Capture one recording with an exported model."""
+    parser = argparse.ArgumentParser(prog="python -m wearcap.export.watches", description=main.__doc__)
+    parser.add_argument("model", type=Path, help="exported .onnx or .pt2 file, its .json beside it")
+    parser.add_argument("recording", type=Path, help="recording (.safetensors) with a head and two watches")
+    parser.add_argument("output", type=Path, help="where to write the motion, as a recording (.safetensors)")
+    options = parser.parse_args(arguments)
+    recording = RecordingFile(options.recording).load()
+    motion = load_exported_mocap_every(options.model)(recording)
+    save_recording(Recording(recording.name, motion=motion, skeleton=motion.skeleton), options.output)
+    print(f"{len(motion)} frames at {motion.fps:.0f} Hz: {options.output}")
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except WearcapError as error:
+        sys.exit(f"error: {error}")

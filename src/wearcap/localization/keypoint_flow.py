@@ -1,0 +1,244 @@
+"""Keypoints that a detector missed, followed by optical flow from the detections before and behind (MocapEvery §3.4).
+
+Each missing keypoint is tracked forwards from its last detection and backwards from its next; what both say is blended,
+the nearer detection counting more. A video passes through a buffer of as many frames as a keypoint is followed.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.localization.keypoints import Detector, Keypoint
+from wearcap.recording.recording import Cue
+
+APART_AT_MOST = 4.0
+"""Times `apart_px`, beyond which two tracks do not follow the same thing."""
+
+
+@dataclass(frozen=True)
+class FlowSettings:
+    """How far keypoints are followed, and when one is lost."""
+
+    reach: int = 15
+    """Frames from a detection at most; 0: detections alone."""
+    window_px: int = 21
+    levels: int = 3
+    """Halvings of the picture in which large steps are sought."""
+    return_px: float = 1.0
+    """A step is false that does not lead back to where it began so closely."""
+    likeness: float = 0.6
+    """Least correlation of what a track shows with what was around the detection."""
+    apart_px: float = 3.0
+    """Distance of the two tracks that halves the confidence."""
+
+    def __post_init__(self):
+        if self.reach < 0 or self.window_px < 3 or self.levels < 0:
+            raise WearcapError(f"flow over {self.reach} frames in windows of {self.window_px} px with {self.levels} levels",
+                               expected="0 frames or more, 3 px or more, 0 levels or more")  # fmt: skip
+
+
+class Spotted(NamedTuple):
+    """All keypoints of one frame (pixels); a confidence of 0 where there is none."""
+
+    pixels: Float32[np.ndarray, "keypoint 2"]
+    confidence: Float32[np.ndarray, "keypoint"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """Where each keypoint was followed to (NaN where it is not), and the detection that it comes from."""
+
+    pixels: Float32[np.ndarray, "keypoint 2"]
+    age: Float32[np.ndarray, "keypoint"]
+    """Frames since the detection."""
+    trust: Float32[np.ndarray, "keypoint"]
+    """The detection's confidence."""
+    look: Float32[np.ndarray, "keypoint row column"]
+    """What was around it."""
+
+    @property
+    def there(self) -> Bool[np.ndarray, "keypoint"]:
+        return np.isfinite(self.pixels[:, 0])
+
+    def where(self, chosen: Bool[np.ndarray, "keypoint"], other: "_Track") -> "_Track":
+        """The chosen keypoints of this track, the rest of another."""
+        return _Track(*(
+            np.where(chosen.reshape(-1, *[1] * (mine.ndim - 1)), mine, theirs)
+            for mine, theirs in zip(vars(self).values(), vars(other).values())
+        ))  # fmt: skip
+
+
+@dataclass(eq=False)
+class _Frame:
+    grey: UInt8[np.ndarray, "height width"]
+    found: Bool[np.ndarray, "keypoint"]
+    forward: _Track
+    backward: _Track
+
+
+class KeypointFlow:
+    """Takes a video's frames one by one, and gives each back, in order, once nothing behind can add to it."""
+
+    def __init__(self, joints: Sequence[str], settings: FlowSettings = FlowSettings()):
+        self.joints, self.settings = tuple(joints), settings
+        self._frames: deque[_Frame] = deque()
+        count, side = len(self.joints), settings.window_px
+        none = np.full(count, np.nan, np.float32)
+        self._nowhere = _Track(np.stack([none, none], -1), none, none, np.zeros((count, side, side), np.float32))  # fmt: skip
+
+    def advance(
+        self, picture: UInt8[np.ndarray, "height width 3"], found: Mapping[str, Keypoint]
+    ) -> list[Spotted]:
+        """Frames that are final now, none to one."""
+        grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+        detected = self._detected(grey, found)
+        forward = self._nowhere
+        if self._frames:
+            last = self._frames[-1]
+            if grey.shape != last.grey.shape:
+                raise WearcapError(
+                    f"a picture of {grey.shape[1]}x{grey.shape[0]} pixels after one of "
+                    f"{last.grey.shape[1]}x{last.grey.shape[0]}", expected="a video of one size",
+                )  # fmt: skip
+            forward = _followed(_without(last.forward, detected.there), last.grey, grey, self.settings)
+        forward = detected.where(detected.there, forward)
+        self._frames.append(_Frame(grey, detected.there, forward, self._nowhere))
+        self._look_back(detected)
+        ready = len(self._frames) > self.settings.reach
+        return [_blended(self._frames.popleft(), self.settings)] if ready else []
+
+    def finish(self) -> list[Spotted]:
+        """The frames that are left."""
+        rest = [_blended(frame, self.settings) for frame in self._frames]
+        self._frames.clear()
+        return rest
+
+    def _detected(self, grey: np.ndarray, found: Mapping[str, Keypoint]) -> _Track:
+        rows = [found.get(joint, Keypoint(np.nan, np.nan, 0.0)) for joint in self.joints]
+        table = np.array(rows, np.float32).reshape(-1, 3)
+        table[~(np.isfinite(table).all(-1) & (table[:, 2] > 0))] = np.nan
+        pixels, trust = table[:, :2].copy(), table[:, 2].copy()
+        there = np.isfinite(trust)
+        look = self._nowhere.look.copy()
+        look[there] = _patches(grey, pixels[there], self.settings.window_px)
+        return _Track(pixels, np.where(there, 0, np.nan).astype(np.float32), trust, look)
+
+    def _look_back(self, detected: _Track) -> None:
+        """From detections backwards through the frames that lack them."""
+        track = detected
+        for later, earlier in pairwise(reversed(self._frames)):
+            track = _without(track, earlier.found)
+            if not track.there.any():
+                return
+            track = _followed(track, later.grey, earlier.grey, self.settings)
+            earlier.backward = track.where(track.there, earlier.backward)
+
+
+def tracked_cues(
+    pictures: Iterable[UInt8[np.ndarray, "height width 3"]],
+    timestamps: Float64[Tensor, "time"],
+    detector: Detector,
+    settings: FlowSettings = FlowSettings(),
+) -> dict[str, Cue]:
+    """Cues of all joints that a detector finds in a video or that are followed from there; each holds only the frames
+    at which its joint was seen.
+
+    Raises WearcapError when there are not as many pictures as timestamps.
+    """
+    flow, times = KeypointFlow(detector.joints, settings), timestamps.tolist()
+    spotted, count = list[Spotted](), 0
+    for count, picture in enumerate(pictures, 1):
+        if count > len(times):
+            break
+        spotted += flow.advance(picture, detector(picture, times[count - 1]))
+    spotted += flow.finish()
+    if count != len(times):
+        raise WearcapError(f"{'more' if count > len(times) else count} pictures for {len(times)} timestamps",
+                           expected="a picture for each timestamp of the camera")  # fmt: skip
+    if not spotted:
+        return {}
+    pixels, confidence = (torch.from_numpy(np.stack(part, 1)) for part in zip(*spotted))
+    return {
+        joint: Cue(timestamps[sure > 0], joint, where[sure > 0], sure[sure > 0])
+        for joint, where, sure in zip(flow.joints, pixels, confidence)
+        if (sure > 0).any()
+    }
+
+
+def _without(track: _Track, ended: Bool[np.ndarray, "keypoint"]) -> _Track:
+    return replace(track, pixels=np.where(ended[:, None], np.float32(np.nan), track.pixels))
+
+
+def _followed(track: _Track, before: np.ndarray, after: np.ndarray, settings: FlowSettings) -> _Track:
+    """Tracks one frame on; those that are lost, or come from too far, end."""
+    rows = np.flatnonzero(track.there & (track.age < settings.reach))
+    pixels = np.full_like(track.pixels, np.nan)
+    if len(rows):
+        start = track.pixels[rows]
+        end, moved = _flow(before, after, start, settings)
+        back, returned = _flow(after, before, end, settings)
+        inside = ((end >= -0.5) & (end < np.array(after.shape[::-1]) - 0.5)).all(-1)
+        same = _likeness(_patches(after, end, settings.window_px), track.look[rows]) >= settings.likeness
+        near = np.linalg.norm(back - start, axis=-1) <= settings.return_px
+        good = moved & returned & inside & near & same
+        pixels[rows[good]] = end[good]
+    return replace(track, pixels=pixels, age=track.age + 1)
+
+
+def _flow(
+    before: np.ndarray, after: np.ndarray, start: Float32[np.ndarray, "keypoint 2"], settings: FlowSettings
+) -> tuple[Float32[np.ndarray, "keypoint 2"], Bool[np.ndarray, "keypoint"]]:
+    side = settings.window_px
+    end, status, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, start[:, None], None, winSize=(side, side), maxLevel=settings.levels  # type: ignore[call-overload]
+    )  # fmt: skip
+    return end[:, 0], status[:, 0] == 1
+
+
+def _patches(
+    grey: np.ndarray, pixels: Float32[np.ndarray, "keypoint 2"], side: int
+) -> Float32[np.ndarray, "keypoint row column"]:
+    """The squares around keypoints, between pixels where these are."""
+    if not len(pixels):
+        return np.zeros((0, side, side), np.float32)
+    offset = np.arange(side, dtype=np.float32) - (side - 1) / 2
+    y, x = (pixels[:, axis, None, None] + grid for axis, grid in zip((1, 0), np.meshgrid(offset, offset, indexing="ij")))  # fmt: skip
+    maps = (part.reshape(-1, side).astype(np.float32) for part in (x, y))
+    found = cv2.remap(grey, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return found.reshape(-1, side, side).astype(np.float32)
+
+
+def _likeness(
+    a: Float32[np.ndarray, "keypoint row column"], b: Float32[np.ndarray, "keypoint row column"]
+) -> Float[np.ndarray, "keypoint"]:
+    """Correlation coefficient of patches; 0 for flat ones."""
+    a, b = (part - part.mean((1, 2), keepdims=True) for part in (a, b))
+    scale = np.sqrt((a**2).sum((1, 2)) * (b**2).sum((1, 2)))
+    return (a * b).sum((1, 2)) / np.maximum(scale, 1e-6)
+
+
+def _blended(frame: _Frame, settings: FlowSettings) -> Spotted:
+    """What both directions say: each weighed by how near the other's detection is not, both less sure the further away
+    their detections and they themselves are from each other."""
+    ways = (frame.forward, frame.backward)
+    there = np.stack([way.there for way in ways])
+    age = np.where(there, np.stack([way.age for way in ways]), 1.0)
+    share = there / np.maximum(age, 1e-6)
+    share = share / np.maximum(share.sum(0), 1e-9)
+    where = np.where(there[..., None], np.stack([way.pixels for way in ways]), 0.0)
+    sure = np.where(there, np.stack([way.trust for way in ways]) * (1 - age / (settings.reach + 1)), 0.0)
+    apart = np.where(there.all(0), np.linalg.norm(where[0] - where[1], axis=-1), 0.0)
+    confidence = (share * sure).sum(0) / (1 + (apart / settings.apart_px) ** 2)
+    confidence[apart > APART_AT_MOST * settings.apart_px] = 0.0
+    return Spotted(
+        (share[..., None] * where).sum(0).astype(np.float32), confidence.clip(0, 1).astype(np.float32)
+    )

@@ -1,0 +1,120 @@
+"""A wearer's wrists in the head camera's pictures by MediaPipe's hand landmarker, an optional package.
+
+Nothing is downloaded: the model is a file that the user has.
+"""
+
+import importlib
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import UInt8
+
+from wearcap.errors import WearcapError
+from wearcap.localization.keypoints import Keypoint
+
+MODEL_VARIABLE = "WEARCAP_HANDS_MODEL"
+"""Environment variable with the path of `hand_landmarker.task`."""
+WRIST = 0
+"""Of MediaPipe's 21 landmarks."""
+SIDE_PULL = 2.0
+"""How much the side of the picture speaks for a hand: logit of being the left one at the picture's left border."""
+
+
+class Hand(NamedTuple):
+    """One hand that was found."""
+
+    x: float
+    """Of the wrist, as a share of the picture's width."""
+    y: float
+    left: float
+    """Probability that it is a left hand."""
+
+
+class MediaPipeHands:
+    """Wrists of up to two hands, followed by MediaPipe from picture to picture: one object per video."""
+
+    joints = ("left_wrist", "right_wrist")
+
+    def __init__(self, model: str | Path | None = None, min_confidence: float = 0.5):
+        """`model`: `hand_landmarker.task`; None: the file that $WEARCAP_HANDS_MODEL names.
+
+        Raises WearcapError when the package or the model is missing, or the model is no such file.
+        """
+        self._mediapipe = _package()
+        vision, path = self._mediapipe.tasks.vision, find_model(model)
+        options = vision.HandLandmarkerOptions(
+            base_options=self._mediapipe.tasks.BaseOptions(model_asset_path=str(path)),
+            running_mode=vision.RunningMode.VIDEO, num_hands=2, min_hand_detection_confidence=min_confidence,
+            min_hand_presence_confidence=min_confidence, min_tracking_confidence=min_confidence,
+        )  # fmt: skip
+        try:
+            self._landmarker: Any = vision.HandLandmarker.create_from_options(options)
+        except (ValueError, RuntimeError, OSError) as error:
+            raise WearcapError(f"not a model that MediaPipe can run ({' '.join(str(error).split())[:200]})", where=path,
+                               expected="hand_landmarker.task", fix="Download it again.") from error  # fmt: skip
+
+    def __call__(self, picture: UInt8[np.ndarray, "height width 3"], time_s: float) -> dict[str, Keypoint]:
+        image = self._mediapipe.Image(
+            image_format=self._mediapipe.ImageFormat.SRGB, data=np.ascontiguousarray(picture)
+        )
+        said = self._landmarker.detect_for_video(image, round(1000 * time_s))
+        hands = [
+            Hand(marks[WRIST].x, marks[WRIST].y, _left(side[0].category_name, side[0].score))
+            for marks, side in zip(said.hand_landmarks, said.handedness)
+        ]
+        height, width = picture.shape[:2]
+        return {
+            joint: Keypoint(hand.x * width - 0.5, hand.y * height - 0.5, sure)
+            for joint, (hand, sure) in wearers_hands(hands).items()
+        }
+
+
+def wearers_hands(hands: Sequence[Hand]) -> dict[str, tuple[Hand, float]]:
+    """Which of up to two hands is the wearer's left wrist and which the right, and how sure that is (0…1).
+
+    A wearer sees their left hand rather on the left: that adds to what the hand looks like. Two hands are never one side's.
+    """
+    votes = [_logit(hand.left) + SIDE_PULL * (1 - 2 * min(max(hand.x, 0.0), 1.0)) for hand in hands]
+    if len(hands) == 1:
+        votes.append(-votes[0])
+    if not hands:
+        return {}
+    first = "left_wrist" if votes[0] >= votes[1] else "right_wrist"
+    second = "right_wrist" if first == "left_wrist" else "left_wrist"
+    sure = 1 / (1 + math.exp(-abs(votes[0] - votes[1]) / 2))
+    return {joint: (hand, sure) for joint, hand in zip((first, second), hands)}
+
+
+def find_model(given: str | Path | None) -> Path:
+    """The file given, else the one that `MODEL_VARIABLE` names. Raises WearcapError when there is none."""
+    named = given or os.environ.get(MODEL_VARIABLE)
+    if not named or not Path(named).expanduser().is_file():
+        raise WearcapError(
+            "there is no model of MediaPipe's hands", where=named or f"${MODEL_VARIABLE}", expected="hand_landmarker.task",
+            fix="Download it from https://ai.google.dev/edge/mediapipe/solutions/vision/hand_landmarker and give "
+                f"model=PATH or set {MODEL_VARIABLE}, or take detector=recorded.",
+        )  # fmt: skip
+    return Path(named).expanduser()
+
+
+def _package() -> ModuleType:
+    try:
+        return importlib.import_module("mediapipe")
+    except ModuleNotFoundError as error:
+        raise WearcapError(f"MediaPipe's hands need the package {error.name!r}",
+                           fix='pip install "wearcap[hands]", or take detector=recorded, which needs none.') from error  # fmt: skip
+
+
+def _left(name: str, score: float) -> float:
+    """MediaPipe names the person's own side in a picture that is not mirrored, as a head camera's is."""
+    return score if name == "Left" else 1.0 - score
+
+
+def _logit(probability: float) -> float:
+    p = min(max(probability, 1e-3), 1 - 1e-3)
+    return math.log(p / (1 - p))

@@ -1,0 +1,158 @@
+"""Structure from motion over an ordered row of pictures, through COLMAP (needs the extra: `pip install "wearcap[track]"`).
+
+Everything it works out lies in one folder: `database.db` (features and matches), `sparse/` (what was mapped) and, once
+that is finished, `model/`. A run that was stopped goes on where it was.
+"""
+
+import importlib
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+
+Advance = Callable[[str, int, int], None]
+"""Told of progress: the step's name, how much of it is done, and how much there is."""
+MODEL = "model"
+_CHUNK = 8
+_LENSES = {("pinhole", 0): "PINHOLE", ("opencv", 4): "OPENCV", ("fisheye", 4): "OPENCV_FISHEYE"}
+"""COLMAP's model for ours, by the number of coefficients."""
+
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """How pictures are matched and mapped."""
+
+    overlap: int = 10
+    """Each picture is matched with so many that follow, and with some further ones at growing distances."""
+    max_keypoints: int = 4096
+    max_size: int = 1600
+    """Larger pictures are shrunk to this side (px) for features."""
+    lens: str = "SIMPLE_RADIAL"
+    """COLMAP's model where no camera is given and it calibrates itself; OPENCV_FISHEYE for very wide lenses."""
+    threads: int = -1
+    seed: int = 0
+
+
+def map_pictures(
+    names: Sequence[str], images: Path, folder: Path, camera: Camera | None, settings: MappingSettings, advance: Advance
+) -> Path:  # fmt: skip
+    """Map pictures `images`/NAME in their order; returns the folder of the largest model, which io/colmap reads.
+
+    A given camera is kept as it is; otherwise one that all pictures share is calibrated meanwhile. Unit and axes are
+    arbitrary. Raises WearcapError when the extra is missing, for a camera that COLMAP has no model of, and when no
+    two pictures could be put together.
+    """
+    if (folder / MODEL / "images.bin").is_file():
+        return folder / MODEL
+    lens = None if camera is None else colmap_camera(camera)
+    colmap = _pycolmap()
+    folder.mkdir(parents=True, exist_ok=True)
+    _extract(colmap, names, images, folder / "database.db", lens, settings, advance)
+    advance("matching", 0, 1)
+    _match(colmap, folder / "database.db", settings)
+    advance("matching", 1, 1)
+    return _map(colmap, len(names), images, folder, lens is not None, settings, advance)
+
+
+def colmap_camera(camera: Camera) -> tuple[str, str]:
+    """COLMAP's name of a camera's model, and its parameters (pixel centres at .5) as COLMAP writes them."""
+    name = _LENSES.get((camera.model, len(camera.distortion)))
+    if name is None:
+        raise WearcapError(f"COLMAP has no camera {camera.model!r} with {len(camera.distortion)} coefficients",
+                           expected="pinhole, opencv (4) or fisheye (4)",
+                           fix="Undistort the video, or leave the camera to be calibrated.")  # fmt: skip
+    values = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, *camera.distortion)
+    return name, ",".join(f"{value:.12g}" for value in values)
+
+
+def _pycolmap() -> Any:
+    try:
+        colmap = importlib.import_module("pycolmap")
+    except ImportError as error:
+        raise WearcapError("structure from motion needs the package pycolmap",
+                           fix='Run: pip install "wearcap[track]", or give a finished COLMAP model: from_model=DIR.') from error  # fmt: skip
+    colmap.logging.minloglevel = 2  # its errors come as exceptions, its progress is told by ours
+    return colmap
+
+
+def _extract(
+    colmap: Any, names: Sequence[str], images: Path, database: Path, lens: tuple[str, str] | None,
+    settings: MappingSettings, advance: Advance,
+) -> None:  # fmt: skip
+    """Features of all pictures, a few at a time; those in the database stay, and all share its one camera."""
+    reader, options = colmap.ImageReaderOptions(), colmap.FeatureExtractionOptions()
+    reader.camera_model, reader.camera_params = lens or (settings.lens, "")
+    options.num_threads, options.max_image_size = settings.threads, settings.max_size
+    options.sift.max_num_features = settings.max_keypoints
+    for start in range(0, len(names), _CHUNK):
+        advance("features", start, len(names))
+        if database.is_file():
+            with colmap.Database.open(database) as opened:
+                cameras = opened.read_all_cameras()
+            reader.existing_camera_id = cameras[0].camera_id if cameras else -1
+        # The first picture brings the camera that the others share.
+        first = _CHUNK if start or reader.existing_camera_id >= 0 else 1
+        for part in (names[start : start + first], names[start + first : start + _CHUNK]):
+            if part:
+                _told(colmap.extract_features, database, images, image_names=list(part), reader_options=reader,
+                      camera_mode=colmap.CameraMode.SINGLE, extraction_options=options)  # fmt: skip
+                with colmap.Database.open(database) as opened:
+                    reader.existing_camera_id = opened.read_all_cameras()[0].camera_id
+    advance("features", len(names), len(names))
+
+
+def _match(colmap: Any, database: Path, settings: MappingSettings) -> None:
+    """Match each picture with those that follow; pairs that are in the database are not matched again."""
+    pairing, matching = colmap.SequentialPairingOptions(), colmap.FeatureMatchingOptions()
+    pairing.overlap, pairing.num_threads, matching.num_threads = settings.overlap, settings.threads, settings.threads  # fmt: skip
+    _told(colmap.match_sequential, database, matching_options=matching, pairing_options=pairing)
+
+
+def _map(
+    colmap: Any, count: int, images: Path, folder: Path, calibrated: bool, settings: MappingSettings, advance: Advance
+) -> Path:  # fmt: skip
+    """Incremental mapping; the model with most pictures is put in place when it is whole."""
+    options = colmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed, options.min_model_size = settings.threads, settings.seed, 3
+    if calibrated:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    done = 2
+
+    def one_more() -> None:
+        nonlocal done
+        done += 1
+        advance("mapping", min(done, count), count)
+
+    advance("mapping", 0, count)
+    shutil.rmtree(folder / "sparse", ignore_errors=True)
+    (folder / "sparse").mkdir()
+    models = _told(colmap.incremental_mapping, folder / "database.db", images, folder / "sparse", options=options,
+                   next_image_callback=one_more)  # fmt: skip
+    advance("mapping", count, count)
+    if not models:
+        raise WearcapError(f"no two of {count} pictures could be put together", where=images,
+                           expected="a textured, still scene, seen from places some way apart",
+                           fix="Move the camera instead of turning it on the spot, or take more pictures a second (fps=…).")  # fmt: skip
+    best = max(models.values(), key=lambda model: model.num_reg_images())
+    with tempfile.TemporaryDirectory(dir=folder) as temporary:
+        best.write(temporary)
+        (folder / MODEL).mkdir(exist_ok=True)
+        # images.bin says that the model is whole: it comes last.
+        for path in sorted(Path(temporary).iterdir(), key=lambda path: path.name == "images.bin"):
+            path.replace(folder / MODEL / path.name)
+    return folder / MODEL
+
+
+def _told(step: Callable, database: Path, *arguments: Any, **options: Any) -> Any:
+    """COLMAP's own exceptions, as errors a user can mend."""
+    try:
+        return step(database, *arguments, **options)
+    except (RuntimeError, ValueError) as error:
+        raise WearcapError(f"COLMAP stopped ({' '.join(str(error).split())})"[:300], where=database,
+                           fix="Remove the folder and run again.") from error  # fmt: skip

@@ -1,0 +1,225 @@
+"""From a plain video, or a folder of pictures, to the camera's path and points of its surroundings.
+
+A single camera knows no metres and no gravity: scale and axes of the result are arbitrary.
+"""
+
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, UInt8
+from PIL import Image
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path, write_text
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.trajectory import Trajectory, filled
+from wearcap.io.camera_json import camera_row, write_camera
+from wearcap.io.colmap import ColmapModel, read_colmap
+from wearcap.io.json_text import read_json
+from wearcap.io.pictures import SUFFIXES
+from wearcap.io.ply import Ply, write_ply
+from wearcap.io.tum import write_tum
+from wearcap.io.video import read_frames, read_image, video_info
+from wearcap.localization.picture import check_size
+from wearcap.localization.structure import Advance, MappingSettings, map_pictures
+
+FRAMES, STATE = "frames", "settings.json"
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """Which pictures are taken, and what becomes of those that find no place."""
+
+    fps: float | int
+    """Pictures a second that are taken of a video; of a folder's pictures, how many belong to a second."""
+    max_gap_s: float | int
+    """Shorter gaps between placed pictures are interpolated."""
+    mapping: MappingSettings
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """An ordered row of picture files."""
+
+    folder: Path
+    names: tuple[str, ...]
+    timestamps: Float64[Tensor, "picture"]
+
+
+@dataclass(frozen=True)
+class Track:
+    """A camera's path in a world of arbitrary unit and axes."""
+
+    T_world_cam: Trajectory
+    """Of placed pictures, and of those in short gaps between them."""
+    camera: Camera
+    points_world: Float64[np.ndarray, "point 3"]
+    colors: UInt8[np.ndarray, "point 3"]
+    pictures: int
+    placed: int
+    gaps_s: tuple[tuple[float, float, bool], ...]
+    """Start and end of each stretch without placed pictures, and whether it was bridged."""
+    reprojection_px: float
+    """Mean distance of points from where they were seen; NaN without tracks."""
+
+
+def track_pictures(
+    source: str | Path, output: str | Path, settings: TrackSettings, camera: Camera | None, advance: Advance
+) -> Track:  # fmt: skip
+    """Track the camera of a video or of a folder of pictures; `output` keeps what is worked out on the way.
+
+    A run that was stopped goes on, a finished reconstruction is taken as it is. Raises WearcapError when `output`
+    belongs to another source or other settings, without pictures, and as `map_pictures` does.
+    """
+    source, output = Path(source), Path(output)
+    if not source.exists():
+        raise WearcapError(
+            "no such file or folder", where=source, expected="a video, or a folder of pictures"
+        )
+    _claim(source, output, settings, camera)
+    pictures = picture_row(source, settings.fps) if source.is_dir() else _frames(source, output, settings.fps, advance)  # fmt: skip
+    if len(pictures.names) < 3:
+        raise WearcapError(f"{len(pictures.names)} pictures", where=source, expected="at least 3", fix="Take more a second: fps=…")  # fmt: skip
+    if camera is not None:
+        check_size(read_image(pictures.folder / pictures.names[0]), camera, pictures.names[0])
+    model = map_pictures(pictures.names, pictures.folder, output, camera, settings.mapping, advance)
+    return track_of_model(read_colmap(model, pictures.folder), pictures, settings.max_gap_s, where=output)
+
+
+def picture_row(folder: str | Path, fps: float) -> Pictures:
+    """A folder's pictures in order of name, `fps` of them a second."""
+    folder = Path(folder)
+    names = tuple(sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES))
+    if not names:
+        raise WearcapError("no pictures in this folder", where=folder, expected=", ".join(SUFFIXES))
+    return Pictures(folder, names, torch.arange(len(names), dtype=torch.float64) / fps)
+
+
+def model_row(model: ColmapModel, fps: float) -> Pictures:
+    """The pictures that a model holds, in order of name, as if none was missing."""
+    names = tuple(photo.file.name for photo in model.photos)
+    folder = model.photos[0].file.parent if model.photos else Path()
+    return Pictures(folder, names, torch.arange(len(names), dtype=torch.float64) / fps)
+
+
+def track_of_model(model: ColmapModel, pictures: Pictures, max_gap_s: float, where: str | Path) -> Track:
+    """The path of a model's camera over a row of pictures; gaps up to `max_gap_s` are interpolated.
+
+    Raises WearcapError when the model holds none of the pictures, or several cameras.
+    """
+    number = {name: index for index, name in enumerate(pictures.names)}
+    photos = {number[photo.file.name]: photo for photo in model.photos if photo.file.name in number}
+    if not photos:
+        raise WearcapError(f"the model places none of {len(pictures.names)} pictures", where=where,
+                           expected=f"names such as {pictures.names[0]}" if pictures.names else "photos")  # fmt: skip
+    cameras = {photo.camera for photo in photos.values()}
+    if len(cameras) > 1:
+        raise WearcapError(f"{len(cameras)} cameras", where=where, expected="pictures of one camera",
+                           fix="Map the video as taken with a single camera.")  # fmt: skip
+    placed = torch.zeros(len(pictures.names), dtype=torch.bool)
+    placed[list(photos)] = True
+    R, t = torch.eye(3).repeat(len(placed), 1, 1), torch.zeros(len(placed), 3)
+    for index, photo in photos.items():
+        R[index], t[index] = photo.T_world_cam.R.float(), photo.T_world_cam.t.float()
+    whole = filled(Trajectory(pictures.timestamps, R, t), placed)
+    gaps, kept = _gaps(placed, pictures.timestamps, max_gap_s)
+    return Track(
+        whole[kept], next(iter(cameras)), model.tracks.points_world, model.tracks.colors, len(placed),
+        int(placed.sum()), gaps, reprojection_error(model),
+    )  # fmt: skip
+
+
+def reprojection_error(model: ColmapModel) -> float:
+    """Mean distance (px) of a model's points from where its photos saw them; NaN without observations."""
+    tracks, distances = model.tracks, [np.zeros(0)]
+    for index, photo in enumerate(model.photos):
+        mine = tracks.photo == index
+        points = torch.from_numpy(tracks.points_world[tracks.point[mine]])
+        pixels, valid = photo.camera.project(photo.T_world_cam.inverse() @ points)  # pyright: ignore[reportArgumentType]
+        off = np.linalg.norm(pixels.numpy() - tracks.pixels[mine], axis=1)
+        distances.append(off[valid.numpy()])
+    joined = np.concatenate(distances)
+    return float(joined.mean()) if len(joined) else float("nan")
+
+
+def write_track(track: Track, output: str | Path, source: str) -> None:
+    """Write trajectory.txt (TUM), points.ply, camera.json and report.json into a folder."""
+    output = Path(output)
+    write_tum(track.T_world_cam, output / "trajectory.txt")
+    points = track.points_world.astype(np.float32)
+    write_ply(Ply(points, track.colors), output / "points.ply")
+    error = None if np.isnan(track.reprojection_px) else round(track.reprojection_px, 4)
+    write_camera(track.camera, output / "camera.json", {"source": source, "reprojection_px": error})
+    report = {
+        "source": source, "scale": "arbitrary: no metres, no gravity", "pictures": track.pictures, "placed": track.placed,
+        "placed_share": round(track.placed / track.pictures, 4),
+        "interpolated": len(track.T_world_cam) - track.placed, "points": len(track.points_world),
+        "reprojection_px": error,
+        "gaps": [{"start_s": start, "stop_s": stop, "interpolated": bridged} for start, stop, bridged in track.gaps_s],
+    }  # fmt: skip
+    write_text(output / "report.json", json.dumps(report, indent=1) + "\n")
+
+
+def _gaps(
+    placed: Bool[Tensor, "picture"], timestamps: Float64[Tensor, "picture"], max_gap_s: float
+) -> tuple[tuple[tuple[float, float, bool], ...], Bool[Tensor, "picture"]]:
+    """Stretches without placed pictures (from the last one before to the first one after), and the frames kept."""
+    kept, gaps = placed.clone(), []
+    index = placed.nonzero()[:, 0]
+    edges = [-1, *index.tolist(), len(placed)]
+    for before, after in itertools.pairwise(edges):
+        if after - before > 1:
+            inside = before >= 0 and after < len(placed)
+            start, stop = timestamps[max(before, 0)].item(), timestamps[min(after, len(placed) - 1)].item()
+            bridged = inside and stop - start <= max_gap_s
+            kept[before + 1 : after] = bridged
+            gaps.append((start, stop, bridged))
+    return tuple(gaps), kept
+
+
+def _claim(source: Path, output: Path, settings: TrackSettings, camera: Camera | None) -> None:
+    """Write down whose folder this is. Raises WearcapError when it is another's."""
+    about = source.stat()
+    mine = {
+        "source": str(source.resolve()), "bytes": about.st_size if source.is_file() else len(_listed(source)),
+        "fps": float(settings.fps), "mapping": asdict(settings.mapping), "camera": None if camera is None else camera_row(camera),
+    }  # fmt: skip
+    mine["mapping"].pop("threads")
+    if (output / STATE).is_file():
+        if read_json(output / STATE) != mine:
+            raise WearcapError("this folder holds the track of another source, or of other settings", where=output,
+                               expected=str(output / STATE), fix="Choose another: output=DIR.")  # fmt: skip
+        return
+    write_text(output / STATE, json.dumps(mine, indent=1) + "\n")
+
+
+def _listed(folder: Path) -> Sequence[Path]:
+    return [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+
+
+def _frames(video: Path, output: Path, fps: float, advance: Advance) -> Pictures:
+    """Frames of a video nearest to an even clock, as JPEGs in `output`/frames, with the times that the video says."""
+    folder, listed = output / FRAMES, output / FRAMES / "times.json"
+    if listed.is_file():
+        rows = read_json(listed)
+        return Pictures(folder, tuple(rows), torch.tensor(list(rows.values()), dtype=torch.float64))
+    info = video_info(video)
+    expected = max(int(info.frames / info.fps * fps), 1)
+    folder.mkdir(parents=True, exist_ok=True)
+    rows: dict[str, float] = {}
+    for time, picture in read_frames(video):
+        if time * fps + 0.5 * fps / info.fps < len(rows):
+            continue
+        name = f"{len(rows):06d}.jpg"
+        with atomic_path(folder / name) as temporary:
+            Image.fromarray(picture).save(temporary, quality=95)
+        rows[name] = time
+        advance("pictures", min(len(rows), expected), expected)
+    write_text(listed, json.dumps(rows, indent=0) + "\n")
+    return Pictures(folder, tuple(rows), torch.tensor(list(rows.values()), dtype=torch.float64))

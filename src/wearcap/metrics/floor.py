@@ -1,0 +1,35 @@
+"""Whether a floor that is followed is the one that is stood on."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def stood_on(
+    sole_height: Float[Tensor, "time foot"], contact: Bool[Tensor, "time foot"]
+) -> tuple[Float[Tensor, "time"], Float[Tensor, "time"]]:
+    """Lowest and highest ground (m) that the feet stand on, or stood on last.
+
+    `sole_height` is that of each foot's lowest point. On the level and on slopes both are nearly one; on stairs they
+    are a step apart. A foot that has not stood yet counts from where it first stands; one that never does, not at all.
+    """
+    ground = []
+    frames = torch.arange(len(contact))
+    for foot in range(contact.shape[1]):
+        stands = contact[:, foot].nonzero()[:, 0]
+        if not len(stands):
+            continue
+        latest = stands[(torch.searchsorted(stands, frames, right=True) - 1).clamp_min(0)]
+        ground.append(sole_height[latest, foot])
+    if not ground:
+        nowhere = torch.full((len(contact),), torch.nan)
+        return nowhere, nowhere
+    both = torch.stack(ground)
+    return both.amin(0), both.amax(0)
+
+
+def floor_error_m(
+    height: Float[Tensor, "time"], low: Float[Tensor, "time"], high: Float[Tensor, "time"]
+) -> Float[Tensor, "time"]:
+    """How far (m) a floor's height is from what lies between the lowest and the highest ground that is stood on."""
+    return torch.maximum(low - height, height - high).clamp_min(0)

@@ -1,0 +1,220 @@
+"""From a monocular SLAM's world to ours by a board, and from the camera to the head (MocapEvery appendix C.2).
+
+The camera is put on four positions: C1 and C2 on the board's y axis, C3 and C4 on its x axis, as far apart as measured.
+p_world = scale · R_world_slam p_slam + t_world_slam; the origin is where the axes meet. Cameras are OpenCV's.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.trajectory import Trajectory, interpolate
+from wearcap.recording.recording import HeadStream
+from wearcap.sensors.stillness import StepCheck, Stretch, during, unstillness_deg
+
+MARKS = ("C1", "C2", "C3", "C4")
+T_HEAD_CAM_M = (0.09, 0.0, 0.09)
+"""A camera on the forehead, from the head joint: a nominal value, which is measured on nobody."""
+
+
+@dataclass(frozen=True)
+class AlignmentLimits:
+    """What is accepted of the board positions and of standing."""
+
+    residual_m: float = 0.01
+    scale_spread: float = 0.03
+    corner_deg: float = 3.0
+    mark_still_m: float = 0.008
+    mark_still_deg: float = 1.0
+    stand_still_deg: float = 4.0
+    view_deg: float = 60.0
+
+
+@dataclass(frozen=True)
+class SlamAlignment:
+    """The similarity that turns a SLAM's world into ours, and how well the four positions obey it."""
+
+    scale: float
+    """Metres per unit of the SLAM."""
+    R_world_slam: Float64[Tensor, "3 3"]
+    t_world_slam: Float64[Tensor, "3"]
+    residual_m: float
+    """Root mean square of what the refinement minimises: off-axis coordinates, heights, distances."""
+    scale_spread: float
+    """Between the scales by either distance, as a share."""
+    corner_deg: float
+    """By which the two lines miss a right angle."""
+
+    def points(self, points_slam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Positions in the world (m)."""
+        moved = self.scale * points_slam.double() @ self.R_world_slam.mT + self.t_world_slam
+        return moved.to(points_slam.dtype)
+
+    def apply(self, trajectory: Trajectory) -> Trajectory:
+        """Poses in the world."""
+        R = self.R_world_slam.to(trajectory.R_world_body) @ trajectory.R_world_body
+        return Trajectory(trajectory.timestamps, R, self.points(trajectory.t_world_body))
+
+
+@dataclass(frozen=True)
+class HeadMount:
+    """How a camera sits on the head."""
+
+    R_head_cam: Float[Tensor, "3 3"]
+    t_head_cam: Float[Tensor, "3"]
+    still_deg: float
+    """Root mean square angle to the mean while standing."""
+
+    @property
+    def view_deg(self) -> float:
+        """Between the optical axis and straight ahead."""
+        return math.degrees(math.acos(min(max(self.R_head_cam[0, 2].item(), -1.0), 1.0)))
+
+    def apply(self, T_world_cam: Trajectory) -> HeadStream:
+        """The camera's path as that of a device whose axes are the head's."""
+        R = T_world_cam.R_world_body
+        return HeadStream(
+            T_world_cam.timestamps, R @ self.R_head_cam.mT.to(R), T_world_cam.t_world_body, torch.eye(3), self.t_head_cam
+        )  # fmt: skip
+
+
+def mark_positions(
+    slam: Trajectory, stretches: Sequence[Stretch]
+) -> tuple[Float64[Tensor, "mark 3"], Float64[Tensor, "mark"], list[float]]:
+    """Mean camera centres during the four stretches, how far samples lie from them (root mean square; units of the
+    SLAM), and by how much the camera turns meanwhile (degrees)."""
+    if len(stretches) != len(MARKS):
+        raise WearcapError(f"{len(stretches)} stretches on the board", where="camera on the board",
+                           expected="four: C1 and C2 on the y axis, C3 and C4 on the x axis")  # fmt: skip
+    inside = [during(slam.timestamps, s, f"camera on {name}", 1.0) for name, s in zip(MARKS, stretches)]
+    there = [slam.t_world_body[part].double() for part in inside]
+    mean = torch.stack([part.mean(0) for part in there])
+    moved = torch.stack([(part - at).square().sum(-1).mean().sqrt() for part, at in zip(there, mean)])
+    return mean, moved, [unstillness_deg(slam.R_world_body[part]) for part in inside]
+
+
+def align_by_marks(
+    marks_slam: Float[Tensor, "mark 3"], distances_m: tuple[float, float], height_m: float = 0.0
+) -> SlamAlignment:
+    """Similarity from the four positions, |C1 C2| and |C3 C4| (m), and the camera's height above the floor on the board.
+
+    Closed form, then refined by least squares over all residuals at once. Raises WearcapError where two positions
+    coincide, all lie on a line, or a distance is not positive.
+    """
+    C = marks_slam.double().numpy()
+    lines = np.stack([C[1] - C[0], C[3] - C[2]])
+    lengths = np.linalg.norm(lines, axis=1)
+    if min(distances_m) <= 0 or not np.isfinite(C).all() or lengths.min() < 1e-9:
+        raise WearcapError(f"distances of {distances_m} m, and {lengths.round(4).tolist()} in the SLAM", where="camera on the board",
+                           expected="four different places and distances above 0",
+                           fix="Measure |C1 C2| and |C3 C4| on the board.")  # fmt: skip
+    across = np.linalg.norm(np.cross(*lines)) / lengths.prod()
+    if across < 0.5:
+        raise WearcapError(f"C1 C2 and C3 C4 are {math.degrees(math.asin(across)):.0f}° apart", where="camera on the board",
+                           expected="90°", fix="Put C1 and C2 on the y axis, C3 and C4 on the x axis.")  # fmt: skip
+    scales = np.array(distances_m) / lengths
+    start = _closed_form(C, np.array(distances_m), height_m)
+    found = least_squares(_residuals, start, args=(C, distances_m, height_m), x_scale="jac")
+    return SlamAlignment(
+        float(np.exp(found.x[3])), torch.from_numpy(Rotation.from_rotvec(found.x[:3]).as_matrix()),
+        torch.from_numpy(found.x[4:].copy()), float(np.sqrt(np.mean(found.fun**2))),
+        float(abs(scales[0] - scales[1]) / scales.mean()),
+        abs(90 - math.degrees(math.acos(np.clip(lines[0] @ lines[1] / lengths.prod(), -1, 1)))),
+    )  # fmt: skip
+
+
+def _closed_form(C: np.ndarray, distances: np.ndarray, height: float) -> np.ndarray:
+    """Rotation vector, log scale and translation: scale by least squares, rotation by Procrustes, then each
+    coordinate of the origin as the mean of what should be zero."""
+    lines = np.stack([C[1] - C[0], C[3] - C[2]])
+    lengths = np.linalg.norm(lines, axis=1)
+    scale = distances @ lengths / (lengths @ lengths)
+    normal = np.cross(lines[1], lines[0])
+    there = np.stack([*(lines / lengths[:, None]), normal / np.linalg.norm(normal)])
+    R = Rotation.align_vectors(np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]), there)[0]
+    placed = scale * R.apply(C)
+    t = -np.array([placed[:2, 0].mean(), placed[2:, 1].mean(), placed[:, 2].mean() - height])
+    return np.concatenate([R.as_rotvec(), [np.log(scale)], t])
+
+
+def _residuals(x: np.ndarray, C: np.ndarray, distances: tuple[float, float], height: float) -> np.ndarray:
+    """What the axes, the height and the distances say of the placed positions (m)."""
+    P = np.exp(x[3]) * Rotation.from_rotvec(x[:3]).apply(C) + x[4:]
+    apart = [P[1, 1] - P[0, 1] - distances[0], P[3, 0] - P[2, 0] - distances[1]]
+    return np.concatenate([P[:2, 0], P[2:, 1], P[:, 2] - height, apart])
+
+
+def scale_by_walks(slam: Trajectory, walks: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
+    """Metres per unit of the SLAM from walked distances, and the spread of the scales by each of them, as a share.
+
+    A walk is (start s, stop s, metres between the two places). Raises WearcapError for walks that lead nowhere.
+    """
+    if not walks:
+        raise WearcapError("no walked distance", expected="(start s, stop s, metres), once or more")
+    at = torch.tensor([walk[:2] for walk in walks], dtype=torch.float64).reshape(-1)
+    ends = interpolate(slam.timestamps, slam.t_world_body.double(), at).reshape(-1, 2, 3)
+    lengths = (ends[:, 1] - ends[:, 0]).norm(dim=-1).numpy()
+    metres = np.array([walk[2] for walk in walks])
+    if lengths.min() < 1e-9 or metres.min() <= 0:
+        raise WearcapError(f"walks of {metres.tolist()} m, and {lengths.round(4).tolist()} in the SLAM", where="walked distances",
+                           expected="two different places and a distance above 0", fix="Check the times of the walks.")  # fmt: skip
+    scales = metres / lengths
+    return float(metres @ lengths / (lengths @ lengths)), float(np.ptp(scales) / scales.mean())
+
+
+def mount_by_standing(
+    T_world_cam: Trajectory,
+    standing: Stretch,
+    facing_deg: float = 90.0,
+    t_head_cam: tuple[float, float, float] = T_HEAD_CAM_M,
+) -> HeadMount:
+    """How the camera sits on the head of someone who stands upright and looks ahead, in a direction that is known.
+
+    R_head_cam = R_world_headᵀ mean(R_world_cam); the translation (m) is given.
+    """
+    R = T_world_cam.R_world_body[during(T_world_cam.timestamps, standing, "standing", 3.0)]
+    R_world_head = rotation.about_axis("z", torch.tensor(math.radians(facing_deg), dtype=torch.float64))
+    R_head_cam = R_world_head.mT @ rotation.mean_rotation(R.double())
+    return HeadMount(R_head_cam.float(), torch.tensor(t_head_cam), unstillness_deg(R))
+
+
+def mark_checks(
+    found: SlamAlignment,
+    moved_m: Float[Tensor, "mark"],
+    turned_deg: Sequence[float],
+    limits: AlignmentLimits = AlignmentLimits(),
+) -> list[StepCheck]:
+    """What tells whether the camera's four positions went well; `moved_m` and `turned_deg` as `mark_positions` has it."""
+    still = "Let go of the camera, or give a stretch in which it rests."
+    ruler = "Measure |C1 C2| and |C3 C4| again, and check which position is which."
+    rows = []
+    for name, moved, turned in zip(MARKS, moved_m.tolist(), turned_deg):
+        rows.append(StepCheck(f"camera on {name}", "moves", moved, limits.mark_still_m, "m", still))
+        rows.append(StepCheck(f"camera on {name}", "turns", turned, limits.mark_still_deg, "°", still))
+    return [
+        *rows,
+        StepCheck("camera on the board", "scales by the two distances differ", 100 * found.scale_spread,
+                  100 * limits.scale_spread, "%", ruler),
+        StepCheck("camera on the board", "axes miss a right angle", found.corner_deg, limits.corner_deg, "°",
+                  "Put C1 and C2 on the y axis, C3 and C4 on the x axis."),
+        StepCheck("camera on the board", "residual", found.residual_m, limits.residual_m, "m", ruler),
+    ]  # fmt: skip
+
+
+def mount_checks(found: HeadMount, limits: AlignmentLimits = AlignmentLimits()) -> list[StepCheck]:
+    """What tells whether standing went well."""
+    return [
+        StepCheck("standing", "not still", found.still_deg, limits.stand_still_deg, "°",
+                  "Stand upright and look ahead for 10 s, or give a calmer stretch."),
+        StepCheck("standing", "optical axis away from straight ahead", found.view_deg, limits.view_deg, "°",
+                  "Face the board's y while standing, or say where you faced (facing_deg)."),
+    ]  # fmt: skip

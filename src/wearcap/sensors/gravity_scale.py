@@ -1,0 +1,232 @@
+"""A monocular SLAM's scale and vertical where no board was used: from an inertial sensor on the head, or from the floor.
+
+Inertial: with s metres per unit, s a_slam - g_slam = R_slam_imu f for the specific force f (m/s²), so that gravity and scale
+are linear unknowns. Nearly all error lies in a_slam, a second difference of jittery positions; solved for s, that
+error would stand beside the unknown and pull s down by as much as its share of a_slam's variance. So the equation is
+solved as a_slam = (1/s) R f + g/s, the error on the left.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+import torch
+from jaxtyping import Float, Float64
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from wearcap.body.limb_ik import swing_between
+from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import Trajectory, find_gaps, interpolate, resample
+from wearcap.recording.recording import ImuStream
+from wearcap.sensors.imu import GRAVITY, acceleration
+from wearcap.sensors.stillness import Stretch, during
+
+_HALF_S = 0.25
+"""Second differences reach so far to both sides: longer ones have less of the jitter, shorter ones more of the gait."""
+_BLOCK_S = 1.0
+"""Errors further apart in time are taken as independent."""
+_BIAS = 0.05
+"""Deviation (m/s²) that an accelerometer's bias is expected to have."""
+_GRAVITY_SHARE = 0.05
+"""By which the length of the gravity found may differ from 9.81 m/s²."""
+_ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class GravityScale:
+    """Vertical and scale of a SLAM's world. The heading stays the SLAM's: R_world_slam is the least turn that puts z up."""
+
+    R_world_slam: Float64[Tensor, "3 3"]
+    scale: float
+    """Metres per unit of the SLAM."""
+    scale_std: float
+    gravity_std_deg: float
+    """Deviation of the vertical's direction."""
+
+    @property
+    def scale_std_percent(self) -> float:
+        return 100 * self.scale_std / self.scale
+
+
+def by_head_imu(
+    slam: Trajectory,
+    imu: ImuStream,
+    R_cam_imu: Float[Tensor, "3 3"] | None = None,
+    t_cam_imu: Float[Tensor, "3"] | None = None,
+) -> GravityScale:
+    """Scale and vertical from a sensor (acc_imu, the camera's clock) fixed to the camera at a known place (m).
+
+    Huber's robust least squares in (1/s, g/s, bias/s); its covariance lets errors within a second hang together.
+    Raises WearcapError where the two share less than 10 s, do not move enough to tell the scale, or contradict each
+    other: gravity not 9.81 m/s² long, or a negative scale.
+    """
+    a_slam, felt, R, fps = _alike(slam, imu, R_cam_imu, t_cam_imu)
+    # a_slam = k R f - h - R b with h = -g/s (up), b = k bias
+    rows = np.concatenate([felt[:, :, None], np.broadcast_to(-np.eye(3), R.shape), -R], 2)
+    x, covariance = _robust(rows, a_slam, round(_BLOCK_S * fps), _BIAS)
+    k, up = x[0], x[1:4]
+    length = np.linalg.norm(up) / k if abs(k) > 1e-12 else math.inf
+    deviation = math.sqrt(covariance[0, 0]) / abs(k)
+    if deviation > 0.1:
+        raise WearcapError(f"the scale stays uncertain by {100 * deviation:.0f} %", where="scale from the head's sensor",
+                           expected="at most 10 %", fix="Walk with turns for half a minute; give more of the log.")  # fmt: skip
+    if k <= 0 or abs(length / GRAVITY - 1) > _GRAVITY_SHARE:
+        raise WearcapError(f"gravity of {length:.2f} m/s² and a scale of {1 / k:.3g}", where="scale from the head's sensor",
+                           expected="9.81 m/s² and a scale above 0",
+                           fix="Check the unit of the accelerations, how the sensor sits on the camera, and the clocks.")  # fmt: skip
+    direction = up / np.linalg.norm(up)
+    across = np.eye(3) - np.outer(direction, direction)
+    turn = across @ covariance[1:4, 1:4] @ across / (up @ up)
+    return GravityScale(_upright(direction), 1 / k, deviation / k, math.degrees(math.sqrt(np.trace(turn))))
+
+
+def _alike(
+    slam: Trajectory, imu: ImuStream, R_cam_imu: Tensor | None, t_cam_imu: Tensor | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Second differences of the camera's path, what the sensor felt through the same filter, R_slam_imu; frames a second.
+
+    (p(t-h) + p(t+h) - 2p(t)) / h² is the acceleration under a triangle of half-width h; so the forces go under one, too.
+    """
+    if imu.acc_imu is None:
+        raise WearcapError(
+            "a stream without acc_imu", where="the head's sensor", expected="specific force (m/s²)"
+        )
+    start, stop = max(slam.timestamps[0], imu.timestamps[0]), min(slam.timestamps[-1], imu.timestamps[-1])
+    if stop - start < 10:
+        raise WearcapError(f"camera and sensor share {max((stop - start).item(), 0):.1f} s", where="scale from the head's sensor",
+                           expected="10 s or more", fix="Bring both to one clock, and walk for longer.")  # fmt: skip
+    if len(gaps := find_gaps(slam.timestamps, 0.5)):
+        raise WearcapError(f"the camera is lost at {slam.timestamps[gaps[0]].item():.2f} s", where="scale from the head's sensor",
+                           expected="poses without gaps", fix="Give a part without gaps.")  # fmt: skip
+    step, fine = slam.timestamps.diff().median().item(), 4
+    n = max(round(_HALF_S / step), 1)
+    # On the camera's frames: between them positions would be interpolated, which flattens them.
+    first = slam.timestamps[torch.searchsorted(slam.timestamps, start)].item()
+    dense = torch.arange(first, stop.item(), step / fine, dtype=torch.float64)
+    R_cam_imu = torch.eye(3) if R_cam_imu is None else R_cam_imu
+    poses = resample(
+        Trajectory(slam.timestamps, slam.R_world_body.double(), slam.t_world_body.double()), dense
+    )
+    R = poses.R_world_body @ R_cam_imu.double()
+    force = interpolate(imu.timestamps, imu.acc_imu.double(), dense)
+    felt = (R @ force[..., None])[..., 0].numpy()
+    triangle = np.bartlett(2 * n * fine + 1)
+    felt, turned = (
+        scipy.ndimage.convolve1d(value, triangle / triangle.sum(), axis=0)[::fine]
+        for value in (felt, R.numpy().reshape(-1, 9))
+    )
+    arm = torch.zeros(3) if t_cam_imu is None else t_cam_imu
+    swung = acceleration((poses.R_world_body @ arm.double())[::fine], 1 / step, n).numpy()
+    a_slam = acceleration(poses.t_world_body[::fine], 1 / step, n).numpy()
+    inner = slice(n, len(a_slam) - n)
+    return a_slam[inner], (felt - swung)[inner], turned.reshape(-1, 3, 3)[inner], 1 / step
+
+
+def _robust(rows: np.ndarray, y: np.ndarray, block: int, bias: float) -> tuple[np.ndarray, np.ndarray]:
+    """Huber's estimate of x in rows (time, 3, unknown) x = y (time, 3), and its covariance with errors that hang
+    together within blocks. The last three unknowns, k times a bias, are drawn to zero."""
+    weight, prior = np.ones(len(y)), np.zeros(rows.shape[2])
+    sigma2, k = y.var(), 0.0
+    for _ in range(_ROUNDS):
+        # Errors hang together over a block: a block counts as one observation against the prior.
+        prior[-3:] = block * sigma2 / max(k * bias, 1e-6) ** 2 if k else 1e6 * len(y)
+        normal = np.einsum("t,tij,tik->jk", weight, rows, rows) + np.diag(prior)
+        x = np.linalg.solve(normal, np.einsum("t,tij,ti->j", weight, rows, y))
+        k = abs(x[0])
+        error = y - rows @ x
+        size = np.linalg.norm(error, axis=1)
+        scale = np.median(size) / 1.54  # of a three-dimensional normal error, per axis
+        weight = np.minimum(1.0, 2.5 * scale / np.maximum(size, 1e-12))
+        sigma2 = scale**2
+    scores = np.einsum("t,tij,ti->tj", weight, rows, error)
+    count = len(scores) // block * block
+    summed = scores[:count].reshape(-1, block, rows.shape[2]).sum(1)
+    inverse = np.linalg.inv(normal)
+    middle = summed.T @ summed * len(scores) / max(count, 1)
+    middle[-3:, -3:] += np.diag(prior[-3:] ** 2 * (k * bias) ** 2)
+    return x, inverse @ middle @ inverse
+
+
+def by_floor(
+    slam: Trajectory,
+    points_slam: Float[Tensor, "point 3"],
+    standing: Stretch,
+    height_m: float,
+    height_std_m: float = 0.005,
+    seed: int = 0,
+) -> GravityScale:
+    """Scale and vertical from the floor beneath the path, and the camera's height above it while standing (m).
+
+    The floor is the plane with most points beneath the path (RANSAC, then total least squares), not more than 35° from
+    what the camera takes for level. Deviations by a bootstrap over patches of the floor, with `height_std_m` of the
+    measured height. Raises WearcapError when too few points lie on a plane, or the height is none of a head.
+    """
+    if not 0.5 < height_m < 2.5:
+        raise WearcapError(
+            f"a standing height of {height_m} m", where="scale from the floor", expected="0.5 m to 2.5 m"
+        )
+    random = np.random.default_rng(seed)
+    eyes = slam.t_world_body[during(slam.timestamps, standing, "standing", 1.0)].double().mean(0).numpy()
+    rough = -slam.R_world_body[:, :, 1].double().mean(0).numpy()
+    points = _beneath(
+        points_slam.double().numpy(), slam.t_world_body.double().numpy(), rough / np.linalg.norm(rough)
+    )
+    floor = _floor_points(points, eyes, rough / np.linalg.norm(rough), random)
+    up, height = _plane(floor, eyes)
+    patch = np.unique(np.floor(floor / (height / 4)).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
+    members = np.split(np.argsort(patch, kind="stable"), np.cumsum(np.bincount(patch))[:-1])
+    turns, scales = [], []
+    for _ in range(200):
+        drawn = np.concatenate([members[k] for k in random.integers(0, len(members), len(members))])
+        up_k, height_k = _plane(floor[drawn], eyes)
+        turns.append(math.acos(min(up @ up_k, 1.0)))
+        scales.append((height_m + height_std_m * random.standard_normal()) / height_k)
+    deviation = math.degrees(math.sqrt(np.mean(np.square(turns))))
+    return GravityScale(_upright(up), height_m / height, float(np.std(scales)), deviation)
+
+
+def _beneath(points: np.ndarray, path: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Points within 50° of straight below some place of the path, down to twice the usual drop."""
+    across = np.eye(3) - np.outer(up, up)
+    distance, nearest = KDTree(path @ across).query(points @ across)
+    drop = (path[nearest] - points) @ up
+    below = (drop > 0) & (distance < 1.2 * drop)
+    return points[below]
+
+
+def _floor_points(
+    points: np.ndarray, eyes: np.ndarray, rough: np.ndarray, random: np.random.Generator
+) -> np.ndarray:
+    """Points of the plane with most support; a point counts within 2 % of the camera's height above it."""
+    best = np.zeros(len(points), bool)
+    for _ in range(500 if len(points) >= 30 else 0):
+        a, b, c = points[random.choice(len(points), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-12 or abs(normal @ rough) < math.cos(math.radians(35)) * length:
+            continue
+        normal *= np.sign(normal @ rough) / length
+        height = (eyes - a) @ normal
+        near = np.abs((points - a) @ normal) < 0.02 * height
+        best = near if near.sum() > best.sum() else best
+    for _ in range(3):
+        if best.sum() < 30:
+            raise WearcapError(f"{int(best.sum())} of {len(points)} points beneath the path lie on one plane", where="scale from the floor",
+                               expected="30 or more", fix="Look at the floor while walking, or use the board.")  # fmt: skip
+        up, height = _plane(points[best], eyes)
+        best = np.abs((points - eyes) @ up + height) < 0.02 * height
+    return points[best]
+
+
+def _plane(points: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, float]:
+    """Unit normal of the points' plane towards the eyes, and their height above it."""
+    middle = points.mean(0)
+    normal = np.linalg.eigh(np.cov((points - middle).T))[1][:, 0]
+    height = float((eyes - middle) @ normal)
+    return (normal, height) if height > 0 else (-normal, -height)
+
+
+def _upright(up: np.ndarray) -> Float64[Tensor, "3 3"]:
+    return swing_between(torch.from_numpy(up.copy()), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))

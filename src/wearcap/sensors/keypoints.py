@@ -1,0 +1,126 @@
+"""What detectors on a head camera would report of a true motion: the wearer's own joints, and another person's pose.
+
+Only the picture's borders hide anything here: walls, furniture and the body itself do not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64
+from scipy.stats import norm
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, interpolate, resample
+from wearcap.recording.motion import Motion
+from wearcap.recording.recording import CameraStream, Cue
+from wearcap.sensors.noise import smooth_noise
+from wearcap.sensors.slam import R_DEVICE_CAM
+
+ACTION_CAMERA = Camera("pinhole", 1920, 1080, 895.2, 785.7, 959.5, 539.5)
+"""94° x 69°, what the wide lens of an action camera shows."""
+DOWN_DEG, T_HEAD_CAM = 22.5, (0.09, 0.0, 0.09)
+"""How far the camera looks down, and its place in the head's frame (m)."""
+BURST_S = 0.2
+"""How long a detector goes on missing a joint, about."""
+NEAR_M = 0.05
+"""Nothing is seen that is closer to the lens."""
+TRUNK = ("head", "left_shoulder", "right_shoulder", "left_hip", "right_hip")
+"""Joints that a pose estimator has to see."""
+DEPTH_SHARE = 0.05
+"""Deviation of a person's distance, as a share of it: one picture does not tell size from distance."""
+
+
+def action_camera(timestamps: Float64[Tensor, "time"]) -> CameraStream:
+    """`ACTION_CAMERA` on a head, taking pictures at these times."""
+    down = rotation.about_axis("y", torch.tensor(DOWN_DEG).deg2rad())
+    return CameraStream(timestamps, ACTION_CAMERA, down @ R_DEVICE_CAM, torch.tensor(T_HEAD_CAM))
+
+
+def camera_path(motion: Motion, stream: CameraStream) -> Trajectory:
+    """True poses of a camera on the head of a true motion, at those of its times that the motion covers.
+
+    Raises WearcapError when these are fewer than two.
+    """
+    T_world_cam = motion.joint("head") @ Rigid(stream.R_head_cam, stream.t_head_cam)[None]
+    times = stream.timestamps
+    times = times[(times >= motion.timestamps[0]) & (times <= motion.timestamps[-1])]
+    if len(times) < 2:
+        raise WearcapError(f"{len(times)} pictures of the head camera during the motion", expected="two or more, on one clock")  # fmt: skip
+    return resample(Trajectory(motion.timestamps, T_world_cam.R, T_world_cam.t), times)
+
+
+def seen_joints(
+    motion: Motion, T_world_cam: Trajectory, camera: Camera, joints: Sequence[str], noise_px: float, drop: float,
+    rng: np.random.Generator,
+) -> dict[str, Cue]:  # fmt: skip
+    """Pixels of joints in a camera's frames (OpenCV axes, within the motion's time), as a detector would find them.
+
+    A share `drop` of what is in the picture is missed, in short bursts. Half of the noise's variance lasts for about a
+    second; how noisy a frame is (`noise_px` in the middle) varies as much, and confidence falls with it. Cues hold the
+    frames that show their joint; joints that are never seen are left out.
+    """
+    count, fps = len(T_world_cam), _rate(T_world_cam)
+    cues = {}
+    for joint in joints:
+        t_world = interpolate(motion.timestamps, motion.joint(joint).t, T_world_cam.timestamps)
+        pixels, seen = _in_picture(t_world[:, None], T_world_cam, camera)
+        missed = smooth_noise(rng, count, 1, BURST_S, fps)[:, 0] > norm.isf(drop)
+        deviation = noise_px * (0.4 * smooth_noise(rng, count, 1, 1.0, fps)).exp()
+        noise = (smooth_noise(rng, count, 2, 1.0, fps) + smooth_noise(rng, count, 2, 0.0, fps)) / np.sqrt(2)
+        off = pixels[:, 0] + deviation * noise
+        confidence = 1 / (1 + 0.25 * (deviation[:, 0] / max(noise_px, 1e-6)) ** 2)
+        found = seen[:, 0] & ~missed
+        if found.any():
+            cues[joint] = Cue(T_world_cam.timestamps[found], joint, off[found].float(), confidence[found])
+    return cues
+
+
+def seen_wearer(
+    motion: Motion, T_world_cam: Trajectory, camera: Camera, noise_deg: float, rng: np.random.Generator,
+    period_s: float = 1.0, range_m: float = 8.0,
+) -> tuple[Motion, Float[Tensor, "time joint"]]:  # fmt: skip
+    """A person's motion as a monocular pose estimator finds it in another wearer's camera, and its confidence.
+
+    Local rotations are off by `noise_deg` (root mean square), changing over about `period_s`; the root's place by its
+    distance. Frames count in which trunk and head are in the picture and nearer than `range_m`, and of these the joints
+    that are in the picture with their children; all else has confidence 0. Both need one clock and one world.
+    """
+    times = T_world_cam.timestamps
+    joints = interpolate(motion.timestamps, motion.T_world_joint.t, times)
+    _, seen = _in_picture(joints, T_world_cam, camera)
+    away = joints[:, 0] - T_world_cam.t_world_body
+    distance = away.norm(dim=-1)
+    skeleton, fps, count = motion.skeleton, _rate(T_world_cam), len(times)
+    found = seen[:, skeleton.indices(*TRUNK)].all(-1) & (distance < range_m)
+    clear = seen.clone()
+    for joint, parent in enumerate(skeleton.parents):
+        if parent >= 0:
+            clear[:, parent] &= seen[:, joint]
+    confidence = (1 - 0.5 * (distance / range_m).clamp_max(1))[:, None] * (clear & found[:, None])
+    nearest = torch.searchsorted((motion.timestamps[1:] + motion.timestamps[:-1]) / 2, times)
+    turn = smooth_noise(rng, count, 3 * len(skeleton), period_s, fps).unflatten(-1, (-1, 3))
+    R = motion.R_parent_joint[nearest] @ rotation.exp(np.deg2rad(noise_deg) / np.sqrt(3) * turn)
+    deeper = DEPTH_SHARE * smooth_noise(rng, count, 1, period_s, fps)
+    estimate = replace(
+        motion, timestamps=times, R_parent_joint=R, t_world_root=joints[:, 0] + deeper * away, contact_prob=None,
+        hand_contact_prob=None, object_motion=None, interactions=None, provenance={"source": "simulated pose estimator"},
+    )  # fmt: skip
+    return estimate, confidence.float()
+
+
+def _in_picture(
+    t_world: Float[Tensor, "time point 3"], T_world_cam: Trajectory, camera: Camera
+) -> tuple[Float[Tensor, "time point 2"], Bool[Tensor, "time point"]]:
+    p_cam = T_world_cam.T_world_body.inverse()[:, None] @ t_world
+    pixels, seen = camera.project(p_cam)
+    return pixels, seen & (torch.linalg.vector_norm(p_cam, dim=-1) > NEAR_M)
+
+
+def _rate(path: Trajectory) -> float:
+    return 1.0 / path.timestamps.diff().median().item()

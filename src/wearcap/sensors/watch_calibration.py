@@ -1,0 +1,222 @@
+"""From a watch's own reference frame and its place on the arm to the world and the wrist (MocapEvery appendix C.2).
+
+Both watches lie on a board whose axes are the world's (z up, y where the wearer will face), then are worn in a T-pose
+that faces y. With our names eq. 6 and 7 read R_world_joint = R_world_ref R_ref_imu R_imu_joint,
+acc_world = R_world_ref acc_ref, and R_imu_joint = R_world_imu(T)ᵀ R_world_joint(T). A skeleton's rest pose is a T-pose that
+faces x, so that facing y R_world_joint(T) = Rz(90°) for both wrists. A pose that is held wrongly by a constant angle
+cannot be told from a watch that sits otherwise.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.recording.recording import ImuStream
+from wearcap.sensors.stillness import (
+    StepCheck,
+    Stretch,
+    common,
+    during,
+    require,
+    still_intervals,
+    unstillness_deg,
+)
+from wearcap.sensors.watches import WRISTS, require_sides
+
+FACING_DEG = 90.0
+"""The T-pose faces the world's y."""
+
+
+@dataclass(frozen=True)
+class CalibrationLimits:
+    """What is accepted of the board and the T-pose."""
+
+    board_still_deg: float = 1.0
+    board_tilt_deg: float = 3.0
+    pose_still_deg: float = 4.0
+    face_up_deg: float = 40.0
+    """Between the T-pose's vertical and the watch's face: palms down, the watch on the back of the wrist."""
+    arm_level_deg: float = 20.0
+    arm_facing_deg: float = 25.0
+    arms_apart_deg: float = 15.0
+    """Between the lines of the two forearms."""
+
+
+@dataclass(frozen=True)
+class WatchCalibration:
+    """How one watch's reference frame lies in the world and the watch on its wrist; how well that is known (degrees)."""
+
+    joint: str
+    R_world_ref: Float[Tensor, "3 3"]
+    R_joint_imu: Float[Tensor, "3 3"]
+    board_still_deg: float
+    """Root mean square angle to the mean while on the board."""
+    board_tilt_deg: float
+    """Of the board's z against the vertical that the watch feels."""
+    pose_still_deg: float
+
+    @property
+    def face_up_deg(self) -> float:
+        """By which the watch's face (its z axis) looks away from straight up in the T-pose."""
+        return _angle_deg(self.R_joint_imu[2, 2])
+
+    @property
+    def arm_level_deg(self) -> float:
+        """Slope of the watch's x axis, which lies along the forearm, in the T-pose."""
+        return abs(90.0 - _angle_deg(self.R_joint_imu[2, 0]))
+
+    @property
+    def arm_facing_deg(self) -> float:
+        """By which the forearm points away from the side of someone who faces the board's y."""
+        x = self.R_joint_imu[:, 0]
+        return math.degrees(math.atan2(abs(x[0].item()), abs(x[1].item())))
+
+    def apply(self, stream: ImuStream) -> ImuStream:
+        """The stream in the world: orientation and free acceleration (eq. 6), and where the watch sits on the wrist."""
+        R_ref_imu = _orientation(stream)
+        R = self.R_world_ref.to(R_ref_imu)
+        acc = None if stream.acc_world is None else stream.acc_world @ R.mT
+        return replace(
+            stream, joint=self.joint, R_world_imu=R @ R_ref_imu, acc_world=acc, R_joint_imu=self.R_joint_imu.to(R)
+        )  # fmt: skip
+
+
+def measure_watch(stream: ImuStream, board: Stretch, t_pose: Stretch) -> WatchCalibration:
+    """Calibrate one watch (log in its own reference frame, z up) without judging how well the steps went.
+
+    Raises WearcapError for a stretch that is shorter than 2 s or not in the log.
+    """
+    R_ref_imu = _orientation(stream)
+    on_board = R_ref_imu[during(stream.timestamps, board, f"board, {stream.joint}")]
+    worn = R_ref_imu[during(stream.timestamps, t_pose, f"T-pose, {stream.joint}")]
+    R_ref_world = rotation.mean_rotation(on_board.double())
+    R_world_imu = R_ref_world.mT @ rotation.mean_rotation(worn.double())
+    R_world_joint = rotation.about_axis("z", torch.tensor(math.radians(FACING_DEG), dtype=torch.float64))
+    return WatchCalibration(
+        stream.joint, R_ref_world.mT.float().contiguous(), (R_world_joint.mT @ R_world_imu).float(),
+        unstillness_deg(on_board), _angle_deg(R_ref_world[2, 2]), unstillness_deg(worn),
+    )  # fmt: skip
+
+
+def measure_watches(
+    streams: Mapping[str, ImuStream], board: Stretch, t_pose: Stretch
+) -> dict[str, WatchCalibration]:
+    """`measure_watch` for both wrists. Raises WearcapError when one is missing or the stretches overlap."""
+    if missing := [joint for joint in WRISTS if joint not in streams]:
+        raise WearcapError(f"no watch on {' and '.join(missing)}", expected=" and ".join(WRISTS))
+    if board[0] < t_pose[1] and t_pose[0] < board[1]:
+        raise WearcapError(f"board {board} and T-pose {t_pose} overlap", where="board and T-pose",
+                           expected="two stretches, one after the other")  # fmt: skip
+    return {joint: measure_watch(streams[joint], board, t_pose) for joint in WRISTS}
+
+
+def watch_checks(
+    found: Mapping[str, WatchCalibration], limits: CalibrationLimits = CalibrationLimits()
+) -> list[StepCheck]:
+    """What tells whether the board and the T-pose went well, in the order of the steps."""
+    still = "Let go of the watches, and give a stretch in which nothing touches them."
+    steady = "Hold the pose for 3 s without moving, or give a calmer stretch."
+    flat = "Put the board on a level table, the watches' backs flat on it."
+    palms = "Hold the palms down, the watch on the back of the wrist, its x axis along the forearm."
+    level = "Raise both arms to the height of the shoulders."
+    facing = "Face the board's y in the T-pose; on the board the 12 o'clock of both watches points along y."
+    rows = []
+    for joint, one in found.items():
+        for step, what, measured, limit, fix in (
+            ("board", "not still", one.board_still_deg, limits.board_still_deg, still),
+            ("board", "tilt of its z against gravity", one.board_tilt_deg, limits.board_tilt_deg, flat),
+            ("T-pose", "not still", one.pose_still_deg, limits.pose_still_deg, steady),
+            ("T-pose", "slope of the forearm", one.arm_level_deg, limits.arm_level_deg, level),
+            ("T-pose", "face of the watch looks away from up", one.face_up_deg, limits.face_up_deg, palms),
+            ("T-pose", "forearm away from the wearer's side", one.arm_facing_deg, limits.arm_facing_deg, facing),
+        ):  # fmt: skip
+            rows.append(StepCheck(f"{step}, {joint}", what, measured, limit, "°", fix))
+    rows.append(
+        StepCheck("T-pose, both", "the forearms' lines disagree", _apart_deg(found), limits.arms_apart_deg, "°",
+                  "Stretch both arms out to one line; both watches lie on the board in the same direction.")
+    )  # fmt: skip
+    return rows
+
+
+def require_watches(
+    streams: Mapping[str, ImuStream],
+    found: Mapping[str, WatchCalibration],
+    t_pose: Stretch,
+    limits: CalibrationLimits = CalibrationLimits(),
+) -> None:
+    """Raise WearcapError for the first step that went wrong, and for logs of the wrong arms.
+
+    Which arm is which shows only once the arms hang, in the half minute after the T-pose.
+    """
+    require(watch_checks(found, limits))
+    after = []
+    for joint in WRISTS:
+        stream = found[joint].apply(streams[joint])
+        later = (stream.timestamps > t_pose[1]) & (stream.timestamps < t_pose[1] + 30)
+        if not later.any():
+            return
+        R = stream.R_world_imu[later] @ stream.R_joint_imu.mT  # pyright: ignore[reportOptionalSubscript, reportOptionalMemberAccess]
+        after.append(R[torch.linspace(0, len(R) - 1, 300).long()])
+    require_sides(torch.stack(after, 1), "after the T-pose")
+
+
+def calibrate_watches(
+    streams: Mapping[str, ImuStream],
+    board: Stretch,
+    t_pose: Stretch,
+    limits: CalibrationLimits = CalibrationLimits(),
+) -> dict[str, WatchCalibration]:
+    """Both watches' calibrations from logs (by joint) and the stretches (s, on their clocks) of board and T-pose.
+
+    Raises WearcapError that says which step went wrong: too short, not still, board not level, T-pose implausible,
+    watches that disagree or are swapped.
+    """
+    found = measure_watches(streams, board, t_pose)
+    require_watches(streams, found, t_pose, limits)
+    return found
+
+
+def propose_steps(streams: Mapping[str, ImuStream]) -> tuple[Stretch | None, Stretch | None]:
+    """Where two uncalibrated logs seem to have the board and the T-pose: stretches (s) still in both, or None.
+
+    On the board both watches lie level and as still as no arm is; in the T-pose, later, faces still look up and the
+    forearms are level.
+    """
+    still = [still_intervals(stream.timestamps, _orientation(stream)) for stream in streams.values()]
+    board, t_pose = None, None
+    for stretch in common(*still):
+        parts = [_orientation(s)[during(s.timestamps, stretch, "")].double() for s in streams.values()]
+        means = [rotation.mean_rotation(R) for R in parts]
+        tilt = max(_angle_deg(R[2, 2]) for R in means)
+        slope = max(abs(90 - _angle_deg(R[2, 0])) for R in means)
+        limits = CalibrationLimits()
+        if board is None:
+            calm = max(unstillness_deg(R) for R in parts)
+            board = stretch if tilt < limits.board_tilt_deg and calm < limits.board_still_deg else None
+        elif tilt < limits.face_up_deg and slope < limits.arm_level_deg:
+            t_pose = stretch
+            break
+    return board, t_pose
+
+
+def _orientation(stream: ImuStream) -> Float[Tensor, "time 3 3"]:
+    if stream.R_world_imu is None:
+        raise WearcapError("a watch's log without orientation", where=stream.joint, expected="one with attitude",
+                           fix="Switch on device motion when you record.")  # fmt: skip
+    return stream.R_world_imu
+
+
+def _angle_deg(cos: Tensor) -> float:
+    return math.degrees(math.acos(min(max(cos.item(), -1.0), 1.0)))
+
+
+def _apart_deg(found: Mapping[str, WatchCalibration]) -> float:
+    """Between the lines of the watches' x axes in the T-pose; crowns may point to the hand or to the elbow."""
+    left, right = (found[joint].R_joint_imu[:, 0] for joint in WRISTS)
+    return _angle_deg((left @ right).abs())

@@ -1,0 +1,196 @@
+"""`wearcap calibrate steps=watches`: from a simulated session's files to calibration.json and a recording."""
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+import torch
+
+from wearcap.cli import calibrate as verb
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.io.tum import write_tum
+from wearcap.io.watch_calibration_json import read_watch_calibration
+from wearcap.recording import ImuStream, RecordingStore
+from wearcap.recording.locate import load_recording
+from wearcap.sensors.watches import WRISTS, watches_at
+from wearcap.simulation.calibration_session import (
+    MARKS,
+    STANDING,
+    SWINGS_S,
+    CalibrationSession,
+    simulate_calibration,
+)
+from wearcap_testing import recording_of, swaying_motion
+
+G = 9.80665
+
+
+def write_sensor_log(watch: ImuStream, path: Path) -> None:
+    """SensorLog's CSV: Core Motion's signs and units."""
+    R = watch.R_world_imu.double()
+    free = (R.mT @ watch.acc_world.double()[..., None])[..., 0]
+    gravity = R[:, 2] * G
+    quaternion = rotation.quat_wxyz_from_matrix(R)[:, [1, 2, 3, 0]]
+    names = [f"accelerometerAcceleration{axis}(G)" for axis in "XYZ"]
+    names += [f"motionUserAcceleration{axis}(G)" for axis in "XYZ"] + [f"motionQuaternion{axis}(R)" for axis in "XYZW"]  # fmt: skip
+    table = torch.cat([-(free + gravity) / G, -free / G, quaternion], -1).tolist()
+    rows = [
+        ",".join([datetime.fromtimestamp(time, UTC).isoformat(), *(f"{value:.7f}" for value in row)])
+        for time, row in zip(watch.timestamps.tolist(), table)
+    ]
+    path.write_text("\n".join([",".join(["loggingTime(txt)", *names]), *rows]) + "\n")
+
+
+@pytest.fixture(scope="module")
+def made() -> CalibrationSession:
+    return simulate_calibration(0, watch_fps=50.0, walk_s=0.0)
+
+
+@pytest.fixture(scope="module")
+def files(made, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("session")
+    for joint, stream in made.watches.items():
+        write_sensor_log(stream, folder / f"{joint.split('_')[0]}.csv")
+    write_tum(made.slam, folder / "camera.txt")
+    return folder
+
+
+def written(*stretches) -> str:
+    return ",".join(f"[{start:.2f},{stop:.2f}]" for start, stop in stretches)
+
+
+def arguments(made: CalibrationSession, files: Path, out: Path, camera: bool = True) -> dict[str, str]:
+    zero = max(stream.timestamps[0].item() for stream in made.watches.values())
+    steps = {
+        key: written([at - zero for at in stretch["left_wrist"]])
+        for key, stretch in (("board", made.board), ("tpose", made.t_pose))
+    }
+    given = {"steps": "watches", "left": f"{files}/left.csv", "right": f"{files}/right.csv", **steps,
+             "output": f"{out}/calibration.json", "hydra.run.dir": f"{out}/run"}  # fmt: skip
+    if camera:
+        swings = ",".join(f"{at:.4f}" for at in made.swings_s.tolist())
+        given |= {"camera": f"{files}/camera.txt", "marks": f"[{written(*MARKS)}]", "standing": written(STANDING),
+                  "distances_m": f"[{made.distances_m[0]},{made.distances_m[1]}]", "mark_height_m": str(made.mark_height_m),
+                  "swings": f"[{swings}]", "camera_fps": "60"}  # fmt: skip
+    return given
+
+
+def calibrate(given: dict[str, str], *more: str) -> None:
+    verb.main([*(f"{key}={value}" for key, value in given.items()), *more])
+
+
+def apart_deg(a: torch.Tensor, b: torch.Tensor) -> float:
+    return rotation.geodesic(a.double(), b.double()).rad2deg().item()
+
+
+def test_a_session_becomes_a_calibration_and_a_recording(made, files, tmp_path, capsys):
+    given = arguments(made, files, tmp_path) | {"recording": f"{tmp_path}/worn.safetensors"}
+    calibrate(given)
+    said = capsys.readouterr().out
+    assert "residual" in said
+    assert "no  " not in said.replace("not", "")
+    found = read_watch_calibration(tmp_path / "calibration.json")
+    for joint in WRISTS:
+        assert apart_deg(found.watches[joint].R_world_ref, made.R_world_ref[joint]) < 0.5
+        assert apart_deg(found.watches[joint].R_joint_imu, made.R_joint_imu[joint]) < 0.5
+        middle = torch.tensor([SWINGS_S + 8], dtype=torch.float64)
+        assert (found.clocks[joint].clock.to_camera(middle - made.offset_s[joint]) - middle).abs() < 0.005
+    assert found.camera.scale == pytest.approx(made.scale, rel=0.005)
+    assert apart_deg(found.camera.R_world_slam, made.R_world_slam) < 0.5
+    assert apart_deg(found.head.R_head_cam, made.R_head_cam) < 0.5
+    content = json.loads((tmp_path / "calibration.json").read_text())
+    assert all(check["ok"] for check in content["checks"])
+    assert content["about"]["left"] == "left.csv"
+    recording = load_recording(tmp_path / "worn.safetensors")
+    at = torch.arange(STANDING[0], STANDING[1], 1 / 30, dtype=torch.float64)
+    R, _ = watches_at(recording.imu, at, "test")
+    torch.testing.assert_close(R[:, :, 2, 1].mean(0), torch.tensor([-1.0, 1.0]), atol=0.01, rtol=0)
+    assert recording.floor.height.tolist() == [0.0]
+    upright = (recording.head.timestamps > STANDING[0]) & (recording.head.timestamps < STANDING[1])
+    assert recording.head.t_world_device[upright, 2].mean() == pytest.approx(made.standing_m, abs=0.01)
+
+
+def test_watches_alone_go_into_a_data_set(made, files, tmp_path, capsys):
+    store = RecordingStore(tmp_path)
+    store.add(recording_of(swaying_motion(60), "walk"), split="test", config_hash="kept")
+    calibrate(arguments(made, files, tmp_path, camera=False) | {"recording": f"{tmp_path}/walk"})
+    assert "stay on their own clock" in capsys.readouterr().out
+    store = RecordingStore.open(tmp_path)
+    assert all(wrong is None for _, wrong in store.verify())
+    assert store.entries["walk"].config_hash == "kept"
+    recording = store.load("walk")
+    assert set(recording.imu) == set(WRISTS)
+    assert recording.motion is not None
+
+
+def test_the_guide_says_the_steps_and_where_the_logs_have_them(made, files, tmp_path, capsys):
+    given = arguments(made, files, tmp_path)
+    for key in ("board", "tpose", "marks", "standing"):
+        del given[key]
+    calibrate(given, "--guide")
+    said = capsys.readouterr().out
+    assert "1. Lay both watches on the board" in said
+    assert "5. Swing" in said
+    assert "given: swings" in said
+    hint = said.split("try: ")[1].split()
+    assert [word.split("=")[0] for word in hint] == ["board", "tpose", "marks", "standing"]
+    assert not (tmp_path / "calibration.json").exists()
+    with pytest.raises(WearcapError, match="no board, tpose, marks, standing.*Give them as board="):
+        calibrate(given)
+    # What is proposed is good enough to calibrate with.
+    calibrate(given, *hint)
+    found = read_watch_calibration(tmp_path / "calibration.json")
+    assert apart_deg(found.watches["left_wrist"].R_joint_imu, made.R_joint_imu["left_wrist"]) < 1.0
+    assert found.camera.scale == pytest.approx(made.scale, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"board": "[20.0,23.0]"}, "board, left_wrist: (not still|tilt).*Expected at most"),
+        ({"board": "[3.0,4.0]"}, "board, left_wrist.*1.00 s long"),
+        ({"tpose": "[60,63]"}, "T-pose, left_wrist: slope of the forearm"),
+        ({"board": "3"}, r"board=3.*Expected board=\[from,to\]"),
+        ({"distances_m": "[0.5]"}, "distances_m.*Expected 2 numbers"),
+        ({"distances_m": "[D,D]"}, "scales by the two distances differ"),
+        ({"marks": "[[1,4]]"}, "1 stretches"),
+        ({"swings": "[66.0,67.0]"}, "arm swings"),
+        ({"facing_deg": "-90"}, "standing: optical axis away"),
+        ({"steps": "watch"}, "no steps 'watch'. Did you mean 'watches'"),
+        ({"left": "none.csv"}, "none.csv"),
+        ({"camera": "null"}, "marks, standing, swings without a camera"),
+        ({"recording": "nowhere/x"}, "nowhere/x: no recording here"),
+        ({"bord": "[1,2]"}, "Did you mean 'board'"),
+    ],
+)
+def test_what_is_wrong_is_said_and_nothing_is_written(made, files, tmp_path, change, match):
+    change = {key: value.replace("D", str(made.distances_m[0])) for key, value in change.items()}
+    with pytest.raises(WearcapError, match=match):
+        calibrate(arguments(made, files, tmp_path) | change)
+    assert not (tmp_path / "calibration.json").exists()
+
+
+def test_swapped_logs_are_noticed(made, files, tmp_path):
+    given = arguments(made, files, tmp_path, camera=False)
+    with pytest.raises(WearcapError, match="swapped|disagree"):
+        calibrate(given | {"left": given["right"], "right": given["left"]})
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("{}", "lacks 'watches'"),
+        ('{"watches": {"left_wrist": {}}}', "lacks 'R_world_ref_wxyz'"),
+        ('{"watches": {"left_wrist": {"R_world_ref_wxyz": [2, 0, 0, 0]}}}', "no unit quaternion"),
+        ('{"watches": {}, "clocks": {"left_wrist": {"camera_s": [], "watch_s": []}}}', "without knots"),
+        ("[1, 2]", "not a watches' calibration"),
+        ("{", "not readable JSON"),
+    ],
+)
+def test_a_foreign_file_is_refused(tmp_path, text, match):
+    path = tmp_path / "calibration.json"
+    path.write_text(text)
+    with pytest.raises(WearcapError, match=match):
+        read_watch_calibration(path)

@@ -1,0 +1,159 @@
+"""Windows of heads and wrists: what they tell does not depend on north, on the rate of a file, or on who looks in a mirror."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.skeleton import xsens23
+from wearcap.data.statistics import collate
+from wearcap.data.watch_features import ENDS, Sensed, WatchFeatures, to_world
+from wearcap.data.watch_windows import Variation, WatchDataset, WatchWindow, mirror, scaled, turned, watched
+from wearcap.data.windows import Source
+from wearcap.errors import WearcapError
+from wearcap_testing import small_dataset
+
+SKELETON = xsens23()
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return str(small_dataset(tmp_path_factory.mktemp("data")).root)
+
+
+def dataset(root: str, split: str = "train", **settings) -> WatchDataset:
+    return WatchDataset([Source(root)], split, window=40, stride=10, fps=60.0, every=2, **settings)
+
+
+def batch(root: str, **settings) -> WatchWindow:
+    windows = dataset(root, **settings)
+    return collate([windows[(k % len(windows), k)] for k in range(8)])
+
+
+def told(features: WatchFeatures, window: WatchWindow) -> torch.Tensor:
+    canonical = features.canonical(window.sensed, window.floor_height)
+    return features.encode(window.sensed, window.floor_height, window.size, canonical)
+
+
+@pytest.mark.parametrize(
+    ("settings", "size"),
+    [({"frame": "head"}, 31), ({"frame": "head", "absolute": False}, 27), ({"body": True}, 35), ({"frame": "world", "absolute": False}, 27),
+     ({"wrists": "positions"}, 31), ({"frame": "own"}, 31), ({"frame": "own", "body": True}, 35)],
+)  # fmt: skip
+def test_sizes_are_the_documents(root, settings, size):
+    features = WatchFeatures(**settings)
+    assert features.size == size
+    assert told(features, batch(root)).shape == (8, 40, size)
+
+
+@pytest.mark.parametrize("frame", ["own", "heading", "head"])
+def test_north_and_place_make_no_difference(root, frame):
+    """All but the head's up-vector in the world, which the document tells as it is."""
+    features = WatchFeatures(frame=frame, absolute=frame != "head")
+    window = dataset(root)[3]
+    moved = turned(window, 1.3)
+    moved = moved._replace(t_world_head=moved.t_world_head + torch.tensor([5.0, -3.0, 0.0]))
+    here, there = (told(features, collate([w])) for w in (window, moved))
+    torch.testing.assert_close(here, there, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("frame", ["own", "heading", "head", "world"])
+@pytest.mark.parametrize("where", ["head", "window"])
+def test_motion_comes_back_as_it_went_in(root, frame, where):
+    features, window = WatchFeatures(frame=frame, root=where), batch(root)
+    canonical = features.canonical(window.sensed, window.floor_height)
+    code = features.encode_motion(window.R_parent_joint, window.t_world_root, window.sensed, canonical)
+    assert code.shape[-1] == features.motion_size == 3 + 6 * 23
+    R, t = to_world(*features.decode_motion(code, window.sensed, canonical), canonical)
+    torch.testing.assert_close(R, window.R_parent_joint, atol=1e-4, rtol=0)
+    torch.testing.assert_close(t, window.t_world_root, atol=1e-4, rtol=0)
+    last = features.decode_motion(code[:, -5:], window.sensed, canonical)
+    torch.testing.assert_close(to_world(*last, canonical)[1], window.t_world_root[:, -5:], atol=1e-4, rtol=0)
+
+
+def test_a_mirror_seen_twice_shows_what_was_there(root):
+    window = dataset(root)[0]
+    for part, back in zip(window, mirror(mirror(window, SKELETON), SKELETON)):
+        torch.testing.assert_close(part, back, atol=1e-6, rtol=0)
+
+
+def test_in_a_mirror_the_wrists_are_still_those_of_the_body(root):
+    for window in (
+        dataset(root)[0],
+        mirror(dataset(root)[0], SKELETON),
+        turned(dataset(root)[0], 2.0),
+        scaled(dataset(root)[0], 1.2),
+    ):
+        body = forward_kinematics(
+            SKELETON, window.R_parent_joint, window.t_world_root, window.t_parent_joint[None]
+        )
+        wrists = SKELETON.indices(*ENDS[:2])
+        torch.testing.assert_close(body.R[:, wrists], window.R_world_wrist, atol=1e-4, rtol=0)
+        torch.testing.assert_close(body.t[:, wrists], window.t_world_wrist, atol=1e-4, rtol=0)
+        head = SKELETON.index("head")
+        torch.testing.assert_close(body.t[:, head], window.t_world_head, atol=1e-4, rtol=0)
+
+
+def test_faster_windows_hold_more_of_the_recording_and_stronger_accelerations(root):
+    store, name = dataset(root).recordings[0]
+    whole = watched(store.path_of(name), 2)
+    frames = torch.arange(40) * 2.0
+    plain, fast = whole.window(frames), whole.window(frames * 1.25, 1.25)
+    torch.testing.assert_close(
+        fast.t_world_root[32], plain.t_world_root[39] * 0 + whole.t_world_root[80], atol=1e-4, rtol=0
+    )
+    at = whole.sensed.acc_world_wrist[80]
+    torch.testing.assert_close(fast.acc_world_wrist[32], 1.25**2 * at, atol=1e-4, rtol=0)
+    between = whole.window(torch.tensor([10.5]))
+    mean = (whole.t_world_root[10] + whole.t_world_root[11]) / 2
+    torch.testing.assert_close(between.t_world_root[0], mean, atol=1e-6, rtol=0)
+
+
+def test_windows_are_functions_of_their_seed(root):
+    windows = dataset(root, augment=True, variation=Variation(1.2, 1.1, 2.0, 0.1, 1.0, 0.02), beginnings=0.5)
+    for one, two in zip(windows[(1, 7)], windows[(1, 7)]):
+        assert torch.equal(one, two)
+    assert not torch.equal(windows[(1, 7)].R_world_wrist, windows[(1, 8)].R_world_wrist)
+    plain = dataset(root)
+    assert torch.equal(plain[(1, 7)].R_world_wrist, plain[(1, 8)].R_world_wrist)
+
+
+def test_errors_are_those_of_the_variation(root):
+    plain = dataset(root, augment=True)
+    wrong = dataset(root, augment=True, variation=Variation(wrist_deg=3.0))
+    angles = []
+    for k in range(40):
+        a, b = plain[(0, k)], wrong[(0, k)]
+        off = a.R_world_wrist.mT @ b.R_world_wrist
+        torch.testing.assert_close(off, off[:1].expand_as(off), atol=1e-4, rtol=0)
+        angles.append(
+            torch.arccos(((off[0].diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)).rad2deg()
+        )
+    assert 3.0 < torch.stack(angles).mean() < 6.5  # √(8/π) · 3 degrees
+    torch.testing.assert_close(plain[(0, 1)].R_parent_joint, wrong[(0, 1)].R_parent_joint)
+
+
+def test_a_beginning_stands_still(root):
+    windows = dataset(root, augment=True, beginnings=1.0)
+    held = [int((windows[(0, k)].t_world_head.diff(dim=0).abs().amax(-1) == 0).sum()) for k in range(20)]
+    assert max(held) > 10
+    assert min(held) < 30
+
+
+@pytest.mark.parametrize("wrong", [{"frame": "moon"}, {"wrists": "gloves"}, {"root": "tree"}])
+def test_unknown_settings(wrong):
+    with pytest.raises(WearcapError, match="watch features have no"):
+        WatchFeatures(**wrong)
+
+
+def test_another_rate_is_refused(root):
+    with pytest.raises(WearcapError, match="frames per second"):
+        WatchDataset([Source(root)], "train", window=40, stride=10, fps=30.0, every=1)
+
+
+def test_sensed_is_the_first_half_of_a_window(root):
+    window = batch(root)
+    assert isinstance(window.sensed, Sensed)
+    assert window.sensed.t_world_wrist is window.t_world_wrist
+    assert replace(Variation(), scale=2.0).scale == 2.0

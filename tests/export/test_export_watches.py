@@ -1,0 +1,58 @@
+"""MocapEvery's network leaves the house: the same motion from the file, and files that do not belong are refused."""
+
+import json
+import sys
+from subprocess import run
+
+import pytest
+import torch
+
+from watched_walk import drawn_pipeline, watched_walk
+from wearcap.errors import WearcapError
+from wearcap.export.watches import export_mocap_every, load_exported_mocap_every
+from wearcap.recording.store import RecordingFile, save_recording
+
+
+@pytest.mark.parametrize("format", ["onnx", "pt2"])
+def test_the_file_says_what_the_network_says(tmp_path, format):
+    pipeline, recording = drawn_pipeline(), watched_walk()
+    report = export_mocap_every(pipeline, tmp_path / f"net.{format}", format)
+    assert report.max_abs_error < 1e-4
+    motion = load_exported_mocap_every(report.path)(recording)
+    torch.testing.assert_close(motion.T_world_joint.t, pipeline(recording).T_world_joint.t, atol=1e-4, rtol=0)
+    about = json.loads((tmp_path / "net.json").read_text())
+    assert about["features"]["frame"] == "heading"
+    assert about["window"] == 16
+
+
+def test_it_runs_without_lightning_and_hydra(tmp_path):
+    pytest.importorskip("onnxruntime")
+    recording = watched_walk()
+    export_mocap_every(drawn_pipeline(), tmp_path / "net.onnx", "onnx")
+    save_recording(recording, tmp_path / "walk.safetensors")
+    program = (
+        "import sys; from wearcap.export.watches import main; main(sys.argv[1:]); "
+        "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
+    )
+    run(
+        [
+            sys.executable,
+            "-c",
+            program,
+            tmp_path / "net.onnx",
+            tmp_path / "walk.safetensors",
+            tmp_path / "out.safetensors",
+        ],
+        check=True,
+    )
+    motion = RecordingFile(tmp_path / "out.safetensors").load().motion
+    assert motion is not None
+    assert len(motion) == len(recording.head.timestamps)
+
+
+def test_a_sidecar_of_another_network_is_refused(tmp_path):
+    report = export_mocap_every(drawn_pipeline(), tmp_path / "net.pt2", "pt2")
+    about = json.loads((tmp_path / "net.json").read_text())
+    (tmp_path / "net.json").write_text(json.dumps(about | {"network": "contact"}))
+    with pytest.raises(WearcapError):
+        load_exported_mocap_every(report.path)

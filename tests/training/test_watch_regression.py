@@ -1,0 +1,217 @@
+"""Training MocapEvery's estimator and its manifold: losses vanish for the truth, every experiment learns and runs."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from torch import nn
+
+from wearcap.body.skeleton import xsens23
+from wearcap.cli import capture, evaluate, train
+from wearcap.cli.conf import compose
+from wearcap.cli.load import load_system, load_visual_cues
+from wearcap.data.statistics import collate
+from wearcap.data.watch_features import ENDS, WatchFeatures
+from wearcap.data.watch_windows import WatchDataset
+from wearcap.data.windows import Source
+from wearcap.errors import WearcapError
+from wearcap.io.amass import read_amass
+from wearcap.io.motion_npz import read_motion
+from wearcap.models.motion_manifold import MotionManifold
+from wearcap.models.watch_estimator import Estimate, LastPoseEstimator, TwoStageEstimator
+from wearcap.training.motion_manifold import ManifoldTraining
+from wearcap.training.watch_regression import WatchRegression
+from wearcap_testing import small_dataset
+
+EXPERIMENTS = (
+    "mocap_every", "mocap_every_document", "mocap_every_one_stage", "mocap_every_neither", "mocap_every_hands",
+    "mocap_every_avatarposer",
+)  # fmt: skip
+SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
+WEIGHTS = {
+    "root": 1.0, "rotation": 1.0, "position": 10.0, "mid": 5.0, "consistency": 2.0, "contact": 0.5,
+    "foot_velocity": 0.2, "velocity": 1.0,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return small_dataset(tmp_path_factory.mktemp("data")).root
+
+
+def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
+    return [
+        f"experiment={experiment}", f"data.sources.cmu.root={data}", "data.sources.simulated=null", f"data.val_sources.cmu.root={data}",
+        "debug=fast", f"hydra.run.dir={run}", f"paths.outputs={run.parent}", "trainer.accelerator=cpu", "trainer.precision=32-true",
+        "data.workers=0", "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "callbacks.progress=null", *more,
+    ]  # fmt: skip
+
+
+def batch(data: Path):
+    windows = WatchDataset([Source(str(data))], "train", window=40, stride=10, fps=60.0, every=2)
+    return collate([windows[(k % len(windows), k)] for k in range(16)])
+
+
+def system(net=None, **features) -> WatchRegression:
+    told = WatchFeatures(**features)
+    make = net or (lambda **sizes: TwoStageEstimator(**sizes, window=40, width=32, layers=1, heads=2, feedforward=32, hidden=32, dropout=0.0, frames_per_token=2))  # fmt: skip
+    return WatchRegression(make, told, xsens23(), 30.0, WEIGHTS, torch.optim.AdamW, end_weight=2.0)
+
+
+class Oracle(nn.Module):
+    """Says what it was told."""
+
+    window = 40
+
+    def __init__(self, **sizes):
+        super().__init__()
+        self.said: Estimate | None = None
+
+    def forward(self, features):
+        return self.said
+
+
+@pytest.mark.parametrize(
+    "features", [{}, {"frame": "own"}, {"frame": "head", "root": "window"}, {"frame": "world"}]
+)
+def test_the_truth_costs_nothing(data, features):
+    windows, oracle = batch(data), system(Oracle, **features)
+    _, true, canonical = oracle._inputs(windows)
+    joints = oracle._joints(true, windows, canonical)[:, :, xsens23().indices(*ENDS)]
+    ends = oracle._seen(joints, windows, canonical)
+    sure = 40 * (2 * windows.foot_contact - 1)
+    oracle.net.said = Estimate(true, sure, ends.flatten(-2))
+    for name, term in oracle.terms(windows).items():
+        assert term < 0.005, name  # the smoothing of norms at zero
+    wrong = true.clone()
+    wrong[..., 0] += 0.1
+    oracle.net.said = Estimate(wrong, sure, ends.flatten(-2))
+    terms = oracle.terms(windows)
+    assert terms["root"] == pytest.approx(0.1, abs=0.01)
+    assert terms["position"] == pytest.approx(0.1, abs=0.01)
+    assert terms["consistency"] == pytest.approx(0.1, abs=0.01)
+    assert terms["velocity"] < 0.1  # what is off by a constant in a head that turns
+
+
+def test_both_stages_and_contacts_are_learned(data):
+    torch.manual_seed(0)
+    windows, learner = batch(data), system()
+    learner.set_statistics(
+        WatchDataset([Source(str(data))], "train", window=40, stride=10, fps=60.0, every=2), 20
+    )
+    terms = learner.terms(windows)
+    sum(WEIGHTS[name] * term for name, term in terms.items()).backward()
+    assert set(terms) == set(WEIGHTS)
+    for name, parameter in learner.net.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+
+
+def test_contacts_come_before_the_body():
+    """The document's order: what is said of contacts changes what is said of the body."""
+    torch.manual_seed(0)
+    net = TwoStageEstimator(31, 141, 40, 32, 1, 2, 32, 16, 0.0).eval()
+    features = torch.randn(2, 40, 31)
+    before = net(features)
+    with torch.no_grad():
+        net.contact[-1].bias += 3.0
+    after = net(features)
+    assert not torch.allclose(before.motion, after.motion)
+    torch.testing.assert_close(before.ends, after.ends)
+
+
+def test_one_stage_says_no_ends():
+    net = TwoStageEstimator(31, 141, 40, 32, 1, 2, 32, 16, 0.0, multi_stage=False)
+    assert net(torch.randn(1, 40, 31)).ends is None
+
+
+def test_the_last_pose_alone():
+    said = LastPoseEstimator(27, 141, 40, 32, 1, 4, 32, 0.0)(torch.randn(3, 40, 27))
+    assert said.motion.shape == (3, 1, 141)
+    assert said.contact_logit.shape == (3, 1, 2)
+
+
+def test_the_documents_size():
+    config = compose("train", ["experiment=mocap_every_full", "paths.run=none"])
+    net = instantiate(config.model, _convert_="all").net
+    assert net.embed.out_features == 640
+    assert net.embed_ends.out_features == 640
+    assert len(net.encoder.layers) == 4
+    assert net.encoder.layers[0].self_attn.num_heads == 10
+    assert net.body[0].out_features == 256
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_runs(experiment, data, tmp_path):
+    run = tmp_path / "run"
+    train.main(arguments(experiment, data, run, *SMALL))
+    trained, config = load_system(run / "checkpoints" / "last.ckpt")
+    assert isinstance(trained, WatchRegression)
+    assert config["model"]["features"]["_target_"].endswith("WatchFeatures")
+
+
+def test_prodigy_may_stand_in_a_checkpoint(data, tmp_path):
+    run = tmp_path / "run"
+    train.main(arguments("mocap_every", data, run, *SMALL, "optimizer=prodigy", "optimizer.optimizer.lr=1.0"))
+    assert isinstance(load_system(run / "checkpoints" / "last.ckpt")[0], WatchRegression)
+
+
+def test_a_trained_estimator_is_evaluated_and_edits_by_cues(data, tmp_path):
+    run, manifold = tmp_path / "run", tmp_path / "manifold"
+    train.main(arguments("mocap_every", data, run, *SMALL))
+    train.main(arguments("motion_manifold", data, manifold, "model.net.channels=8", "model.net.width=5"))
+    found = tmp_path / "table.json"
+    evaluate.main(
+        [f"checkpoint={run}/checkpoints/last.ckpt", "pipeline=mocap_every", f"dataset={data}", "baselines=false", "seeds=[0]",
+         f"output={found}", f"hydra.run.dir={tmp_path / 'evaluate'}"],
+    )  # fmt: skip
+    scores = json.loads(found.read_text())["methods"]["wearcap"]
+    assert {"r_mpjpe_cm", "mpjpe_cm", "mpjve_cm_s", "root_cm", "jitter_ratio", "right_hand_pe_cm"} <= set(
+        scores
+    )
+    capture.main(
+        [f"checkpoint={run}/checkpoints/last.ckpt", "pipeline=mocap_every", f"recording={data}/r4", "smpl=true", "video=false",
+         "body=false", f"output={tmp_path / 'capture'}", f"hydra.run.dir={tmp_path / 'capture'}"],
+    )  # fmt: skip
+    motion = read_motion(tmp_path / "capture" / "motion.npz")
+    smpl = read_amass(tmp_path / "capture" / "motion_smplh.npz").motion
+    assert motion.fps == pytest.approx(30.0)
+    assert smpl is not None
+    wrists = [m.joint("left_wrist").t - m.joint("left_elbow").t for m in (motion, smpl)]
+    straight = [w / w.norm(dim=-1, keepdim=True) for w in wrists]
+    assert (straight[0] * straight[1]).sum(-1).min() > 0.95
+    assert (tmp_path / "capture" / "motion.bvh").is_file()
+    assert load_visual_cues(str(manifold / "checkpoints" / "last.ckpt")).window == 80
+    with pytest.raises(WearcapError, match="need a motion manifold"):
+        load_visual_cues(str(run / "checkpoints" / "last.ckpt"))
+
+
+def manifold_system() -> ManifoldTraining:
+    weights = {"contact": 0.2, "root": 1.0, "rotation": 2.0, "position": 10.0, "velocity": 0.5}
+    return ManifoldTraining(
+        lambda size: MotionManifold(size, 16, 5, 3), xsens23(), 30.0, weights, torch.optim.AdamW
+    )
+
+
+def test_the_manifold_keeps_time_and_learns(data):
+    torch.manual_seed(0)
+    windows, learner = batch(data), manifold_system()
+    learner.set_statistics(
+        WatchDataset([Source(str(data))], "train", window=40, stride=10, fps=60.0, every=2), 20
+    )
+    assert learner.net.size == 5 + 6 * 23
+    optimizer, losses = torch.optim.AdamW(learner.parameters(), 3e-3), []
+    for _ in range(30):
+        terms = learner.terms(windows)
+        loss = sum(weight * terms[name] for name, weight in learner.loss_weights.items())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.6 * losses[0]
+    for frames in (8, 40, 80):
+        motion = torch.randn(2, frames, learner.net.size)
+        assert learner.net.encode(motion).shape == (2, 16, frames // 8)
+        assert learner.net(motion).shape == motion.shape
