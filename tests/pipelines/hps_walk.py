@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from walking_person import walk
 
+from walking_person import walk
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from walking_person import MOUNT, sound_recording
 
+from walking_person import MOUNT, sound_recording
 from wearcap.body.skeleton import xsens23
 from wearcap.cli.doctor import main
 from wearcap.errors import WearcapError

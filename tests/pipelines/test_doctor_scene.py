@@ -9,8 +9,8 @@ import pytest
 import torch
 from PIL import Image
 from small_scene import LEVEL, inverted, room_cloud, write_room
-from walking_person import sound_recording
 
+from walking_person import sound_recording
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.photos import write_photos

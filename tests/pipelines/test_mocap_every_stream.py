@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from watched_walk import drawn_pipeline, watched_walk
 
+from watched_walk import drawn_pipeline, watched_walk
 from wearcap.geometry.rigid import Rigid
 from wearcap.pipelines.mocap_every_stream import MocapEverySession, WatchSample, Wearing
 from wearcap.recording import Motion
