@@ -73,9 +73,9 @@ def with_slam(recording: Recording) -> Recording:
     )
 
 
-def body_row(recording: Recording, captured: Captured) -> Row:
+def body_row(recording: Recording, captured: Captured, seed: int = 0) -> Row:
     """Scores in the world, the document's metrics among them."""
-    return score_in_world(captured.motion, recording, recording.name, 0)
+    return score_in_world(captured.motion, recording, recording.name, seed)
 
 
 def floor_row(recording: Recording, captured: Captured) -> Row:

@@ -2,13 +2,15 @@
 
 Bodies are measured where they are put in the world. Rows without a checkpoint are left out and said so. Checkpoints
 come by name (checkpoints/) or path; those of baselines and ablations from RUNS/NAME/checkpoints/last.ckpt, where
-`wearcap train experiment=EXPERIMENT paths.run=RUNS/NAME` puts them.
+`wearcap train experiment=EXPERIMENT paths.run=RUNS/NAME` puts them; further seeds of a training from RUNS/NAME_1,
+RUNS/NAME_2 and so on: the table gives their mean and spread.
 """
 
 import argparse
 import json
 from pathlib import Path
 
+from mocap_every_calibration import GOALS, calibration_scores
 from mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pipeline_of
 from rich.console import Console
 from rich.progress import Progress
@@ -17,7 +19,7 @@ from tabling import finite
 from wearcap.cli.load import load_visual_cues
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.metrics.table import Scores, Summary, aggregate, rich_table
+from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.optimize.latent_motion import LatentSolver
 from wearcap.recording import RecordingStore
@@ -66,7 +68,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings"
     )
     parser.add_argument("--recordings", type=int, help="no more than so many of each data set")
-    parser.add_argument("--parts", nargs="*", default=["body", "floor", "cues"], help="tables to make")
+    parser.add_argument("--sessions", type=int, default=30, help="simulated calibrations")
+    parser.add_argument(
+        "--parts", nargs="*", default=["body", "floor", "cues", "calibration"], help="tables to make"
+    )
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -76,7 +81,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         for part in options.parts:
             title, columns, scores = PARTS[part](options, progress)
             found[title] = {method: {k: vars(v) for k, v in row.items()} for method, row in scores.items()}
-            console.print(rich_table(title, scores, columns))
+            console.print(f"\n{title}\n\n{markdown_table(scores, columns)}", markup=False, soft_wrap=True)
     path = options.output / "mocap_every.json"
     write_text(path, json.dumps(finite({"about": about, "tables": found}), indent=1) + "\n")
     return path
@@ -93,19 +98,26 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
         Method("ours, heads as by SLAM", options.checkpoint, slam=True),
         Method("ours, heads as by SLAM, not hung", options.checkpoint, ("pipeline=mocap_every", "pipeline.hang=false"), slam=True),
     ]  # fmt: skip
-    others = []
-    for name, (experiment, pipeline) in TRAINED.items():
-        path = options.runs / experiment / "checkpoints" / "last.ckpt"
-        if path.is_file():
-            others.append(Method(name, str(path), (*pipeline, level)))
-        else:
-            progress.console.print(f"left out: {name} (no {path})")
+    trained = {}
+    for name, (run, pipeline) in TRAINED.items():
+        paths = [
+            options.runs / seeded / "checkpoints" / "last.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")
+        ]
+        trained[name] = [Method(name, str(path), (*pipeline, level)) for path in paths if path.is_file()]
+        if not trained[name]:
+            progress.console.print(f"left out: {name} (no {paths[0]})")
+    rows = {name: methods for name, methods in trained.items() if methods}
+    rows |= {method.name: [method] for method in ours}
     store, names = _recordings(options, "cmu")
     scores = {}
-    for method in [*others, *ours]:
-        bar = progress.add_task(method.name, total=len(names))
-        rows = [body_row(*pair) for pair in captures(method, store, names, lambda b=bar: progress.advance(b))]
-        scores[method.name] = aggregate(rows)
+    for name, methods in rows.items():
+        bar = progress.add_task(name, total=len(methods) * len(names))
+        scored = [
+            body_row(recording, captured, seed)
+            for seed, method in enumerate(methods)
+            for recording, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
+        ]
+        scores[name] = aggregate(scored)
     return f"Tables 2, 6, 7: CMU, {options.split}", BODY, scores | DOCUMENT
 
 
@@ -158,7 +170,15 @@ def _recordings(options: argparse.Namespace, data: str) -> tuple[RecordingStore,
     return store, store.names(options.split)[: 3 if options.quick else options.recordings]
 
 
-PARTS = {"body": _body, "floor": _floor, "cues": _cues}
+def _calibration(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
+    """Appendix C.2: planted frames, mounts, scales and clocks."""
+    sessions = 3 if options.quick else options.sessions
+    bar = progress.add_task("calibration", total=2 * sessions)
+    scores = calibration_scores(sessions, lambda: progress.advance(bar))
+    return f"Calibration: errors in {sessions} simulated sessions", tuple(GOALS), scores
+
+
+PARTS = {"body": _body, "floor": _floor, "cues": _cues, "calibration": _calibration}
 PREPARE = {
     "cmu": "Run: wearcap prepare cmu source=FOLDER",
     "simulated": "Run: wearcap prepare simulated",
