@@ -12,10 +12,8 @@ from torch.utils.data import Dataset
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.datamodule import SeededWindows
 from wearcap.data.motion_features import MotionFeatures, Movement
-from wearcap.data.windows import Source, mirrored_name, share_out
+from wearcap.data.windows import MIRROR, Source, mirrored_name, share_out
 from wearcap.recording.store import RecordingFile
-
-_FLIP = (1.0, -1.0, 1.0)
 
 
 class MovementDataset(Dataset):
@@ -57,7 +55,7 @@ def _movement(path: Path, features: MotionFeatures) -> Movement:
 
 def mirror(movement: Movement, skeleton: Skeleton) -> Movement:
     """The same movement seen in a mirror that swaps left and right."""
-    flip = movement.joints.new_tensor(_FLIP)
+    flip = movement.joints.new_tensor(MIRROR)
     twins = [skeleton.index(mirrored_name(name)) for name in skeleton.joint_names]
     return movement._replace(
         joints=movement.joints[..., twins, :] * flip,

@@ -14,11 +14,16 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.data.datamodule import SeededWindows
 from wearcap.data.features import body_size
 from wearcap.data.watch_features import Sensed, mirrored, synthetic_wrists
-from wearcap.data.windows import Source, mirrored_name, mirrored_rotations, share_out, true_foot_contact
+from wearcap.data.windows import (
+    MIRROR,
+    Source,
+    mirrored_name,
+    mirrored_rotations,
+    share_out,
+    true_foot_contact,
+)
 from wearcap.geometry import rotation
 from wearcap.recording.store import RecordingFile
-
-_FLIP = (1.0, -1.0, 1.0)
 
 
 class WatchWindow(NamedTuple):
@@ -59,6 +64,8 @@ class Variation:
     """Tilt of the head, about each axis."""
     floor_m: float = 0.0
     """Of the floor's height."""
+    size: float = 0.0
+    """Of each length of the wearer as told, as a share of it: tapes slip, and nobody should be known by theirs."""
 
 
 class WatchDataset(Dataset):
@@ -118,6 +125,7 @@ class WatchDataset(Dataset):
             + wrong.acc_m_s2 * torch.randn(window.acc_world_wrist.shape, generator=random),
             R_world_head=window.R_world_head @ turn[2],
             floor_height=window.floor_height + wrong.floor_m * torch.randn(1, generator=random),
+            size=window.size * (1 + wrong.size * torch.randn(window.size.shape, generator=random)),
         )
 
 
@@ -193,7 +201,7 @@ def scaled(window: WatchWindow, factor: float) -> WatchWindow:
 
 def mirror(window: WatchWindow, skeleton: Skeleton) -> WatchWindow:
     """The same happening seen in a mirror that swaps left and right."""
-    flip = torch.tensor(_FLIP)
+    flip = torch.tensor(MIRROR)
     twins = [skeleton.index(mirrored_name(name)) for name in skeleton.joint_names]
     return window._replace(
         **mirrored(window.sensed)._asdict(),

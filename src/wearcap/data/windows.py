@@ -23,7 +23,8 @@ from wearcap.recording.store import RecordingFile, RecordingStore
 
 MIN_FRAMES = 10
 """Shortest beginning of a capture that is trained on."""
-_FLIP = (1.0, -1.0, 1.0)
+MIRROR = (1.0, -1.0, 1.0)
+"""Left and right change places: y of every position."""
 
 
 class Window(NamedTuple):
@@ -234,7 +235,7 @@ def true_foot_contact(recording: Recording) -> Bool[Tensor, "time foot"]:
 
 def mirror_window(window: Window, skeleton: Skeleton) -> Window:
     """The same motion seen in a mirror that swaps left and right; its surroundings are read as mirrored already."""
-    flip = torch.tensor(_FLIP)
+    flip = torch.tensor(MIRROR)
     return window._replace(
         R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton),
         R_world_head=window.R_world_head * torch.outer(flip, flip),
@@ -248,7 +249,7 @@ def mirrored_rotations(
     R_parent_joint: Float[Tensor, "*batch joint 3 3"], skeleton: Skeleton
 ) -> Float[Tensor, "*batch joint 3 3"]:
     """A pose seen in a mirror that swaps left and right."""
-    flip = R_parent_joint.new_tensor(_FLIP)
+    flip = R_parent_joint.new_tensor(MIRROR)
     return R_parent_joint[..., _twins(skeleton), :, :] * torch.outer(flip, flip)
 
 
