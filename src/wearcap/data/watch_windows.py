@@ -64,8 +64,6 @@ class Variation:
     """Tilt of the head, about each axis."""
     floor_m: float = 0.0
     """Of the floor's height."""
-    size: float = 0.0
-    """Of each length of the wearer as told, as a share of it: tapes slip, and nobody should be known by theirs."""
 
 
 class WatchDataset(Dataset):
@@ -125,7 +123,6 @@ class WatchDataset(Dataset):
             + wrong.acc_m_s2 * torch.randn(window.acc_world_wrist.shape, generator=random),
             R_world_head=window.R_world_head @ turn[2],
             floor_height=window.floor_height + wrong.floor_m * torch.randn(1, generator=random),
-            size=window.size * (1 + wrong.size * torch.randn(window.size.shape, generator=random)),
         )
 
 
