@@ -9,10 +9,11 @@ import torch
 from PIL import Image
 
 from wearcap.cli import render as render_verb
+from wearcap.data.prepare.clean import at_times
 from wearcap.errors import WearcapError
-from wearcap.recording import PointCloud, Recording
+from wearcap.recording import Motion, PointCloud, Recording
 from wearcap.viewer.head_path import draw_head_path
-from wearcap.viewer.picture import SKY, contact_sheet, save_png
+from wearcap.viewer.picture import SKY, contact_sheet, save_png, shared_frames
 from wearcap.viewer.video import write_video
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
@@ -43,6 +44,21 @@ def test_frames_beyond_the_columns_continue_below():
         80,
         3,
     )
+
+
+def test_motions_of_two_rates_are_shown_at_the_same_moments():
+    motion = swaying_motion(60)
+    slow = at_times(motion, motion.timestamps[10:60:2])
+    late = replace(slow, timestamps=slow.timestamps + 0.3)
+
+    def second_row(other: Motion) -> np.ndarray:
+        return contact_sheet({"a": motion, "b": other}, [25, 40, 58], size=(80, 100))[100:].astype(int)
+
+    same, shifted = (np.abs(second_row(b) - second_row(motion))[20:].mean() for b in (slow, late))
+    assert same < 0.1 * shifted
+    assert shared_frames({"a": motion, "b": slow}, 4) == [10, 26, 42, 58]
+    with pytest.raises(WearcapError, match="share no time"):
+        shared_frames({"a": motion, "b": replace(motion, timestamps=motion.timestamps + 60)}, 4)
 
 
 def test_frames_that_are_not_there_are_named():

@@ -15,7 +15,7 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.viewer.head_path import draw_head_path
 from wearcap.viewer.objects import with_objects
-from wearcap.viewer.picture import contact_sheet, save_png
+from wearcap.viewer.picture import contact_sheet, save_png, shared_frames
 from wearcap.viewer.video import write_video
 
 HELP = "pictures without a screen: wearcap render DATASET/NAME --out sheet.png|motion.mp4"
@@ -62,9 +62,7 @@ def main(arguments: list[str]) -> None:
         if out.suffix == ".mp4":
             write_video(out, motions, fps=options.fps, **shown)
         else:
-            last = min(map(len, motions.values())) - 1
-            frames = np.linspace(0, last, min(options.frames, last + 1)).round().astype(int).tolist()
-            save_png(out, contact_sheet(motions, frames, **shown))
+            save_png(out, contact_sheet(motions, shared_frames(motions, options.frames), **shown))
     show(f"wrote {out}")
 
 

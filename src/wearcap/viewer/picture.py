@@ -1,6 +1,6 @@
 """Pictures of motion without a screen: truth and captures beside each other, shaded, with feet one can judge."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -144,30 +144,50 @@ def contact_sheet(
     environment: Environment | None = None,
     distance: float = 4.2,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Frames of motions on a shared clock, one row per motion, the camera following the first motion's root.
+    """Moments of motions on a shared clock, one row per motion, the camera following the first motion's root.
 
-    `size` is a panel's (width, height). Without `frames`, `columns` frames spread over the shortest motion are
-    drawn; with more frames than columns, the rows repeat below. Objects of an `environment` are drawn where each
-    motion has them. Raises WearcapError for frames that are not there.
+    `size` is a panel's (width, height). `frames` are the first motion's, the others' are the nearest in time; without
+    them `shared_frames` chooses `columns`. With more frames than columns, the rows repeat below. Objects of an
+    `environment` are drawn where each motion has them. Raises WearcapError for frames that are not there, and for
+    motions that share no time.
     """
     shown = actors(motions, body, environment)
-    length = min(len(motion) for motion in motions.values())
-    spread = np.linspace(0, length - 1, columns).round().astype(int).tolist()
-    frames = spread if frames is None else list(frames)
+    length = len(shown[0].motion)
+    frames = shared_frames(motions, columns) if frames is None else list(frames)
     if not frames or max(frames) >= length or min(frames) < 0:
         raise WearcapError(f"frames {frames}", expected=f"some from 0 to {length - 1}")
+    clocks = [actor.motion.timestamps.numpy() for actor in shown]
     bands = [frames[start : start + columns] for start in range(0, len(frames), columns)]
     width, height = size
     sheet = Image.new("RGB", (width * min(columns, len(frames)), height * len(shown) * len(bands)), "white")
     for band, chosen in enumerate(bands):
         for column, frame in enumerate(chosen):
             target = focus(shown[0].motion, frame)
-            for row, actor in enumerate(shown):
-                image = panel(actor, frame, target, size, world=world, distance=distance)
-                seconds = (actor.motion.timestamps[frame] - actor.motion.timestamps[0]).item()
+            for row, (actor, clock) in enumerate(zip(shown, clocks)):
+                nearest = frame if row == 0 else int(np.abs(clock - clocks[0][frame]).argmin())
+                image = panel(actor, nearest, target, size, world=world, distance=distance)
+                seconds = clock[nearest] - clocks[0][0]
                 text = f"{actor.label}  {seconds:.2f} s" if column == 0 else f"{seconds:.2f} s"
                 sheet.paste(captioned(image, text), (column * width, (band * len(shown) + row) * height))
     return np.asarray(sheet)
+
+
+def shared_time(motions: Iterable[Motion]) -> tuple[float, float]:
+    """First and last moment (s) that all motions have. Raises WearcapError when there is none."""
+    clocks = [motion.timestamps for motion in motions]
+    start, stop = max(clock[0].item() for clock in clocks), min(clock[-1].item() for clock in clocks)
+    if stop < start:
+        raise WearcapError("the motions share no time", expected="recordings of the same moments")
+    return start, stop
+
+
+def shared_frames(motions: dict[str, Motion], count: int) -> list[int]:
+    """`count` frames of the first motion (fewer where it has fewer), spread over the time that all motions have."""
+    start, stop = shared_time(motions.values())
+    clock = next(iter(motions.values())).timestamps.numpy()
+    first = int(np.searchsorted(clock, start))
+    last = max(int(np.searchsorted(clock, stop, side="right")) - 1, first)
+    return np.linspace(first, last, min(count, last - first + 1)).round().astype(int).tolist()
 
 
 def focus(motion: Motion, frame: int) -> Float[np.ndarray, "3"]:

@@ -13,7 +13,7 @@ from wearcap.files import atomic_path
 from wearcap.geometry.mesh import Mesh
 from wearcap.recording.motion import Motion
 from wearcap.scene.environment import Environment
-from wearcap.viewer.picture import actors, captioned, focus, panel
+from wearcap.viewer.picture import actors, captioned, focus, panel, shared_time
 
 
 def write_video(
@@ -37,10 +37,7 @@ def write_video(
             f"a video of {size[0]}x{size[1]} at {fps} fps", expected="even sizes, a positive rate"
         )
     shown = actors(motions, body, environment)
-    start = max(motion.timestamps[0].item() for motion in motions.values())
-    stop = min(motion.timestamps[-1].item() for motion in motions.values())
-    if stop < start:
-        raise WearcapError("the motions share no time", expected="recordings of the same moments")
+    start, stop = shared_time(motions.values())
     if max_seconds is not None:
         stop = min(stop, start + max_seconds)
     times = start + np.arange(int((stop - start) * fps) + 1) / fps
