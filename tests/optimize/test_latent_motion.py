@@ -9,6 +9,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
+from wearcap.metrics.physics import jitter_m_s3
 from wearcap.models.motion_manifold import MotionManifold
 from wearcap.optimize.latent_motion import (
     LatentSolver,
@@ -133,6 +134,25 @@ def test_only_windows_that_show_something_are_edited():
         torch.testing.assert_close(
             edited.R_parent_joint[still], motion.R_parent_joint[still], atol=1e-4, rtol=0
         )
+
+
+def test_a_detectors_errors_do_not_shake_the_arm():
+    motion = thirty()
+    recording, places = with_place(motion, slice(40, 120))
+    cue = recording.cues["right_wrist"]
+    noise = 0.02 * torch.randn(places.shape, generator=torch.Generator().manual_seed(0))
+    shaken = replace(recording, cues={"right_wrist": replace(cue, points=places + noise)})
+    jitter, error = {}, {}
+    for smooth in (0.0, 2.0):
+        editor = VisualCues(
+            Straight(), LatentWeights(stay=0.01, contact=0.0), LatentSolver(steps=60), smooth=smooth
+        )
+        edited, _ = editor.edit(motion, shaken, motion.joint("head"))
+        wrist = edited.joint("right_wrist").t[45:115]
+        jitter[smooth] = jitter_m_s3(wrist[:, None], 30.0)
+        error[smooth] = (wrist - places[45:115]).norm(dim=-1).mean()
+    assert jitter[2.0] < 0.5 * jitter[0.0]
+    assert error[2.0] < error[0.0] + 0.005
 
 
 def test_nothing_seen_nothing_changed():

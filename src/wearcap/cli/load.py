@@ -89,7 +89,7 @@ def load_visual_cues(
     manifold: str,
     weights: LatentWeights | None = None,
     solver: LatentSolver | None = None,
-    **settings: int | bool,
+    **settings: int | float | bool,
 ) -> VisualCues:
     """An editor in the manifold of a checkpoint of experiment=motion_manifold; see `VisualCues` for the settings."""
     system, _ = load_system(manifold)

@@ -52,6 +52,9 @@ class VisualCues:
     residual: bool = True
     """Whether what the manifold changes is added to the capture (ours), or the manifold's own motion taken (the
     document), with what its autoencoder loses."""
+    smooth: float = 2.0
+    """Frames (deviation of a Gaussian) over which a change is spread, so that a detector's errors do not shake the arm;
+    with `residual` alone (ours)."""
     batch: int = 16
     """Windows that are edited at once."""
 
@@ -107,10 +110,11 @@ class VisualCues:
             start = self.manifold.encode(X0)
             rebuilt = self.manifold.decode(start)
 
+        spread = _spread(self.window, self.smooth)
+
         def edited(latent: Tensor) -> Tensor:
-            return (
-                X0 + self.manifold.decode(latent) - rebuilt if self.residual else self.manifold.decode(latent)
-            )
+            said = self.manifold.decode(latent)
+            return X0 + spread @ (said - rebuilt) if self.residual else said
 
         def body(latent: Tensor) -> Body:
             posed = decode_window(edited(latent), origin)
@@ -124,6 +128,13 @@ class VisualCues:
         with torch.no_grad():
             posed = decode_window(edited(solution.latent), origin)
         return posed.R_parent_joint, posed.t_world_root, solution
+
+
+def _spread(window: int, frames: float) -> Float[Tensor, "time time"]:
+    """Averages over time with the weights of a Gaussian; 0 frames: nothing is averaged."""
+    time = torch.arange(window, dtype=torch.float32)
+    weight = torch.exp(-0.5 * ((time[:, None] - time) / max(frames, 1e-3)) ** 2)
+    return weight / weight.sum(1, keepdim=True)
 
 
 class _Blend:
