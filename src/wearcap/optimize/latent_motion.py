@@ -90,7 +90,7 @@ class LatentSolver:
     """ "lbfgs" (ours) or "adam" (the document: 500 steps at 7e-4 for pixels, 1e-3 for poses)."""
 
     kind: str = "lbfgs"
-    steps: int = 40
+    steps: int = 35
     learning_rate: float = 7e-4
     """Of Adam."""
 
