@@ -210,9 +210,9 @@ def _timeline(recording: Recording, motion: Motion | None) -> Timeline:
 
 
 def _floor_height(recording: Recording) -> float:
-    """The floor as recorded; else below nearly all points where no body stands; else zero."""
+    """The lowest floor as recorded; else below nearly all points where no body stands; else zero."""
     if recording.floor is not None and len(recording.floor.height):
-        return float(recording.floor.height.median())
+        return float(recording.floor.height.min())
     if recording.motion is None and recording.points is not None and len(recording.points.points_world):
         return float(np.quantile(recording.points.points_world[:, 2].numpy(), 0.01))
     return 0.0
