@@ -81,6 +81,9 @@ def _check(motion: Motion, path: str | Path) -> None:
             motion.hand_contact_prob,
             ("time", len(HANDS)),
         )
+    if motion.body_contact_prob is not None:
+        arrays["body_contact_prob"] = motion.body_contact_prob
+        shapes["body_contact_prob"] = ("time", "point")
     if motion.interactions is not None:
         _check_interactions(motion.interactions, path)
     for name, track in (motion.object_motion or {}).items():

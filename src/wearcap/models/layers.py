@@ -30,7 +30,8 @@ class RotaryAttention(nn.Module):
     cos: Tensor
     sin: Tensor
 
-    def __init__(self, width: int, heads: int, max_tokens: int):
+    def __init__(self, width: int, heads: int, max_tokens: int, streams: int = 1):
+        """Of `streams`, one behind the other, tokens of one number share a position."""
         super().__init__()
         if width % (2 * heads):
             raise ValueError(f"width {width} must be a multiple of twice the number of heads ({heads})")
@@ -38,7 +39,7 @@ class RotaryAttention(nn.Module):
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
         half = width // heads // 2
-        angle = torch.outer(torch.arange(max_tokens), 10000.0 ** (-torch.arange(half) / half))
+        angle = torch.outer(torch.arange(max_tokens), 10000.0 ** (-torch.arange(half) / half)).repeat(streams, 1)
         self.register_buffer("cos", angle.cos(), persistent=False)
         self.register_buffer("sin", angle.sin(), persistent=False)
 
@@ -65,11 +66,13 @@ def attention_mask(valid: Bool[Tensor, "batch token"]) -> Bool[Tensor, "batch 1 
 class AdaptiveBlock(nn.Module):
     """A DiT block (Peebles & Xie 2023): attention and MLP, each scaled, shifted and gated by the level."""
 
-    def __init__(self, width: int, heads: int, feedforward: int, max_tokens: int, dropout: float):
+    def __init__(
+        self, width: int, heads: int, feedforward: int, max_tokens: int, dropout: float, streams: int = 1
+    ):
         super().__init__()
         self.norm_attention = nn.LayerNorm(width, elementwise_affine=False)
         self.norm_mlp = nn.LayerNorm(width, elementwise_affine=False)
-        self.attention = RotaryAttention(width, heads, max_tokens)
+        self.attention = RotaryAttention(width, heads, max_tokens, streams)
         self.mlp = nn.Sequential(
             nn.Linear(width, feedforward), nn.GELU(), nn.Dropout(dropout), nn.Linear(feedforward, width)
         )

@@ -190,7 +190,7 @@ def view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> View:
     near = (view.motion.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6
     motion = replace(
         view.motion, timestamps=timestamps, R_parent_joint=view.motion.R_parent_joint[nearest],
-        t_world_root=view.motion.t_world_root[nearest], contact_prob=None, hand_contact_prob=None, object_motion=None,
+        t_world_root=view.motion.t_world_root[nearest], contact_prob=None, hand_contact_prob=None, body_contact_prob=None, object_motion=None,
     )  # fmt: skip
     return View(motion, view.confidence[nearest] * near[:, None])
 

@@ -26,6 +26,8 @@ class Motion:
     """Probability of floor contact of `FOOT_PATCHES`."""
     hand_contact_prob: Float[Tensor, "time hand"] | None = None
     """Probability that each of `HANDS` holds something."""
+    body_contact_prob: Float[Tensor, "time point"] | None = None
+    """Probability that each of the body's contact points (`body.contact_points`) touches the active object."""
     object_motion: dict[str, Trajectory] | None = None
     interactions: Interactions | None = None
     provenance: dict[str, str] = field(default_factory=dict)
@@ -55,6 +57,7 @@ class Motion:
         times = self.timestamps[start:stop]
         contact = None if self.contact_prob is None else self.contact_prob[start:stop]
         hands = None if self.hand_contact_prob is None else self.hand_contact_prob[start:stop]
+        skin = None if self.body_contact_prob is None else self.body_contact_prob[start:stop]
         objects = self.object_motion
         if objects is not None and len(times):
             objects = {
@@ -62,7 +65,8 @@ class Motion:
             }
         return replace(
             self, timestamps=times, R_parent_joint=self.R_parent_joint[start:stop],
-            t_world_root=self.t_world_root[start:stop], contact_prob=contact, hand_contact_prob=hands, object_motion=objects,
+            t_world_root=self.t_world_root[start:stop], contact_prob=contact, hand_contact_prob=hands,
+            body_contact_prob=skin, object_motion=objects,
         )  # fmt: skip
 
 

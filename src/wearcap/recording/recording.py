@@ -147,6 +147,8 @@ class Recording:
     localization: Localization | None = None
     points: PointCloud | None = None
     cues: dict[str, Cue] = field(default_factory=dict)
+    tracked: dict[str, Trajectory] = field(default_factory=dict)
+    """Poses of joints that are tracked in space, such as wrists by controllers, by the skeleton's names."""
     scene: str | None = None
     """File of the surroundings' geometry (.ply or .glb), relative to the data set's directory."""
     environment: str | None = None

@@ -109,7 +109,7 @@ def seen_wearer(
     deeper = DEPTH_SHARE * smooth_noise(rng, count, 1, period_s, fps)
     estimate = replace(
         motion, timestamps=times, R_parent_joint=R, t_world_root=joints[:, 0] + deeper * away, contact_prob=None,
-        hand_contact_prob=None, object_motion=None, interactions=None, provenance={"source": "simulated pose estimator"},
+        hand_contact_prob=None, body_contact_prob=None, object_motion=None, interactions=None, provenance={"source": "simulated pose estimator"},
     )  # fmt: skip
     return estimate, confidence.float()
 

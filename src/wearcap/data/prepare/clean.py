@@ -1,5 +1,6 @@
 """What motion capture needs before it is a truth: one rate, no glitches, a level floor, foot contacts."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -45,17 +46,8 @@ def resampled(motion: Motion, fps: float | int) -> Motion:
         n = round(ratio)
         times = motion.timestamps[::n].contiguous()
         R, t = motion.R_parent_joint[::n], motion.t_world_root[::n]
-        contact, hands = (
-            None if p is None else p[::n] for p in (motion.contact_prob, motion.hand_contact_prob)
-        )
-        return replace(
-            motion,
-            timestamps=times,
-            R_parent_joint=R,
-            t_world_root=t,
-            contact_prob=contact,
-            hand_contact_prob=hands,
-        )
+        contacts = _of_contacts(motion, lambda prob: prob[::n])
+        return replace(motion, timestamps=times, R_parent_joint=R, t_world_root=t, **contacts)
     start, stop = motion.timestamps[0].item(), motion.timestamps[-1].item()
     times = start + torch.arange(int((stop - start) * fps + 1e-6) + 1, dtype=torch.float64) / fps
     return at_times(motion, times)
@@ -63,15 +55,18 @@ def resampled(motion: Motion, fps: float | int) -> Motion:
 
 def at_times(motion: Motion, times: Float64[Tensor, "new_time"]) -> Motion:
     """The motion at other times within its own: slerp (rotations), lerp (root, contacts)."""
-    contact, hands = (
-        None if prob is None else interpolate(motion.timestamps, prob, times)
-        for prob in (motion.contact_prob, motion.hand_contact_prob)
-    )
+    contacts = _of_contacts(motion, lambda prob: interpolate(motion.timestamps, prob, times))
     return replace(
         motion, timestamps=times, R_parent_joint=_slerp(motion.timestamps, motion.R_parent_joint, times),
-        t_world_root=interpolate(motion.timestamps, motion.t_world_root, times), contact_prob=contact,
-        hand_contact_prob=hands,
+        t_world_root=interpolate(motion.timestamps, motion.t_world_root, times), **contacts,
     )  # fmt: skip
+
+
+def _of_contacts(motion: Motion, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
+    """The motion's probabilities of contact, changed, by the names of its fields."""
+    names = ("contact_prob", "hand_contact_prob", "body_contact_prob")
+    there = {name: getattr(motion, name) for name in names}
+    return {name: change(prob) for name, prob in there.items() if prob is not None}
 
 
 def _slerp(

@@ -1,0 +1,92 @@
+"""Points on a body's surface whose contact with objects is told (ECHO §3.1: 64 of the body's vertices)."""
+
+from functools import cache
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from wearcap.body.anny_body import anny_body
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.model import BodyModel
+from wearcap.body.skeleton import xsens23
+from wearcap.body.t_pose import t_pose
+
+BODY_POINTS = 64
+HAND_POINTS = 7
+"""Of each hand: a share of the points that is near the share of SMPL-X's vertices that its hands have."""
+
+
+@cache
+def _reference() -> BodyModel:
+    return anny_body(xsens23())
+
+
+@cache
+def _rows() -> Int64[Tensor, "point"]:
+    """Vertices of the default body: left hand, left side, then the same mirrored on the right.
+
+    Farthest points of the surface in the T-pose, on the left half, and the nearest vertex to each one's mirror image.
+    """
+    body = _reference()
+    at, held = in_t_pose(body), body.skin_joints[:, 0]
+    hand = body.skeleton.index("left_wrist")
+    left = at[:, 1] > 0.01
+    wrist = _farthest(at, (held == hand).nonzero()[:, 0], HAND_POINTS)
+    rest = _farthest(at, (left & (held != hand)).nonzero()[:, 0], BODY_POINTS // 2 - HAND_POINTS)
+    ours = torch.cat([wrist, rest])
+    right = (at[:, 1] < -0.01).nonzero()[:, 0]
+    twins = torch.cdist(at[ours] * at.new_tensor([1.0, -1.0, 1.0]), at[right]).argmin(1)
+    return torch.cat([ours, right[twins]])
+
+
+def mirrored_points() -> Int64[Tensor, "point"]:
+    """Number of each point's twin on the other side."""
+    return torch.arange(BODY_POINTS).roll(BODY_POINTS // 2)
+
+
+def hand_of_points() -> dict[str, Int64[Tensor, "_"]]:
+    """Numbers of the points on the left and on the right hand."""
+    first = torch.arange(HAND_POINTS)
+    return {"left": first, "right": first + BODY_POINTS // 2}
+
+
+def contact_points(body: BodyModel) -> BodyModel:
+    """A body of nothing but its contact points, in their order; `vertices` gives their places.
+
+    On a body of another surface than the default one's: its vertices that are nearest in the T-pose, sizes aligned.
+    """
+    reference, rows = _reference(), _rows()
+    if body.faces.shape != reference.faces.shape or not torch.equal(body.faces, reference.faces):
+        wanted, given = in_t_pose(reference)[rows], in_t_pose(body)
+        low, high = given.min(0).values, given.max(0).values
+        first, last = (in_t_pose(reference).min(0).values, in_t_pose(reference).max(0).values)
+        rows = torch.cdist((wanted - first) / (last - first) * (high - low) + low, given).argmin(1)
+    blend = None if body.pose_blend is None else body.pose_blend[:, rows]
+    return BodyModel(
+        body.skeleton, body.rest_vertices[rows], torch.zeros(0, 3, dtype=torch.long), body.skin_joints[rows],
+        body.skin_weights[rows], {}, blend,
+    )  # fmt: skip
+
+
+def in_t_pose(body: BodyModel) -> Float[Tensor, "vertex 3"]:
+    """The surface with legs straight down and arms straight sideways, the root at the origin (m)."""
+    pose = t_pose(body.skeleton)
+    R_parent_joint = pose.R.clone()
+    parents = torch.tensor(body.skeleton.parents[1:])
+    R_parent_joint[1:] = pose.R[parents].mT @ pose.R[1:]
+    world = forward_kinematics(body.skeleton, R_parent_joint.float(), torch.zeros(3))
+    return body.vertices(world)
+
+
+def _farthest(
+    at: Float[Tensor, "vertex 3"], among: Int64[Tensor, "candidate"], count: int
+) -> Int64[Tensor, "count"]:
+    """Farthest point sampling of some vertices, beginning at the one furthest from the body's middle plane."""
+    places = at[among]
+    chosen = [int(places[:, 1].argmax())]
+    distance = (places - places[chosen[0]]).norm(dim=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (places - places[chosen[-1]]).norm(dim=1))
+    return among[torch.tensor(chosen)]

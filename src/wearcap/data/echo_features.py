@@ -1,0 +1,161 @@
+"""What ECHO is told and says (ECHO §3.1): three tracked points in; body, object and contacts out."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.contact_points import BODY_POINTS
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.data.features import LIMBS
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+
+POINTS = ("head", "left_wrist", "right_wrist")
+"""Joints that are tracked, in this order."""
+FRAMES = ("own", "window", "world")
+CONTACTS = BODY_POINTS + len(FOOT_PATCHES)
+OBJECT_SIZE = 9
+"""Translation and 6D rotation."""
+EXTENTS = 6
+"""Half extents along the canonical axes and the bounding box's middle (m)."""
+
+
+class ThreePoints(NamedTuple):
+    """Head and wrists, frame by frame at the model's rate."""
+
+    R_world_point: Float[Tensor, "*batch time point 3 3"]
+    t_world_point: Float[Tensor, "*batch time point 3"]
+
+
+class Modalities(NamedTuple):
+    """Human, object and contacts in normalised space: clean, noised or predicted."""
+
+    human: Float[Tensor, "batch time human"]
+    object: Float[Tensor, "batch time 9"]
+    contact: Float[Tensor, "batch time contact"]
+    """64 body points, then `FOOT_PATCHES`: 1 touches, -1 does not."""
+
+
+class Body(NamedTuple):
+    """A body's motion in the world."""
+
+    R_parent_joint: Float[Tensor, "*batch time joint 3 3"]
+    t_world_root: Float[Tensor, "*batch time 3"]
+
+
+@dataclass(frozen=True)
+class EchoFeatures:
+    """Encodes three tracked points, bodies and objects, in the world or from a head.
+
+    frame "window": gravity-aligned, at the head of the window's first frame (the document). "own" (ours): each frame
+    in its own head's heading and place, so that nothing depends on where in the window it happens, and nothing has to
+    be re-expressed when the window moves. "world": as it was recorded (the document's row without canonical frame).
+    """
+
+    frame: str = "own"
+    body: bool = True
+    """Whether the wearer's size and the head's height over the floor are told (ours)."""
+    classes: tuple[str, ...] | list[str] = ()
+    """Names of the object classes, in the order of their one-hot code."""
+    shape_size: int = 256
+    """Of the object encoder's feature; 0: objects are told by class and extents alone."""
+    joints: int = 23
+    fps: float = 30.0
+
+    def __post_init__(self):
+        if self.frame not in FRAMES:
+            raise WearcapError(f"ECHO has no frame {self.frame!r}", expected=f"one of {', '.join(FRAMES)}")
+
+    @property
+    def condition_size(self) -> int:
+        """54 (the document), 2 of the head's heading in its own frame, 1 of the floor and the body's size."""
+        return 54 + (2 if self.frame == "own" else 0) + (1 + len(LIMBS) if self.body else 0)
+
+    @property
+    def human_size(self) -> int:
+        """Root translation, and 6D rotations of all joints."""
+        return 3 + 6 * self.joints
+
+    @property
+    def object_condition_size(self) -> int:
+        return len(self.classes) + EXTENTS + self.shape_size
+
+    @property
+    def moves(self) -> bool:
+        """Whether what is said has to be re-expressed when the window moves."""
+        return self.frame == "window"
+
+    def class_code(self, name: str) -> Float[Tensor, "class"]:
+        """One-hot code of a class. Raises WearcapError for one that the model does not know."""
+        if name not in self.classes:
+            raise WearcapError(f"the model knows no object class {name!r}", expected=f"one of {', '.join(self.classes)}",
+                               fix="Give the object's category the name of the class that is most like it.")  # fmt: skip
+        return torch.nn.functional.one_hot(
+            torch.tensor(list(self.classes).index(name)), len(self.classes)
+        ).float()
+
+    def canonical(self, points: ThreePoints) -> Rigid:
+        """Poses in the world of the frames that windows are said in: R "batch #time 3 3", t "batch #time 3"."""
+        R, t = points.R_world_point[:, :, 0], points.t_world_point[:, :, 0]
+        if self.frame == "world":
+            return Rigid(torch.eye(3).to(R).expand(len(R), 1, 3, 3), torch.zeros_like(t[:, :1]))
+        if self.frame == "window":
+            R, t = R[:, :1], t[:, :1]
+        return Rigid(rotation.about_axis("z", rotation.yaw_of(R)), t)
+
+    def condition(
+        self,
+        points: ThreePoints,
+        floor_height: Float[Tensor, "batch time"],
+        size: Float[Tensor, "batch limb"],
+    ) -> Float[Tensor, "batch time condition"]:
+        """[R, ω, J, v] of the three points (ECHO eq. 4): ω is the turn since the frame before, as 6D, v the velocity (m/s)."""
+        R, t = points
+        frame = self.canonical(points)
+        R_canonical_world = frame.R.mT[:, :, None]
+        turn = torch.cat([torch.eye(3).to(R).expand_as(R[:, :1]), R[:, :-1].mT @ R[:, 1:]], 1)
+        step = t.diff(dim=1) * self.fps
+        step = torch.cat([step[:, :1] if step.shape[1] else torch.zeros_like(t), step], 1)
+        places = (R_canonical_world @ (t - frame.t[:, :, None])[..., None])[..., 0]
+        first = Rigid(
+            rotation.about_axis("z", rotation.yaw_of(R[:, :1, 0])), t[:, :1, 0]
+        )  # of the first head
+        parts = [
+            rotation.rot6d_from_matrix(R_canonical_world @ R).flatten(-2),
+            rotation.rot6d_from_matrix(turn).flatten(-2),
+            places.flatten(-2),
+            (R_canonical_world @ step[..., None])[..., 0].flatten(-2),
+        ]
+        if self.frame == "own":
+            # The head is at its own origin: its place and heading are told from the window's first head instead.
+            parts[2] = torch.cat([first.inverse() @ t[:, :, 0], parts[2][..., 3:]], -1)
+            parts.append((first.R.mT @ frame.R)[..., :2, 0])
+        if self.body:
+            height = (t[:, :, 0, 2] - floor_height)[..., None] / size[:, None, :1]
+            parts += [height, size[:, None].expand(-1, t.shape[1], -1)]
+        return torch.cat(parts, -1)
+
+    def encode_body(self, body: Body, frame: Rigid) -> Float[Tensor, "batch time human"]:
+        """Root and local rotations, the root's pose as `frame` sees it."""
+        root = frame.inverse() @ Rigid(body.R_parent_joint[:, :, 0], body.t_world_root)
+        R = torch.cat([root.R[:, :, None], body.R_parent_joint[:, :, 1:]], 2)
+        return torch.cat([root.t, rotation.rot6d_from_matrix(R).flatten(-2)], -1)
+
+    def decode_body(self, human: Float[Tensor, "batch time human"], frame: Rigid) -> Body:
+        """The inverse of `encode_body`."""
+        R = rotation.matrix_from_rot6d(human[..., 3:].unflatten(-1, (-1, 6)))
+        root = frame @ Rigid(R[:, :, 0], human[..., :3])
+        return Body(torch.cat([root.R[:, :, None], R[:, :, 1:]], 2), root.t)
+
+    def encode_object(self, T_world_object: Rigid, frame: Rigid) -> Float[Tensor, "batch time 9"]:
+        """Translation and 6D rotation of an object as `frame` sees it."""
+        T = frame.inverse() @ T_world_object
+        return torch.cat([T.t, rotation.rot6d_from_matrix(T.R)], -1)
+
+    def decode_object(self, value: Float[Tensor, "batch time 9"], frame: Rigid) -> Rigid:
+        """The inverse of `encode_object`."""
+        return frame @ Rigid(rotation.matrix_from_rot6d(value[..., 3:]), value[..., :3])

@@ -1,0 +1,129 @@
+"""A conveyor of frames whose noise grows towards its end (ECHO §3.3): frames enter as noise and leave clean.
+
+All lanes of a conveyor take a frame at the same moment; a recording that has ended sends padding.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from wearcap.diffusion.process import add_noise, posterior_step
+from wearcap.diffusion.schedule import Schedule
+from wearcap.errors import WearcapError
+
+STEPS = ("posterior", "redraw")
+Denoise = Callable[
+    [Float[Tensor, "lane frame feature"], Float[Tensor, "lane frame modality"]],
+    Float[Tensor, "lane frame feature"],
+]
+"""x̂0 from x_t and its levels, of all the frames on the conveyor."""
+
+
+@dataclass(frozen=True)
+class Belt:
+    """How a conveyor runs: `context` clean frames are kept before the ramp, on which a frame is denoised `per_frame`
+    times for every frame that enters. Raises WearcapError for a context that leaves no ramp, and for unknown steps."""
+
+    window: int
+    context: int
+    per_frame: int = 1
+    spacing: float = 1.0
+    """1: levels fall evenly; more: smaller steps where little noise is left."""
+    eta: float = 1.0
+    """1: the stochastic posterior; 0: DDIM."""
+    step: str = "posterior"
+    """"redraw": x̂0 is noised anew in every step, as ECHO eq. 11 is printed."""
+
+    def __post_init__(self):
+        if not 0 <= self.context < self.window:
+            raise WearcapError(
+                f"a context of {self.context} frames in a window of {self.window}",
+                expected=f"from 0 to {self.window - 1}",
+            )
+        if self.per_frame < 1:
+            raise WearcapError(f"{self.per_frame} steps per frame", expected="at least 1")
+        if self.step not in STEPS:
+            raise WearcapError(f"no step {self.step!r}", expected=f"one of {', '.join(STEPS)}")
+
+    @property
+    def ramp(self) -> int:
+        """Frames on their way from noise to clean; a pose is final when as many frames, less one, have followed it."""
+        return self.window - self.context
+
+    @property
+    def steps(self) -> int:
+        """That a frame is denoised by in all (the document: 100)."""
+        return self.ramp * self.per_frame
+
+    def levels(self, age: Int64[Tensor, "frame"]) -> Float[Tensor, "frame"]:
+        """Of frames that have been denoised `age` times: 1 for new ones, 0 for clean ones."""
+        return (1 - age / self.steps).clamp(0, 1) ** self.spacing
+
+
+@dataclass(frozen=True)
+class Held:
+    """What of the frames on a conveyor is not to be denoised."""
+
+    known: Float[Tensor, "lane frame feature"]
+    is_known: Bool[Tensor, "lane frame modality"]
+    """Observed: at level 0, as `known` says."""
+    is_absent: Bool[Tensor, "lane frame modality"]
+    """Not there at all: stays noise."""
+
+
+class Conveyor:
+    """The frames of several lanes, the oldest first; never more than the window."""
+
+    def __init__(self, belt: Belt, schedule: Schedule, sizes: tuple[int, ...], lanes: int):
+        """`sizes`: features of each modality."""
+        self.belt, self.schedule, self.sizes = belt, schedule, sizes
+        self.x = torch.zeros(lanes, 0, sum(sizes))
+        self.age = torch.zeros(0, dtype=torch.long)
+
+    def push(self, noise: Float[Tensor, "lane feature"]) -> bool:
+        """Take a new frame on; True where the oldest one had to make room."""
+        full = len(self.age) == self.belt.window
+        self.x = torch.cat([self.x[:, int(full) :], noise[:, None].to(self.x)], 1)
+        self.age = torch.cat([self.age[int(full) :], self.age.new_zeros(1)])
+        return full
+
+    def run(
+        self,
+        denoise: Denoise,
+        held: Held,
+        noise: Float[Tensor, "step lane frame feature"],
+        amend: Callable[[Float[Tensor, "lane frame feature"]], Float[Tensor, "lane frame feature"]]
+        | None = None,
+    ) -> None:
+        """As many steps as there are between two frames; `noise` is what each adds. `amend` changes every x̂0 (guidance)."""
+        known = self._wide(held.is_known)
+        for fresh in noise:
+            level, after = self._levels(self.age, held), self._levels(self.age + 1, held)
+            self.x = torch.where(known, held.known, self.x)
+            x0_hat = denoise(self.x, level)
+            if amend is not None:
+                x0_hat = amend(x0_hat)
+            level, after = self._wide(level), self._wide(after)
+            if self.belt.step == "redraw":
+                moved = torch.where(after < level, add_noise(x0_hat, fresh, after, self.schedule), self.x)
+                self.x = torch.where(known, held.known, moved)
+            else:
+                self.x = posterior_step(self.x, x0_hat, level, after, fresh, self.schedule, self.belt.eta)
+            self.age = (self.age + 1).clamp_max(self.belt.steps)
+
+    @property
+    def clean(self) -> int:
+        """Frames that are final."""
+        return int((self.age >= self.belt.steps).sum())
+
+    def _levels(self, age: Int64[Tensor, "frame"], held: Held) -> Float[Tensor, "lane frame modality"]:
+        level = self.belt.levels(age)[:, None].expand(held.is_known.shape)
+        return torch.where(held.is_known, 0.0, torch.where(held.is_absent, 1.0, level))
+
+    def _wide(self, value: Tensor) -> Tensor:
+        """Per feature instead of per modality."""
+        sizes = torch.tensor(self.sizes)
+        return value.repeat_interleave(sizes, -1, output_size=sum(self.sizes))
