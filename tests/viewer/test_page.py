@@ -14,8 +14,9 @@ from wearcap.geometry import rotation
 from wearcap.io.motion_npz import write_motion
 from wearcap.recording import ContactTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.locate import dataset_folder
-from wearcap.viewer.page import CAPTURE_COLOR, Page
+from wearcap.viewer.page import Page
 from wearcap.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
+from wearcap.viewer.page_motions import CAPTURE_COLOR
 from wearcap.viewer.page_timeline import Timeline
 from wearcap_browser import chromium
 
@@ -49,7 +50,7 @@ def a_recording(**parts) -> Recording:
 
 @pytest.fixture
 def page():
-    page = Page(a_recording(), a_walk(sideways=0.3), port=18080)
+    page = Page(a_recording(), {"capture": a_walk(sideways=0.3)}, port=18080)
     yield page
     page.stop()
 
@@ -99,7 +100,7 @@ def test_feet_are_coloured_by_contact(page):
 def test_layouts_and_keys(page):
     page.arrange("beside")
     truth, capture = (page.bodies[name].body.handle for name in ("truth", "capture"))
-    assert truth.position[1] - capture.position[1] == pytest.approx(1.2 - 0.3, abs=1e-6)
+    assert truth.position[1] - capture.position[1] == pytest.approx(page.aside_m - 0.3, abs=1e-6)
     page.arrange("capture")
     assert capture.visible
     assert not truth.visible
@@ -191,7 +192,7 @@ def like(picture: np.ndarray, color: tuple[int, int, int]) -> int:
 def test_chromium_draws_the_page(page, tmp_path):
     """Canvas, controls and the body in a real browser; it plays, and hides what is put away."""
     with chromium(tmp_path / "profile", page.url) as browser:
-        browser.poll(lambda: "Truth and capture" in browser.text())
+        browser.poll(lambda: "Truth and captures" in browser.text())
         text = browser.text()
         for label in ("walk", "Play", "Time (s)", "Speed", "Follow with the camera"):
             assert label in text, label

@@ -25,6 +25,7 @@ from wearcap.pipelines.hps_stream import follow
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.locate import load_recording
+from wearcap.scene.environment import Environment
 from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
 from wearcap.viewer.video import write_video
@@ -52,7 +53,7 @@ def run(config: DictConfig) -> Motion | None:
         )
         motion = draws[0]
         if len(draws) > 1:
-            _write_samples(draws, recording, folder)
+            _write_samples(draws, recording, folder, config)
     else:
         captured = staged(pipeline, config, config.recording, Console(stderr=True)).run(
             recording, config.until
@@ -79,25 +80,34 @@ def _write(motion: Motion, recording: Recording, folder: Path, config: DictConfi
     body = anny_body(motion.skeleton, recording.shape or None) if config.body else None
     write_glb(motion, folder / "motion.glb", body=body)
     if config.video:
-        truth = with_objects(recording)
+        environment = _objects(motion, recording, config)
+        truth = with_objects(recording, environment)
         shown = {"truth": truth} if truth is not None else {}
-        environment = None
-        if motion.object_motion is not None:
-            environment = environment_of(recording, config.recording, config.pipeline.get("environment"))
         write_video(
             folder / "motion.mp4", shown | {"capture": motion}, environment=environment,
             max_seconds=config.video_seconds,
         )  # fmt: skip
 
 
-def _write_samples(draws: list[Motion], recording: Recording, folder: Path) -> None:
+def _write_samples(draws: list[Motion], recording: Recording, folder: Path, config: DictConfig) -> None:
     """sample-0.npz, …, and samples.png: what one input leaves open (thesis Fig. 6.6)."""
     shown = {f"sample {number}": motion for number, motion in enumerate(draws)}
     for label, motion in shown.items():
         write_motion(motion, folder / f"{label.replace(' ', '-')}.npz")
-    truth = {} if recording.motion is None else {"truth": recording.motion}
+    environment = _objects(draws[0], recording, config)
+    truth = with_objects(recording, environment)
     body = anny_body(draws[0].skeleton, recording.shape or None)
-    save_png(folder / "samples.png", contact_sheet(truth | shown, body=body))
+    sheet = contact_sheet(
+        ({} if truth is None else {"truth": truth}) | shown, body=body, environment=environment
+    )
+    save_png(folder / "samples.png", sheet)
+
+
+def _objects(motion: Motion, recording: Recording, config: DictConfig) -> Environment | None:
+    """The objects that a motion with object poses is shown with."""
+    if motion.object_motion is None:
+        return None
+    return environment_of(recording, config.recording, config.pipeline.get("environment"))
 
 
 def _live(pipeline: object, config: DictConfig, folder: Path) -> None:

@@ -8,11 +8,10 @@ from rich import print as show
 
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.load import environment_of
+from wearcap.cli.motions import read_motions
 from wearcap.errors import WearcapError
-from wearcap.io.motion_npz import read_motion
 from wearcap.recording.locate import load_recording
 from wearcap.recording.motion import Motion
-from wearcap.recording.recording import Recording
 from wearcap.viewer.head_path import draw_head_path
 from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png, shared_frames
@@ -27,8 +26,9 @@ def main(arguments: list[str]) -> None:
     )
     parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
     parser.add_argument(
-        "--motion", help="captured motion (.npz that `wearcap capture` wrote) to draw with it"
-    )
+        "--motion", nargs="+", action="extend", default=[], metavar="FILE",
+        help="captured motions (.npz that `wearcap capture` wrote) to draw with it",
+    )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, help=".png for a contact sheet, .mp4 for a video (default: NAME.png)"
     )
@@ -46,7 +46,10 @@ def main(arguments: list[str]) -> None:
         raise WearcapError(
             f"cannot draw a {out.suffix or 'file without an ending'}", where=out, expected=".png or .mp4"
         )
-    motions = _motions(recording, options.motion, options.start, options.stop)
+    environment = environment_of(recording, options.recording, options.environment)
+    truth = with_objects(recording, environment)
+    motions = ({} if truth is None else {"truth": truth}) | read_motions(options.motion)
+    motions = {label: _between(motion, options.start, options.stop) for label, motion in motions.items()}
     size = {"size": _size(options.size)} if options.size else {}
     if not motions:
         if out.suffix == ".mp4":
@@ -55,25 +58,12 @@ def main(arguments: list[str]) -> None:
     else:
         skeleton = next(iter(motions.values())).skeleton
         body = None if options.sticks else anny_body(skeleton, recording.shape or None)
-        shown = size | {
-            "body": body,
-            "environment": environment_of(recording, options.recording, options.environment),
-        }
+        shown = size | {"body": body, "environment": environment}
         if out.suffix == ".mp4":
             write_video(out, motions, fps=options.fps, **shown)
         else:
             save_png(out, contact_sheet(motions, shared_frames(motions, options.frames), **shown))
     show(f"wrote {out}")
-
-
-def _motions(
-    recording: Recording, captured: str | None, start_s: float, stop_s: float | None
-) -> dict[str, Motion]:
-    truth = with_objects(recording)
-    motions = {"truth": truth} if truth is not None else {}
-    if captured:
-        motions["capture"] = read_motion(captured)
-    return {label: _between(motion, start_s, stop_s) for label, motion in motions.items()}
 
 
 def _between(motion: Motion, start_s: float, stop_s: float | None) -> Motion:

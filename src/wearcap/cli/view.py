@@ -5,15 +5,16 @@ import logging
 
 from wearcap.errors import WearcapError
 
-HELP = "show a recording in the browser: wearcap view DATASET/NAME [--motion motion.npz]"
+HELP = "show a recording in the browser: wearcap view DATASET/NAME [--motion motion.npz …]"
 
 
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="wearcap view", description="Show a recording in the browser.")
     parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
     parser.add_argument(
-        "--motion", help="captured motion (.npz that `wearcap capture` wrote) to show with it"
-    )
+        "--motion", nargs="+", action="extend", default=[], metavar="FILE",
+        help="captured motions (.npz that `wearcap capture` wrote) to show with it; several stand side by side",
+    )  # fmt: skip
     parser.add_argument(
         "--port", type=int, default=8080, help="port of the page (default 8080, else the next free)"
     )
@@ -26,16 +27,16 @@ def main(arguments: list[str]) -> None:
         raise WearcapError(f"port {options.port}", expected="1 to 65535")
 
     from wearcap.cli.load import environment_of
-    from wearcap.io.motion_npz import read_motion
+    from wearcap.cli.motions import read_motions
     from wearcap.recording.locate import dataset_folder, load_recording
     from wearcap.viewer.page import Page
 
     # Browsers open connections in advance and drop them; the server's log of that is no news to a user.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     recording = load_recording(options.recording)
-    motion = read_motion(options.motion) if options.motion else None
     page = Page(
-        recording, motion, folder=dataset_folder(options.recording), host=options.host, port=options.port,
+        recording, read_motions(options.motion), folder=dataset_folder(options.recording),
+        host=options.host, port=options.port,
         environment=environment_of(recording, options.recording, options.environment),
     )  # fmt: skip
     print(f"{recording.name}: open {page.url} (Ctrl+C ends; space plays, J and L jump by a second)")

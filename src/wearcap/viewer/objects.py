@@ -1,15 +1,23 @@
 """Objects of an interactive environment as they are shown: posed meshes, and a layer of the page."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+import torch
 import viser
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
 
+from wearcap.body.anny_body import anny_body
+from wearcap.body.contact_points import contact_points
+from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh, capsules
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording.acts import NO_OBJECT, active_at, true_acts
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
@@ -17,13 +25,22 @@ from wearcap.scene.objects import SceneObject
 
 CLOUD_BALLS, CLOUD_BALL_M = 1500, 0.012
 """A cloud without faces is shown as so many small balls."""
+TOUCH_M = 0.05
+"""A contact point of the body that is so near to the active object's surface touches it (τ_c of ECHO §3.1)."""
 
 
 def pose_at(track: Trajectory | None, thing: SceneObject, time_s: float) -> Rigid:
     """Where an object is shown: its pose at the nearest frame of its track, or the initial one without a track."""
+    return poses_at(track, thing, torch.tensor([time_s], dtype=torch.float64))[0]
+
+
+def poses_at(track: Trajectory | None, thing: SceneObject, times: Float64[Tensor, "time"]) -> Rigid:
+    """`pose_at` of many times (s)."""
     if track is None or not len(track):
-        return thing.T_world_object
-    return track.T_world_body[int((track.timestamps - time_s).abs().argmin())]
+        T = thing.T_world_object
+        return Rigid(T.R.expand(len(times), 3, 3), T.t.expand(len(times), 3))
+    middles = (track.timestamps[1:] + track.timestamps[:-1]) / 2
+    return track.T_world_body[torch.searchsorted(middles, times)]
 
 
 @lru_cache(maxsize=1024)
@@ -50,32 +67,92 @@ def moved(mesh: Mesh, T_world_object: Rigid) -> Mesh:
     return replace(mesh, vertices=(mesh.vertices @ R.T + t).astype(np.float32))
 
 
-def with_objects(recording: Recording) -> Motion | None:
-    """The true motion with the true objects and hands, for viewers that show one motion each."""
+def with_objects(recording: Recording, environment: Environment | None = None) -> Motion | None:
+    """The true motion with the true objects, hands and contact points, for viewers that show one motion each."""
     truth = recording.motion
     if truth is None:
         return None
     held = recording.interactions
     hands = None if held is None else held.hand_contact(truth.timestamps).to(truth.t_world_root.dtype)
-    return replace(truth, object_motion=recording.object_motion or None, hand_contact_prob=hands)
+    points = None if environment is None else true_body_contact(recording, truth, environment)
+    return replace(
+        truth, object_motion=recording.object_motion or None, hand_contact_prob=hands, body_contact_prob=points
+    )  # fmt: skip
+
+
+def true_body_contact(
+    recording: Recording, truth: Motion, environment: Environment
+) -> Float[Tensor, "time point"] | None:
+    """1 where a contact point of the body is within `TOUCH_M` of the active object's surface, else 0.
+
+    None where nothing tells which object is active, and for bodies that are no human's.
+    """
+    if recording.interactions is None and len(recording.object_motion) != 1:
+        return None
+    try:
+        points = contact_points(anny_body(truth.skeleton, recording.shape))
+    except WearcapError:
+        return None
+    touches = torch.zeros(len(truth), len(points.rest_vertices))
+    names = [thing.name for thing in environment.objects]
+    acts = [act for act in true_acts(recording) if act.object in names]
+    active = active_at(acts, names, truth.timestamps)
+    for number in active.unique().tolist():
+        if number == NO_OBJECT:
+            continue
+        thing, take = environment.objects[number], (active == number).nonzero()[:, 0]
+        T = poses_at(recording.object_motion.get(thing.name), thing, truth.timestamps[take])
+        places = points.vertices(truth.T_world_joint[take])
+        touches[take] = _touches(environment, thing, places, T).to(touches.dtype)
+    return touches
+
+
+def _touches(
+    environment: Environment, thing: SceneObject, places: Float[Tensor, "time point 3"], T_world_object: Rigid
+) -> Bool[Tensor, "time point"]:
+    """Whether points of the world (m) touch an object; only those inside the ball around it are measured."""
+    low, high = torch.from_numpy(np.stack([thing.mesh.vertices.min(0), thing.mesh.vertices.max(0)]))
+    middle = T_world_object.R @ ((low + high) / 2).to(T_world_object.R) + T_world_object.t
+    radius = (high - low).norm() / 2
+    near = (places - middle[:, None]).norm(dim=-1) <= radius + TOUCH_M
+    frame = near.nonzero()[:, 0]
+    distance, _ = environment.distance(thing.name, places[near], T_world_object[frame])
+    touches = torch.zeros_like(near)
+    touches[near] = distance <= TOUCH_M
+    return touches
 
 
 class ObjectsLayer:
     """Objects on the page; a frame is one pose per object."""
 
-    def __init__(self, server: viser.ViserServer, environment: Environment, tracks: dict[str, Trajectory]):
-        self.environment, self.tracks = environment, tracks
+    def __init__(
+        self, server: viser.ViserServer, name: str, things: Sequence[SceneObject], tracks: dict[str, Trajectory],
+        tint: tuple[int, int, int] | None = None,
+    ):  # fmt: skip
+        """`tint`: RGB (0…255) that the objects' own colours are mixed with half and half."""
+        self.things, self.tracks, self.offset = tuple(things), tracks, np.zeros(3)
         self.handles = []
-        for thing in environment.objects:
+        for thing in self.things:
             mesh = shown_mesh(thing)
-            color = np.atleast_2d(mesh.color).mean(0)
+            color = 255 * np.atleast_2d(mesh.color).mean(0)
+            if tint is not None:
+                color = (color + tint) / 2
             self.handles.append(server.scene.add_mesh_simple(
-                f"/objects/{thing.name}", mesh.vertices, mesh.faces.astype(np.uint32),
-                color=tuple(int(255 * c) for c in color),
+                f"/{name}/{thing.name}", mesh.vertices, mesh.faces.astype(np.uint32),
+                color=tuple(int(c) for c in color),
             ))  # fmt: skip
 
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
+        self.offset = offset
+        for handle in self.handles:
+            handle.visible = visible
+
     def show(self, time: float) -> None:
-        for thing, handle in zip(self.environment.objects, self.handles):
+        for thing, handle in zip(self.things, self.handles):
             pose = pose_at(self.tracks.get(thing.name), thing, time)
-            handle.wxyz = quat_wxyz_from_matrix(pose.R.double()).numpy()
-            handle.position = pose.t.double().numpy()
+            wxyz, position = (
+                quat_wxyz_from_matrix(pose.R.double()).numpy(),
+                pose.t.double().numpy() + self.offset,
+            )
+            if not (np.array_equal(wxyz, handle.wxyz) and np.array_equal(position, handle.position)):
+                handle.wxyz, handle.position = wxyz, position

@@ -9,84 +9,61 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.recording import Motion, Recording
 from wearcap.scene.environment import Environment
 from wearcap.viewer.objects import ObjectsLayer
-from wearcap.viewer.page_layers import (
-    BodyLayer,
-    FeetLayer,
-    HeadLayer,
-    Layer,
-    Placed,
-    add_points,
-    read_scene,
-    surface_or_sticks,
-)
+from wearcap.viewer.page_layers import HeadLayer, Layer, Placed, add_points, read_scene
+from wearcap.viewer.page_motions import TRUTH, motions_shown, moving_objects, placed_motions, spacing_m
 from wearcap.viewer.page_timeline import SPEEDS, Timeline
 
 UPDATES_PER_S = 30.0
-ASIDE_M = 1.2
-TRUTH_COLOR, CAPTURE_COLOR = (150, 155, 160), (70, 160, 150)
-_LAYOUTS = ("over", "beside", "truth", "capture")
+OVER, BESIDE = "over", "beside"
 
 
 class Page:
     """One recording's page. `run` plays until interrupted; `stop` closes the server."""
 
     def __init__(
-        self, recording: Recording, motion: Motion | None = None, *, folder: Path | None = None,
+        self, recording: Recording, captures: dict[str, Motion] | None = None, *, folder: Path | None = None,
         host: str = "127.0.0.1", port: int = 8080, environment: Environment | None = None,
     ):  # fmt: skip
-        """`motion`: what was captured; `folder`: the data set's, where `recording.scene` lies.
+        """`captures`: what was captured, by the name to show; several stand side by side at first.
 
-        Objects of an `environment` stand where the capture has them, else where they truly were.
+        `folder`: the data set's, where `recording.scene` lies. Objects of an `environment` that move do so with each
+        motion, the others stand where the truth, else the beginning, has them.
         """
-        self.timeline = _timeline(recording, motion)
+        motions = motions_shown(recording, captures or {}, environment)
+        self.timeline = _timeline(recording, motions)
         self._stopped = False
         scene = read_scene(folder / recording.scene) if recording.scene and folder is not None else None
         self.server = viser.ViserServer(host=host, port=port, label="wearcap", verbose=False)
         self.server.scene.set_up_direction("+z")
         self.server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
-        self.bodies: dict[str, Placed] = {}
-        self.layers: list[Layer] = []
-        self._add_bodies(recording, motion)
+        things = moving_objects(list(motions.values()), environment)
+        self.bodies: dict[str, Placed] = placed_motions(self.server, recording, motions, things)
+        self.layers: list[Layer] = list(self.bodies.values())
+        self.aside_m = spacing_m(list(motions.values()), things) if len(motions) > 1 else 0.0
         if recording.head is not None and len(recording.head.timestamps):
             self.layers.append(HeadLayer(self.server, recording.head))
+        self._surroundings = self.server.scene.add_frame("/surroundings", show_axes=False)
         if recording.points is not None:
             add_points(self.server, recording.points)
         if scene is not None:
-            self.server.scene.add_mesh_trimesh("/scene", scene)
+            self.server.scene.add_mesh_trimesh("/surroundings/scene", scene)
         if environment is not None:
-            tracks = (
-                motion.object_motion
-                if motion is not None and motion.object_motion
-                else recording.object_motion
-            )
-            self.layers.append(ObjectsLayer(self.server, environment, tracks))
+            still = [thing for thing in environment.objects if thing not in things]
+            self.layers.append(ObjectsLayer(self.server, "surroundings", still, recording.object_motion))
+        self.layout = BESIDE if len(self.bodies) - (TRUTH in self.bodies) > 1 else OVER
+        self._followed = np.zeros(3)
         self._add_floor(recording)
         self._add_controls(recording)
-        self._followed = self._focus()
+        self.arrange(self.layout)
         self._point_camera()
-        self.show()
 
     @property
     def url(self) -> str:
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
-
-    def _add_bodies(self, recording: Recording, motion: Motion | None) -> None:
-        for name, shown, color in (
-            ("truth", recording.motion, TRUTH_COLOR),
-            ("capture", motion, CAPTURE_COLOR),
-        ):
-            if shown is None or not len(shown):
-                continue
-            body = surface_or_sticks(shown.skeleton, recording.shape)
-            layer = BodyLayer(self.server, name, shown, body, color)
-            placed = Placed(layer, _feet(self.server, name, shown, recording))
-            self.bodies[name] = placed
-            self.layers.append(placed)
 
     def _add_floor(self, recording: Recording) -> None:
         self.server.scene.add_grid(
@@ -106,12 +83,16 @@ class Page:
         )
         self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1×")
         self._follow = gui.add_checkbox("Follow with the camera", initial_value=False)
+        # What stands around one motion stands in the others' way where they are set aside.
+        self._surroundings.visible = self.layout != BESIDE
+        around = gui.add_checkbox("Surroundings", initial_value=self._surroundings.visible)
+        around.on_update(lambda _: setattr(self._surroundings, "visible", around.value))
         self._play.on_click(lambda _: self.toggle())
         self._slider.on_update(self._scrubbed)
         self._speed.on_update(lambda _: setattr(clock, "speed", float(self._speed.value[:-1])))
-        if len(self.bodies) == 2:
-            self._layout = gui.add_dropdown("Truth and capture", _LAYOUTS, initial_value="over")
-            self._layout.on_update(lambda _: self.arrange(self._layout.value))
+        if len(self.bodies) > 1:
+            layout = gui.add_dropdown("Truth and captures", self._layouts(), initial_value=self.layout)
+            layout.on_update(lambda _: self.arrange(layout.value))
         keys = (
             ("Play or pause", "space", self.toggle), ("Back one second", "J", lambda: self.jump(-1.0)),
             ("On one second", "L", lambda: self.jump(1.0)), ("To the start", "home", lambda: self.jump(-np.inf)),
@@ -129,13 +110,18 @@ class Page:
         self._slider.value = self.timeline.time
         self.show()
 
+    def _layouts(self) -> tuple[str, ...]:
+        return (OVER, BESIDE, *self.bodies)
+
     def arrange(self, layout: str) -> None:
-        """Truth and capture "over" one another, "beside", or one alone."""
-        if layout not in _LAYOUTS:
-            raise WearcapError(f"no layout {layout!r}", expected=f"one of {', '.join(_LAYOUTS)}")
-        for name, placed in self.bodies.items():
-            aside = ASIDE_M if layout == "beside" and name == "truth" else 0.0
-            placed.place(np.array([0.0, aside, 0.0]), layout in ("over", "beside", name))
+        """Truth and captures "over" one another, "beside" (the first capture in its place), or one alone."""
+        if layout not in self._layouts():
+            raise WearcapError(f"no layout {layout!r}", expected=f"one of {', '.join(self._layouts())}")
+        self.layout = layout
+        for column, (name, placed) in enumerate(self.bodies.items()):
+            aside = self.aside_m * ((TRUTH in self.bodies) - column) if layout == BESIDE else 0.0
+            visible = layout in (OVER, BESIDE, name)
+            placed.place(np.array([0.0, aside, 0.0]), visible, named=visible and layout != OVER)
         self.show()
 
     def _scrubbed(self, event: viser.GuiEvent) -> None:
@@ -152,21 +138,24 @@ class Page:
         self.server.flush()
 
     def _focus(self) -> np.ndarray:
-        """What the camera looks at: the body, or the head."""
-        for placed in reversed(self.bodies.values()):
-            return np.array(placed.body.handle.position)
+        """What the camera looks at: the middle of the bodies that are shown, or the head."""
+        shown = [placed.body.handle.position for placed in self.bodies.values() if placed.body.handle.visible]
+        if shown:
+            return np.mean(shown, axis=0)
         for layer in self.layers:
             if isinstance(layer, HeadLayer):
                 return np.array(layer.frustum.position)
         return np.zeros(3)
 
     def _point_camera(self) -> None:
-        for layer in self.layers:
-            layer.show(self.timeline.time)
+        """From the front left; several that stand side by side are looked at from in front of the middle one."""
         self._followed = self._focus()
+        way = np.array([2.2, 2.0, 0.9])
+        if self.layout == BESIDE:
+            way = np.array([1.0, 0.15, 0.3]) * max(3.0, 1.0 + 0.35 * self.aside_m * len(self.bodies))
         camera = self.server.initial_camera
         camera.look_at = tuple(self._followed)
-        camera.position = tuple(self._followed + np.array([2.2, 2.0, 0.9]))
+        camera.position = tuple(self._followed + way)
 
     def _follow_camera(self) -> None:
         focus = self._focus()
@@ -195,18 +184,17 @@ class Page:
         self.server.stop()
 
 
-def _timeline(recording: Recording, motion: Motion | None) -> Timeline:
+def _timeline(recording: Recording, motions: dict[str, Motion]) -> Timeline:
     """From the first to the last moment of whatever moves."""
-    streams = [
-        s.timestamps
-        for s in (recording.motion, motion, recording.head)
-        if s is not None and len(s.timestamps)
-    ]
+    head = recording.head
+    streams = [motion.timestamps for motion in motions.values()]
+    if head is not None and len(head.timestamps):
+        streams.append(head.timestamps)
     if not streams and recording.points is None and not recording.scene:
         raise WearcapError(f"recording {recording.name!r} has nothing to show",
                            expected="a motion, a head path, points or a scene")  # fmt: skip
-    start = min((s[0].item() for s in streams), default=0.0)
-    return Timeline(start, max((s[-1].item() for s in streams), default=0.0), start)
+    start = min((times[0].item() for times in streams), default=0.0)
+    return Timeline(start, max((times[-1].item() for times in streams), default=0.0), start)
 
 
 def _floor_height(recording: Recording) -> float:
@@ -216,16 +204,3 @@ def _floor_height(recording: Recording) -> float:
     if recording.motion is None and recording.points is not None and len(recording.points.points_world):
         return float(np.quantile(recording.points.points_world[:, 2].numpy(), 0.01))
     return 0.0
-
-
-def _feet(server: viser.ViserServer, name: str, motion: Motion, recording: Recording) -> FeetLayer | None:
-    """Contacts: the motion's own, or for the truth the recording's."""
-    if not set(FOOT_PATCHES) <= set(motion.skeleton.sites):
-        return None
-    if motion.contact_prob is not None:
-        return FeetLayer(server, f"{name}_feet", motion, motion.contact_prob > 0.5, motion.timestamps)
-    track = recording.contacts if name == "truth" else None
-    if track is None or not set(FOOT_PATCHES) <= set(track.parts):
-        return None
-    columns = [track.parts.index(patch) for patch in FOOT_PATCHES]
-    return FeetLayer(server, f"{name}_feet", motion, track.contact[:, columns], track.timestamps)

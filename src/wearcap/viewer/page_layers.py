@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -21,6 +21,8 @@ from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.recording import HeadStream, Motion, PointCloud
 
 MAX_POINTS = 200_000
+LABEL_ABOVE_M = 0.3
+"""Above the highest joint."""
 CONTACT_COLOR, AIR_COLOR = (230, 60, 40), (190, 190, 190)
 _R_DEVICE_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """A camera (x right, y down, z forward) that looks the way the head does."""
@@ -28,6 +30,13 @@ _R_DEVICE_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0
 
 class Layer(Protocol):
     def show(self, time: float) -> None: ...
+
+
+@runtime_checkable
+class MotionLayer(Layer, Protocol):
+    """What belongs to one motion: it can be set aside by an offset (m) and hidden."""
+
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None: ...
 
 
 def nearest_frame(timestamps: Float64[Tensor, "time"], time: float) -> int:
@@ -91,6 +100,10 @@ class BodyLayer:
             skin_weights=weights, color=color,
         )  # fmt: skip
 
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
+        self.offset = offset
+        self.handle.visible = visible
+
     def show(self, time: float) -> None:
         frame = nearest_frame(self.motion.timestamps, time)
         pose = self.motion.T_world_joint[frame]
@@ -114,6 +127,11 @@ class FeetLayer:
             server.scene.add_icosphere(f"/{name}/{patch}", 0.028, AIR_COLOR, subdivisions=2)
             for patch in FOOT_PATCHES
         ]
+
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
+        self.offset = offset
+        for ball in self.balls:
+            ball.visible = visible
 
     def show(self, time: float) -> None:
         frame = nearest_frame(self.motion.timestamps, time)
@@ -157,7 +175,7 @@ def add_points(server: viser.ViserServer, cloud: PointCloud) -> None:
     # Half precision is exact to a millimetre only near the node, so the node stands in their middle.
     centre = points.mean(0)
     server.scene.add_point_cloud(
-        "/points", (points - centre).astype(np.float32), colors.astype(np.uint8), point_size=0.012,
+        "/surroundings/points", (points - centre).astype(np.float32), colors.astype(np.uint8), point_size=0.012,
         position=centre, precision="float32",
     )  # fmt: skip
 
@@ -175,22 +193,51 @@ def read_scene(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
+class LabelLayer:
+    """A motion's name above its head."""
+
+    def __init__(self, server: viser.ViserServer, name: str, motion: Motion):
+        self.motion, self.offset = motion, np.zeros(3)
+        self.handle = server.scene.add_label(f"/{name}_label", name, anchor="bottom-center")
+
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
+        self.offset = offset
+        self.handle.visible = visible
+
+    def show(self, time: float) -> None:
+        if not self.handle.visible:
+            return
+        joints = self.motion.T_world_joint.t[nearest_frame(self.motion.timestamps, time)].double().numpy()
+        top = np.array([*joints[0, :2], joints[:, 2].max() + LABEL_ABOVE_M])
+        self.handle.position = top + self.offset
+
+
 @dataclass
 class Placed:
     """Layers of one motion, shown or hidden and set aside together."""
 
     body: BodyLayer
     feet: FeetLayer | None
+    points: MotionLayer | None = None
+    objects: MotionLayer | None = None
+    label: LabelLayer | None = None
 
-    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
-        self.body.offset = offset
-        self.body.handle.visible = visible
-        if self.feet is not None:
-            self.feet.offset = offset
-            for ball in self.feet.balls:
-                ball.visible = visible
+    @property
+    def layers(self) -> list[MotionLayer]:
+        every = (self.body, self.feet, self.points, self.objects)
+        return [layer for layer in every if layer is not None]
+
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool, named: bool = False) -> None:
+        """`named`: with its name, where it has a label."""
+        for layer in self.layers:
+            layer.place(offset, visible)
+        if self.label is not None:
+            self.label.place(offset, named)
 
     def show(self, time: float) -> None:
-        self.body.show(time)
-        if self.feet is not None:
-            self.feet.show(time)
+        if not self.body.handle.visible:
+            return
+        for layer in self.layers:
+            layer.show(time)
+        if self.label is not None:
+            self.label.show(time)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from wearcap.body.contact_points import contact_points
 from wearcap.body.kinematics import site_positions
 from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import FOOT_PATCHES
@@ -22,6 +24,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording.interactions import HANDS
 from wearcap.recording.motion import Motion
 from wearcap.scene.environment import Environment
+from wearcap.viewer.body_points import lit_points
 from wearcap.viewer.objects import posed_meshes
 from wearcap.viewer.page_layers import stick_body
 
@@ -49,7 +52,7 @@ class Actor:
     """Objects that are drawn where the motion's `object_motion` has them."""
 
     def meshes(self, frame: int) -> list[Mesh]:
-        """Body, marks of feet and hands in contact, and objects of one frame."""
+        """Body, marks of feet in contact, lit contact points (without them: marks of holding hands), and objects."""
         T = self.motion.T_world_joint[frame]
         vertices = self.body.vertices(T).detach().numpy().astype(np.float32)
         body = Mesh(
@@ -57,13 +60,21 @@ class Actor:
         )
         palms = tuple(f"{side}_palm" for side in HANDS)
         feet = self._marks(T, FOOT_PATCHES, self.motion.contact_prob, frame, 0.028, CONTACT_COLOR)
-        hands = self._marks(T, palms, self.motion.hand_contact_prob, frame, 0.055, HOLD_COLOR)
+        if self.motion.body_contact_prob is None:
+            touching = self._marks(T, palms, self.motion.hand_contact_prob, frame, 0.055, HOLD_COLOR)
+        else:
+            lit = lit_points(self._points, self.motion, frame)
+            touching = [] if lit is None else [lit]
         if self.environment is None:
-            return [body, *feet, *hands]
+            return [body, *feet, *touching]
         objects = posed_meshes(
             self.environment, self.motion.object_motion or {}, self.motion.timestamps[frame].item()
         )
-        return [body, *feet, *hands, *objects]
+        return [body, *feet, *touching, *objects]
+
+    @cached_property
+    def _points(self) -> BodyModel:
+        return contact_points(self.body)
 
     def _marks(
         self, T_world_joint: Rigid, sites: tuple[str, ...], prob: Tensor | None, frame: int, radius: float,

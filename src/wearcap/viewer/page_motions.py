@@ -1,0 +1,140 @@
+"""The motions of one recording on the page: each with its feet, contact points, objects and name."""
+
+from collections.abc import Sequence
+from itertools import pairwise, product
+
+import numpy as np
+import torch
+import viser
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording import Motion, Recording
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import SceneObject
+from wearcap.viewer.body_points import BodyPointsLayer
+from wearcap.viewer.objects import ObjectsLayer, poses_at, with_objects
+from wearcap.viewer.page_layers import (
+    BodyLayer,
+    FeetLayer,
+    LabelLayer,
+    Placed,
+    surface_or_sticks,
+)
+
+TRUTH = "truth"
+TRUTH_COLOR = (150, 155, 160)
+CAPTURE_COLOR = (70, 160, 150)
+COLORS = (CAPTURE_COLOR, (215, 140, 75), (155, 110, 170), (120, 165, 85), (80, 125, 200), (205, 95, 110))
+"""Of captures, in order."""
+ASIDE_M = 1.2
+"""Least way from one motion to the next, side by side."""
+FLESH_M, NEAR_M = 0.2, 1.0
+"""What a body reaches beyond its joints; objects further than this from the root are left behind, not with it."""
+STILL_M, STILL_RAD = 0.02, 0.05
+"""An object whose pose changes by less stands still."""
+
+
+def motions_shown(
+    recording: Recording, captures: dict[str, Motion], environment: Environment | None
+) -> dict[str, Motion]:
+    """The truth, where known, and the captures: those that have frames."""
+    truth = with_objects(recording, environment)
+    shown = ({} if truth is None else {TRUTH: truth}) | captures
+    return {name: motion for name, motion in shown.items() if len(motion)}
+
+
+def moving_objects(motions: Sequence[Motion], environment: Environment | None) -> list[SceneObject]:
+    """Objects that move in any of the motions."""
+    if environment is None:
+        return []
+    tracks = [motion.object_motion or {} for motion in motions]
+    return [thing for thing in environment.objects if any(_moves(of.get(thing.name), thing) for of in tracks)]
+
+
+def _moves(track: Trajectory | None, thing: SceneObject) -> bool:
+    if track is None or not len(track):
+        return False
+    R, t = track.R_world_body, track.t_world_body
+    turned = (R - thing.R_world_object.to(R)).flatten(1).norm(dim=1).max()
+    shifted = (t - thing.t_world_object.to(t)).norm(dim=1).max()
+    # A small angle is the matrices' distance divided by √2.
+    return float(shifted) > STILL_M or float(turned) > 2**0.5 * STILL_RAD
+
+
+def placed_motions(
+    server: viser.ViserServer,
+    recording: Recording,
+    motions: dict[str, Motion],
+    things: Sequence[SceneObject],
+) -> dict[str, Placed]:
+    """All motions by name, each with its own of the objects that move, tinted like its body where there are several."""
+    placed, captures = {}, 0
+    for name, motion in motions.items():
+        color = TRUTH_COLOR if name == TRUTH else COLORS[captures % len(COLORS)]
+        captures += name != TRUTH
+        body = surface_or_sticks(motion.skeleton, recording.shape)
+        several, points, objects = len(motions) > 1, None, None
+        if motion.body_contact_prob is not None:
+            points = BodyPointsLayer(server, f"{name}_points", motion, body)
+        if things and motion.object_motion:
+            tint = color if several else None
+            objects = ObjectsLayer(server, f"{name}_objects", things, motion.object_motion, tint)
+        placed[name] = Placed(
+            BodyLayer(server, name, motion, body, color), _feet(server, name, motion, recording), points, objects,
+            LabelLayer(server, name, motion) if several else None,
+        )  # fmt: skip
+    return placed
+
+
+def _feet(server: viser.ViserServer, name: str, motion: Motion, recording: Recording) -> FeetLayer | None:
+    """Contacts: the motion's own, or for the truth the recording's."""
+    if not set(FOOT_PATCHES) <= set(motion.skeleton.sites):
+        return None
+    if motion.contact_prob is not None:
+        return FeetLayer(server, f"{name}_feet", motion, motion.contact_prob > 0.5, motion.timestamps)
+    track = recording.contacts if name == TRUTH else None
+    if track is None or not set(FOOT_PATCHES) <= set(track.parts):
+        return None
+    columns = [track.parts.index(patch) for patch in FOOT_PATCHES]
+    return FeetLayer(server, f"{name}_feet", motion, track.contact[:, columns], track.timestamps)
+
+
+def spacing_m(motions: Sequence[Motion], things: Sequence[SceneObject] = ()) -> float:
+    """How far apart (m, along y) neighbours stand so that none covers the next one at any moment.
+
+    The first has the greatest y. What a motion takes up: its body, and the objects that are near to it.
+    """
+    start = min(motion.timestamps[0].item() for motion in motions)
+    stop = max(motion.timestamps[-1].item() for motion in motions)
+    times = torch.linspace(start, stop, 400, dtype=torch.float64)
+    spans = [_span(motion, things, times) for motion in motions]
+    overlaps = [float((behind[1] - ahead[0]).max()) for ahead, behind in pairwise(spans)]
+    return max(ASIDE_M, *overlaps)
+
+
+def _span(
+    motion: Motion, things: Sequence[SceneObject], times: Float64[Tensor, "time"]
+) -> tuple[Float[Tensor, "time"], Float[Tensor, "time"]]:
+    """Least and greatest y (m) of a motion and what is with it, at some times."""
+    middles = (motion.timestamps[1:] + motion.timestamps[:-1]) / 2
+    joints = motion.T_world_joint.t[torch.searchsorted(middles, times)].double()
+    low, high = joints[..., 1].amin(1) - FLESH_M, joints[..., 1].amax(1) + FLESH_M
+    for thing in things if motion.object_motion else ():
+        T = poses_at((motion.object_motion or {}).get(thing.name), thing, times)
+        corners = torch.from_numpy(_corners(thing)).to(T.t)
+        placed = (corners @ T.R.mT + T.t[:, None]).double()
+        y, middle = placed[..., 1], placed.mean(1)
+        radius = (corners - corners.mean(0)).norm(dim=1).max()
+        near = (middle - joints[:, 0])[:, :2].norm(dim=1) < radius + NEAR_M
+        low = torch.where(near, torch.minimum(low, y.amin(1)), low)
+        high = torch.where(near, torch.maximum(high, y.amax(1)), high)
+    return low, high
+
+
+def _corners(thing: SceneObject) -> Float[np.ndarray, "8 3"]:
+    """Of the box around an object in its own axes (m)."""
+    low, high = thing.mesh.vertices.min(0), thing.mesh.vertices.max(0)
+    return np.array(list(product(*zip(low, high, strict=True))))
