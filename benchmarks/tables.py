@@ -11,6 +11,7 @@ Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables). Systems:
     mocap_every   MocapEvery: bodies, floors on hillsides, hands in the picture; its document's Tables 2 to 7
     egoview       our image encoder: hands in the head camera's pictures
     voxels        codes of the points around the body: what they bring back
+    objects       the object encoder's feature: category, extents, instance of objects unknown to it
     simulation    how far simulated people differ from CMU's: gait statistics, and a discriminator
 
 Each system is a module tables_SYSTEM.py in this folder with `add_arguments(parser)` and

@@ -1,0 +1,124 @@
+"""Clouds of objects: even by area, the same for a seed; generated objects, their splits, their variation, their file."""
+
+import numpy as np
+import pytest
+import torch
+
+from wearcap.data.object_clouds import (
+    CloudAugmentation,
+    ObjectClouds,
+    generate_clouds,
+    object_cloud,
+    random_rotation,
+)
+from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import Mesh
+
+CLASSES = ["box", "chair", "drawer", "door"]
+
+
+def mesh_of(vertices: list, faces: list) -> Mesh:
+    return Mesh(
+        np.array(vertices, np.float32).reshape(-1, 3),
+        np.array(faces, np.int32).reshape(-1, 3),
+        np.zeros(3, np.float32),
+    )
+
+
+def two_triangles() -> Mesh:
+    """One of 3 m² at z = 0, one of 1 m² at z = 5."""
+    low, high = [[0, 0, 0], [3, 0, 0], [0, 2, 0]], [[0, 0, 5], [2, 0, 5], [0, 1, 5]]
+    return mesh_of([*low, *high], [[0, 1, 2], [3, 4, 5]])
+
+
+def test_a_cloud_is_even_by_area_and_the_same_again():
+    cloud = object_cloud(two_triangles(), 4000)
+    assert cloud.shape == (4000, 3)
+    low = cloud[cloud[:, 2] == 0]
+    assert abs(len(low) - 3000) <= 1
+    assert ((low[:, 0] / 3 + low[:, 1] / 2) <= 1 + 1e-5).all()
+    # a quarter of a triangle's area lies beyond half of its way to a corner
+    assert (low[:, 0] > 1.5).float().mean() == pytest.approx(0.25, abs=0.03)
+    assert (low[:, 1] > 1.0).float().mean() == pytest.approx(0.25, abs=0.03)
+    assert (low[:, 0] / 3 + low[:, 1] / 2 < 0.5).float().mean() == pytest.approx(0.25, abs=0.03)
+    assert torch.equal(cloud, object_cloud(two_triangles(), 4000))
+    assert not torch.equal(cloud, object_cloud(two_triangles(), 4000, seed=1))
+    assert object_cloud(two_triangles()).shape == (1500, 3)
+
+
+def test_without_faces_the_vertices_are_drawn():
+    vertices = np.random.default_rng(0).normal(size=(40, 3)).tolist()
+    cloud = object_cloud(mesh_of(vertices, []), 100)
+    _, counts = cloud.unique(dim=0, return_counts=True)
+    assert len(counts) == 40
+    assert set(counts.tolist()) == {2, 3}
+    assert len(object_cloud(mesh_of(vertices, []), 7).unique(dim=0)) == 7
+
+
+def test_meshes_that_are_no_surface_are_refused():
+    with pytest.raises(WearcapError, match="0 vertices"):
+        object_cloud(mesh_of([], []))
+    with pytest.raises(WearcapError, match="NaN or infinite"):
+        object_cloud(mesh_of([[0, 0, float("nan")]], []))
+
+
+def test_objects_of_splits_differ_and_are_generated_alike():
+    clouds, labels = generate_clouds("train", CLASSES, 3, 100)
+    assert clouds.shape == (12, 100, 3)
+    assert labels.bincount().tolist() == [3, 3, 3, 3]
+    assert torch.equal(clouds, generate_clouds("train", CLASSES, 3, 100)[0])
+    assert not any(torch.equal(a, b) for a in clouds for b in generate_clouds("val", CLASSES, 3, 100)[0])
+    assert len({tuple(cloud.amax(0).tolist()) for cloud in clouds}) == 12
+    with pytest.raises(WearcapError, match="no objects of class 'piano'"):
+        generate_clouds("train", ["piano"], 1)
+
+
+def test_rotations_are_rotations_and_uniform():
+    random = torch.Generator().manual_seed(0)
+    R = torch.stack([random_rotation(random) for _ in range(2000)])
+    torch.testing.assert_close(R @ R.mT, torch.eye(3).expand_as(R), atol=1e-5, rtol=0)
+    assert R.det().min() > 0.99
+    assert R.mean(0).abs().max() < 0.05
+    trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)
+    assert trace.mean().abs() < 0.07  # 0 over all rotations, its square 1
+    assert trace.square().mean() == pytest.approx(1.0, abs=0.1)
+
+
+def test_views_are_turned_as_told():
+    points = object_cloud(two_triangles(), 500)
+    still = CloudAugmentation(stretch=0.0, jitter_m=0.0, least_kept=0.6, turned=0.0)
+    view = still(points, torch.Generator().manual_seed(3))
+    assert 300 <= len(view.unique(dim=0)) <= 500
+    assert set(view[:, 2].unique().tolist()) <= {0.0, 5.0}, "about the vertical"
+    assert not torch.allclose(view.amax(0), points.amax(0))
+    torch.testing.assert_close(view.norm(dim=-1).amax(), points.norm(dim=-1).amax(), atol=0.2, rtol=0)
+    assert torch.equal(view, still(points, torch.Generator().manual_seed(3)))
+    any_way = CloudAugmentation(turned=1.0)(points, torch.Generator().manual_seed(3))
+    assert len(any_way[:, 2].unique()) > 100
+
+
+def test_a_datamodule_keeps_its_objects_in_a_file(tmp_path):
+    settings = {
+        "classes": CLASSES,
+        "per_class": 3,
+        "val_per_class": 2,
+        "batch_size": 4,
+        "steps_per_epoch": 2,
+        "points": 64,
+    }
+    data = ObjectClouds(str(tmp_path), **settings)
+    data.setup("fit")
+    batches = list(data.train_dataloader())
+    assert len(batches) == 2
+    assert batches[0].points.shape == (4, 2, 64, 3)
+    assert batches[0].label.shape == (4,)
+    first = next(iter(data.val_dataloader()))
+    first_cloud = data.dataset("val").clouds[0]
+    assert torch.equal(first.points[0, 0], first_cloud), "as it is"
+    assert not torch.equal(first.points[0, 0], first.points[0, 1])
+    made = (tmp_path / "train.safetensors").stat().st_mtime_ns
+    data.dataset("train")
+    assert (tmp_path / "train.safetensors").stat().st_mtime_ns == made
+    assert len(ObjectClouds(str(tmp_path), **settings | {"per_class": 4}).dataset("train")) == 16
+    with pytest.raises(WearcapError, match="'chair'"):
+        ObjectClouds(str(tmp_path), **settings | {"classes": ["chairr"]})
