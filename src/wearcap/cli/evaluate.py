@@ -12,6 +12,8 @@ from wearcap.cli.load import LearnedPipeline, load_pipeline, load_realism, stage
 from wearcap.errors import WearcapError
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, write_scores
 from wearcap.pipelines.baselines import MeanPose, NearestWindow
+from wearcap.pipelines.echo import Echo
+from wearcap.pipelines.echo_dataset import EchoOnDataset
 from wearcap.pipelines.evaluation import Measure, Pipeline, evaluate, score, score_in_world
 from wearcap.pipelines.ireplica import IReplica
 from wearcap.pipelines.ireplica_evaluation import with_interactions
@@ -62,15 +64,24 @@ def _learned(checkpoints: list[str], config: DictConfig, progress: Progress) -> 
         assert isinstance(pipeline, LearnedPipeline)
         seeds = [index * 1000 + seed for seed in config.seeds]
         title = Path(checkpoint).parts[-3:][0]
-        measure = _beside(realism, OURS, score_in_world if isinstance(pipeline, MocapEvery) else score)
-        rows += _rows(pipeline, store, seeds, config, progress, title, measure)
+        capture, scoring = _measured(pipeline, store)
+        measure = _beside(realism, OURS, scoring)
+        rows += _rows(capture, store, seeds, config, progress, title, measure)
     scores: Scores = {OURS: _summaries(rows, realism, OURS)}
-    if config.baselines:
+    if config.baselines and not isinstance(pipeline, Echo):
         for name, method in (("mean pose", MeanPose), ("nearest window", NearestWindow)):
             baseline = method.fit([RecordingStore.open(source) for source in sources])
             rows = list(_rows(baseline, store, [0], config, progress, name, _beside(realism, name)))
             scores[name] = _summaries(rows, realism, name)
     return store, scores
+
+
+def _measured(pipeline: LearnedPipeline, store: RecordingStore) -> tuple[Pipeline, Measure]:
+    """A pipeline with what it needs of a data set beside the recordings, and the measures of its document."""
+    if isinstance(pipeline, Echo):
+        with_objects = EchoOnDataset(pipeline, store.root)
+        return with_objects, with_objects.score
+    return pipeline, score_in_world if isinstance(pipeline, MocapEvery) else score
 
 
 def _beside(realism: Realism | None, method: str, measure: Measure = score) -> Measure:

@@ -13,6 +13,7 @@ from wearcap.io.environment import read_environment
 from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
 from wearcap.optimize.latent_motion import LatentSolver, LatentWeights
 from wearcap.pipelines.contact_prediction import ContactPredictor
+from wearcap.pipelines.echo import Echo
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.mocap_every import MocapEvery
 from wearcap.pipelines.pose_regressor import PoseRegressorCapture
@@ -23,10 +24,12 @@ from wearcap.recording.locate import dataset_folder
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
 from wearcap.training.contact_detection import ContactDetection
+from wearcap.training.echo_diffusion import EchoDiffusion
 from wearcap.training.egoview import EgoView
 from wearcap.training.motion_autoencoder import MotionEncoding
 from wearcap.training.motion_diffusion import MotionDiffusion
 from wearcap.training.motion_manifold import ManifoldTraining
+from wearcap.training.object_encoding import ObjectEncoding
 from wearcap.training.pose_regression import PoseRegression
 from wearcap.training.voxel_reconstruction import VoxelReconstruction
 from wearcap.training.watch_regression import WatchRegression
@@ -39,14 +42,17 @@ System = (
     | MotionEncoding
     | ManifoldTraining
     | VoxelReconstruction
+    | ObjectEncoding
+    | EchoDiffusion
     | EgoView
 )
-LearnedPipeline = HMD2 | PoseRegressorCapture | MocapEvery
+LearnedPipeline = HMD2 | PoseRegressorCapture | MocapEvery | Echo
 """Pipelines around one network, whole recordings at a time."""
 NETWORKS: dict[str, tuple[type[System], str]] = {
     "HMD2": (MotionDiffusion, "experiment=hmd2"),
     "PoseRegressorCapture": (PoseRegression, "experiment=pose_regressor_head or pose_regressor_hands"),
     "MocapEvery": (WatchRegression, "experiment=mocap_every"),
+    "Echo": (EchoDiffusion, "experiment=echo"),
 }
 """What a learned pipeline's checkpoint has to hold, and which experiment makes one."""
 

@@ -112,7 +112,8 @@ def body_contact(
     Distances are exact, to the surface and not to its vertices (ours), which may be further apart than τ_c.
     """
     T_object_world = shape.of_mesh(T_world_middle).inverse()
-    local = (T_object_world[:, None] @ points_world).double()
+    R, t = T_object_world.R.double(), T_object_world.t.double()
+    local = (R[:, None] @ points_world.double()[..., None])[..., 0] + t[:, None]
     low, high = shape.mesh.vertices.min(0) - within_m, shape.mesh.vertices.max(0) + within_m
     flat = local.flatten(0, 1).numpy()
     near = np.flatnonzero(((flat >= low) & (flat <= high)).all(1))

@@ -132,7 +132,7 @@ def echo_track(
         R[rows], t[rows] = T.R, T.t
         skin = surface.vertices(motion.T_world_joint[take[rows]])
         contact[rows, : CONTACTS - len(FOOT_PATCHES)] = body_contact(skin, shape, T, within_m).float()
-    contact[:, CONTACTS - len(FOOT_PATCHES) :] = _patches(recording)[take].float()
+    contact[:, CONTACTS - len(FOOT_PATCHES) :] = foot_patches(recording)[take].float()
     floor = recording.floor.height[take] if recording.floor is not None else torch.zeros(len(take))
     return EchoTrack(
         points, floor.float(), motion.skeleton, body_size(motion.skeleton),
@@ -140,7 +140,7 @@ def echo_track(
     )  # fmt: skip
 
 
-def _patches(recording: Recording) -> Bool[Tensor, "time patch"]:
+def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
     """Contact of `FOOT_PATCHES` with the floor, as recorded. Raises WearcapError where it was not."""
     track, motion = recording.contacts, recording.motion
     assert motion is not None
@@ -195,8 +195,8 @@ class EchoDataset(Dataset):
     def _read_track(self, number: int) -> EchoTrack:
         store, name, every = self.recordings[number]
         recording = RecordingFile(store.path_of(name)).load()
-        has = self.objects and recording.environment is not None
-        environment = _environment(store.root / recording.environment) if has else None
+        file = recording.environment if self.objects else None
+        environment = None if file is None else _environment(store.root / file)
         return echo_track(recording, environment, self._reader, every, self.within_m)
 
     def __getitem__(self, item: tuple[int, int] | int) -> EchoWindow:

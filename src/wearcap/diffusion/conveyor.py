@@ -99,14 +99,14 @@ class Conveyor:
         | None = None,
     ) -> None:
         """As many steps as there are between two frames; `noise` is what each adds. `amend` changes every x̂0 (guidance)."""
-        known = self._wide(held.is_known)
+        known = self.wide(held.is_known)
         for fresh in noise:
             level, after = self._levels(self.age, held), self._levels(self.age + 1, held)
             self.x = torch.where(known, held.known, self.x)
             x0_hat = denoise(self.x, level)
             if amend is not None:
                 x0_hat = amend(x0_hat)
-            level, after = self._wide(level), self._wide(after)
+            level, after = self.wide(level), self.wide(after)
             if self.belt.step == "redraw":
                 moved = torch.where(after < level, add_noise(x0_hat, fresh, after, self.schedule), self.x)
                 self.x = torch.where(known, held.known, moved)
@@ -123,7 +123,7 @@ class Conveyor:
         level = self.belt.levels(age)[:, None].expand(held.is_known.shape)
         return torch.where(held.is_known, 0.0, torch.where(held.is_absent, 1.0, level))
 
-    def _wide(self, value: Tensor) -> Tensor:
+    def wide(self, value: Tensor) -> Tensor:
         """Per feature instead of per modality."""
         sizes = torch.tensor(self.sizes)
         return value.repeat_interleave(sizes, -1, output_size=sum(self.sizes))

@@ -1,0 +1,245 @@
+"""ECHO (Petrov et al.): human, object and contacts from head and wrists, by one diffusion model, endlessly."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from wearcap.body.anny_body import anny_body
+from wearcap.body.contact_points import BODY_POINTS, contact_points
+from wearcap.body.skeleton import Skeleton
+from wearcap.data.echo_features import EchoFeatures
+from wearcap.data.echo_objects import ObjectReader, ObjectShape
+from wearcap.diffusion.conveyor import Belt, Denoise
+from wearcap.diffusion.schedule import Schedule
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.models.echo import EchoDenoiser, EchoPlan
+from wearcap.models.point_encoder import PointNeXt
+from wearcap.pipelines.echo_guidance import Guidance, GuidedScene
+from wearcap.pipelines.echo_queue import Amend, EchoQueue, Said, Told
+from wearcap.pipelines.echo_told import Lane, Scenario, lane_of
+from wearcap.pipelines.hmd2 import hang_from_head, head_path
+from wearcap.recording import Motion, Recording
+from wearcap.recording.acts import Act, true_acts
+from wearcap.scene.environment import Environment
+
+_PLANS = 256
+"""Patterns of noise levels whose plans are kept."""
+
+
+@dataclass
+class Echo:
+    """Captures whole recordings on a conveyor of frames; recordings share batches, which changes nothing but the time."""
+
+    net: EchoDenoiser
+    features: EchoFeatures
+    schedule: Schedule
+    skeleton: Skeleton
+    """For recordings that do not say whose body it is."""
+    encoder: PointNeXt | None = None
+    contacts: bool = True
+    """Whether the network was trained on contacts."""
+    context: int = 10
+    """Clean frames that are kept before the ramp: a pose is final when window - context - 1 frames have followed it."""
+    per_frame: int = 2
+    """Steps for every frame that enters; with a window of 60 and a context of 10 the document's 100 for each frame."""
+    spacing: float = 1.0
+    eta: float = 1.0
+    step: str = "posterior"
+    """See `diffusion.conveyor.Belt`."""
+    hang: bool = True
+    """Whether the body hangs from the measured head (ours) or stands where it was drawn (the document)."""
+    guidance: Guidance | None = None
+    """None: the prediction is left as it is."""
+    acts: str | Sequence[Mapping[str, Any]] = "truth"
+    """Which object is active when: "truth", as the recording's interactions say; "none": the human alone; or a list of
+    {object, start_s, stop_s}."""
+    environment: str | None = None
+    """File of the objects; None: what the recording names."""
+    device: str = "cpu"
+    _plans: dict[bytes, EchoPlan] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        if isinstance(self.acts, str) and self.acts not in ("truth", "none"):
+            raise WearcapError(f"no acts {self.acts!r}", expected="truth, none, or a list of {object, start_s, stop_s}")  # fmt: skip
+        _ = self.belt, self._given_acts()
+
+    @property
+    def belt(self) -> Belt:
+        """How the conveyor runs."""
+        return Belt(self.net.window, self.context, self.per_frame, self.spacing, self.eta, self.step)
+
+    @property
+    def fps(self) -> float:
+        return self.features.fps
+
+    @property
+    def latency_s(self) -> float:
+        """Between a frame and its final pose."""
+        return (self.belt.ramp - 1) / self.fps
+
+    def prepare(self) -> None:
+        """Bring the networks to their device."""
+        self.net.to(self.device).eval()
+        self._plans.clear()
+
+    def reader(self) -> ObjectReader:
+        """What turns objects into what the network is told."""
+        return ObjectReader(self.features, self.encoder)
+
+    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
+        """One motion of the human alone per (recording, seed); with objects: `capture_scenarios`."""
+        return self.capture_scenarios([Scenario(recording) for recording in recordings], seeds)
+
+    def _given_acts(self) -> tuple[Act, ...]:
+        if isinstance(self.acts, str):
+            return ()
+        try:
+            return tuple(sorted((Act(**row) for row in self.acts), key=lambda act: act.start_s))
+        except TypeError as error:
+            raise WearcapError(f"acts {list(self.acts)}", expected="a list of {object, start_s, stop_s}") from error  # fmt: skip
+
+    def scenario(self, recording: Recording, environment: Environment | None) -> Scenario:
+        """A recording with the objects that are active in it, as `acts` says.
+
+        A recording without objects is of a human alone, unless acts were given.
+        """
+        if self.acts == "truth":
+            there = environment is not None and bool(recording.object_motion)
+            return Scenario(recording, environment, tuple(true_acts(recording)) if there else ())
+        return Scenario(recording, environment, self._given_acts())
+
+    @torch.no_grad()
+    def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
+        """One motion per (scenario, seed), with `object_motion` and `body_contact_prob` where objects are active.
+
+        Raises WearcapError as `head_path` and `lane_of` do.
+        """
+        self.prepare()
+        # 1. the three tracked points on the model's clock, and the active objects' codes; once for all seeds
+        reader, once = self.reader(), {id(scenario): scenario for scenario in scenarios}
+        lane_by = {key: self._lane(scenario, reader) for key, scenario in once.items()}
+        lanes = [lane_by[id(scenario)] for scenario in scenarios]
+        # 2. frame after frame enters as noise and leaves clean
+        said = self._conveyed(lanes, [scenario.recording for scenario in scenarios], seeds)
+        # 3. the body hangs from the measured head; objects rest between the times they are active
+        return [motion_of(lane, part, self.hang, self.settings()) for lane, part in zip(lanes, said)]
+
+    def _lane(self, scenario: Scenario, reader: ObjectReader) -> Lane:
+        return lane_of(scenario, head_path(scenario.recording, self.skeleton, self.fps), reader)
+
+    def _conveyed(
+        self, lanes: Sequence[Lane], recordings: Sequence[Recording], seeds: Sequence[int]
+    ) -> list[Said]:
+        longest = max(len(lane.path.timestamps) for lane in lanes)
+        queue = EchoQueue(self, [lane.path.skeleton for lane in lanes], seeds)
+        if self.guidance is not None:
+            queue.guided = guided_by(
+                [lane.path.skeleton for lane in lanes],
+                [recording.shape for recording in recordings],
+                [lane.objects for lane in lanes],
+            )
+        told = [_padded(lane.told, longest) for lane in lanes]
+        whole = Told(*(torch.cat(fields) for fields in zip(*told)))
+        out = []
+        for frame in range(longest + self.belt.ramp - 1):
+            fresh = whole.frames(slice(frame, frame + 1)) if frame < longest else queue.padding()
+            said = queue.push(fresh)
+            if said is not None:
+                out.append(said)
+        together = Said(*(torch.cat(parts, 1) for parts in zip(*out)))
+        return [
+            Said(*(part[k : k + 1, : len(lane.path.timestamps)] for part in together))
+            for k, lane in enumerate(lanes)
+        ]
+
+    def denoiser(self, queue: EchoQueue, told: Told, frame: Rigid) -> tuple[Denoise, Amend | None]:
+        """x̂0 of the frames on a conveyor as a function of x_t and levels, and what guidance makes of it.
+
+        What the frames are told is encoded once, what their levels do is kept for when the same ones come again.
+        """
+        condition = self.features.condition(told.points, told.floor_height, queue.size)
+        given = (condition, told.object_code, told.has_object, told.valid)
+        encoded = self.net.encode(*(part.to(self.device) for part in given))
+        valid = told.valid.to(self.device)
+
+        def denoise(x_t: Tensor, level: Tensor) -> Tensor:
+            return self.net.step(x_t.to(self.device), self._plan(level), encoded, valid).float().cpu()
+
+        if self.guidance is None or queue.guided is None:
+            return denoise, None
+        guidance, (surfaces, objects) = self.guidance, queue.guided
+        scene = GuidedScene(self.net, self.features, told, frame, surfaces, objects)
+        return denoise, lambda x0_hat: guidance.amended(x0_hat, scene)
+
+    def _plan(self, level: Float[Tensor, "lane frame modality"]) -> EchoPlan:
+        """A plan for all lanes, of one lane's width where all have the same levels."""
+        if (level == level[:1]).all():
+            level = level[:1]
+            key = level.numpy().tobytes()
+            if key not in self._plans:
+                if len(self._plans) >= _PLANS:
+                    self._plans.pop(next(iter(self._plans)))
+                self._plans[key] = self.net.plan(level.to(self.device))
+            return self._plans[key]
+        return self.net.plan(level.to(self.device))
+
+    def settings(self) -> dict[str, str]:
+        """What the motion depends on, beside the network."""
+        return {
+            "pipeline": "echo", "context": str(self.context), "per_frame": str(self.per_frame), "eta": str(self.eta),
+            "step": self.step, "hang": str(self.hang), "guidance": str(self.guidance),
+        }  # fmt: skip
+
+
+def motion_of(lane: Lane, said: Said, hung: bool, provenance: dict[str, str]) -> Motion:
+    """What was said of a lane as a motion, hung from the measured head or not."""
+    path, contact = lane.path, said.contact_prob[0]
+    motion = Motion(
+        path.timestamps, path.skeleton, said.R_parent_joint[0], said.t_world_root[0], contact[:, BODY_POINTS:],
+        body_contact_prob=contact[:, :BODY_POINTS] * lane.told.has_object[0, :, None],
+        object_motion=object_tracks(lane, said) or None, provenance=provenance,
+    )  # fmt: skip
+    return hang_from_head(motion, path.T_world_head) if hung else motion
+
+
+def guided_by(
+    skeletons: Sequence[Skeleton],
+    shapes: Sequence[dict[str, float]],
+    objects: Sequence[Sequence[ObjectShape]],
+) -> tuple[list, list]:
+    """Contact points of every lane's body, and trees over its objects' points: what guidance pulls at."""
+    surfaces = [
+        contact_points(anny_body(skeleton, shape or None)) for skeleton, shape in zip(skeletons, shapes)
+    ]
+    return surfaces, [[KDTree(shape.cloud.numpy()) for shape in mine] for mine in objects]
+
+
+def object_tracks(lane: Lane, said: Said) -> dict[str, Trajectory]:
+    """Each object's poses: as said while it is active, as it was last (before the first time: as it will be first) else."""
+    active = torch.where(lane.told.has_object[0], lane.told.object_number[0], -1.0)
+    T = Rigid(said.R_world_object[0], said.t_world_object[0])
+    tracks = {}
+    for number, shape in enumerate(lane.objects):
+        rows = (active == number).nonzero()[:, 0]
+        if not len(rows):
+            continue
+        last = torch.searchsorted(rows, torch.arange(len(active)), right=True).sub(1).clamp_min(0)
+        pose = shape.of_mesh(T[rows[last]])
+        tracks[shape.name] = Trajectory(lane.path.timestamps, pose.R, pose.t)
+    return tracks
+
+
+def _padded(told: Told, length: int) -> Told:
+    """Up to a length: the last frame again, not valid."""
+    count = told.valid.shape[1]
+    take = torch.arange(length).clamp_max(count - 1)
+    there = torch.arange(length) < count
+    padded = told.frames(take)
+    return padded._replace(valid=padded.valid & there, is_known=padded.is_known & there[:, None])
