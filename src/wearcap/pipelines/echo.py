@@ -24,7 +24,7 @@ from wearcap.models.point_encoder import PointNeXt
 from wearcap.pipelines.echo_guidance import Guidance, GuidedScene
 from wearcap.pipelines.echo_queue import Amend, EchoQueue, Said, Told
 from wearcap.pipelines.echo_told import Lane, Scenario, lane_of
-from wearcap.pipelines.hmd2 import hang_from_head, head_path
+from wearcap.pipelines.hmd2 import HeadPath, hang_from_head, head_path
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import Act, true_acts
 from wearcap.scene.environment import Environment
@@ -137,15 +137,16 @@ class Echo:
     def _conveyed(
         self, lanes: Sequence[Lane], recordings: Sequence[Recording], seeds: Sequence[int]
     ) -> list[Said]:
-        longest = max(len(lane.path.timestamps) for lane in lanes)
-        queue = EchoQueue(self, [lane.path.skeleton for lane in lanes], seeds)
-        if self.guidance is not None:
-            queue.guided = guided_by(
-                [lane.path.skeleton for lane in lanes],
-                [recording.shape for recording in recordings],
-                [lane.objects for lane in lanes],
-            )
-        told = [_padded(lane.told, longest) for lane in lanes]
+        """All frames of every lane: its stretches side by side, what lies between them as it was before."""
+        parts = [(k, *stretch) for k, lane in enumerate(lanes) for stretch in lane.path.stretches]
+        longest = max(stop - start for _, start, stop in parts)
+        queue = self.queue(
+            [lanes[k].path.skeleton for k, *_ in parts],
+            [stretch_seed(seeds[k], start) for k, start, _ in parts],
+            [recordings[k].shape for k, *_ in parts],
+            [lanes[k].objects for k, *_ in parts],
+        )
+        told = [_padded(lanes[k].told, start, stop, longest) for k, start, stop in parts]
         whole = Told(*(torch.cat(fields) for fields in zip(*told)))
         out = []
         for frame in range(longest + self.belt.ramp - 1):
@@ -153,11 +154,24 @@ class Echo:
             said = queue.push(fresh)
             if said is not None:
                 out.append(said)
-        together = Said(*(torch.cat(parts, 1) for parts in zip(*out)))
-        return [
-            Said(*(part[k : k + 1, : len(lane.path.timestamps)] for part in together))
-            for k, lane in enumerate(lanes)
-        ]
+        together = Said(*(torch.cat(fields, 1) for fields in zip(*out)))
+        found: list[list[Said]] = [[] for _ in lanes]
+        for row, (k, start, stop) in enumerate(parts):
+            found[k].append(Said(*(field[row : row + 1, : stop - start] for field in together)))
+        return [_bridged(said, lane.path) for said, lane in zip(found, lanes)]
+
+    def queue(
+        self,
+        skeletons: Sequence[Skeleton],
+        seeds: Sequence[int],
+        shapes: Sequence[dict[str, float]],
+        objects: Sequence[Sequence[ObjectShape]],
+    ) -> EchoQueue:
+        """An empty queue of as many lanes, with what guidance pulls at where there is guidance."""
+        queue = EchoQueue(self, skeletons, seeds)
+        if self.guidance is not None:
+            queue.guided = guided_by(skeletons, shapes, objects)
+        return queue
 
     def denoiser(self, queue: EchoQueue, told: Told, frame: Rigid) -> tuple[Denoise, Amend | None]:
         """x̂0 of the frames on a conveyor as a function of x_t and levels, and what guidance makes of it.
@@ -236,10 +250,22 @@ def object_tracks(lane: Lane, said: Said) -> dict[str, Trajectory]:
     return tracks
 
 
-def _padded(told: Told, length: int) -> Told:
-    """Up to a length: the last frame again, not valid."""
-    count = told.valid.shape[1]
-    take = torch.arange(length).clamp_max(count - 1)
-    there = torch.arange(length) < count
+def stretch_seed(seed: int, start: int) -> int:
+    """Of a stretch that begins at a frame: stretches of one recording have noise of their own."""
+    return seed + 1_000_003 * start
+
+
+def _padded(told: Told, start: int, stop: int, length: int) -> Told:
+    """Frames start…stop-1, up to a length: the last one again, not valid."""
+    take = (start + torch.arange(length)).clamp_max(stop - 1)
+    there = torch.arange(length) < stop - start
     padded = told.frames(take)
     return padded._replace(valid=padded.valid & there, is_known=padded.is_known & there[:, None])
+
+
+def _bridged(said: list[Said], path: HeadPath) -> Said:
+    """Stretches as one; frames in the gaps between them are as the one before."""
+    frames = torch.cat([torch.arange(start, stop) for start, stop in path.stretches])
+    whole = Said(*(torch.cat(fields, 1) for fields in zip(*said)))
+    last = torch.searchsorted(frames, torch.arange(len(path.timestamps)), right=True).sub(1).clamp_min(0)
+    return Said(*(field[:, last] for field in whole))

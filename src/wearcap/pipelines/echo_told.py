@@ -23,7 +23,7 @@ from wearcap.recording.acts import NO_OBJECT, Act, active_at
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
-from wearcap.scene.object_mesh import check_object_mesh
+from wearcap.scene.object_mesh import check_object
 
 WRISTS = POINTS[1:]
 SWAPPED_M = 0.02
@@ -133,7 +133,7 @@ def _objects(scenario: Scenario, names: list[str], reader: ObjectReader) -> list
     for name in names:
         assert scenario.environment is not None
         item = scenario.environment.by_name(name)
-        check_object_mesh(item.mesh, f"object {name!r} of {scenario.recording.name}")
+        check_object(item, f"object {name!r} of {scenario.recording.name}")
         shapes.append(reader(item))
     return shapes
 

@@ -24,6 +24,7 @@ from wearcap.data.surroundings import latest_before
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.hmd2_places import Memory, Places
 from wearcap.pipelines.hmd2_track import Chunk, HeadTrack
@@ -299,9 +300,23 @@ def joined(parts: list[Motion]) -> Motion | None:
     """Consecutive pieces of a motion as one; None for no piece."""
     if len(parts) < 2:
         return parts[0] if parts else None
-    contacts = [part.contact_prob for part in parts if part.contact_prob is not None]
+    contacts, skin = (
+        [value for part in parts if (value := getattr(part, name)) is not None]
+        for name in ("contact_prob", "body_contact_prob")
+    )
+    tracks: dict[str, list[Trajectory]] = {}
+    for part in parts:
+        for name, track in (part.object_motion or {}).items():
+            tracks.setdefault(name, []).append(track)
     return Motion(
         torch.cat([part.timestamps for part in parts]), parts[0].skeleton,
         torch.cat([part.R_parent_joint for part in parts]), torch.cat([part.t_world_root for part in parts]),
-        torch.cat(contacts) if contacts else None, provenance=parts[0].provenance,
+        torch.cat(contacts) if contacts else None, body_contact_prob=torch.cat(skin) if skin else None,
+        object_motion={name: _end_to_end(each) for name, each in tracks.items()} or None,
+        provenance=parts[0].provenance,
     )  # fmt: skip
+
+
+def _end_to_end(tracks: list[Trajectory]) -> Trajectory:
+    times, R, t = zip(*((each.timestamps, each.R_world_body, each.t_world_body) for each in tracks))
+    return Trajectory(torch.cat(times), torch.cat(R), torch.cat(t))

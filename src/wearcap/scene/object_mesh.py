@@ -8,6 +8,7 @@ from jaxtyping import Float64
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
+from wearcap.scene.objects import SceneObject
 
 EXTENTS_M = (0.01, 5.0)
 """Longest side of the box around an object that a person handles (m)."""
@@ -26,7 +27,13 @@ def centered(mesh: Mesh) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
     return replace(mesh, vertices=(mesh.vertices - center).astype(np.float32)), center
 
 
-def check_object_mesh(mesh: Mesh, where: str | Path) -> None:
+def check_object(item: SceneObject, where: str | Path) -> None:
+    """`check_object_mesh` of an environment's object; what turns on a hinge or slides along an axis is in the axes of
+    its mount, wherever that is."""
+    check_object_mesh(item.mesh, where, item.freedom.kind not in ("hinge", "axis"))
+
+
+def check_object_mesh(mesh: Mesh, where: str | Path, own_axes: bool = True) -> None:
     """Raise WearcapError unless a mesh can be an object's, in metres and in axes of its own.
 
     Refused, each with its own message: no vertices, coordinates that are NaN or infinite, no faces, faces of vertices
@@ -51,7 +58,7 @@ def check_object_mesh(mesh: Mesh, where: str | Path) -> None:
     low, high = vertices.min(0), vertices.max(0)
     _check_unit(float((high - low).max()), where)
     off = float(np.linalg.norm(np.maximum(np.maximum(low, -high), 0.0)))
-    if off > MAX_OFF_CENTER * (high - low).max():
+    if own_axes and off > MAX_OFF_CENTER * (high - low).max():
         raise WearcapError(
             f"the object's mesh is not centred: its origin lies {off:.2f} m outside of the box around it", where=where,
             expected="axes of its own, with the origin in or near the object",

@@ -1,0 +1,238 @@
+"""ECHO while things happen: tracked points go in as they come, bodies and objects come out frame by frame.
+
+What is said is what `Echo` says of the whole recording with the same seed; a pose comes `Echo.latency_s` after its
+moment. Memory does not grow.
+"""
+
+import math
+from bisect import insort
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.data.echo_features import CONTACTS, POINTS
+from wearcap.data.echo_objects import ObjectShape
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.models.echo import MODALITIES
+from wearcap.pipelines.echo import Echo, motion_of, stretch_seed
+from wearcap.pipelines.echo_queue import EchoQueue, Said, Told
+from wearcap.pipelines.echo_told import Lane
+from wearcap.pipelines.hmd2 import HeadPath
+from wearcap.pipelines.hmd2_stream import joined
+from wearcap.pipelines.hmd2_track import Chunk, HeadTrack
+from wearcap.recording import Motion
+from wearcap.scene.environment import Environment
+from wearcap.scene.object_mesh import check_object
+
+WRISTS = POINTS[1:]
+MAX_GAP_S = 0.5
+"""A wrist that is not tracked for longer rests where it was seen last."""
+
+
+@dataclass(frozen=True, eq=False)
+class EchoWearer:
+    """Who wears the kit, and how the head device sits."""
+
+    skeleton: Skeleton
+    shape: Mapping[str, float] = field(default_factory=dict)
+    R_head_device: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
+    t_head_device: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
+    floor_m: float | None = None
+    """Height of the floor; None: the first head's, less that of one who stands."""
+
+
+class EchoSession:
+    """A streaming capture of one wearer among some objects."""
+
+    def __init__(
+        self, pipeline: Echo, wearer: EchoWearer, environment: Environment | None = None, seed: int = 0
+    ):
+        """Raises WearcapError for objects whose mesh or class cannot be used."""
+        pipeline.prepare()
+        self.pipeline, self.wearer, self.seed = pipeline, wearer, seed
+        self.silent = 0
+        """Frames for which a wrist had nothing to say."""
+        reader = pipeline.reader()
+        self._shapes: dict[str, ObjectShape] = {}
+        for item in environment.objects if environment is not None else ():
+            check_object(item, f"object {item.name!r}")
+            self._shapes[item.name] = reader(item)
+        self._names = list(self._shapes)
+        self._track = HeadTrack(pipeline.fps, 1)
+        self._wrists: dict[str, list[tuple[float, Tensor, Tensor]]] = {joint: [] for joint in WRISTS}
+        self._acts: list[tuple[float, str | None]] = []
+        self._seen: list[tuple[float, str, Rigid]] = []
+        self._chunks: list[Chunk] = []
+        self._queue: EchoQueue | None = None
+        self._waiting: list[tuple[float, Told, Rigid]] = []
+        """Times, what was told, and the head, of frames that are taken and not given yet."""
+        self._floor_m = wearer.floor_m
+
+    @property
+    def dropped(self) -> int:
+        """Head poses that came too late, twice, or were not finite."""
+        return self._track.dropped
+
+    def head(self, timestamp: float, T_world_device: Rigid | None) -> None:
+        """Take in a moment of the head device: its pose, if tracking has one."""
+        self._track.take(timestamp, T_world_device)
+
+    def wrist(self, joint: str, timestamp: float, T_world_joint: Rigid) -> None:
+        """Take in the pose of a wrist joint; what is not finite or comes twice is left out.
+
+        Raises WearcapError for another joint than the wrists.
+        """
+        if joint not in self._wrists:
+            raise WearcapError(f"no tracked joint {joint!r}", expected=" or ".join(WRISTS))
+        known = self._wrists[joint]
+        R, t = T_world_joint.R.float().cpu(), T_world_joint.t.float().cpu()
+        finite = math.isfinite(timestamp) and R.isfinite().all() and t.isfinite().all()
+        if finite and all(time != timestamp for time, *_ in known[-3:]):
+            insort(known, (timestamp, R, t), key=lambda pose: pose[0])
+
+    def activate(self, name: str | None, timestamp: float) -> None:
+        """From a time (s) on this object is the active one; None: none is. Frames whose poses are not final yet, too.
+
+        Raises WearcapError for an unknown object.
+        """
+        if name is not None and name not in self._shapes:
+            raise WearcapError(f"no object {name!r}", expected=f"one of {', '.join(self._shapes) or 'no objects'}")  # fmt: skip
+        self._acts = [act for act in self._acts if act[0] < timestamp] + [(timestamp, name)]
+        self._retell()
+
+    def see_object(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
+        """An object's pose is known at a moment, from a camera for instance (ECHO §4.2). Raises as `activate` does."""
+        if name not in self._shapes:
+            raise WearcapError(f"no object {name!r}", expected=f"one of {', '.join(self._shapes) or 'no objects'}")  # fmt: skip
+        T = self._shapes[name].centred(Rigid(T_world_object.R.float(), T_world_object.t.float()))
+        self._seen.append((timestamp, name, T))
+        self._retell()
+
+    def poses(self, ended: bool = False) -> Motion | None:
+        """The frames that are final since the last time; `ended`: nothing more will come."""
+        while (chunk := self._track.next(ended)) is not None:
+            self._chunks.append(chunk)
+        given: list[Motion] = []
+        while self._chunks and (ended or self._told(self._chunks[0])):
+            given += self._advance(self._chunks.pop(0))
+        if ended:
+            given += self._finish()
+        return joined(given)
+
+    def _told(self, chunk: Chunk) -> bool:
+        """Whether both wrists have said where they are at a frame, or are silent."""
+        time, head = chunk.timestamps[-1].item(), self._track.newest
+        newest = [poses[-1][0] if poses else -math.inf for poses in self._wrists.values()]
+        return all(last >= time - 1e-6 or head > max(time, last) + MAX_GAP_S for last in newest)
+
+    def _advance(self, chunk: Chunk) -> list[Motion]:
+        given: list[Motion] = []
+        if chunk.begins or self._queue is None:
+            given += self._finish()
+            skeleton = self.wearer.skeleton
+            self._queue = self.pipeline.queue(
+                [skeleton], [stretch_seed(self.seed, chunk.first)], [dict(self.wearer.shape)],
+                [list(self._shapes.values())],
+            )  # fmt: skip
+        mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
+        T_world_head = chunk.T_world_device @ mount
+        if self._floor_m is None:
+            self._floor_m = T_world_head.t[0, 2].item() - self.wearer.skeleton.height_of("head")
+        time = chunk.timestamps[0].item()
+        told = self._frame(time, T_world_head)
+        said = self._queue.push(told)
+        self._waiting.append((time, told, T_world_head))
+        return given + self._give(said)
+
+    def _finish(self) -> list[Motion]:
+        """The frames of a stretch that has ended."""
+        given: list[Motion] = []
+        while self._queue is not None and self._waiting:
+            given += self._give(self._queue.push(self._queue.padding()))
+        self._queue = None
+        return given
+
+    def _frame(self, time: float, T_world_head: Rigid) -> Told:
+        poses = [T_world_head, *(self._wrist_at(joint, time) for joint in WRISTS)]
+        R, t = torch.stack([T.R for T in poses], 1), torch.stack([T.t for T in poses], 1)
+        joints = len(self.wearer.skeleton)
+        one = torch.ones(1, dtype=torch.bool)
+        unseen = (torch.eye(3).repeat(1, joints, 1, 1), torch.zeros(1, 3), torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, CONTACTS))  # fmt: skip
+        floor = torch.full((1,), float(self._floor_m or 0.0))
+        fields = (R, t, floor, *self._active(time), one, *unseen, torch.zeros(1, len(MODALITIES), dtype=torch.bool))  # fmt: skip
+        return self._observed(Told(*(value[None] for value in fields)), time)
+
+    def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Whether an object is active at a time, its code and its number."""
+        name = next((name for start, name in reversed(self._acts) if start <= time + 1e-6), None)
+        if name is None:
+            size = self.pipeline.features.object_condition_size
+            return torch.zeros(1, dtype=torch.bool), torch.zeros(1, size), torch.full((1,), -1.0)
+        number = torch.full((1,), float(self._names.index(name)))
+        return torch.ones(1, dtype=torch.bool), self._shapes[name].code[None], number
+
+    def _observed(self, told: Told, time: float) -> Told:
+        """With the active object's pose, where it was seen within half a frame."""
+        for at, name, T in self._seen:
+            mine = bool(told.has_object) and self._names[int(told.object_number)] == name
+            if mine and abs(at - time) <= 0.5 / self.pipeline.fps + 1e-6:
+                known = told.is_known.clone()
+                known[..., 1] = True
+                told = told._replace(R_world_object=T.R[None, None], t_world_object=T.t[None, None], is_known=known)  # fmt: skip
+        return told
+
+    def _retell(self) -> None:
+        """What has become known of the frames that are on the conveyor."""
+        if self._queue is None or self._queue.told is None or not self._waiting:
+            return
+        whole, first = self._queue.told, self._queue.told.valid.shape[1] - len(self._waiting)
+        frames = [whole.frames(slice(k, k + 1)) for k in range(max(first, 0))]
+        for k, (time, told, head) in enumerate(self._waiting):
+            has, code, number = (value[None] for value in self._active(time))
+            changed = told._replace(has_object=has, object_code=code, object_number=number)
+            changed = self._observed(changed, time)
+            self._waiting[k] = (time, changed, head)
+            frames.append(changed)
+        self._queue.told = Told(*(torch.cat(fields, 1) for fields in zip(*frames)))
+
+    def _wrist_at(self, joint: str, time: float) -> Rigid:
+        known = self._wrists[joint]
+        if not known or known[-1][0] < time - MAX_GAP_S:
+            self.silent += 1
+        if not known:
+            return Rigid(torch.eye(3)[None], torch.zeros(1, 3))
+        times, R, t = zip(*known)
+        clock = torch.tensor(times, dtype=torch.float64)
+        at = torch.tensor([min(max(time, times[0]), times[-1])], dtype=torch.float64)
+        exact = (clock - at).abs() < 1e-4
+        if exact.any():
+            number = int(exact.long().argmax())
+            pose = Rigid(R[number][None], t[number][None])
+        else:
+            pose = resample(Trajectory(clock, torch.stack(R), torch.stack(t)), at).T_world_body
+        self._wrists[joint] = [sample for sample in known if sample[0] >= time - 1.0] or known[-1:]
+        return Rigid(pose.R.float(), pose.t.float())
+
+    def _give(self, said: Said | None) -> list[Motion]:
+        if said is None or not self._waiting:
+            return []
+        time, told, T_world_head = self._waiting.pop(0)
+        path = HeadPath(
+            torch.tensor([time], dtype=torch.float64), T_world_head, T_world_head, told.floor_height[0],
+            self.wearer.skeleton, ((0, 1),),
+        )  # fmt: skip
+        self._forget(time)
+        lane = Lane(path, told, list(self._shapes.values()))
+        return [motion_of(lane, said, self.pipeline.hang, self.pipeline.settings())]
+
+    def _forget(self, time: float) -> None:
+        """What no later frame asks for."""
+        self._seen = [row for row in self._seen if row[0] > time - 1.0]
+        past = [k for k, (start, _) in enumerate(self._acts) if start <= time]
+        self._acts = self._acts[past[-1] :] if past else self._acts
