@@ -8,6 +8,7 @@ Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables). Systems:
     hmd2_head     HMD2 on the head path alone: MPJPE and its parts, realism, beside trivial baselines
     hps           HPS on simulated sessions: its document's three tables, drift, outages of localisation
     ireplica      iReplica on simulated interactions: its document's tables, robustness
+    echo          ECHO: bodies, objects and contacts; baselines, ablations, sparse observations
     mocap_every   MocapEvery: bodies, floors on hillsides, hands in the picture; its document's Tables 2 to 7
     egoview       our image encoder: hands in the head camera's pictures
     voxels        codes of the points around the body: what they bring back

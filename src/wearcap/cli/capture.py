@@ -20,11 +20,13 @@ from wearcap.io.gltf import write_glb
 from wearcap.io.motion_npz import write_motion
 from wearcap.io.scan import read_scan
 from wearcap.io.scene_folder import cloud_file
+from wearcap.pipelines.echo import Echo
+from wearcap.pipelines.echo_dataset import EchoOnDataset
 from wearcap.pipelines.hps import HPS
 from wearcap.pipelines.hps_stream import follow
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
-from wearcap.recording.locate import load_recording
+from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.scene.environment import Environment
 from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
@@ -48,9 +50,11 @@ def run(config: DictConfig) -> Motion | None:
             raise WearcapError(f"samples={config.samples}", expected="at least 1")
         if config.until is not None or config.cache is not None:
             raise WearcapError(f"until={config.until} cache={config.cache}", expected="a pipeline with stages, such as pipeline=hps")  # fmt: skip
-        draws = pipeline.capture(
-            [recording] * config.samples, range(config.seed, config.seed + config.samples)
-        )
+        seeds = range(config.seed, config.seed + config.samples)
+        capturing = pipeline
+        if isinstance(pipeline, Echo):
+            capturing = EchoOnDataset(pipeline, dataset_folder(config.recording))
+        draws = capturing.capture([recording] * config.samples, seeds)
         motion = draws[0]
         if len(draws) > 1:
             _write_samples(draws, recording, folder, config)

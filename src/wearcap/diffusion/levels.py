@@ -24,6 +24,8 @@ class LevelMix:
     observed: float = 0.15
     ramp: tuple[int, int] | list[int] = (10, 60)
     """Fewest and most frames over which a conveyor's level grows from 0 to 1."""
+    together: bool = False
+    """Whether the modalities share the windows' one level (BoDiffusion's)."""
 
     def levels(
         self, frames: Float[Tensor, "batch time modality"], draws: Float[Tensor, "batch 9"]
@@ -37,7 +39,8 @@ class LevelMix:
         tail = tail_at * (time - 1 + ramp)
         place = torch.arange(time, device=frames.device)[None, :, None]
         grows = (1 - (tail - place) / ramp).clamp(0, 1).expand(-1, -1, count)
-        single = draws[:, None, -count:].expand(-1, time, -1)
+        single = draws[:, None, -1:] if self.together else draws[:, None, -count:]
+        single = single.expand(-1, time, count)
         levels = torch.where(
             kind < self.independent,
             frames,

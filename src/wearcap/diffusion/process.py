@@ -16,9 +16,11 @@ def add_noise(
     level: Level,
     schedule: Schedule,
 ) -> Float[Tensor, "batch time feature"]:
-    """x_t = √ᾱ x0 + √(1 - ᾱ) ε (thesis eq. 6.1)."""
-    alpha_bar = schedule(_wide(level))
-    return alpha_bar.sqrt() * x0 + (1 - alpha_bar).sqrt() * noise
+    """x_t = √ᾱ x0 + √(1 - ᾱ) ε (thesis eq. 6.1); level 0 is x0 itself, whatever rounding makes of ᾱ."""
+    level = _wide(level)
+    alpha_bar = schedule(level)
+    noised = alpha_bar.sqrt() * x0 + (1 - alpha_bar).clamp_min(0).sqrt() * noise
+    return torch.where(level == 0, x0, noised)
 
 
 def posterior_step(

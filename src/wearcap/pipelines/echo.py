@@ -5,9 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from scipy.spatial import KDTree
-from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, contact_points
@@ -19,18 +17,18 @@ from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.models.echo import EchoDenoiser, EchoPlan
+from wearcap.models.echo import EchoDenoiser
+from wearcap.models.echo_runtime import EchoRunner, require_runtime
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.pipelines.echo_guidance import Guidance, GuidedScene
 from wearcap.pipelines.echo_queue import Amend, EchoQueue, Said, Told
+from wearcap.pipelines.echo_rewindow import Rewindow
+from wearcap.pipelines.echo_search import ActSearch
 from wearcap.pipelines.echo_told import Lane, Scenario, lane_of
 from wearcap.pipelines.hmd2 import HeadPath, hang_from_head, head_path
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import Act, true_acts
 from wearcap.scene.environment import Environment
-
-_PLANS = 256
-"""Patterns of noise levels whose plans are kept."""
 
 
 @dataclass
@@ -53,22 +51,27 @@ class Echo:
     eta: float = 1.0
     step: str = "posterior"
     """See `diffusion.conveyor.Belt`."""
+    rewindow: int | None = None
+    """Frames by which windows advance that are denoised from scratch, as is usual; None: a conveyor."""
     hang: bool = True
     """Whether the body hangs from the measured head (ours) or stands where it was drawn (the document)."""
     guidance: Guidance | None = None
     """None: the prediction is left as it is."""
-    acts: str | Sequence[Mapping[str, Any]] = "truth"
-    """Which object is active when: "truth", as the recording's interactions say; "none": the human alone; or a list of
-    {object, start_s, stop_s}."""
+    acts: str | Sequence[Mapping[str, Any]] | ActSearch = "truth"
+    """Which object is active when: "truth", as the recording's interactions say; "none": the human alone; a list of
+    {object, start_s, stop_s}; or a search."""
     environment: str | None = None
     """File of the objects; None: what the recording names."""
+    runtime: str = "eager"
+    """See `models.echo_runtime`."""
     device: str = "cpu"
-    _plans: dict[bytes, EchoPlan] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _runner: EchoRunner | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self):
         if isinstance(self.acts, str) and self.acts not in ("truth", "none"):
             raise WearcapError(f"no acts {self.acts!r}", expected="truth, none, or a list of {object, start_s, stop_s}")  # fmt: skip
         _ = self.belt, self._given_acts()
+        require_runtime(self.runtime, self.device)
 
     @property
     def belt(self) -> Belt:
@@ -85,9 +88,10 @@ class Echo:
         return (self.belt.ramp - 1) / self.fps
 
     def prepare(self) -> None:
-        """Bring the networks to their device."""
+        """Bring the network to its device and into the form it runs in; what is exported or compiled is made once."""
         self.net.to(self.device).eval()
-        self._plans.clear()
+        if self._runner is None or self.runtime == "eager":
+            self._runner = EchoRunner(self.net, self.runtime)
 
     def reader(self) -> ObjectReader:
         """What turns objects into what the network is told."""
@@ -98,7 +102,7 @@ class Echo:
         return self.capture_scenarios([Scenario(recording) for recording in recordings], seeds)
 
     def _given_acts(self) -> tuple[Act, ...]:
-        if isinstance(self.acts, str):
+        if isinstance(self.acts, str | ActSearch):
             return ()
         try:
             return tuple(sorted((Act(**row) for row in self.acts), key=lambda act: act.start_s))
@@ -113,6 +117,9 @@ class Echo:
         if self.acts == "truth":
             there = environment is not None and bool(recording.object_motion)
             return Scenario(recording, environment, tuple(true_acts(recording)) if there else ())
+        if isinstance(self.acts, ActSearch) and environment is not None:
+            alone = self.capture_scenarios([Scenario(recording)], [0])[0]
+            return Scenario(recording, environment, self.acts(alone, environment))
         return Scenario(recording, environment, self._given_acts())
 
     @torch.no_grad()
@@ -148,13 +155,7 @@ class Echo:
         )
         told = [_padded(lanes[k].told, start, stop, longest) for k, start, stop in parts]
         whole = Told(*(torch.cat(fields) for fields in zip(*told)))
-        out = []
-        for frame in range(longest + self.belt.ramp - 1):
-            fresh = whole.frames(slice(frame, frame + 1)) if frame < longest else queue.padding()
-            said = queue.push(fresh)
-            if said is not None:
-                out.append(said)
-        together = Said(*(torch.cat(fields, 1) for fields in zip(*out)))
+        together = queue.run(whole)
         found: list[list[Said]] = [[] for _ in lanes]
         for row, (k, start, stop) in enumerate(parts):
             found[k].append(Said(*(field[row : row + 1, : stop - start] for field in together)))
@@ -169,6 +170,8 @@ class Echo:
     ) -> EchoQueue:
         """An empty queue of as many lanes, with what guidance pulls at where there is guidance."""
         queue = EchoQueue(self, skeletons, seeds)
+        if self.rewindow is not None:
+            queue = Rewindow(self, skeletons, seeds, self.rewindow)
         if self.guidance is not None:
             queue.guided = guided_by(skeletons, shapes, objects)
         return queue
@@ -179,36 +182,21 @@ class Echo:
         What the frames are told is encoded once, what their levels do is kept for when the same ones come again.
         """
         condition = self.features.condition(told.points, told.floor_height, queue.size)
-        given = (condition, told.object_code, told.has_object, told.valid)
-        encoded = self.net.encode(*(part.to(self.device) for part in given))
-        valid = told.valid.to(self.device)
-
-        def denoise(x_t: Tensor, level: Tensor) -> Tensor:
-            return self.net.step(x_t.to(self.device), self._plan(level), encoded, valid).float().cpu()
-
+        if self._runner is None:
+            self.prepare()
+        assert self._runner is not None
+        denoise = self._runner.begin(condition, told.object_code, told.has_object, told.valid)
         if self.guidance is None or queue.guided is None:
             return denoise, None
         guidance, (surfaces, objects) = self.guidance, queue.guided
         scene = GuidedScene(self.net, self.features, told, frame, surfaces, objects)
         return denoise, lambda x0_hat: guidance.amended(x0_hat, scene)
 
-    def _plan(self, level: Float[Tensor, "lane frame modality"]) -> EchoPlan:
-        """A plan for all lanes, of one lane's width where all have the same levels."""
-        if (level == level[:1]).all():
-            level = level[:1]
-            key = level.numpy().tobytes()
-            if key not in self._plans:
-                if len(self._plans) >= _PLANS:
-                    self._plans.pop(next(iter(self._plans)))
-                self._plans[key] = self.net.plan(level.to(self.device))
-            return self._plans[key]
-        return self.net.plan(level.to(self.device))
-
     def settings(self) -> dict[str, str]:
         """What the motion depends on, beside the network."""
         return {
             "pipeline": "echo", "context": str(self.context), "per_frame": str(self.per_frame), "eta": str(self.eta),
-            "step": self.step, "hang": str(self.hang), "guidance": str(self.guidance),
+            "step": self.step, "rewindow": str(self.rewindow), "hang": str(self.hang), "guidance": str(self.guidance),
         }  # fmt: skip
 
 

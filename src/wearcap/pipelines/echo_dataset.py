@@ -11,6 +11,7 @@ from wearcap.pipelines.echo import Echo
 from wearcap.pipelines.echo_evaluation import Truth, score_echo, truth_of
 from wearcap.pipelines.echo_told import Scenario
 from wearcap.recording import Motion, Recording
+from wearcap.recording.acts import true_acts
 from wearcap.scene.environment import Environment
 
 
@@ -44,9 +45,12 @@ class EchoOnDataset:
         return self.echo.capture_scenarios([once[id(recording)] for recording in recordings], seeds)
 
     def truth(self, motion: Motion, recording: Recording) -> Truth:
-        """What is true at a capture's frames."""
+        """What is true at a capture's frames, whatever the capture was told of active objects."""
         self._reader = self._reader or self.echo.reader()
-        return truth_of(self.scenario(recording), motion.timestamps, self._reader)
+        environment = self.environment(recording)
+        there = environment is not None and bool(recording.object_motion)
+        acts = tuple(true_acts(recording)) if there else ()
+        return truth_of(Scenario(recording, environment, acts), motion.timestamps, self._reader)
 
     def score(self, motion: Motion, recording: Recording, name: str, seed: int) -> Row:
         """ECHO's measures of one capture."""

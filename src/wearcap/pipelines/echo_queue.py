@@ -1,7 +1,7 @@
 """ECHO's queue of frames (ECHO §3.3): what is told of them comes in one by one, what is said of them goes out."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -56,12 +56,14 @@ class Said(NamedTuple):
     """64 body points on the object, then `FOOT_PATCHES` on the floor."""
 
 
+@runtime_checkable
 class Amend(Protocol):
     """Changes x̂0 as guidance wants it."""
 
     def __call__(self, x0_hat: Float[Tensor, "lane frame feature"]) -> Float[Tensor, "lane frame feature"]: ...  # fmt: skip
 
 
+@runtime_checkable
 class Model(Protocol):
     """What of a pipeline the queue needs."""
 
@@ -113,6 +115,15 @@ class EchoQueue:
         self.conveyor.run(denoise, held, noise.transpose(0, 1), amend)
         clean = self.conveyor.clean
         return self._said(clean - 1, frame) if clean else None
+
+    def run(self, whole: Told) -> Said:
+        """All frames of some lanes, to the end."""
+        count, out = whole.valid.shape[1], []
+        for frame in range(count + self.belt.ramp - 1):
+            said = self.push(whole.frames(slice(frame, frame + 1)) if frame < count else self.padding())
+            if said is not None:
+                out.append(said)
+        return Said(*(torch.cat(fields, 1) for fields in zip(*out)))
 
     def padding(self) -> Told:
         """A frame behind the end of all lanes: the last one again, not valid."""

@@ -1,0 +1,188 @@
+"""ECHO on held-out people, places and objects: the document's Tables 1, 2, 3, 4 (ablation) and S2 on the data at hand.
+
+Bodies and objects are measured where they are put in the world, over whole recordings. Rows without a checkpoint are
+left out and said so. Checkpoints come by name (checkpoints/) or path; those of baselines and ablations from
+RUNS/NAME/checkpoints/last.ckpt, where `wearcap train experiment=NAME paths.run=RUNS/NAME` puts them. Means and spreads
+are over seeds of the diffusion, as in the document.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+from echo_rows import Method, pipeline_of, rows, stuck_rows
+from hydra.utils import instantiate
+from rich.console import Console
+from rich.progress import Progress
+from tabling import finite
+
+from wearcap.cli.conf import compose
+from wearcap.errors import WearcapError
+from wearcap.files import write_text
+from wearcap.metrics.table import Row, Scores, Summary, aggregate, markdown_table
+from wearcap.pipelines.echo_baselines import NearestEcho, RigidWrist
+from wearcap.pipelines.echo_dataset import EchoOnDataset
+from wearcap.pipelines.echo_evaluation import score_echo
+from wearcap.recording import RecordingStore
+
+OBJECTS = (
+    "mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "v2v_cm", "center_cm", "rotation_deg", "quaternion",
+    "touch_f1", "jitter_m_s3",
+)  # fmt: skip
+HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_s3", "true_jitter_m_s3")
+ABLATIONS = {
+    "ours, as long as the others": ("echo_short", "pipeline=echo"),
+    "document's frame": ("echo_window", "pipeline=echo"),
+    "no canonical frame": ("echo_world", "pipeline=echo"),
+    "no contacts": ("echo_without_contacts", "pipeline=echo"),
+    "no humans alone": ("echo_without_people", "pipeline=echo"),
+    "no auxiliary losses": ("echo_without_auxiliary", "pipeline=echo"),
+    "document's weights of losses": ("echo_document_losses", "pipeline=echo"),
+    "three tokens per frame": ("echo_three_streams", "pipeline=echo"),
+    "BoDiffusion-style + object": ("bodiffusion_object", "pipeline=bodiffusion_object"),
+}
+SHARES = {"human": (0.01, 0.05, 0.1, 0.25, 1.0), "object": (0.01, 0.05, 0.1, 0.25, 1.0), "contact": (0.01, 0.05, 0.1, 0.25, 1.0)}  # fmt: skip
+DOCUMENT: Scores = {
+    name: {key: Summary(value, None, 4) for key, value in zip(keys, values)}
+    for name, keys, values in (
+        ("document: BEHAVE", (*OBJECTS[:3], *OBJECTS[4:8]), (61.4, 66.8, 0.91, 29.5, 17.1, 82.1, 1.4)),
+        ("document: OMOMO", (*OBJECTS[:3], *OBJECTS[4:8]), (64.1, 69.7, 0.95, 26.7, 15.6, 86.8, 1.2)),
+        ("document: BoDiffusion+Obj, BEHAVE", (*OBJECTS[:3], *OBJECTS[4:6]), (84.1, 95.9, 0.96, 36.1, 24.5)),
+        ("document: all contacts given, BEHAVE", (*OBJECTS[:2], *OBJECTS[4:6]), (59.0, 65.1, 27.0, 14.2)),
+        ("document: no contacts, BEHAVE", ("mpjpe_mm", "v2v_cm"), (72.1, 33.0)),
+        ("document: no AMASS, BEHAVE", ("mpjpe_mm", "v2v_cm"), (83.4, 34.9)),
+        ("document: no canonical frame, BEHAVE", ("mpjpe_mm", "v2v_cm"), (125.0, 39.5)),
+    )
+}  # fmt: skip
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--datasets", type=Path, default=Path("datasets"), help="folder of the prepared data sets")  # fmt: skip
+    parser.add_argument("--split", default="test", help="train, val or test")
+    parser.add_argument("--checkpoint", default="echo", help="ours")
+    parser.add_argument("--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings")  # fmt: skip
+    parser.add_argument("--recordings", type=int, help="no more than so many of each data set")
+    parser.add_argument("--seeds", type=int, default=4, help="runs of each row")
+    parser.add_argument("--lanes", type=int, default=12, help="recordings that share a batch")
+    parser.add_argument("--pipeline", nargs="*", default=[], help="overrides for all rows, as pipeline.per_frame=1")  # fmt: skip
+    parser.add_argument("--parts", nargs="*", default=["objects", "ablation", "sparse", "human"], choices=list(PARTS), help="tables to make")  # fmt: skip
+
+
+def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
+    """Print and write the tables; returns the file."""
+    console, found = Console(width=200), {}
+    path = options.output / "echo.json"
+    with Progress(transient=True, console=console) as progress:
+        for part in options.parts:
+            title, columns, scores = PARTS[part](options, progress)
+            found[title] = {method: {k: vars(v) for k, v in row.items()} for method, row in scores.items()}
+            console.print(f"\n{title}\n\n{markdown_table(scores, columns)}", markup=False, soft_wrap=True)
+            write_text(path, json.dumps(finite({"about": about, "tables": found}), indent=1) + "\n")
+    return path
+
+
+def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
+    """Table 1: ours beside what it must beat."""
+    store, names = _recordings(options, "simulated_objects")
+    ours = Method("ours", options.checkpoint)
+    scores: Scores = {}
+    data = instantiate(compose("train", ["experiment=echo", "paths.run=none", f"paths.datasets={options.datasets}"]).data, _convert_="all")  # fmt: skip
+    training = data.dataset("train")
+    scores["nearest training window"] = _baseline(NearestEcho.fit(training), store, names, ours)
+    wrist, seeds = RigidWrist.fit(training), _seeds(options)
+    bar = progress.add_task("stuck to a wrist", total=len(seeds) * len(names))
+    advance = lambda: progress.advance(bar)  # noqa: E731
+    human = _with(options, Method("human", options.checkpoint, ("pipeline=echo",)))
+    stuck = stuck_rows(human, wrist, store, names, seeds, options.lanes, advance)
+    scores["ours, object stuck to the nearer wrist"] = aggregate(list(stuck))
+    methods = [
+        ours,
+        Method("ours, guided by contacts", options.checkpoint, ("pipeline=echo_guided",)),
+        Method("ours, not hung from the head", options.checkpoint, ("pipeline=echo", "pipeline.hang=false")),
+        Method("ours, noise redrawn (eq. 11 as printed)", options.checkpoint, ("pipeline=echo", "pipeline.step=redraw")),
+        Method("ours, latency of 20 frames", options.checkpoint, ("pipeline=echo_online",)),
+    ]  # fmt: skip
+    scores |= _scores(methods, options, progress, store, names)
+    return f"Table 1: objects, {options.split}", OBJECTS, scores | DOCUMENT
+
+
+def _ablation(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
+    """Table 4: networks that were trained alike, but for one thing."""
+    store, names = _recordings(options, "simulated_objects")
+    methods = []
+    for name, (run, pipeline) in ABLATIONS.items():
+        path = options.runs / run / "checkpoints" / "last.ckpt"
+        if path.is_file():
+            methods.append(Method(name, str(path), (pipeline,)))
+        else:
+            progress.console.print(f"left out: {name} (no {path})")
+    return f"Ablation: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
+
+
+def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
+    """Tables 3 and S2: a share of one modality's frames is given."""
+    store, names = _recordings(options, "simulated_objects")
+    methods = [
+        Method(f"{100 * share:g} % of {modality}", options.checkpoint, observed=(modality, share))
+        for modality, shares in SHARES.items() for share in shares
+    ]  # fmt: skip
+    methods = [Method("nothing", options.checkpoint), *methods]
+    return f"Tables 3, S2: observed, {options.split}", OBJECTS, _scores(methods, options, progress, store, names)  # fmt: skip
+
+
+def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
+    """Table 2: people without objects."""
+    store, names = _recordings(options, "cmu")
+    methods = [Method("ours", options.checkpoint)]
+    path = options.runs / "bodiffusion_object" / "checkpoints" / "last.ckpt"
+    short = options.runs / "echo_short" / "checkpoints" / "last.ckpt"
+    if path.is_file() and short.is_file():
+        methods.append(Method("ours, as long as the next", str(short)))
+        methods.append(Method("BoDiffusion-style + object", str(path), ("pipeline=bodiffusion_object",)))
+    return f"Table 2: CMU, {options.split}", HUMAN, _scores(methods, options, progress, store, names)
+
+
+def _scores(
+    methods: list[Method], options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]
+) -> Scores:  # fmt: skip
+    scores, seeds = {}, _seeds(options)
+    for method in methods:
+        bar = progress.add_task(method.name, total=len(seeds) * len(names))
+        advance = lambda b=bar: progress.advance(b)  # noqa: E731
+        made: list[Row] = list(rows(_with(options, method), store, names, seeds, options.lanes, advance))
+        scores[method.name] = aggregate(made)
+    return scores
+
+
+def _with(options: argparse.Namespace, method: Method) -> Method:
+    return Method(method.name, method.checkpoint, (*method.pipeline, *options.pipeline), method.observed)
+
+
+def _seeds(options: argparse.Namespace) -> list[int]:
+    return list(range(2 if options.quick else options.seeds))
+
+
+def _baseline(method: NearestEcho, store: RecordingStore, names: list[str], like: Method) -> dict[str, Summary]:  # fmt: skip
+    """Scores of what draws nothing."""
+    on = EchoOnDataset(pipeline_of(like), store.root)
+    made = []
+    for name in names:
+        scenario = on.scenario(store.load(name))
+        motion = method.capture_scenarios([scenario], [0])[0]
+        made.append(score_echo(motion, on.truth(motion, scenario.recording), name, 0))
+    return aggregate(made)
+
+
+def _recordings(options: argparse.Namespace, data: str) -> tuple[RecordingStore, list[str]]:
+    root = options.datasets / data
+    if not (root / "manifest.json").is_file():
+        raise WearcapError("no such data set", where=root, fix=PREPARE[data])
+    store = RecordingStore.open(root)
+    return store, store.names(options.split)[: 3 if options.quick else options.recordings]
+
+
+PARTS = {"objects": _objects, "ablation": _ablation, "sparse": _sparse, "human": _human}
+PREPARE = {
+    "cmu": "Run: wearcap prepare cmu source=FOLDER",
+    "simulated_objects": "Run: wearcap prepare simulated_objects",
+}
