@@ -136,8 +136,9 @@ def test_hands_lie_on_the_things_surface(category):
         assert np.allclose(high[:2], thing.half_size, atol=0.02)
         places = [rail.at(share * rail.length) for rail in thing.rails for share in (0.0, 0.4, 1.0)]
         places += [place for left, right, _ in thing.sides for place in (left, right)]
+        places += [grasp.place for grasp in thing.grasps]
         assert places
         for place in places:
             point = np.array(place.point)
             assert ((point > low - 0.011) & (point < high + 0.011)).all()
-            assert np.abs(np.dot(place.normal, place.fingers)) < 1e-6 or category == "box"
+            assert np.abs(np.dot(place.normal, place.fingers)) < 1e-6 or category == "box" or thing.sides

@@ -112,7 +112,7 @@ def _shifted(point: tuple[float, float, float], by: np.ndarray) -> tuple[float, 
 
 def lift(plan: Plan, choice: Carry, rng: np.random.Generator) -> Lifted:
     """Bend down, take hold, and lift; the wearer stands at or near `choice.stand`. `plan.time` becomes the end."""
-    _arrive(plan, choice.stand, rng)
+    arrive(plan, choice.stand, rng)
     start, low = plan.time, choice.palm_height(choice.start) - plan.position[2]
     bend, lean = bend_for(plan, low, rng)
     down = float((0.75 + 1.1 * bend) * rng.uniform(0.9, 1.25) / plan.style.briskness)
@@ -134,7 +134,7 @@ def lift(plan: Plan, choice: Carry, rng: np.random.Generator) -> Lifted:
 def put_down(plan: Plan, lifted: Lifted, rng: np.random.Generator) -> Handling:
     """Lower the box to its place, let go and stand up; the wearer stands at or near `choice.goal`."""
     choice = lifted.choice
-    _arrive(plan, choice.goal, rng)
+    arrive(plan, choice.goal, rng)
     start, low = plan.time + 0.1, choice.palm_height(choice.stop) - plan.position[2]
     bend, lean = bend_for(plan, low, rng)
     down = float((1.0 + 1.2 * bend) * rng.uniform(0.9, 1.3) / plan.style.briskness)
@@ -161,7 +161,8 @@ def put_down(plan: Plan, lifted: Lifted, rng: np.random.Generator) -> Handling:
     return handling_of(choice.thing.name, "sliding", moves, grips)
 
 
-def _arrive(plan: Plan, place: Float[np.ndarray, "3"], rng: np.random.Generator) -> None:
+def arrive(plan: Plan, place: Float[np.ndarray, "3"], rng: np.random.Generator) -> None:
+    """Step to x, y (m) and a heading (rad) nearby, unless one is there."""
     if np.hypot(*(place[:2] - plan.position[:2])) > 0.03 or abs(wrap(place[2] - plan.heading)) > 0.1:
         step_to(plan, rng, place[:2], place[2])
 
@@ -175,10 +176,10 @@ def bend_for(plan: Plan, low: float, rng: np.random.Generator) -> tuple[float, f
     )
 
 
-def bow(plan: Plan, start: float, stop: float, crouch: float, lean: float) -> None:
-    """Bring knees and trunk to a bend between two times."""
+def bow(plan: Plan, start: float, stop: float, crouch: float, lean: float, aside: float = 0.0) -> None:
+    """Bring knees (m) and trunk (rad; forwards, and to the right) to a bend between two times."""
     plan.crouch.move(start, stop, crouch)
-    plan.lean.move(start, stop, (lean, 0.0, 0.0))
+    plan.lean.move(start, stop, (lean, aside, 0.0))
     heels = 0.35 if crouch > DEEP * plan.hip_height else 0.0
     for side in SIDES:
         first, last = (start + 0.3 * (stop - start), stop) if heels else (start, stop - 0.4 * (stop - start))
@@ -205,7 +206,7 @@ class _Way:
     def __call__(self, times: Float[np.ndarray, "time"], T_world_chest: Rigid) -> Rigid:
         lift, lower, near, off = (
             torch.from_numpy(ease((times - start) / (stop - start)))
-            for start, stop in (self.up, self.down, _late(self.up), _early(self.down))
+            for start, stop in (self.up, self.down, late(self.up), early(self.down))
         )
         choice = self.choice
         first, last = (torch.from_numpy(pose) for pose in (choice.start, choice.stop))
@@ -224,9 +225,11 @@ class _Way:
         return Rigid(rotation.about_axis("z", heading), t)
 
 
-def _late(span: tuple[float, float]) -> tuple[float, float]:
+def late(span: tuple[float, float]) -> tuple[float, float]:
+    """A span without its first third."""
     return span[0] + 0.35 * (span[1] - span[0]), span[1]
 
 
-def _early(span: tuple[float, float]) -> tuple[float, float]:
+def early(span: tuple[float, float]) -> tuple[float, float]:
+    """A span without its last third."""
     return span[0], span[1] - 0.35 * (span[1] - span[0])

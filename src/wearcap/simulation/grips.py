@@ -18,6 +18,8 @@ Moves = Callable[[Float[np.ndarray, "time"], Rigid], Rigid]
 """Pose of a thing in the world at rising times (s), given the chest's pose at these times, which only what is
 carried needs."""
 
+SKIN_M = 0.008
+"""A palm's site lies so far inside the hand: it keeps off what the hand touches."""
 SETTLED, DESCENT = 0.2, 0.5
 """Shares of the way there, at its end: the hand is off its place along the normal, and comes down on it."""
 

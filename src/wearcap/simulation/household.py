@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +16,7 @@ from wearcap.simulation.openables import Openable
 from wearcap.simulation.opening import operate
 from wearcap.simulation.outline import distance_to_convex
 from wearcap.simulation.plan import Plan
-from wearcap.simulation.rearranging import floor_place, rearrange, relocate
+from wearcap.simulation.rearranging import fetch, floor_place, rearrange, relocate
 from wearcap.simulation.things import Thing
 from wearcap.simulation.wearer import TAIL_S, Wearer
 
@@ -23,14 +24,16 @@ WEIGHTS = {
     "door": 1.5, "window": 2.2, "drawer": 2.2, "cabinet_door": 1.8, "sofa": 2.5, "table": 1.2, "chair": 1.2, "box": 0.8
 }  # fmt: skip
 """How often things of a kind are gone for, all of them together."""
+HANDHELD = ("suitcase", "backpack", "bottle", "tool", "ball")
+"""What is used while it is carried."""
+EVEN_S = 4.0
+"""Kinds are drawn by their weight over this and the time for which they were held already (s)."""
 AGAIN, ROOM = 0.25, 0.10
 """How often it is what was used last, and several things of one room."""
 TRIES = 5
 SEEM_SHARE = 0.14
 """How often hands do something before a thing without touching it."""
 ORDINARY = ("stand", "look_around", "turn", "walk", "hold", "gesture", "carry", "reach", "sit", "crouch")
-HELD_SHARE = 0.42
-"""Of the time in which hands hold something is aimed at."""
 CLOSE_BEHIND = 0.35
 """How often a door is closed after walking through."""
 PARTLY = 0.25
@@ -39,9 +42,37 @@ BEYOND_M = 0.95
 """Behind a door, where one goes through it."""
 REACHED_M = 0.4
 NEAR_M = 2.5
-"""Things so much further off are gone for a third as often."""
 IN_ROOM, SAME_ROOM_M = 4, 3.5
 """Most things that are moved when a room is rearranged."""
+
+
+@dataclass(frozen=True)
+class Habits:
+    """What somebody goes for, and how eagerly."""
+
+    weights: Mapping[str, float]
+    """By category."""
+    held_share: float
+    """Of the time in which hands hold something is aimed at."""
+    even: bool = False
+    """Rather what was held less so far."""
+    again: float = AGAIN
+    """How often it is what was used last, unless that was in the hands for long."""
+    near_m: float = NEAR_M
+    """Things so much further off are gone for a third as often."""
+    seem_share: float = SEEM_SHARE
+    """How often hands do something before a thing without touching it."""
+
+
+USUAL = Habits(WEIGHTS, 0.42)
+VARIED = Habits(
+    {
+        "door": 3.0, "window": 4.4, "drawer": 4.4, "cabinet_door": 4.6, "sofa": 4.5, "table": 2.6, "chair": 2.4,
+        "box": 0.5, "suitcase": 1.2, "backpack": 1.2, "bottle": 1.0, "tool": 1.0, "ball": 0.9,
+    },
+    0.75, even=True, again=0.7, near_m=1.5, seem_share=0.04,
+)  # fmt: skip
+"""Every kind is held for a fair share of the time, hand-held things for about half of it."""
 
 
 def seem_to_handle(
@@ -65,8 +96,8 @@ def seem_to_handle(
 class Household:
     """Plans one thing after the other; what is in the house changes with it."""
 
-    def __init__(self, house: House, person: Wearer, rng: np.random.Generator):
-        self.house, self.rng = house, rng
+    def __init__(self, house: House, person: Wearer, rng: np.random.Generator, habits: Habits = USUAL):
+        self.house, self.rng, self.habits = house, rng, habits
         static = house.flat.static
         worlds = [house.world(point) for point in static.sample_floor(rng, 6)]
         largest = max(worlds, key=lambda world: int(world.navigation.walkable.sum()))
@@ -82,7 +113,7 @@ class Household:
         while self.plan.time < duration_s + TAIL_S:
             start = self.plan.time
             held = sum(stop - begin for h in self.house.handlings for begin, stop, _ in h.rows)
-            eager = 0.5 + 3.0 * (HELD_SHARE - held / max(start, 10.0))
+            eager = 0.5 + 3.0 * (self.habits.held_share - held / max(start, 10.0))
             name = self.interact() if self.rng.random() < np.clip(eager, 0.1, 0.92) else self.do_ordinary()
             if self.plan.time < start + 0.05:
                 ACTIVITIES["stand"].act(self.plan, self.house.flat.static, self.rng)
@@ -102,7 +133,8 @@ class Household:
     def interact(self) -> str:
         """Use something, after going through whatever doors lie on the way; "stand" where nothing could be done."""
         chance = self.rng.random()
-        if chance < AGAIN and self.last is not None and (done := self.use(self.last)) != "stand":
+        again = self.habits.again if self._kind(self.last) not in HANDHELD else AGAIN
+        if chance < again and self.last is not None and (done := self.use(self.last)) != "stand":
             return done
         if chance > 1.0 - ROOM:
             return self.rearrange_room()
@@ -123,11 +155,11 @@ class Household:
         return f"{verb} {(self.openables | self.things)[name].category}"
 
     def _act(self, name: str) -> bool:
-        seem = seem_to_handle if self.rng.random() < SEEM_SHARE else None
+        seem = seem_to_handle if self.rng.random() < self.habits.seem_share else None
         if name in self.openables:
             return self.turn(self.openables[name], seem)
         thing = self.things[name]
-        act = relocate if thing.category == "box" else rearrange
+        act = {"box": relocate, **dict.fromkeys(HANDHELD, fetch)}.get(thing.category, rearrange)
         return act(self.plan, self.house, self.rng, thing, seem)
 
     def rearrange_room(self) -> str:
@@ -216,9 +248,19 @@ class Household:
         """The name of something to use next, rather of what is near."""
         kinds = Counter(item.category for item in items.values())
         away = [np.linalg.norm(self.place_of(name)[:2] - self.plan.position[:2]) for name in items]
-        weights = np.exp(-np.array(away) / NEAR_M)
-        weights *= [WEIGHTS[item.category] / kinds[item.category] for item in items.values()]
+        weights = np.exp(-np.array(away) / self.habits.near_m)
+        weights *= [self._weight(item.category) / kinds[item.category] for item in items.values()]
         return str(self.rng.choice(list(items), p=weights / weights.sum()))
+
+    def _kind(self, name: str | None) -> str:
+        return (self.openables | self.things)[name].category if name is not None else ""
+
+    def _weight(self, category: str) -> float:
+        if not self.habits.even:
+            return self.habits.weights[category]
+        items = self.openables | self.things
+        spans = [h.stop_s - h.start_s for h in self.house.handlings if items[h.name].category == category]
+        return self.habits.weights[category] / (EVEN_S + sum(spans))
 
     def _side(self, door: Openable) -> int:
         """Handle on the side where one stands: 0 where the leaf opens to."""

@@ -14,7 +14,7 @@ from wearcap.simulation.house import House
 from wearcap.simulation.household import Household
 from wearcap.simulation.interactive_flat import InteractiveFlat, build_interactive_flat
 from wearcap.simulation.localization_noise import LocalizationNoise, localize_statistically
-from wearcap.simulation.simulate import POOLS, person_of
+from wearcap.simulation.simulate import POOLS, activity_of, person_of
 from wearcap.simulation.wearer import perform
 from wearcap.simulation.world import World
 
@@ -81,9 +81,6 @@ def simulate_interactions(
     suit = suit_motion(motion, simulated.contact, config.suit, rng)
     camera, path, _ = head_camera(motion, person.t_head_device, config, rng)
     texture = view_texture(flat.world, path, max(1, round(config.camera_fps / 2)))
-    seconds: dict[str, float] = {}
-    for label in simulated.labels:
-        seconds[label.name] = seconds.get(label.name, 0.0) + float(label.stop_s - label.start_s)
     recording = Recording(
         name, suit=suit, camera=camera,
         localization=localize_statistically(path, config.localization, rng, texture), motion=motion,
@@ -91,7 +88,7 @@ def simulate_interactions(
         object_motion=house.object_motion(motion), interactions=house.interactions(duration),
         floor=FloorTrack(motion.timestamps, simulated.floor_height), skeleton=person.skeleton, shape=person.shape,
         subject=person.name, location=flat.static.name,
-        activity=", ".join(sorted(seconds, key=lambda key: -seconds[key])), source="wearcap simulation",
+        activity=activity_of(simulated.labels), source="wearcap simulation",
         license="MIT (generated)",
     )  # fmt: skip
     return SimulatedInteractions(recording, flat.environment, flat.world, flat.static)

@@ -1,12 +1,16 @@
 """Finding new places for things in a flat, and ways on which neither they nor who moves them touch anything."""
 
+from collections.abc import Callable, Iterator
 from itertools import islice
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from wearcap.simulation.actions import approach
 from wearcap.simulation.carrying import Carry, carry_options, lift, put_down
+from wearcap.simulation.holding import Take, take_options, take_up
+from wearcap.simulation.holding import put_down as put_held_down
 from wearcap.simulation.house import House, Seem
 from wearcap.simulation.interactive_flat import obstacle
 from wearcap.simulation.openables import Openable
@@ -15,9 +19,13 @@ from wearcap.simulation.plan import Plan
 from wearcap.simulation.shuffling import step_to
 from wearcap.simulation.sliding import Slide, slide, slide_options
 from wearcap.simulation.things import Thing, floor_pose
+from wearcap.simulation.using import use
 from wearcap.simulation.world import World
 
-TRIES, OPTIONS = 24, 4
+C = TypeVar("C", Carry, Take)
+Options = Callable[[Plan, Thing, np.ndarray, np.ndarray, np.random.Generator], Iterator[C]]
+
+TRIES, OPTIONS, PLACES = 24, 4, 4
 APART_M, BODY_M = 0.04, 0.22
 """Room kept from other things by what is moved, and by the middle of who moves it."""
 REACHED_M = 0.35
@@ -25,6 +33,8 @@ REACHED_M = 0.35
 FAR_M = {"sofa": (0.3, 1.6), "table": (0.3, 1.8), "chair": (0.25, 2.2)}
 """How far things are moved."""
 CARRIED_M = 5.0
+USED_BEFORE, USED_AGAIN = 0.7, 0.7
+"""How often what is held is used before it is carried, and then once more; what was not is always used there."""
 TURN_SHARE = 0.4
 BEFORE_M = 0.45
 """Kept free before what opens, beyond its sweep."""
@@ -83,17 +93,21 @@ def choose_slide(
     for _ in range(TRIES):
         stop = _drawn_stop(thing, start, rng)
         outline = rectangle((0.0, 0.0), (2 * thing.half_size[0], 2 * thing.half_size[1]))
-        if not _apart(_outlines(outline, stop[None]), low, APART_M) or not _apart(
-            _outlines(outline, stop[None]), zones, 0.0
+        if not apart(outlines(outline, stop[None]), low, APART_M) or not apart(
+            outlines(outline, stop[None]), zones, 0.0
         ):
             continue
         for choice in islice(slide_options(plan, thing, start, stop, rng), OPTIONS):
-            if not _apart(_outlines(outline, choice.thing_at(KEYS)), low, 0.5 * APART_M):
+            if not apart(outlines(outline, choice.thing_at(KEYS)), low, 0.5 * APART_M):
                 continue
             body = choice.body_at(KEYS)[:, :2]
             free = min(distance_to_convex(body, footprint).min() for footprint in solid)
             reached = np.linalg.norm(points - choice.stand[:2], axis=1).min() < REACHED_M
-            if free > BODY_M and reached and _leaves_way(house, world, choice):
+            if (
+                free > BODY_M
+                and reached
+                and _leaves_way(house, world, thing, choice.stop, choice.body_at(np.ones(1))[0, :2])
+            ):
                 return choice
     return None
 
@@ -106,7 +120,7 @@ def relocate(
     With `seem`, that is done before it instead, and nothing is touched.
     """
     world = house.world(plan.position)
-    choice = choose_carry(plan, house, world, rng, thing)
+    choice = choose_carry(plan, house, world, rng, thing, carry_options)
     floor = float(plan.position[2])
     if choice is None:
         return False
@@ -126,10 +140,46 @@ def relocate(
     return True
 
 
+def fetch(plan: Plan, house: House, rng: np.random.Generator, thing: Thing, seem: Seem | None = None) -> bool:
+    """Take a hand-held thing, use it, and put it down elsewhere on the floor; False where that cannot be done.
+
+    With `seem`, that is done before it instead, and nothing is touched.
+    """
+    world = house.world(plan.position)
+    for _ in range(PLACES):
+        choice = choose_carry(plan, house, world, rng, thing, take_options)
+        if choice is None:
+            return False
+        if _leaves_way(house, world, thing, choice.stop[:3], choice.goal[:2]):
+            break
+    else:
+        return False
+    floor = float(plan.position[2])
+    x, y, heading = choice.stand
+    if not approach(plan, world, rng, np.array([x, y, floor]), float(heading)):
+        return False
+    if seem is not None:
+        step_to(plan, rng, choice.stand[:2], float(heading))
+        seem(plan, choice.places, house.poses[thing.name], thing.height, rng)
+        return True
+    held = take_up(plan, choice, rng)
+    early = rng.random() < USED_BEFORE
+    if early:
+        use(plan, held, rng)
+    there = house.world(plan.position, without=(thing.name,))
+    x, y, heading = choice.goal
+    approach(plan, there, rng, np.array([x, y, floor]), float(heading))
+    if rng.random() < (USED_AGAIN if early else 1.0):
+        use(plan, held, rng)
+    house.handlings.append(put_held_down(plan, held, rng))
+    house.poses[thing.name] = floor_pose(choice.stop[:3], float(choice.stop[3]))
+    return True
+
+
 def choose_carry(
-    plan: Plan, house: House, world: World, rng: np.random.Generator, thing: Thing
-) -> Carry | None:
-    """A free place on the floor for a box and a way to hold it; None where none was found."""
+    plan: Plan, house: House, world: World, rng: np.random.Generator, thing: Thing, options: Options[C]
+) -> C | None:
+    """A free place on the floor for a thing and a way to hold it; None where none was found."""
     place, level = floor_place(house, thing), float(house.poses[thing.name].t[2])
     points = world.navigation.node_points[:, :2]
     if np.linalg.norm(points - place[:2], axis=1).min() > 1.0:
@@ -140,10 +190,10 @@ def choose_carry(
     for _ in range(TRIES):
         spot = points[rng.integers(len(points))] + rng.uniform(-0.3, 0.3, 2)
         stop = np.array([*spot, rng.uniform(-np.pi, np.pi)])
-        apart = 0.8 < np.linalg.norm(spot - place[:2]) < CARRIED_M
-        if not apart or not _apart(_outlines(outline, stop[None]), [*others, *zones], APART_M):
+        far = 0.8 < np.linalg.norm(spot - place[:2]) < CARRIED_M
+        if not far or not apart(outlines(outline, stop[None]), [*others, *zones], APART_M):
             continue
-        for choice in carry_options(plan, thing, np.append(place, level), np.append(stop, level), rng):
+        for choice in options(plan, thing, np.append(place, level), np.append(stop, level), rng):
             ends = np.stack([choice.stand[:2], choice.goal[:2]])
             free = min(distance_to_convex(ends, footprint).min() for footprint in others)
             away = np.linalg.norm(ends[:, None] - points[None], axis=-1).min(1)
@@ -152,11 +202,13 @@ def choose_carry(
     return None
 
 
-def _leaves_way(house: House, world: World, choice: Slide) -> bool:
-    """Whether one who has moved a thing still gets to most of the floor that one got to before."""
-    end = np.append(choice.body_at(np.ones(1))[0, :2], float(house.poses[choice.thing.name].t[2]))
-    placed = obstacle(choice.thing, floor_pose(choice.stop, end[2]))
-    grid = house.flat.static.navigation.barred((*house.obstacles((choice.thing.name,)), placed), end)
+def _leaves_way(
+    house: House, world: World, thing: Thing, stop: Float[np.ndarray, "3"], body: Float[np.ndarray, "2"]
+) -> bool:
+    """Whether one who has moved a thing, and stands at `body`, still gets to most of the floor that one got to before."""
+    end = np.append(body, float(house.poses[thing.name].t[2]))
+    placed = obstacle(thing, floor_pose(stop, end[2]))
+    grid = house.flat.static.navigation.barred((*house.obstacles((thing.name,)), placed), end)
     away = np.linalg.norm(grid.node_points[:, :2] - end[:2], axis=1)
     enough = grid.walkable.sum() > WAY_SHARE * world.navigation.walkable.sum()
     return bool(enough) and float(away.min()) < REACHED_M
@@ -218,13 +270,14 @@ def _drawn_stop(
     return start + np.array([far * np.cos(angle), far * np.sin(angle), spin])
 
 
-def _outlines(
+def outlines(
     outline: Float[np.ndarray, "4 2"], places: Float[np.ndarray, "key 3"]
 ) -> Float[np.ndarray, "key 4 2"]:
+    """An outline at places x, y (m), heading (rad)."""
     return np.stack([outline @ turn(heading).T + np.array([x, y]) for x, y, heading in places])
 
 
-def _apart(
+def apart(
     outlines: Float[np.ndarray, "key 4 2"], others: list[Float[np.ndarray, "corner 2"]], least_m: float
 ) -> bool:
     """Whether outlines keep off others: neither's border comes near the other."""

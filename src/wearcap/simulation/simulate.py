@@ -1,5 +1,6 @@
 """One simulated recording: a world, a person, what they do, and what their sensors say of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from wearcap.simulation.flat import build_flat
 from wearcap.simulation.hillside import build_hillside
 from wearcap.simulation.outdoor import build_outdoor
 from wearcap.simulation.person import Person, draw_person
+from wearcap.simulation.plan import Label
 from wearcap.simulation.site import build_site
 from wearcap.simulation.wearer import SimulatedMotion, simulate_motion
 from wearcap.simulation.world import World
@@ -120,14 +122,18 @@ def sense(
         semidense_points(world.mesh, world.face_texture, head, rng) if config.points else None
     )
     suit = suit_motion(motion, simulated.contact, config.suit, rng) if config.suit else None
-    seconds: dict[str, float] = {}
-    for label in simulated.labels:
-        seconds[label.name] = seconds.get(label.name, 0.0) + float(label.stop_s - label.start_s)
     return Recording(
         name, head=head, imu=imu, suit=suit, points=points, motion=motion,
         contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, simulated.contact),
         floor=FloorTrack(motion.timestamps, simulated.floor_height), skeleton=person.skeleton, shape=person.shape,
         subject=person.name, location=world.name,
-        activity=", ".join(sorted(seconds, key=lambda key: -seconds[key])), source="wearcap simulation",
-        license="MIT (generated)",
+        activity=activity_of(simulated.labels), source="wearcap simulation", license="MIT (generated)",
     )  # fmt: skip
+
+
+def activity_of(labels: Sequence[Label]) -> str:
+    """What was done, the longest first."""
+    seconds: dict[str, float] = {}
+    for label in labels:
+        seconds[label.name] = seconds.get(label.name, 0.0) + float(label.stop_s - label.start_s)
+    return ", ".join(sorted(seconds, key=lambda key: -seconds[key]))

@@ -10,12 +10,10 @@ from jaxtyping import Float
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.simulation import furniture
+from wearcap.simulation import furniture, handhelds
 from wearcap.simulation.builder import Part, Piece, hue, piece_mesh
-from wearcap.simulation.grips import GripPlace, Vector
-
-SKIN_M = 0.008
-"""A palm's site lies so far inside the hand: it keeps off what the hand touches."""
+from wearcap.simulation.grips import SKIN_M, GripPlace, Vector
+from wearcap.simulation.handhelds import Grasp, Handheld
 
 
 @dataclass(frozen=True)
@@ -60,6 +58,8 @@ class Thing:
     """Where it is pushed and pulled."""
     sides: tuple[tuple[GripPlace, GripPlace, float], ...] = ()
     """Ways to lift it between both hands: the left and right palm's places and the holder's heading against it."""
+    grasps: tuple[Grasp, ...] = ()
+    """Ways to lift it with one hand."""
 
     @property
     def name(self) -> str:
@@ -170,6 +170,18 @@ def _box(name: str, rng: np.random.Generator) -> Thing:
     return replace(thing, sides=tuple(sides))
 
 
+def _held(
+    category: str, make: Callable[[np.random.Generator], Handheld]
+) -> Callable[[str, np.random.Generator], Thing]:
+    def thing(name: str, rng: np.random.Generator) -> Thing:
+        shape = make(rng)
+        scene_object = SceneObject(name, category, shape.mesh, torch.eye(3), torch.zeros(3), Freedom("free"))
+        half_size = (shape.size[0] / 2, shape.size[1] / 2)
+        return Thing(scene_object, half_size, shape.height, sides=shape.sides, grasps=shape.grasps)
+
+    return thing
+
+
 def _sliding(name: str, category: str, piece: Piece, rails: list[Rail]) -> Thing:
     return replace(_of_piece(name, category, piece, Freedom("plane")), rails=tuple(rails))
 
@@ -186,4 +198,5 @@ def _vector(values: Float[np.ndarray, "3"]) -> Vector:
 
 THINGS: dict[str, Callable[[str, np.random.Generator], Thing]] = {
     "sofa": _sofa, "table": _table, "chair": _chair, "box": _box,
+    **{category: _held(category, make) for category, make in handhelds.MAKERS.items()},
 }  # fmt: skip

@@ -1,5 +1,6 @@
 """The simulated wearer's recordings: nothing to download, the same bytes for the same seed."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -43,20 +44,26 @@ def simulated_tasks(
                               activities=tuple(activities) if activities else None, world=world, camera=camera)  # fmt: skip
     if not config.duration_s > 0 or not config.fps > 0:
         raise WearcapError(f"recordings of {duration_s} s at {fps} Hz", expected="positive numbers")
-    if unknown := set(recordings) - set(SPLITS):
-        raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
+    checked_splits(recordings, splits)
     simulator = source_files()
     tasks = []
     for split, count in recordings.items():
-        if splits.of(f"sim-{split}-person-000") != split:
-            raise WearcapError(
-                f"people of the simulated {split} split are listed elsewhere", where=splits.path
-            )
         for index in range(count):
             name = f"sim-{split}-{seed}-{index:04d}"
             make = Simulated(config, name, split, seed * 1_000_000 + index, Path(output))
             tasks.append(Task(name, make, split, content_hash(asdict(config), make.seed, split, simulator)))
     return tasks
+
+
+def checked_splits(recordings: Mapping[str, int], splits: Splits) -> None:
+    """Raises WearcapError for an unknown split, or when a simulated person's name belongs to another split's list."""
+    if unknown := set(recordings) - set(SPLITS):
+        raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
+    for split in recordings:
+        if splits.of(f"sim-{split}-person-000") != split:
+            raise WearcapError(
+                f"people of the simulated {split} split are listed elsewhere", where=splits.path
+            )
 
 
 def source_files() -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from wearcap.data.prepare.engine import Task, content_hash
-from wearcap.data.prepare.simulated import source_files
+from wearcap.data.prepare.simulated import checked_splits, source_files
 from wearcap.data.prepare.splits import Splits
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -15,7 +15,6 @@ from wearcap.io.environment import FILE_NAME, write_environment
 from wearcap.io.ply import Ply, write_ply
 from wearcap.io.scene_folder import CLOUD
 from wearcap.recording.recording import Recording
-from wearcap.recording.store import SPLITS
 from wearcap.simulation.interaction_session import (
     InteractionConfig,
     SimulatedInteractions,
@@ -51,15 +50,21 @@ class SimulatedInteractionsTask:
 
     def _write_scene(self, simulated: SimulatedInteractions, folder: Path) -> None:
         """The scan with everything at its initial pose, and the objects, unless they are there already."""
-        note, wanted = folder / MADE, json.dumps({"spacing_m": self.spacing_m, "simulator": self.simulator})
-        files = (folder / CLOUD, folder / FILE_NAME)
-        if note.is_file() and note.read_text(encoding="utf-8") == wanted and all(f.is_file() for f in files):
+        wanted = json.dumps({"spacing_m": self.spacing_m, "simulator": self.simulator})
+        if is_made(folder, wanted, CLOUD, FILE_NAME):
             return
         rng = np.random.default_rng(12)
         scan = scan_world(Scenery.of(simulated.world), self.spacing_m, rng, walked=simulated.static)
         write_ply(Ply(scan.points, scan.colors), folder / CLOUD)
         write_environment(simulated.environment, folder / FILE_NAME)
-        write_text(note, wanted)
+        write_text(folder / MADE, wanted)
+
+
+def is_made(folder: Path, wanted: str, *files: str) -> bool:
+    """Whether a scene's files are there, made as `wanted` says."""
+    note = folder / MADE
+    current = note.is_file() and note.read_text(encoding="utf-8") == wanted
+    return current and all((folder / file).is_file() for file in files)
 
 
 def simulated_interactions_tasks(
@@ -71,17 +76,12 @@ def simulated_interactions_tasks(
     Scenes go to `output`/scenes, with points `spacing_m` apart. Raises WearcapError for an unknown split, or when a
     simulated person's name belongs to another split's list.
     """
-    if unknown := set(recordings) - set(SPLITS):
-        raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
+    checked_splits(recordings, splits)
     if not spacing_m > 0:
         raise WearcapError(f"points {spacing_m} m apart", expected="a positive spacing")
     config = InteractionConfig(fps=float(fps), camera_fps=float(camera_fps), minutes=float(minutes))
     simulator, tasks = source_files(), []
     for split, count in recordings.items():
-        if splits.of(f"sim-{split}-person-000") != split:
-            raise WearcapError(
-                f"people of the simulated {split} split are listed elsewhere", where=splits.path
-            )
         for index in range(count):
             name, number = f"interactions-{split}-{seed}-{index:04d}", seed * 1_000_000 + index
             make = SimulatedInteractionsTask(

@@ -1,0 +1,107 @@
+"""Sessions with hand-held things: what the truth says agrees with itself, and the other sessions' flats are as before."""
+
+import hashlib
+
+import numpy as np
+import pytest
+import torch
+
+from wearcap.body.kinematics import site_positions
+from wearcap.errors import WearcapError
+from wearcap.simulation.handhelds import MAKERS
+from wearcap.simulation.handling import Handling
+from wearcap.simulation.house import House
+from wearcap.simulation.household import HANDHELD, VARIED, Household
+from wearcap.simulation.interaction_session import flat_of
+from wearcap.simulation.object_session import ObjectConfig, object_flat_of, simulate_objects
+from wearcap.simulation.simulate import POOLS, person_of
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return simulate_objects(ObjectConfig(minutes=0.8), "session", "val", 1)
+
+
+def test_a_recording_has_all_its_parts(simulated):
+    recording = simulated.recording
+    categories = {item.category for item in simulated.environment.objects}
+    assert categories >= {*HANDHELD, "door", "sofa", "table", "chair", "box", "drawer"}
+    assert set(HANDHELD) == set(MAKERS)
+    assert set(recording.object_motion) == {item.name for item in simulated.environment.objects}
+    assert recording.motion.fps == pytest.approx(30.0)
+    assert recording.head.timestamps[-1] == pytest.approx(48.0, abs=0.2)
+    assert recording.suit is recording.camera is recording.points is None
+    assert recording.location.startswith("sim-val-object_flat")
+    assert len(recording.interactions.objects) >= 1
+
+
+def test_palms_stay_on_what_they_hold(simulated):
+    recording, rows = simulated.recording, simulated.recording.interactions
+    motion, times = recording.motion, recording.motion.timestamps
+    palms = site_positions(motion.skeleton, motion.T_world_joint, ("left_palm", "right_palm"))
+    for k, name in enumerate(rows.objects):
+        during = (times >= rows.start_s[k]) & (times < rows.stop_s[k])
+        pose = recording.object_motion[name].T_world_body[during]
+        for hand in range(2):
+            if rows.hands[k, hand] and during.sum() > 1:
+                local = pose.inverse() @ palms[during, hand]
+                assert (local - local.median(0).values).norm(dim=-1).max() < 0.01, name
+
+
+def test_things_rest_unless_held_and_nothing_is_below_the_floor(simulated):
+    recording, times = simulated.recording, simulated.recording.motion.timestamps
+    rows = recording.interactions
+    for item in simulated.environment.objects:
+        track = recording.object_motion[item.name]
+        held = torch.zeros(len(times), dtype=torch.bool)
+        for k, name in enumerate(rows.objects):
+            if name == item.name:
+                held |= (times >= rows.start_s[k] - 0.04) & (times <= rows.stop_s[k] + 0.04)
+        moved = track.t_world_body.diff(dim=0).norm(dim=-1) > 1e-5
+        assert not (moved & ~(held[1:] | held[:-1])).any(), item.name
+        lowest = (track.R_world_body[:, 2] @ torch.from_numpy(item.mesh.vertices).T).amin(1)
+        assert (lowest + track.t_world_body[:, 2]).min() > -1e-3, item.name
+
+
+def test_a_seed_gives_one_recording_and_another_seed_another(simulated):
+    short = ObjectConfig(minutes=0.1)
+    one, two = (simulate_objects(short, "x", "val", 1).recording for _ in range(2))
+    assert torch.equal(one.motion.R_parent_joint, two.motion.R_parent_joint)
+    assert torch.equal(one.head.t_world_device, two.head.t_world_device)
+    other = simulate_objects(short, "x", "val", 1 + POOLS["val"][1]).recording
+    assert other.location == one.location
+    assert not torch.equal(one.motion.t_world_root, other.motion.t_world_root)
+
+
+def test_every_hand_held_kind_is_handled():
+    flat = object_flat_of("val", 1)
+    house = House(flat)
+    household = Household(house, person_of("val", 1), np.random.default_rng(0), VARIED)
+    for kind in HANDHELD:
+        names = [thing.name for thing in flat.things if thing.category == kind]
+        assert any(household.use(name) == f"move {kind}" for name in names for _ in range(4)), kind
+    assert {handling.name.rpartition("_")[0] for handling in house.handlings} >= set(HANDHELD)
+
+
+def test_what_was_held_less_is_gone_for_more():
+    flat = object_flat_of("val", 1)
+    house = House(flat)
+    household = Household(house, person_of("val", 1), np.random.default_rng(0), VARIED)
+    before = household._weight("ball")
+    moves = lambda times, chest: house.poses["ball_1"]  # noqa: E731
+    house.handlings.append(Handling("ball_1", "sliding", moves, 0.0, 20.0, ((0.0, 20.0, (True, True)),)))
+    assert household._weight("ball") < 0.3 * before
+
+
+def test_flats_without_hand_held_things_are_what_they_were():
+    flat = flat_of("val", 0)
+    digest = hashlib.sha256()
+    for item in flat.environment.objects:
+        digest.update(f"{item.name} {item.t_world_object.tolist()}".encode())
+        digest.update(np.round(item.mesh.vertices, 4).tobytes())
+    assert digest.hexdigest()[:16] == "cbc37c96ed5d2aae"
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(WearcapError, match="min"):
+        ObjectConfig(minutes=0.0)
