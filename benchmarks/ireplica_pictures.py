@@ -1,4 +1,4 @@
-"""Contact sheets of captured interactions, truth above and capture below, for the README: chosen by what was moved.
+"""Contact sheets of captured interactions, truth above and capture below, for the pages: chosen by what was moved.
 
 python benchmarks/ireplica_pictures.py DATASET SPLIT CHECKPOINT OUTPUT
 """

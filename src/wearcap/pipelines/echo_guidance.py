@@ -21,8 +21,8 @@ from wearcap.pipelines.echo_queue import Told
 
 @dataclass(frozen=True)
 class Guidance:
-    """How far x̂0 goes down the gradient in every step. Costs are squares of metres, summed over points; ours are the
-    weights, and that the body is moved less than the object: it is known better."""
+    """How far x̂0 goes down the gradient in every step. Costs are squares of metres, each frame's mean over its points;
+    ours are the weights, and that the body is moved less than the object: it is known better."""
 
     object: float = 3.0
     """By which the object comes to the body's points that touch it."""
@@ -67,7 +67,8 @@ class GuidedScene:
     def costs(
         self, x0_hat: Float[Tensor, "lane frame feature"], threshold: float
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Squared distances (m²) of touching points to the object, and of standing feet to the floor, summed."""
+        """Squared distances (m²) of touching points to the object, and of standing feet to the floor: means over each
+        frame's points, summed over frames."""
         human, thing, contact = self.net.motion_normalizer.inverse(x0_hat).split(self.net.sizes, -1)
         body, T_object = (
             self.features.decode_body(human, self.frame),
@@ -84,7 +85,7 @@ class GuidedScene:
             stands = said[lane, :, BODY_POINTS:] & self.told.valid[lane, :, None]
             soles = site_positions(surface.skeleton, pose, FOOT_PATCHES)
             height = soles[..., 2] - self.told.floor_height[lane, :, None]
-            stand = stand + (height.square() * stands).sum()
+            stand = stand + (height.square() * stands / stands.sum(1, keepdim=True).clamp_min(1)).sum()
         return touch, stand
 
     def _to_object(
@@ -95,11 +96,12 @@ class GuidedScene:
         arm = surface.vertices(pose)[frame, point] - T_object.t[frame]
         local = (T_object.R[frame].mT @ arm[..., None])[..., 0]
         number = self.told.object_number[lane, frame].long()
+        share = 1 / touches.sum(1)[frame]
         total = local.new_zeros(())
         for index in number.unique().tolist():
             tree = self.objects[lane][int(index)]
             mine = local[number == index]
             _, nearest = tree.query(mine.detach().double().numpy())
             target = torch.from_numpy(np.asarray(tree.data, np.float32)[nearest])
-            total = total + (mine - target).square().sum()
+            total = total + ((mine - target).square().sum(1) * share[number == index]).sum()
         return total
