@@ -233,6 +233,16 @@ ROWS = {
         "no checkpoint, but HMD2 needs a trained network"),
     "capture: a checkpoint for nothing": (
         lambda data, ckpt, tmp, out: hps(data, out, f"checkpoint={ckpt}"), "a checkpoint, but HPS has no network"),
+    "capture: echo without a checkpoint": (
+        lambda data, ckpt, tmp, out: ["capture", "pipeline=echo", f"recording={data}/r4", f"hydra.run.dir={out}"],
+        "no checkpoint, but Echo needs a trained network"),
+    "capture: echo with another's checkpoint": (
+        lambda data, ckpt, tmp, out: [
+            "capture", "pipeline=echo", f"checkpoint={ckpt}", f"recording={data}/r4", f"hydra.run.dir={out}", "video=false"],
+        "experiment=echo"),
+    "train: echo without objects' files": (
+        lambda data, ckpt, tmp, out: ["train", "experiment=echo", f"paths.datasets={tmp}/none", "data.encoder=null", f"hydra.run.dir={out}"],
+        "no data set here"),
     "capture: stages of a pipeline without": (
         lambda data, ckpt, tmp, out: with_checkpoint("capture", ckpt, out, f"recording={data}/r4", "until=align"),
         "until=align cache=None"),

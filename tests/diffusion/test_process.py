@@ -94,3 +94,9 @@ def test_known_frames_come_out_as_given():
     )
     assert torch.allclose(drawn[:, :2], known[:, :2], atol=1e-6)
     assert not torch.allclose(drawn[:, 2:], known[:, 2:], atol=0.1)
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
+def test_at_level_0_there_is_no_noise_whatever_is_rounded(schedule):
+    x0, noise = torch.randn(2, 5, 3), 1e6 * torch.randn(2, 5, 3)
+    assert torch.equal(add_noise(x0, noise, torch.zeros(2, 1), schedule), x0)

@@ -19,7 +19,8 @@ from wearcap_testing import small_dataset
 
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("motion_diffusion*.yaml"))
 KINDS = (
-    "motion_", "contact_", "pose_regressor_", "egoego_", "egoview", "voxel_autoencoder", "hmd2", "mocap_every",
+    "motion_", "contact_", "pose_regressor_", "egoego_", "egoview", "voxel_autoencoder", "hmd2", "mocap_every", "object_encoder",
+    "echo", "bodiffusion_object",
 )  # fmt: skip
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 
@@ -56,7 +57,8 @@ def test_every_experiment_takes_a_step(experiment, data, tmp_path):
 def test_every_experiment_is_tried_by_a_test():
     """Each kind in a module of its own: contact detection in test_contact_detection, baselines in test_pose_regression,
     the autoencoder of FID in test_motion_autoencoder_training, of points in test_voxel_reconstruction, ours of pictures
-    in test_egoview, all that sees them in test_hmd2_training; MocapEvery and its manifold in test_watch_regression."""
+    in test_egoview, all that sees them in test_hmd2_training; MocapEvery and its manifold in test_watch_regression; of
+    objects in test_object_encoding; ECHO in test_echo_training."""
     named = {path.stem for path in (conf_dir() / "experiment").glob("*.yaml")}
     assert all(name.startswith(KINDS) for name in named)
 

@@ -82,12 +82,19 @@ class Conveyor:
         self.belt, self.schedule, self.sizes = belt, schedule, sizes
         self.x = torch.zeros(lanes, 0, sum(sizes))
         self.age = torch.zeros(0, dtype=torch.long)
+        self.level = torch.zeros(lanes, 0, len(sizes))
+        """Where each frame's modalities have come to."""
+        self._known = torch.zeros(lanes, 0, len(sizes), dtype=torch.bool)
+        self._modality = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
 
     def push(self, noise: Float[Tensor, "lane feature"]) -> bool:
         """Take a new frame on; True where the oldest one had to make room."""
         full = len(self.age) == self.belt.window
         self.x = torch.cat([self.x[:, int(full) :], noise[:, None].to(self.x)], 1)
         self.age = torch.cat([self.age[int(full) :], self.age.new_zeros(1)])
+        new = self.level.new_ones(len(self.level), 1, len(self.sizes))
+        self.level = torch.cat([self.level[:, int(full) :], new], 1)
+        self._known = torch.cat([self._known[:, int(full) :], new < 1], 1)
         return full
 
     def run(
@@ -98,32 +105,36 @@ class Conveyor:
         amend: Callable[[Float[Tensor, "lane frame feature"]], Float[Tensor, "lane frame feature"]]
         | None = None,
     ) -> None:
-        """As many steps as there are between two frames; `noise` is what each adds. `amend` changes every x̂0 (guidance)."""
-        known = self.wide(held.is_known)
+        """As many steps as there are between two frames; `noise` is what each adds. `amend` changes every x̂0 (guidance).
+
+        What was absent and is there now comes from noise to its frame's level in one step; what is there or known no more
+        becomes noise, but in frames that are final.
+        """
+        lost = self._known & ~held.is_known & (self.age < self.belt.steps)[:, None]
+        known, gone = self.wide(held.is_known), (held.is_absent & (self.level < 1)) | lost
+        self._known = held.is_known
+        self.x = torch.where(self.wide(gone), noise[0], self.x)
+        self.level = torch.where(held.is_known, 0.0, torch.where(gone, 1.0, self.level))
         for fresh in noise:
-            level, after = self._levels(self.age, held), self._levels(self.age + 1, held)
+            due = self.belt.levels(self.age + 1)[:, None].expand_as(self.level)
+            level, then = self.level, torch.where(held.is_absent, self.level, torch.minimum(due, self.level))
             self.x = torch.where(known, held.known, self.x)
             x0_hat = denoise(self.x, level)
             if amend is not None:
                 x0_hat = amend(x0_hat)
-            level, after = self.wide(level), self.wide(after)
+            now, after = self.wide(level), self.wide(then)
             if self.belt.step == "redraw":
-                moved = torch.where(after < level, add_noise(x0_hat, fresh, after, self.schedule), self.x)
-                self.x = torch.where(known, held.known, moved)
+                moved = add_noise(x0_hat, fresh, after, self.schedule)
+                self.x = torch.where(known, held.known, torch.where(after < now, moved, self.x))
             else:
-                self.x = posterior_step(self.x, x0_hat, level, after, fresh, self.schedule, self.belt.eta)
-            self.age = (self.age + 1).clamp_max(self.belt.steps)
+                self.x = posterior_step(self.x, x0_hat, now, after, fresh, self.schedule, self.belt.eta)
+            self.level, self.age = then, (self.age + 1).clamp_max(self.belt.steps)
 
     @property
     def clean(self) -> int:
         """Frames that are final."""
         return int((self.age >= self.belt.steps).sum())
 
-    def _levels(self, age: Int64[Tensor, "frame"], held: Held) -> Float[Tensor, "lane frame modality"]:
-        level = self.belt.levels(age)[:, None].expand(held.is_known.shape)
-        return torch.where(held.is_known, 0.0, torch.where(held.is_absent, 1.0, level))
-
     def wide(self, value: Tensor) -> Tensor:
         """Per feature instead of per modality."""
-        sizes = torch.tensor(self.sizes)
-        return value.repeat_interleave(sizes, -1, output_size=sum(self.sizes))
+        return value.index_select(-1, self._modality)

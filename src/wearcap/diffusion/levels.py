@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.errors import WearcapError
+
 DRAWS = 9
 """Uniform numbers per window that `LevelMix.levels` takes."""
 
@@ -27,10 +29,21 @@ class LevelMix:
     together: bool = False
     """Whether the modalities share the windows' one level (BoDiffusion's)."""
 
+    def __post_init__(self):
+        low, high = self.ramp
+        if (
+            not 1 <= low <= high
+            or min(self.independent, self.conveyor) < 0
+            or self.independent + self.conveyor > 1 + 1e-9
+        ):
+            raise WearcapError(f"shares {self.independent} and {self.conveyor}, ramps of {low} to {high} frames",
+                               expected="shares that add up to no more than 1, and a rising pair of 1 or more frames")  # fmt: skip
+
     def levels(
-        self, frames: Float[Tensor, "batch time modality"], draws: Float[Tensor, "batch 9"]
+        self, frames: Float[Tensor, "batch time draw"], draws: Float[Tensor, "batch 9"]
     ) -> Float[Tensor, "batch time modality"]:
-        """Levels from uniform random numbers, one per frame and modality and `DRAWS` per window."""
+        """Levels from uniform random numbers: one per frame and modality, one more per frame, and `DRAWS` per window."""
+        frames, chance = frames[..., :-1], frames[..., -1:]
         time, count = frames.shape[1:]
         kind, ramp_at, tail_at, known, which, share, *_ = draws[..., None, None].unbind(1)
         low, high = self.ramp
@@ -48,5 +61,5 @@ class LevelMix:
         )
         modality = torch.arange(count, device=frames.device) == (which * count).long()
         # Few frames are known as often as many: the share of known frames grows with the cube.
-        seen = frames.roll(1, -1) < share**3
+        seen = chance < share**3
         return torch.where((known < self.observed) & modality & seen, 0.0, levels)

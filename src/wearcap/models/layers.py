@@ -39,13 +39,15 @@ class RotaryAttention(nn.Module):
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
         half = width // heads // 2
-        angle = torch.outer(torch.arange(max_tokens), 10000.0 ** (-torch.arange(half) / half)).repeat(streams, 1)
+        angle = torch.outer(torch.arange(max_tokens), 10000.0 ** (-torch.arange(half) / half))
+        angle = angle.repeat(streams, 1, 1)
         self.register_buffer("cos", angle.cos(), persistent=False)
         self.register_buffer("sin", angle.sin(), persistent=False)
 
     def _rotate(self, x: Float[Tensor, "batch head token depth"]) -> Float[Tensor, "batch head token depth"]:
         first, second = x.chunk(2, -1)
-        cos, sin = self.cos[: x.shape[-2]].to(x.dtype), self.sin[: x.shape[-2]].to(x.dtype)
+        count = x.shape[-2] // len(self.cos)
+        cos, sin = (table[:, :count].flatten(0, 1).to(x.dtype) for table in (self.cos, self.sin))
         return torch.cat([first * cos - second * sin, first * sin + second * cos], -1)
 
     def forward(

@@ -13,6 +13,7 @@ from wearcap.data.echo_objects import ObjectReader
 from wearcap.data.echo_windows import EchoDataset, EchoTrack
 from wearcap.data.features import body_size
 from wearcap.data.statistics import MIN_SCALE
+from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
@@ -31,10 +32,10 @@ def _own(features: EchoFeatures) -> EchoFeatures:
 
 
 def _channels(features: EchoFeatures, points: ThreePoints, floor_height: Tensor, size: Tensor) -> Float[Tensor, "time channel"]:  # fmt: skip
-    """What each frame's three points are like, seen from its own head."""
+    """What each frame's three points are like, seen from its own head: the condition without the head's way and heading
+    since the window began, and without the body's size."""
     told = features.condition(ThreePoints(*(part[None] for part in points)), floor_height[None], size[None])[0]  # fmt: skip
-    keep = [*range(36), *range(39, 54), 56]
-    return told[:, keep]
+    return torch.cat([told[:, :36], told[:, 39:54], told[:, 56:57]], 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,7 @@ class NearestEcho:
     """By class; `NO_CLASS` without an object."""
     frames: dict[str, Int64[Tensor, "window"]]
     """First frame of each window."""
-    said: Float[Tensor, "frame feature"]
+    said: Float[Tensor, "frame value"]
 
     @classmethod
     def fit(cls, dataset: EchoDataset, window: int = 30, stride: int = 3, sample: int = 3) -> "NearestEcho":
@@ -162,6 +163,8 @@ class RigidWrist:
             if len(where):
                 place[name], offset[name] = where.mean(0), way.mean(0)
                 turn[name] = rotation.mean_rotation(R)
+        if not place:
+            raise WearcapError("nothing is touched in these training windows", expected="recordings with objects in hands")  # fmt: skip
         return cls(features, dataset.encoder, place, offset, turn)
 
     def attached(self, motion: Motion, lane: Lane) -> Motion:

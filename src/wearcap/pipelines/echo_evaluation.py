@@ -8,16 +8,16 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
-from wearcap.body.contact_points import BODY_POINTS, contact_points
+from wearcap.body.contact_points import BODY_POINTS, TOUCH_M, contact_points
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.data.echo_features import CONTACTS
 from wearcap.data.echo_objects import ObjectReader, ObjectShape, body_contact
-from wearcap.data.echo_windows import WITHIN_M, foot_patches
+from wearcap.data.echo_windows import foot_patches
 from wearcap.data.floor import interpolate
 from wearcap.data.prepare.clean import at_times
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.geometry.trajectory import Trajectory, nearest_frames, resample
 from wearcap.metrics.detection import detection_scores
 from wearcap.metrics.objects import (
     center_error_cm,
@@ -77,13 +77,13 @@ def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: Ob
         shape = reader(environment.by_name(name))
         T = shape.centred(_poses_at(recording.object_motion[name], times))
         rows = (active == number).nonzero()[:, 0]
-        touch[rows] = body_contact(surface.vertices(motion.T_world_joint[rows]), shape, T[rows], WITHIN_M)
+        touch[rows] = body_contact(surface.vertices(motion.T_world_joint[rows]), shape, T[rows], TOUCH_M)
         shapes.append(shape)
         poses.append(T)
     floor = torch.zeros(len(times))
     if recording.floor is not None:
         floor = interpolate(recording.floor.timestamps, recording.floor.height, times).float()
-    nearest = torch.searchsorted((whole.timestamps[1:] + whole.timestamps[:-1]) / 2, times)
+    nearest = nearest_frames(whole.timestamps, times)
     return Truth(motion, floor, shapes, active, poses, touch, foot_patches(recording)[nearest].float())
 
 

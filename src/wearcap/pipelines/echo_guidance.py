@@ -69,7 +69,8 @@ class GuidedScene:
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Squared distances (m²) of touching points to the object, and of standing feet to the floor: means over each
         frame's points, summed over frames."""
-        human, thing, contact = self.net.motion_normalizer.inverse(x0_hat).split(self.net.sizes, -1)
+        mean, scale = self.net.motion_normalizer.mean.to(x0_hat), self.net.motion_normalizer.scale.to(x0_hat)
+        human, thing, contact = (x0_hat * scale + mean).split(self.net.sizes, -1)
         body, T_object = (
             self.features.decode_body(human, self.frame),
             self.features.decode_object(thing, self.frame),

@@ -151,22 +151,30 @@ class EchoQueue:
         return Held(known, is_known, torch.stack(absent, -1) & ~is_known)
 
     def _move(self, frame: Rigid) -> None:
-        """Re-express what is on the conveyor where the window's frame has moved: z' = A z + √ᾱ b (exact: the channels
-        of each vector share one scale)."""
+        """Re-express what is on the conveyor where the window's frame has moved."""
         assert self._frame is not None
-        net, belt = self.pipeline.net, self.belt
-        change = frame.inverse() @ self._frame
-        alpha_bar = self.pipeline.schedule(belt.levels(self.conveyor.age))[:, None].sqrt()
-        scale = net.motion_normalizer.scale.cpu()
-        x = self.conveyor.x.clone()
         assert self.told is not None
-        for at, there in ((0, None), (net.sizes[0], self.told.has_object[..., None])):
+        level = self.belt.levels(self.conveyor.age)[:, None]
+        self.conveyor.x = self._reexpressed(self.conveyor.x, frame.inverse() @ self._frame, level, self.told)
+
+    def _reexpressed(
+        self,
+        x: Float[Tensor, "lane frame feature"],
+        change: Rigid,
+        level: Float[Tensor, "#frame 1"],
+        told: Told,
+    ) -> Float[Tensor, "lane frame feature"]:
+        """z' = A z + √ᾱ b (exact: the channels of each vector share one scale)."""
+        net, alpha_bar = self.pipeline.net, self.pipeline.schedule(level).sqrt()
+        scale = net.motion_normalizer.scale.cpu()
+        x = x.clone()
+        for at, there in ((0, None), (net.sizes[0], told.has_object[..., None])):
             shift = alpha_bar * (change.t / scale[at])
             shift = shift if there is None else shift * there
             x[..., at : at + 3] = self._turned(x[..., at : at + 3], change.R) + shift
             for column in (at + 3, at + 6):
                 x[..., column : column + 3] = self._turned(x[..., column : column + 3], change.R)
-        self.conveyor.x = x
+        return x
 
     @staticmethod
     def _turned(value: Float[Tensor, "lane frame 3"], R: Float[Tensor, "lane 1 3 3"]) -> Tensor:

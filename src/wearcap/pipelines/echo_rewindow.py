@@ -24,7 +24,7 @@ class Rewindow(EchoQueue):
         self.stride = stride
 
     @torch.no_grad()
-    def window(self, told: Told, before: Float[Tensor, "lane frame feature"]) -> Float[Tensor, "lane frame feature"]:  # fmt: skip
+    def window(self, told: Told, before: Float[Tensor, "lane known feature"]) -> Float[Tensor, "lane frame feature"]:  # fmt: skip
         """x̂0 of a window, of whose frames the first ones are known, in normalised space."""
         frame = self.pipeline.features.canonical(told.points)
         count = told.valid.shape[1]
@@ -32,7 +32,8 @@ class Rewindow(EchoQueue):
         held = self._held(told, frame)
         denoise, amend = self.pipeline.denoiser(self, told, frame)
         levels = step_levels(self.belt.steps, self.belt.spacing)
-        x = self._noise(count)
+        # As much for a window that is not full: what is drawn for a lane does not depend on how long others are.
+        x = self._noise(self.belt.window)[:, :count]
         known = held.known.clone()
         known[:, :known_frames] = before
         is_known = held.is_known.clone()
@@ -45,7 +46,10 @@ class Rewindow(EchoQueue):
             x = torch.where(wide(is_known), known, x)
             x0_hat = denoise(x, level)
             x0_hat = x0_hat if amend is None else amend(x0_hat)
-            x = posterior_step(x, x0_hat, wide(level), wide(then), self._noise(count), self.pipeline.schedule, self.belt.eta)  # fmt: skip
+            noise = self._noise(self.belt.window)[:, :count]
+            x = posterior_step(
+                x, x0_hat, wide(level), wide(then), noise, self.pipeline.schedule, self.belt.eta
+            )
         return x
 
     @torch.no_grad()
@@ -57,8 +61,12 @@ class Rewindow(EchoQueue):
         while start < count:
             first = max(0, start - context)
             told = whole.frames(slice(first, min(first + self.belt.window, count)))
-            x = self.window(told, before[:, before.shape[1] - (start - first) :])
-            frame = self.pipeline.features.canonical(told.points)
+            before, frame = before[:, before.shape[1] - (start - first) :], self.pipeline.features.canonical(told.points)  # fmt: skip
+            if self._frame is not None and self.pipeline.features.moves:
+                change, known = frame.inverse() @ self._frame, told.frames(slice(0, start - first))
+                before = self._reexpressed(before, change, torch.zeros(1, 1), known)
+            self._frame = frame
+            x = self.window(told, before)
             stop = min(start + self.stride, count)
             given.append(self._decoded(x, slice(start - first, stop - first), frame))
             kept = x[:, : stop - first]

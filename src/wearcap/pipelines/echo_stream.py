@@ -1,11 +1,11 @@
 """ECHO while things happen: tracked points go in as they come, bodies and objects come out frame by frame.
 
-What is said is what `Echo` says of the whole recording with the same seed; a pose comes `Echo.latency_s` after its
-moment. Memory does not grow.
+What is said is what `Echo` says of the whole recording with the same seed, as far as it is known in time; a pose comes
+`Echo.latency_s` after its moment. Memory does not grow.
 """
 
 import math
-from bisect import insort
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -17,22 +17,27 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.data.echo_features import CONTACTS, POINTS
 from wearcap.data.echo_objects import ObjectShape
 from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.models.echo import MODALITIES
-from wearcap.pipelines.echo import Echo, motion_of, stretch_seed
+from wearcap.models.onnx_runner import undisturbed
+from wearcap.pipelines.echo import Echo, guided_by, motion_of, stretch_seed
 from wearcap.pipelines.echo_queue import EchoQueue, Said, Told
 from wearcap.pipelines.echo_told import Lane
 from wearcap.pipelines.hmd2 import HeadPath
 from wearcap.pipelines.hmd2_stream import joined
 from wearcap.pipelines.hmd2_track import Chunk, HeadTrack
 from wearcap.recording import Motion
+from wearcap.recording.acts import SAME_S
 from wearcap.scene.environment import Environment
 from wearcap.scene.object_mesh import check_object
 
 WRISTS = POINTS[1:]
 MAX_GAP_S = 0.5
 """A wrist that is not tracked for longer rests where it was seen last."""
+ASIDE_M, BELOW = 0.25, 0.47
+"""Where a wrist hangs: beside the head (m), and below it as a share of the head's height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +58,16 @@ class EchoSession:
     def __init__(
         self, pipeline: Echo, wearer: EchoWearer, environment: Environment | None = None, seed: int = 0
     ):
-        """Raises WearcapError for objects whose mesh or class cannot be used."""
+        """Raises WearcapError for a pipeline without a conveyor."""
+        if pipeline.rewindow is not None:
+            raise WearcapError(f"a stream with rewindow={pipeline.rewindow}", expected="a conveyor: rewindow=null")  # fmt: skip
         pipeline.prepare()
         self.pipeline, self.wearer, self.seed = pipeline, wearer, seed
         self.silent = 0
         """Frames for which a wrist had nothing to say."""
-        reader = pipeline.reader()
+        self._environment, self._reader = environment, pipeline.reader()
         self._shapes: dict[str, ObjectShape] = {}
-        for item in environment.objects if environment is not None else ():
-            check_object(item, f"object {item.name!r}")
-            self._shapes[item.name] = reader(item)
-        self._names = list(self._shapes)
+        """Objects that have been named so far, in that order."""
         self._track = HeadTrack(pipeline.fps, 1)
         self._wrists: dict[str, list[tuple[float, Tensor, Tensor]]] = {joint: [] for joint in WRISTS}
         self._acts: list[tuple[float, str | None]] = []
@@ -92,37 +96,53 @@ class EchoSession:
             raise WearcapError(f"no tracked joint {joint!r}", expected=" or ".join(WRISTS))
         known = self._wrists[joint]
         R, t = T_world_joint.R.float().cpu(), T_world_joint.t.float().cpu()
-        finite = math.isfinite(timestamp) and R.isfinite().all() and t.isfinite().all()
-        if finite and all(time != timestamp for time, *_ in known[-3:]):
-            insort(known, (timestamp, R, t), key=lambda pose: pose[0])
+        if not (math.isfinite(timestamp) and R.isfinite().all() and t.isfinite().all()):
+            return
+        place = bisect_left(known, timestamp, key=lambda pose: pose[0])
+        if place == len(known) or known[place][0] != timestamp:
+            known.insert(place, (timestamp, R, t))
 
     def activate(self, name: str | None, timestamp: float) -> None:
         """From a time (s) on this object is the active one; None: none is. Frames whose poses are not final yet, too.
 
-        Raises WearcapError for an unknown object.
+        Raises WearcapError for an unknown object, and for one whose mesh or class cannot be used.
         """
-        if name is not None and name not in self._shapes:
-            raise WearcapError(f"no object {name!r}", expected=f"one of {', '.join(self._shapes) or 'no objects'}")  # fmt: skip
+        if name is not None:
+            self._shape(name)
         self._acts = [act for act in self._acts if act[0] < timestamp] + [(timestamp, name)]
         self._retell()
 
     def see_object(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
-        """An object's pose is known at a moment, from a camera for instance (ECHO §4.2). Raises as `activate` does."""
+        """An object's pose is known at a moment, from a camera for instance (ECHO §4.2); what is not finite is left out.
+
+        Raises as `activate` does.
+        """
+        T = self._shape(name).centred(Rigid(T_world_object.R.float(), T_world_object.t.float()))
+        if math.isfinite(timestamp) and T.R.isfinite().all() and T.t.isfinite().all():
+            self._seen.append((timestamp, name, T))
+            self._retell()
+
+    def _shape(self, name: str) -> ObjectShape:
         if name not in self._shapes:
-            raise WearcapError(f"no object {name!r}", expected=f"one of {', '.join(self._shapes) or 'no objects'}")  # fmt: skip
-        T = self._shapes[name].centred(Rigid(T_world_object.R.float(), T_world_object.t.float()))
-        self._seen.append((timestamp, name, T))
-        self._retell()
+            if self._environment is None:
+                raise WearcapError(f"no object {name!r}", expected="a session with an environment")
+            item = self._environment.by_name(name)
+            check_object(item, f"object {name!r}")
+            self._shapes[name] = self._reader(item)
+            if self._queue is not None and self._queue.guided is not None:
+                self._queue.guided = guided_by([self.wearer.skeleton], [dict(self.wearer.shape)], [list(self._shapes.values())])  # fmt: skip
+        return self._shapes[name]
 
     def poses(self, ended: bool = False) -> Motion | None:
         """The frames that are final since the last time; `ended`: nothing more will come."""
         while (chunk := self._track.next(ended)) is not None:
             self._chunks.append(chunk)
         given: list[Motion] = []
-        while self._chunks and (ended or self._told(self._chunks[0])):
-            given += self._advance(self._chunks.pop(0))
-        if ended:
-            given += self._finish()
+        with undisturbed(self.pipeline.runtime == "onnx"):
+            while self._chunks and (ended or self._told(self._chunks[0])):
+                given += self._advance(self._chunks.pop(0))
+            if ended:
+                given += self._finish()
         return joined(given)
 
     def _told(self, chunk: Chunk) -> bool:
@@ -142,6 +162,7 @@ class EchoSession:
             )  # fmt: skip
         mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
         T_world_head = chunk.T_world_device @ mount
+        self._amend(chunk.amended @ mount)
         if self._floor_m is None:
             self._floor_m = T_world_head.t[0, 2].item() - self.wearer.skeleton.height_of("head")
         time = chunk.timestamps[0].item()
@@ -149,6 +170,18 @@ class EchoSession:
         said = self._queue.push(told)
         self._waiting.append((time, told, T_world_head))
         return given + self._give(said)
+
+    def _amend(self, T_world_head: Rigid) -> None:
+        """Put the head of the last frames where it turned out to have been."""
+        count = min(len(T_world_head.t), len(self._waiting))
+        for k in range(count):
+            time, told, _ = self._waiting[-count + k]
+            at = T_world_head[len(T_world_head.t) - count + k : len(T_world_head.t) - count + k + 1]
+            R, t = told.R_world_point.clone(), told.t_world_point.clone()
+            R[0, 0, 0], t[0, 0, 0] = at.R[0], at.t[0]
+            self._waiting[-count + k] = (time, told._replace(R_world_point=R, t_world_point=t), at)
+        if count:
+            self._retell()
 
     def _finish(self) -> list[Motion]:
         """The frames of a stretch that has ended."""
@@ -159,7 +192,7 @@ class EchoSession:
         return given
 
     def _frame(self, time: float, T_world_head: Rigid) -> Told:
-        poses = [T_world_head, *(self._wrist_at(joint, time) for joint in WRISTS)]
+        poses = [T_world_head, *(self._wrist_at(joint, time, T_world_head) for joint in WRISTS)]
         R, t = torch.stack([T.R for T in poses], 1), torch.stack([T.t for T in poses], 1)
         joints = len(self.wearer.skeleton)
         one = torch.ones(1, dtype=torch.bool)
@@ -170,17 +203,17 @@ class EchoSession:
 
     def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor]:
         """Whether an object is active at a time, its code and its number."""
-        name = next((name for start, name in reversed(self._acts) if start <= time + 1e-6), None)
+        name = next((name for start, name in reversed(self._acts) if start <= time + SAME_S), None)
         if name is None:
             size = self.pipeline.features.object_condition_size
             return torch.zeros(1, dtype=torch.bool), torch.zeros(1, size), torch.full((1,), -1.0)
-        number = torch.full((1,), float(self._names.index(name)))
+        number = torch.full((1,), float(list(self._shapes).index(name)))
         return torch.ones(1, dtype=torch.bool), self._shapes[name].code[None], number
 
     def _observed(self, told: Told, time: float) -> Told:
         """With the active object's pose, where it was seen within half a frame."""
         for at, name, T in self._seen:
-            mine = bool(told.has_object) and self._names[int(told.object_number)] == name
+            mine = bool(told.has_object) and list(self._shapes)[int(told.object_number)] == name
             if mine and abs(at - time) <= 0.5 / self.pipeline.fps + 1e-6:
                 known = told.is_known.clone()
                 known[..., 1] = True
@@ -195,18 +228,30 @@ class EchoSession:
         frames = [whole.frames(slice(k, k + 1)) for k in range(max(first, 0))]
         for k, (time, told, head) in enumerate(self._waiting):
             has, code, number = (value[None] for value in self._active(time))
-            changed = told._replace(has_object=has, object_code=code, object_number=number)
+            changed = told._replace(
+                has_object=has,
+                object_code=code,
+                object_number=number,
+                is_known=torch.zeros_like(told.is_known),
+            )
             changed = self._observed(changed, time)
             self._waiting[k] = (time, changed, head)
             frames.append(changed)
         self._queue.told = Told(*(torch.cat(fields, 1) for fields in zip(*frames)))
 
-    def _wrist_at(self, joint: str, time: float) -> Rigid:
+    def _hanging(self, joint: str, T_world_head: Rigid) -> Rigid:
+        """Of a wrist that has not been seen yet: beside the body, arms down."""
+        heading = rotation.about_axis("z", rotation.yaw_of(T_world_head.R))
+        aside = ASIDE_M if joint == WRISTS[0] else -ASIDE_M
+        below = torch.tensor([0.0, aside, -BELOW * self.wearer.skeleton.height_of("head")])
+        return Rigid(heading, T_world_head.t + (heading @ below[:, None])[..., 0])
+
+    def _wrist_at(self, joint: str, time: float, T_world_head: Rigid) -> Rigid:
         known = self._wrists[joint]
         if not known or known[-1][0] < time - MAX_GAP_S:
             self.silent += 1
         if not known:
-            return Rigid(torch.eye(3)[None], torch.zeros(1, 3))
+            return self._hanging(joint, T_world_head)
         times, R, t = zip(*known)
         clock = torch.tensor(times, dtype=torch.float64)
         at = torch.tensor([min(max(time, times[0]), times[-1])], dtype=torch.float64)

@@ -132,9 +132,13 @@ def _objects(scenario: Scenario, names: list[str], reader: ObjectReader) -> list
     shapes = []
     for name in names:
         assert scenario.environment is not None
-        item = scenario.environment.by_name(name)
-        check_object(item, f"object {name!r} of {scenario.recording.name}")
-        shapes.append(reader(item))
+        where = f"object {name!r} of {scenario.recording.name}"
+        try:
+            item = scenario.environment.by_name(name)
+            check_object(item, where)
+            shapes.append(reader(item))
+        except WearcapError as error:
+            raise WearcapError(error.what, where=where, expected=error.expected, fix=error.fix) from error
     return shapes
 
 
@@ -181,7 +185,7 @@ def _frames(times: Float64[Tensor, "frame"], path: HeadPath, where: str) -> Tens
     """Numbers of the frames next to some times. Raises WearcapError for times beyond the recording."""
     clock = path.timestamps
     step = (clock[1] - clock[0]).item() if len(clock) > 1 else 0.0
-    beyond = (times < clock[0] - step) | (times > clock[-1] + step)
+    beyond = ~((times >= clock[0] - step) & (times <= clock[-1] + step))
     if beyond.any():
         raise WearcapError(f"an observation at {times[beyond][0].item():.2f} s, beyond the recording", where=where,
                            expected=f"times from {clock[0].item():.2f} to {clock[-1].item():.2f} s")  # fmt: skip

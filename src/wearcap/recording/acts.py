@@ -14,6 +14,8 @@ from wearcap.recording.recording import Recording
 MARGIN_S = 2.0
 """Before the first touch and after the last one, in which an object is the active one already and still."""
 NO_OBJECT = -1
+SAME_S = 1e-6
+"""Times nearer than this are one."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,11 @@ def true_acts(recording: Recording, margin_s: float = MARGIN_S) -> list[Act]:
 def spread_acts(held: Sequence[Act], margin_s: float = MARGIN_S) -> list[Act]:
     """Acts that reach `margin_s` beyond the stretches in which objects are held, none into another.
 
-    `held` is ordered by its start; stretches of one object that follow each other become one.
+    `held` is ordered by its start; stretches of one object that follow each other become one. Where one object is held
+    within the time of another, it is the active one, and the other one before and behind.
     """
     merged: list[Act] = []
-    for act in held:
+    for act in _side_by_side(held):
         if merged and merged[-1].object == act.object and act.start_s - merged[-1].stop_s < 2 * margin_s:
             merged[-1] = Act(act.object, merged[-1].start_s, max(merged[-1].stop_s, act.stop_s))
         else:
@@ -62,6 +65,21 @@ def spread_acts(held: Sequence[Act], margin_s: float = MARGIN_S) -> list[Act]:
         Act(act.object, max(act.start_s - margin_s, edges[k]), min(act.stop_s + margin_s, edges[k + 1]))
         for k, act in enumerate(merged)
     ]
+
+
+def _side_by_side(held: Sequence[Act]) -> list[Act]:
+    """Stretches of which none lies within another: the longer one is cut."""
+    left, done = list(held), []
+    while left:
+        act = left.pop(0)
+        inner = next((k for k, other in enumerate(left) if other.stop_s < act.stop_s), None)
+        if inner is not None and left[inner].object != act.object:
+            left.insert(inner + 1, Act(act.object, left[inner].stop_s, act.stop_s))
+            left.sort(key=lambda part: part.start_s)
+            act = Act(act.object, act.start_s, left[inner].start_s)
+        if act.stop_s > act.start_s:
+            done.append(act)
+    return done
 
 
 def active_at(
@@ -75,8 +93,7 @@ def active_at(
     for act in acts:
         if act.object not in names:
             raise WearcapError(f"an act of {act.object!r}", expected=f"one of {', '.join(names) or 'no objects'}")  # fmt: skip
-        first, last = torch.searchsorted(
-            timestamps, torch.tensor([act.start_s, act.stop_s], dtype=torch.float64)
-        )
+        ends = torch.tensor([act.start_s, act.stop_s], dtype=torch.float64) - SAME_S
+        first, last = torch.searchsorted(timestamps, ends)
         active[int(first) : int(last)] = list(names).index(act.object)
     return active

@@ -1,0 +1,124 @@
+"""A walking person who carries boxes beside their wrists, without errors, and an ECHO whose network has drawn weights."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from walking_person import SEAT, walk
+from wearcap.body.skeleton import FOOT_PATCHES, xsens23
+from wearcap.data.echo_features import CONTACTS, OBJECT_SIZE, EchoFeatures
+from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.geometry import rotation
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.environment import write_environment
+from wearcap.models.echo import EchoDenoiser
+from wearcap.pipelines.echo import Echo
+from wearcap.pipelines.echo_told import Scenario
+from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Recording, RecordingStore
+from wearcap.recording.acts import true_acts
+from wearcap.recording.interactions import Interactions
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Freedom, SceneObject
+
+WINDOW, FPS = 16, 30.0
+CLASSES = ("box", "chair")
+HALF, MIDDLE = np.array([0.15, 0.1, 0.05]), np.array([0.04, 0.0, 0.02])
+GRIP = Rigid(rotation.exp(torch.tensor([0.2, 0.4, -0.7])), torch.tensor([0.08, 0.0, -0.06]))
+"""T_wrist_box."""
+CARRIED = (("box_1", "left", 0.4, 1.2),)
+"""Box, side, from when to when (s) it is told to be held; it is beside that wrist all the time."""
+
+
+def box_mesh(half=HALF, middle=MIDDLE) -> Mesh:
+    """A box about a point of its own axes."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    return Mesh((corners * half + middle).astype(np.float32), np.array(faces, np.int32), np.ones(3, np.float32))  # fmt: skip
+
+
+def thing(name: str, category: str = "box", mesh: Mesh | None = None) -> SceneObject:
+    return SceneObject(name, category, mesh or box_mesh(), torch.eye(3), torch.zeros(3), Freedom("free"))
+
+
+def boxes(carried=CARRIED) -> Environment:
+    """The boxes that are carried, the second one a chair of other measures."""
+    names = dict.fromkeys(name for name, *_ in carried)
+    return Environment(
+        tuple(
+            thing(name, CLASSES[k % 2], box_mesh(HALF / (1 + k), MIDDLE * k)) for k, name in enumerate(names)
+        )
+    )
+
+
+def carrying(seconds: float = 2.0, name: str = "carry", carried=CARRIED, fps: float = FPS) -> Recording:
+    """A walk with boxes."""
+    time = torch.arange(int(seconds * fps), dtype=torch.float64) / fps
+    motion, contact = walk(time)
+    T_world_device = motion.joint("head") @ SEAT
+    tracks = {}
+    for box, side, *_ in carried:
+        T = motion.joint(f"{side}_wrist") @ GRIP
+        tracks[box] = Trajectory(time, T.R, T.t)
+    start, stop = (torch.tensor([row[k] for row in carried], dtype=torch.float64) for k in (2, 3))
+    hands = torch.tensor([[row[1] == "left", row[1] == "right"] for row in carried]).bool().reshape(-1, 2)
+    held = Interactions(start, stop, hands, tuple(row[0] for row in carried), ("sliding",) * len(carried))
+    return Recording(
+        name, head=HeadStream(time, T_world_device.R, T_world_device.t, SEAT.R, SEAT.t), motion=motion,
+        contacts=ContactTrack(time, FOOT_PATCHES, contact), floor=FloorTrack(time, torch.zeros(len(time))),
+        skeleton=motion.skeleton, object_motion=tracks, interactions=held if carried else None,
+        subject=f"subject_{name}", location="nowhere", license="MIT",
+    )  # fmt: skip
+
+
+def carried_dataset(root: Path, splits: Sequence[str] = ("train", "val", "test"), fps: float = FPS) -> str:
+    """One carrying walk per split, with its boxes' file."""
+    from dataclasses import replace
+
+    store = RecordingStore(root)
+    write_environment(boxes(), root / "scene")
+    for number, split in enumerate(splits):
+        recording = carrying(2.0, f"c{number}", fps=fps)
+        store.add(replace(recording, environment="scene/environment.json"), split=split, config_hash="test")
+    return str(root)
+
+
+def small_features(frame: str = "own", **changes) -> EchoFeatures:
+    return EchoFeatures(**{"frame": frame, "classes": CLASSES, "shape_size": 0} | changes)
+
+
+def small_net(features: EchoFeatures, **changes) -> EchoDenoiser:
+    """Drawn weights, and statistics with which anything it says is a pose."""
+    torch.manual_seed(0)
+    sizes = (
+        features.human_size,
+        OBJECT_SIZE,
+        CONTACTS,
+        features.condition_size,
+        features.object_condition_size,
+    )
+    settings = {"window": WINDOW, "width": 32, "layers": 1, "heads": 2, "feedforward": 32, "dropout": 0.0}
+    net = EchoDenoiser(*sizes, **settings | changes)
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    mean, scale = torch.zeros(sum(net.sizes)), torch.full((sum(net.sizes),), 0.5)
+    mean[9 : features.human_size] = torch.tensor([1.0, 0, 0, 0, 1.0, 0]).repeat(features.joints - 1)
+    scale[net.sizes[0] + OBJECT_SIZE :] = 1.0
+    net.motion_normalizer.set(mean, scale)
+    return net.eval()
+
+
+def drawn_echo(frame: str = "own", net=None, **settings) -> Echo:
+    """A small pipeline; a pose is final when seven frames have followed it."""
+    features = small_features(frame)
+    given = {"context": 8, "per_frame": 1, **settings}
+    return Echo(net or small_net(features), features, CosineSchedule(), xsens23(), **given)
+
+
+def scenario_of(recording: Recording, carried=CARRIED, margin_s: float = 0.1, **changes) -> Scenario:
+    """What is told of a walk with boxes."""
+    acts = tuple(true_acts(recording, margin_s)) if recording.object_motion else ()
+    return Scenario(recording, boxes(carried), acts, **changes)

@@ -1,0 +1,85 @@
+"""Levels as training draws them: in range, in the shares that are asked for, growing along a conveyor."""
+
+import pytest
+import torch
+
+from wearcap.diffusion.levels import DRAWS, LevelMix
+from wearcap.errors import WearcapError
+
+SHAPE = (4000, 20, 3)
+
+
+def drawn(**shares) -> tuple[torch.Tensor, torch.Tensor]:
+    random = torch.Generator().manual_seed(0)
+    frames = torch.rand(*SHAPE[:2], SHAPE[2] + 1, generator=random)
+    draws = torch.rand(SHAPE[0], DRAWS, generator=random)
+    return LevelMix(**shares).levels(frames, draws), frames[..., :-1]
+
+
+def test_levels_are_of_every_frame_and_modality_and_within_their_range():
+    levels, _ = drawn()
+    assert levels.shape == SHAPE
+    assert levels.min() >= 0
+    assert levels.max() <= 1
+
+
+def test_independent_levels_are_those_of_the_frames():
+    levels, frames = drawn(independent=1.0, conveyor=0.0, observed=0.0)
+    assert torch.equal(levels, frames)
+
+
+def test_a_conveyors_levels_grow_and_are_alike_for_all_modalities():
+    levels, _ = drawn(independent=0.0, conveyor=1.0, observed=0.0)
+    assert (levels.diff(dim=1) >= 0).all()
+    assert (levels == levels[..., :1]).all()
+    assert (levels[:, 0] > 0.5).any(), "a queue that fills"
+    assert (levels[:, -1] < 0.5).any(), "a queue that empties"
+
+
+def test_a_conveyors_slope_is_that_of_a_ramp_that_is_asked_for():
+    levels, _ = drawn(independent=0.0, conveyor=1.0, observed=0.0, ramp=[10, 14])
+    steps = levels.diff(dim=1)
+    inside = steps[(levels[:, 1:] < 1) & (levels[:, :-1] > 0)]
+    assert inside.min() >= 1 / 14 - 1e-5
+    assert inside.max() <= 1 / 10 + 1e-5
+
+
+def test_else_each_modality_has_one_level_of_its_own():
+    levels, _ = drawn(independent=0.0, conveyor=0.0, observed=0.0)
+    assert (levels == levels[:, :1]).all()
+    assert levels[:, 0].mT.corrcoef().fill_diagonal_(0).abs().max() < 0.1
+
+
+def test_windows_are_dealt_out_in_the_shares_that_are_asked_for():
+    levels, frames = drawn(independent=0.2, conveyor=0.5, observed=0.0)
+    single = (levels == levels[:, :1]).all(1).all(1)
+    independent = (levels == frames).all(1).all(1)
+    grows = (levels == levels[..., :1]).all(-1).all(-1) & ~single
+    assert independent.float().mean() == pytest.approx(0.2, abs=0.03)
+    assert grows.float().mean() == pytest.approx(0.5, abs=0.05)  # some are flat within the window
+    assert (single & ~independent).float().mean() == pytest.approx(0.3, abs=0.05)
+
+
+def test_observed_frames_are_of_one_modality_at_a_time():
+    levels, _ = drawn(independent=1.0, conveyor=0.0, observed=0.4)
+    touched = (levels == 0).any(1)
+    assert touched.sum(-1).max() == 1
+    share = touched.float().mean(0)
+    assert (share > 0.07).all()
+    assert share.sum() < 0.4
+
+
+def test_what_is_observed_says_nothing_about_the_other_modalities_levels():
+    levels, _ = drawn(independent=1.0, conveyor=0.0, observed=1.0)
+    for modality in range(3):
+        known = levels[..., modality] == 0
+        other = levels[..., (modality - 1) % 3][known]
+        assert other.mean() == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"ramp": [20, 10]}, {"ramp": [0, 5]}, {"independent": 0.7, "conveyor": 0.6}]
+)
+def test_shares_and_ramps_that_cannot_be_are_refused(wrong):
+    with pytest.raises(WearcapError, match="Expected shares that add up"):
+        LevelMix(**wrong)

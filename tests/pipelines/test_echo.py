@@ -1,0 +1,312 @@
+"""ECHO on whole recordings: what is known comes out as it is, frames of reference change nothing, lanes are alone."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from carried_box import FPS, GRIP, WINDOW, boxes, carrying, drawn_echo, scenario_of
+from wearcap.body.contact_points import BODY_POINTS
+from wearcap.data.echo_features import CONTACTS, Body
+from wearcap.diffusion.process import add_noise
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.pipelines.echo import Echo
+from wearcap.pipelines.echo_queue import EchoQueue, Told
+from wearcap.pipelines.echo_rewindow import Rewindow
+from wearcap.pipelines.echo_told import Observed, lane_of
+from wearcap.pipelines.hmd2 import head_path
+from wearcap.recording import Motion
+
+TWO = (("box_1", "left", 0.1, 0.35), ("box_2", "right", 0.6, 0.8))
+FRAMES = ("own", "window", "world")
+
+
+def lane(echo: Echo, scenario):
+    return lane_of(scenario, head_path(scenario.recording, echo.skeleton, echo.fps), echo.reader())
+
+
+def everything(recording) -> Observed:
+    """The truth of all modalities at every frame; contacts in a pattern."""
+    motion, count = recording.motion, len(recording.motion)
+    contact = (torch.arange(count)[:, None] + torch.arange(CONTACTS)) % 3 == 0
+    return Observed(motion, recording.object_motion, motion.timestamps, contact.float())
+
+
+def assert_true(motion: Motion, recording, scenario, atol: float = 2e-4) -> None:
+    true = recording.motion
+    torch.testing.assert_close(motion.R_parent_joint, true.R_parent_joint, atol=atol, rtol=0)
+    torch.testing.assert_close(motion.t_world_root, true.t_world_root, atol=atol, rtol=0)
+    for act in scenario.acts:
+        active = (true.timestamps >= act.start_s) & (true.timestamps < act.stop_s)
+        found, given = motion.object_motion[act.object], recording.object_motion[act.object]
+        torch.testing.assert_close(found.t_world_body[active], given.t_world_body[active], atol=atol, rtol=0)
+        torch.testing.assert_close(found.R_world_body[active], given.R_world_body[active], atol=atol, rtol=0)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("rewindow", [None, 3])
+def test_what_is_observed_comes_out_as_it_is(frame, rewindow):
+    recording = carrying(1.0, carried=TWO)
+    scenario = scenario_of(recording, TWO, observed=everything(recording))
+    echo = drawn_echo(frame, hang=False, rewindow=rewindow)
+    motion = echo.capture_scenarios([scenario], [0])[0]
+    assert_true(motion, recording, scenario)
+    contact = scenario.observed.contact
+    torch.testing.assert_close(motion.contact_prob, contact[:, BODY_POINTS:], atol=1e-5, rtol=0)
+    active = lane(echo, scenario).told.has_object[0, :, None]
+    torch.testing.assert_close(motion.body_contact_prob, contact[:, :BODY_POINTS] * active, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("modality", range(3))
+def test_known_frames_of_one_modality_enter_at_level_0(modality):
+    recording, take = carrying(1.2), torch.tensor([4, 17, 30])
+    all_of_it, times = everything(recording), recording.motion.timestamps[take]
+    motion = replace(recording.motion, timestamps=times, R_parent_joint=recording.motion.R_parent_joint[take], t_world_root=recording.motion.t_world_root[take])  # fmt: skip
+    seen = (
+        Observed(motion),
+        Observed(object_motion={name: track[take] for name, track in recording.object_motion.items()}),
+        Observed(contact_times=times, contact=all_of_it.contact[take]),
+    )[modality]
+    echo, given = drawn_echo(hang=False), []
+    denoiser = echo.denoiser
+
+    def watched(queue, told, frame):
+        denoise, amend = denoiser(queue, told, frame)
+
+        def look(x, level):
+            given.append((level, told.is_known))
+            return denoise(x, level)
+
+        return look, amend
+
+    echo.denoiser = watched
+    found = echo.capture_scenarios([scenario_of(recording, margin_s=3.0, observed=seen)], [0])[0]
+    plain = drawn_echo(hang=False).capture_scenarios([scenario_of(recording, margin_s=3.0)], [0])[0]
+    for level, known in given:
+        assert (level[known] == 0).all()
+        assert not known[..., [k for k in range(3) if k != modality]].any()
+    pairs = [
+        (found.t_world_root, plain.t_world_root, recording.motion.t_world_root),
+        (*(m.object_motion["box_1"].t_world_body for m in (found, plain)), recording.object_motion["box_1"].t_world_body),
+        (found.contact_prob, plain.contact_prob, all_of_it.contact[:, BODY_POINTS:]),
+    ]  # fmt: skip
+    value, without, true = pairs[modality]
+    torch.testing.assert_close(value[take], true[take], atol=2e-4, rtol=0)
+    assert (without[take] - true[take]).abs().max() > 0.01
+    others = torch.ones(len(value), dtype=torch.bool)
+    others[take] = False
+    assert not torch.allclose(value[others], without[others], atol=1e-5), "its neighbours hear of it"
+
+
+def truth_of(echo: Echo, told: Told, frame: Rigid) -> torch.Tensor:
+    """x0 as the frame sees what stands beside what is told."""
+    body = echo.features.encode_body(Body(told.R_parent_joint, told.t_world_root), frame)
+    thing = echo.features.encode_object(Rigid(told.R_world_object, told.t_world_object), frame)
+    return echo.net.motion_normalizer(torch.cat([body, thing, 2 * told.contact - 1], -1))
+
+
+class Knowing(Echo):
+    """Whose denoiser is perfect."""
+
+    def denoiser(self, queue, told, frame):
+        truth = truth_of(self, told, frame)
+        known = queue.seen if hasattr(queue, "seen") else []
+
+        def denoise(x, level):
+            known.append(torch.where(queue.conveyor.wide(level) == 0, (x - truth).abs(), 0.0))
+            return truth
+
+        return denoise, None
+
+
+def knowing(frame: str, **settings) -> Echo:
+    plain = drawn_echo(frame)
+    given = {"context": 8, "per_frame": 2, "hang": False} | settings
+    return Knowing(plain.net, plain.features, plain.schedule, plain.skeleton, **given)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize(
+    ("make", "step"),
+    [
+        (EchoQueue, "posterior"),
+        (EchoQueue, "redraw"),
+        (lambda *given: Rewindow(*given, stride=3), "posterior"),
+    ],
+)
+def test_a_perfect_denoiser_says_the_truth_in_any_frame(frame, make, step):
+    """And what is clean stays the truth while the windows' frame of reference moves."""
+    recording = carrying(1.0, carried=TWO)
+    echo = knowing(frame, step=step)
+    told = lane(echo, scenario_of(recording, TWO, observed=everything(recording))).told
+    told = told._replace(is_known=torch.zeros_like(told.is_known))
+    queue = make(echo, [echo.skeleton], [0])
+    queue.seen = []
+    said = queue.run(told)
+    torch.testing.assert_close(said.t_world_root, told.t_world_root, atol=2e-4, rtol=0)
+    torch.testing.assert_close(said.R_parent_joint, told.R_parent_joint, atol=2e-4, rtol=0)
+    there = told.has_object
+    torch.testing.assert_close(said.t_world_object[there], told.t_world_object[there], atol=2e-4, rtol=0)
+    torch.testing.assert_close(said.R_world_object[there], told.R_world_object[there], atol=2e-4, rtol=0)
+    assert max(part.max() for part in queue.seen) < 5e-3, "clean frames are what they were said to be"
+
+
+def test_what_moves_with_the_window_is_noised_in_the_new_frame():
+    """z' = A z + √ᾱ b against encoding there, with the same noise turned."""
+    echo = drawn_echo("window")
+    queue, recording = EchoQueue(echo, [echo.skeleton], [0]), carrying(1.6)
+    told = lane(echo, scenario_of(recording, margin_s=5.0, observed=everything(recording))).told
+    before, queue.told = told.frames(slice(0, WINDOW)), told.frames(slice(5, 5 + WINDOW))
+    old, new = (echo.features.canonical(part.points) for part in (before, queue.told))
+    queue.conveyor.age = torch.arange(WINDOW).flip(0)
+    level = echo.belt.levels(queue.conveyor.age)[None]
+    noise = torch.randn(1, WINDOW, sum(echo.net.sizes))
+    queue.conveyor.x = add_noise(truth_of(echo, queue.told, old), noise, level, echo.schedule)
+    turned, change = noise.clone(), new.R.mT @ old.R
+    first = echo.net.sizes[0]
+    for at in (0, 3, 6, first, first + 3, first + 6):
+        turned[..., at : at + 3] = (change @ noise[..., at : at + 3, None])[..., 0]
+    expected = add_noise(truth_of(echo, queue.told, new), turned, level, echo.schedule)
+    queue._frame = old
+    queue._move(new)
+    torch.testing.assert_close(queue.conveyor.x, expected, atol=1e-4, rtol=0)
+    assert (new.t - old.t).norm() > 0.1
+
+
+@pytest.mark.parametrize("settings", [{}, {"frame": "window"}, {"rewindow": 3}, {"per_frame": 2}])
+def test_lanes_do_not_know_of_each_other(settings):
+    echo = drawn_echo(**settings)
+    scenarios = [scenario_of(carrying(0.9)), scenario_of(carrying(0.7, carried=TWO[1:]), TWO[1:])]
+    together = echo.capture_scenarios(scenarios, [3, 4])
+    for scenario, seed, motion in zip(scenarios, (3, 4), together):
+        alone = echo.capture_scenarios([scenario], [seed])[0]
+        torch.testing.assert_close(motion.T_world_joint.t, alone.T_world_joint.t, atol=1e-3, rtol=0)
+        torch.testing.assert_close(motion.body_contact_prob, alone.body_contact_prob, atol=1e-3, rtol=0)
+        assert set(motion.object_motion or {}) == set(alone.object_motion or {})
+
+
+def test_a_seed_says_what_is_drawn():
+    echo, scenario = drawn_echo(), scenario_of(carrying(0.9))
+    one, two, other = echo.capture_scenarios([scenario] * 3, [1, 1, 2])
+    torch.testing.assert_close(one.R_parent_joint, two.R_parent_joint, atol=1e-4, rtol=0)
+    assert not torch.allclose(one.R_parent_joint, other.R_parent_joint, atol=1e-3)
+
+
+@pytest.mark.parametrize("seconds", [0.55, 1.1])
+@pytest.mark.parametrize("rewindow", [None, 3, 8])
+def test_every_frame_is_said_however_short_the_recording(seconds, rewindow):
+    recording = carrying(seconds)
+    motion = drawn_echo(rewindow=rewindow).capture([recording], [0])[0]
+    assert torch.equal(motion.timestamps, recording.motion.timestamps)
+    assert motion.R_parent_joint.isfinite().all()
+    assert motion.object_motion is None
+
+
+def test_windows_that_would_leave_frames_out_are_refused():
+    with pytest.raises(WearcapError, match=r"advance by 9.*Expected 1 to 8"):
+        drawn_echo(rewindow=9)
+
+
+def test_the_body_hangs_from_the_measured_head():
+    recording = carrying(1.0)
+    motion = drawn_echo().capture([recording], [0])[0]
+    head, true = motion.joint("head"), recording.motion.joint("head")
+    torch.testing.assert_close(head.t, true.t, atol=1e-4, rtol=0)
+    torch.testing.assert_close(head.R, true.R, atol=1e-4, rtol=0)
+    standing = drawn_echo(hang=False).capture([recording], [0])[0]
+    assert not torch.allclose(standing.joint("head").t, true.t, atol=1e-2)
+
+
+def test_objects_rest_between_the_times_they_are_active():
+    recording = carrying(1.2, carried=TWO)
+    scenario = scenario_of(recording, TWO)
+    motion = drawn_echo().capture_scenarios([scenario], [0])[0]
+    for act in scenario.acts:
+        track, time = motion.object_motion[act.object], motion.timestamps
+        assert torch.equal(track.timestamps, time)
+        before, behind = track.t_world_body[time < act.start_s], track.t_world_body[time >= act.stop_s]
+        active = track.t_world_body[(time >= act.start_s) & (time < act.stop_s)]
+        assert (before == active[:1]).all()
+        assert (behind == active[-1:]).all()
+        assert (active.diff(dim=0).norm(dim=-1) > 0).all()
+    idle = torch.ones(len(motion), dtype=torch.bool)
+    for act in scenario.acts:
+        idle &= (motion.timestamps < act.start_s) | (motion.timestamps >= act.stop_s)
+    assert not motion.body_contact_prob[idle].any()
+
+
+def with_gap(recording, first: int, stop: int):
+    head = recording.head
+    keep = [k for k in range(len(head.timestamps)) if not first <= k < stop]
+    return replace(recording, head=replace(head, timestamps=head.timestamps[keep], R_world_device=head.R_world_device[keep], t_world_device=head.t_world_device[keep]))  # fmt: skip
+
+
+def test_behind_a_gap_of_the_head_it_begins_anew():
+    whole = carrying(2.5)
+    broken = with_gap(whole, 25, 55)
+    echo = drawn_echo()
+    motion = echo.capture([broken], [5])[0]
+    assert len(motion) == 75
+    assert (motion.R_parent_joint[25:55, 1] == motion.R_parent_joint[24, 1]).all(), "as before"
+    cut = replace(whole, head=replace(whole.head, timestamps=whole.head.timestamps[:25], R_world_device=whole.head.R_world_device[:25], t_world_device=whole.head.t_world_device[:25]))  # fmt: skip
+    first = echo.capture([cut], [5])[0]
+    torch.testing.assert_close(motion.R_parent_joint[:25], first.R_parent_joint, atol=1e-4, rtol=0)
+
+
+def test_a_frame_waits_for_the_ramp():
+    echo, recording = drawn_echo(), carrying(1.0)
+    assert echo.latency_s == pytest.approx(7 / FPS)
+    queue, told = EchoQueue(echo, [echo.skeleton], [0]), lane(echo, scenario_of(recording)).told
+    given = [queue.push(told.frames(slice(k, k + 1))) is not None for k in range(30)]
+    assert given == [False] * 7 + [True] * 23
+
+
+def test_a_queue_needs_no_more_the_longer_it_runs():
+    echo = drawn_echo()
+    queue, told = EchoQueue(echo, [echo.skeleton], [0]), lane(echo, scenario_of(carrying(2.0))).told
+    for k in range(60):
+        queue.push(told.frames(slice(k, k + 1)))
+        assert queue.told.valid.shape[1] == queue.conveyor.x.shape[1] <= WINDOW
+
+
+def test_acts_may_be_given():
+    recording, environment = carrying(1.5), boxes()
+    acts = [{"object": "box_1", "start_s": 0.9, "stop_s": 1.2}, {"object": "box_1", "start_s": 0.2, "stop_s": 0.4}]  # fmt: skip
+    told = drawn_echo(acts=acts).scenario(recording, environment).acts
+    assert [act.start_s for act in told] == [0.2, 0.9]
+    assert drawn_echo(acts="none").scenario(recording, environment).acts == ()
+    assert [act.object for act in drawn_echo().scenario(recording, environment).acts] == ["box_1"]
+    assert drawn_echo().scenario(carrying(1.0, carried=()), None).acts == ()
+
+
+@pytest.mark.parametrize(
+    "wrong", ["guess", [{"object": "a"}], [{"object": "a", "start_s": 0.0, "end_s": 1.0}]]
+)
+def test_acts_that_are_none_are_refused(wrong):
+    with pytest.raises(WearcapError, match="acts.*Expected .*a list of {object, start_s, stop_s}"):
+        drawn_echo(acts=wrong)
+
+
+def tracked(recording, **changes):
+    """With wrists from controllers at another rate, in place of the true ones."""
+    motion = carrying(recording.motion.timestamps[-1].item() + 0.1, fps=90.0).motion
+    tracks = {}
+    for joint in ("left_wrist", "right_wrist"):
+        T = motion.joint(joint)
+        tracks[joint] = Trajectory(motion.timestamps, T.R, T.t)
+    return replace(recording, tracked=tracks | changes)
+
+
+def test_wrists_of_controllers_are_as_good_as_true_ones():
+    recording = carrying(1.0)
+    echo = drawn_echo()
+    one, two = (lane(echo, scenario_of(each)).told for each in (recording, replace(tracked(recording), motion=None)))  # fmt: skip
+    torch.testing.assert_close(one.t_world_point, two.t_world_point, atol=1e-4, rtol=0)
+    torch.testing.assert_close(one.R_world_point, two.R_world_point, atol=1e-4, rtol=0)
+
+
+def test_the_grip_of_these_tests_is_no_identity():
+    assert not torch.allclose(GRIP.R, rotation.about_axis("z", torch.zeros(())), atol=0.1)

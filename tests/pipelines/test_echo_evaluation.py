@@ -1,0 +1,188 @@
+"""ECHO's scores and its baselines: the truth is perfect, what is wrong is wrong by as much, and baselines find their like."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from carried_box import (
+    GRIP,
+    WINDOW,
+    boxes,
+    carried_dataset,
+    carrying,
+    drawn_echo,
+    scenario_of,
+    small_features,
+)
+from wearcap.data.echo_features import CONTACTS
+from wearcap.data.echo_windows import EchoDataset
+from wearcap.data.windows import Source
+from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.metrics.objects import vertex_error_cm
+from wearcap.pipelines.echo_baselines import NearestEcho, RigidWrist
+from wearcap.pipelines.echo_dataset import EchoOnDataset
+from wearcap.pipelines.echo_evaluation import MEASURES, MODALITIES, observed_share, score_echo, truth_of
+from wearcap.pipelines.echo_told import lane_of
+from wearcap.pipelines.hmd2 import head_path
+from wearcap.recording import RecordingStore
+
+RECORDING = carrying(1.5)
+TIMES = RECORDING.motion.timestamps
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return scenario_of(RECORDING)
+
+
+@pytest.fixture(scope="module")
+def truth(scenario):
+    return truth_of(scenario, TIMES, drawn_echo().reader())
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> EchoDataset:
+    root = carried_dataset(tmp_path_factory.mktemp("carried"))
+    return EchoDataset([Source(root)], "train", features=small_features(), encoder=None, window=WINDOW, stride=4)  # fmt: skip
+
+
+def perfect(truth):
+    return replace(
+        truth.motion, object_motion=RECORDING.object_motion, body_contact_prob=truth.touch.float(),
+    )  # fmt: skip
+
+
+def test_the_truth_is_perfect(truth):
+    scores = score_echo(perfect(truth), truth, "a", 0).scores
+    assert set(MEASURES) <= set(scores)
+    for name in (
+        "mpjpe_mm",
+        "mpjve_mm",
+        "v2v_cm",
+        "center_cm",
+        "rotation_deg",
+        "quaternion",
+        "busy_mpjpe_mm",
+    ):
+        assert scores[name] == pytest.approx(0.0, abs=0.05), name
+    assert scores["touch_f1"] == 1.0
+    assert scores["foot_contact"] == scores["true_foot_contact"] > 0
+    assert scores["jitter_m_s3"] == scores["true_jitter_m_s3"]
+
+
+def test_what_is_wrong_is_wrong_by_as_much(truth):
+    motion = perfect(truth)
+    track = RECORDING.object_motion["box_1"]
+    shifted = Trajectory(track.timestamps, track.R_world_body, track.t_world_body + torch.tensor([0.03, 0.0, 0.04]))  # fmt: skip
+    moved = replace(motion, t_world_root=motion.t_world_root + 0.1, object_motion={"box_1": shifted})
+    scores = score_echo(moved, truth, "a", 0).scores
+    assert scores["mpjpe_mm"] == pytest.approx(100 * 3**0.5, rel=1e-3)
+    assert scores["mpjve_mm"] == pytest.approx(0.0, abs=0.01)
+    assert scores["v2v_cm"] == pytest.approx(5.0, rel=1e-3)
+    assert scores["center_cm"] == pytest.approx(5.0, rel=1e-3)
+    assert scores["rotation_deg"] == pytest.approx(0.0, abs=0.05)
+
+
+def test_objects_count_while_they_are_active_alone(truth):
+    track, busy = RECORDING.object_motion["box_1"], truth.active >= 0
+    assert busy.any()
+    assert not busy.all()
+    away = torch.where(busy[:, None], track.t_world_body, 9.0)
+    moved = replace(perfect(truth), object_motion={"box_1": Trajectory(track.timestamps, track.R_world_body, away)})  # fmt: skip
+    assert score_echo(moved, truth, "a", 0).scores["v2v_cm"] == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_human_alone_has_no_scores_of_objects():
+    recording = carrying(1.0, carried=())
+    alone = truth_of(scenario_of(recording), recording.motion.timestamps, drawn_echo().reader())
+    scores = score_echo(alone.motion, alone, "a", 0).scores
+    assert "v2v_cm" not in scores
+    assert "touch_f1" not in scores
+
+
+def test_truth_is_read_at_a_captures_own_times(truth, scenario):
+    fine = torch.arange(0.0, 1.2, 0.01, dtype=torch.float64)
+    other = truth_of(scenario, fine, drawn_echo().reader())
+    assert len(other.motion) == len(fine) == len(other.touch)
+    torch.testing.assert_close(other.T_world_object[0].t[::10], truth.T_world_object[0].t[:36:3], atol=1e-4, rtol=0)  # fmt: skip
+
+
+@pytest.mark.parametrize("missing", ["motion", "object_motion"])
+def test_without_a_truth_there_is_nothing_to_compare_with(scenario, missing):
+    nothing = replace(RECORDING, **{missing: None if missing == "motion" else {}})
+    with pytest.raises(WearcapError, match="carry: no true .*Expected"):
+        truth_of(replace(scenario, recording=nothing), TIMES, drawn_echo().reader())
+
+
+@pytest.mark.parametrize("modality", MODALITIES)
+@pytest.mark.parametrize("share", [0.1, 1.0])
+def test_a_share_of_the_truth_is_observed(truth, scenario, modality, share):
+    seen = observed_share(truth, modality, share, seed=1)
+    echo = drawn_echo()
+    lane = lane_of(replace(scenario, observed=seen), head_path(RECORDING, echo.skeleton, echo.fps), echo.reader())  # fmt: skip
+    known, place = lane.told.is_known[0], MODALITIES.index(modality)
+    assert not known[:, [k for k in range(3) if k != place]].any()
+    if share == 1.0:
+        active = lane.told.has_object[0]
+        assert torch.equal(known[:, place], active if modality == "object" else torch.ones_like(active))
+    elif modality != "object":
+        assert known[:, place].sum() == round(share * len(TIMES))
+    other = observed_share(truth, modality, share, seed=1)
+    assert str(other) == str(seen)
+    if modality == "contact":
+        assert seen.contact.shape[1] == CONTACTS
+
+
+def test_an_unknown_modality_is_refused(truth):
+    with pytest.raises(WearcapError, match="no modality 'smell'. Expected one of human, object, contact"):
+        observed_share(truth, "smell", 0.1, 0)
+
+
+def test_a_data_set_brings_its_objects(dataset):
+    store = dataset.recordings[0][0]
+    on = EchoOnDataset(drawn_echo(), store.root)
+    recordings = [store.load(name) for name in ("c0", "c1")]
+    motions = on.capture(recordings, [0, 0])
+    assert [set(motion.object_motion) for motion in motions] == [{"box_1"}] * 2
+    row = on.score(motions[0], recordings[0], "c0", 0)
+    assert {"v2v_cm", "mpjpe_mm"} <= set(row.scores)
+    assert on.environment(replace(recordings[0], environment=None)) is None
+    given = EchoOnDataset(drawn_echo(environment=str(store.root / "scene")), Path("elsewhere"))
+    assert given.environment(recordings[0]).by_name("box_1") is not None
+
+
+def test_the_nearest_window_of_what_was_seen_is_itself(dataset):
+    nearest = NearestEcho.fit(dataset, window=12, stride=1)
+    recording = replace(dataset.recordings[0][0].load("c0"), name="again")
+    motion = nearest.capture_scenarios([scenario_of(recording, margin_s=2.0)], [0])[0]
+    away = (motion.T_world_joint.t - recording.motion.T_world_joint.t).norm(dim=-1)
+    assert away.mean() < 0.03
+    found, true = motion.object_motion["box_1"], recording.object_motion["box_1"]
+    assert (found.t_world_body - true.t_world_body).norm(dim=-1).mean() < 0.03
+
+
+def test_an_object_is_stuck_to_the_wrist_that_carried_it(dataset):
+    stuck = RigidWrist.fit(dataset)
+    echo, recording = drawn_echo(), carrying(1.5)
+    scenario = scenario_of(recording, margin_s=2.0)
+    lane = lane_of(scenario, head_path(recording, echo.skeleton, echo.fps), echo.reader())
+    motion = stuck.attached(recording.motion, lane)
+    found, true = motion.object_motion["box_1"], recording.object_motion["box_1"]
+    wrist = recording.motion.joint("left_wrist").t
+    assert (found.t_world_body - wrist).norm(dim=-1).max() < 0.4
+    error = vertex_error_cm(found.T_world_body, true.T_world_body, torch.zeros(1, 3))
+    assert error.mean() < 20
+    assert GRIP.t.norm() > 0.05
+
+
+def test_baselines_are_functions_of_the_training_split_alone(dataset):
+    one, two = (NearestEcho.fit(dataset, window=12) for _ in range(2))
+    assert torch.equal(one.said, two.said)
+    assert set(one.descriptor) == {"box"}
+    np.testing.assert_array_equal(one.frames["box"].numpy(), two.frames["box"].numpy())
+    assert RecordingStore.open(dataset.recordings[0][0].root).names("train") == ["c0"]
+    assert len(boxes()) == 1

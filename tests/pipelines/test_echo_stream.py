@@ -1,0 +1,295 @@
+"""ECHO as a stream: the same motion and objects as in one go, and what becomes known late is heard while it can be."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from carried_box import CARRIED, boxes, carrying, drawn_echo, scenario_of, thing
+from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.rigid import Rigid
+from wearcap.pipelines.echo_stream import EchoSession, EchoWearer
+from wearcap.pipelines.hmd2_stream import joined
+from wearcap.recording import Motion
+from wearcap.recording.acts import active_at
+from wearcap.scene.environment import Environment
+
+TWO = (("box_1", "left", 0.1, 0.4), ("box_2", "right", 0.7, 0.9))
+WRISTS = ("left_wrist", "right_wrist")
+NAN = Rigid(torch.full((3, 3), torch.nan), torch.zeros(3))
+
+
+def wearer(recording, **changes) -> EchoWearer:
+    head = recording.head
+    return EchoWearer(recording.skeleton, {}, head.R_head_device, head.t_head_device, **{"floor_m": 0.0} | changes)  # fmt: skip
+
+
+def feed(session: EchoSession, recording, frame: int, wrists=WRISTS) -> None:
+    head = recording.head
+    time = head.timestamps[frame].item()
+    session.head(time, head.T_world_device[frame])
+    for joint in wrists:
+        session.wrist(joint, time, recording.motion.joint(joint)[frame])
+
+
+def streamed(
+    session: EchoSession, recording, before=None, frames=None, wrists=WRISTS
+) -> tuple[Motion, list[int]]:
+    """The joined poses, and how many had come out after each frame; `before(frame)` happens first."""
+    parts, counts = [], []
+    for frame in frames or range(len(recording.motion)):
+        if before is not None:
+            before(frame)
+        feed(session, recording, frame, wrists)
+        parts.append(session.poses())
+        counts.append(sum(len(part) for part in parts if part is not None))
+    parts.append(session.poses(ended=True))
+    return joined([part for part in parts if part is not None]), counts
+
+
+def told_acts(session: EchoSession, scenario) -> None:
+    for act in scenario.acts:
+        session.activate(act.object, act.start_s)
+        session.activate(None, act.stop_s)
+
+
+def assert_same(motion: Motion, whole: Motion, scenario) -> None:
+    torch.testing.assert_close(motion.timestamps, whole.timestamps, atol=1e-6, rtol=0)
+    torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)
+    for name in ("contact_prob", "body_contact_prob"):
+        torch.testing.assert_close(getattr(motion, name), getattr(whole, name), atol=1e-3, rtol=0)
+    for act in scenario.acts:
+        active = active_at([act], [act.object], whole.timestamps) == 0
+        found, given = motion.object_motion[act.object], whole.object_motion[act.object]
+        torch.testing.assert_close(found.t_world_body, given.t_world_body[active], atol=1e-3, rtol=0)
+        torch.testing.assert_close(found.R_world_body, given.R_world_body[active], atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"frame": "window"}, {"hang": False}, {"per_frame": 2, "context": 0}]
+)
+def test_a_stream_says_what_a_whole_capture_says(settings):
+    """Two objects, one after the other, with nothing between."""
+    recording, echo = carrying(1.2, carried=TWO), drawn_echo(**settings)
+    scenario = scenario_of(recording, TWO)
+    session = EchoSession(echo, wearer(recording), boxes(TWO), seed=3)
+    told_acts(session, scenario)
+    motion, counts = streamed(session, recording)
+    assert_same(motion, echo.capture_scenarios([scenario], [3])[0], scenario)
+    waiting = round(echo.latency_s * echo.fps)
+    assert counts == [max(0, k - waiting) + (k >= waiting) for k in range(len(counts))]
+    assert session.dropped == session.silent == 0
+
+
+def test_a_human_alone_needs_no_objects():
+    recording, echo = carrying(1.0), drawn_echo()
+    motion, _ = streamed(EchoSession(echo, wearer(recording), seed=1), recording)
+    whole = echo.capture([recording], [1])[0]
+    torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)
+    assert motion.object_motion is None
+
+
+@pytest.mark.parametrize("late", [0, 3, 6])
+def test_an_object_may_be_told_of_before_its_frames_are_final(late):
+    """The act begins at frame 20; frames that are out already stay as they were."""
+    recording, echo = carrying(1.4), drawn_echo()
+    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    start = recording.motion.timestamps[20].item()
+    motion, _ = streamed(session, recording, lambda frame: session.activate("box_1", start) if frame == 21 + late else None)  # fmt: skip
+    track = motion.object_motion["box_1"]
+    assert track.timestamps[0].item() == pytest.approx(start, abs=1e-6)
+    assert len(track) == len(motion) - 20
+    assert track.t_world_body.isfinite().all()
+
+
+def test_what_is_final_stays_as_it_was():
+    recording, echo = carrying(1.4), drawn_echo()
+    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    motion, _ = streamed(session, recording, lambda frame: session.activate("box_1", 0.0) if frame == 25 else None)  # fmt: skip
+    alone = echo.capture([recording], [3])[0]
+    torch.testing.assert_close(motion.T_world_joint.t[:18], alone.T_world_joint.t[:18], atol=1e-3, rtol=0)
+    assert motion.object_motion["box_1"].timestamps[0].item() == pytest.approx(18 / 30, abs=1e-6)
+
+
+def test_an_object_that_is_seen_is_where_it_was_seen():
+    recording, echo = carrying(1.4), drawn_echo(hang=False)
+    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    session.activate("box_1", 0.0)
+    track = recording.object_motion["box_1"]
+
+    def look(frame: int) -> None:
+        if frame in (14, 30):  # the pose of four frames ago has been found
+            session.see_object("box_1", track.timestamps[frame - 4].item(), track.T_world_body[frame - 4])
+
+    motion, _ = streamed(session, recording, look)
+    found = motion.object_motion["box_1"]
+    for frame in (10, 26):
+        torch.testing.assert_close(found.t_world_body[frame], track.t_world_body[frame], atol=1e-4, rtol=0)
+        torch.testing.assert_close(found.R_world_body[frame], track.R_world_body[frame], atol=1e-4, rtol=0)
+    assert (found.t_world_body[18] - track.t_world_body[18]).norm() > 0.01
+
+
+def test_what_was_seen_of_one_object_is_not_believed_of_another():
+    recording, echo = carrying(1.4, carried=TWO), drawn_echo(hang=False)
+    session = EchoSession(echo, wearer(recording), boxes(TWO), seed=3)
+    session.activate("box_1", 0.0)
+    far = Rigid(torch.eye(3), torch.tensor([50.0, 0.0, 0.0]))
+
+    def happen(frame: int) -> None:
+        if frame == 20:
+            session.see_object("box_1", 18 / 30, far)
+        if frame == 21:
+            session.activate("box_2", 15 / 30)
+
+    motion, _ = streamed(session, recording, happen)
+    assert motion.object_motion["box_2"].t_world_body.abs().max() < 20
+
+
+@pytest.mark.parametrize("broken", [NAN, Rigid(torch.eye(3), torch.tensor([0.0, torch.inf, 0.0]))])
+def test_what_is_not_finite_is_left_out(broken):
+    recording, echo = carrying(1.0), drawn_echo()
+    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    session.activate("box_1", 0.0)
+
+    def happen(frame: int) -> None:
+        time = frame / 30
+        if frame in (5, 12):
+            session.head(time - 0.01, broken)
+            session.head(float("nan"), recording.head.T_world_device[frame])
+            session.wrist("left_wrist", time - 0.01, broken)
+            session.wrist("left_wrist", float("nan"), recording.motion.joint("left_wrist")[frame])
+            session.see_object("box_1", time - 2 / 30, broken)
+            session.see_object("box_1", float("nan"), Rigid.identity())
+
+    motion, _ = streamed(session, recording, happen)
+    plain = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    plain.activate("box_1", 0.0)
+    expected, _ = streamed(plain, recording)
+    torch.testing.assert_close(motion.T_world_joint.t, expected.T_world_joint.t, atol=1e-3, rtol=0)
+    assert session.dropped == 4
+
+
+def test_wrists_may_come_late_and_in_any_order():
+    recording, echo = carrying(1.4), drawn_echo()
+    session, parts = EchoSession(echo, wearer(recording), seed=3), []
+    count = len(recording.motion)
+    for frame in range(count):
+        feed(session, recording, frame, ())
+        if frame % 6 == 5 or frame == count - 1:
+            for back in reversed(range(frame - frame % 6, frame + 1)):
+                for joint in WRISTS:
+                    session.wrist(joint, back / 30, recording.motion.joint(joint)[back])
+        parts.append(session.poses())
+    parts.append(session.poses(ended=True))
+    motion = joined([part for part in parts if part is not None])
+    whole = echo.capture([recording], [3])[0]
+    torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)
+    assert session.silent == 0
+
+
+def test_a_pose_that_comes_twice_is_left_out_however_late():
+    recording, echo = carrying(1.0), drawn_echo()
+    session = EchoSession(echo, wearer(recording), seed=3)
+
+    def repeat(frame: int) -> None:
+        if frame > 8:
+            session.wrist("left_wrist", (frame - 8) / 30, recording.motion.joint("left_wrist")[frame - 8])
+
+    fine = recording.motion.timestamps + 0.01  # between two wrists' poses
+    shifted = replace(recording, head=replace(recording.head, timestamps=fine))
+    parts = []
+    for frame in range(len(fine)):
+        repeat(frame)
+        session.head(fine[frame].item(), shifted.head.T_world_device[frame])
+        for joint in WRISTS:
+            session.wrist(joint, frame / 30, recording.motion.joint(joint)[frame])
+        parts.append(session.poses())
+    parts.append(session.poses(ended=True))
+    assert joined([part for part in parts if part is not None]).R_parent_joint.isfinite().all()
+
+
+def test_a_silent_wrist_is_counted_and_holds_nothing_up():
+    recording = carrying(2.0)
+    session = EchoSession(drawn_echo(), wearer(recording), seed=3)
+    motion, _ = streamed(session, recording, wrists=("left_wrist",))
+    assert len(motion) == len(recording.motion)
+    assert session.silent == len(motion)
+    assert motion.R_parent_joint.isfinite().all()
+
+
+def test_behind_a_gap_it_begins_anew_as_the_whole_capture_does():
+    recording, echo = carrying(3.0), drawn_echo()
+    keep = [*range(30), *range(60, 90)]
+    head = recording.head
+    known = replace(recording, head=replace(head, timestamps=head.timestamps[keep], R_world_device=head.R_world_device[keep], t_world_device=head.t_world_device[keep]))  # fmt: skip
+    session = EchoSession(echo, wearer(recording), seed=5)
+    parts = []
+    for frame in range(90):
+        time = frame / 30
+        if frame in keep:
+            session.head(time, head.T_world_device[frame])
+        for joint in WRISTS:
+            session.wrist(joint, time, recording.motion.joint(joint)[frame])
+        parts.append(session.poses())
+    parts.append(session.poses(ended=True))
+    motion = joined([part for part in parts if part is not None])
+    whole = echo.capture([known], [5])[0]
+    torch.testing.assert_close(motion.timestamps, whole.timestamps[keep], atol=1e-6, rtol=0)
+    torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t[keep], atol=1e-3, rtol=0)
+
+
+def test_a_long_stream_needs_no_more_than_a_short_one():
+    recording, echo = carrying(2.0), drawn_echo()
+    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    sizes = []
+    for lap in range(4):
+        for frame in range(40):
+            time = 4 / 3 * lap + frame / 30
+            session.head(time, recording.head.T_world_device[frame])
+            for joint in WRISTS:
+                session.wrist(joint, time, recording.motion.joint(joint)[frame])
+            if frame % 10 == 0:
+                session.activate("box_1" if frame % 20 else None, time)
+                session.see_object("box_1", time, recording.object_motion["box_1"].T_world_body[frame])
+            session.poses()
+        sizes.append((*(len(part) for part in session._wrists.values()), len(session._acts), len(session._seen), len(session._waiting), len(session._chunks)))  # fmt: skip
+    assert sizes[3] == sizes[1]
+
+
+def test_the_floor_is_where_one_who_stands_has_it():
+    recording = carrying(0.6)
+    session = EchoSession(drawn_echo(), wearer(recording, floor_m=None), seed=0)
+    streamed(session, recording)
+    head = recording.motion.joint("head").t[0, 2].item()
+    assert session._floor_m == pytest.approx(head - recording.skeleton.height_of("head"), abs=1e-5)
+
+
+def test_unknown_names_are_refused():
+    session = EchoSession(drawn_echo(), EchoWearer(carrying(0.6).skeleton), boxes())
+    for call in (
+        lambda: session.activate("ghost", 0.0),
+        lambda: session.see_object("ghost", 0.0, Rigid.identity()),
+    ):
+        with pytest.raises(WearcapError, match="no object 'ghost'. Expected one of box_1"):
+            call()
+    with pytest.raises(WearcapError, match="no tracked joint 'nose'. Expected left_wrist or right_wrist"):
+        session.wrist("nose", 0.0, Rigid.identity())
+
+
+def test_objects_that_cannot_be_used_are_refused_when_they_are_named():
+    mesh = boxes(CARRIED).by_name("box_1").mesh
+    huge = Mesh(mesh.vertices * 1000, mesh.faces, mesh.color)
+    things = Environment((thing("a", mesh=huge), thing("b", "piano")))
+    session = EchoSession(drawn_echo(), EchoWearer(carrying(0.6).skeleton), things)
+    with pytest.raises(WearcapError, match="object 'a': .*looks like millimetres"):
+        session.activate("a", 0.0)
+    with pytest.raises(WearcapError, match="knows no object class 'piano'"):
+        session.activate("b", 0.0)
+    with pytest.raises(WearcapError, match="no object 'c'"):
+        session.activate("c", 0.0)
+
+
+def test_windows_from_scratch_are_no_stream():
+    with pytest.raises(WearcapError, match="rewindow=3. Expected a conveyor"):
+        EchoSession(drawn_echo(rewindow=3), EchoWearer(carrying(0.6).skeleton))

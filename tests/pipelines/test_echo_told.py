@@ -1,0 +1,139 @@
+"""What ECHO cannot be told: each fault with its own message, that says where and what was expected."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from carried_box import box_mesh, boxes, carrying, drawn_echo, scenario_of, thing
+from wearcap.data.echo_features import CONTACTS
+from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.pipelines.echo_told import Observed, lane_of
+from wearcap.pipelines.hmd2 import head_path
+from wearcap.recording.acts import Act
+from wearcap.scene.environment import Environment
+
+RECORDING = carrying(1.0)
+TIMES = RECORDING.motion.timestamps
+
+
+def told(scenario):
+    echo = drawn_echo()
+    return lane_of(scenario, head_path(scenario.recording, echo.skeleton, echo.fps), echo.reader()).told
+
+
+def with_mesh(vertices=None, faces=None, category: str = "box"):
+    mesh = box_mesh()
+    given = Mesh(mesh.vertices if vertices is None else vertices.astype(np.float32), mesh.faces if faces is None else faces, mesh.color)  # fmt: skip
+    return replace(scenario_of(RECORDING), environment=Environment((thing("box_1", category, given),)))
+
+
+def spoiled() -> np.ndarray:
+    vertices = box_mesh().vertices.copy()
+    vertices[3] = np.nan
+    return vertices
+
+
+def tracked(**changes):
+    """Wrists from controllers, some of them changed."""
+    tracks = {}
+    for joint in ("left_wrist", "right_wrist"):
+        T = RECORDING.motion.joint(joint)
+        tracks[joint] = Trajectory(TIMES, T.R, T.t)
+    return scenario_of(replace(RECORDING, tracked=tracks | changes))
+
+
+def track(take=slice(None), shift: float = 0.0, broken: bool = False) -> Trajectory:
+    T = RECORDING.motion.joint("left_wrist")[take]
+    t = torch.where(torch.arange(len(T.t))[:, None] == 7, torch.nan, T.t) if broken else T.t
+    return Trajectory(TIMES[take] + shift, T.R, t)
+
+
+def swapped():
+    scenario = tracked()
+    left, right = (scenario.recording.tracked[joint] for joint in ("left_wrist", "right_wrist"))
+    return tracked(left_wrist=right, right_wrist=left)
+
+
+def observing(**seen):
+    return scenario_of(RECORDING, observed=Observed(**seen))
+
+
+def late_motion():
+    return replace(RECORDING.motion, timestamps=TIMES + 1.0)
+
+
+def broken_motion():
+    return replace(RECORDING.motion, t_world_root=torch.full_like(RECORDING.motion.t_world_root, torch.nan))
+
+
+BOX = RECORDING.object_motion["box_1"]
+FAULTS = {
+    "a mesh in millimetres": (lambda: with_mesh(box_mesh().vertices * 1000), "object 'box_1' of carry: .*looks like millimetres"),
+    "a mesh that is not centred": (lambda: with_mesh(box_mesh().vertices + 3), "object 'box_1' of carry: .*not centred"),
+    "a mesh with NaN": (lambda: with_mesh(spoiled()), "object 'box_1' of carry: 1 vertices .* NaN"),
+    "a mesh without faces": (lambda: with_mesh(faces=np.zeros((0, 3), np.int32)), "object 'box_1' of carry: .*no faces"),
+    "an unknown class": (lambda: with_mesh(category="piano"), "object 'box_1' of carry: .*no object class 'piano'. Expected one of box, chair"),
+    "an act of an unknown object": (
+        lambda: replace(scenario_of(RECORDING), acts=(Act("ghost", 0.0, 1.0),)), "object 'ghost' of carry: no object 'ghost'. Expected one of box_1"),
+    "acts, but no objects": (lambda: replace(scenario_of(RECORDING), environment=None), "carry: acts of 'box_1', but no objects"),
+    "wrists swapped": (swapped, "carry: the left wrist is .* cm to the right of the right one.*Swap the two trackers"),
+    "no wrists": (
+        lambda: scenario_of(replace(RECORDING, motion=None)), "carry: wrists are tracked by nothing.*Expected `tracked` poses of left_wrist and"),
+    "wrists with NaN": (lambda: tracked(left_wrist=track(broken=True)), "carry: poses of wrists that are NaN"),
+    "a wrist for a part of the time": (
+        lambda: tracked(left_wrist=track(slice(0, 10))), "carry: tracking of left_wrist from 0.00 to 0.30 s. Expected all of 0.00 to 0.97 s"),
+    "a wrist of another clock": (lambda: tracked(left_wrist=track(shift=60.0)), "tracking of left_wrist from 60.00"),
+    "a wrist at a single time": (lambda: tracked(left_wrist=track(slice(0, 1))), "tracking of left_wrist at 1 times"),
+    "a wrist whose times fall": (lambda: tracked(left_wrist=track(torch.arange(30).flip(0))), "30 times that do not grow"),
+    "a body observed too late": (lambda: observing(motion=late_motion()), "carry: an observation at 1.* beyond the recording.*Expected times from 0.00 to 0.97"),
+    "an object observed too late": (
+        lambda: observing(object_motion={"box_1": replace(BOX, timestamps=BOX.timestamps + 2.0)}), "carry: an observation at 2.* s, beyond"),
+    "contacts observed too early": (
+        lambda: observing(contact_times=torch.tensor([-3.0]).double(), contact=torch.zeros(1, CONTACTS)), "carry: an observation at -3.00 s"),
+    "observed at no time": (
+        lambda: observing(contact_times=torch.tensor([torch.nan]).double(), contact=torch.zeros(1, CONTACTS)), "carry: an observation at nan s"),
+    "an unknown object observed": (lambda: observing(object_motion={"ghost": BOX}), "carry: an observed object 'ghost'. Expected one of box_1"),
+    "too few contacts": (
+        lambda: observing(contact_times=TIMES[:1], contact=torch.zeros(1, 4)), "carry: observed contacts of 4 points. Expected 64 of the body"),
+    "an observed body with NaN": (lambda: observing(motion=broken_motion()), "carry: observations that are NaN"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_named(fault):
+    make, message = FAULTS[fault]
+    with pytest.raises(WearcapError, match=message) as caught:
+        told(make())
+    assert caught.value.expected
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+
+def test_what_is_sound_passes():
+    assert told(tracked()).valid.all()
+    assert told(scenario_of(RECORDING)).has_object.any()
+
+
+def test_what_is_seen_of_an_object_while_it_is_not_active_is_not_believed():
+    scenario = observing(object_motion={"box_1": BOX})
+    seen = told(scenario)
+    assert torch.equal(seen.is_known[0, :, 1], seen.has_object[0])
+
+
+def test_the_floor_is_the_recordings_else_the_paths():
+    floor = replace(RECORDING.floor, height=torch.full((30,), 0.2))
+    assert (told(scenario_of(replace(RECORDING, floor=floor))).floor_height == 0.2).all()
+    without = told(scenario_of(replace(RECORDING, floor=None))).floor_height
+    assert without.abs().max() < 0.2
+
+
+def test_objects_are_read_once_however_often_they_are_active():
+    acts = (Act("box_1", 0.0, 0.3), Act("box_1", 0.6, 0.8))
+    echo, scenario = drawn_echo(), replace(scenario_of(RECORDING), acts=acts, environment=boxes())
+    lane = lane_of(scenario, head_path(RECORDING, echo.skeleton, echo.fps), echo.reader())
+    assert len(lane.objects) == 1
+    assert lane.told.has_object[0].sum() == 9 + 6

@@ -1,0 +1,265 @@
+"""Training ECHO: the truth costs nothing, objects count where there are some, every experiment runs, resumed as straight."""
+
+import csv
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from carried_box import WINDOW, carried_dataset, carrying, small_features, small_net
+from wearcap.body.skeleton import xsens23
+from wearcap.cli import capture, evaluate, train
+from wearcap.cli.conf import conf_dir
+from wearcap.cli.load import load_system
+from wearcap.data.echo_features import OBJECT_SIZE
+from wearcap.data.echo_windows import EchoDataset, EchoWindow
+from wearcap.data.statistics import collate
+from wearcap.data.windows import Source
+from wearcap.diffusion.levels import LevelMix
+from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.io.motion_npz import read_motion
+from wearcap.models.echo import EchoDenoiser
+from wearcap.training.echo_diffusion import EchoDiffusion
+from wearcap_testing import small_dataset
+
+EXPERIMENTS = sorted(
+    path.stem
+    for kind in ("echo", "bodiffusion")
+    for path in (conf_dir() / "experiment").glob(f"{kind}*.yaml")
+)
+WEIGHTS = {"human": 1.0, "object": 1.0, "contact": 1.0, "object_vertices": 1.0, "joints": 2.0, "velocity": 0.1, "skate": 0.05}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> str:
+    return carried_dataset(tmp_path_factory.mktemp("carried"))
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory) -> str:
+    return str(small_dataset(tmp_path_factory.mktemp("people"), (200,) * 6).root)
+
+
+def dataset(features, *roots: str) -> EchoDataset:
+    sources = [Source(root) for root in roots]
+    return EchoDataset(sources, "train", features=features, encoder=None, window=WINDOW, stride=4)
+
+
+def batch(features, *roots: str, count: int = 8) -> EchoWindow:
+    windows = dataset(features, *roots)
+    return collate([windows[(k * 5 % len(windows), k)] for k in range(count)])
+
+
+def learner(net=None, frame: str = "own", **changes) -> EchoDiffusion:
+    features = small_features(frame)
+    make = net or partial(EchoDenoiser, window=WINDOW, width=32, layers=1, heads=2, feedforward=32, dropout=0.0)  # fmt: skip
+    given = {"loss_weights": WEIGHTS, "levels": LevelMix(ramp=(4, 16)), "optimizer": torch.optim.AdamW}
+    return EchoDiffusion(make, features, CosineSchedule(), xsens23(), **given | changes)
+
+
+class Oracle(EchoDenoiser):
+    """Says what it was told to."""
+
+    def forward(self, x_t, level, encoded, valid):
+        return self.said
+
+
+def oracle(frame: str = "own") -> EchoDiffusion:
+    return learner(partial(Oracle, window=WINDOW, width=32, layers=1, heads=2, feedforward=32), frame)
+
+
+def explicit_vertices(batch: EchoWindow, cloud: torch.Tensor, R, t) -> torch.Tensor:
+    """Root of the mean square over all points of an object, point by point."""
+    found = (R[:, :, None] @ cloud[None, None, :, :, None])[..., 0] + t[:, :, None]
+    true = batch.T_world_object[:, :, None] @ cloud
+    return ((found - true).square().sum(-1).mean(-1) + 1e-6).sqrt()
+
+
+@pytest.mark.parametrize("frame", ["own", "window", "world"])
+def test_the_truth_costs_nothing(data, people, frame):
+    system = oracle(frame)
+    windows = batch(system.features, data, people)
+    at = system.features.canonical(windows.points)
+    system.net.said = system._truth(windows, at)
+    for name, term in system.terms(windows).items():
+        if name != "skate":
+            assert term < 0.005, name
+    wrong = system.net.said.clone()
+    wrong[..., 2] += 0.1
+    system.net.said = wrong
+    terms = system.terms(windows)
+    assert terms["joints"] == pytest.approx(0.1, abs=0.01)
+    assert terms["object_vertices"] < 0.005
+    assert terms["velocity"] < 1e-3
+
+
+@pytest.mark.parametrize("frame", ["own", "window"])
+def test_the_vertex_term_is_the_mean_over_the_points(data, frame):
+    system = oracle(frame)
+    windows, source = batch(system.features, data), dataset(system.features, data)
+    cloud = source.track(0).objects[0].cloud
+    at = system.features.canonical(windows.points)
+    said = system._truth(windows, at)
+    turn = rotation.exp(0.7 * torch.randn(*windows.valid.shape, 3))
+    R, t = turn @ windows.R_world_object, windows.t_world_object + 0.2 * torch.randn_like(windows.t_world_object)  # fmt: skip
+    first = system.net.sizes[0]
+    said[..., first : first + OBJECT_SIZE] = system.features.encode_object(type(at)(R, t), at)
+    value = system._vertices(said, windows, at)
+    torch.testing.assert_close(value, explicit_vertices(windows, cloud, R, t).mean(), atol=1e-4, rtol=1e-4)
+
+
+def test_objects_that_are_not_there_count_for_nothing(data, people):
+    torch.manual_seed(0)
+    system = learner(partial(small_net_like))
+    mixed = batch(system.features, data, people, count=12)
+    none = ~mixed.has_object
+    assert none.any()
+    assert mixed.has_object.any()
+    other = mixed._replace(
+        R_world_object=torch.where(none[..., None, None], rotation.exp(torch.ones(3)), mixed.R_world_object),
+        t_world_object=torch.where(none[..., None], 9.0, mixed.t_world_object),
+        object_code=torch.where(none[..., None], 5.0, mixed.object_code),
+    )
+    for name, term in system.terms(mixed).items():
+        torch.testing.assert_close(system.terms(other)[name], term, msg=name)
+
+
+def small_net_like(**_):
+    return small_net(small_features())
+
+
+def test_absent_objects_are_noise_alone(data, people):
+    system = learner()
+    windows = batch(system.features, data, people, count=12)
+    levels = system._levels(windows)
+    assert (levels[..., 1][~windows.has_object] == 1).all()
+    assert (levels[..., 1][windows.has_object] < 1).any()
+    without = learner(contacts=False)
+    assert (without._levels(windows)[..., 2] == 1).all()
+    assert "contact" not in without.terms(windows)
+
+
+def test_padding_counts_for_nothing(data):
+    torch.manual_seed(0)
+    system = learner(partial(small_net_like))
+    windows = batch(system.features, data)
+    short = windows.valid.clone()
+    short[:, 10:] = False
+    windows = windows._replace(valid=short)
+    other = windows._replace(
+        t_world_root=torch.where(short[..., None], windows.t_world_root, 7.0),
+        t_world_object=torch.where(short[..., None], windows.t_world_object, -7.0),
+        contact=torch.where(short[..., None], windows.contact, 1.0),
+    )
+    for name, term in system.terms(windows).items():
+        torch.testing.assert_close(system.terms(other)[name], term, msg=name)
+
+
+@pytest.mark.parametrize("frame", ["own", "window", "world"])
+def test_every_term_is_finite_and_every_weight_is_learned(data, people, frame):
+    torch.manual_seed(0)
+    system = learner(frame=frame)
+    system.set_statistics(dataset(system.features, data, people), 100)
+    terms = system.terms(batch(system.features, data, people))
+    assert set(terms) == set(WEIGHTS)
+    assert all(term.isfinite() for term in terms.values())
+    sum(WEIGHTS[name] * term for name, term in terms.items()).backward()
+    for name, parameter in system.net.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+
+
+def test_where_windows_move_vectors_share_one_scale(data):
+    system = learner(frame="window")
+    system.set_statistics(dataset(system.features, data), 100)
+    mean, scale = system.net.motion_normalizer.mean, system.net.motion_normalizer.scale
+    first = system.net.sizes[0]
+    for part in (slice(0, 3), slice(3, 9), slice(first, first + 3), slice(first + 3, first + 9)):
+        assert (mean[part] == 0).all()
+        assert (scale[part] == scale[part][0]).all()
+    assert (scale[first + OBJECT_SIZE :] == 1).all()
+
+
+def test_windows_and_model_must_be_of_the_same_features(data):
+    with pytest.raises(WearcapError, match="windows of other features"):
+        learner(frame="world").set_statistics(dataset(small_features("own"), data), 100)
+
+
+def test_one_batch_is_learned(data, people):
+    torch.manual_seed(0)
+    system = learner()
+    system.set_statistics(dataset(system.features, data, people), 100)
+    windows = batch(system.features, data, people, count=4)
+    optimizer, losses = torch.optim.AdamW(system.parameters(), 5e-3), []
+    for _ in range(50):
+        loss = system.measure(windows)["loss"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.35 * losses[0]
+
+
+def arguments(experiment: str, data: str, people: str, run: Path, *more: str) -> list[str]:
+    human = [] if experiment == "echo_without_people" else [f"data.sources.cmu.root={people}"]
+    return [
+        f"experiment={experiment}", f"data.sources.objects.root={data}", f"data.val_sources.objects.root={data}", *human,
+        "debug=fast", f"hydra.run.dir={run}", f"paths.outputs={run.parent}", f"data.window={WINDOW}", "data.workers=0",
+        "data.encoder=null", "model.encoder=null", "features.shape_size=0", "model.net.width=32", "model.net.layers=1",
+        "model.net.heads=4", "model.net.feedforward=32", "trainer.accelerator=cpu", "trainer.precision=32-true",
+        "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "callbacks.progress=null",
+        "logger.csv.flush_logs_every_n_steps=1", *more,
+    ]  # fmt: skip
+
+
+def losses_of(run: Path) -> dict[int, str]:
+    with open(run / "metrics.csv") as file:
+        return {int(row["step"]): row["train/loss"] for row in csv.DictReader(file) if row.get("train/loss")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_runs(experiment, data, people, tmp_path):
+    train.main(arguments(experiment, data, people, tmp_path / "run", "trainer.max_steps=2"))
+    system, _ = load_system(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    assert isinstance(system, EchoDiffusion)
+    assert not torch.equal(system.net.motion_normalizer.scale, torch.ones(sum(system.net.sizes)))
+
+
+@pytest.mark.slow
+def test_stopped_and_resumed_equals_straight_through(data, people, tmp_path):
+    """Batches, noise, levels and dropout are functions of seed and step."""
+    more = ("data.steps_per_epoch=2", "model.net.dropout=0.3", "optimizer.scheduler.total=6", "optimizer.scheduler.warmup=1")  # fmt: skip
+    runs = {name: tmp_path / name / "run" for name in ("straight", "half", "resumed")}
+    train.main(arguments("echo", data, people, runs["straight"], "trainer.max_steps=6", *more))
+    train.main(arguments("echo", data, people, runs["half"], "trainer.max_steps=2", *more))
+    resume = f"resume={runs['half']}/checkpoints/last.ckpt"
+    train.main(arguments("echo", data, people, runs["resumed"], "trainer.max_steps=6", resume, *more))
+    straight, after = losses_of(runs["straight"]), losses_of(runs["resumed"])
+    assert min(after) == 2
+    assert after == {step: loss for step, loss in straight.items() if step >= 2}
+
+
+def test_with_the_encoder_it_trains_is_evaluated_and_captures(data, people, tmp_path):
+    """The whole way with the objects' shapes, as the configs have it."""
+    run = tmp_path / "run"
+    given = [row for row in arguments("echo", data, people, run) if "encoder=null" not in row and "shape_size" not in row]  # fmt: skip
+    train.main(given)
+    checkpoint = run / "checkpoints" / "last.ckpt"
+    assert load_system(checkpoint)[0].features.shape_size == 256
+    common = [f"checkpoint={checkpoint}", "pipeline=echo_online", "pipeline.context=12"]
+    evaluate.main([
+        *common, f"dataset={data}", "baselines=false", "seeds=[0]", f"output={tmp_path}/table.json", f"hydra.run.dir={tmp_path}/e",
+    ])  # fmt: skip
+    scores = json.loads((tmp_path / "table.json").read_text())["methods"]["wearcap"]
+    assert {"mpjpe_mm", "v2v_cm", "center_cm", "rotation_deg", "touch_f1"} <= set(scores)
+    capture.main([
+        *common, f"recording={data}/c2", "video=false", "body=false", f"output={tmp_path}/c", f"hydra.run.dir={tmp_path}/c",
+    ])  # fmt: skip
+    motion = read_motion(tmp_path / "c" / "motion.npz")
+    assert len(motion) == len(carrying(2.0).motion)
+    assert set(motion.object_motion) == {"box_1"}
