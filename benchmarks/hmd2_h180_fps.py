@@ -4,15 +4,8 @@
 baseline, to be at least `goal` (on an H200). Without a CUDA device it is left out.
 """
 
-from online import figure, frames_per_second, pipeline_of, without_cuda
-
-DOCUMENT = 1350.0
+from online import beside_document
 
 
 def measure(pushes: int = 100) -> list[dict]:
-    if without_cuda("hmd2_h180_fps"):
-        return []
-    pipeline = pipeline_of(
-        "full", "cuda", stride=180, steps=20, spacing=1.0, runtime="auto", precision="auto"
-    )
-    return [figure("hmd2_h180_fps", frames_per_second(pipeline, pushes), DOCUMENT, 10.0)]
+    return beside_document("hmd2_h180_fps", 180, 1350.0, pushes)

@@ -124,6 +124,16 @@ def figure(name: str, value: float, baseline: float, goal: float) -> dict:
     }  # fmt: skip
 
 
+def beside_document(name: str, stride: int, document: float, pushes: int) -> list[dict]:
+    """Full model on a GPU at one stride in 20 steps, beside the document's frames per second; nothing without a GPU."""
+    if without_cuda(name):
+        return []
+    pipeline = pipeline_of(
+        "full", "cuda", stride=stride, steps=20, spacing=1.0, runtime="auto", precision="auto"
+    )
+    return [figure(name, frames_per_second(pipeline, pushes), document, 10.0)]
+
+
 def without_cuda(name: str) -> bool:
     """Whether a benchmark for a GPU has none; says so."""
     if not torch.cuda.is_available():

@@ -84,6 +84,15 @@ def test_two_processes_give_the_joint_gradient():
     assert figure["ratio"] <= figure["goal"]
 
 
+@pytest.mark.slow
+def test_a_short_echo_stream_is_measured():
+    figure = figure_of(
+        "import echo_stream_memory as b; print(*map(json.dumps, b.measure(minutes=0.2)), sep='\\n')"
+    )
+    assert figure["name"] == "echo_stream_memory"
+    assert 0.9 < figure["ratio"] < 1.2
+
+
 def test_dominant_frequency_finds_a_planted_one():
     import gait_statistics as gait
 

@@ -10,10 +10,10 @@ from ocam_files import lens, xml_of
 
 from wearcap.body.skeletons import smpl24
 from wearcap.geometry import rotation
-from wearcap.io.amass import A
 from wearcap.io.hps import PELVIS_SMPL, nominal_mount
 from wearcap.io.hps_unity import JOINTS
 from wearcap.io.ply import Ply, write_ply
+from wearcap.io.smpl_axes import A
 from wearcap.recording import Motion
 from wearcap_testing import swaying_motion
 
@@ -125,3 +125,9 @@ def write_hps(root: Path, name: str = NAME, scan: bool = True) -> Motion:
     if scan:
         write_scan(root / "scans" / SCAN)
     return truth
+
+
+def same_motion(a, b, atol: float = 1e-5) -> None:
+    assert a.skeleton.name == b.skeleton.name == "smpl24"
+    torch.testing.assert_close(a.R_parent_joint, b.R_parent_joint, atol=atol, rtol=0)
+    torch.testing.assert_close(a.t_world_root, b.t_world_root, atol=atol, rtol=0)

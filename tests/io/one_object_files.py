@@ -7,21 +7,21 @@ import joblib
 import numpy as np
 import torch
 
+from boxes import BOX_FACES, box_corners
 from wearcap.body.skeleton import Skeleton
 from wearcap.body.skeletons import smplh52, smplx22
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.amass import PELVIS_SMPLH, A
+from wearcap.io.amass import PELVIS_SMPLH
 from wearcap.io.ply import Ply, write_ply
+from wearcap.io.smpl_axes import A
 from wearcap.recording import Motion
 
 BEHAVE_NAME, OMOMO_NAME = "Date03_Sub04_boxlarge_hand", "sub16_largebox_007"
 T_CAMERA_WORLD = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 """A level camera's axes: x right, y down, z forward."""
-CORNERS = np.array([[x, y, z] for x in (0.0, 0.4) for y in (0.0, 0.3) for z in (0.0, 0.2)], np.float32)
+CORNERS = box_corners((0.0, 0.0, 0.0), (0.4, 0.3, 0.2))
 """Of a box (m) whose corner is the origin."""
-FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
-                  [0, 6, 4], [1, 5, 7], [1, 7, 3]], np.int32)  # fmt: skip
 FLOOR = -1.3
 """Of the data's own world (m)."""
 TRANS2JOINT = np.array([0.01, 0.35, -0.02], np.float32)
@@ -93,7 +93,7 @@ def write_behave(
         np.savez(folder / f"{file}_fit_all.npz", **kept)
     info = {"cat": cat, "gender": "male", "config": "../calibs", "intrinsic": "../calibs", "empty": None}
     (folder / "info.json").write_text(json.dumps(info))
-    write_ply(ply or Ply(CORNERS, None, FACES), root / "objects" / cat / f"{cat}_f1000.ply")
+    write_ply(ply or Ply(CORNERS, None, BOX_FACES), root / "objects" / cat / f"{cat}_f1000.ply")
     return root
 
 
@@ -114,12 +114,8 @@ def omomo_entry(fps: float = 30.0, name: str = OMOMO_NAME, seconds: float = 6.0)
 
 def obj_text(unit: float = 1 / SCALE) -> str:
     lines = ["# a box", "mtllib box.mtl", *(f"v {x} {y} {z}" for x, y, z in (CORNERS * unit).tolist())]
-    return (
-        "\n".join(
-            [*lines, "usemtl wood", *(f"f {a + 1}//1 {b + 1}//1 {c + 1}//1" for a, b, c in FACES.tolist())]
-        )
-        + "\n"
-    )
+    faces = (f"f {a + 1}//1 {b + 1}//1 {c + 1}//1" for a, b, c in BOX_FACES.tolist())
+    return "\n".join([*lines, "usemtl wood", *faces]) + "\n"
 
 
 def write_omomo(root: Path, *entries: dict, mesh: str | None = None, split: str = "test") -> Path:

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from one_object_files import (
     BEHAVE_NAME,
     CORNERS,
-    FACES,
     behave_arrays,
     carried,
     frame_times,
@@ -19,6 +18,7 @@ from one_object_files import (
     write_behave,
 )
 
+from boxes import BOX_FACES
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.behave import R_WORLD_CAMERA, behave_mesh_path, behave_names, read_behave
@@ -137,13 +137,16 @@ def test_an_objects_path_that_cannot_be_is_refused(tmp_path, fault):
 
 MESHES = {
     "millimetres": (
-        Ply(CORNERS * 1000, None, FACES),
+        Ply(CORNERS * 1000, None, BOX_FACES),
         "400 m long. Expected 0.01 to 5 m. It looks like millimetres",
     ),
-    "kilometres": (Ply(CORNERS / 1000, None, FACES), "0.0004 m long"),
+    "kilometres": (Ply(CORNERS / 1000, None, BOX_FACES), "0.0004 m long"),
     "a cloud": (Ply(CORNERS), "no faces"),
     "empty": (Ply(CORNERS[:0]), "no vertices"),
-    "NaN": (Ply(np.where(CORNERS == 0, np.nan, CORNERS).astype(np.float32), None, FACES), "NaN or infinite"),
+    "NaN": (
+        Ply(np.where(CORNERS == 0, np.nan, CORNERS).astype(np.float32), None, BOX_FACES),
+        "NaN or infinite",
+    ),
 }
 
 

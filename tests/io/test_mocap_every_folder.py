@@ -2,6 +2,7 @@
 
 import os
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,17 @@ from mocap_every_files import BOARD_M, FIX, SCALE, SHUTTER_S, cloud, truth, worl
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.mocap_every_folder import (
-    board_alignment,
+    BoardWalks,
     is_mocap_every_folder,
     mocap_every_files,
     mocap_every_recording,
     read_mocap_every_folder,
 )
+from wearcap.sensors.camera_alignment import align_by_walks
+
+
+def aligned(board: BoardWalks):
+    return align_by_walks(board.x_slam, board.y_slam, board.length_m, board.height_m)
 
 
 def test_everything_is_read(tmp_path):
@@ -44,7 +50,7 @@ def test_everything_is_read(tmp_path):
 def test_the_board_says_scale_and_axes(tmp_path):
     write_capture(tmp_path)
     read = read_mocap_every_folder(tmp_path)
-    scale, T_world_slam = board_alignment(read.board)
+    scale, T_world_slam = aligned(read.board)
     assert scale == pytest.approx(SCALE, rel=1e-5)
     recording = mocap_every_recording(read, scale, T_world_slam)
     t, R = truth()
@@ -147,7 +153,7 @@ def test_a_board_without_a_right_angle_is_refused(tmp_path):
     write_capture(tmp_path)
     board = read_mocap_every_folder(tmp_path).board
     with pytest.raises(WearcapError, match="no right angle"):
-        board_alignment(type(board)(board.x_slam, board.x_slam, board.length_m, board.height_m))
+        aligned(replace(board, y_slam=board.x_slam))
 
 
 @fuzz
@@ -163,7 +169,7 @@ def test_damaged_files_are_read_or_refused(tmp_path_factory, data):
         path.write_text(data.draw(mutated(content.decode())))
     try:
         read = read_mocap_every_folder(folder)
-        recording = mocap_every_recording(read, *(board_alignment(read.board) if read.board else ()))
+        recording = mocap_every_recording(read, *(aligned(read.board) if read.board else ()))
     except WearcapError:
         return
     assert recording.head.R_world_device.isfinite().all()

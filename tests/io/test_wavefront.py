@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from hostile import fuzz, mutated
 from hypothesis import given
-from one_object_files import CORNERS, FACES, obj_text
+from one_object_files import CORNERS, obj_text
 
+from boxes import BOX_FACES
 from wearcap.errors import WearcapError
 from wearcap.io.wavefront import read_obj
 
@@ -14,7 +15,7 @@ def test_a_box(tmp_path):
     (tmp_path / "a.obj").write_text(obj_text(1.0))
     mesh = read_obj(tmp_path / "a.obj")
     np.testing.assert_allclose(mesh.vertices, CORNERS)
-    np.testing.assert_array_equal(mesh.faces, FACES)
+    np.testing.assert_array_equal(mesh.faces, BOX_FACES)
 
 
 def test_colours_texture_polygons_and_indices_from_the_end(tmp_path):

@@ -4,29 +4,24 @@ import json
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
+from boxes import box_mesh
 from wearcap.cli.main import run_verb
-from wearcap.geometry.mesh import Mesh
 from wearcap.io.environment import write_environment
 from wearcap.pipelines.doctor import Finding, examine
 from wearcap.pipelines.doctor.environment import check_environment
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 
-FACES = np.array(
-    [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4], [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6],
-     [1, 3, 5], [3, 7, 5]], np.int32)  # fmt: skip
-
 
 def thing(
     name, size=(1.0, 0.6, 0.8), at=(0.0, 0.0, 0.0), freedom=Freedom("plane"), origin=0.0
 ) -> SceneObject:
     """A box on its frame's floor; with origin 0.5 its frame is at its left end."""
-    corner = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (origin - 0.5, origin + 0.5)])
-    mesh = Mesh((corner * size).astype(np.float32), FACES, np.ones(3, np.float32))
+    x, y, z = size
+    mesh = box_mesh(((origin - 0.5) * x, -y / 2, 0.0), ((origin + 0.5) * x, y / 2, z))
     return SceneObject(name, name.split("_")[0], mesh, torch.eye(3), torch.tensor(at), freedom)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from boxes import box_mesh
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
@@ -14,15 +15,12 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 
 WHITE = np.ones(3, np.float32)
-BOX_FACES = np.array(
-    [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4], [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6],
-     [1, 3, 5], [3, 7, 5]], np.int32)  # fmt: skip
 
 
 def box(size) -> Mesh:
     """Standing on its frame's floor."""
-    corner = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
-    return Mesh((corner * size).astype(np.float32), BOX_FACES, WHITE)
+    x, y, z = size
+    return box_mesh((-x / 2, -y / 2, 0.0), (x / 2, y / 2, z))
 
 
 def thing(name, mesh, x=0.0, y=0.0, turn=0.0, freedom=Freedom("plane")) -> SceneObject:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from boxes import BOX_FACES, box_corners
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.recording import HeadStream
@@ -18,18 +19,14 @@ from wearcap.sensors.slam import (
     textured_points,
 )
 
-BOX_FACES = np.array(
-    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
-     [1, 5, 7], [1, 7, 3]], np.int32
-)  # fmt: skip
 EXACT = SlamPoints(noise_at_2m=0.0, outliers=0.0)
 
 
 def boxes(*spans) -> Mesh:
     """One mesh of axis-aligned boxes, each ((x, y, z) low, (x, y, z) high)."""
-    vertices = [np.array(np.meshgrid(*zip(low, high), indexing="ij")).reshape(3, 8).T for low, high in spans]
+    vertices = [box_corners(low, high) for low, high in spans]
     faces = np.concatenate([BOX_FACES + 8 * k for k in range(len(spans))]).astype(np.int32)
-    return Mesh(np.concatenate(vertices).astype(np.float32), faces, np.array([0.5, 0.5, 0.5], np.float32))
+    return Mesh(np.concatenate(vertices), faces, np.array([0.5, 0.5, 0.5], np.float32))
 
 
 WALL, SHELF, HIDDEN = ((2, -4, 0), (2.1, 4, 3)), ((1.5, -1, 1), (1.7, 1, 2)), ((3, -4, 0), (3.1, 4, 3))

@@ -102,9 +102,7 @@ def test_kerbs_are_stepped_over_only_where_they_can(place):
     points = grid.origin + (cells + np.array([1.0, 0.5])) * grid.cell
     known = np.zeros(len(points), bool)
     for flight in place.flights:
-        along = np.array([np.cos(flight.direction), np.sin(flight.direction)])
-        offset = points - np.array(flight.start)
-        run, side = offset @ along, offset @ np.array([-along[1], along[0]])
+        run, side = flight.up_and_left(points)
         known |= (run > -0.2) & (run < flight.length + 0.2) & (np.abs(side) < flight.width / 2)
     assert len(points)
     assert known.all()

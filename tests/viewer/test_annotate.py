@@ -1,105 +1,34 @@
-"""The annotator: its server and files, and a real browser in which hands are clicked while a video plays."""
+"""The annotator's server and files: what is served, saved, refused, exported and started from."""
 
-import http.client
 import json
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 import torch
+from annotated_flat import CLOCK, FPS, FRAMES, TIMES, ask, held, labels, served, write_flat
 
 from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.cli.annotate import main as annotate
 from wearcap.errors import WearcapError
-from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
-from wearcap.io.contact_labels import Label, LabelClock, annotation_of, read_contact_labels
+from wearcap.io.contact_labels import Label, read_contact_labels
 from wearcap.io.environment import write_environment
 from wearcap.io.motion_npz import write_motion
-from wearcap.recording import CameraStream, Motion, Recording, RecordingStore
-from wearcap.recording.interactions import Interactions
+from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.viewer.annotate import Desk, take_of
+from wearcap.viewer.annotate import take_of
 from wearcap.viewer.annotate_server import AnnotationServer, byte_range
 from wearcap.viewer.annotation_file import AnnotationFile, Conflict
 from wearcap.viewer.annotation_start import starting_labels
-from wearcap_browser import SHIFT, Chromium, chromium
 from wearcap_testing import recording_of, swaying_motion
-
-FRAMES, FPS = 600, 60.0
-TIMES = torch.arange(FRAMES, dtype=torch.float64) / FPS
-CLOCK = LabelClock.of("r0", TIMES)
-
-
-def held(start: list[float], stop: list[float], hands: list[list[bool]], thing: str = "") -> Interactions:
-    kind = "sliding" if thing else ""
-    return Interactions(torch.tensor(start).double(), torch.tensor(stop).double(),
-                        torch.tensor(hands, dtype=torch.bool).reshape(-1, 2), (thing,) * len(start), (kind,) * len(start))  # fmt: skip
-
-
-def a_film(path: Path, seconds: float = 10.0, fps: int = 30) -> Path:
-    """A video whose brightness is its time."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264" if "libx264" in av.codecs_available else "mpeg4", rate=fps)
-        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
-        for number in range(round(seconds * fps)):
-            picture = np.full((120, 160, 3), 40 + int(180 * number / (seconds * fps)), np.uint8)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        container.mux(stream.encode(None))
-    return path
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Path:
-    """Recordings r0 (with a camera's video) and r1 (without), and what is known of r0's objects."""
-    root = tmp_path_factory.mktemp("flat")
-    store = RecordingStore(root)
-    a_film(root / "r0.mp4")
-    stamps = torch.arange(300, dtype=torch.float64) / 30
-    camera = CameraStream(stamps, Camera("pinhole", 160, 120, 100.0, 100.0, 79.5, 59.5), torch.eye(3), torch.zeros(3),
-                          video="r0.mp4")  # fmt: skip
-    for number in range(2):
-        recording = recording_of(swaying_motion(FRAMES, number, FPS), f"r{number}")
-        if number == 0:
-            sofa = held([2.0], [4.0], [[True, True]], "sofa")
-            recording = replace(recording, camera=camera, interactions=sofa)
-        store.add(recording, split="test", config_hash="x")
-    return root
-
-
-@contextmanager
-def served(dataset: Path, output: Path, where: str = "", **options) -> Iterator[AnnotationServer]:
-    server = AnnotationServer(Desk.of(dataset / where, output, **options), port=18300)
-    try:
-        yield server
-    finally:
-        server.stop()
-
-
-def ask(server: AnnotationServer, method: str, path: str, body: object = None, **headers: str):
-    """Status, headers and body of a request."""
-    connection = http.client.HTTPConnection("127.0.0.1", int(server.url.rsplit(":", 1)[1]), timeout=20)
-    text = None if body is None else body if isinstance(body, str) else json.dumps(body)
-    given = ({"Content-Type": "application/json"} if text is not None else {}) | {
-        key.replace("_", "-"): value for key, value in headers.items()
-    }
-    connection.request(method, path, text, given)
-    reply = connection.getresponse()
-    data = reply.read()
-    connection.close()
-    return reply.status, reply.headers, data
-
-
-def labels(left=(), right=(), clock: LabelClock = CLOCK) -> dict:
-    return annotation_of(
-        {"left": tuple(Label(*s) for s in left), "right": tuple(Label(*s) for s in right)}, clock
-    )
+    return write_flat(tmp_path_factory.mktemp("flat"))
 
 
 def test_the_page_gets_its_files_and_a_recordings_numbers(dataset, tmp_path):
@@ -286,232 +215,3 @@ def test_objects_of_the_environment_can_be_named(tmp_path):
     recording = replace(recording_of(swaying_motion(30), "r"), environment="environment.json")
     seen = replace(recording, interactions=held([0.1], [0.2], [[True, False]], "sofa"))
     assert take_of(seen, tmp_path).objects == {"door_1": "hinged", "sofa": "sliding"}
-
-
-# The page itself.
-
-
-@contextmanager
-def opened(
-    dataset: Path, output: Path, profile: Path, where: str = "r0"
-) -> Iterator[tuple[Chromium, AnnotationServer]]:
-    with served(dataset, output, where) as server, chromium(profile, server.url, webgl=False) as browser:
-        settled(browser)
-        yield browser, server
-
-
-def settled(browser: Chromium) -> None:
-    """The page is open and, where there is a video, it shows its first picture."""
-    browser.poll(lambda: browser.evaluate(
-        "window.annotator?.ready && (annotator.player.usable || !annotator.take.header.video)"
-    ))  # fmt: skip
-
-
-def spans(browser: Chromium, hand: str) -> list[list[float]]:
-    return browser.evaluate(f"annotator.labels.state.{hand}.map(l => [l.start, l.stop])")
-
-
-def saved(browser: Chromium) -> bool:
-    return browser.poll(lambda: browser.evaluate("document.getElementById('saved').className") == "saved", 20)
-
-
-def film_time(browser: Chromium) -> float:
-    return browser.evaluate("document.getElementById('video').currentTime")
-
-
-def shown_time(browser: Chromium) -> float:
-    return browser.evaluate("annotator.player.time")
-
-
-def click_hand(browser: Chromium, hand: str) -> None:
-    """Where the hand is once the frame that was asked for is drawn."""
-    browser.poll(
-        lambda: browser.evaluate("annotator.view.frame === annotator.player.frame && !annotator.view.stale")
-    )
-    browser.click(*browser.evaluate(f"annotator.handPosition('{hand}')"))
-
-
-def on_disk(output: Path, hand: str) -> list[list[float]]:
-    return json.loads((output / "r0.contacts.json").read_text())["contacts"][f"{hand}_hand"]
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_contacts_are_marked_while_the_video_plays_and_are_there_after_a_reload(dataset, tmp_path):
-    with opened(dataset, tmp_path, tmp_path / "profile") as (browser, _):
-        browser.key(" ")
-        begin = time.monotonic()
-        browser.poll(lambda: shown_time(browser) > 1.0)
-        assert abs(film_time(browser) - shown_time(browser)) < 0.15
-        click_hand(browser, "left")
-        browser.poll(lambda: shown_time(browser) > 2.0)
-        assert abs(shown_time(browser) - (time.monotonic() - begin)) < 1.0, "about real time"
-        browser.key(" ")
-        (start, stop), = spans(browser, "left")  # fmt: skip
-        assert 1.0 <= start < 2.0
-        assert stop == pytest.approx(10.0), "open until it is ended"
-
-        browser.key("ArrowRight", SHIFT)
-        frame = browser.evaluate("annotator.player.frame")
-        assert shown_time(browser) == pytest.approx(frame / FPS)
-        browser.poll(lambda: abs(film_time(browser) - frame / FPS) < 0.01)
-        click_hand(browser, "left")
-        assert spans(browser, "left") == [[start, pytest.approx(frame / FPS)]]
-        browser.key("l")
-        browser.key("ArrowRight", SHIFT)
-        browser.key("l")
-        assert spans(browser, "right") == [[pytest.approx(frame / FPS), pytest.approx((frame + 60) / FPS)]]
-
-        grip = browser.evaluate(f"annotator.lanePosition('left', {frame / FPS})")
-        target = browser.evaluate("annotator.lanePosition('left', 7.0)")
-        browser.drag([tuple(grip), ((grip[0] + target[0]) / 2, grip[1]), tuple(target)])
-        assert spans(browser, "left")[0][1] == pytest.approx(7.0, abs=0.05)
-        browser.poll(lambda: abs(film_time(browser) - spans(browser, "left")[0][1]) < 0.02)
-        browser.key("z")
-        assert spans(browser, "left") == [[start, pytest.approx(frame / FPS)]]
-        browser.key("z", SHIFT)
-        moved = spans(browser, "left")
-        assert moved[0][1] == pytest.approx(7.0, abs=0.05)
-        assert saved(browser)
-        assert on_disk(tmp_path, "left") == moved
-
-        browser.evaluate("window.before_reload = true")
-        browser.call("Page.reload")
-        browser.poll(lambda: browser.evaluate("!window.before_reload"))
-        settled(browser)
-        assert spans(browser, "left") == moved
-        assert len(spans(browser, "right")) == 1
-        assert browser.exceptions == []
-    clock = LabelClock.of("r0", TIMES)
-    assert read_contact_labels(tmp_path / "r0.contacts.json", clock).start_s[0].item() == start
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_editing_by_keys_and_mouse(dataset, tmp_path):
-    AnnotationFile(tmp_path, CLOCK).save(labels([(1.0, 2.0), (5.0, 6.0)], [(3.0, CLOCK.stop_s)]), "")
-    with opened(dataset, tmp_path, tmp_path / "profile") as (browser, _):
-        seen = []
-        for _ in range(6):
-            browser.key("]")
-            seen.append(round(shown_time(browser), 3))
-        assert seen[:5] == [1.0, 2.0, 3.0, 5.0, 6.0]
-        browser.key("[")
-        assert shown_time(browser) == pytest.approx(6.0) or shown_time(browser) == pytest.approx(5.0)
-        browser.key("Home")
-        browser.key("ArrowRight")
-        browser.key("ArrowRight")
-        browser.key("ArrowLeft")
-        assert browser.evaluate("annotator.player.frame") == 1
-        browser.key("ArrowDown")
-        assert browser.evaluate("document.getElementById('video').playbackRate") == 0.75
-
-        browser.click(*browser.evaluate("annotator.lanePosition('left', 5.5)"))
-        assert shown_time(browser) == pytest.approx(5.5, abs=0.05)
-        browser.fill(*browser.element("document.getElementById('object')"), "sofa")
-        browser.poll(lambda: browser.evaluate("annotator.labels.state.left[1].kind") == "sliding")
-        browser.click(*browser.evaluate("annotator.lanePosition('left', 1.5)"))
-        browser.key("Delete")
-        assert spans(browser, "left") == [[5.0, 6.0]]
-        # A start is not dragged beyond the contact's own end, nor an end over the next start.
-        grip = browser.evaluate("annotator.lanePosition('left', 5.0)")
-        browser.drag([tuple(grip), tuple(browser.evaluate("annotator.lanePosition('left', 9.0)"))])
-        (start, stop), = spans(browser, "left")  # fmt: skip
-        assert stop - start == pytest.approx(1 / FPS)
-        browser.key("z")
-        x, y = browser.evaluate("annotator.lanePosition('left', 6.0)")
-        browser.drag([(x, y), (1090, y)])
-        assert spans(browser, "left") == [[5.0, CLOCK.stop_s]], "an end can be taken away again"
-        browser.key("z")
-
-        before = browser.evaluate("annotator.view.yaw")
-        x, y = browser.evaluate(
-            "(() => { const b = annotator.view.canvas.getBoundingClientRect(); return [b.x + 30, b.y + 30] })()"
-        )
-        browser.drag([(x, y), (x + 40, y + 10)])
-        assert browser.evaluate("annotator.view.yaw") != before
-        assert browser.evaluate("annotator.labels.before.length") == 2, "turning the view changes no label"
-        assert saved(browser)
-        assert browser.exceptions == []
-    stored = json.loads((tmp_path / "r0.contacts.json").read_text())
-    assert stored["contacts"] == {"left_hand": [[5.0, 6.0]], "right_hand": [[3.0, -1.0]]}
-    assert stored["objects"]["left_hand"] == ["sofa"]
-    assert stored["classes"]["left_hand"] == ["sliding"]
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_labels_outlive_a_server_that_is_away_and_another_window(dataset, tmp_path):
-    profile = tmp_path / "profile"
-    with opened(dataset, tmp_path, profile) as (browser, server):
-        port = int(server.url.rsplit(":", 1)[1])
-        server.stop()
-        browser.key("End")
-        browser.key("ArrowLeft", SHIFT)
-        browser.key("a")
-        browser.poll(lambda: "does not answer" in browser.text())
-        again = AnnotationServer(Desk.of(dataset / "r0", tmp_path), port)
-        assert again.url == server.url
-        try:
-            assert saved(browser)
-            assert len(on_disk(tmp_path, "left")) == 1
-            AnnotationFile(tmp_path, CLOCK).save(labels([(1.0, 2.0)]), "", force=True)
-            browser.key("l")
-            browser.poll(lambda: "another window" in browser.text())
-            assert on_disk(tmp_path, "left") == [[1.0, 2.0]]
-            browser.click(*browser.element("document.getElementById('mine')"))
-            assert saved(browser)
-            assert len(on_disk(tmp_path, "right")) == 1
-            kept = [
-                json.loads(p.read_text())["contacts"]["left_hand"] for p in (tmp_path / "backups").iterdir()
-            ]
-            assert [[1.0, 2.0]] in kept
-            assert browser.exceptions == []
-        finally:
-            again.stop()
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_unsaved_labels_come_back_when_the_browser_was_closed(dataset, tmp_path):
-    with opened(dataset, tmp_path, tmp_path / "profile") as (browser, server):
-        kept = {"labels": labels([(1.0, 2.0)]), "base": ""}
-        browser.evaluate(f"localStorage.setItem(annotator.saver.key, {json.dumps(json.dumps(kept))})")
-        browser.go("about:blank")
-        browser.go(server.url)
-        settled(browser)
-        assert spans(browser, "left") == [[1.0, 2.0]]
-        assert saved(browser)
-        assert on_disk(tmp_path, "left") == [[1.0, 2.0]]
-        assert browser.evaluate("localStorage.length") == 0
-        browser.key("l")
-        browser.go("about:blank")  # at once, before the save that waits
-        browser.poll(lambda: len(on_disk(tmp_path, "right")) == 1, 10)
-
-        browser.go(server.url)
-        settled(browser)
-        browser.evaluate(f"localStorage.setItem(annotator.saver.key, {json.dumps(json.dumps(kept))})")
-        browser.go("about:blank")
-        browser.go(server.url)  # the file has changed since these were kept
-        settled(browser)
-        browser.poll(lambda: "never saved" in browser.text())
-        assert len(spans(browser, "right")) == 1
-        browser.click(*browser.element("document.getElementById('mine')"))
-        browser.poll(lambda: on_disk(tmp_path, "right") == [])
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_several_recordings_and_one_without_a_video(dataset, tmp_path):
-    with opened(dataset, tmp_path, tmp_path / "profile", "") as (browser, _):
-        browser.key("a")
-        browser.key("PageDown")
-        browser.poll(lambda: browser.evaluate("annotator.ready && annotator.take.header.name") == "r1")
-        assert len(on_disk(tmp_path, "left")) == 1, "saved before the next was opened"
-        assert browser.evaluate("document.getElementById('film').hidden")
-        browser.key(" ")
-        browser.poll(lambda: shown_time(browser) > 3.0)
-        assert browser.evaluate("annotator.framesPerSecond") > 5
-        browser.key(" ")
-        assert spans(browser, "left") == []
-        assert browser.exceptions == []

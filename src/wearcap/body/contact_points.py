@@ -9,10 +9,12 @@ from torch import Tensor
 from wearcap.body.anny_body import anny_body
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.model import BodyModel
-from wearcap.body.skeleton import xsens23
+from wearcap.body.skeleton import MIRROR, xsens23
 from wearcap.body.t_pose import t_pose
 
 BODY_POINTS = 64
+TOUCH_M = 0.05
+"""A point touches an object whose surface is no further: τ_c, which the document leaves open (ours)."""
 HAND_POINTS = 7
 """Of each hand: a share of the points that is near the share of SMPL-X's vertices that its hands have."""
 
@@ -36,7 +38,7 @@ def _rows() -> Int64[Tensor, "point"]:
     rest = _farthest(at, (left & (held != hand)).nonzero()[:, 0], BODY_POINTS // 2 - HAND_POINTS)
     ours = torch.cat([wrist, rest])
     right = (at[:, 1] < -0.01).nonzero()[:, 0]
-    twins = torch.cdist(at[ours] * at.new_tensor([1.0, -1.0, 1.0]), at[right]).argmin(1)
+    twins = torch.cdist(at[ours] * at.new_tensor(MIRROR), at[right]).argmin(1)
     return torch.cat([ours, right[twins]])
 
 

@@ -5,8 +5,6 @@ from wearcap.errors import WearcapError
 
 DENSITY = 1000.0
 """Of a human body (kg/m³), lungs half full."""
-PHENOTYPES = ("gender", "muscle", "weight", "height", "proportions")
-"""Anny's words, each 0…1 (gender: 0 male, 1 female); `height` and `weight` are read in m and kg instead."""
 
 
 def stature(skeleton: Skeleton) -> float:
@@ -25,7 +23,10 @@ def skeleton_of_height(height_m: float, skeleton: Skeleton | None = None) -> Ske
 
 
 def phenotype_of(shape: dict[str, float]) -> dict[str, float]:
-    """Anny's phenotypes that a recording's shape states outright; other models' coefficients are passed over."""
+    """Anny's phenotypes that a recording's shape states outright, each 0…1 (gender: 0 male, 1 female).
+
+    Other models' coefficients are passed over.
+    """
     return {name: float(shape[name]) for name in ("gender", "muscle", "proportions") if name in shape}
 
 

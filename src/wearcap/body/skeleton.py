@@ -18,6 +18,9 @@ from wearcap.errors import WearcapError
 FOOT_PATCHES = ("left_heel", "left_toe_tip", "right_heel", "right_toe_tip")
 """Sites whose floor contact is sensed, predicted and stored, always in this order."""
 
+MIRROR = (1.0, -1.0, 1.0)
+"""Of every position, where left and right change places: y is turned round."""
+
 _ALIASES = {
     "left_toe": "left_foot", "right_toe": "right_foot",
     "left_foot": "left_toe", "right_foot": "right_toe",

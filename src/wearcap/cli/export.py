@@ -7,11 +7,13 @@ from wearcap.cli.conf import hydra_main
 from wearcap.cli.load import load_pipeline, load_system
 from wearcap.errors import WearcapError
 from wearcap.export.contact import export_contact
+from wearcap.export.echo import export_echo
 from wearcap.export.network import ExportReport
 from wearcap.export.sidecar import export_hmd2
 from wearcap.export.watches import export_mocap_every
 from wearcap.models.checkpoint import share_checkpoint
 from wearcap.pipelines.contact_prediction import load_detector
+from wearcap.pipelines.echo import Echo
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.mocap_every import MocapEvery
 from wearcap.training.contact_detection import ContactDetection
@@ -36,8 +38,10 @@ def run(config: DictConfig) -> dict[str, ExportReport]:
             reports = export_hmd2(pipeline, config.output, config.format)
         elif isinstance(pipeline, MocapEvery):
             reports = {"network": export_mocap_every(pipeline, config.output, config.format)}
+        elif isinstance(pipeline, Echo):
+            reports = {"network": export_echo(pipeline, config.output, config.format)}
         else:
-            raise WearcapError("this pipeline has no network to export", where=config.checkpoint, expected="HMD²'s or MocapEvery's: pipeline=hmd2, pipeline=mocap_every")  # fmt: skip
+            raise WearcapError("this pipeline has no network to export", where=config.checkpoint, expected="HMD²'s, MocapEvery's or ECHO's: pipeline=hmd2, pipeline=mocap_every, pipeline=echo")  # fmt: skip
     for name, report in reports.items():
         show(f"exported {name}: {report.path}\n{report}")
     return reports

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics, site_positions
 from wearcap.body.retarget import fit_offsets, retarget
-from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
+from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, Skeleton, xsens23
 from wearcap.body.skeletons import smpl24, smplh52
 from wearcap.data.prepare.clean import resampled
 from wearcap.errors import WearcapError
@@ -59,9 +59,9 @@ class SmplAngles:
         return torch.cat([body, torch.zeros_like(body[..., :6]), hands], -1)
 
 
-_POINT, _ROT6D = (1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
-_SIDE_SIGNS = (*_POINT * 4, *_ROT6D, 1.0)
-_MIDDLE_SIGNS = (*_POINT * 2, *_ROT6D, 1.0)
+_ROT6D = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
+_SIDE_SIGNS = (*MIRROR * 4, *_ROT6D, 1.0)
+_MIDDLE_SIGNS = (*MIRROR * 2, *_ROT6D, 1.0)
 """What a mirror does to the entries: y changes sign, and the second column of a rotation once more."""
 
 

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 from wearcap.body.skeleton import Skeleton
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.data.contact_features import is_even, pose_frames
-from wearcap.data.windows import Source, mirrored_rotations, share_out
+from wearcap.data.windows import Source, asked_for, mirrored_rotations, share_out
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
@@ -73,8 +73,7 @@ class ContactDataset(Dataset):
         return len(self.starts)
 
     def __getitem__(self, item: tuple[int, int] | int) -> ContactWindow:
-        index, seed = item if isinstance(item, tuple) else (item, item)
-        random = torch.Generator().manual_seed(seed)
+        index, random = asked_for(item)
         recording, start, _ = self.starts[index].tolist()
         store, name = self.recordings[recording]
         poses = _poses(store.path_of(name), self.stream, self.skeleton.name, self.fps)

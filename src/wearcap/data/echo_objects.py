@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.skeleton import MIRROR
 from wearcap.data.echo_features import EchoFeatures
-from wearcap.data.object_clouds import object_cloud
+from wearcap.data.surface_points import object_cloud
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.triangle_distance import TriangleIndex
@@ -75,7 +76,7 @@ class ObjectReader:
         one_hot = self.features.class_code(item.category)
         cloud = object_cloud(item.mesh)
         middle = (cloud.max(0).values + cloud.min(0).values) / 2
-        both = torch.stack([cloud - middle, (cloud - middle) * torch.tensor([1.0, -1.0, 1.0])])
+        both = torch.stack([cloud - middle, (cloud - middle) * torch.tensor(MIRROR)])
         parts = [one_hot.expand(2, -1), cloud_extents(both)]
         if self.encoder is not None and self.features.shape_size:
             parts.append(self.encoder(both))

@@ -11,13 +11,13 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from wearcap.body.anny_body import anny_body
-from wearcap.body.contact_points import contact_points, mirrored_points
+from wearcap.body.contact_points import TOUCH_M, contact_points, mirrored_points
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
 from wearcap.data.datamodule import SeededWindows
 from wearcap.data.echo_features import CONTACTS, OBJECT_SIZE, POINTS, Body, EchoFeatures, ThreePoints
 from wearcap.data.echo_objects import ObjectReader, ObjectShape, body_contact, object_poses
 from wearcap.data.features import body_size
-from wearcap.data.windows import MIRROR, Source, mirrored_name, mirrored_rotations, share_out
+from wearcap.data.windows import MIRROR, Source, asked_for, joint_twins, mirrored_rotations, share_out
 from wearcap.diffusion.levels import DRAWS
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -28,8 +28,6 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.scene.environment import Environment
 
-WITHIN_M = 0.05
-"""τ_c, which the document leaves open: ours."""
 MIN_FRAMES = 6
 """Shortest window that is trained on."""
 
@@ -58,7 +56,7 @@ class EchoWindow(NamedTuple):
     """Of the object's points about its middle (`ObjectShape`)."""
     valid: Bool[Tensor, "*batch time"]
     noise: Float[Tensor, "*batch time feature"]
-    level_draws: Float[Tensor, "*batch time modality"]
+    level_draws: Float[Tensor, "*batch time 4"]
     draws: Float[Tensor, "*batch draw"]
     """Diffusion noise and what levels are drawn from: functions of seed and step, not of the process."""
 
@@ -159,7 +157,7 @@ class EchoDataset(Dataset):
 
     def __init__(
         self, sources: list[Source], split: str, *, features: EchoFeatures, encoder: PointNeXt | None, window: int,
-        stride: int, mirror: bool = False, balance: float = 1.0, beginnings: float = 0.0, within_m: float = WITHIN_M,
+        stride: int, mirror: bool = False, balance: float = 1.0, beginnings: float = 0.0, within_m: float = TOUCH_M,
         objects: bool = True,
     ):  # fmt: skip
         """`beginnings` is the share of windows that end before they are full, as a capture's first and last ones do;
@@ -168,7 +166,7 @@ class EchoDataset(Dataset):
         self.window, self.stride, self.mirror = window, stride, mirror
         self.beginnings, self.within_m, self.objects = beginnings, within_m, objects
         self._reader = ObjectReader(features, encoder)
-        self._track = cache(self._read_track)
+        self._tracks: dict[int, EchoTrack] = {}
         self.recordings: list[tuple[RecordingStore, str, int]] = []
         starts, weights = [], []
         for source in sources:
@@ -190,7 +188,9 @@ class EchoDataset(Dataset):
 
     def track(self, number: int) -> EchoTrack:
         """A whole recording, by its number in `recordings`."""
-        return self._track(number)
+        if number not in self._tracks:
+            self._tracks[number] = self._read_track(number)
+        return self._tracks[number]
 
     def _read_track(self, number: int) -> EchoTrack:
         store, name, every = self.recordings[number]
@@ -200,8 +200,7 @@ class EchoDataset(Dataset):
         return echo_track(recording, environment, self._reader, every, self.within_m)
 
     def __getitem__(self, item: tuple[int, int] | int) -> EchoWindow:
-        index, seed = item if isinstance(item, tuple) else (item, item)
-        random = torch.Generator().manual_seed(seed)
+        index, random = asked_for(item)
         number, start, frames = self.starts[index].tolist()
         shift, mirrored, cut, end = torch.rand(4, generator=random).tolist()
         if self.mirror:
@@ -232,7 +231,7 @@ class EchoDataset(Dataset):
             track.skeleton.t_parent_joint, track.body.R_parent_joint[take], track.body.t_world_root[take],
             track.contact[take], active != NO_OBJECT, code, track.T_world_object.R[take], track.T_world_object.t[take],
             mean, spread, torch.arange(self.window) < stop - start, noise,
-            torch.rand(self.window, 3, generator=random), torch.rand(DRAWS, generator=random),
+            torch.rand(self.window, 4, generator=random), torch.rand(DRAWS, generator=random),
         )  # fmt: skip
 
 
@@ -254,12 +253,11 @@ def mirror_window(window: EchoWindow, skeleton: Skeleton) -> EchoWindow:
     """
     flip = torch.tensor(MIRROR)
     turn = torch.outer(flip, flip)
-    twins = [skeleton.index(mirrored_name(name)) for name in skeleton.joint_names]
     points = [0, 2, 1]
     patches = [len(mirrored_points()) + k for k in (2, 3, 0, 1)]
     return window._replace(
         R_world_point=window.R_world_point[:, points] * turn, t_world_point=window.t_world_point[:, points] * flip,
-        t_parent_joint=window.t_parent_joint[twins] * flip,
+        t_parent_joint=window.t_parent_joint[joint_twins(skeleton)] * flip,
         R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton), t_world_root=window.t_world_root * flip,
         contact=window.contact[:, [*mirrored_points().tolist(), *patches]],
         R_world_object=window.R_world_object * turn, t_world_object=window.t_world_object * flip,
@@ -278,16 +276,16 @@ class EchoWindows(SeededWindows):
     def __init__(
         self, sources: dict[str, dict | None], features: EchoFeatures, window: int, stride: int, batch_size: int,
         steps_per_epoch: int | None = None, val_windows: int | None = None, workers: int = 0, seed: int = 0,
-        augment: bool = True, balance: float = 1.0, beginnings: float = 0.0, within_m: float = WITHIN_M,
-        objects: bool = True, encoder: str | None = "object_encoder", val_sources: dict[str, dict | None] | None = None,
+        augment: bool = True, balance: float = 1.0, beginnings: float = 0.0, within_m: float = TOUCH_M,
+        objects: bool = True, encoder: PointNeXt | str | None = "object_encoder", val_sources: dict[str, dict | None] | None = None,
     ):  # fmt: skip
         """See `SeededWindows` and `EchoDataset`; what varies windows is for training alone.
 
-        `encoder` is a checkpoint of experiment=object_encoder; None: objects have no feature.
+        `encoder` is a checkpoint of experiment=object_encoder, or another PointNeXt; None: objects have no feature.
         """
         super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
         self.features, self.window, self.stride = features, window, stride
-        self.encoder = None if encoder is None else load_object_encoder(encoder)
+        self.encoder = load_object_encoder(encoder) if isinstance(encoder, str) else encoder
         self.augment, self.balance, self.beginnings = augment, balance, beginnings
         self.within_m, self.objects = within_m, objects
 

@@ -69,9 +69,9 @@ class HeadFeatures:
     ) -> Float[Tensor, "batch time condition"]:
         """Features of a head path; `size` holds the wearer's `body_size` (m)."""
         R_canonical_world = self.frame_of(R_world_head).transpose(-1, -2)
-        velocity = _difference(t_world_head) * fps
+        velocity = first_repeated(t_world_head.diff(dim=1)) * fps
         step = rotation.log(R_world_head[:, :-1].transpose(-1, -2) @ R_world_head[:, 1:]) * fps
-        angular_head = torch.cat([step[:, :1], step], 1)
+        angular_head = first_repeated(step)
         R_canonical_head = R_canonical_world @ R_world_head
         velocity = (R_canonical_world @ velocity[..., None])[..., 0]
         angular = (R_canonical_head @ angular_head[..., None])[..., 0]
@@ -122,7 +122,6 @@ def body_size(skeleton: Skeleton) -> Float[Tensor, "limb"]:
     return torch.tensor([skeleton.height_of("head"), *lengths[1:]])
 
 
-def _difference(value: Float[Tensor, "batch time 3"]) -> Float[Tensor, "batch time 3"]:
-    """Backward difference; the first frame repeats the second's."""
-    step = value.diff(dim=1)
+def first_repeated(step: Float[Tensor, "batch step *rest"]) -> Float[Tensor, "batch time *rest"]:
+    """Changes since the frame before, one per frame: the first frame repeats the second's."""
     return torch.cat([step[:, :1], step], 1)

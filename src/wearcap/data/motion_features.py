@@ -9,6 +9,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
+from wearcap.data.features import first_repeated
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.metrics.physics import CONTACT_SPEED_M_S, local_floor
@@ -78,8 +79,8 @@ class MotionFeatures:
         R_heading_world = rotation.about_axis("z", -yaw)[:, :, None]
         ground = torch.cat([joints[:, :, 0, :2], floor_height[..., None]], -1)[:, :, None]
         local = (R_heading_world @ (joints - ground)[..., None])[..., 0]
-        velocity = (R_heading_world @ (_difference(joints) * rate)[..., None])[..., 0]
-        yaw_rate = rotation.wrap_angle(_difference(yaw)) * rate
+        velocity = (R_heading_world @ (first_repeated(joints.diff(dim=1)) * rate)[..., None])[..., 0]
+        yaw_rate = rotation.wrap_angle(first_repeated(yaw.diff(dim=1))) * rate
         contact = self._contact(local[..., 2], velocity.norm(dim=-1))
         root = [yaw_rate[..., None], velocity[:, :, 0, :2], local[:, :, 0, 2:]]
         return torch.cat([*root, local[:, :, 1:].flatten(-2), velocity.flatten(-2), contact], -1)
@@ -102,9 +103,3 @@ class MotionFeatures:
         others = features[..., 4 : 1 + 3 * len(self.skeleton)].unflatten(-1, (-1, 3))
         root = torch.cat([torch.zeros_like(features[..., :2]), features[..., 3:4]], -1)
         return torch.cat([root[..., None, :], others], -2)
-
-
-def _difference(value: Float[Tensor, "window frame *rest"]) -> Float[Tensor, "window frame *rest"]:
-    """Backward difference; the first frame repeats the second's."""
-    step = value.diff(dim=1)
-    return torch.cat([step[:, :1], step], 1)

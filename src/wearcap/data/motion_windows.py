@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 from torch.utils.data import Dataset
 
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.data.datamodule import SeededWindows
 from wearcap.data.motion_features import MotionFeatures, Movement
-from wearcap.data.windows import MIRROR, Source, mirrored_name, share_out
+from wearcap.data.windows import Source, asked_for, joint_twins, share_out
 from wearcap.recording.store import RecordingFile
 
 
@@ -37,8 +37,8 @@ class MovementDataset(Dataset):
         return len(self.starts)
 
     def __getitem__(self, item: tuple[int, int] | int) -> Movement:
-        index, seed = item if isinstance(item, tuple) else (item, item)
-        shift, mirrored = torch.rand(2, generator=torch.Generator().manual_seed(seed)).tolist()
+        index, random = asked_for(item)
+        shift, mirrored = torch.rand(2, generator=random).tolist()
         recording, start, _ = self.starts[index].tolist()
         store, name = self.recordings[recording]
         whole = _movement(store.path_of(name), self.features)
@@ -56,7 +56,7 @@ def _movement(path: Path, features: MotionFeatures) -> Movement:
 def mirror(movement: Movement, skeleton: Skeleton) -> Movement:
     """The same movement seen in a mirror that swaps left and right."""
     flip = movement.joints.new_tensor(MIRROR)
-    twins = [skeleton.index(mirrored_name(name)) for name in skeleton.joint_names]
+    twins = joint_twins(skeleton)
     return movement._replace(
         joints=movement.joints[..., twins, :] * flip,
         R_world_root=movement.R_world_root * torch.outer(flip, flip),

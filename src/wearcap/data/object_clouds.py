@@ -17,43 +17,18 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from wearcap.data.datamodule import SeededWindows
+from wearcap.data.surface_points import POINTS, object_cloud
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import atomic_path
 from wearcap.geometry import rotation
-from wearcap.geometry.mesh import Mesh
 from wearcap.simulation.interactive_flat import build_interactive_flat
 from wearcap.simulation.things import THINGS, make_thing
 
-POINTS = 1500
 OPENABLES = ("door", "window", "drawer", "cabinet_door")
 _SEEDS = {"train": 0, "val": 1, "test": 2}
 _PER_FLAT = 3
 """Instances of a category taken from one flat: more would be much alike."""
 _KEY = "made_of"
-
-
-def object_cloud(mesh: Mesh, count: int = POINTS, seed: int = 0) -> Float[Tensor, "point 3"]:
-    """`count` points (m) spread evenly by area over a surface, or drawn from the vertices where there are no faces.
-
-    Always the same for a seed. Raises WearcapError for a mesh without vertices, or with some that are not finite.
-    """
-    if not len(mesh.vertices) or not np.isfinite(mesh.vertices).all():
-        raise WearcapError(f"a mesh of {len(mesh.vertices)} vertices, some perhaps NaN or infinite, has no cloud",
-                           expected="at least one vertex, all of them finite (m)")  # fmt: skip
-    rng = np.random.default_rng(seed)
-    corners = mesh.vertices.astype(np.float64)[mesh.faces]
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
-    if not area.sum() > 0:
-        shuffled = rng.permutation(len(mesh.vertices))
-        return torch.from_numpy(mesh.vertices[np.resize(shuffled, count)].astype(np.float32))
-    # evenly along the faces' areas laid end to end: each face gets its share to within one point
-    at = (np.arange(count) + rng.random(count)) / count * area.sum()
-    face = np.minimum(np.searchsorted(area.cumsum(), at, side="right"), len(area) - 1)
-    along, across = rng.random((2, count, 1))
-    root = np.sqrt(along)
-    points = (1 - root) * a[face] + root * (1 - across) * b[face] + root * across * c[face]
-    return torch.from_numpy(points.astype(np.float32))
 
 
 class ObjectViews(NamedTuple):

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from wearcap.data.datamodule import SeededWindows
-from wearcap.data.windows import Source, share_out
+from wearcap.data.windows import Source, asked_for, share_out
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.store import RecordingFile
@@ -65,8 +65,7 @@ class PlaceDataset(Dataset):
         return len(self.starts)
 
     def __getitem__(self, item: tuple[int, int] | int) -> Places:
-        index, seed = item if isinstance(item, tuple) else (item, item)
-        random = torch.Generator().manual_seed(seed)
+        index, random = asked_for(item)
         recording, start, count = self.starts[index].tolist()
         store, name = self.recordings[recording]
         chosen = start + torch.randint(min(self.window, count - start), (self.frames,), generator=random)

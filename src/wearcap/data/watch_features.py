@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import Skeleton
-from wearcap.data.features import LIMBS
+from wearcap.body.skeleton import MIRROR, Skeleton
+from wearcap.data.features import LIMBS, first_repeated
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.sensors.imu import acceleration
@@ -38,7 +38,7 @@ class Sensed(NamedTuple):
 
 def mirrored(sensed: Sensed) -> Sensed:
     """The same seen in a mirror that swaps left and right."""
-    flip = sensed.t_world_head.new_tensor([1.0, -1.0, 1.0])
+    flip = sensed.t_world_head.new_tensor(MIRROR)
     turn = torch.outer(flip, flip)
     return Sensed(
         sensed.R_world_head * turn, sensed.t_world_head * flip, sensed.R_world_wrist.flip(-3) * turn,
@@ -165,9 +165,9 @@ class WatchFeatures:
         R, t = canonical
         if self.frame != "own":
             return (R.mT @ (sensed.t_world_head - t)[..., None])[..., 0]
-        velocity = _after_first(sensed.t_world_head.diff(dim=1)) * self.fps
+        velocity = first_repeated(sensed.t_world_head.diff(dim=1)) * self.fps
         turn = rotation.log(sensed.R_world_head[:, :-1].mT @ sensed.R_world_head[:, 1:])
-        return torch.cat([(R.mT @ velocity[..., None])[..., 0], _after_first(turn) * self.fps], -1)
+        return torch.cat([(R.mT @ velocity[..., None])[..., 0], first_repeated(turn) * self.fps], -1)
 
     def encode_motion(
         self,
@@ -205,8 +205,3 @@ def to_world(
     R, t = canonical.last(t_root.shape[1])
     turned = torch.cat([(R @ R_parent_joint[:, :, 0])[:, :, None], R_parent_joint[:, :, 1:]], 2)
     return turned, t + (R @ t_root[..., None])[..., 0]
-
-
-def _after_first(change: Float[Tensor, "batch step axis"]) -> Float[Tensor, "batch time axis"]:
-    """Changes from the frame before; the first frame repeats the second's."""
-    return torch.cat([change[:, :1], change], 1)

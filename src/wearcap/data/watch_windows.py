@@ -10,14 +10,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.data.datamodule import SeededWindows
 from wearcap.data.features import body_size
 from wearcap.data.watch_features import Sensed, mirrored, synthetic_wrists
 from wearcap.data.windows import (
-    MIRROR,
     Source,
-    mirrored_name,
+    asked_for,
+    joint_twins,
     mirrored_rotations,
     share_out,
     true_foot_contact,
@@ -93,8 +93,7 @@ class WatchDataset(Dataset):
         return len(self.starts)
 
     def __getitem__(self, item: tuple[int, int] | int) -> WatchWindow:
-        index, seed = item if isinstance(item, tuple) else (item, item)
-        random = torch.Generator().manual_seed(seed)
+        index, random = asked_for(item)
         shift, mirrored, turn, begins, held, faster, larger = torch.rand(7, generator=random).tolist()
         recording, start, _ = self.starts[index].tolist()
         store, name = self.recordings[recording]
@@ -199,7 +198,7 @@ def scaled(window: WatchWindow, factor: float) -> WatchWindow:
 def mirror(window: WatchWindow, skeleton: Skeleton) -> WatchWindow:
     """The same happening seen in a mirror that swaps left and right."""
     flip = torch.tensor(MIRROR)
-    twins = [skeleton.index(mirrored_name(name)) for name in skeleton.joint_names]
+    twins = joint_twins(skeleton)
     return window._replace(
         **mirrored(window.sensed)._asdict(),
         R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton), t_world_root=window.t_world_root * flip,

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
+from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, Skeleton
 from wearcap.data.features import FEET, body_size
 from wearcap.data.floor import floor_from_path, floor_from_points
 from wearcap.data.surroundings import NOTHING, Surroundings
@@ -23,8 +23,6 @@ from wearcap.recording.store import RecordingFile, RecordingStore
 
 MIN_FRAMES = 10
 """Shortest beginning of a capture that is trained on."""
-MIRROR = (1.0, -1.0, 1.0)
-"""Left and right change places: y of every position."""
 
 
 class Window(NamedTuple):
@@ -111,6 +109,15 @@ def _usable(store: RecordingStore, split: str, fps: float, min_frames: int) -> I
             yield name
 
 
+def asked_for(item: tuple[int, int] | int) -> tuple[int, torch.Generator]:
+    """Number of the window that is asked for, and what its variations are drawn from: its seed.
+
+    A number alone comes from Lightning's overfit_batches, which puts its own sampler in: the same draws each time.
+    """
+    index, seed = item if isinstance(item, tuple) else (item, item)
+    return index, torch.Generator().manual_seed(seed)
+
+
 class WindowDataset(Dataset):
     """Windows of one split of one or more data sets. An item is asked for by (window, seed), or by its window alone."""
 
@@ -144,9 +151,7 @@ class WindowDataset(Dataset):
         return len(self.starts)
 
     def __getitem__(self, item: tuple[int, int] | int) -> Window:
-        # A number alone comes from Lightning's overfit_batches, which puts its own sampler in: same noise each time.
-        index, seed = item if isinstance(item, tuple) else (item, item)
-        random = torch.Generator().manual_seed(seed)
+        index, random = asked_for(item)
         recording, start, frames = self.starts[index].tolist()
         shift, mirrored, cut, end = torch.rand(4, generator=random).tolist()
         if self.mirror:
@@ -240,7 +245,7 @@ def mirror_window(window: Window, skeleton: Skeleton) -> Window:
         R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton),
         R_world_head=window.R_world_head * torch.outer(flip, flip),
         t_world_head=window.t_world_head * flip,
-        t_parent_joint=window.t_parent_joint[_twins(skeleton)] * flip,
+        t_parent_joint=window.t_parent_joint[joint_twins(skeleton)] * flip,
         foot_contact=window.foot_contact.flip(-1),
     )
 
@@ -250,10 +255,11 @@ def mirrored_rotations(
 ) -> Float[Tensor, "*batch joint 3 3"]:
     """A pose seen in a mirror that swaps left and right."""
     flip = R_parent_joint.new_tensor(MIRROR)
-    return R_parent_joint[..., _twins(skeleton), :, :] * torch.outer(flip, flip)
+    return R_parent_joint[..., joint_twins(skeleton), :, :] * torch.outer(flip, flip)
 
 
-def _twins(skeleton: Skeleton) -> list[int]:
+def joint_twins(skeleton: Skeleton) -> list[int]:
+    """Number of each joint's twin on the other side."""
     return [skeleton.index(mirrored_name(name)) for name in skeleton.joint_names]
 
 

@@ -5,14 +5,11 @@
 Poses come one by one and wait for the 30 that follow; the state is the last 61 frames.
 """
 
-import argparse
-import sys
-from pathlib import Path
-
 import torch
 
 from wearcap.data.contact_features import pose_frames
 from wearcap.errors import WearcapError
+from wearcap.export import command
 from wearcap.export.contact import load_exported_contact
 from wearcap.files import write_text
 from wearcap.pipelines.contact_prediction import ContactStream
@@ -22,10 +19,9 @@ from wearcap.recording.store import RecordingFile
 
 def main(arguments: list[str]) -> None:
     """Tell hand contact in one recording with an exported model and write it as a table."""
-    parser = argparse.ArgumentParser(prog="python -m wearcap.export.contact_runner", description=main.__doc__)
-    parser.add_argument("model", type=Path, help="exported .onnx or .pt2 file, its .json beside it")
-    parser.add_argument("recording", type=Path, help="recording (.safetensors) with a suit, or a motion")
-    parser.add_argument("output", type=Path, help="where to write times and probabilities (.csv)")
+    parser = command.parser(
+        "contact_runner", main.__doc__, "a suit, or a motion", "times and probabilities (.csv)"
+    )
     options = parser.parse_args(arguments)
     detector = load_exported_contact(options.model)
     recording = RecordingFile(options.recording).load()
@@ -46,7 +42,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except WearcapError as error:
-        sys.exit(f"error: {error}")
+    command.run(main)

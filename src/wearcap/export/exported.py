@@ -12,6 +12,7 @@ from wearcap.errors import WearcapError
 
 Run = Callable[..., Tensor]
 """Called with the network's arguments by name."""
+_AGAIN = "Copy it again, or make it anew with `wearcap export`."
 
 
 def open_onnx(path: str | Path) -> Run:
@@ -27,7 +28,9 @@ def open_onnx(path: str | Path) -> Run:
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions share no base of their own
-        raise WearcapError(f"not a readable ONNX file ({_first_line(error)})", where=path) from error
+        raise WearcapError(
+            f"not a readable ONNX file ({_first_line(error)})", where=path, fix=_AGAIN
+        ) from error
 
     def run(**inputs: Tensor) -> Tensor:
         arrays = {name: value.contiguous().numpy() for name, value in inputs.items()}
@@ -46,7 +49,9 @@ def open_pt2(path: str | Path) -> Run:
         _refuse_pickles(path)
         module = torch.export.load(str(path)).module()
     except (RuntimeError, ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
-        raise WearcapError(f"not a readable .pt2 archive ({_first_line(error)})", where=path) from error
+        raise WearcapError(
+            f"not a readable .pt2 archive ({_first_line(error)})", where=path, fix=_AGAIN
+        ) from error
     return lambda **inputs: module(**inputs)
 
 

@@ -5,8 +5,6 @@
 Windows, features and sampler are the eager pipeline's own: the same noise gives the same motion.
 """
 
-import argparse
-import sys
 from pathlib import Path
 
 import torch
@@ -14,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from wearcap.data.features import HeadFeatures
-from wearcap.errors import WearcapError
+from wearcap.export import command
 from wearcap.export.exported import Run, open_exported
 from wearcap.export.sidecar import SCHEDULES, part_path, read_sidecar, skeleton_from_json
 from wearcap.models.denoiser import Conditions, LevelPlan, MotionDenoiser, Normalizer
@@ -110,12 +108,7 @@ def load_exported(path: str | Path) -> HMD2:
 
 def main(arguments: list[str]) -> None:
     """Capture the motion of one recording with an exported model and write it as a recording."""
-    parser = argparse.ArgumentParser(prog="python -m wearcap.export.runner", description=main.__doc__)
-    parser.add_argument(
-        "model", type=Path, help="exported .onnx or .pt2 file, its .json and its parts beside it"
-    )
-    parser.add_argument("recording", type=Path, help="recording (.safetensors) with a head stream")
-    parser.add_argument("output", type=Path, help="where to write the motion (.safetensors)")
+    parser = command.parser("runner", main.__doc__, "a head stream", "the motion (.safetensors)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the sampler's noise (default 0)")
     options = parser.parse_args(arguments)
     recording = RecordingFile(options.recording).load()
@@ -128,7 +121,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except WearcapError as error:
-        sys.exit(f"error: {error}")
+    command.run(main)

@@ -205,7 +205,9 @@ def read_sidecar(path: str | Path, network: str) -> dict:
         raise WearcapError("no such sidecar", where=sidecar, expected="the .json file that `wearcap export` wrote "
                            "beside the model", fix="Copy both files.") from error  # fmt: skip
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise WearcapError(f"not a readable sidecar ({error})", where=sidecar) from error
+        raise WearcapError(
+            f"not a readable sidecar ({error})", where=sidecar, fix="Export the model again."
+        ) from error
     if not isinstance(tree, dict) or tree.get("wearcap_export") != VERSION:
         raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
     # The first sidecars did not say: all were denoisers'.

@@ -5,8 +5,6 @@
 The file holds the network alone; frames, floor and windows are the pipeline's own.
 """
 
-import argparse
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,6 +14,7 @@ from torch import Tensor, nn
 
 from wearcap.data.watch_features import WatchFeatures
 from wearcap.errors import WearcapError
+from wearcap.export import command
 from wearcap.export.exported import Run, open_exported
 from wearcap.export.network import ExportReport, export_network
 from wearcap.export.sidecar import header, read_sidecar, skeleton_from_json, skeleton_to_json, write_sidecar
@@ -87,10 +86,7 @@ def load_exported_mocap_every(path: str | Path) -> MocapEvery:
 
 def main(arguments: list[str]) -> None:
     """Capture one recording with an exported model."""
-    parser = argparse.ArgumentParser(prog="python -m wearcap.export.watches", description=main.__doc__)
-    parser.add_argument("model", type=Path, help="exported .onnx or .pt2 file, its .json beside it")
-    parser.add_argument("recording", type=Path, help="recording (.safetensors) with a head and two watches")
-    parser.add_argument("output", type=Path, help="where to write the motion, as a recording (.safetensors)")
+    parser = command.parser("watches", main.__doc__, "a head and two watches", "the motion (.safetensors)")
     options = parser.parse_args(arguments)
     recording = RecordingFile(options.recording).load()
     motion = load_exported_mocap_every(options.model)(recording)
@@ -99,7 +95,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except WearcapError as error:
-        sys.exit(f"error: {error}")
+    command.run(main)

@@ -71,6 +71,13 @@ def interpolate(
     return torch.lerp(value[before], value[after], blend)
 
 
+def nearest_frames(
+    timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "new_time"]
+) -> Int64[Tensor, "new_time"]:
+    """The frame that is nearest to each of some times, however far away it is."""
+    return torch.searchsorted((timestamps[1:] + timestamps[:-1]) / 2, at.contiguous())
+
+
 def resample(trajectory: Trajectory, timestamps: Float64[Tensor, "new_time"]) -> Trajectory:
     """Poses at other times: linear in translation, slerp in rotation.
 

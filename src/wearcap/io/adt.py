@@ -3,7 +3,6 @@
 The files' world has y up (gravity along -y); here it is turned to z up, x staying x.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +15,8 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.aria_mps import head_stream, read_closed_loop, turn_up
-from wearcap.io.csv_table import open_text, read_columns
+from wearcap.io.csv_table import read_columns
+from wearcap.io.json_text import read_json_object
 from wearcap.io.poses import check_finite, check_rising, checked_trajectory
 from wearcap.recording import Cue, Recording
 
@@ -64,7 +64,7 @@ def read_adt(folder: str | Path, *, fps: float | None = None, T_aria_cpf: Rigid 
         name=folder.resolve().name, head=head_stream(trajectory, fps=fps, T_aria_cpf=T_aria_cpf),
         cues=read_skeleton(skeletons[0]) if skeletons else {},
         object_motion={o.name: _path(o) for o in objects if o.moves and o.timestamps is not None},
-        location=str(_json(folder / "metadata.json").get("scene", "")) if (folder / "metadata.json").is_file() else "",
+        location=str(read_json_object(folder / "metadata.json").get("scene", "")) if (folder / "metadata.json").is_file() else "",
         source="Aria Digital Twin",
     )  # fmt: skip
 
@@ -72,7 +72,7 @@ def read_adt(folder: str | Path, *, fps: float | None = None, T_aria_cpf: Rigid 
 def read_skeleton(path: str | Path) -> dict[str, Cue]:
     """3D cues by joint name from `Skeleton_*.json` (120 Hz). Raises WearcapError for other joint counts or NaN."""
     try:
-        frames = _json(path)["frames"]
+        frames = read_json_object(path)["frames"]
         times = np.array([frame["timestamp_ns"] for frame in frames], dtype=np.float64) * 1e-9
         joints = np.array([frame["joints"] for frame in frames], dtype=np.float64)
     except (KeyError, TypeError, ValueError) as error:
@@ -100,7 +100,7 @@ def read_objects(folder: str | Path) -> list[AdtObject]:
     extents = [f"p_local_obj_{axis}{end}[m]" for end in ("min", "max") for axis in "xyz"]
     boxes = read_columns(folder / "3d_bounding_box.csv", extents, text=["object_uid"])
     box_of = dict(zip(boxes["object_uid"], np.stack([boxes[name] for name in extents], 1).reshape(-1, 2, 3)))
-    instances = _json(folder / "instances.json")
+    instances = read_json_object(folder / "instances.json")
     order = np.argsort(poses["object_uid"], kind="stable")
     objects = []
     for rows in np.split(order, np.unique(poses["object_uid"][order], return_index=True)[1][1:]):
@@ -133,14 +133,3 @@ def _object_poses(rows: dict[str, np.ndarray], where: Path) -> tuple[Rigid, Tens
 def _path(thing: AdtObject) -> Trajectory:
     assert thing.timestamps is not None
     return Trajectory(thing.timestamps, thing.T_world_obj.R, thing.T_world_obj.t)
-
-
-def _json(path: str | Path) -> dict:
-    try:
-        with open_text(path) as file:
-            content = json.load(file)
-    except json.JSONDecodeError as error:
-        raise WearcapError(f"not readable JSON ({error})", where=path) from error
-    if not isinstance(content, dict):
-        raise WearcapError("not a JSON object", where=path, expected="a dictionary at the top")
-    return content

@@ -1,8 +1,7 @@
 """AMASS: SMPL+H `.npz` files and SMPL-X "stageii" files in; AMASS-style SMPL+H files out.
 
-AMASS' world is metric and z up; its joint frames are SMPL's (x left, y up, z forward). With A turning those axes into
-ours, a joint's rotation is A · R · Aᵀ and the root's R · Aᵀ. SMPL turns about its pelvis but places its template's
-origin, so the pelvis stands at `trans` + J₀ with J₀ the template's pelvis in SMPL's own axes.
+AMASS' world is metric and z up; its joint frames are SMPL's (`io.smpl_axes`). SMPL turns about its pelvis but places its
+template's origin, so the pelvis stands at `trans` + J₀ with J₀ the template's pelvis in SMPL's own axes.
 """
 
 from pathlib import Path
@@ -18,10 +17,8 @@ from wearcap.files import atomic_path
 from wearcap.geometry import rotation
 from wearcap.io.frame_grid import even_frames, nominal_fps
 from wearcap.io.npz import read_npz, require
+from wearcap.io.smpl_axes import A, rotations_from_smpl, shape_from_arrays
 from wearcap.recording import Motion, Recording
-
-A = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-"""From SMPL's axes (x left, y up, z forward) into ours (x forward, y left, z up)."""
 
 PELVIS_SMPLH = (-0.0022, -0.2408, 0.0286)
 PELVIS_SMPLX = (0.0031, -0.3514, 0.0120)
@@ -46,17 +43,15 @@ def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] |
                            fix="shape.npz files beside the motions hold none: leave them out.")  # fmt: skip
     fps = _rate(arrays, path)
     stageii = _is_smplx(arrays)
-    poses = _axis_angles(arrays, path, stageii)
     skeleton = smplx22() if stageii else smplh52()
     pelvis = t_template_pelvis or (PELVIS_SMPLX if stageii else PELVIS_SMPLH)
-    R = rotation.exp(poses)
-    R = torch.cat([R[:, :1] @ A.T, A @ R[:, 1:] @ A.T], 1)
+    R = rotations_from_smpl(_axis_angles(arrays, path, stageii))
     t_root = torch.from_numpy(arrays["trans"].astype(np.float64)) + torch.tensor(pelvis, dtype=torch.float64)
     gender = _text(arrays.get("gender"))
     provenance = {"source": path.name, "format": "amass", **({"gender": gender} if gender else {})}
     motion = Motion(torch.arange(len(R), dtype=torch.float64) / fps, skeleton, R.float(), t_root.float(), provenance=provenance)  # fmt: skip
     return Recording(
-        path.stem, motion=motion, skeleton=skeleton, shape=_shape(arrays, path), subject=path.absolute().parent.name,
+        path.stem, motion=motion, skeleton=skeleton, shape=shape_from_arrays(arrays, path), subject=path.absolute().parent.name,
         source="AMASS",
     )  # fmt: skip
 
@@ -122,14 +117,6 @@ def _axis_angles(arrays: dict[str, np.ndarray], path: Path, stageii: bool) -> Fl
     if len(vectors) == 0:
         raise WearcapError("no frames", where=path)
     return torch.from_numpy(vectors.astype(np.float64)).unflatten(1, (-1, 3))
-
-
-def _shape(arrays: dict[str, np.ndarray], path: Path) -> dict[str, float]:
-    if "betas" not in arrays:
-        return {}
-    betas = {"betas": arrays["betas"].reshape(-1)}
-    require(betas, path, betas=("feature",))
-    return {f"beta_{k}": float(beta) for k, beta in enumerate(betas["betas"])}
 
 
 def _text(array: np.ndarray | None) -> str:

@@ -183,7 +183,9 @@ def timecode_offset_s(path: str | Path) -> float:
     provider = _open(path)
     device_ns = provider.get_first_time_ns_all_streams(TimeDomain.DEVICE_TIME)
     if not provider.supports_time_domain(provider.get_all_streams()[0], TimeDomain.TIME_CODE):
-        raise WearcapError("carries no time code", where=path)
+        raise WearcapError(
+            "carries no time code", where=path, expected="a recording made with one, as Nymeria's"
+        )
     return (device_ns - provider.convert_from_device_time_to_timecode_ns(device_ns)) * 1e-9
 
 

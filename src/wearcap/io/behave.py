@@ -25,6 +25,7 @@ from wearcap.io.npz import read_npz, require
 from wearcap.io.one_object import OneObject, smpl_motion
 from wearcap.io.ply import read_ply
 from wearcap.io.poses import check_rising
+from wearcap.io.smpl_axes import shape_from_betas
 from wearcap.scene.object_mesh import centered, check_object_mesh
 
 FPS = 30
@@ -185,4 +186,4 @@ def _shape(body: dict[str, np.ndarray], path: Path, frames: int) -> dict[str, fl
     else:
         require(body, path, betas=("feature",))
         mean = body["betas"]
-    return {f"beta_{k}": float(beta) for k, beta in enumerate(mean)}
+    return shape_from_betas(mean)

@@ -29,6 +29,7 @@ from wearcap.io.json_text import read_json
 from wearcap.io.npz import read_npz, require
 from wearcap.io.ply import read_ply
 from wearcap.io.poses import checked_trajectory
+from wearcap.io.smpl_axes import shape_from_betas
 from wearcap.io.smpl_json import read_smpl_json
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.recording.recording import Recording
@@ -99,9 +100,7 @@ def read_egohoi(
     if interactions is not None:
         labels_of(interactions, clock)  # refuses a hand that holds two things at once
     shape = root / "smpl_shapes" / f"{subject_of(name)}.json"
-    betas = body.shape or (
-        {f"beta_{k}": v for k, v in enumerate(read_hps_subject(shape).betas)} if shape.is_file() else {}
-    )
+    betas = body.shape or (shape_from_betas(read_hps_subject(shape).betas) if shape.is_file() else {})
     recording = Recording(
         name, motion=body.motion, object_motion=paths, interactions=interactions, skeleton=body.motion.skeleton,
         shape=betas, subject=subject_of(name), location=location_of(name), activity=activity_of(name), source="EgoHOI",

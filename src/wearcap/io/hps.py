@@ -17,11 +17,11 @@ from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
-from wearcap.io.amass import A
-from wearcap.io.json_text import read_json
+from wearcap.io.json_text import read_json_object
 from wearcap.io.npz import require
 from wearcap.io.poses import NORM_TOLERANCE
 from wearcap.io.restricted_pickle import read_pickle
+from wearcap.io.smpl_axes import rotations_from_smpl
 from wearcap.recording import Localization, Motion
 
 FPS = 30.0
@@ -58,8 +58,7 @@ def read_hps_motion(path: str | Path, t_template_pelvis: tuple[float, float, flo
     sizes = require(arrays, path, poses=("time", 72), transes=("time", 3))
     if not sizes["time"]:
         raise WearcapError("no frames", where=path)
-    R = rotation.exp(torch.from_numpy(arrays["poses"].astype(np.float64)).unflatten(1, (-1, 3)))
-    R = torch.cat([R[:, :1] @ A.T, A @ R[:, 1:] @ A.T], 1)
+    R = rotations_from_smpl(torch.from_numpy(arrays["poses"].astype(np.float64)).unflatten(1, (-1, 3)))
     t = torch.from_numpy(arrays["transes"].astype(np.float64)) + torch.tensor(
         t_template_pelvis, dtype=torch.float64
     )
@@ -71,7 +70,7 @@ def read_hps_motion(path: str | Path, t_template_pelvis: tuple[float, float, flo
 
 def read_hps_subject(path: str | Path) -> HpsSubject:
     """Read `hps_betas/SUBx.json`. Raises WearcapError for missing betas or what is no number."""
-    content = _mapping(path)
+    content = read_json_object(path)
     try:
         betas = np.asarray(content["betas"], np.float64).reshape(-1)
         heel_m = float(content.get("root_to_heel", 0.0))
@@ -87,7 +86,7 @@ def read_hps_subject(path: str | Path) -> HpsSubject:
 
 def read_hps_starts(path: str | Path) -> tuple[int, int]:
     """(frame of the localised video, frame of the suit) that show the same clap: `hps_inits/*.json`."""
-    content = _mapping(path)
+    content = read_json_object(path)
     starts = [content.get(key) for key in ("cam_start", "imu_start")]
     if not all(isinstance(start, int | float) and 0 <= start <= MAX_FRAMES for start in starts):
         raise WearcapError(
@@ -102,7 +101,7 @@ def read_hps_localization(path: str | Path, fps: float | int = FPS) -> Localizat
     Frames that are null or absent have confidence 0, an identity rotation and position 0; the others confidence 1, for
     the file knows no more. Raises WearcapError naming the frame for what is no pose, and when no frame has one.
     """
-    rows = _mapping(path)
+    rows = read_json_object(path)
     frames = _frame_numbers(rows, path)
     count = max(frames.values(), default=-1) + 1
     quat_wxyz, position = np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, 3))
@@ -153,7 +152,7 @@ def read_hps_cameras(path: str | Path) -> dict[str, Camera]:
     Raises WearcapError naming the camera for missing or wrong parameters.
     """
     cameras: dict[str, Camera] = {}
-    for serial, row in _mapping(path).items():
+    for serial, row in read_json_object(path).items():
         where = f"{path}, camera {serial!r}"
         try:
             lens = row["parameters"]
@@ -201,10 +200,3 @@ def resampled_localization(localization: Localization, fps: float | int) -> Loca
 def nominal_mount() -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """(R_head_cam, t_head_cam) of a camera on the forehead that looks ahead, upright (ours: it is not measured)."""
     return torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), torch.tensor([0.12, 0.0, 0.12])
-
-
-def _mapping(path: str | Path) -> dict[str, Any]:
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="a JSON object")
-    return content

@@ -29,6 +29,7 @@ from wearcap.io.hps import (
 from wearcap.io.hps_scene import CLOUD
 from wearcap.io.hps_unity import read_unity_motion
 from wearcap.io.mvnx import read_mvnx
+from wearcap.io.smpl_axes import shape_from_betas
 from wearcap.io.video import video_info
 from wearcap.recording import CameraStream, Localization, Motion, Recording
 
@@ -123,9 +124,7 @@ def _shaped(root: Path, name: str, motion: Motion) -> tuple[dict[str, float], Mo
         return {}, motion
     subject = read_hps_subject(path)
     about = {"gender": subject.gender, "root_to_heel_m": f"{subject.root_to_heel_m:.4f}"}
-    return {f"beta_{k}": beta for k, beta in enumerate(subject.betas)}, replace(
-        motion, provenance=motion.provenance | about
-    )
+    return shape_from_betas(subject.betas), replace(motion, provenance=motion.provenance | about)
 
 
 def _suit(root: Path, name: str) -> Recording | None:

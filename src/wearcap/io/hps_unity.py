@@ -16,8 +16,8 @@ from torch import Tensor
 from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
-from wearcap.io.amass import A
 from wearcap.io.hps import FPS, PELVIS_SMPL
+from wearcap.io.smpl_axes import A
 from wearcap.io.text import at_line, finite_floats, is_finite_number, read_text
 from wearcap.recording import Motion
 

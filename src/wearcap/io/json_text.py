@@ -15,3 +15,11 @@ def read_json(path: str | Path) -> Any:
     except (ValueError, RecursionError) as error:
         raise WearcapError(f"not readable JSON ({error})"[:300], where=path, expected="a whole JSON file",
                            fix="Fetch it again.") from error  # fmt: skip
+
+
+def read_json_object(path: str | Path) -> dict[str, Any]:
+    """A JSON file's object. Raises WearcapError as `read_json` does, and for a file that holds something else."""
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="a JSON object")
+    return content

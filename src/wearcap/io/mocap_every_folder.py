@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import roma
 import torch
 import yaml
 from jaxtyping import Float
@@ -41,7 +40,7 @@ _SLAM_PIXELS = 384 * 512
 
 
 @dataclass(frozen=True)
-class Board:
+class BoardWalks:
     """How the camera was carried over the calibration board: from where to where (SLAM's units), and what was measured."""
 
     x_slam: Float[Tensor, "end 3"]
@@ -66,7 +65,7 @@ class MocapEveryFolder:
     points_slam: Float[Tensor, "point 3"] | None = None
     video: Path | None = None
     imu: dict[str, ImuStream] | None = None
-    board: Board | None = None
+    board: BoardWalks | None = None
 
 
 def is_mocap_every_folder(folder: str | Path) -> bool:
@@ -98,25 +97,6 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
         {joint: read_watch_log(folder / log, joint) for joint, log in zip(WRISTS, LOGS) if (folder / log).is_file()},
         _board(track, config, marks, folder),
     )  # fmt: skip
-
-
-def board_alignment(board: Board) -> tuple[float, Rigid]:
-    """Scale (m per unit) and T_world_slam: p_world = T_world_slam @ (scale · p_slam).
-
-    The scale is the mean of both lengths' (appendix C.2). The rotation brings the walks nearest to the world's x and y,
-    both alike, in closed form where the document optimises; the origin lies on the floor under the start of y.
-    Raises WearcapError for walks that are no right angle.
-    """
-    ways = torch.stack([end[1] - end[0] for end in (board.x_slam, board.y_slam)]).double()
-    length = ways.norm(dim=1)
-    if not (length > 0).all() or abs((ways[0] @ ways[1] / length.prod()).item()) > 0.5:
-        raise WearcapError("the camera's ways along the board's edges are no right angle", where="board",
-                           fix=f"Check the times of x and y in {MARKS}.")  # fmt: skip
-    scale = (torch.tensor(board.length_m, dtype=torch.float64) / length).mean().item()
-    axes = torch.eye(3, dtype=torch.float64)[:2]
-    R: Tensor = roma.special_procrustes(axes.T @ (ways / length[:, None]))  # pyright: ignore[reportAssignmentType]
-    start = torch.tensor([0.0, 0.0, board.height_m], dtype=torch.float64)
-    return scale, Rigid(R, start - R @ (scale * board.y_slam[0].double())).to(torch.float32)
 
 
 def mocap_every_recording(
@@ -160,7 +140,7 @@ def _trajectory(path: Path, start_s: float) -> Trajectory:
     table = np.asarray(content) if isinstance(content, np.ndarray | list) else np.zeros(0)
     require({"poses": table}, path, poses=("time", 7))
     if not len(table):
-        raise WearcapError("no poses", where=path)
+        raise WearcapError("no poses", where=path, expected="a row of 7 numbers per picture")
     if abs(table[0, 3]) > 0.9999 > abs(table[0, 6]):
         raise WearcapError("the first quaternion is the identity with the scalar first", where=path,
                            expected="x y z, then qx qy qz qw", fix="Move the scalar to the end of the rows.")  # fmt: skip
@@ -194,7 +174,9 @@ def _shutter(config: dict[str, Any], marks: dict[str, Any], folder: Path) -> flo
     return 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
 
 
-def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> Board | None:
+def _board(
+    track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path
+) -> BoardWalks | None:
     measured = config.get("cam_scale_origin")
     if measured is None or not {"x", "y"} <= marks.keys():
         return None
@@ -211,7 +193,7 @@ def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], fol
             raise WearcapError(f"{name} at {times.tolist()} s", where=folder / MARKS,
                                expected=f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path")  # fmt: skip
         ends.append(track.t_world_body[(track.timestamps[None] - times[:, None]).abs().argmin(1)])
-    return Board(ends[0], ends[1], (length[0], length[1]), height)
+    return BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
 
 
 def _numbers(values: Any, count: int, what: str, where: Path) -> list[float]:

@@ -4,7 +4,6 @@ The suit's data has its own clock and a drifting world of its own; both are brou
 (io/head_alignment.py), whose world is metric with z up.
 """
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +18,13 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate
-from wearcap.io.amass import PELVIS_SMPLH, A
+from wearcap.io.amass import PELVIS_SMPLH
 from wearcap.io.aria_mps import T_HEAD_DEVICE, find_mps_file, head_stream, read_closed_loop, read_mps_points
 from wearcap.io.aria_vrs import extract_video
 from wearcap.io.head_alignment import align_head, clock_offset
+from wearcap.io.json_text import read_json_object
 from wearcap.io.npz import read_npz, require
+from wearcap.io.smpl_axes import rotations_from_smpl
 from wearcap.recording import ContactTrack, HeadStream, Motion, Recording
 
 SUIT_HZ = 240.0
@@ -133,8 +134,7 @@ def read_smpl_neutral(path: str | Path) -> Motion:
         transl=("time", 3),
     )
     axis_angle = np.concatenate([arrays["global_orient"], arrays["body_pose"]], 1).reshape(-1, 24, 3)
-    R = rotation.exp(torch.from_numpy(axis_angle.astype(np.float64)))
-    R = torch.cat([R[:, :1] @ A.T, A @ R[:, 1:] @ A.T], 1)
+    R = rotations_from_smpl(torch.from_numpy(axis_angle.astype(np.float64)))
     t_root = torch.from_numpy(arrays["transl"].astype(np.float64)) + torch.tensor(
         PELVIS_SMPLH, dtype=torch.float64
     )
@@ -241,10 +241,7 @@ def read_metadata(folder: Path) -> dict:
     path = folder / "metadata.json"
     if not path.is_file():
         return about
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise WearcapError(f"not readable JSON ({error})", where=path) from error
+    content = read_json_object(path)
     about["subject"] = str(content.get("participant_id") or content.get("fake_name") or about["subject"])
     about["location"] = str(content.get("location", ""))
     about["activity"] = str(content.get("script", ""))

@@ -25,6 +25,7 @@ from wearcap.io.amass import PELVIS_SMPLX
 from wearcap.io.npz import require
 from wearcap.io.one_object import OneObject, smpl_motion
 from wearcap.io.restricted_pickle import read_pickle
+from wearcap.io.smpl_axes import shape_from_arrays
 from wearcap.io.wavefront import read_obj
 from wearcap.scene.object_mesh import centered, check_object_mesh
 
@@ -126,7 +127,7 @@ def omomo_take(sequence: OmomoSequence, root: str | Path, fps: float | int) -> O
     scale = _scale(arrays["obj_scale"][known], where)
     mesh, center = _mesh(root, sequence.object_name, scale)
     path = _path(arrays, times, torch.from_numpy(center), torch.from_numpy(known), where)
-    take = OneObject(sequence.name, motion, sequence.object_name, path, mesh, _shape(arrays, where), sequence.subject,
+    take = OneObject(sequence.name, motion, sequence.object_name, path, mesh, shape_from_arrays(arrays, where), sequence.subject,
                      "_".join(sequence.name.split("_")[1:]))  # fmt: skip
     return take.frames(torch.from_numpy(known))
 
@@ -190,11 +191,3 @@ def _path(
     scale = torch.from_numpy(arrays["obj_scale"].astype(np.float64))
     t = torch.from_numpy(arrays["obj_trans"].astype(np.float64)) + scale[:, None] * (R @ center)
     return Trajectory(times, R.float(), t.float())
-
-
-def _shape(arrays: dict[str, np.ndarray], where: str) -> dict[str, float]:
-    if "betas" not in arrays:
-        return {}
-    betas = {"betas": arrays["betas"].reshape(-1)}
-    require(betas, where, betas=("feature",))
-    return {f"beta_{k}": float(beta) for k, beta in enumerate(betas["betas"])}

@@ -7,10 +7,9 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
-from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.amass import A
+from wearcap.io.smpl_axes import rotations_from_smpl
 from wearcap.recording.motion import Motion
 
 
@@ -57,6 +56,5 @@ def smpl_motion(
     t_world_pelvis: Float64[Tensor, "time 3"], provenance: dict[str, str],
 ) -> Motion:  # fmt: skip
     """A motion of our skeleton from SMPL's rotation vectors (in SMPL's axes) and the pelvis' place (m)."""
-    R = rotation.exp(rotvec)
-    R = torch.cat([R[:, :1] @ A.T, A @ R[:, 1:] @ A.T], 1)
+    R = rotations_from_smpl(rotvec)
     return Motion(timestamps, skeleton, R.float(), t_world_pelvis.float(), provenance=provenance)

@@ -16,11 +16,10 @@ import torch
 
 from wearcap.body.skeletons import smpl24, smplh52
 from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
-from wearcap.io.amass import A
 from wearcap.io.json_text import read_json
 from wearcap.io.npz import require
 from wearcap.io.poses import check_rising
+from wearcap.io.smpl_axes import rotations_from_smpl, shape_from_betas
 from wearcap.io.text import MAX_BYTES
 from wearcap.recording.motion import Motion
 
@@ -85,8 +84,7 @@ def _rotations(arrays: dict[str, np.ndarray]) -> torch.Tensor:
     else:
         parts = [body, np.zeros((len(body), _BODY + 6 - body.shape[1]))]
     vectors = np.concatenate([arrays["global_orient"], *parts], 1)
-    R = rotation.exp(torch.from_numpy(vectors).unflatten(1, (-1, 3)))
-    return torch.cat([R[:, :1] @ A.T, A @ R[:, 1:] @ A.T], 1)
+    return rotations_from_smpl(torch.from_numpy(vectors).unflatten(1, (-1, 3)))
 
 
 def _unzipped(path: Path) -> Any:
@@ -137,7 +135,7 @@ def _frames(content: Any, path: Path) -> tuple[list[dict], dict]:
 def _newer(frame: dict, path: Path, number: int) -> dict:
     pose = frame.get("pose")
     if not isinstance(pose, list) or len(pose) != 72:
-        raise WearcapError(f"frame {number} has no pose of 72 numbers", where=path)
+        raise WearcapError(f"frame {number} has no pose of 72 numbers", where=path, expected=_EXPECTED)
     found = {"time": frame.get("time"), "global_orient": pose[:3], "body_pose": pose[3:]}
     return found | ({"transl": frame["translation"]} if "translation" in frame else {})
 
@@ -159,4 +157,4 @@ def _shape(about: dict, path: Path) -> dict[str, float]:
         raise WearcapError(
             f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers"
         )
-    return {f"beta_{k}": beta for k, beta in enumerate(betas.tolist())}
+    return shape_from_betas(betas)

@@ -1,7 +1,7 @@
 """Real inertial sensors beside a true SMPL pose: TotalCapture (6 sensors) and DIP-IMU (17), as DIP's authors give them.
 
 Both worlds have y up and are turned by +90° about x. A sensor's orientation is that of its bone in SMPL's own axes (x
-left, y up, z forward), so that it is mounted on our joint's axes by `io.amass.A`; accelerations are free of gravity.
+left, y up, z forward), so that it is mounted on our joint's axes by `io.smpl_axes.A`; accelerations are free of gravity.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,9 +18,9 @@ from torch import Tensor
 from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.amass import A
 from wearcap.io.npz import read_npz, require
 from wearcap.io.restricted_pickle import read_pickle
+from wearcap.io.smpl_axes import A, rotations_from_smpl
 from wearcap.recording import ImuStream, Motion
 
 FPS = 60.0
@@ -159,8 +159,8 @@ def _motion(arrays: dict[str, np.ndarray], frames: int, path: Path) -> Motion:
     require({"gt": pose}, path, gt=("time", 72))
     if len(pose) != frames:
         raise WearcapError(f"{len(pose)} poses for {frames} samples", where=path, expected="one each")
-    R = rotation.exp(torch.from_numpy(pose.astype(np.float64)).unflatten(1, (-1, 3)))
-    R = torch.cat([R_UP @ R[:, :1] @ A.T, A @ R[:, 1:] @ A.T], 1)
+    R = rotations_from_smpl(torch.from_numpy(pose.astype(np.float64)).unflatten(1, (-1, 3)))
+    R = torch.cat([R_UP @ R[:, :1], R[:, 1:]], 1)
     return Motion(
         torch.arange(frames, dtype=torch.float64) / FPS, smpl24(), R.float(), torch.zeros(frames, 3),
         provenance={"source": path.name, "format": "totalcapture"},

@@ -1,14 +1,12 @@
 """What finds a body's joints in the pictures of a video, and detections that another program wrote down."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
 from wearcap.errors import WearcapError
-from wearcap.io.keypoints_csv import read_keypoints
 from wearcap.recording.recording import Cue
 
 
@@ -54,11 +52,6 @@ class RecordedDetections:
             for cue in cues.values()
             if len(cue.timestamps)
         }
-
-    @classmethod
-    def from_file(cls, path: str | Path, within_s: float) -> "RecordedDetections":
-        """From a file of `io.keypoints_csv`, with pixels."""
-        return cls(read_keypoints(path), within_s)
 
     @property
     def joints(self) -> tuple[str, ...]:

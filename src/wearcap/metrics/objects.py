@@ -28,7 +28,7 @@ def center_error_cm(
 ) -> Float[Tensor, "*batch"]:
     """E_c (eq. 17): distance (cm) of the mean of the vertices from its true place."""
     center = vertices.mean(0)
-    return 100 * (T_found @ center - T_true @ center).norm(dim=-1)
+    return 100 * (T_found @ center - T_true @ center).norm(dim=-1)  # pyright: ignore[reportOperatorIssue]
 
 
 def rotation_difference_deg(T_found: Rigid, T_true: Rigid) -> Float[Tensor, "*batch"]:

@@ -69,6 +69,11 @@ class PointNeXt(nn.Module):
                 expected="one of each per stage",
             )
         self.size, self.strides, self.y_up = width << len(strides), tuple(strides), y_up
+        self.settings = {
+            "width": width, "strides": list(strides), "blocks": list(blocks), "neighbours": list(neighbours), "radius": radius,
+            "radius_scaling": radius_scaling, "expansion": expansion, "normalized": normalized, "y_up": y_up,
+        }  # fmt: skip
+        """That make another one like it."""
         self.stem = nn.Linear(3, width)
         stages = []
         for stage, (stride, count, most) in enumerate(zip(strides, blocks, neighbours)):

@@ -196,7 +196,8 @@ def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPa
             yield path, recording.motion.R_parent_joint
     if first is None:
         raise WearcapError("no training recordings with head and motion",
-                           where=", ".join(str(store.root) for store in stores))  # fmt: skip
+                           where=", ".join(str(store.root) for store in stores),
+                           expected="a training split of recordings with both")  # fmt: skip
 
 
 def _read(store: RecordingStore, name: str) -> Recording:
@@ -267,7 +268,7 @@ def _load(path: str | Path, kind: str) -> tuple[tuple[str, ...], float, dict[str
             about = json.loads((file.metadata() or {}).get("baseline", "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (OSError, safetensors.SafetensorError) as error:
-        raise WearcapError(f"not a readable baseline ({error})", where=path) from error
+        raise WearcapError(f"not a readable baseline ({error})", where=path, expected="what `save` of one wrote") from error  # fmt: skip
     if about.get("kind") != kind:
         raise WearcapError(f"holds {about.get('kind', 'no baseline')}", where=path, expected=kind)
     return tuple(about["joint_names"]), about["fps"], tensors

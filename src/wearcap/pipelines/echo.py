@@ -70,7 +70,9 @@ class Echo:
     def __post_init__(self):
         if isinstance(self.acts, str) and self.acts not in ("truth", "none"):
             raise WearcapError(f"no acts {self.acts!r}", expected="truth, none, or a list of {object, start_s, stop_s}")  # fmt: skip
-        _ = self.belt, self._given_acts()
+        ramp, _ = self.belt.ramp, self._given_acts()
+        if self.rewindow is not None and not 0 < self.rewindow <= ramp:
+            raise WearcapError(f"windows that advance by {self.rewindow} frames", expected=f"1 to {ramp}, the window less the context")  # fmt: skip
         require_runtime(self.runtime, self.device)
 
     @property

@@ -4,12 +4,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool
 from torch import Tensor
 
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.data.prepare.clean import at_times
 from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import nearest_frames
 from wearcap.metrics.position import mpjpe_cm, root_error_cm
 from wearcap.metrics.table import Row, evaluate_motion
 from wearcap.pipelines.hmd2 import hang_from_head
@@ -95,7 +96,7 @@ def truth_at(
     if truth is None:
         raise WearcapError("no true motion to compare with", where=name, expected="a recording with `motion`")
     if _within(motion, truth):
-        frame = _nearest_frames(truth, motion.timestamps)
+        frame = nearest_frames(truth.timestamps, motion.timestamps)
         truth, contact = at_times(truth, motion.timestamps), None if contact is None else contact[frame]
     return truth, contact
 
@@ -111,12 +112,6 @@ def _within(motion: Motion, truth: Motion) -> bool:
         and ends is not None
         and bool(motion.timestamps[0] >= ends[0] - 1e-6 and motion.timestamps[-1] <= ends[1] + 1e-6)
     )
-
-
-def _nearest_frames(motion: Motion, timestamps: Float64[Tensor, "time"]) -> Int64[Tensor, "time"]:
-    """Frame of a motion that is nearest to each time."""
-    middle = (motion.timestamps[1:] + motion.timestamps[:-1]) / 2
-    return torch.searchsorted(middle, timestamps.contiguous())
 
 
 def _foot_contact(recording: Recording) -> Bool[Tensor, "time patch"] | None:

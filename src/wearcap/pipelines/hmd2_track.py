@@ -73,6 +73,9 @@ class HeadTrack:
 
     def take(self, timestamp: float, T_world_device: Rigid | None) -> None:
         """Take in a moment, with the device's pose if it is known. It may come after later ones, until their chunk is out."""
+        if not math.isfinite(timestamp):
+            self.dropped += 1
+            return
         self.newest = max(self.newest, timestamp)
         if T_world_device is None:
             return

@@ -80,7 +80,8 @@ class Synchronization:
             return None
         camera, suit = recording.camera, recording.suit
         if camera is None:
-            raise WearcapError("no camera in this recording", where=recording.name)
+            raise WearcapError("no camera in this recording", where=recording.name,
+                               expected="a head camera that hears the suit's claps")  # fmt: skip
         wrists = [recording.imu[name] for name in WRISTS if name in recording.imu]
         if not wrists and suit is not None:
             wrists = [synthesize_imu(suit, name, n=1) for name in WRISTS]

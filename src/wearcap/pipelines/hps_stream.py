@@ -138,9 +138,7 @@ class HpsStream:
         times = torch.arange(first, last + 1, dtype=torch.float64) / fps
         inside = (times >= self.suit.timestamps[0]) & (times <= self.suit.timestamps[-1])
         motion, turn = at_times(self.suit, times[inside]), rotation.about_axis("z", angle)
-        R = motion.R_parent_joint.clone()
-        R[:, 0] = turn @ R[:, 0]
-        return replace(motion, R_parent_joint=R, t_world_root=motion.t_world_root @ turn.mT + move)
+        return motion.moved(Rigid(turn, move))
 
     def _start(self, aligned: Motion) -> Initialization:
         """The window's initialisation; while nothing of it is localised, the suit carries on from the last frames."""
@@ -154,10 +152,7 @@ class HpsStream:
                 start.motion.joint("head").R[nearest].double(), seen.R_world_cam.double(), sure.double()
             )
             return start
-        turn = rotation.about_axis("z", self.yaw.float())
-        R = aligned.R_parent_joint.clone()
-        R[:, 0] = turn @ R[:, 0]
-        carried = replace(aligned, R_parent_joint=R, t_world_root=aligned.t_world_root @ turn.mT)
+        carried = aligned.moved(Rigid(rotation.about_axis("z", self.yaw.float()), torch.zeros(3)))
         if self.done is not None:
             at = int(
                 torch.searchsorted(carried.timestamps, self.done.timestamps[-1]).clamp(max=len(carried) - 1)

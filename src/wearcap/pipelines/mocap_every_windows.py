@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.data.features import body_size
 from wearcap.data.watch_features import Sensed, mirrored, to_world
 from wearcap.data.windows import mirrored_rotations
@@ -120,7 +120,7 @@ class EstimatorWindows:
         contact = told.contact_logit.float().sigmoid()
         if pipeline.mirror:
             R = torch.stack([R[0], mirrored_rotations(R[1], skeleton)])
-            t = torch.stack([t[0], t[1] * t.new_tensor([1.0, -1.0, 1.0])])
+            t = torch.stack([t[0], t[1] * t.new_tensor(MIRROR)])
             contact = torch.stack([contact[0], contact[1].flip(-1)])
         return torch.cat([t, rotation.rot6d_from_matrix(R).flatten(-2), contact], -1).mean(0)
 

@@ -112,7 +112,9 @@ def _require_one_session(recordings: Sequence[Recording]) -> None:
     for recording in recordings:
         stream = recording.head or recording.motion
         if stream is None or not len(stream.timestamps):
-            raise WearcapError("neither head poses nor a motion", where=recording.name)
+            raise WearcapError(
+                "neither head poses nor a motion", where=recording.name, expected="one of both"
+            )
         spans.append((stream.timestamps[0].item(), stream.timestamps[-1].item()))
     if spans and max(start for start, _ in spans) > min(stop for _, stop in spans):
         raise WearcapError("recordings of one session at different times", where=recordings[0].session,

@@ -11,6 +11,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.data.manifold_features import FEET, Posed, decode_window, encode_window, origin_of
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import nearest_frames
 from wearcap.models.motion_manifold import MotionManifold
 from wearcap.optimize.latent_motion import (
     Body,
@@ -172,8 +173,7 @@ def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
     if not len(cue.timestamps):
         empty = torch.zeros(len(timestamps), cue.points.shape[-1])
         return replace(cue, timestamps=timestamps, points=empty, confidence=torch.zeros(len(timestamps)))
-    middle = (cue.timestamps[1:] + cue.timestamps[:-1]) / 2
-    nearest = torch.searchsorted(middle, timestamps.contiguous())
+    nearest = nearest_frames(cue.timestamps, timestamps)
     step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
     points = cue.points[nearest]
     near = ((cue.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6) & points.isfinite().all(-1)
@@ -184,8 +184,7 @@ def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
 
 def view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> View:
     """A view at a motion's frames, likewise."""
-    middle = (view.motion.timestamps[1:] + view.motion.timestamps[:-1]) / 2
-    nearest = torch.searchsorted(middle, timestamps.contiguous())
+    nearest = nearest_frames(view.motion.timestamps, timestamps)
     step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
     near = (view.motion.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6
     motion = replace(

@@ -69,6 +69,21 @@ class Motion:
             body_contact_prob=skin, object_motion=objects,
         )  # fmt: skip
 
+    def moved(self, T_new_world: Rigid) -> "Motion":
+        """The same motion, and its objects', in other world axes."""
+        R_new, t_new = T_new_world.R, T_new_world.t
+        R = self.R_parent_joint.clone()
+        R[:, 0] = R_new @ R[:, 0]
+        objects = self.object_motion
+        if objects is not None:
+            objects = {
+                name: Trajectory(track.timestamps, R_new @ track.R_world_body, track.t_world_body @ R_new.mT + t_new)
+                for name, track in objects.items()
+            }  # fmt: skip
+        return replace(
+            self, R_parent_joint=R, t_world_root=self.t_world_root @ R_new.mT + t_new, object_motion=objects
+        )
+
 
 def _within(track: Trajectory, start_s: float, stop_s: float) -> Trajectory:
     first = int(torch.searchsorted(track.timestamps, start_s))

@@ -1,7 +1,5 @@
 """The suit's world turned and moved into the scene's: thesis eq. 4.14 and 4.15, and the camera's mount (eq. 4.3)."""
 
-from dataclasses import replace
-
 import roma
 import torch
 from jaxtyping import Bool, Float
@@ -46,9 +44,7 @@ def align_suit(
     R_scene_suit = rotation.about_axis("z", turn)
     worn: Tensor = head @ mount.t  # pyright: ignore[reportAssignmentType]
     move = _weighted_median(T_world_cam.t - worn @ R_scene_suit.mT, weight)
-    R = suit.R_parent_joint.clone()
-    R[:, 0] = R_scene_suit @ R[:, 0]
-    return replace(suit, R_parent_joint=R, t_world_root=suit.t_world_root @ R_scene_suit.mT + move), turn
+    return suit.moved(Rigid(R_scene_suit, move)), turn
 
 
 def inliers(localization: Localization) -> Bool[Tensor, "time"]:

@@ -1,7 +1,8 @@
 """From a monocular SLAM's world to ours by a board, and from the camera to the head (MocapEvery appendix C.2).
 
-The camera is put on four positions: C1 and C2 on the board's y axis, C3 and C4 on its x axis, as far apart as measured.
-p_world = scale · R_world_slam p_slam + t_world_slam; the origin is where the axes meet. Cameras are OpenCV's.
+The camera is put on four positions (`align_by_marks`): C1 and C2 on the board's y axis, C3 and C4 on its x axis, as
+far apart as measured; the origin is where the axes meet. Or it is carried along the board's edges, as for MocapEvery's
+own capture folders (`align_by_walks`). p_world = scale · R_world_slam p_slam + t_world_slam. Cameras are OpenCV's.
 """
 
 import math
@@ -9,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import roma
 import torch
 from jaxtyping import Float, Float64
 from scipy.optimize import least_squares
@@ -17,6 +19,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate
 from wearcap.recording.recording import HeadStream
 from wearcap.sensors.stillness import StepCheck, Stretch, during, unstillness_deg
@@ -151,6 +154,33 @@ def _residuals(x: np.ndarray, C: np.ndarray, distances: tuple[float, float], hei
     P = np.exp(x[3]) * Rotation.from_rotvec(x[:3]).apply(C) + x[4:]
     apart = [P[1, 1] - P[0, 1] - distances[0], P[3, 0] - P[2, 0] - distances[1]]
     return np.concatenate([P[:2, 0], P[2:, 1], P[:, 2] - height, apart])
+
+
+def align_by_walks(
+    x_slam: Float[Tensor, "end 3"],
+    y_slam: Float[Tensor, "end 3"],
+    length_m: tuple[float, float],
+    height_m: float,
+) -> tuple[float, Rigid]:
+    """Scale (m per unit) and T_world_slam of a camera that was carried along the board's x and y edge.
+
+    p_world = T_world_slam @ (scale · p_slam). Told are where each walk began and ended, how long the edges are, and how
+    high the camera was above the floor where the walk along y began.
+
+    The scale is the mean of both edges' (appendix C.2). The rotation brings the walks nearest to the world's x and y,
+    both alike, in closed form where the document optimises; the origin lies on the floor under the start of y.
+    Raises WearcapError for walks that are no right angle.
+    """
+    ways = torch.stack([end[1] - end[0] for end in (x_slam, y_slam)]).double()
+    length = ways.norm(dim=1)
+    if not (length > 0).all() or abs((ways[0] @ ways[1] / length.prod()).item()) > 0.5:
+        raise WearcapError("the camera's ways along the board's edges are no right angle", where="camera on the board",
+                           expected="about 90°", fix="Check the times of the walks along x and y.")  # fmt: skip
+    scale = (torch.tensor(length_m, dtype=torch.float64) / length).mean().item()
+    axes = torch.eye(3, dtype=torch.float64)[:2]
+    R: Tensor = roma.special_procrustes(axes.T @ (ways / length[:, None]))  # pyright: ignore[reportAssignmentType]
+    start = torch.tensor([0.0, 0.0, height_m], dtype=torch.float64)
+    return scale, Rigid(R, start - R @ (scale * y_slam[0].double())).to(torch.float32)
 
 
 def scale_by_walks(slam: Trajectory, walks: Sequence[tuple[float, float, float]]) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, interpolate, resample
+from wearcap.geometry.trajectory import Trajectory, interpolate, nearest_frames, resample
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream, Cue
 from wearcap.sensors.noise import smooth_noise
@@ -103,7 +103,7 @@ def seen_wearer(
         if parent >= 0:
             clear[:, parent] &= seen[:, joint]
     confidence = (1 - 0.5 * (distance / range_m).clamp_max(1))[:, None] * (clear & found[:, None])
-    nearest = torch.searchsorted((motion.timestamps[1:] + motion.timestamps[:-1]) / 2, times)
+    nearest = nearest_frames(motion.timestamps, times)
     turn = smooth_noise(rng, count, 3 * len(skeleton), period_s, fps).unflatten(-1, (-1, 3))
     R = motion.R_parent_joint[nearest] @ rotation.exp(np.deg2rad(noise_deg) / np.sqrt(3) * turn)
     deeper = DEPTH_SHARE * smooth_noise(rng, count, 1, period_s, fps)

@@ -64,9 +64,7 @@ def on_stairs(world: World, points: np.ndarray) -> np.ndarray:
     """Whether floor points lie on a flight or within a step of its ends."""
     near = np.zeros(len(points), bool)
     for flight in world.flights:
-        along = np.array([np.cos(flight.direction), np.sin(flight.direction)])
-        offset = points[:, :2] - np.array(flight.start)
-        run, side = offset @ along, offset @ np.array([-along[1], along[0]])
+        run, side = flight.up_and_left(points[:, :2])
         near |= (run > -0.8) & (run < flight.length + 0.8) & (np.abs(side) < flight.width / 2 + 0.1)
     return near
 

@@ -24,6 +24,11 @@ ROOM_KINDS: dict[str, tuple[str, ...]] = {
 HAS_TABLE = ("living room", "kitchen")
 
 
+def middle_and_size(box: Box) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Of a box (m)."""
+    return ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), (box[2] - box[0], box[3] - box[1])
+
+
 def overlaps(a: Box, b: Box, margin: float = 0.0) -> bool:
     apart = a[0] >= b[2] + margin or b[0] >= a[2] + margin or a[1] >= b[3] + margin or b[1] >= a[3] + margin
     return not apart

@@ -24,6 +24,12 @@ SETTLED, DESCENT = 0.2, 0.5
 """Shares of the way there, at its end: the hand is off its place along the normal, and comes down on it."""
 
 
+def vector(values: Float[np.ndarray, "3"]) -> Vector:
+    """The same as plain numbers."""
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
 @dataclass(frozen=True)
 class GripPlace:
     """Where a palm lies on a thing, in the thing's axes."""

@@ -63,16 +63,16 @@ def flat_of(split: str, number: int) -> InteractiveFlat:
 
 
 def simulate_interactions(
-    config: InteractionConfig, name: str, split: str, seed: int, flat: InteractiveFlat | None = None
+    config: InteractionConfig, name: str, split: str, seed: int
 ) -> SimulatedInteractions:
-    """The recording of a seed; without a flat, in the split's flat of the same number.
+    """The recording of a seed, in the split's flat of the same number.
 
     Sensed are `suit`, `camera` and its `localization`. True are `motion`, `contacts` of the feet, `floor`,
     `interactions` and, for everything that can be moved, `object_motion` on the motion's timestamps.
     """
     rng = np.random.default_rng([7, sum(map(ord, split)), seed])
     person = person_of(split, int(rng.integers(POOLS[split][0])))
-    flat = flat or flat_of(split, flat_number(split, seed))
+    flat = flat_of(split, flat_number(split, seed))
     house, duration = House(flat), 60.0 * config.minutes
     household = Household(house, person, rng)
     household.live(duration)

@@ -15,7 +15,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.simulation.builder import Part, Piece, hue, piece_mesh
 from wearcap.simulation.furniture import PATTERNED, PLAIN, wood
-from wearcap.simulation.grips import GripPlace
+from wearcap.simulation.grips import GripPlace, vector
 from wearcap.simulation.outline import turn
 
 LEAF_M, PANEL_M = 0.04, 0.02
@@ -95,7 +95,7 @@ def hook(point: tuple[float, float, float], inwards: tuple[float, float]) -> Gri
     fingers /= np.linalg.norm(fingers)
     rise = float(np.hypot(*fingers[:2]))
     normal = np.array([*(-fingers[2] * np.array(inwards)), rise])
-    return GripPlace(point, _vector(normal), _vector(fingers))
+    return GripPlace(point, vector(normal), vector(fingers))
 
 
 def hinged(
@@ -125,7 +125,7 @@ def hinged(
         parts.append(Part((width - edge, side * (face + 0.02), level), (0.02, 0.06, 0.02), METAL, PATTERNED))
         handles.append(hook((place, out, level), (0.0, -side)))
     spin = rotation.about_axis("z", torch.tensor(heading, dtype=torch.float64)).float()
-    freedom = Freedom("hinge", pivot=_vector(foot), limits=(min(way * most, 0.0), max(way * most, 0.0)))
+    freedom = Freedom("hinge", pivot=vector(foot), limits=(min(way * most, 0.0), max(way * most, 0.0)))
     scene_object = SceneObject(
         category, category, _mesh(category, parts), spin, torch.from_numpy(np.asarray(foot)).float(), freedom
     )
@@ -214,11 +214,6 @@ def _mesh(kind: str, parts: list[Part]):
 
 def _box_outline(x: tuple[float, float], y) -> Float[np.ndarray, "4 2"]:
     return np.array([[x[0], y[0]], [x[1], y[0]], [x[1], y[1]], [x[0], y[1]]])
-
-
-def _vector(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
 
 
 def direction(heading: float) -> Float[np.ndarray, "2"]:

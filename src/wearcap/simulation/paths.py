@@ -40,10 +40,7 @@ def plan_path(
 
 def _onto_line(points: np.ndarray, flight, side: float) -> None:
     """Move, in place, the inner points on a flight to `side` metres left of its middle line."""
-    along = np.array([np.cos(flight.direction), np.sin(flight.direction)])
-    left = np.array([-along[1], along[0]])
-    offset = points[:, :2] - np.array(flight.start)
-    run, off = offset @ along, offset @ left
+    run, off = flight.up_and_left(points[:, :2])
     on = (
         (run > -STAIR_APPROACH_M)
         & (run < flight.length + STAIR_APPROACH_M)
@@ -51,7 +48,7 @@ def _onto_line(points: np.ndarray, flight, side: float) -> None:
     )
     on &= (points[:, 2] > flight.base_z - 0.3) & (points[:, 2] < flight.top_z + 0.3)
     on[[0, -1]] = False
-    points[on, :2] += ((side - off[on]) * 0.5)[:, None] * left
+    points[on, :2] += ((side - off[on]) * 0.5)[:, None] * flight.left
 
 
 def _evenly(points: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 
 from wearcap.simulation.builder import WorldBuilder, hue
 from wearcap.simulation.flat import before_door
-from wearcap.simulation.furnish import ROOM_KINDS, Box, Plan, overlaps
+from wearcap.simulation.furnish import ROOM_KINDS, Box, Plan, middle_and_size, overlaps
 from wearcap.simulation.furniture import MAKERS, wood
 from wearcap.simulation.outdoor import put_somewhere
 from wearcap.simulation.outline import rectangle
@@ -146,7 +146,7 @@ def _row(box: Box, spacing: float, width: float) -> list[tuple[float, float]]:
 
 def _shell(builder: WorldBuilder, box: Box, name: str, rng: np.random.Generator) -> None:
     """Floor, ceiling with lamps, and the room's outline."""
-    middle, size = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), (box[2] - box[0], box[3] - box[1])
+    middle, size = middle_and_size(box)
     corners = rectangle(middle, size)
     shade = float(rng.uniform(0.45, 0.75))
     color = wood(rng) if name.startswith("room") else (shade, 0.98 * shade, 0.93 * shade)

@@ -4,7 +4,7 @@ import numpy as np
 
 from wearcap.simulation import world as w
 from wearcap.simulation.builder import WorldBuilder, hue
-from wearcap.simulation.furnish import Box
+from wearcap.simulation.furnish import Box, middle_and_size
 from wearcap.simulation.furniture import MAKERS
 from wearcap.simulation.outline import rectangle
 
@@ -20,7 +20,7 @@ def slab(
     plane: tuple[float, float, float] | None = None,
 ) -> None:  # fmt: skip
     """A rectangle of ground whose top lies at z, or on a plane (of the builder's frame)."""
-    middle, size = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), (box[2] - box[0], box[3] - box[1])
+    middle, size = middle_and_size(box)
     builder.add_surface(
         kind,
         rectangle(middle, size),

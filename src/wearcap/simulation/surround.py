@@ -13,7 +13,7 @@ from wearcap.recording.motion import Motion
 from wearcap.simulation.body_space import BodySpace, SweptFloor
 from wearcap.simulation.builder import Piece, WorldBuilder, hue
 from wearcap.simulation.flat import before_door
-from wearcap.simulation.furnish import ROOM_KINDS, Box, Plan
+from wearcap.simulation.furnish import ROOM_KINDS, Box, Plan, middle_and_size
 from wearcap.simulation.furniture import MAKERS, wood
 from wearcap.simulation.outdoor import PAVEMENT_THINGS, SQUARE_THINGS, put_somewhere
 from wearcap.simulation.outline import rectangle
@@ -152,7 +152,7 @@ def _room(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generator)
     builder = plan.builder
     gap = rng.uniform(*WALL_M, 4)
     box = (reach[0] - gap[0], reach[1] - gap[1], reach[2] + gap[2], reach[3] + gap[3])
-    middle, size = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), (box[2] - box[0], box[3] - box[1])
+    middle, size = middle_and_size(box)
     builder.add_surface("floor", rectangle(middle, size), wood(rng), texture=1.5, thickness=0.05)
     builder.rooms.append(Room("room", builder.to_world(rectangle(middle, size)), 0.0))
     color = hue(rng, (0.0, 0.15))
@@ -221,7 +221,7 @@ def _street(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generato
         (light * warm, light, light * 0.98),
         float(rng.choice([3.0, 5.0, 6.0])),
     )
-    middle, size = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), (box[2] - box[0], box[3] - box[1])
+    middle, size = middle_and_size(box)
     builder.rooms.append(Room("street", builder.to_world(rectangle(middle, size)), 0.0, open_air=True))
     builder.add_box((*middle, -0.11), (size[0] + 24.0, size[1] + 24.0, 0.1), (0.42, 0.52, 0.32), 1.0)
     doors = [(float(rng.uniform(box[0] + 1.2, box[2] - 1.2)), 0.0)]

@@ -12,7 +12,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.simulation import furniture, handhelds
 from wearcap.simulation.builder import Part, Piece, hue, piece_mesh
-from wearcap.simulation.grips import SKIN_M, GripPlace, Vector
+from wearcap.simulation.grips import SKIN_M, GripPlace, Vector, vector
 from wearcap.simulation.handhelds import Grasp, Handheld
 
 
@@ -43,7 +43,7 @@ class Rail:
         normal, fingers = (
             np.cos(tilt) * normal - np.sin(tilt) * fingers, np.cos(tilt) * fingers + np.sin(tilt) * normal,
         )  # fmt: skip
-        return GripPlace(_vector(point + SKIN_M * normal), _vector(normal), _vector(fingers))
+        return GripPlace(vector(point + SKIN_M * normal), vector(normal), vector(fingers))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def _table(name: str, rng: np.random.Generator) -> Thing:
         wide = abs(left @ np.array([half_depth, half_width])) - 0.08
         edge = -(deep - 0.012) * ahead
         ends = (np.append(edge + way * wide * left, top) for way in (1.0, -1.0))
-        start, stop = (_vector(end) for end in ends)
+        start, stop = (vector(end) for end in ends)
         rails.append(
             Rail(start, stop, (0.0, 0.0, 1.0), (float(ahead[0]), float(ahead[1]), 0.0), facing, 0.012)
         )
@@ -160,9 +160,9 @@ def _box(name: str, rng: np.random.Generator) -> Thing:
             np.array([np.cos(facing), np.sin(facing), 0.0]),
             np.array([-np.sin(facing), np.cos(facing), 0.0]),
         )
-        fingers = _vector((ahead - 0.35 * np.array(up)) / np.hypot(1.0, 0.35))
+        fingers = vector((ahead - 0.35 * np.array(up)) / np.hypot(1.0, 0.35))
         hands = (
-            GripPlace(_vector(way * (half + SKIN_M) * left + [0.0, 0.0, level]), _vector(way * left), fingers)
+            GripPlace(vector(way * (half + SKIN_M) * left + [0.0, 0.0, level]), vector(way * left), fingers)
             for way in (1.0, -1.0)
         )
         sides.append((*hands, facing))
@@ -189,11 +189,6 @@ def _sliding(name: str, category: str, piece: Piece, rails: list[Rail]) -> Thing
 def _of_piece(name: str, category: str, piece: Piece, freedom: Freedom) -> Thing:
     scene_object = SceneObject(name, category, piece_mesh(piece), torch.eye(3), torch.zeros(3), freedom)
     return Thing(scene_object, (piece.size[0] / 2, piece.size[1] / 2), piece.z_range[1])
-
-
-def _vector(values: Float[np.ndarray, "3"]) -> Vector:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
 
 
 THINGS: dict[str, Callable[[str, np.random.Generator], Thing]] = {

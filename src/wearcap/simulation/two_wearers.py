@@ -11,7 +11,7 @@ import torch
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.recording.motion import Motion
+from wearcap.geometry.rigid import Rigid
 from wearcap.recording.recording import Recording
 from wearcap.sensors.keypoints import action_camera
 from wearcap.simulation.simulate import OUTDOOR_SHARE, POOLS, SimulationConfig, person_of, sense, world_of
@@ -59,12 +59,5 @@ def face_to_face(first: SimulatedMotion, second: SimulatedMotion, distance_m: fl
     place = a.t_world_root[0] + distance_m * torch.stack([ahead.cos(), ahead.sin(), torch.zeros(())])
     rise = first.floor_height[0] - second.floor_height[0]
     place = torch.stack([place[0], place[1], b.t_world_root[0, 2] + rise])
-    return replace(
-        second, motion=_moved(b, R, place - R @ b.t_world_root[0]), floor_height=second.floor_height + rise
-    )
-
-
-def _moved(motion: Motion, R: torch.Tensor, t: torch.Tensor) -> Motion:
-    turned = motion.R_parent_joint.clone()
-    turned[:, 0] = R @ turned[:, 0]
-    return replace(motion, R_parent_joint=turned, t_world_root=motion.t_world_root @ R.mT + t)
+    moved = b.moved(Rigid(R, place - R @ b.t_world_root[0]))
+    return replace(second, motion=moved, floor_height=second.floor_height + rise)

@@ -208,9 +208,7 @@ def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float,
 
     `foot` is how far the toes are ahead of the ankle (m).
     """
-    along = np.array([np.cos(flight.direction), np.sin(flight.direction)])
-    offset = points[:, :2] - np.array(flight.start)
-    run, side = offset @ along, offset @ np.array([-along[1], along[0]])
+    run, side = flight.up_and_left(points[:, :2])
     inside = (np.abs(side) < flight.width / 2 + 0.1) & (run > -0.6) & (run < flight.length + 0.6)
     climbed = flight.base_z + flight.rise * np.clip(run / flight.tread + 0.5, 0, flight.steps)
     inside &= np.abs(points[:, 2] - climbed) < 0.35  # the floors above and below the flight are not on it

@@ -114,6 +114,17 @@ class Flight:
     def top_z(self) -> float:
         return self.base_z + self.steps * self.rise
 
+    @property
+    def left(self) -> np.ndarray:
+        """Unit vector to the left of who goes up."""
+        return np.array([-np.sin(self.direction), np.cos(self.direction)])
+
+    def up_and_left(self, points_xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far (m) points are from `start` on the way up, and to its left."""
+        along = np.array([np.cos(self.direction), np.sin(self.direction)])
+        offset = points_xy - np.array(self.start)
+        return offset @ along, offset @ self.left
+
 
 @dataclass(frozen=True)
 class Room:

@@ -1,10 +1,20 @@
 """What all systems do alike: an optimiser that is given, and a step that logs what it measured."""
 
 from collections.abc import Callable
+from typing import Any
 
 import lightning
 import torch
 from torch import Tensor
+
+
+class SeededSteps(lightning.LightningModule):
+    """What a step draws (dropout, augmentation) is a function of seed and step, so that a resumed run repeats it."""
+
+    seed: int
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
 
 class GivenOptimizer(lightning.LightningModule):

@@ -16,6 +16,13 @@ from wearcap.training.motion_diffusion import MotionDiffusion
 from wearcap.viewer.picture import contact_sheet, save_png
 
 
+def is_due(trainer: lightning.Trainer, every_n_epochs: int) -> bool:
+    """Whether what watches every n-th validation, and the training's last one, is to look now, in this process."""
+    last = trainer.max_steps > 0 and trainer.global_step >= trainer.max_steps
+    due = last or (trainer.current_epoch + 1) % every_n_epochs == 0
+    return due and trainer.is_global_zero and not trainer.sanity_checking
+
+
 class CaptureValidation(Callback):
     """Captures some validation recordings with the current weights: logs their metrics, draws them beside truth.
 
@@ -36,9 +43,7 @@ class CaptureValidation(Callback):
         self.picture = picture
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: MotionDiffusion) -> None:
-        last = trainer.max_steps > 0 and trainer.global_step >= trainer.max_steps
-        due = last or (trainer.current_epoch + 1) % self.every_n_epochs == 0
-        if trainer.sanity_checking or not trainer.is_global_zero or not due:
+        if not is_due(trainer, self.every_n_epochs):
             return
         pipeline = self.pipeline(**pl_module.pipeline_parts(), device=str(pl_module.device))
         recordings = self._recordings(trainer.datamodule.val_sources[0].root)  # pyright: ignore[reportAttributeAccessIssue]

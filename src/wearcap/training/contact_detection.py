@@ -13,10 +13,10 @@ from wearcap.data.statistics import collate
 from wearcap.geometry import rotation
 from wearcap.metrics.detection import mean_detection_scores
 from wearcap.models.contact import REACH, ContactNetwork
-from wearcap.training.base import GivenOptimizer
+from wearcap.training.base import GivenOptimizer, SeededSteps
 
 
-class ContactDetection(GivenOptimizer):
+class ContactDetection(SeededSteps, GivenOptimizer):
     """A contact network for some classes of interaction; what it is trained on and scored by are single frames."""
 
     def __init__(
@@ -40,10 +40,6 @@ class ContactDetection(GivenOptimizer):
         random = torch.Generator().manual_seed(0)
         windows = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
         self.net.normalize_on(self._pose(collate([dataset[item] for item in zip(windows, range(limit))])))
-
-    def on_train_batch_start(self, batch: ContactWindow, batch_idx: int) -> None:
-        """Dropout, too, is a function of seed and step, so that a resumed run repeats it."""
-        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def _pose(self, batch: ContactWindow) -> Float[Tensor, "batch time feature"]:
         return self.features.encode(batch.R_parent_joint @ rotation.exp(batch.error))

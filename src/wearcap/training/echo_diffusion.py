@@ -21,17 +21,17 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.models.echo import EchoDenoiser
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.training import losses
-from wearcap.training.base import WeighedTerms
+from wearcap.training.base import SeededSteps, WeighedTerms
 
 
-class EchoDiffusion(WeighedTerms):
+class EchoDiffusion(SeededSteps, WeighedTerms):
     """x0-prediction with a noise level for every frame and modality.
 
     Loss terms, weighed by `loss_weights`: "human", "object" and "contact" are mean squares in normalised space (eq. 12's
     first three; squares are ours: their minimum is the mean that the posterior step takes x̂0 for); "object_vertices"
     (the root of the mean square over the surface, which needs no vertices), "joints" and "skate" are distances in metres
     (its last three); "velocity" of the joints is ours. Frames without an active object have no part in what is said of
-    one. `modalities` (ours, for the ablation): which are diffused at all; one that is not stays noise.
+    one.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class EchoDiffusion(WeighedTerms):
                 self.features.condition(batch.points, batch.floor_height, batch.size)[batch.valid]
             )
         human, thing, condition = (torch.cat(part) for part in rows.values())
-        ranges = [self._range(human, True), self._range(thing, False)]
+        ranges = [self._range(human), self._range(thing)]
         mean, scale = (torch.cat(part) for part in zip(*ranges))
         contact = torch.zeros(CONTACTS), torch.ones(CONTACTS)
         self.net.motion_normalizer.set(torch.cat([mean, contact[0]]), torch.cat([scale, contact[1]]))
@@ -89,7 +89,7 @@ class EchoDiffusion(WeighedTerms):
         if self.encoder is not None and dataset.encoder is not None:
             self.encoder.load_state_dict(dataset.encoder.state_dict())
 
-    def _range(self, rows: Float[Tensor, "row value"], human: bool) -> tuple[Tensor, Tensor]:
+    def _range(self, rows: Float[Tensor, "row value"]) -> tuple[Tensor, Tensor]:
         """Mean and scale per value; of vectors that move with the window (root and object) one scale, about zero, so
         that noise stays noise when they are turned."""
         if not len(rows):
@@ -113,10 +113,6 @@ class EchoDiffusion(WeighedTerms):
         if self.encoder is not None:
             self.encoder.eval()
         return self
-
-    def on_train_batch_start(self, batch: EchoWindow, batch_idx: int) -> None:
-        """Dropout, too, is a function of seed and step, so that a resumed run repeats it."""
-        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def _levels(self, batch: EchoWindow) -> Float[Tensor, "batch time modality"]:
         """Of a batch; an object that is not there is noise alone."""
@@ -153,6 +149,11 @@ class EchoDiffusion(WeighedTerms):
         condition = self.features.condition(batch.points, batch.floor_height, batch.size)
         encoded = self.net.encode(condition, batch.object_code, batch.has_object, batch.valid)
         x0_hat = self.net(x_t, levels, encoded, batch.valid).float()
+        # Millimetres are lost in half precision.
+        with torch.autocast(x0_hat.device.type, enabled=False):
+            return self._compared(x0_hat, x0, batch, frame)
+
+    def _compared(self, x0_hat: Tensor, x0: Tensor, batch: EchoWindow, frame: Rigid) -> dict[str, Tensor]:
         square = (x0_hat - x0).square() * self._counts(batch)
         weight = batch.valid.float()
         terms = {

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import lightning
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -13,11 +12,12 @@ from wearcap.data.ego_frames import HANDS, POINTS, EgoFrame, EgoFrames
 from wearcap.metrics.detection import average_precision
 from wearcap.models.denoiser import Normalizer
 from wearcap.models.image_encoder import EgoViewEncoder, letterboxed
+from wearcap.training.base import SeededSteps
 
 LEAST_SPREAD_M = 0.02
 
 
-class EgoView(lightning.LightningModule):
+class EgoView(SeededSteps):
     """Linear heads on the embedding tell which of `POINTS` are in the picture, and where they are.
 
     The loss is their binary cross-entropy plus the Huber loss of the places, in standard deviations, of those that are.
@@ -81,10 +81,6 @@ class EgoView(lightning.LightningModule):
         miss = F.smooth_l1_loss(places / spread, point_cam / spread, reduction="none").mean(-1)
         seen = F.binary_cross_entropy_with_logits(logits, visible.to(logits.dtype))
         return seen + (miss * visible).sum() / visible.sum().clamp_min(1)
-
-    def on_train_batch_start(self, batch: EgoFrame, batch_idx: int) -> None:
-        """Augmentation is a function of seed and step, so that a resumed run repeats it."""
-        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def training_step(self, batch: EgoFrame, batch_idx: int) -> Tensor:
         varied = self.pictures(batch), batch.point_cam, batch.visible

@@ -14,6 +14,7 @@ from wearcap.pipelines.ireplica import IReplica
 from wearcap.pipelines.ireplica_evaluation import score_interactions
 from wearcap.pipelines.stages import Source
 from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.training.callbacks import is_due
 from wearcap.training.contact_detection import ContactDetection
 
 
@@ -31,9 +32,7 @@ class IReplicaValidation(Callback):
         self._registered: list[tuple[Recording, Source, Motion]] | None = None
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: ContactDetection) -> None:
-        last = trainer.max_steps > 0 and trainer.global_step >= trainer.max_steps
-        due = last or (trainer.current_epoch + 1) % self.every_n_epochs == 0
-        if trainer.sanity_checking or not trainer.is_global_zero or not due:
+        if not is_due(trainer, self.every_n_epochs):
             return
         training = pl_module.training
         detector = ContactDetector(pl_module.net, pl_module.features, pl_module.classes, pl_module.fps)

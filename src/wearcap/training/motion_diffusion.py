@@ -18,13 +18,13 @@ from wearcap.errors import WearcapError
 from wearcap.models.denoiser import Conditions, MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.training import losses
-from wearcap.training.base import WeighedTerms
+from wearcap.training.base import SeededSteps, WeighedTerms
 
 _TAIL_FRAMES = 20
 """Within which the weight of a window's last frames falls off."""
 
 
-class MotionDiffusion(WeighedTerms):
+class MotionDiffusion(SeededSteps, WeighedTerms):
     """x0-prediction under one noise level per window; loss terms are weighed by `loss_weights`.
 
     "motion" is the document's plain MSE; "joints", "velocity" and "skate" are ours (0 leaves them out). Levels are drawn
@@ -98,10 +98,6 @@ class MotionDiffusion(WeighedTerms):
         if self.place_encoder is not None:
             self.place_encoder.eval()
         return self
-
-    def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:
-        """Dropout, too, is a function of seed and step, so that a resumed run repeats it."""
-        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def conditions(self, batch: Window) -> Conditions:
         """What the network is told of a batch, modalities dropped by the windows' chances."""

@@ -14,11 +14,11 @@ from wearcap.data.tracked_points import TrackedPoints, decode_pose, encode_pose,
 from wearcap.data.windows import Window, WindowDataset
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.pose_regressor import PoseRegressor
-from wearcap.training.base import WeighedTerms
+from wearcap.training.base import SeededSteps, WeighedTerms
 from wearcap.training.losses import joint_velocity, masked_mean
 
 
-class PoseRegression(WeighedTerms):
+class PoseRegression(SeededSteps, WeighedTerms):
     """Regression of single frames from their pasts: `pairs` of neighbouring frames of every window are asked for.
 
     Loss terms, weighed by `loss_weights`, are mean absolute errors: "root" and "rotation" of 6D rotations, "joints" of
@@ -63,10 +63,6 @@ class PoseRegression(WeighedTerms):
             (self.net.motion_normalizer, torch.cat(motion)),
         ):
             normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
-
-    def on_train_batch_start(self, batch: Window, batch_idx: int) -> None:
-        """Dropout and the frames asked for are functions of seed and step, so that a resumed run repeats them."""
-        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def _features(self, batch: Window) -> Float[Tensor, "batch time feature"]:
         T_world_head = Rigid(batch.R_world_head, batch.t_world_head)

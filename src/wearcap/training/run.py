@@ -50,7 +50,8 @@ def resume_path(resume: str | None, runs: Path) -> Path | None:
         return None
     if resume != "auto":
         if not Path(resume).is_file():
-            raise WearcapError("no such checkpoint to resume from", where=resume)
+            raise WearcapError("no such checkpoint to resume from", where=resume,
+                               expected="a run's .ckpt file, or resume=auto for the newest")  # fmt: skip
         return Path(resume)
     found = sorted(runs.glob("**/last.ckpt"), key=lambda path: path.stat().st_mtime)
     return found[-1] if found else None

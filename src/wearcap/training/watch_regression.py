@@ -14,11 +14,11 @@ from wearcap.data.statistics import MIN_SCALE, collate
 from wearcap.data.watch_features import ENDS, Canonical, WatchFeatures, to_world
 from wearcap.data.watch_windows import WatchDataset, WatchWindow
 from wearcap.models.watch_estimator import TrainedEstimator
-from wearcap.training.base import WeighedTerms
+from wearcap.training.base import SeededSteps, WeighedTerms
 from wearcap.training.losses import EPSILON_M2
 
 
-class WatchRegression(WeighedTerms):
+class WatchRegression(SeededSteps, WeighedTerms):
     """Regression of bodies from a head and two wrists.
 
     Loss terms, weighed by `loss_weights`, are means over frames and joints: "root" and "rotation" (eq. 2), "position"
@@ -69,10 +69,6 @@ class WatchRegression(WeighedTerms):
         ):  # fmt: skip
             rows = rows.flatten(0, 1)
             normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
-
-    def on_train_batch_start(self, batch: WatchWindow, batch_idx: int) -> None:
-        """Dropout is a function of seed and step, so that a resumed run repeats it."""
-        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def _inputs(
         self, batch: WatchWindow

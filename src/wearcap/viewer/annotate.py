@@ -180,7 +180,7 @@ class Desk:
         if (Path(where) / "manifest.json").is_file():
             places = [Path(where) / name for name in RecordingStore.open(where).names()]
         if not places:
-            raise WearcapError("a data set without recordings", where=where)
+            raise WearcapError("a data set without recordings", where=where, fix="Prepare some first.")
         if len(places) > 1 and (motion is not None or video is not None):
             raise WearcapError("a motion or a video for several recordings", where=where,
                                expected=f"one recording, such as {places[0]}")  # fmt: skip

@@ -23,7 +23,8 @@ def starting_labels(source: str | Path, recording: Recording, clock: LabelClock)
     """
     if str(source) == "recording":
         if recording.interactions is None:
-            raise WearcapError(f"recording {recording.name!r} has no interactions to start from")
+            raise WearcapError("no interactions to start from", where=recording.name, expected="a recording that has them",
+                               fix="Start from a label file (.json), from a captured motion (.npz), or from nothing.")  # fmt: skip
         return labels_of(recording.interactions, clock)
     if Path(source).suffix == ".json":
         return parse_labels(read_json(source), clock, where=source)

@@ -23,7 +23,7 @@ def draw_head_path(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Two panels of `size` (width, height). Raises WearcapError when there is no head path either."""
     if recording.head is None:
-        raise WearcapError("neither motion nor head path to draw", where=recording.name)
+        raise WearcapError("nothing to draw", where=recording.name, expected="a motion, or a head's path")
     path = recording.head.t_world_device.double().numpy()
     points = np.zeros((0, 3)) if recording.points is None else recording.points.points_world.double().numpy()
     cloud = np.concatenate([path, points])

@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
-from wearcap.body.contact_points import contact_points
+from wearcap.body.contact_points import TOUCH_M, contact_points
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh, capsules
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
-from wearcap.geometry.trajectory import Trajectory
+from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.recording.acts import NO_OBJECT, active_at, true_acts
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
@@ -25,8 +25,6 @@ from wearcap.scene.objects import SceneObject
 
 CLOUD_BALLS, CLOUD_BALL_M = 1500, 0.012
 """A cloud without faces is shown as so many small balls."""
-TOUCH_M = 0.05
-"""A contact point of the body that is so near to the active object's surface touches it (τ_c of ECHO §3.1)."""
 
 
 def pose_at(track: Trajectory | None, thing: SceneObject, time_s: float) -> Rigid:
@@ -39,8 +37,7 @@ def poses_at(track: Trajectory | None, thing: SceneObject, times: Float64[Tensor
     if track is None or not len(track):
         T = thing.T_world_object
         return Rigid(T.R.expand(len(times), 3, 3), T.t.expand(len(times), 3))
-    middles = (track.timestamps[1:] + track.timestamps[:-1]) / 2
-    return track.T_world_body[torch.searchsorted(middles, times)]
+    return track.T_world_body[nearest_frames(track.timestamps, times)]
 
 
 @lru_cache(maxsize=1024)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import FOOT_PATCHES
-from wearcap.geometry.trajectory import Trajectory
+from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.recording import Motion, Recording
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
@@ -119,8 +119,7 @@ def _span(
     motion: Motion, things: Sequence[SceneObject], times: Float64[Tensor, "time"]
 ) -> tuple[Float[Tensor, "time"], Float[Tensor, "time"]]:
     """Least and greatest y (m) of a motion and what is with it, at some times."""
-    middles = (motion.timestamps[1:] + motion.timestamps[:-1]) / 2
-    joints = motion.T_world_joint.t[torch.searchsorted(middles, times)].double()
+    joints = motion.T_world_joint.t[nearest_frames(motion.timestamps, times)].double()
     low, high = joints[..., 1].amin(1) - FLESH_M, joints[..., 1].amax(1) + FLESH_M
     for thing in things if motion.object_motion else ():
         T = poses_at((motion.object_motion or {}).get(thing.name), thing, times)

@@ -19,7 +19,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh, capsules, checker_floor
-from wearcap.geometry.render import Light, Splats, render
+from wearcap.geometry.render import Light, render
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.interactions import HANDS
 from wearcap.recording.motion import Motion
@@ -128,7 +128,6 @@ def panel(
     size: tuple[int, int],
     *,
     world: Mesh | None = None,
-    splats: Sequence[Splats] = (),
     supersample: int = 2,
     distance: float = 4.2,
 ) -> UInt8[np.ndarray, "height width 3"]:
@@ -139,7 +138,7 @@ def panel(
     below = (float(target[0]), float(target[1]), float(ground[2]))
     light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
     return render(
-        camera, T_world_cam, [*actor.meshes(frame), stage], list(splats), light=light, background=SKY,
+        camera, T_world_cam, [*actor.meshes(frame), stage], light=light, background=SKY,
         supersample=supersample,
     ).color  # fmt: skip
 

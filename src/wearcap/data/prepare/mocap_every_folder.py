@@ -12,13 +12,13 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.io.hps import nominal_mount
 from wearcap.io.mocap_every_folder import (
     MocapEveryFolder,
-    board_alignment,
     is_mocap_every_folder,
     mocap_every_files,
     mocap_every_recording,
     read_mocap_every_folder,
 )
 from wearcap.recording.recording import Recording
+from wearcap.sensors.camera_alignment import align_by_walks
 from wearcap.sensors.slam_track import clean_track
 
 VERSION = 1
@@ -88,7 +88,8 @@ def _alignment(read: MocapEveryFolder, settings: MocapEverySettings, folder: Pat
             raise WearcapError("it does not say how long a unit of SLAM is", where=folder,
                                expected="cam_scale_origin in config.yaml, and x and y in camera_calib.pkl",
                                fix="Measure it, and give scale=METRES_PER_UNIT.")  # fmt: skip
-        return board_alignment(read.board)
+        board = read.board
+        return align_by_walks(board.x_slam, board.y_slam, board.length_m, board.height_m)
     if settings.scale <= 0:
         raise WearcapError(f"scale={settings.scale}", expected="metres per unit of SLAM, above 0")
     R_world_cam, _ = nominal_mount()

@@ -61,9 +61,8 @@ def checked_splits(recordings: Mapping[str, int], splits: Splits) -> None:
         raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
     for split in recordings:
         if splits.of(f"sim-{split}-person-000") != split:
-            raise WearcapError(
-                f"people of the simulated {split} split are listed elsewhere", where=splits.path
-            )
+            raise WearcapError(f"people of the simulated {split} split are listed elsewhere", where=splits.path,
+                               expected=f"a line sim-{split}-*,{split}")  # fmt: skip
 
 
 def source_files() -> str:

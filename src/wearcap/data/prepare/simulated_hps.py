@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from wearcap.data.prepare.engine import Task, content_hash
-from wearcap.data.prepare.simulated import source_files
+from wearcap.data.prepare.simulated import checked_splits, source_files
 from wearcap.data.prepare.splits import Splits
 from wearcap.errors import WearcapError
 from wearcap.io.scene_folder import CLOUD
 from wearcap.recording.recording import Recording
-from wearcap.recording.store import SPLITS
 from wearcap.simulation.changes import changed_world
 from wearcap.simulation.head_camera import HEAD_CAMERA_TRUTH
 from wearcap.simulation.head_video import Filming, write_head_video
@@ -88,8 +87,7 @@ def simulated_hps_tasks(
     distances = [0.0, *map(float, returns_m), float(end_m)]
     if any(b <= a for a, b in pairwise(distances)):
         raise WearcapError(f"returns at {returns_m} m, end at {end_m} m", expected="distances that rise")
-    if unknown := set(recordings) - set(SPLITS):
-        raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
+    checked_splits(recordings, splits)
     protocol = Protocol(returns_m=tuple(distances[1:-1]), end_m=distances[-1])
     config = HpsConfig(fps=float(fps), camera_fps=float(camera_fps), protocol=protocol)
     scene = None if spacing_m is None else SceneSettings(spacing_m=float(spacing_m), photo_m=float(photo_m))
@@ -97,10 +95,6 @@ def simulated_hps_tasks(
     simulator, made = source_files(), [asdict(part) if part else None for part in (config, scene, video)]
     tasks = []
     for split, count in recordings.items():
-        if splits.of(f"sim-{split}-person-000") != split:
-            raise WearcapError(
-                f"people of the simulated {split} split are listed elsewhere", where=splits.path
-            )
         for index in range(count):
             name, number = f"hps-{split}-{seed}-{index:04d}", seed * 1_000_000 + index
             make = SimulatedHps(config, scene, video, name, split, number, Path(output))

@@ -38,7 +38,9 @@ def read_splits(path: str | Path) -> Splits:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:
-        raise WearcapError("no such split list", where=path) from error
+        raise WearcapError(
+            "no such split list", where=path, expected="a .csv with columns subject,split"
+        ) from error
     table = list(csv.DictReader(line for line in lines if line.strip() and not line.startswith("#")))
     if not table or set(table[0]) != {"subject", "split"}:
         raise WearcapError("not a split list", where=path, expected="columns subject,split")

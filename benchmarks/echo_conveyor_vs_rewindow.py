@@ -1,0 +1,113 @@
+"""ECHO's conveyor against windows that are denoised from scratch (h = 10): time per frame, and error of both.
+
+Both keep 10 clean frames and denoise every frame in 100 steps (`pipeline=echo`, `pipeline=echo_rewindow`), in the same lanes,
+in turn. Windows need 100 steps for 10 frames, the conveyor two for each: one fifth, and its queue besides. value: the
+conveyor's ms per frame and lane, once its window is full; baseline: the windows'; ratio = baseline / value, to be at
+least `goal`. Where there is a checkpoint `echo` and the test split of datasets/simulated_objects, also E_v2v (cm)
+and MPJPE (mm) over the beginnings of some of its recordings: value the conveyor's, baseline the windows', ratio =
+value / baseline, to be at most `goal`.
+"""
+
+import statistics
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from echo_runs import NAME, figure, lanes_of, pipeline_of
+
+from wearcap.models.checkpoint import shared_checkpoints
+from wearcap.pipelines.echo import Echo
+from wearcap.pipelines.echo_dataset import EchoOnDataset
+from wearcap.pipelines.echo_queue import EchoQueue, Told
+from wearcap.pipelines.echo_rewindow import Rewindow
+from wearcap.recording import Recording, RecordingStore
+
+STRIDE = 10
+DATASET = Path(__file__).resolve().parents[1] / "datasets" / "simulated_objects"
+
+
+def measure(lanes: int = 4, rounds: int = 6, recordings: int = 4, seconds: float = 20.0) -> list[dict]:
+    conveyor = pipeline_of("echo")
+    windows = replace(conveyor, rewindow=STRIDE)
+    rows = [_time(conveyor, windows, lanes, rounds)]
+    if NAME in shared_checkpoints() and (DATASET / "manifest.json").is_file():
+        rows += _errors(conveyor, windows, recordings, seconds)
+    else:
+        print(f"no checkpoint {NAME!r} or no {DATASET}: time alone", file=sys.stderr)
+    return rows
+
+
+@torch.no_grad()
+def _time(conveyor: Echo, windows: Echo, lanes: int, rounds: int) -> dict:
+    """In turn: as many frames through the queue as one window gives."""
+    window = conveyor.net.window
+    told = lanes_of(conveyor, lanes, (window + STRIDE * (rounds + 1)) / conveyor.fps)
+    queue, again = _queue(conveyor, lanes), _queue(windows, lanes)
+    assert isinstance(again, Rewindow)
+    for number in range(window):
+        queue.push(told.frames(slice(number, number + 1)))
+    first = told.frames(slice(0, window))
+    before = again.window(first, torch.zeros(lanes, 0, sum(conveyor.net.sizes)))[:, : conveyor.context]
+    ours, theirs = [], []
+    for number in range(rounds):
+        ours.append(_seconds(lambda start=window + STRIDE * number: _pushed(queue, told, start)))
+        there = told.frames(slice(STRIDE * number, STRIDE * number + window))
+        theirs.append(_seconds(lambda there=there: again.window(there, before)))
+    value, baseline = (1000 * statistics.median(times) / STRIDE / lanes for times in (ours, theirs))
+    return figure("echo_conveyor_vs_rewindow", value, "ms/frame", baseline, baseline / value, 5.0)
+
+
+def _queue(pipeline: Echo, lanes: int) -> EchoQueue:
+    pipeline.prepare()
+    return pipeline.queue([pipeline.skeleton] * lanes, list(range(lanes)), [{}] * lanes, [[]] * lanes)
+
+
+def _pushed(queue: EchoQueue, told: Told, start: int) -> None:
+    for number in range(start, start + STRIDE):
+        queue.push(told.frames(slice(number, number + 1)))
+
+
+def _seconds(run) -> float:
+    begin = time.perf_counter()
+    run()
+    return time.perf_counter() - begin
+
+
+def _errors(conveyor: Echo, windows: Echo, recordings: int, seconds: float) -> list[dict]:
+    """Means over recordings; of the object over those in which one is active."""
+    store = RecordingStore.open(DATASET)
+    shown = [_beginning(store.load(name), seconds) for name in store.names("test")[:recordings]]
+    means = []
+    for pipeline in (conveyor, windows):
+        on = EchoOnDataset(pipeline, DATASET)
+        motions = on.capture(shown, [0] * len(shown))
+        scores = [
+            on.score(motion, recording, recording.name, 0).scores for motion, recording in zip(motions, shown)
+        ]
+        means.append(
+            {
+                name: statistics.mean(score[name] for score in scores if name in score)
+                for name in ("v2v_cm", "mpjpe_mm")
+            }
+        )
+    ours, theirs = means
+    return [
+        figure(f"echo_conveyor_{name}", ours[name], unit, theirs[name], ours[name] / theirs[name], 1.0)
+        for name, unit in (("v2v_cm", "cm"), ("mpjpe_mm", "mm"))
+    ]
+
+
+def _beginning(recording: Recording, seconds: float) -> Recording:
+    """Its first seconds: the head's path says for how long something is captured."""
+    head = recording.head
+    assert head is not None
+    count = int(torch.searchsorted(head.timestamps, head.timestamps[0] + seconds))
+    return replace(
+        recording,
+        head=replace(
+            head, timestamps=head.timestamps[:count], R_world_device=head.R_world_device[:count],
+            t_world_device=head.t_world_device[:count],
+        ),
+    )  # fmt: skip

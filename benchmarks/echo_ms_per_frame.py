@@ -1,0 +1,44 @@
+"""ECHO on a GPU, the document's size without guidance: milliseconds per frame.
+
+Drawn weights; context and steps of `pipeline=echo` (two for every frame that enters), compiled with CUDA graphs in float32.
+A frame is everything from what is told of it to body, object and contacts in the world: one wearer alone, and eight side by
+side, of whom each has an eighth of the time. baseline: the document's 13.73 ms on an RTX 4090; ratio = baseline / value, to
+be at least `goal` (1.4 ms, on an H200). Without a CUDA device it is left out.
+"""
+
+import time
+
+import torch
+from echo_runs import figure, lanes_of, pipeline_of
+from online import without_cuda
+
+from wearcap.pipelines.echo import Echo
+
+DOCUMENT_MS = 13.73
+GOAL_MS = 1.4
+
+
+def measure(frames: int = 200, lanes: tuple[int, ...] = (1, 8), device: str = "cuda") -> list[dict]:
+    if device == "cuda" and without_cuda("echo_ms_per_frame"):
+        return []
+    runtime = "compile" if device == "cuda" else "eager"
+    pipeline = pipeline_of("echo", device, "echo_full", runtime=runtime)
+    rows = []
+    for count in lanes:
+        value = _milliseconds(pipeline, frames, count)
+        name = "echo_ms_per_frame" + (f"_{count}_wearers" if count > 1 else "")
+        rows.append(figure(name, value, "ms", DOCUMENT_MS, DOCUMENT_MS / value, DOCUMENT_MS / GOAL_MS))
+    return rows
+
+
+@torch.no_grad()
+def _milliseconds(pipeline: Echo, frames: int, lanes: int) -> float:
+    pipeline.prepare()
+    told, filling = lanes_of(pipeline, lanes, (frames + 90) / pipeline.fps), 90
+    queue = pipeline.queue([pipeline.skeleton] * lanes, list(range(lanes)), [{}] * lanes, [[]] * lanes)
+    for number in range(filling):
+        queue.push(told.frames(slice(number, number + 1)))
+    begin = time.perf_counter()
+    for number in range(filling, filling + frames):
+        queue.push(told.frames(slice(number, number + 1)))
+    return 1000 * (time.perf_counter() - begin) / frames / lanes

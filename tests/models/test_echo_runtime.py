@@ -1,0 +1,113 @@
+"""However ECHO's steps are run, they say the same; what levels ask for is worked out once and does not pile up."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from carried_box import WINDOW, drawn_echo, small_features, small_net
+from wearcap.errors import WearcapError
+from wearcap.models import echo_runtime
+from wearcap.models.echo_runtime import EchoPlans, EchoRunner
+
+
+def levels_of(lanes: int, frames: int, start: int) -> torch.Tensor:
+    """As on a queue, with an object that comes in at another frame in every lane."""
+    level = torch.linspace(0, 1, frames)[None, :, None].repeat(lanes, 1, 3)
+    for lane in range(lanes):
+        level[lane, : max(start - lane, 0), 1] = 1.0
+    return level
+
+
+def told(lanes: int, frames: int) -> list[torch.Tensor]:
+    """Condition, object, whether there is one, and which frames are valid."""
+    features, random = small_features(), torch.Generator().manual_seed(0)
+    sizes = features.condition_size, features.object_condition_size
+    condition, code = (torch.randn(lanes, frames, size, generator=random) for size in sizes)
+    valid = torch.arange(frames).expand(lanes, -1) < frames - torch.arange(lanes)[:, None]
+    return [condition, code, torch.rand(lanes, frames, generator=random) < 0.5, valid]
+
+
+@pytest.mark.parametrize("streams", [1, 3])
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_plans_are_those_of_the_network(streams, lanes):
+    net = small_net(small_features(), streams=streams)
+    plans = EchoPlans(net)
+    for start in (0, 3, 4, 9):
+        level = levels_of(lanes, WINDOW, start)
+        found, expected = plans.plan(plans(level)), net.plan(level)
+        for one, other in zip((*found.worth, *found.blocks), (*expected.worth, *expected.blocks)):
+            torch.testing.assert_close(one.expand_as(other), other)
+
+
+def test_plans_do_not_pile_up(monkeypatch):
+    monkeypatch.setattr(echo_runtime, "MOST_ROWS", 50)
+    net = small_net(small_features())
+    plans, random = EchoPlans(net), torch.Generator().manual_seed(0)
+    for _ in range(20):
+        level = torch.rand(1, WINDOW, 3, generator=random)
+        torch.testing.assert_close(plans.plan(plans(level)).worth[1], net.plan(level).worth[1])
+        assert len(plans._rows) == len(plans._number) <= 50 + WINDOW
+        assert len(plans._windows) <= echo_runtime.MOST_WINDOWS
+
+
+def test_lanes_of_the_same_levels_share_a_plan():
+    plans = EchoPlans(small_net(small_features()))
+    assert plans(levels_of(1, WINDOW, 2).repeat(4, 1, 1)).shape == (1, WINDOW, plans.size)
+
+
+def said(runner: EchoRunner) -> list[torch.Tensor]:
+    """Of a whole window, and of some that are not full yet."""
+    answers, random = [], torch.Generator().manual_seed(1)
+    for lanes, frames in ((1, WINDOW), (2, 5)):
+        level = levels_of(lanes, frames, 3)
+        x_t = torch.randn(lanes, frames, sum(runner.net.sizes), generator=random)
+        answers.append(runner.begin(*told(lanes, frames))(x_t, level))
+    return answers
+
+
+@torch.no_grad()
+def worst_of(runtime: str, device: str = "cpu") -> float:
+    """Largest difference from eager steps."""
+    net = small_net(small_features(), streams=3, blend=3)
+    expected = said(EchoRunner(net))
+    found = said(EchoRunner(net.to(device), runtime))
+    return max((one - two).abs().max().item() for one, two in zip(found, expected))
+
+
+@pytest.mark.slow
+def test_onnx_runtime_says_the_same():
+    pytest.importorskip("onnxruntime")
+    assert worst_of("onnx") < 1e-4
+
+
+def worst_of_compiled(device: str) -> float:
+    """In a process of its own: what checks the shapes in tests cannot be compiled."""
+    program = f"from test_echo_runtime import worst_of; print(worst_of('compile', {device!r}))"
+    here = Path(__file__).parent
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(here), str(here.parent)])}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return float(done.stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+def test_compiled_it_says_the_same():
+    assert worst_of_compiled("cpu") < 1e-4
+
+
+@pytest.mark.gpu
+def test_on_a_gpu_it_says_the_same():
+    assert worst_of_compiled("cuda") < 1e-3
+
+
+def test_runtimes_that_cannot_run_are_refused():
+    with pytest.raises(WearcapError, match="one of eager, onnx, compile"):
+        drawn_echo(runtime="onix")
+    with pytest.raises(WearcapError, match="runtime 'onnx' on cuda"):
+        drawn_echo(runtime="onnx", device="cuda")
