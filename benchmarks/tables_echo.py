@@ -99,7 +99,9 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, tupl
         ours,
         Method("ours, guided by contacts", options.checkpoint, ("pipeline=echo_guided",)),
         Method("ours, not hung from the head", options.checkpoint, ("pipeline=echo", "pipeline.hang=false")),
-        Method("ours, noise redrawn (eq. 11 as printed)", options.checkpoint, ("pipeline=echo", "pipeline.step=redraw")),
+        Method("ours, noise redrawn (eq. 11 as printed)", options.checkpoint, ("pipeline=echo", "pipeline.step=redraw", "pipeline.spacing=1.0")),
+        Method("ours, the stochastic posterior", options.checkpoint, ("pipeline=echo", "pipeline.eta=1.0", "pipeline.spacing=1.0")),
+        Method("ours, as in the document", options.checkpoint, ("pipeline=echo_document",)),
         Method("ours, latency of 20 frames", options.checkpoint, ("pipeline=echo_online",)),
     ]  # fmt: skip
     scores |= _scores(methods, options, progress, store, names)
