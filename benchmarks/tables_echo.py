@@ -22,13 +22,10 @@ from wearcap.files import write_text
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, markdown_table
 from wearcap.pipelines.echo_baselines import NearestEcho, RigidWrist
 from wearcap.pipelines.echo_dataset import EchoOnDataset
-from wearcap.pipelines.echo_evaluation import score_echo
+from wearcap.pipelines.echo_evaluation import MEASURES, score_echo
 from wearcap.recording import RecordingStore
 
-OBJECTS = (
-    "mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "v2v_cm", "center_cm", "rotation_deg", "quaternion",
-    "touch_f1", "jitter_m_s3",
-)  # fmt: skip
+OBJECTS = MEASURES
 HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_s3", "true_jitter_m_s3")
 ABLATIONS = {
     "ours, as long as the others": ("echo_short", "pipeline=echo"),

@@ -30,6 +30,7 @@ from wearcap.metrics.objects import (
 from wearcap.metrics.physics import jitter_m_s3
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.metrics.table import Row
+from wearcap.models.echo import MODALITIES
 from wearcap.pipelines.echo_told import Observed, Scenario
 from wearcap.recording import Motion
 from wearcap.recording.acts import active_at
@@ -38,7 +39,6 @@ MEASURES = (
     "mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "v2v_cm", "center_cm", "rotation_deg", "quaternion",
     "touch_f1", "jitter_m_s3",
 )  # fmt: skip
-MODALITIES = ("human", "object", "contact")
 
 
 @dataclass(frozen=True, eq=False)
