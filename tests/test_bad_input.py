@@ -5,7 +5,6 @@ import gzip
 import json
 import os
 import struct
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,40 +12,16 @@ import numpy as np
 import pytest
 import torch
 
-from wearcap.cli import main as cli
+from command_line import exit_code, files_in
 from wearcap.cli import train
-from wearcap.geometry.camera import Camera
-from wearcap.geometry.mesh import Mesh
 from wearcap.io.bvh import write_bvh
-from wearcap.io.environment import write_environment
 from wearcap.io.motion_npz import write_motion
-from wearcap.recording import CameraStream, ImuStream, Localization, RecordingStore
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
-from wearcap_testing import recording_of, small_dataset, swaying_motion
+from wearcap.recording import RecordingStore
+from wearcap_testing import recording_of, small_dataset, suited, swaying_motion
 
 SMALL = ["debug=fast", "data.window=60", "trainer.accelerator=cpu", "model.net.width=32", "model.net.layers=1",
          "model.net.heads=4", "model.net.feedforward=32", "trainer.enable_progress_bar=false",
          "trainer.enable_model_summary=false", "callbacks.progress=null"]  # fmt: skip
-
-
-def exit_code(arguments: list[str]) -> int:
-    with pytest.raises(SystemExit) as caught:
-        cli.main(arguments)
-    return int(caught.value.code or 0)
-
-
-def files_in(folder: Path) -> set[str]:
-    """What a run left, but for Hydra's and our own record of it."""
-    kept = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    return {
-        name
-        for name in kept
-        if not name.startswith((".hydra/", "run.json", "config.yaml")) and not name.endswith(".log")
-    }
-
-
-# Readers -----------------------------------------------------------------------------------------------------------
 
 
 def motion_file(write, name: str) -> bytes:
@@ -171,20 +146,6 @@ def hps(data: Path, out: Path, *more: str) -> list[str]:
     """Capture the data set's only recording, or r4."""
     recording = data / "r4" if (data / "recordings/r4.safetensors").is_file() else data
     return ["capture", "pipeline=hps", f"recording={recording}", f"hydra.run.dir={out}", "video=false", *more]
-
-
-def suited(root: Path, short: bool = False, **parts) -> Path:
-    """A data set of one recording with a suit, a localised camera, and no scan."""
-    motion = swaying_motion(90)
-    head = motion.joint("head")
-    suit = replace(motion, contact_prob=torch.ones(90, 4))
-    if short:
-        object.__setattr__(suit, "contact_prob", torch.zeros(50, 4))  # the type itself would refuse it here
-    camera = CameraStream(motion.timestamps, Camera.pinhole(64, 48, 60.0), torch.eye(3), torch.zeros(3))
-    found = Localization(motion.timestamps, head.R, head.t, torch.ones(90))
-    sensed = {"suit": suit, "camera": camera, "localization": found} | parts
-    RecordingStore(root).add(replace(recording_of(motion, "r"), **sensed), split="test", config_hash="x")
-    return root
 
 
 ROWS = {
@@ -364,135 +325,3 @@ def test_a_recording_with_nan_joints_is_named_by_the_doctor(tmp_path, capsys):
     RecordingStore(tmp_path).add(recording_of(motion, "r"), split="test", config_hash="x")
     assert exit_code(["doctor", str(tmp_path)]) == 1
     assert "NaN" in capsys.readouterr().out
-
-
-# Scenes and camera-localised recordings ------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def small_scene(monkeypatch):
-    monkeypatch.syspath_prepend(Path(__file__).parent / "pipelines")
-    import small_scene
-
-    return small_scene
-
-
-def photo_rows(folder: Path, change) -> None:
-    path = folder / "photos.json"
-    content = json.loads(path.read_text())
-    change(content["photos"])
-    path.write_text(json.dumps(content))
-
-
-SCENES = {
-    "missing intrinsics": (lambda scene, folder: photo_rows(folder, lambda rows: rows[0]["camera"].pop("fx")), "lacks 'fx'"),
-    "an empty map": (lambda scene, folder: photo_rows(folder, lambda rows: rows.clear()), "no photos"),
-    "a cloud without colour": (lambda scene, folder: scene.write_room(folder, colors=False), "no colour"),
-    "a scene in millimetres": (lambda scene, folder: scene.write_room(folder, unit=1000), "looks like millimetres"),
-    "image size and calibration": (
-        lambda scene, folder: photo_rows(folder, lambda rows: rows[0]["camera"].update(width=160)), "size and calibration differ"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("row", SCENES)
-def test_the_doctor_names_a_scenes_fault_once(row, small_scene, tmp_path, capsys):
-    damage, message = SCENES[row]
-    small_scene.write_room(tmp_path)
-    damage(small_scene, tmp_path)
-    assert exit_code(["doctor", "--json", str(tmp_path)]) == 1
-    findings = next(iter(json.loads(capsys.readouterr().out)["findings"].values()))
-    errors = [finding for finding in findings if finding["severity"] == "error"]
-    assert len(errors) == 1
-    assert message in errors[0]["what"]
-    assert errors[0]["fix"]
-
-
-def test_contacts_shorter_than_poses(tmp_path, capsys):
-    motion = swaying_motion(90)
-    recording = recording_of(motion, "r")
-    short = replace(motion)
-    object.__setattr__(short, "contact_prob", torch.zeros(50, 4))  # the type itself would refuse it here
-    RecordingStore(tmp_path).add(replace(recording, suit=short), split="test", config_hash="x")
-    assert exit_code(["doctor", "--json", str(tmp_path)]) == 1
-    assert "Motion.contact_prob has 50 rows for 90 timestamps" in capsys.readouterr().out
-
-
-def test_no_clap_is_said(tmp_path, capsys):
-    motion = swaying_motion(600)
-    wrist = motion.joint("left_wrist")
-    imu = ImuStream(motion.timestamps, "left_wrist", R_world_imu=wrist.R, acc_world=torch.zeros(600, 3))
-    found = Localization(motion.timestamps, wrist.R, wrist.t, torch.ones(600))
-    recording = replace(recording_of(motion, "r"), imu={"left_wrist": imu}, localization=found)
-    RecordingStore(tmp_path).add(recording, split="test", config_hash="x")
-    with suppress(SystemExit):
-        cli.main(["doctor", "--json", str(tmp_path)])
-    findings = json.loads(capsys.readouterr().out)["findings"]["r"]
-    assert ["no clap found" in finding["what"] for finding in findings if finding["check"] == "claps"] == [
-        True
-    ]
-
-
-# Objects that can be moved, and contact labels -----------------------------------------------------------------------
-
-
-def spoiled_environment(folder: Path, change) -> Path:
-    """The file of one door, with something changed in it."""
-    corners = np.array([[x, y, z] for x in (0.0, 0.8) for y in (0.0, 0.04) for z in (0.0, 2.0)], np.float32)
-    mesh = Mesh(corners, np.zeros((0, 3), np.int32), np.ones(3, np.float32))
-    door = SceneObject(
-        "door", "door", mesh, torch.eye(3), torch.zeros(3), Freedom("hinge", pivot=(0.0, 0.0, 0.0))
-    )
-    write_environment(Environment((door,)), folder)
-    path = folder / "environment.json"
-    content = json.loads(path.read_text())
-    change(content["objects"][0])
-    path.write_text(json.dumps(content))
-    return path
-
-
-OBJECTS = {
-    "an object without degrees of freedom": (lambda row: row.pop("freedom"), "no degree of freedom"),
-    "a hinge far from its mesh": (lambda row: row["freedom"].update(pivot=[9.0, 0.0, 0.0]), "8.20 m from its mesh"),
-    "a missing mesh": (lambda row: row.update(mesh="objects/none.ply"), "its mesh objects/none.ply is missing"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("row", OBJECTS)
-def test_an_environments_fault_is_one_error(row, tmp_path, capsys):
-    change, message = OBJECTS[row]
-    path = spoiled_environment(tmp_path, change)
-    before = {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)}
-    assert exit_code(["doctor", "--json", str(path)]) == 1
-    found = next(iter(json.loads(capsys.readouterr().out)["findings"].values()))
-    errors = [finding for finding in found if finding["severity"] == "error"]
-    assert len(errors) == 1
-    assert message in errors[0]["what"]
-    assert errors[0]["fix"]
-    assert {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)} == before
-
-
-LABELS = {
-    "overlapping labels": ({"contacts": {"left_hand": [[0.1, 0.6], [0.4, 0.8]], "right_hand": []}}, "labels of left_hand overlap"),
-    "an end before the start, and more": (
-        {"contacts": {"left_hand": [[0.5, 0.2], [0.6, 0.8]], "right_hand": []}}, "an end before its start means"),
-    "an empty label": ({"contacts": {"left_hand": [], "right_hand": [[0.5, 0.5]]}}, "right_hand label 0 is empty"),
-    "another recording": (
-        {"schema_version": 1, "recording": {"name": "other", "frames": 9, "start_s": 0.0, "stop_s": 9.0},
-         "contacts": {"left_hand": [], "right_hand": []}}, "labels of recording 'other'"),
-    "longer than the recording": ({"contacts": {"left_hand": [[0.1, 60.0]], "right_hand": []}}, "outside the recording"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("row", LABELS)
-def test_labels_that_cannot_be_are_refused_and_kept(row, tmp_path, capsys):
-    content, message = LABELS[row]
-    data, output = suited(tmp_path / "data"), tmp_path / "labels"
-    output.mkdir()
-    file = output / "r.contacts.json"
-    file.write_text(json.dumps(content))
-    assert exit_code(["annotate", f"{data}/r", "--output", str(output), "--no-browser"]) == 2
-    told = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
-    assert len(told) == 1
-    assert message in told[0]
-    assert json.loads(file.read_text()) == content
-    assert files_in(output) == {file.name}

@@ -1,12 +1,23 @@
 """Small recordings for tests, made in milliseconds: a body that sways while it wanders in a circle."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
 from wearcap.geometry import rotation
-from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Motion, Recording, RecordingStore
+from wearcap.geometry.camera import Camera
+from wearcap.recording import (
+    CameraStream,
+    ContactTrack,
+    FloorTrack,
+    HeadStream,
+    Localization,
+    Motion,
+    Recording,
+    RecordingStore,
+)
 
 
 def swaying_motion(frames: int, seed: int = 0, fps: float = 60.0, skeleton: Skeleton | None = None) -> Motion:
@@ -41,3 +52,17 @@ def small_dataset(root: Path, frames: tuple[int, ...] = (400, 300, 90, 300, 260,
     for index, (count, split) in enumerate(zip(frames, ("train", "train", "train", "val", "test", "test"))):
         store.add(recording_of(swaying_motion(count, index), f"r{index}"), split=split, config_hash="test")
     return store
+
+
+def suited(root: Path, short: bool = False, **parts) -> Path:
+    """A data set of one recording with a suit, a localised camera, and no scan."""
+    motion = swaying_motion(90)
+    head = motion.joint("head")
+    suit = replace(motion, contact_prob=torch.ones(90, 4))
+    if short:
+        object.__setattr__(suit, "contact_prob", torch.zeros(50, 4))  # the type itself would refuse it here
+    camera = CameraStream(motion.timestamps, Camera.pinhole(64, 48, 60.0), torch.eye(3), torch.zeros(3))
+    found = Localization(motion.timestamps, head.R, head.t, torch.ones(90))
+    sensed = {"suit": suit, "camera": camera, "localization": found} | parts
+    RecordingStore(root).add(replace(recording_of(motion, "r"), **sensed), split="test", config_hash="x")
+    return root
