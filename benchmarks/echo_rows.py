@@ -1,18 +1,16 @@
 """What ECHO's tables capture: rows on whole recordings, with objects, with parts of the truth observed."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
-from wearcap.metrics.table import Row
 from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_baselines import RigidWrist
 from wearcap.pipelines.echo_dataset import EchoOnDataset
-from wearcap.pipelines.echo_evaluation import observed_share, score_echo
-from wearcap.pipelines.echo_told import Scenario, lane_of
+from wearcap.pipelines.echo_evaluation import Truth, observed_share
+from wearcap.pipelines.echo_told import Lane, Scenario, lane_of
 from wearcap.pipelines.hmd2 import head_path
 from wearcap.recording import Motion, RecordingStore
 
@@ -34,25 +32,24 @@ def pipeline_of(method: Method) -> Echo:
     return pipeline
 
 
-def rows(
-    method: Method, store: RecordingStore, names: Sequence[str], seeds: Sequence[int], lanes: int, step: Callable[[], None],
-) -> Iterator[Row]:  # fmt: skip
-    """Every recording with every seed, `lanes` of them at a time."""
-    on = EchoOnDataset(pipeline_of(method), store.root)
-    for scenario, motion, name, seed in captured(method, on, store, names, seeds, lanes):
-        yield score_echo(motion, on.truth(motion, scenario.recording), name, seed)
-        step()
+@dataclass(frozen=True, eq=False)
+class Captured:
+    """One recording, captured with one seed."""
+
+    name: str
+    seed: int
+    motion: Motion
+    truth: Truth
+    lane: Lane
 
 
 def captured(
-    method: Method,
-    on: EchoOnDataset,
-    store: RecordingStore,
-    names: Sequence[str],
-    seeds: Sequence[int],
-    lanes: int,
-) -> Iterator[tuple[Scenario, Motion, str, int]]:
-    """Recordings of like length side by side, so that none waits long for another."""
+    method: Method, store: RecordingStore, names: Sequence[str], seeds: Sequence[int], lanes: int
+) -> Iterator[Captured]:
+    """Every recording with every seed, `lanes` of them at a time: those of like length side by side, so that none waits
+    long for another."""
+    on = EchoOnDataset(pipeline_of(method), store.root)
+    reader = on.echo.reader()
     ordered = sorted(names, key=lambda name: store.entries[name].frames)
     jobs = [(name, seed) for name in ordered for seed in seeds]
     for start in range(0, len(jobs), lanes):
@@ -61,7 +58,9 @@ def captured(
         scenarios = [_observing(method, on, known[name], seed) for name, seed in batch]
         motions = on.echo.capture_scenarios(scenarios, [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):
-            yield known[name], motion, name, seed
+            scenario = known[name]
+            lane = lane_of(scenario, head_path(scenario.recording, on.echo.skeleton, on.echo.fps), reader)
+            yield Captured(name, seed, motion, on.truth(motion, scenario.recording), lane)
 
 
 def _observing(method: Method, on: EchoOnDataset, scenario: Scenario, seed: int) -> Scenario:
@@ -77,17 +76,3 @@ def _observing(method: Method, on: EchoOnDataset, scenario: Scenario, seed: int)
 
 def _still(count: int, joints: int):
     return torch.eye(3).repeat(count, joints, 1, 1), torch.zeros(count, 3)
-
-
-def stuck_rows(
-    method: Method, wrist: RigidWrist, store: RecordingStore, names: Sequence[str], seeds: Sequence[int], lanes: int,
-    step: Callable[[], None],
-) -> Iterator[Row]:  # fmt: skip
-    """Another row's bodies, with objects stuck to wrists."""
-    on = EchoOnDataset(pipeline_of(method), store.root)
-    reader = on.echo.reader()
-    for scenario, motion, name, seed in captured(method, on, store, names, seeds, lanes):
-        lane = lane_of(scenario, head_path(scenario.recording, on.echo.skeleton, on.echo.fps), reader)
-        stuck = wrist.attached(motion, lane)
-        yield score_echo(stuck, on.truth(stuck, scenario.recording), name, seed)
-        step()

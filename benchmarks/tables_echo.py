@@ -8,9 +8,11 @@ are over seeds of the diffusion, as in the document.
 
 import argparse
 import json
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
-from echo_rows import Method, pipeline_of, rows, stuck_rows
+from echo_rows import Captured, Method, captured, pipeline_of
 from hydra.utils import instantiate
 from rich.console import Console
 from rich.progress import Progress
@@ -19,13 +21,14 @@ from tabling import finite
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.metrics.table import Row, Scores, Summary, aggregate, markdown_table
+from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
 from wearcap.pipelines.echo_baselines import NearestEcho, RigidWrist
 from wearcap.pipelines.echo_dataset import EchoOnDataset
 from wearcap.pipelines.echo_evaluation import MEASURES, score_echo
 from wearcap.recording import RecordingStore
 
 OBJECTS = MEASURES
+OBJECT_PARTS = ("v2v_cm", "center_cm", "rotation_deg", "touch_f1", "jitter_m_s3")
 HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_s3", "true_jitter_m_s3")
 ABLATIONS = {
     "ours, as long as the others": ("echo_short", "pipeline=echo"),
@@ -37,6 +40,36 @@ ABLATIONS = {
     "document's weights of losses": ("echo_document_losses", "pipeline=echo"),
     "three tokens per frame": ("echo_three_streams", "pipeline=echo"),
     "BoDiffusion-style + object": ("bodiffusion_object", "pipeline=bodiffusion_object"),
+}
+SETTINGS = {
+    "ours": ("pipeline=echo",),
+    "objects move untouched": (
+        "pipeline=echo",
+        "pipeline.rest=null",
+    ),
+    "guided by contacts": ("pipeline=echo_guided",),
+    "not hung from the head": (
+        "pipeline=echo",
+        "pipeline.hang=false",
+    ),
+    "steps evenly spaced": (
+        "pipeline=echo",
+        "pipeline.spacing=1.0",
+    ),
+    "the stochastic posterior": (
+        "pipeline=echo",
+        "pipeline.eta=1.0",
+    ),
+    "the stochastic posterior, evenly spaced": ("pipeline=echo", "pipeline.eta=1.0", "pipeline.spacing=1.0"),
+    "noise redrawn (eq. 11 as printed)": ("pipeline=echo", "pipeline.step=redraw", "pipeline.spacing=1.0"),
+    "context of 10": (
+        "pipeline=echo",
+        "pipeline.context=10",
+    ),
+    "context of 40: latency of 20 frames": (
+        "pipeline=echo",
+        "pipeline.context=40",
+    ),
 }
 SHARES = {"human": (0.01, 0.05, 0.1, 0.25, 1.0), "object": (0.01, 0.05, 0.1, 0.25, 1.0), "contact": (0.01, 0.05, 0.1, 0.25, 1.0)}  # fmt: skip
 DOCUMENT: Scores = {
@@ -86,23 +119,22 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, tupl
     data = instantiate(compose("train", ["experiment=echo", "paths.run=none", f"paths.datasets={options.datasets}"]).data, _convert_="all")  # fmt: skip
     training = data.dataset("train")
     scores["nearest training window"] = _baseline(NearestEcho.fit(training), store, names, ours)
-    wrist, seeds = RigidWrist.fit(training), _seeds(options)
-    bar = progress.add_task("stuck to a wrist", total=len(seeds) * len(names))
-    advance = lambda: progress.advance(bar)  # noqa: E731
-    human = _with(options, Method("human", options.checkpoint, ("pipeline=echo",)))
-    stuck = stuck_rows(human, wrist, store, names, seeds, options.lanes, advance)
-    scores["ours, object stuck to the nearer wrist"] = aggregate(list(stuck))
-    methods = [
-        ours,
-        Method("ours, guided by contacts", options.checkpoint, ("pipeline=echo_guided",)),
-        Method("ours, not hung from the head", options.checkpoint, ("pipeline=echo", "pipeline.hang=false")),
-        Method("ours, noise redrawn (eq. 11 as printed)", options.checkpoint, ("pipeline=echo", "pipeline.step=redraw", "pipeline.spacing=1.0")),
-        Method("ours, the stochastic posterior", options.checkpoint, ("pipeline=echo", "pipeline.eta=1.0", "pipeline.spacing=1.0")),
-        Method("ours, as in the document", options.checkpoint, ("pipeline=echo_document",)),
-        Method("ours, latency of 20 frames", options.checkpoint, ("pipeline=echo_online",)),
-    ]  # fmt: skip
-    scores |= _scores(methods, options, progress, store, names)
+    wrist = RigidWrist.fit(training)
+    mine, stuck = [], []
+    for one in _captured(ours, options, progress, store, names):
+        mine.append(score_echo(one.motion, one.truth, one.name, one.seed))
+        stuck.append(score_echo(wrist.attached(one.motion, one.lane), one.truth, one.name, one.seed))
+    scores |= {"ours, object stuck to the nearer wrist": aggregate(stuck), "ours": aggregate(mine)}
+    document = Method("ours, captured as in the document", options.checkpoint, ("pipeline=echo_document",))
+    scores |= _scores([document], options, progress, store, names)
     return f"Table 1: objects, {options.split}", OBJECTS, scores | DOCUMENT
+
+
+def _settings(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
+    """How the conveyor runs; defaults are chosen by this table, on the validation split."""
+    store, names = _recordings(options, "simulated_objects")
+    methods = [Method(name, options.checkpoint, changes) for name, changes in SETTINGS.items()]
+    return f"Settings: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
 
 
 def _ablation(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
@@ -144,21 +176,28 @@ def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[
 def _scores(
     methods: list[Method], options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]
 ) -> Scores:  # fmt: skip
-    scores, seeds = {}, _seeds(options)
+    scores: Scores = {}
     for method in methods:
-        bar = progress.add_task(method.name, total=len(seeds) * len(names))
-        advance = lambda b=bar: progress.advance(b)  # noqa: E731
-        made: list[Row] = list(rows(_with(options, method), store, names, seeds, options.lanes, advance))
+        made = [
+            score_echo(one.motion, one.truth, one.name, one.seed)
+            for one in _captured(method, options, progress, store, names)
+        ]
         scores[method.name] = aggregate(made)
+        means = (f"{key} {scores[method.name][key].mean:.2f}" for key in ("mpjpe_mm", *OBJECT_PARTS) if key in scores[method.name])  # fmt: skip
+        progress.console.print(f"{method.name}: {', '.join(means)}")
     return scores
 
 
-def _with(options: argparse.Namespace, method: Method) -> Method:
-    return Method(method.name, method.checkpoint, (*method.pipeline, *options.pipeline), method.observed)
-
-
-def _seeds(options: argparse.Namespace) -> list[int]:
-    return list(range(2 if options.quick else options.seeds))
+def _captured(
+    method: Method, options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]
+) -> Iterator[Captured]:
+    """With all seeds."""
+    seeds = list(range(2 if options.quick else options.seeds))
+    bar = progress.add_task(method.name, total=len(seeds) * len(names))
+    changed = replace(method, pipeline=(*method.pipeline, *options.pipeline))
+    for one in captured(changed, store, names, seeds, options.lanes):
+        progress.advance(bar)
+        yield one
 
 
 def _baseline(method: NearestEcho, store: RecordingStore, names: list[str], like: Method) -> dict[str, Summary]:  # fmt: skip
@@ -180,7 +219,13 @@ def _recordings(options: argparse.Namespace, data: str) -> tuple[RecordingStore,
     return store, store.names(options.split)[: 3 if options.quick else options.recordings]
 
 
-PARTS = {"objects": _objects, "ablation": _ablation, "sparse": _sparse, "human": _human}
+PARTS = {
+    "objects": _objects,
+    "ablation": _ablation,
+    "settings": _settings,
+    "sparse": _sparse,
+    "human": _human,
+}
 PREPARE = {
     "cmu": "Run: wearcap prepare cmu source=FOLDER",
     "simulated_objects": "Run: wearcap prepare simulated_objects",

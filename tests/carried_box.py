@@ -112,9 +112,9 @@ def small_net(features: EchoFeatures, **changes) -> EchoDenoiser:
 
 
 def drawn_echo(frame: str = "own", net=None, **settings) -> Echo:
-    """A small pipeline; a pose is final when seven frames have followed it."""
+    """A small pipeline; a pose is final when seven frames have followed it, and objects are as drawn."""
     features = small_features(frame)
-    given = {"context": 8, "per_frame": 1, **settings}
+    given = {"context": 8, "per_frame": 1, "rest": None, **settings}
     return Echo(net or small_net(features), features, CosineSchedule(), xsens23(), **given)
 
 

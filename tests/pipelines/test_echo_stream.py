@@ -82,6 +82,28 @@ def test_a_stream_says_what_a_whole_capture_says(settings):
     assert session.dropped == session.silent == 0
 
 
+def test_objects_rest_in_a_stream_from_their_first_contact_on():
+    """What comes before it is final before the contact is known."""
+    recording = carrying(1.2, carried=TWO)
+    scenario = scenario_of(recording, TWO)
+    drawn = drawn_echo().capture_scenarios([scenario], [3])[0]
+    likely = drawn.body_contact_prob.amax(1)
+    threshold = likely[likely > 0].median().item()
+    echo = drawn_echo(rest=threshold)
+    whole = echo.capture_scenarios([scenario], [3])[0]
+    session = EchoSession(echo, wearer(recording), boxes(TWO), seed=3)
+    told_acts(session, scenario)
+    motion, _ = streamed(session, recording)
+    for act in scenario.acts:
+        active = (active_at([act], [act.object], whole.timestamps) == 0).nonzero()[:, 0]
+        first = int((likely[active] >= threshold).nonzero()[0])
+        found, given = motion.object_motion[act.object], whole.object_motion[act.object]
+        moved = drawn.object_motion[act.object].t_world_body[active]
+        torch.testing.assert_close(found.t_world_body[first:], given.t_world_body[active][first:], atol=1e-3, rtol=0)  # fmt: skip
+        torch.testing.assert_close(found.t_world_body[:first], moved[:first], atol=1e-3, rtol=0)
+        assert not torch.allclose(given.t_world_body[active], moved, atol=1e-3)
+
+
 def test_a_human_alone_needs_no_objects():
     recording, echo = carrying(1.0), drawn_echo()
     motion, _ = streamed(EchoSession(echo, wearer(recording), seed=1), recording)

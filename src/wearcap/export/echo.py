@@ -46,7 +46,7 @@ from wearcap.recording.locate import dataset_folder
 from wearcap.recording.store import RecordingFile, save_recording
 
 MAX_ERROR = 1e-4
-_CONVEYOR = ("context", "per_frame", "spacing", "eta", "step", "rewindow", "hang")
+_CONVEYOR = ("context", "per_frame", "spacing", "eta", "step", "rewindow", "hang", "rest")
 
 
 class _DenoiserGraph(nn.Module):

@@ -22,6 +22,7 @@ from wearcap.models.echo_runtime import EchoRunner, require_runtime
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.pipelines.echo_guidance import Guidance, GuidedScene
 from wearcap.pipelines.echo_queue import Amend, EchoQueue, Said, Told
+from wearcap.pipelines.echo_rest import rested
 from wearcap.pipelines.echo_rewindow import Rewindow
 from wearcap.pipelines.echo_search import ActSearch
 from wearcap.pipelines.echo_told import Lane, Scenario, lane_of
@@ -55,6 +56,9 @@ class Echo:
     """Frames by which windows advance that are denoised from scratch, as is usual; None: a conveyor."""
     hang: bool = True
     """Whether the body hangs from the measured head (ours) or stands where it was drawn (the document)."""
+    rest: float | None = 0.7
+    """Objects stay where they are in frames in which nothing touches them with this probability (ours); None: they are as
+    drawn (the document), and so they are where the network knows no contacts."""
     guidance: Guidance | None = None
     """None: the prediction is left as it is."""
     acts: str | Sequence[Mapping[str, Any]] | ActSearch = "truth"
@@ -88,6 +92,11 @@ class Echo:
     def latency_s(self) -> float:
         """Between a frame and its final pose."""
         return (self.belt.ramp - 1) / self.fps
+
+    @property
+    def rests_below(self) -> float | None:
+        """`rest`, where the network knows contacts."""
+        return self.rest if self.contacts else None
 
     def prepare(self) -> None:
         """Bring the network to its device and into the form it runs in; what is exported or compiled is made once."""
@@ -137,7 +146,9 @@ class Echo:
         lanes = [lane_by[id(scenario)] for scenario in scenarios]
         # 2. frame after frame enters as noise and leaves clean
         said = self._conveyed(lanes, [scenario.recording for scenario in scenarios], seeds)
-        # 3. the body hangs from the measured head; objects rest between the times they are active
+        # 3. the body hangs from the measured head; objects rest while nothing touches them
+        if (threshold := self.rests_below) is not None:
+            said = [rested(lane.told, part, threshold) for lane, part in zip(lanes, said)]
         return [motion_of(lane, part, self.hang, self.settings()) for lane, part in zip(lanes, said)]
 
     def _lane(self, scenario: Scenario, reader: ObjectReader) -> Lane:
@@ -198,7 +209,7 @@ class Echo:
         """What the motion depends on, beside the network."""
         return {
             "pipeline": "echo", "context": str(self.context), "per_frame": str(self.per_frame), "eta": str(self.eta),
-            "step": self.step, "rewindow": str(self.rewindow), "hang": str(self.hang), "guidance": str(self.guidance),
+            "step": self.step, "rewindow": str(self.rewindow), "hang": str(self.hang), "rest": str(self.rest), "guidance": str(self.guidance),
         }  # fmt: skip
 
 

@@ -24,6 +24,7 @@ from wearcap.models.echo import MODALITIES
 from wearcap.models.onnx_runner import undisturbed
 from wearcap.pipelines.echo import Echo, guided_by, motion_of, stretch_seed
 from wearcap.pipelines.echo_queue import EchoQueue, Said, Told
+from wearcap.pipelines.echo_rest import Resting
 from wearcap.pipelines.echo_told import Lane
 from wearcap.pipelines.hmd2 import HeadPath
 from wearcap.pipelines.hmd2_stream import joined
@@ -77,6 +78,8 @@ class EchoSession:
         self._waiting: list[tuple[float, Told, Rigid]] = []
         """Times, what was told, and the head, of frames that are taken and not given yet."""
         self._floor_m = wearer.floor_m
+        threshold = pipeline.rests_below
+        self._resting = None if threshold is None else Resting(threshold)
 
     @property
     def dropped(self) -> int:
@@ -274,6 +277,8 @@ class EchoSession:
         )  # fmt: skip
         self._forget(time)
         lane = Lane(path, told, list(self._shapes.values()))
+        if self._resting is not None:
+            said = self._resting(told, said)
         return [motion_of(lane, said, self.pipeline.hang, self.pipeline.settings())]
 
     def _forget(self, time: float) -> None:

@@ -1,0 +1,94 @@
+"""Objects rest while nothing touches them: where they were touched last, and before that where they will be."""
+
+import pytest
+import torch
+
+from carried_box import carrying, drawn_echo, scenario_of
+from wearcap.body.contact_points import BODY_POINTS
+from wearcap.data.echo_features import CONTACTS
+from wearcap.geometry import rotation
+from wearcap.pipelines.echo_queue import Said, Told
+from wearcap.pipelines.echo_rest import Resting, rested
+
+TOUCH = 0.7
+ACTS = [-1, 0, 0, 0, 0, 0, 0, 1, 1, 1, -1, 1, 1, 1]
+"""Numbers of the active object."""
+TOUCHED = [3, 4, 11]
+"""Frames in which it is touched."""
+MOVED = [0, 3, 3, 3, 4, 4, 4, 7, 8, 9, 10, 11, 11, 11]
+"""Frames whose poses are taken: the first act of object 1 has no contact, its second begins with one."""
+
+
+def frames(active=ACTS, touched=TOUCHED, observed=()) -> tuple[Told, Said]:
+    """Objects that move a metre and turn a little in every frame; one point of the body touches."""
+    count = len(active)
+    number = torch.tensor([active], dtype=torch.float32)
+    eye, zeros = torch.eye(3).repeat(1, count, 1, 1), torch.zeros(1, count, 3)
+    contact = torch.full((1, count, CONTACTS), 0.6)
+    contact[..., BODY_POINTS:] = 1.0
+    contact[0, touched, 12] = TOUCH
+    known = torch.zeros(1, count, 3, dtype=torch.bool)
+    known[0, list(observed), 1] = True
+    told = Told(
+        eye[:, :, None].repeat(1, 1, 3, 1, 1), zeros[:, :, None].repeat(1, 1, 3, 1), zeros[..., 0], number >= 0, zeros[..., :1],
+        number, number > -2, eye[:, :, None], zeros, eye, zeros, contact, known,
+    )  # fmt: skip
+    way = torch.arange(count, dtype=torch.float32)
+    turn = rotation.exp(torch.stack([0 * way, 0 * way, 0.1 * way], -1))
+    return told, Said(
+        eye[:, :, None], zeros, turn[None], torch.stack([way, 0 * way, 0 * way], -1)[None], contact
+    )
+
+
+def places(said: Said) -> list[int]:
+    assert torch.equal(
+        said.R_world_object, frames()[1].R_world_object[:, said.t_world_object[0, :, 0].long()]
+    )
+    return said.t_world_object[0, :, 0].long().tolist()
+
+
+def test_objects_move_while_they_are_touched_alone():
+    told, said = frames()
+    found = rested(told, said, TOUCH)
+    assert places(found) == MOVED
+    assert found.contact_prob is said.contact_prob
+
+
+def test_an_observed_pose_is_believed_without_a_contact():
+    told, said = frames(observed=[6, 9])
+    assert places(rested(told, said, TOUCH)) == [0, 3, 3, 3, 4, 4, 6, 9, 9, 9, 10, 11, 11, 11]
+
+
+def test_feet_on_the_floor_touch_no_object():
+    told, said = frames(touched=[])
+    assert places(rested(told, said, 0.65)) == list(range(len(ACTS)))
+
+
+def test_lanes_rest_on_their_own():
+    one, other = frames(), frames(touched=[5, 9])
+    both = [type(a)(*(torch.cat(fields) for fields in zip(a, b))) for a, b in zip(one, other)]
+    found = rested(*both, TOUCH)
+    for k, (told, said) in enumerate((one, other)):
+        assert torch.equal(found.t_world_object[k : k + 1], rested(told, said, TOUCH).t_world_object)
+
+
+def test_frame_by_frame_it_is_the_same_from_the_first_contact_on():
+    told, said = frames()
+    step = Resting(TOUCH)
+    way = []
+    for k in range(len(ACTS)):
+        one = slice(k, k + 1)
+        way.append(step(told.frames(one), Said(*(field[:, one] for field in said))).t_world_object[0, 0, 0])
+    assert [int(x) for x in way] == [0, 1, 2, *MOVED[3:]]
+
+
+@pytest.mark.parametrize("settings", [{"rest": None}, {"contacts": False}])
+def test_without_contacts_objects_are_as_they_are_drawn(settings):
+    recording = carrying(1.0)
+    scenario = scenario_of(recording)
+    echo = drawn_echo(**{"rest": 0.0, **settings})
+    motion = echo.capture_scenarios([scenario], [0])[0]
+    track = motion.object_motion["box_1"]
+    active = (motion.timestamps >= 0.4) & (motion.timestamps < 1.2)
+    assert echo.rests_below is None
+    assert (track.t_world_body[active].diff(dim=0).norm(dim=-1) > 0).all()
