@@ -43,33 +43,15 @@ ABLATIONS = {
 }
 SETTINGS = {
     "ours": ("pipeline=echo",),
-    "objects move untouched": (
-        "pipeline=echo",
-        "pipeline.rest=null",
-    ),
+    "objects move untouched": ("pipeline=echo", "pipeline.rest=null"),
     "guided by contacts": ("pipeline=echo_guided",),
-    "not hung from the head": (
-        "pipeline=echo",
-        "pipeline.hang=false",
-    ),
-    "steps evenly spaced": (
-        "pipeline=echo",
-        "pipeline.spacing=1.0",
-    ),
-    "the stochastic posterior": (
-        "pipeline=echo",
-        "pipeline.eta=1.0",
-    ),
+    "not hung from the head": ("pipeline=echo", "pipeline.hang=false"),
+    "steps evenly spaced": ("pipeline=echo", "pipeline.spacing=1.0"),
+    "the stochastic posterior": ("pipeline=echo", "pipeline.eta=1.0"),
     "the stochastic posterior, evenly spaced": ("pipeline=echo", "pipeline.eta=1.0", "pipeline.spacing=1.0"),
     "noise redrawn (eq. 11 as printed)": ("pipeline=echo", "pipeline.step=redraw", "pipeline.spacing=1.0"),
-    "context of 10": (
-        "pipeline=echo",
-        "pipeline.context=10",
-    ),
-    "context of 40: latency of 20 frames": (
-        "pipeline=echo",
-        "pipeline.context=40",
-    ),
+    "context of 10": ("pipeline=echo", "pipeline.context=10"),
+    "context of 40: latency of 20 frames": ("pipeline=echo", "pipeline.context=40"),
 }
 SHARES = {"human": (0.01, 0.05, 0.1, 0.25, 1.0), "object": (0.01, 0.05, 0.1, 0.25, 1.0), "contact": (0.01, 0.05, 0.1, 0.25, 1.0)}  # fmt: skip
 DOCUMENT: Scores = {
