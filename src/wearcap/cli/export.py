@@ -8,9 +8,9 @@ from wearcap.cli.load import load_pipeline, load_system
 from wearcap.errors import WearcapError
 from wearcap.export.contact import export_contact
 from wearcap.export.echo import export_echo
+from wearcap.export.hmd2 import export_hmd2
+from wearcap.export.mocap_every import export_mocap_every
 from wearcap.export.network import ExportReport
-from wearcap.export.sidecar import export_hmd2
-from wearcap.export.watches import export_mocap_every
 from wearcap.models.checkpoint import share_checkpoint
 from wearcap.pipelines.contact_prediction import load_detector
 from wearcap.pipelines.echo import Echo

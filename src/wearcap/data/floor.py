@@ -10,6 +10,7 @@ from scipy.ndimage import percentile_filter
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import interpolate_held
 from wearcap.recording import PointCloud
 from wearcap.scene.floor import estimate_floor
 
@@ -32,9 +33,9 @@ def floor_from_path(
     `stature`, the head joint's height in the rest pose (m). Stairs are followed late, long sits mistaken for steps.
     """
     every = torch.arange(timestamps[0].item(), timestamps[-1].item() + _LOOK_EVERY_S, _LOOK_EVERY_S).double()
-    seen = interpolate(timestamps, t_world_head[:, 2], every).numpy()
+    seen = interpolate_held(timestamps, t_world_head[:, 2], every).numpy()
     upright = percentile_filter(seen, 90, size=int(UPRIGHT_WITHIN_S / _LOOK_EVERY_S), mode="nearest")
-    return interpolate(every, torch.from_numpy(np.asarray(upright) - stature).float(), timestamps)
+    return interpolate_held(every, torch.from_numpy(np.asarray(upright) - stature).float(), timestamps)
 
 
 def floor_from_points(
@@ -155,14 +156,3 @@ def tracked_floor(
             taken = until
         floor[start : start + LOOK_FRAMES] = tracker.follow(t_world_head[start : start + LOOK_FRAMES])
     return floor
-
-
-def interpolate(
-    known: Float64[Tensor, "known"], value: Float[Tensor, "known"], wanted: Float64[Tensor, "time"]
-) -> Float[Tensor, "time"]:
-    """Linear interpolation in time, constant beyond the ends."""
-    if len(known) == 1:
-        return value.expand(len(wanted)).clone()
-    right = torch.searchsorted(known, wanted).clamp(1, len(known) - 1)
-    share = ((wanted - known[right - 1]) / (known[right] - known[right - 1])).clamp(0, 1).to(value.dtype)
-    return value[right - 1] + share * (value[right] - value[right - 1])

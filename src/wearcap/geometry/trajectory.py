@@ -71,6 +71,17 @@ def interpolate(
     return torch.lerp(value[before], value[after], blend)
 
 
+def interpolate_held(
+    timestamps: Float64[Tensor, "time"], value: Float[Tensor, "time"], at: Float64[Tensor, "new_time"]
+) -> Float[Tensor, "new_time"]:
+    """Values at any times, linearly between frames; beyond the ends they are those of the ends."""
+    if len(timestamps) == 1:
+        return value.expand(len(at)).clone()
+    right = torch.searchsorted(timestamps, at).clamp(1, len(timestamps) - 1)
+    share = ((at - timestamps[right - 1]) / (timestamps[right] - timestamps[right - 1])).clamp(0, 1)
+    return value[right - 1] + share.to(value.dtype) * (value[right] - value[right - 1])
+
+
 def nearest_frames(
     timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "new_time"]
 ) -> Int64[Tensor, "new_time"]:

@@ -266,7 +266,5 @@ def _padded(told: Told, start: int, stop: int, length: int) -> Told:
 
 def _bridged(said: list[Said], path: HeadPath) -> Said:
     """Stretches as one; frames in the gaps between them are as the one before."""
-    frames = torch.cat([torch.arange(start, stop) for start, stop in path.stretches])
-    whole = Said(*(torch.cat(fields, 1) for fields in zip(*said)))
-    last = torch.searchsorted(frames, torch.arange(len(path.timestamps)), right=True).sub(1).clamp_min(0)
-    return Said(*(field[:, last] for field in whole))
+    whole, held = Said(*(torch.cat(fields, 1) for fields in zip(*said))), path.held_frames
+    return Said(*(field[:, held] for field in whole))

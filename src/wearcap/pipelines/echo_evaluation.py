@@ -13,11 +13,10 @@ from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.data.echo_features import CONTACTS
 from wearcap.data.echo_objects import ObjectReader, ObjectShape, body_contact
 from wearcap.data.echo_windows import foot_patches
-from wearcap.data.floor import interpolate
 from wearcap.data.prepare.clean import at_times
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, nearest_frames, resample
+from wearcap.geometry.trajectory import Trajectory, interpolate_held, nearest_frames, resample
 from wearcap.metrics.detection import detection_scores
 from wearcap.metrics.objects import (
     center_error_cm,
@@ -82,7 +81,7 @@ def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: Ob
         poses.append(T)
     floor = torch.zeros(len(times))
     if recording.floor is not None:
-        floor = interpolate(recording.floor.timestamps, recording.floor.height, times).float()
+        floor = interpolate_held(recording.floor.timestamps, recording.floor.height, times).float()
     nearest = nearest_frames(whole.timestamps, times)
     return Truth(motion, floor, shapes, active, poses, touch, foot_patches(recording)[nearest].float())
 

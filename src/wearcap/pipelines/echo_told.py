@@ -11,11 +11,10 @@ from wearcap.body.contact_points import BODY_POINTS
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.data.echo_features import CONTACTS, POINTS
 from wearcap.data.echo_objects import ObjectReader, ObjectShape
-from wearcap.data.floor import interpolate
 from wearcap.data.prepare.clean import at_times
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.geometry.trajectory import Trajectory, interpolate_held, resample
 from wearcap.models.echo import MODALITIES
 from wearcap.pipelines.echo_queue import Told
 from wearcap.pipelines.hmd2 import HeadPath
@@ -80,7 +79,7 @@ def lane_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> Lane:
     )
     floor = path.floor_height
     if recording.floor is not None:
-        floor = interpolate(recording.floor.timestamps, recording.floor.height, path.timestamps)
+        floor = interpolate_held(recording.floor.timestamps, recording.floor.height, path.timestamps)
     known = _observed(scenario, path, names, objects, active)
     told = (R, t, floor.float(), active != NO_OBJECT, codes[active], active.float(), torch.ones(count, dtype=torch.bool))  # fmt: skip
     return Lane(path, Told(*(part[None] for part in (*told, *known))), objects)

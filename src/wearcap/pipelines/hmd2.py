@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from wearcap.body.hang import hang
@@ -53,6 +53,13 @@ class HeadPath:
     def stature(self) -> float:
         """Height of the head joint in the rest pose (m)."""
         return self.skeleton.height_of("head")
+
+    @property
+    def held_frames(self) -> Int64[Tensor, "time"]:
+        """Which frame of all stretches' together counts at each time: in a gap the last one before it."""
+        frames = torch.cat([torch.arange(start, stop) for start, stop in self.stretches])
+        count = len(self.timestamps)
+        return torch.searchsorted(frames, torch.arange(count), right=True).sub(1).clamp_min(0)
 
 
 @dataclass

@@ -19,12 +19,11 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.floor import interpolate
 from wearcap.data.surroundings import latest_before
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory
+from wearcap.geometry.trajectory import Trajectory, interpolate_held
 from wearcap.pipelines.hmd2 import HMD2
 from wearcap.pipelines.hmd2_places import Memory, Places
 from wearcap.pipelines.hmd2_track import Chunk, HeadTrack
@@ -123,7 +122,7 @@ class _Lane:
             return tracked
         known, height = (torch.tensor(part, dtype=torch.float64) for part in zip(*self.floors))
         self.floors = self.floors[_newest(known, times[-1].item()) :]
-        return interpolate(known, height.float(), times)
+        return interpolate_held(known, height.float(), times)
 
     def give(self, waiting: int) -> list[Motion]:
         """The poses that wait, but for the last `waiting` frames; none or one motion."""

@@ -8,10 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.floor import floor_from_points, interpolate
+from wearcap.data.floor import floor_from_points
 from wearcap.data.prepare.clean import at_times
 from wearcap.data.watch_features import Sensed, WatchFeatures, synthetic_wrists
 from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import interpolate_held
 from wearcap.models.onnx_runner import Runner, missing_libraries, onnx_runner
 from wearcap.models.watch_estimator import Estimate, WatchEstimator
 from wearcap.optimize.latent_motion import LatentSolution
@@ -160,7 +161,7 @@ class MocapEvery:
         head's path says."""
         track = recording.floor
         if track is not None:
-            initial = interpolate(
+            initial = interpolate_held(
                 track.timestamps, track.height, torch.tensor([time_s], dtype=torch.float64)
             )[0].item()
         else:
@@ -202,8 +203,5 @@ class MocapEvery:
 
 def _bridged(said: list[Said], path: HeadPath) -> Said:
     """Stretches as one; frames in the gaps between them hold the pose before, at the interpolated head."""
-    count = len(path.timestamps)
-    frames = torch.cat([torch.arange(start, stop) for start, stop in path.stretches])
-    whole = Said(*(torch.cat(part) for part in zip(*said)))
-    take = torch.searchsorted(frames, torch.arange(count), right=True).sub(1).clamp_min(0)
-    return Said(*(part[take] for part in whole))
+    whole, held = Said(*(torch.cat(part) for part in zip(*said))), path.held_frames
+    return Said(*(part[held] for part in whole))

@@ -13,7 +13,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.data.features import HeadFeatures
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
-from wearcap.export import exported, network, runner, sidecar
+from wearcap.export import exported, hmd2, network
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.models.denoiser import MotionDenoiser
@@ -81,7 +81,7 @@ def exports(pipeline, tmp_path_factory):
     return {
         format: (
             folder / format / f"model.{format}",
-            sidecar.export_hmd2(pipeline, folder / format / f"model.{format}", format),
+            hmd2.export_hmd2(pipeline, folder / format / f"model.{format}", format),
         )
         for format in FORMATS
     }
@@ -115,16 +115,16 @@ def test_pipeline_reports_small_error(exports, format):
 @pytest.mark.parametrize("format", FORMATS)
 def test_runner_equals_the_eager_pipeline(pipeline, recording, exports, format):
     eager = pipeline(recording, seed=5)
-    motion = runner.load_exported(exports[format][0])(recording, seed=5)
+    motion = hmd2.load_exported_hmd2(exports[format][0])(recording, seed=5)
     assert pipeline.sense(recording, head_path(recording, xsens23(), 60.0)).points_valid.any()
     torch.testing.assert_close(motion.R_parent_joint, eager.R_parent_joint, atol=1e-4, rtol=0)
     torch.testing.assert_close(motion.t_world_root, eager.t_world_root, atol=1e-4, rtol=0)
-    other = runner.load_exported(exports[format][0])(recording, seed=6)
+    other = hmd2.load_exported_hmd2(exports[format][0])(recording, seed=6)
     assert (other.R_parent_joint - eager.R_parent_joint).abs().max() > 1e-2
 
 
 def test_runner_restores_settings(pipeline, exports):
-    loaded = runner.load_exported(exports["onnx"][0])
+    loaded = hmd2.load_exported_hmd2(exports["onnx"][0])
     assert loaded.skeleton == pipeline.skeleton
     assert loaded.features == pipeline.features
     assert (loaded.fps, loaded.steps, loaded.stride, loaded.eta) == (60.0, 3, 16, 1.0)
@@ -135,7 +135,7 @@ def test_runner_restores_settings(pipeline, exports):
 def test_runner_command_needs_neither_lightning_nor_hydra(recording, exports, tmp_path):
     save_recording(recording, tmp_path / "in.safetensors")
     program = (
-        "import sys; from wearcap.export.runner import main; main(sys.argv[1:]); "
+        "import sys; from wearcap.export.hmd2 import main; main(sys.argv[1:]); "
         "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
     )
     model, source, target = exports["onnx"][0], tmp_path / "in.safetensors", tmp_path / "out.safetensors"
@@ -178,24 +178,24 @@ def test_missing_library_and_wrong_names_are_told(tmp_path, monkeypatch):
 def test_hostile_model_files_are_named(tmp_path, exports, format):
     path = tmp_path / f"model.{format}"
     with pytest.raises(WearcapError, match="no such exported model"):
-        runner.load_exported(path)
+        hmd2.load_exported_hmd2(path)
     path.write_bytes(exports[format][0].read_bytes()[:1000])
     with pytest.raises(WearcapError, match="not a readable"):
-        runner.load_exported(path)
+        hmd2.load_exported_hmd2(path)
     path.write_bytes(exports[format][0].read_bytes())
     with pytest.raises(WearcapError, match="no such sidecar"):
-        runner.load_exported(path)
+        hmd2.load_exported_hmd2(path)
     path.with_suffix(".json").write_text("{")
     with pytest.raises(WearcapError, match="not a readable sidecar"):
-        runner.load_exported(path)
+        hmd2.load_exported_hmd2(path)
     about = json.loads(exports[format][0].with_suffix(".json").read_text())
     about["model"]["sha256"] = "0" * 64
     path.with_suffix(".json").write_text(json.dumps(about))
     with pytest.raises(WearcapError, match="belongs to another model"):
-        runner.load_exported(path)
+        hmd2.load_exported_hmd2(path)
     path.with_suffix(".json").write_text(exports[format][0].with_suffix(".json").read_text())
     with pytest.raises(WearcapError, match="a part of the exported model is missing"):
-        runner.load_exported(path)
+        hmd2.load_exported_hmd2(path)
 
 
 def test_archives_with_pickles_are_refused(tmp_path):

@@ -1,6 +1,6 @@
 """MocapEvery's estimator as ONNX or torch.export, with a sidecar, and back as a pipeline without the network's code.
 
-    python -m wearcap.export.watches MODEL.onnx RECORDING.safetensors MOTION.safetensors
+    python -m wearcap.export.mocap_every MODEL.onnx RECORDING.safetensors MOTION.safetensors
 
 The file holds the network alone; frames, floor and windows are the pipeline's own.
 """
@@ -86,7 +86,9 @@ def load_exported_mocap_every(path: str | Path) -> MocapEvery:
 
 def main(arguments: list[str]) -> None:
     """Capture one recording with an exported model."""
-    parser = command.parser("watches", main.__doc__, "a head and two watches", "the motion (.safetensors)")
+    parser = command.parser(
+        "mocap_every", main.__doc__, "a head and two watches", "the motion (.safetensors)"
+    )
     options = parser.parse_args(arguments)
     recording = RecordingFile(options.recording).load()
     motion = load_exported_mocap_every(options.model)(recording)

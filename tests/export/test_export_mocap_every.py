@@ -9,7 +9,7 @@ import torch
 
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.errors import WearcapError
-from wearcap.export.watches import export_mocap_every, load_exported_mocap_every
+from wearcap.export.mocap_every import export_mocap_every, load_exported_mocap_every
 from wearcap.recording.store import RecordingFile, save_recording
 
 
@@ -31,7 +31,7 @@ def test_it_runs_without_lightning_and_hydra(tmp_path):
     export_mocap_every(drawn_pipeline(), tmp_path / "net.onnx", "onnx")
     save_recording(recording, tmp_path / "walk.safetensors")
     program = (
-        "import sys; from wearcap.export.watches import main; main(sys.argv[1:]); "
+        "import sys; from wearcap.export.mocap_every import main; main(sys.argv[1:]); "
         "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
     )
     run(
