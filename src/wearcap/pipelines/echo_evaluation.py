@@ -20,7 +20,7 @@ from wearcap.geometry.trajectory import Trajectory, interpolate_held, nearest_fr
 from wearcap.metrics.detection import detection_scores
 from wearcap.metrics.objects import (
     center_error_cm,
-    feet_down,
+    foot_contact_share,
     joint_step_error_mm,
     quaternion_difference,
     rotation_difference_deg,
@@ -99,8 +99,8 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
     scores = {
         "mpjpe_mm": 10 * mpjpe_cm(joints, true).item(),
         "mpjve_mm": joint_step_error_mm(joints, true).item(),
-        "foot_contact": feet_down(skeleton, joints, truth.floor_height).float().mean().item(),
-        "true_foot_contact": feet_down(skeleton, true, truth.floor_height).float().mean().item(),
+        "foot_contact": foot_contact_share(skeleton, joints, truth.floor_height).item(),
+        "true_foot_contact": foot_contact_share(skeleton, true, truth.floor_height).item(),
         "jitter_m_s3": jitter_m_s3(joints, motion.fps).item(),
         "true_jitter_m_s3": jitter_m_s3(true, motion.fps).item(),
     }
