@@ -162,7 +162,8 @@ def test_what_moves_with_the_window_is_noised_in_the_new_frame():
     before, queue.told = told.frames(slice(0, WINDOW)), told.frames(slice(5, 5 + WINDOW))
     old, new = (echo.features.canonical(part.points) for part in (before, queue.told))
     queue.conveyor.age = torch.arange(WINDOW).flip(0)
-    level = echo.belt.levels(queue.conveyor.age)[None]
+    queue.conveyor.level = torch.rand(1, WINDOW, 3)
+    level = echo.net.per_feature(queue.conveyor.level)
     noise = torch.randn(1, WINDOW, sum(echo.net.sizes))
     queue.conveyor.x = add_noise(truth_of(echo, queue.told, old), noise, level, echo.schedule)
     turned, change = noise.clone(), new.R.mT @ old.R
@@ -208,6 +209,11 @@ def test_every_frame_is_said_however_short_the_recording(seconds, rewindow):
 def test_windows_that_would_leave_frames_out_are_refused():
     with pytest.raises(WearcapError, match=r"advance by 9.*Expected 1 to 8"):
         drawn_echo(rewindow=9)
+
+
+def test_windows_from_scratch_know_no_redrawn_noise():
+    with pytest.raises(WearcapError, match="step=redraw with windows.*Expected step=posterior"):
+        drawn_echo(rewindow=3, step="redraw")
 
 
 def test_the_body_hangs_from_the_measured_head():
@@ -282,6 +288,12 @@ def test_acts_may_be_given():
     assert drawn_echo().scenario(carrying(1.0, carried=()), None).acts == ()
 
 
+def test_interactions_tell_which_object_is_active_where_nothing_tells_its_poses():
+    recording = replace(carrying(1.5), object_motion={})
+    assert [act.object for act in drawn_echo().scenario(recording, boxes()).acts] == ["box_1"]
+    assert drawn_echo().scenario(replace(recording, interactions=None), boxes()).acts == ()
+
+
 @pytest.mark.parametrize(
     "wrong", ["guess", [{"object": "a"}], [{"object": "a", "start_s": 0.0, "end_s": 1.0}]]
 )
@@ -306,6 +318,20 @@ def test_wrists_of_controllers_are_as_good_as_true_ones():
     one, two = (lane(echo, scenario_of(each)).told for each in (recording, replace(tracked(recording), motion=None)))  # fmt: skip
     torch.testing.assert_close(one.t_world_point, two.t_world_point, atol=1e-4, rtol=0)
     torch.testing.assert_close(one.R_world_point, two.R_world_point, atol=1e-4, rtol=0)
+
+
+def test_observations_may_be_in_double_precision():
+    recording = carrying(1.0, carried=TWO)
+    seen = everything(recording)
+    motion = replace(recording.motion, R_parent_joint=recording.motion.R_parent_joint.double(), t_world_root=recording.motion.t_world_root.double())  # fmt: skip
+    tracks = {name: Trajectory(track.timestamps, track.R_world_body.double(), track.t_world_body.double()) for name, track in recording.object_motion.items()}  # fmt: skip
+    echo = drawn_echo(hang=False)
+    one, two = (
+        lane(echo, scenario_of(recording, TWO, observed=each)).told
+        for each in (seen, replace(seen, motion=motion, object_motion=tracks))
+    )
+    torch.testing.assert_close(one.t_world_object, two.t_world_object)
+    torch.testing.assert_close(one.R_parent_joint, two.R_parent_joint)
 
 
 def test_the_grip_of_these_tests_is_no_identity():

@@ -152,6 +152,24 @@ def test_an_object_that_is_seen_is_where_it_was_seen():
     assert (found.t_world_body[18] - track.t_world_body[18]).norm() > 0.01
 
 
+def test_of_several_sights_of_an_object_the_nearest_in_time_counts():
+    recording, echo = carrying(1.0), drawn_echo(hang=False)
+    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    session.activate("box_1", 0.0)
+    track = recording.object_motion["box_1"]
+    away = Rigid(torch.eye(3), torch.full((3,), 5.0))
+
+    def look(frame: int) -> None:
+        if frame == 14:
+            time = track.timestamps[10].item()
+            for shift, pose in ((-0.015, away), (0.0, track.T_world_body[10]), (0.015, away)):
+                session.see_object("box_1", time + shift, pose)
+
+    motion, _ = streamed(session, recording, look)
+    found = motion.object_motion["box_1"].t_world_body[10]
+    torch.testing.assert_close(found, track.t_world_body[10], atol=1e-4, rtol=0)
+
+
 def test_what_was_seen_of_one_object_is_not_believed_of_another():
     recording, echo = carrying(1.4, carried=TWO), drawn_echo(hang=False)
     session = EchoSession(echo, wearer(recording), boxes(TWO), seed=3)
@@ -249,11 +267,14 @@ def test_behind_a_gap_it_begins_anew_as_the_whole_capture_does():
     parts = []
     for frame in range(90):
         time = frame / 30
-        if frame in keep:
-            session.head(time, head.T_world_device[frame])
+        session.head(time, head.T_world_device[frame] if frame in keep else None)
         for joint in WRISTS:
             session.wrist(joint, time, recording.motion.joint(joint)[frame])
         parts.append(session.poses())
+        if frame == 59:
+            assert sum(len(part) for part in parts if part is not None) == 30, (
+                "a stretch that is over is said"
+            )
     parts.append(session.poses(ended=True))
     motion = joined([part for part in parts if part is not None])
     whole = echo.capture([known], [5])[0]
@@ -283,8 +304,18 @@ def test_the_floor_is_where_one_who_stands_has_it():
     recording = carrying(0.6)
     session = EchoSession(drawn_echo(), wearer(recording, floor_m=None), seed=0)
     streamed(session, recording)
-    head = recording.motion.joint("head").t[0, 2].item()
-    assert session._floor_m == pytest.approx(head - recording.skeleton.height_of("head"), abs=1e-5)
+    floor = session._queue.told.floor_height if session._queue else session._frame(1.0, recording.motion.joint("head")[:1]).floor_height  # fmt: skip
+    assert floor[0, -1].item() == pytest.approx(0.0, abs=0.1)
+
+
+def test_who_sits_at_first_and_stands_up_has_a_floor():
+    recording = carrying(0.6)
+    session = EchoSession(drawn_echo(), wearer(recording, floor_m=None), seed=0)
+    head, low = recording.motion.joint("head")[:1], torch.tensor([0.0, 0.0, 0.5])
+    sitting = [session._frame(k / 30, Rigid(head.R, head.t - low)).floor_height.item() for k in range(30)]
+    standing = [session._frame(1 + k / 30, head).floor_height.item() for k in range(60)]
+    assert sitting == pytest.approx([standing[-1] - 0.5] * 30, abs=1e-3)
+    assert standing[-1] == pytest.approx(head.t[0, 2].item() - recording.skeleton.height_of("head"), abs=1e-3)
 
 
 def test_unknown_names_are_refused():

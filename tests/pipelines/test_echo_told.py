@@ -12,7 +12,7 @@ from wearcap.data.echo_features import CONTACTS
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.pipelines.echo_told import Observed, lane_of
+from wearcap.pipelines.echo_told import Observed, lane_of, wrist_poses
 from wearcap.pipelines.hmd2 import head_path
 from wearcap.recording.acts import Act
 from wearcap.scene.environment import Environment
@@ -84,6 +84,8 @@ FAULTS = {
     "wrists swapped": (swapped, "carry: the left wrist is .* cm to the right of the right one.*Swap the two trackers"),
     "no wrists": (
         lambda: scenario_of(replace(RECORDING, motion=None)), "carry: wrists are tracked by nothing.*Expected `tracked` poses of left_wrist and"),
+    "one wrist": (
+        lambda: scenario_of(replace(RECORDING, tracked={"left_wrist": track()})), "carry: only left_wrist is tracked. Expected `tracked` poses of left_wrist and"),
     "wrists with NaN": (lambda: tracked(left_wrist=track(broken=True)), "carry: poses of wrists that are NaN"),
     "a wrist for a part of the time": (
         lambda: tracked(left_wrist=track(slice(0, 10))), "carry: tracking of left_wrist from 0.00 to 0.30 s. Expected all of 0.00 to 0.97 s"),
@@ -111,6 +113,16 @@ def test_a_fault_is_named(fault):
         told(make())
     assert caught.value.expected
     assert str(copy.copy(caught.value)) == str(caught.value)
+
+
+def test_a_wrist_that_is_lost_rests_where_it_was_seen():
+    """Short gaps are bridged; times in a long one, and behind the end, have the last pose before."""
+    times = torch.tensor([0.0, 0.2, 0.6, 1.4, 1.5], dtype=torch.float64)
+    place = torch.stack([times.float(), torch.zeros(5), torch.zeros(5)], 1)
+    at = torch.tensor([-1.0, 0.1, 0.2, 0.4, 0.6, 0.61, 1.39, 1.4, 1.45, 1.5, 9.0], dtype=torch.float64)
+    found = wrist_poses(Trajectory(times, torch.eye(3).repeat(5, 1, 1), place), at).t[:, 0]
+    expected = [0.0, 0.1, 0.2, 0.4, 0.6, 0.6, 0.6, 1.4, 1.45, 1.5, 1.5]
+    torch.testing.assert_close(found, torch.tensor(expected), atol=1e-6, rtol=0)
 
 
 def test_what_is_sound_passes():

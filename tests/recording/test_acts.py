@@ -51,6 +51,7 @@ def test_another_object_between_keeps_two_stretches_apart():
         [Act("a", 2.0, 8.0), Act("b", 5.0, 12.0)],  # overlapping
         [Act("a", 2.0, 15.0), Act("b", 5.0, 6.0), Act("c", 9.0, 10.0)],
         [Act("a", 2.0, 15.0), Act("b", 5.0, 6.0), Act("a", 15.5, 16.0)],
+        [Act("a", 0.0, 10.0), Act("a", 1.0, 2.0), Act("b", 4.0, 5.0)],  # a second hand on the same object
     ],
 )
 def test_of_objects_that_are_held_at_once_each_has_its_time(held):

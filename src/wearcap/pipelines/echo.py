@@ -77,6 +77,8 @@ class Echo:
         ramp, _ = self.belt.ramp, self._given_acts()
         if self.rewindow is not None and not 0 < self.rewindow <= ramp:
             raise WearcapError(f"windows that advance by {self.rewindow} frames", expected=f"1 to {ramp}, the window less the context")  # fmt: skip
+        if self.rewindow is not None and self.step == "redraw":
+            raise WearcapError("step=redraw with windows that are denoised from scratch", expected="step=posterior, or rewindow=null")  # fmt: skip
         require_runtime(self.runtime, self.device)
 
     @property
@@ -118,15 +120,17 @@ class Echo:
         try:
             return tuple(sorted((Act(**row) for row in self.acts), key=lambda act: act.start_s))
         except TypeError as error:
-            raise WearcapError(f"acts {list(self.acts)}", expected="a list of {object, start_s, stop_s}") from error  # fmt: skip
+            raise WearcapError(f"acts {self.acts!r}", expected="a list of {object, start_s, stop_s}") from error  # fmt: skip
 
     def scenario(self, recording: Recording, environment: Environment | None) -> Scenario:
         """A recording with the objects that are active in it, as `acts` says.
 
-        A recording without objects is of a human alone, unless acts were given.
+        A recording without an environment, or without interactions and objects' poses, is of a human alone, unless acts
+        were given.
         """
         if self.acts == "truth":
-            there = environment is not None and bool(recording.object_motion)
+            told = bool(recording.object_motion) or recording.interactions is not None
+            there = environment is not None and told
             return Scenario(recording, environment, tuple(true_acts(recording)) if there else ())
         if isinstance(self.acts, ActSearch) and environment is not None:
             alone = self.capture_scenarios([Scenario(recording)], [0])[0]
@@ -208,8 +212,9 @@ class Echo:
     def settings(self) -> dict[str, str]:
         """What the motion depends on, beside the network."""
         return {
-            "pipeline": "echo", "context": str(self.context), "per_frame": str(self.per_frame), "eta": str(self.eta),
-            "step": self.step, "rewindow": str(self.rewindow), "hang": str(self.hang), "rest": str(self.rest), "guidance": str(self.guidance),
+            "pipeline": "echo", "context": str(self.context), "per_frame": str(self.per_frame), "spacing": str(self.spacing),
+            "eta": str(self.eta), "step": self.step, "rewindow": str(self.rewindow), "hang": str(self.hang),
+            "rest": str(self.rests_below), "guidance": str(self.guidance), "acts": "search" if isinstance(self.acts, ActSearch) else str(self.acts),
         }  # fmt: skip
 
 

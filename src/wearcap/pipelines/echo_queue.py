@@ -154,22 +154,22 @@ class EchoQueue:
         """Re-express what is on the conveyor where the window's frame has moved."""
         assert self._frame is not None
         assert self.told is not None
-        level = self.belt.levels(self.conveyor.age)[:, None]
-        self.conveyor.x = self._reexpressed(self.conveyor.x, frame.inverse() @ self._frame, level, self.told)
+        change = frame.inverse() @ self._frame
+        self.conveyor.x = self._reexpressed(self.conveyor.x, change, self.conveyor.level, self.told)
 
     def _reexpressed(
         self,
         x: Float[Tensor, "lane frame feature"],
         change: Rigid,
-        level: Float[Tensor, "#frame 1"],
+        level: Float[Tensor, "#lane #frame modality"],
         told: Told,
     ) -> Float[Tensor, "lane frame feature"]:
-        """z' = A z + √ᾱ b (exact: the channels of each vector share one scale)."""
+        """z' = A z + √ᾱ b at each modality's own level (exact: the channels of each vector share one scale)."""
         net, alpha_bar = self.pipeline.net, self.pipeline.schedule(level).sqrt()
         scale = net.motion_normalizer.scale.cpu()
         x = x.clone()
-        for at, there in ((0, None), (net.sizes[0], told.has_object[..., None])):
-            shift = alpha_bar * (change.t / scale[at])
+        for modality, at, there in ((0, 0, None), (1, net.sizes[0], told.has_object[..., None])):
+            shift = alpha_bar[..., modality, None] * (change.t / scale[at])
             shift = shift if there is None else shift * there
             x[..., at : at + 3] = self._turned(x[..., at : at + 3], change.R) + shift
             for column in (at + 3, at + 6):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from wearcap.diffusion.process import posterior_step
 from wearcap.diffusion.sampler import step_levels
+from wearcap.models.echo import MODALITIES
 from wearcap.pipelines.echo_queue import EchoQueue, Model, Said, Told
 
 
@@ -64,7 +65,7 @@ class Rewindow(EchoQueue):
             before, frame = before[:, before.shape[1] - (start - first) :], self.pipeline.features.canonical(told.points)  # fmt: skip
             if self._frame is not None and self.pipeline.features.moves:
                 change, known = frame.inverse() @ self._frame, told.frames(slice(0, start - first))
-                before = self._reexpressed(before, change, torch.zeros(1, 1), known)
+                before = self._reexpressed(before, change, torch.zeros(1, 1, len(MODALITIES)), known)
             self._frame = frame
             x = self.window(told, before)
             stop = min(start + self.stride, count)

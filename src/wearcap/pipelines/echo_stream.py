@@ -16,16 +16,17 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.echo_features import CONTACTS, POINTS
 from wearcap.data.echo_objects import ObjectShape
+from wearcap.data.floor import FloorTracker
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.models.echo import MODALITIES
 from wearcap.models.onnx_runner import undisturbed
 from wearcap.pipelines.echo import Echo, guided_by, motion_of, stretch_seed
 from wearcap.pipelines.echo_queue import EchoQueue, Said, Told
 from wearcap.pipelines.echo_rest import Resting
-from wearcap.pipelines.echo_told import Lane
+from wearcap.pipelines.echo_told import MAX_GAP_S, Lane, wrist_poses
 from wearcap.pipelines.hmd2 import HeadPath
 from wearcap.pipelines.hmd2_stream import joined
 from wearcap.pipelines.hmd2_track import Chunk, HeadTrack
@@ -35,8 +36,6 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.object_mesh import check_object
 
 WRISTS = POINTS[1:]
-MAX_GAP_S = 0.5
-"""A wrist that is not tracked for longer rests where it was seen last."""
 ASIDE_M, BELOW = 0.25, 0.47
 """Where a wrist hangs: beside the head (m), and below it as a share of the head's height."""
 
@@ -50,7 +49,8 @@ class EchoWearer:
     R_head_device: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
     t_head_device: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
     floor_m: float | None = None
-    """Height of the floor; None: the first head's, less that of one who stands."""
+    """Height of the floor; None: the head's usual height in the last half minute, less that of one who stands. A capture
+    of the whole recording knows what comes, too."""
 
 
 class EchoSession:
@@ -77,7 +77,7 @@ class EchoSession:
         self._queue: EchoQueue | None = None
         self._waiting: list[tuple[float, Told, Rigid]] = []
         """Times, what was told, and the head, of frames that are taken and not given yet."""
-        self._floor_m = wearer.floor_m
+        self._floor = FloorTracker(wearer.skeleton.height_of("head"), pipeline.fps)
         threshold = pipeline.rests_below
         self._resting = None if threshold is None else Resting(threshold)
 
@@ -144,7 +144,7 @@ class EchoSession:
         with undisturbed(self.pipeline.runtime == "onnx"):
             while self._chunks and (ended or self._told(self._chunks[0])):
                 given += self._advance(self._chunks.pop(0))
-            if ended:
+            if ended or not (self._chunks or self._track.inside):
                 given += self._finish()
         return joined(given)
 
@@ -166,8 +166,6 @@ class EchoSession:
         mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
         T_world_head = chunk.T_world_device @ mount
         self._amend(chunk.amended @ mount)
-        if self._floor_m is None:
-            self._floor_m = T_world_head.t[0, 2].item() - self.wearer.skeleton.height_of("head")
         time = chunk.timestamps[0].item()
         told = self._frame(time, T_world_head)
         said = self._queue.push(told)
@@ -200,7 +198,9 @@ class EchoSession:
         joints = len(self.wearer.skeleton)
         one = torch.ones(1, dtype=torch.bool)
         unseen = (torch.eye(3).repeat(1, joints, 1, 1), torch.zeros(1, 3), torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, CONTACTS))  # fmt: skip
-        floor = torch.full((1,), float(self._floor_m or 0.0))
+        floor = torch.full((1,), self.wearer.floor_m or 0.0)
+        if self.wearer.floor_m is None:
+            floor = self._floor.follow(T_world_head.t)
         fields = (R, t, floor, *self._active(time), one, *unseen, torch.zeros(1, len(MODALITIES), dtype=torch.bool))  # fmt: skip
         return self._observed(Told(*(value[None] for value in fields)), time)
 
@@ -214,14 +214,19 @@ class EchoSession:
         return torch.ones(1, dtype=torch.bool), self._shapes[name].code[None], number
 
     def _observed(self, told: Told, time: float) -> Told:
-        """With the active object's pose, where it was seen within half a frame."""
-        for at, name, T in self._seen:
-            mine = bool(told.has_object) and list(self._shapes)[int(told.object_number)] == name
-            if mine and abs(at - time) <= 0.5 / self.pipeline.fps + 1e-6:
-                known = told.is_known.clone()
-                known[..., 1] = True
-                told = told._replace(R_world_object=T.R[None, None], t_world_object=T.t[None, None], is_known=known)  # fmt: skip
-        return told
+        """With the active object's pose, where it was seen within half a frame: the one that is nearest in time."""
+        if not told.has_object.item():
+            return told
+        active, near = list(self._shapes)[int(told.object_number)], 0.5 / self.pipeline.fps + 1e-6
+        seen = [
+            (abs(at - time), T) for at, name, T in self._seen if name == active and abs(at - time) <= near
+        ]
+        if not seen:
+            return told
+        _, T = min(seen, key=lambda pair: pair[0])
+        known = told.is_known.clone()
+        known[..., 1] = True
+        return told._replace(R_world_object=T.R[None, None], t_world_object=T.t[None, None], is_known=known)
 
     def _retell(self) -> None:
         """What has become known of the frames that are on the conveyor."""
@@ -256,15 +261,11 @@ class EchoSession:
         if not known:
             return self._hanging(joint, T_world_head)
         times, R, t = zip(*known)
-        clock = torch.tensor(times, dtype=torch.float64)
-        at = torch.tensor([min(max(time, times[0]), times[-1])], dtype=torch.float64)
-        exact = (clock - at).abs() < 1e-4
-        if exact.any():
-            number = int(exact.long().argmax())
-            pose = Rigid(R[number][None], t[number][None])
-        else:
-            pose = resample(Trajectory(clock, torch.stack(R), torch.stack(t)), at).T_world_body
-        self._wrists[joint] = [sample for sample in known if sample[0] >= time - 1.0] or known[-1:]
+        track = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
+        pose = wrist_poses(track, torch.tensor([time], dtype=torch.float64))
+        # What came before the last second is asked for no more, but for where the wrist was when it began.
+        old = bisect_left(known, time - 1.0, key=lambda sample: sample[0]) - 1
+        self._wrists[joint] = known[max(old, 0) :]
         return Rigid(pose.R.float(), pose.t.float())
 
     def _give(self, said: Said | None) -> list[Motion]:

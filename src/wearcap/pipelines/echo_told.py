@@ -14,6 +14,7 @@ from wearcap.data.echo_objects import ObjectReader, ObjectShape
 from wearcap.data.prepare.clean import at_times
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate_held, resample
 from wearcap.models.echo import MODALITIES
 from wearcap.pipelines.echo_queue import Told
@@ -25,6 +26,9 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.object_mesh import check_object
 
 WRISTS = POINTS[1:]
+MAX_GAP_S = 0.5
+SAME_S = 1e-4
+"""Times nearer than this are one."""
 SWAPPED_M = 0.02
 """The left wrist is this far to the right of the right one, by the median, where the two are swapped."""
 
@@ -91,12 +95,14 @@ def _tracked_points(
     """Head as measured, wrists as tracked; those of the true motion where nothing tracks them."""
     poses = [path.T_world_head]
     truth = recording.motion
-    if set(WRISTS) <= set(recording.tracked):
-        for joint in WRISTS:
+    found = [joint for joint in WRISTS if joint in recording.tracked]
+    if len(found) == 1:
+        raise WearcapError(f"only {found[0]} is tracked", where=recording.name, expected=f"`tracked` poses of {' and '.join(WRISTS)}")  # fmt: skip
+    if found:
+        for joint in found:
             track = recording.tracked[joint]
             _require_times(track.timestamps, path, f"tracking of {joint}", recording.name)
-            times = path.timestamps.clamp(track.timestamps[0].item(), track.timestamps[-1].item())
-            poses.append(resample(track, times).T_world_body)
+            poses.append(wrist_poses(track, path.timestamps))
     elif truth is not None:
         times = path.timestamps.clamp(truth.timestamps[0].item(), truth.timestamps[-1].item())
         truth = at_times(truth, times)
@@ -113,6 +119,22 @@ def _tracked_points(
         raise WearcapError(f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median", where=recording.name,
                            expected="the left wrist on the left", fix="Swap the two trackers.")  # fmt: skip
     return R, t
+
+
+def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
+    """Poses of a tracked wrist at any times: where it is not tracked for longer than `MAX_GAP_S`, and behind the end, it
+    rests where it was seen last."""
+    times = track.timestamps
+    inside = at.clamp(times[0].item(), times[-1].item())
+    last = (torch.searchsorted(times, inside + SAME_S, right=True) - 1).clamp_min(0)
+    gone = (times[(last + 1).clamp_max(len(times) - 1)] - times[last] > MAX_GAP_S) | (
+        inside - times[last] <= SAME_S
+    )
+    found = resample(track, inside).T_world_body if len(times) > 1 else track.T_world_body[last]
+    held = track.T_world_body[last]
+    return Rigid(
+        torch.where(gone[:, None, None], held.R, found.R), torch.where(gone[:, None], held.t, found.t)
+    )
 
 
 def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, where: str) -> None:
@@ -157,7 +179,7 @@ def _observed(
         at = _frames(seen.motion.timestamps, path, where)
         if len(seen.motion.skeleton) != joints:
             raise WearcapError(f"an observed body of {len(seen.motion.skeleton)} joints", where=where, expected=f"{joints}, as the wearer has")  # fmt: skip
-        R[at], root[at] = seen.motion.R_parent_joint, seen.motion.t_world_root
+        R[at], root[at] = seen.motion.R_parent_joint.float(), seen.motion.t_world_root.float()
         is_known[at, 0] = True
     for name, track in seen.object_motion.items():
         if name not in names:
@@ -165,7 +187,7 @@ def _observed(
         at, number = _frames(track.timestamps, path, where), names.index(name)
         mine = active[at] == number
         T = objects[number].centred(track.T_world_body)
-        R_object[at[mine]], t_object[at[mine]] = T.R[mine], T.t[mine]
+        R_object[at[mine]], t_object[at[mine]] = T.R[mine].float(), T.t[mine].float()
         is_known[at[mine], 1] = True
     if seen.contact is not None and seen.contact_times is not None:
         at = _frames(seen.contact_times, path, where)

@@ -42,8 +42,10 @@ class HeadTrack:
         """Poses that came too late, twice, or were not finite."""
         self._start: float | None = None
         """Time of frame 0: of the first pose."""
-        self._next, self._inside = 0, False
-        """The next frame to go out; whether it continues a stretch."""
+        self._next = 0
+        """The next frame to go out."""
+        self.inside = False
+        """Whether it continues a stretch, as far as is known."""
         self._held = 0
         """Of the last frames, those that no pose was known for."""
         self.newest = -math.inf
@@ -51,7 +53,7 @@ class HeadTrack:
 
     def state(self) -> dict[str, Tensor]:
         start = math.nan if self._start is None else self._start
-        numbers = [start, self._next, self._inside, self._held, self.newest, self.dropped]
+        numbers = [start, self._next, self.inside, self._held, self.newest, self.dropped]
         times, R, t = (
             zip(*self._poses) if self._poses else ((), (torch.zeros(0, 3, 3),), (torch.zeros(0, 3),))
         )
@@ -63,7 +65,7 @@ class HeadTrack:
     def restore(self, state: dict[str, Tensor]) -> None:
         start, next_frame, inside, held, self.newest, dropped = state["numbers"].tolist()
         self._start = None if math.isnan(start) else start
-        self._next, self._inside, self._held, self.dropped = (
+        self._next, self.inside, self._held, self.dropped = (
             int(next_frame),
             bool(inside),
             int(held),
@@ -93,7 +95,7 @@ class HeadTrack:
         while self._poses:
             start = self._poses[0][0] if self._start is None else self._start
             first = self._next
-            if not self._inside:
+            if not self.inside:
                 first = max(first, math.ceil((self._poses[0][0] - 1e-6 - start) * self.fps))
             if not ended and start + (first + self.stride - 1) / self.fps > self.newest + _SAME_S:
                 return None
@@ -103,9 +105,9 @@ class HeadTrack:
             chunk = None
             if count > 0:
                 chunk = self._chunk(known, start, first, count)
-                self._start, self._next, self._inside = start, first + count, True
+                self._start, self._next, self.inside = start, first + count, True
             if stop is not None and first + count >= stop:
-                self._inside, self._held = False, 0
+                self.inside, self._held = False, 0
                 self._poses = self._poses[len(known) :]
             else:
                 self._forget(known)
@@ -140,7 +142,7 @@ class HeadTrack:
         at = torch.where(exact, known.timestamps[place], at)
         poses = (known[place] if exact.all() else resample(known, at)).T_world_body
         held, self._held = self._held, int((times > known.timestamps[-1] + _SAME_S).sum())
-        return Chunk(times[held:], poses[held:], poses[:held], first, not self._inside)
+        return Chunk(times[held:], poses[held:], poses[:held], first, not self.inside)
 
     def _forget(self, known: Trajectory) -> None:
         """Drop the poses that no later frame lies between."""

@@ -72,8 +72,11 @@ def _side_by_side(held: Sequence[Act]) -> list[Act]:
     left, done = list(held), []
     while left:
         act = left.pop(0)
-        inner = next((k for k, other in enumerate(left) if other.stop_s < act.stop_s), None)
-        if inner is not None and left[inner].object != act.object:
+        within = (
+            k for k, other in enumerate(left) if other.stop_s < act.stop_s and other.object != act.object
+        )
+        inner = next(within, None)
+        if inner is not None:
             left.insert(inner + 1, Act(act.object, left[inner].stop_s, act.stop_s))
             left.sort(key=lambda part: part.start_s)
             act = Act(act.object, act.start_s, left[inner].start_s)
