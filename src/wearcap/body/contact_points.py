@@ -1,4 +1,5 @@
-"""Points on a body's surface whose contact with objects is told (ECHO §3.1: 64 of the body's vertices)."""
+"""Points on a body's surface whose contact with objects is told (ECHO §3.1: 64 of the body's vertices; which
+ones is ours: spread evenly, the same on both sides)."""
 
 from functools import cache
 

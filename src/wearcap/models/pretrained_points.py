@@ -1,4 +1,5 @@
-"""PointNeXt-S with weights that the user has: OpenPoints' checkpoints of its ModelNet40 config (ECHO's choice).
+"""PointNeXt-S with weights that the user has: OpenPoints' checkpoints of its ModelNet40 config (ECHO says
+PointNeXt; which one is our reading).
 
 Of `cfgs/modelnet40ply2048/pointnext-s.yaml`; with C=64 the feature has 1024 numbers, with C=32 it has 512.
 """
