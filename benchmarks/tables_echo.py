@@ -16,10 +16,9 @@ from echo_rows import Captured, Method, captured, pipeline_of
 from hydra.utils import instantiate
 from rich.console import Console
 from rich.progress import Progress
-from tabling import finite
+from tabling import finite, recordings_of
 
 from wearcap.cli.conf import compose
-from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
 from wearcap.pipelines.echo_baselines import NearestEcho, RigidWrist
@@ -95,7 +94,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 
 def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 1: ours beside what it must beat."""
-    store, names = _recordings(options, "simulated_objects")
+    store, names = recordings_of(options, "simulated_objects")
     ours = Method("ours", options.checkpoint)
     scores: Scores = {}
     data = instantiate(compose("train", ["experiment=echo", "paths.run=none", f"paths.datasets={options.datasets}"]).data, _convert_="all")  # fmt: skip
@@ -114,14 +113,14 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, tupl
 
 def _settings(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """How the conveyor runs; defaults are chosen by this table, on the validation split."""
-    store, names = _recordings(options, "simulated_objects")
+    store, names = recordings_of(options, "simulated_objects")
     methods = [Method(name, options.checkpoint, changes) for name, changes in SETTINGS.items()]
     return f"Settings: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
 
 
 def _ablation(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 4: networks that were trained alike, but for one thing."""
-    store, names = _recordings(options, "simulated_objects")
+    store, names = recordings_of(options, "simulated_objects")
     methods = []
     for name, (run, pipeline) in ABLATIONS.items():
         path = options.runs / run / "checkpoints" / "last.ckpt"
@@ -134,7 +133,7 @@ def _ablation(options: argparse.Namespace, progress: Progress) -> tuple[str, tup
 
 def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Tables 3 and S2: a share of one modality's frames is given."""
-    store, names = _recordings(options, "simulated_objects")
+    store, names = recordings_of(options, "simulated_objects")
     methods = [
         Method(f"{100 * share:g} % of {modality}", options.checkpoint, observed=(modality, share))
         for modality, shares in SHARES.items() for share in shares
@@ -145,7 +144,7 @@ def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple
 
 def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 2: people without objects."""
-    store, names = _recordings(options, "cmu")
+    store, names = recordings_of(options, "cmu")
     methods = [Method("ours", options.checkpoint)]
     path = options.runs / "bodiffusion_object" / "checkpoints" / "last.ckpt"
     short = options.runs / "echo_short" / "checkpoints" / "last.ckpt"
@@ -193,22 +192,10 @@ def _baseline(method: NearestEcho, store: RecordingStore, names: list[str], like
     return aggregate(made)
 
 
-def _recordings(options: argparse.Namespace, data: str) -> tuple[RecordingStore, list[str]]:
-    root = options.datasets / data
-    if not (root / "manifest.json").is_file():
-        raise WearcapError("no such data set", where=root, fix=PREPARE[data])
-    store = RecordingStore.open(root)
-    return store, store.names(options.split)[: 3 if options.quick else options.recordings]
-
-
 PARTS = {
     "objects": _objects,
     "ablation": _ablation,
     "settings": _settings,
     "sparse": _sparse,
     "human": _human,
-}
-PREPARE = {
-    "cmu": "Run: wearcap prepare cmu source=FOLDER",
-    "simulated_objects": "Run: wearcap prepare simulated_objects",
 }

@@ -14,15 +14,13 @@ from mocap_every_calibration import GOALS, calibration_scores
 from mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pipeline_of
 from rich.console import Console
 from rich.progress import Progress
-from tabling import finite
+from tabling import finite, recordings_of
 
 from wearcap.cli.load import load_visual_cues
-from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.optimize.latent_motion import LatentSolver
-from wearcap.recording import RecordingStore
 
 BODY = (
     "r_mpjpe_cm", "mpjpe_cm", "mpjve_cm_s", "root_cm", "jitter_ratio", "upper_pe_cm", "lower_pe_cm", "hand_pe_cm",
@@ -109,7 +107,7 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
             progress.console.print(f"left out: {name} (no {paths[0]})")
     rows = {name: methods for name, methods in trained.items() if methods}
     rows |= {method.name: [method] for method in ours}
-    store, names = _recordings(options, "cmu")
+    store, names = recordings_of(options, "cmu")
     scores = {}
     for name, methods in rows.items():
         bar = progress.add_task(name, total=len(methods) * len(names))
@@ -124,7 +122,7 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
 
 def _floor(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 3: stairs and ramps between terraces at -4 to 4 m."""
-    store, names = _recordings(options, "simulated_hillside")
+    store, names = recordings_of(options, "simulated_hillside")
     methods = [Method(f"floor {floor}", options.checkpoint, ("pipeline=mocap_every", f"pipeline.floor={floor}")) for floor in FLOORS]  # fmt: skip
     run, pipeline = TRAINED["as in the document"]
     path = options.runs / run / "checkpoints" / "last.ckpt"
@@ -155,7 +153,7 @@ def _cues(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
             ("simulated", "edited", LatentSolver()))  # fmt: skip
     scores: Scores = {}
     for data, label, solver in rows:
-        store, names = _recordings(options, data)
+        store, names = recordings_of(options, data)
         bar = progress.add_task(f"cues: {data}, {label}", total=len(names))
         pairs = []
         for name in names:
@@ -171,14 +169,6 @@ def _cues(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
     return f"Table 4: frames that show the right wrist, {options.split}", CUES, scores | document
 
 
-def _recordings(options: argparse.Namespace, data: str) -> tuple[RecordingStore, list[str]]:
-    root = options.datasets / data
-    if not (root / "manifest.json").is_file():
-        raise WearcapError("no such data set", where=root, fix=PREPARE[data])
-    store = RecordingStore.open(root)
-    return store, store.names(options.split)[: 3 if options.quick else options.recordings]
-
-
 def _calibration(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Appendix C.2: planted frames, mounts, scales and clocks."""
     sessions = 3 if options.quick else options.sessions
@@ -188,9 +178,3 @@ def _calibration(options: argparse.Namespace, progress: Progress) -> tuple[str, 
 
 
 PARTS = {"body": _body, "floor": _floor, "cues": _cues, "calibration": _calibration}
-PREPARE = {
-    "cmu": "Run: wearcap prepare cmu source=FOLDER",
-    "simulated": "Run: wearcap prepare simulated",
-    "simulated_hillside": "Run: wearcap prepare simulated world=hillside 'activities=[walk,stand]' "
-    "'recordings={val: 3, test: 8}' duration_s=90 output=datasets/simulated_hillside",
-}

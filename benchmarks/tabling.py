@@ -1,11 +1,32 @@
-"""What tables of several systems share: summaries over seeds, their cells, JSON without NaN."""
+"""What tables of several systems share: their recordings, summaries over seeds, their cells, JSON without NaN."""
 
+import argparse
 import math
 from typing import Any
 
 from rich.table import Table
 
+from wearcap.errors import WearcapError
 from wearcap.metrics.table import Summary
+from wearcap.recording import RecordingStore
+
+PREPARE = {
+    "cmu": "Run: wearcap prepare cmu source=FOLDER",
+    "simulated": "Run: wearcap prepare simulated",
+    "simulated_hillside": "Run: wearcap prepare simulated world=hillside 'activities=[walk,stand]' "
+    "'recordings={val: 3, test: 8}' duration_s=90 output=datasets/simulated_hillside",
+    "simulated_objects": "Run: wearcap prepare simulated_objects",
+}
+
+
+def recordings_of(options: argparse.Namespace, data: str) -> tuple[RecordingStore, list[str]]:
+    """A prepared data set, and names of its split as `--split`, `--recordings` and `--quick` say. Raises WearcapError
+    where it is missing."""
+    root = options.datasets / data
+    if not (root / "manifest.json").is_file():
+        raise WearcapError("no such data set", where=root, fix=PREPARE[data])
+    store = RecordingStore.open(root)
+    return store, store.names(options.split)[: 3 if options.quick else options.recordings]
 
 
 def summarize(values: list[float]) -> dict[str, float | int | None]:

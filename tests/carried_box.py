@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from boxes import box_mesh as mesh_between
 from walking_person import SEAT, walk
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.data.echo_features import CONTACTS, OBJECT_SIZE, EchoFeatures
@@ -35,9 +36,7 @@ CARRIED = (("box_1", "left", 0.4, 1.2),)
 
 def box_mesh(half=HALF, middle=MIDDLE) -> Mesh:
     """A box about a point of its own axes."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
-    return Mesh((corners * half + middle).astype(np.float32), np.array(faces, np.int32), np.ones(3, np.float32))  # fmt: skip
+    return mesh_between(np.subtract(middle, half), np.add(middle, half))
 
 
 def thing(name: str, category: str = "box", mesh: Mesh | None = None) -> SceneObject:

@@ -7,13 +7,13 @@ import pytest
 import torch
 from PIL import Image
 
+from boxes import box_mesh
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, contact_points, hand_of_points
 from wearcap.cli import render as render_verb
 from wearcap.cli.motions import read_motions
 from wearcap.cli.view import main as view
 from wearcap.errors import WearcapError
-from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.environment import write_environment
 from wearcap.io.motion_npz import write_motion
@@ -33,10 +33,7 @@ FRAMES = 30
 
 
 def crate(name: str, size: float = 0.3) -> SceneObject:
-    corners = size / 2 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-    sides = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    faces = np.array([[a, b, c] for a, b, c, _ in sides] + [[a, c, d] for a, _, c, d in sides], np.int32)
-    mesh = Mesh(corners, faces, np.array([0.7, 0.5, 0.3], np.float32))
+    mesh = box_mesh((-size / 2,) * 3, (size / 2,) * 3)
     return SceneObject(name, "box", mesh, torch.eye(3), torch.tensor([3.0, 3.0, 0.2]), Freedom("free"))
 
 
