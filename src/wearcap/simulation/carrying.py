@@ -27,20 +27,17 @@ DEEP = 0.30
 
 
 @dataclass(frozen=True)
-class Carry:
-    """How somebody will carry a box, decided but not yet on the plan."""
+class Errand:
+    """How somebody will take a thing from one place to another, decided but not yet on the plan."""
 
     thing: Thing
     start: Float[np.ndarray, "4"]
     """Where it stands: x, y (m), heading (rad), height of its underside (m)."""
     stop: Float[np.ndarray, "4"]
     places: dict[str, GripPlace]
+    """By hand: one, or both."""
     facing: float
-    """The holder's heading against the box's (rad)."""
-    away: float
-    """From the middle of the feet to the box's middle when it is lifted and put down (m)."""
-    chest: Float[np.ndarray, "2"]
-    """Its origin ahead of and below the chest while it is carried (m)."""
+    """The holder's heading against the thing's (rad)."""
 
     @property
     def stand(self) -> Float[np.ndarray, "3"]:
@@ -51,6 +48,20 @@ class Carry:
     def goal(self) -> Float[np.ndarray, "3"]:
         """Where the wearer puts it down."""
         return self._before(self.stop)
+
+    def _before(self, pose: np.ndarray) -> np.ndarray:
+        """Where one stands before a thing at a pose."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Carry(Errand):
+    """A box between both palms."""
+
+    away: float
+    """From the middle of the feet to the box's middle when it is lifted and put down (m)."""
+    chest: Float[np.ndarray, "2"]
+    """Its origin ahead of and below the chest while it is carried (m)."""
 
     def _before(self, pose: np.ndarray) -> np.ndarray:
         heading = pose[2] + self.facing

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.carrying import DEEP, arrive, bend_for, bow, early, late, spread
-from wearcap.simulation.grips import Grip, GripPlace
+from wearcap.simulation.carrying import DEEP, Errand, arrive, bend_for, bow, early, late, spread
+from wearcap.simulation.grips import Grip
 from wearcap.simulation.handling import Handling, handling_of
 from wearcap.simulation.hands import ON_THIGHS, hold
 from wearcap.simulation.outline import turn
@@ -40,29 +40,11 @@ SWING_M, SWING_RAD = 0.05, 0.10
 
 
 @dataclass(frozen=True)
-class Take:
-    """How somebody will hold a thing, decided but not yet on the plan."""
+class Take(Errand):
+    """A thing in one hand or in both."""
 
-    thing: Thing
-    start: Float[np.ndarray, "4"]
-    """Where it stands: x, y (m), heading (rad), height of its underside (m)."""
-    stop: Float[np.ndarray, "4"]
-    places: dict[str, GripPlace]
-    """By hand: one, or both."""
-    facing: float
-    """The holder's heading against the thing's (rad)."""
     local: Float[np.ndarray, "2"]
     """The thing's origin from the middle of the feet, ahead and to the left, when it is lifted and put down (m)."""
-
-    @property
-    def stand(self) -> Float[np.ndarray, "3"]:
-        """Where the wearer lifts it: x, y, heading."""
-        return self._before(self.start)
-
-    @property
-    def goal(self) -> Float[np.ndarray, "3"]:
-        """Where the wearer puts it down."""
-        return self._before(self.stop)
 
     def _before(self, pose: np.ndarray) -> np.ndarray:
         heading = pose[2] + self.facing
