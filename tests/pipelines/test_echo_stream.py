@@ -67,12 +67,12 @@ def assert_same(motion: Motion, whole: Motion, scenario) -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"frame": "window"}, {"hang": False}, {"per_frame": 2, "context": 0}]
+    "settings", [{}, {"frame": "window"}, {"hang": False}, {"per_frame": 2, "context": 0}, {"placed": True}]
 )
 def test_a_stream_says_what_a_whole_capture_says(settings):
     """Two objects, one after the other, with nothing between."""
     recording, echo = carrying(1.2, carried=TWO), drawn_echo(**settings)
-    scenario = scenario_of(recording, TWO)
+    scenario = replace(scenario_of(recording, TWO), placed=echo.placed)
     session = EchoSession(echo, wearer(recording), boxes(TWO), seed=3)
     told_acts(session, scenario)
     motion, counts = streamed(session, recording)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from carried_box import box_mesh, boxes, carrying, drawn_echo, scenario_of, thing
+from carried_box import MIDDLE, box_mesh, boxes, carrying, drawn_echo, scenario_of, thing
 from wearcap.data.echo_features import CONTACTS
 from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.pipelines.echo_told import Observed, lane_of, wrist_poses
@@ -141,6 +142,21 @@ def test_the_floor_is_the_recordings_else_the_paths():
     assert (told(scenario_of(replace(RECORDING, floor=floor))).floor_height == 0.2).all()
     without = told(scenario_of(replace(RECORDING, floor=None))).floor_height
     assert without.abs().max() < 0.2
+
+
+def test_an_object_begins_where_its_environment_has_it():
+    acts = (Act("box_1", 0.1, 0.3), Act("box_1", 0.6, 0.8))
+    item = thing("box_1")
+    turn = rotation.exp(torch.tensor([0.3, -0.2, 0.9]))
+    there = Environment((replace(item, R_world_object=turn, t_world_object=torch.tensor([1.0, 2.0, 0.5])),))
+    scenario = replace(scenario_of(RECORDING), acts=acts, environment=there, placed=True)
+    seen = told(scenario)
+    assert seen.is_known[0, :, 1].nonzero()[:, 0].tolist() == [3]
+    torch.testing.assert_close(seen.R_world_object[0, 3], turn)
+    middle = torch.tensor([1.0, 2.0, 0.5]) + turn @ torch.tensor(MIDDLE, dtype=torch.float32)
+    torch.testing.assert_close(seen.t_world_object[0, 3], middle)
+    elsewhere = replace(scenario, observed=Observed(object_motion={"box_1": BOX}))
+    torch.testing.assert_close(told(elsewhere).t_world_object[0, 3], told(replace(elsewhere, placed=False)).t_world_object[0, 3])  # fmt: skip
 
 
 def test_objects_are_read_once_however_often_they_are_active():

@@ -66,6 +66,8 @@ class Echo:
     {object, start_s, stop_s}; or a search."""
     environment: str | None = None
     """File of the objects; None: what the recording names."""
+    placed: bool = False
+    """Whether objects are known to begin where the environment has them (ours; the document knows no places)."""
     runtime: str = "eager"
     """See `models.echo_runtime`."""
     device: str = "cpu"
@@ -131,11 +133,12 @@ class Echo:
         if self.acts == "truth":
             told = bool(recording.object_motion) or recording.interactions is not None
             there = environment is not None and told
-            return Scenario(recording, environment, tuple(true_acts(recording)) if there else ())
+            acts = tuple(true_acts(recording)) if there else ()
+            return Scenario(recording, environment, acts, placed=self.placed)
         if isinstance(self.acts, ActSearch) and environment is not None:
             alone = self.capture_scenarios([Scenario(recording)], [0])[0]
-            return Scenario(recording, environment, self.acts(alone, environment))
-        return Scenario(recording, environment, self._given_acts())
+            return Scenario(recording, environment, self.acts(alone, environment), placed=self.placed)
+        return Scenario(recording, environment, self._given_acts(), placed=self.placed)
 
     @torch.no_grad()
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
@@ -214,7 +217,7 @@ class Echo:
         return {
             "pipeline": "echo", "context": str(self.context), "per_frame": str(self.per_frame), "spacing": str(self.spacing),
             "eta": str(self.eta), "step": self.step, "rewindow": str(self.rewindow), "hang": str(self.hang),
-            "rest": str(self.rests_below), "guidance": str(self.guidance), "acts": "search" if isinstance(self.acts, ActSearch) else str(self.acts),
+            "rest": str(self.rests_below), "placed": str(self.placed), "guidance": str(self.guidance), "acts": "search" if isinstance(self.acts, ActSearch) else str(self.acts),
         }  # fmt: skip
 
 

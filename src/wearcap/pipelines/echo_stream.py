@@ -111,7 +111,12 @@ class EchoSession:
         Raises WearcapError for an unknown object, and for one whose mesh or class cannot be used.
         """
         if name is not None:
+            known = name in self._shapes
             self._shape(name)
+            if self.pipeline.placed and not known and self._environment is not None:
+                # In the middle between then and one frame later: the first frame from then on is the one nearby.
+                soon = timestamp + 0.499 / self.pipeline.fps
+                self.see_object(name, soon, self._environment.by_name(name).T_world_object)
         self._acts = [act for act in self._acts if act[0] < timestamp] + [(timestamp, name)]
         self._retell()
 

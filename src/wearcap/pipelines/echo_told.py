@@ -55,6 +55,8 @@ class Scenario:
     acts: tuple[Act, ...] = ()
     """None: no object is active, and the human alone is captured."""
     observed: Observed = field(default_factory=Observed)
+    placed: bool = False
+    """Whether objects are known to begin where the environment has them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +191,13 @@ def _observed(
         T = objects[number].centred(track.T_world_body)
         R_object[at[mine]], t_object[at[mine]] = T.R[mine].float(), T.t[mine].float()
         is_known[at[mine], 1] = True
+    if scenario.placed and scenario.environment is not None:
+        for number, name in enumerate(names):
+            first = (active == number).nonzero()[:1, 0]
+            if len(first) and not is_known[first, 1]:
+                T = objects[number].centred(scenario.environment.by_name(name).T_world_object)
+                R_object[first], t_object[first] = T.R.float(), T.t.float()
+                is_known[first, 1] = True
     if seen.contact is not None and seen.contact_times is not None:
         at = _frames(seen.contact_times, path, where)
         if seen.contact.shape[1] != CONTACTS:
