@@ -29,8 +29,9 @@ from wearcap.recording import RecordingStore
 OBJECTS = MEASURES
 OBJECT_PARTS = ("v2v_cm", "center_cm", "rotation_deg", "touch_f1", "jitter_m_s3")
 HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_s3", "true_jitter_m_s3")
-ABLATIONS = {
+ABLATIONS: dict[str, tuple[str, ...]] = {
     "ours, as long as the others": ("echo_short", "pipeline=echo"),
+    "the same, objects move untouched": ("echo_short", "pipeline=echo", "pipeline.rest=null"),
     "document's frame": ("echo_window", "pipeline=echo"),
     "no canonical frame": ("echo_world", "pipeline=echo"),
     "no contacts": ("echo_without_contacts", "pipeline=echo"),
@@ -127,14 +128,22 @@ def _settings(options: argparse.Namespace, progress: Progress) -> tuple[str, tup
 def _ablation(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 4: networks that were trained alike, but for one thing."""
     store, names = recordings_of(options, "simulated_objects")
+    methods = _trained(ABLATIONS, options, progress)
+    return f"Ablation: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
+
+
+def _trained(
+    rows: dict[str, tuple[str, ...]], options: argparse.Namespace, progress: Progress
+) -> list[Method]:
+    """Those of which there is a training."""
     methods = []
-    for name, (run, pipeline) in ABLATIONS.items():
+    for name, (run, *pipeline) in rows.items():
         path = options.runs / run / "checkpoints" / "last.ckpt"
         if path.is_file():
-            methods.append(Method(name, str(path), (pipeline,)))
+            methods.append(Method(name, str(path), tuple(pipeline)))
         else:
             progress.console.print(f"left out: {name} (no {path})")
-    return f"Ablation: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
+    return methods
 
 
 def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
@@ -151,12 +160,11 @@ def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple
 def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 2: people without objects."""
     store, names = recordings_of(options, "cmu")
-    methods = [Method("ours", options.checkpoint)]
-    path = options.runs / "bodiffusion_object" / "checkpoints" / "last.ckpt"
-    short = options.runs / "echo_short" / "checkpoints" / "last.ckpt"
-    if path.is_file() and short.is_file():
-        methods.append(Method("ours, as long as the next", str(short)))
-        methods.append(Method("BoDiffusion-style + object", str(path), ("pipeline=bodiffusion_object",)))
+    names_of = ("ours, as long as the others", "no humans alone", "BoDiffusion-style + object")
+    methods = [
+        Method("ours", options.checkpoint),
+        *_trained({name: ABLATIONS[name] for name in names_of}, options, progress),
+    ]
     return f"Table 2: CMU, {options.split}", HUMAN, _scores(methods, options, progress, store, names)
 
 
