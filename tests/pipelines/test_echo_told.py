@@ -13,7 +13,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.pipelines.echo_told import Observed, lane_of, wrist_poses
+from wearcap.pipelines.echo_told import WRISTS, Observed, lane_of, wrist_poses
 from wearcap.pipelines.hmd2 import head_path
 from wearcap.recording.acts import Act
 from wearcap.scene.environment import Environment
@@ -124,6 +124,19 @@ def test_a_wrist_that_is_lost_rests_where_it_was_seen():
     found = wrist_poses(Trajectory(times, torch.eye(3).repeat(5, 1, 1), place), at).t[:, 0]
     expected = [0.0, 0.1, 0.2, 0.4, 0.6, 0.6, 0.6, 1.4, 1.45, 1.5, 1.5]
     torch.testing.assert_close(found, torch.tensor(expected), atol=1e-6, rtol=0)
+
+
+def test_arms_of_a_true_motion_may_be_crossed():
+    motion, R = RECORDING.motion, RECORDING.motion.R_parent_joint.clone()
+    across = rotation.exp(torch.tensor([1.2, 0.0, 0.0]))
+    for side, turn in (("left", across.mT), ("right", across)):
+        joint = motion.skeleton.joint_names.index(f"{side}_shoulder")
+        R[:, joint] = R[:, joint] @ turn
+    crossed = replace(RECORDING, motion=replace(motion, R_parent_joint=R))
+    assert told(scenario_of(crossed)).valid.all()
+    tracks = {joint: Trajectory(TIMES, T.R, T.t) for joint in WRISTS for T in [crossed.motion.joint(joint)]}
+    with pytest.raises(WearcapError, match="the left wrist is 56 cm to the right"):
+        told(scenario_of(replace(crossed, tracked=tracks)))
 
 
 def test_what_is_sound_passes():

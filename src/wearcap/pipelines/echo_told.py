@@ -117,7 +117,8 @@ def _tracked_points(
         raise WearcapError("poses of wrists that are NaN or infinite", where=recording.name, expected="finite poses")  # fmt: skip
     heading = rotation.about_axis("z", rotation.yaw_of(R[:, 0]))
     apart = (heading.mT @ (t[:, 1] - t[:, 2])[..., None])[:, 1, 0].median().item()
-    if apart < -SWAPPED_M:
+    # Those of a true motion are no trackers: somebody crosses the arms.
+    if found and apart < -SWAPPED_M:
         raise WearcapError(f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median", where=recording.name,
                            expected="the left wrist on the left", fix="Swap the two trackers.")  # fmt: skip
     return R, t
