@@ -1,7 +1,7 @@
 """ECHO's conveyor against windows that are denoised from scratch (h = 10): time per frame, and error of both.
 
-Both keep 10 clean frames and denoise every frame in 100 steps (`pipeline=echo`, `pipeline=echo_rewindow`), in the same lanes,
-in turn. Windows need 100 steps for 10 frames, the conveyor two for each: one fifth, and its queue besides. value: the
+Both have the context and the steps of `pipeline=echo`, in the same lanes, in turn. Windows need all steps (112) for 10
+frames, the conveyor two for each: 5.6 times as many, less its queue. value: the
 conveyor's ms per frame and lane, once its window is full; baseline: the windows'; ratio = baseline / value, to be at
 least `goal`. Where there is a checkpoint `echo` and the test split of datasets/simulated_objects, also E_v2v (cm)
 and MPJPE (mm) over the beginnings of some of its recordings: value the conveyor's, baseline the windows', ratio =

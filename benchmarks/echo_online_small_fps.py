@@ -2,7 +2,7 @@
 
 Head and wrists at 30 Hz go in one by one, poses, object and contacts come out; a box is the active object every other two
 seconds. Runtime and steps of `pipeline=echo_online` (0.6 s behind, one step per frame), and in the same runtime those of
-`pipeline=echo` (1.6 s behind, two steps per frame); the first in eager PyTorch, too. Median of several runs of a second or
+`pipeline=echo` (1.8 s behind, two steps per frame); the first in eager PyTorch, too. Median of several runs of a second or
 more, once the window is full. baseline: real time, 30; ratio = value / baseline, to be at least `goal`.
 """
 
