@@ -22,7 +22,7 @@ def inputs(net: EchoDenoiser, time: int = WINDOW):
 
 
 def said(net: EchoDenoiser, x_t, level, condition, code, has_object, valid):
-    return net(x_t, level, net.encode(condition, code, has_object, valid), valid)
+    return net(x_t, level, net.encode(condition, net.object(code), has_object, valid), valid)
 
 
 nets = pytest.mark.parametrize("net", [{}, {"streams": 3}, {"blend": 5}], indirect=True)
@@ -80,11 +80,11 @@ def test_without_an_object_its_code_means_nothing(net):
 
 
 def test_a_level_per_window_is_the_broadcast_case(net):
-    x_t, _, *told = inputs(net)
+    x_t, _, condition, code, has, valid = inputs(net)
     level = torch.full((2, 1, 3), 0.4)
     plan = net.plan(level.expand(-1, WINDOW, -1))
     one = net.plan(level[:1].expand(-1, WINDOW, -1))
-    encoded, valid = net.encode(*told), told[-1]
+    encoded = net.encode(condition, net.object(code), has, valid)
     torch.testing.assert_close(net.step(x_t, plan, encoded, valid), net.step(x_t, one, encoded, valid), atol=1e-5, rtol=0)  # fmt: skip
 
 

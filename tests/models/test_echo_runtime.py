@@ -26,7 +26,7 @@ def levels_of(lanes: int, frames: int, start: int) -> torch.Tensor:
 def told(lanes: int, frames: int) -> list[torch.Tensor]:
     """Condition, object, whether there is one, and which frames are valid."""
     features, random = small_features(), torch.Generator().manual_seed(0)
-    sizes = features.condition_size, features.object_condition_size
+    sizes = features.condition_size, len(small_net(features).no_object)
     condition, code = (torch.randn(lanes, frames, size, generator=random) for size in sizes)
     valid = torch.arange(frames).expand(lanes, -1) < frames - torch.arange(lanes)[:, None]
     return [condition, code, torch.rand(lanes, frames, generator=random) < 0.5, valid]

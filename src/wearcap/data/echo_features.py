@@ -112,10 +112,14 @@ class EchoFeatures:
         points: ThreePoints,
         floor_height: Float[Tensor, "batch time"],
         size: Float[Tensor, "batch limb"],
+        frame: Rigid | None = None,
     ) -> Float[Tensor, "batch time condition"]:
-        """[R, ω, J, v] of the three points (ECHO eq. 4): ω is the turn since the frame before, as 6D, v the velocity (m/s)."""
+        """[R, ω, J, v] of the three points (ECHO eq. 4): ω is the turn since the frame before, as 6D, v the velocity (m/s).
+
+        `frame`: what `canonical` says of the points, where it is known already.
+        """
         R, t = points
-        frame = self.canonical(points)
+        frame = self.canonical(points) if frame is None else frame
         R_canonical_world = frame.R.mT[:, :, None]
         turn = torch.cat([torch.eye(3).to(R).expand_as(R[:, :1]), R[:, :-1].mT @ R[:, 1:]], 1)
         step = t.diff(dim=1) * self.fps

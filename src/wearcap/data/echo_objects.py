@@ -1,5 +1,6 @@
 """Objects as ECHO is told them: class, extents and an encoder's feature; and as its losses see them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +32,7 @@ class ObjectShape:
     cloud: Float[Tensor, "point 3"]
     """Points of its surface about the middle (m)."""
     code: Float[Tensor, "code"]
-    """What the network is told: class, extents, feature."""
+    """What the network is told: class, extents, feature; or what it makes of them (`ObjectReader`)."""
     code_mirrored: Float[Tensor, "code"]
     """The same of the object seen in a mirror across its own y axis."""
     surface: TriangleIndex
@@ -58,9 +59,14 @@ class ObjectShape:
 class ObjectReader:
     """Makes objects into what the network is told, each mesh once."""
 
-    def __init__(self, features: EchoFeatures, encoder: PointNeXt | None):
-        """`encoder` None tells class and extents alone, where the features have no shape."""
-        self.features, self.encoder = features, encoder
+    def __init__(
+        self, features: EchoFeatures, encoder: PointNeXt | None, embed: Callable[[Tensor], Tensor] | None = None
+    ):  # fmt: skip
+        """`encoder` None tells class and extents alone, where the features have no shape. `embed`: the network's layer on
+        codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
+        self.features, self.encoder, self._embed = features, encoder, embed
+        self.nothing: Float[Tensor, "code"] = self._told(torch.zeros(1, features.object_condition_size))[0]
+        """Stands where no object is active."""
         self._known: dict[tuple[int, str], ObjectShape] = {}
 
     @torch.inference_mode()
@@ -80,10 +86,14 @@ class ObjectReader:
         parts = [one_hot.expand(2, -1), cloud_extents(both)]
         if self.encoder is not None and self.features.shape_size:
             parts.append(self.encoder(both))
-        code, code_mirrored = torch.cat(parts, -1).clone().unbind(0)
+        code, code_mirrored = self._told(torch.cat(parts, -1)).unbind(0)
         return ObjectShape(
             item.name, item.category, item.mesh, middle, both[0].clone(), code, code_mirrored, surface_index(item.mesh)
         )  # fmt: skip
+
+    @torch.no_grad()
+    def _told(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:
+        return (codes if self._embed is None else self._embed(codes)).clone()
 
 
 def object_poses(

@@ -65,7 +65,9 @@ class _DenoiserGraph(nn.Module):
         x_t: Float[Tensor, "batch time feature"],
         level: Float[Tensor, "batch time modality"],
     ) -> Float[Tensor, "batch time feature"]:
-        return self.net(x_t, level, self.net.encode(condition, object_code, has_object, valid), valid)
+        return self.net(
+            x_t, level, self.net.encode(condition, self.net.object(object_code), has_object, valid), valid
+        )
 
 
 def export_echo(pipeline: Echo, path: str | Path, format: str) -> ExportReport:
@@ -170,17 +172,18 @@ class ExportedEchoDenoiser(EchoDenoiser):
         self.sizes = tuple(about["sizes"][name] for name in MODALITIES)
         self.motion_normalizer = Normalizer(sum(self.sizes))
         self.motion_normalizer.set(torch.tensor(about["motion_mean"]), torch.tensor(about["motion_scale"]))
+        self.object = nn.Identity()
         self._told = len(about["condition_channels"]), len(about["object_channels"]), 1
 
     def encode(
         self,
         condition: Float[Tensor, "batch time condition"],
-        object_code: Float[Tensor, "batch time code"],
+        thing: Float[Tensor, "batch time embedded"],
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time width"]:
-        """What is told, side by side: the file's network encodes it itself."""
-        return torch.cat([condition, object_code, has_object[..., None].to(condition.dtype)], -1)
+        """What is told, side by side: the file's network embeds and encodes it itself."""
+        return torch.cat([condition, thing, has_object[..., None].to(condition.dtype)], -1)
 
     def plan(self, level: Float[Tensor, "batch time modality"]) -> EchoPlan:
         """The level itself."""

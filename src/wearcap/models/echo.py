@@ -78,14 +78,14 @@ class EchoDenoiser(nn.Module):
     def encode(
         self,
         condition: Float[Tensor, "batch time condition"],
-        object_code: Float[Tensor, "batch time code"],
+        thing: Float[Tensor, "batch time embedded"],
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time width"]:
-        """What a window's frames are told, the same in every step."""
+        """What a window's frames are told, the same in every step. `thing`: their objects' codes, through `object`."""
         mask = valid[..., None].to(condition.dtype)
         wide = self.widen(torch.cat([self.condition_normalizer(condition) * mask, mask], -1))
-        thing = torch.where(has_object[..., None], self.object(object_code), self.no_object)
+        thing = torch.where(has_object[..., None], thing, self.no_object)
         return self.narrow(F.gelu(wide + thing))
 
     def plan(self, level: Float[Tensor, "batch time modality"]) -> EchoPlan:

@@ -103,11 +103,11 @@ class _ToldGraph(nn.Module):
     def forward(
         self,
         condition: Float[Tensor, "batch time condition"],
-        object_code: Float[Tensor, "batch time code"],
+        thing: Float[Tensor, "batch time embedded"],
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time width"]:
-        return self.net.encode(condition, object_code, has_object, valid)
+        return self.net.encode(condition, thing, has_object, valid)
 
 
 class EchoRunner:
@@ -130,7 +130,7 @@ class EchoRunner:
     def begin(
         self,
         condition: Float[Tensor, "batch time condition"],
-        object_code: Float[Tensor, "batch time code"],
+        thing: Float[Tensor, "batch time embedded"],
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Callable[[Tensor, Tensor], Tensor]:
@@ -139,7 +139,7 @@ class EchoRunner:
         Everything goes in and comes out on the CPU.
         """
         count = valid.shape[1]
-        told = [self._whole(part) for part in (condition, object_code, has_object, valid)]
+        told = [self._whole(part) for part in (condition, thing, has_object, valid)]
         encoded, there = self._told(*told), told[-1]
 
         def denoise(x_t: Tensor, level: Tensor) -> Tensor:
@@ -176,7 +176,7 @@ def _onnx(
     there = torch.ones(frames, dtype=torch.bool)
     codes = {
         "condition": torch.zeros(*frames, len(net.condition_normalizer.mean)),
-        "object_code": torch.zeros(*frames, net.object[0].in_features), "has_object": there, "valid": there.clone(),
+        "thing": torch.zeros(*frames, len(net.no_object)), "has_object": there, "valid": there.clone(),
     }  # fmt: skip
     inputs = {
         "x_t": torch.zeros(*frames, sum(net.sizes)), "plan": torch.zeros(*frames, columns),

@@ -109,8 +109,11 @@ class Echo:
             self._runner = EchoRunner(self.net, self.runtime)
 
     def reader(self) -> ObjectReader:
-        """What turns objects into what the network is told."""
-        return ObjectReader(self.features, self.encoder)
+        """What turns objects into what the network is told, which embeds each once."""
+        self.prepare()
+        return ObjectReader(
+            self.features, self.encoder, lambda codes: self.net.object(codes.to(self.device)).cpu()
+        )
 
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
         """One motion of the human alone per (recording, seed); with objects: `capture_scenarios`."""
@@ -201,7 +204,7 @@ class Echo:
 
         What the frames are told is encoded once, what their levels do is kept for when the same ones come again.
         """
-        condition = self.features.condition(told.points, told.floor_height, queue.size)
+        condition = self.features.condition(told.points, told.floor_height, queue.size, frame)
         if self._runner is None:
             self.prepare()
         assert self._runner is not None

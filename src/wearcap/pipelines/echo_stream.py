@@ -213,8 +213,7 @@ class EchoSession:
         """Whether an object is active at a time, its code and its number."""
         name = next((name for start, name in reversed(self._acts) if start <= time + SAME_S), None)
         if name is None:
-            size = self.pipeline.features.object_condition_size
-            return torch.zeros(1, dtype=torch.bool), torch.zeros(1, size), torch.full((1,), -1.0)
+            return torch.zeros(1, dtype=torch.bool), self._reader.nothing[None], torch.full((1,), -1.0)
         number = torch.full((1,), float(list(self._shapes).index(name)))
         return torch.ones(1, dtype=torch.bool), self._shapes[name].code[None], number
 

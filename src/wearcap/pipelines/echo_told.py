@@ -80,9 +80,7 @@ def lane_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> Lane:
     names = list(dict.fromkeys(act.object for act in scenario.acts))
     objects = _objects(scenario, names, reader)
     active = active_at(scenario.acts, names, path.timestamps)
-    codes = torch.stack(
-        [*(shape.code for shape in objects), torch.zeros(reader.features.object_condition_size)]
-    )
+    codes = torch.stack([*(shape.code for shape in objects), reader.nothing])
     floor = path.floor_height
     if recording.floor is not None:
         floor = interpolate_held(recording.floor.timestamps, recording.floor.height, path.timestamps)

@@ -146,8 +146,10 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         frame = self.features.canonical(batch.points)
         x0, levels = self._truth(batch, frame), self._levels(batch)
         x_t = add_noise(x0, batch.noise, self.net.per_feature(levels), self.schedule)
-        condition = self.features.condition(batch.points, batch.floor_height, batch.size)
-        encoded = self.net.encode(condition, batch.object_code, batch.has_object, batch.valid)
+        condition = self.features.condition(batch.points, batch.floor_height, batch.size, frame)
+        encoded = self.net.encode(
+            condition, self.net.object(batch.object_code), batch.has_object, batch.valid
+        )
         x0_hat = self.net(x_t, levels, encoded, batch.valid).float()
         # Millimetres are lost in half precision.
         with torch.autocast(x0_hat.device.type, enabled=False):
