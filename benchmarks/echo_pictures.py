@@ -1,4 +1,4 @@
-"""Contact sheets of ECHO's captures, truth above and capture below: one per kind of object, of its longest act.
+"""Contact sheets of ECHO's captures, truth above and capture below: one per kind of object, of the act with the median error.
 
 python benchmarks/echo_pictures.py DATASET SPLIT CHECKPOINT OUTPUT [KIND …] [OVERRIDE …]
 """
@@ -11,11 +11,14 @@ import torch
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
+from wearcap.data.echo_objects import ObjectShape
+from wearcap.geometry.trajectory import resample
 from wearcap.pipelines.echo import Echo
 from wearcap.pipelines.echo_dataset import EchoOnDataset
-from wearcap.recording import Motion, RecordingStore
+from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.acts import Act, true_acts
 from wearcap.scene.environment import Environment
+from wearcap.scene.objects import SceneObject
 from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
 
@@ -24,26 +27,48 @@ KINDS = ("box", "table", "suitcase")
 
 
 def draw(dataset: Path, split: str, checkpoint: str, folder: Path, kinds: tuple[str, ...], overrides: list[str]) -> None:  # fmt: skip
-    """One sheet per kind, of the act with it that is longest."""
+    """One sheet per kind, of the act whose object is neither better nor worse placed than half of its kind's."""
     config = compose("evaluate", ["pipeline=echo", *overrides])
     pipeline, store = load_pipeline(checkpoint, config.pipeline, "cpu"), RecordingStore.open(dataset)
     assert isinstance(pipeline, Echo)
-    on, best = EchoOnDataset(pipeline, store.root), {}
-    for name in store.names(split):
-        recording = store.load(name)
-        environment = on.environment(recording)
-        assert environment is not None
-        for act in true_acts(recording):
-            kind = environment.by_name(act.object).category
-            if kind in kinds and act.stop_s - act.start_s > best.get(kind, (0.0,))[0]:
-                best[kind] = (act.stop_s - act.start_s, name, act)
-    for kind, (_, name, act) in best.items():
-        recording = store.load(name)
-        motion = on.capture([recording], [0])[0]
+    on, reader = EchoOnDataset(pipeline, store.root), pipeline.reader()
+    found: dict[str, list[tuple[float, int, Act]]] = {kind: [] for kind in kinds}
+    shown = [(recording, acts) for recording in map(store.load, store.names(split)) if (acts := _acts(on, recording, kinds))]  # fmt: skip
+    recordings = [recording for recording, _ in shown]
+    motions = on.capture(recordings, [0] * len(recordings))
+    for number, (recording, acts) in enumerate(shown):
+        for act, item in acts:
+            error = _apart(motions[number], recording, act, reader(item))
+            found[item.category].append((error, number, act))
+    for kind, acts in found.items():
+        if not acts:
+            print(f"{kind}: none in this split")
+            continue
+        error, number, act = sorted(acts, key=lambda one: one[0])[len(acts) // 2]
+        recording, motion = recordings[number], motions[number]
         environment = on.environment(recording)
         assert environment is not None
         save_png(folder / f"{kind}.png", sheet(with_objects(recording, environment), motion, environment, act, recording.shape))  # fmt: skip
-        print(f"{kind}: {name}, {act.object}, {act.start_s:.1f} to {act.stop_s:.1f} s")
+        print(f"{kind}: {recording.name}, {act.object}, {act.start_s:.1f} to {act.stop_s:.1f} s, {100 * error:.0f} cm off, the median of {len(acts)}")  # fmt: skip
+
+
+def _acts(on: EchoOnDataset, recording: Recording, kinds: tuple[str, ...]) -> list[tuple[Act, SceneObject]]:
+    """With objects of some kinds."""
+    environment = on.environment(recording)
+    assert environment is not None
+    acts = [(act, environment.by_name(act.object)) for act in true_acts(recording)]
+    return [(act, item) for act, item in acts if item.category in kinds]
+
+
+def _apart(motion: Motion, recording: Recording, act: Act, shape: ObjectShape) -> float:
+    """Mean distance of points of an object's surface from where they were in truth, during one act (m)."""
+    points = []
+    for tracks in (recording.object_motion, motion.object_motion):
+        track = tracks[act.object]
+        times = torch.arange(act.start_s, act.stop_s, 0.2, dtype=torch.float64)
+        T = resample(track, times.clamp(track.timestamps[0].item(), track.timestamps[-1].item())).T_world_body
+        points.append(shape.centred(T).to(torch.float32)[:, None] @ shape.cloud[::10])
+    return (points[0] - points[1]).norm(dim=-1).mean().item()
 
 
 def sheet(truth: Motion | None, motion: Motion, environment: Environment, act: Act, shape: dict[str, float]):
