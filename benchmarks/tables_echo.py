@@ -31,6 +31,7 @@ HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_
 ABLATIONS: dict[str, tuple[str, ...]] = {
     "ours, as long as the others": ("echo_short", "pipeline=echo"),
     "the same, objects move untouched": ("echo_short", "pipeline=echo", "pipeline.rest=null"),
+    "the same, guided by contacts": ("echo_short", "pipeline=echo_guided"),
     "document's frame": ("echo_window", "pipeline=echo"),
     "no canonical frame": ("echo_world", "pipeline=echo"),
     "no contacts": ("echo_without_contacts", "pipeline=echo"),
