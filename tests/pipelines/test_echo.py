@@ -226,6 +226,17 @@ def test_the_body_hangs_from_the_measured_head():
     assert not torch.allclose(standing.joint("head").t, true.t, atol=1e-2)
 
 
+def test_an_observed_body_does_not_hang():
+    recording = carrying(1.0)
+    truth, device = recording.motion, recording.head
+    seen = replace(truth, timestamps=truth.timestamps[9:10], R_parent_joint=truth.R_parent_joint[9:10], t_world_root=truth.t_world_root[9:10])  # fmt: skip
+    off = replace(recording, head=replace(device, t_world_device=device.t_world_device + 0.02))
+    motion = drawn_echo().capture_scenarios([scenario_of(off, observed=Observed(seen))], [0])[0]
+    torch.testing.assert_close(motion.T_world_joint.t[9:10], seen.T_world_joint.t, atol=1e-4, rtol=0)
+    head, true = motion.joint("head").t, recording.motion.joint("head").t
+    torch.testing.assert_close(head[10:], true[10:] + 0.02, atol=1e-4, rtol=0)
+
+
 def test_objects_rest_between_the_times_they_are_active():
     recording = carrying(1.2, carried=TWO)
     scenario = scenario_of(recording, TWO)

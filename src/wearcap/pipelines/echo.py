@@ -1,7 +1,7 @@
 """ECHO (Petrov et al.): human, object and contacts from head and wrists, by one diffusion model, endlessly."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -225,14 +225,19 @@ class Echo:
 
 
 def motion_of(lane: Lane, said: Said, hung: bool, provenance: dict[str, str]) -> Motion:
-    """What was said of a lane as a motion, hung from the measured head or not."""
+    """What was said of a lane as a motion, hung from the measured head or not; a body that is observed stays as it is."""
     path, contact = lane.path, said.contact_prob[0]
     motion = Motion(
         path.timestamps, path.skeleton, said.R_parent_joint[0], said.t_world_root[0], contact[:, BODY_POINTS:],
         body_contact_prob=contact[:, :BODY_POINTS] * lane.told.has_object[0, :, None],
         object_motion=object_tracks(lane, said) or None, provenance=provenance,
     )  # fmt: skip
-    return hang_from_head(motion, path.T_world_head) if hung else motion
+    if not hung:
+        return motion
+    hanging, seen = hang_from_head(motion, path.T_world_head), lane.told.is_known[0, :, 0]
+    R = torch.where(seen[:, None, None, None], motion.R_parent_joint, hanging.R_parent_joint)
+    t = torch.where(seen[:, None], motion.t_world_root, hanging.t_world_root)
+    return replace(motion, R_parent_joint=R, t_world_root=t)
 
 
 def guided_by(
