@@ -77,8 +77,17 @@ def test_what_is_observed_says_nothing_about_the_other_modalities_levels():
         assert other.mean() == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.parametrize("whole", [0.0, 0.4])
+def test_as_many_windows_as_asked_for_are_known_whole(whole):
+    levels, _ = drawn(independent=1.0, conveyor=0.0, observed=1.0, whole=whole)
+    known = (levels == 0).all(1).any(-1).float().mean()
+    assert known == pytest.approx(whole, abs=0.04)
+    some = (levels == 0).any(1).any(-1).float().mean()
+    assert some > whole + 0.3, "others are known in part"
+
+
 @pytest.mark.parametrize(
-    "wrong", [{"ramp": [20, 10]}, {"ramp": [0, 5]}, {"independent": 0.7, "conveyor": 0.6}]
+    "wrong", [{"whole": 1.0}, {"ramp": [20, 10]}, {"ramp": [0, 5]}, {"independent": 0.7, "conveyor": 0.6}]
 )
 def test_shares_and_ramps_that_cannot_be_are_refused(wrong):
     with pytest.raises(WearcapError, match="Expected shares that add up"):

@@ -24,6 +24,8 @@ class LevelMix:
     independent: float = 0.25
     conveyor: float = 0.6
     observed: float = 0.15
+    whole: float = 0.0
+    """Share of those windows in which all of that modality's frames are known."""
     ramp: tuple[int, int] | list[int] = (10, 60)
     """Fewest and most frames over which a conveyor's level grows from 0 to 1."""
     together: bool = False
@@ -35,9 +37,10 @@ class LevelMix:
             not 1 <= low <= high
             or min(self.independent, self.conveyor) < 0
             or self.independent + self.conveyor > 1 + 1e-9
+            or not 0 <= self.whole < 1
         ):
-            raise WearcapError(f"shares {self.independent} and {self.conveyor}, ramps of {low} to {high} frames",
-                               expected="shares that add up to no more than 1, and a rising pair of 1 or more frames")  # fmt: skip
+            raise WearcapError(f"shares {self.independent} and {self.conveyor}, {self.whole} of windows known whole, ramps of {low} to {high} frames",
+                               expected="shares that add up to no more than 1, less than 1 known whole, and a rising pair of 1 or more frames")  # fmt: skip
 
     def levels(
         self, frames: Float[Tensor, "batch time draw"], draws: Float[Tensor, "batch 9"]
@@ -60,6 +63,6 @@ class LevelMix:
             torch.where(kind < self.independent + self.conveyor, grows, single),
         )
         modality = torch.arange(count, device=frames.device) == (which * count).long()
-        # Few frames are known as often as many: the share of known frames grows with the cube.
-        seen = chance < share**3
+        # Few frames are known as often as many: the share of known frames grows with the cube, up to all of them.
+        seen = chance < (share / (1 - self.whole)) ** 3
         return torch.where((known < self.observed) & modality & seen, 0.0, levels)
