@@ -1,6 +1,7 @@
 """The object encoder end to end: it trains, is scored, resumes, and its checkpoint encodes."""
 
 import csv
+import os
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from wearcap.cli.conf import conf_dir
 from wearcap.cli.load import load_system
 from wearcap.models.point_encoder import load_object_encoder
 from wearcap.training.object_encoding import ObjectEncoding, instance_loss
+from wearcap.training.run import resume_path
 
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("object_encoder*.yaml"))
 
@@ -57,7 +59,7 @@ def test_it_learns_and_its_checkpoint_encodes(experiment, data, tmp_path):
 
 
 @pytest.mark.slow
-def test_resuming_equals_training_straight_through(data, tmp_path):
+def test_resuming_equals_training_straight_through(data, tmp_path, capsys):
     short = ("data.steps_per_epoch=3", "optimizer.scheduler.total=6", "optimizer.scheduler.warmup=2")
     straight = trained("object_encoder", data, tmp_path / "straight", "trainer.max_steps=6", *short)
     half = trained("object_encoder", data, tmp_path / "half", "trainer.max_steps=3", *short)
@@ -66,6 +68,20 @@ def test_resuming_equals_training_straight_through(data, tmp_path):
     )
     one, other = (load_object_encoder(path).state_dict() for path in (straight, resumed))
     assert all(torch.equal(one[name], other[name]) for name in one)
+    capsys.readouterr()
+    trained("object_encoder", data, tmp_path / "again", "trainer.max_steps=6", *short, f"resume={resumed}")
+    assert "no step was left to make" in capsys.readouterr().out
+
+
+def test_auto_goes_on_from_the_run_itself_before_a_newer_one(tmp_path):
+    own, newer = (tmp_path / name / "checkpoints/last.ckpt" for name in ("own", "newer"))
+    assert resume_path("auto", tmp_path / "own", tmp_path) is None
+    for path in (own, newer):
+        path.parent.mkdir(parents=True)
+        path.touch()
+    os.utime(own, (1, 1))
+    assert resume_path("auto", tmp_path / "own", tmp_path) == own
+    assert resume_path("auto", tmp_path / "fresh", tmp_path) == newer
 
 
 def test_an_object_is_found_by_its_other_view():

@@ -28,7 +28,7 @@ def train(config: DictConfig) -> float:
     warnings.filterwarnings("ignore", ".*LeafSpec")
     run = Path(config.paths.run)
     record_run(run, OmegaConf.to_yaml(config, resolve=True))
-    resume = resume_path(config.resume, Path(config.paths.outputs) / "train" / config.name)
+    resume = resume_path(config.resume, run, Path(config.paths.outputs) / "train" / config.name)
     data, system = instantiate(config.data, _convert_="all"), instantiate(config.model, _convert_="all")
     callbacks = [
         instantiate(callback, _convert_="all")
@@ -42,8 +42,13 @@ def train(config: DictConfig) -> float:
     trainer: lightning.Trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers or False)
     show(f"[bold]{config.name}[/bold] in {run}" + (f", going on from {resume}" if resume else ""))
     fit(system, data, trainer, resume)
+    last = run / "checkpoints" / "last.ckpt"
     if trainer.is_global_zero:
-        show(f"checkpoint: {run / 'checkpoints' / 'last.ckpt'}")
+        show(
+            f"checkpoint: {last}"
+            if last.is_file()
+            else f"no step was left to make: {resume} has made {trainer.global_step}"
+        )
     return float(trainer.callback_metrics.get("val/loss", float("nan")))
 
 

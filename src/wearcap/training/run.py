@@ -44,8 +44,9 @@ def keep_freed_memory() -> None:
     libc.mallopt(trim_threshold, 2**31 - 1)
 
 
-def resume_path(resume: str | None, runs: Path) -> Path | None:
-    """A checkpoint to go on from: none, a path, or with "auto" the newest `last.ckpt` below `runs`."""
+def resume_path(resume: str | None, own: Path, runs: Path) -> Path | None:
+    """A checkpoint to go on from: none, a path, or with "auto" the `last.ckpt` of the run's own folder, else the newest
+    below `runs`."""
     if resume is None:
         return None
     if resume != "auto":
@@ -53,6 +54,8 @@ def resume_path(resume: str | None, runs: Path) -> Path | None:
             raise WearcapError("no such checkpoint to resume from", where=resume,
                                expected="a run's .ckpt file, or resume=auto for the newest")  # fmt: skip
         return Path(resume)
+    if (mine := own / "checkpoints" / "last.ckpt").is_file():
+        return mine
     found = sorted(runs.glob("**/last.ckpt"), key=lambda path: path.stat().st_mtime)
     return found[-1] if found else None
 
