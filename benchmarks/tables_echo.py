@@ -145,7 +145,13 @@ def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple
         Method(f"{100 * share:g} % of {modality}", options.checkpoint, observed=(modality, share))
         for modality, shares in SHARES.items() for share in shares
     ]  # fmt: skip
-    methods = [Method("nothing", options.checkpoint), *methods]
+    guided = ("pipeline=echo_guided",)
+    methods = [
+        Method("nothing", options.checkpoint),
+        Method("nothing, guided", options.checkpoint, guided),
+        *methods,
+        Method("100 % of contact, guided", options.checkpoint, guided, ("contact", 1.0)),
+    ]
     return f"Tables 3, S2: observed, {options.split}", OBJECTS, _scores(methods, options, progress, store, names)  # fmt: skip
 
 
