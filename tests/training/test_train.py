@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -119,6 +120,25 @@ def test_killed_and_resumed_equals_straight_through(data, tmp_path):
     # The averaged weights, which validation sees, go on too.
     validated = losses(tmp_path / "straight/run", "val/loss")
     assert losses(resumed, "val/loss") == {step: loss for step, loss in validated.items() if step >= saved}
+
+
+@pytest.mark.slow
+def test_a_run_resumed_in_its_folder_goes_on_with_its_log(data, tmp_path):
+    run = tmp_path / "run"
+    more = ["data.steps_per_epoch=3", "callbacks.capture=null", "optimizer.scheduler.total=12"]
+
+    def trained(steps: int, *resume: str) -> list[tuple[int, str]]:
+        train.main(arguments(data, run, *more, f"trainer.max_steps={steps}", *resume))
+        with open(run / "metrics.csv") as file:
+            rows = [(int(row["step"]), row["train/loss"]) for row in csv.DictReader(file)]
+        return [row for row in rows if row[1]]
+
+    first = trained(3)
+    early = shutil.copy(run / "checkpoints/last.ckpt", tmp_path)
+    more_steps = trained(6, "resume=auto")
+    assert more_steps[:3] == first
+    assert trained(9, f"resume={early}")[:6] == more_steps, "no step is there twice"
+    assert trained(3) == first, "a run from scratch begins its log anew"
 
 
 @pytest.mark.slow
