@@ -28,24 +28,25 @@ from wearcap.recording import RecordingStore
 
 OBJECTS = MEASURES
 HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_s3", "true_jitter_m_s3")
+UNGUIDED = ("pipeline=echo", "pipeline.guidance=null")
 ABLATIONS: dict[str, tuple[str, ...]] = {
-    "ours, as long as the others": ("echo_short", "pipeline=echo"),
-    "the same, objects move untouched": ("echo_short", "pipeline=echo", "pipeline.rest=null"),
-    "the same, guided by contacts": ("echo_short", "pipeline=echo_guided"),
-    "document's frame": ("echo_window", "pipeline=echo"),
-    "no canonical frame": ("echo_world", "pipeline=echo"),
-    "no contacts": ("echo_without_contacts", "pipeline=echo"),
-    "no humans alone": ("echo_without_people", "pipeline=echo"),
-    "no auxiliary losses": ("echo_without_auxiliary", "pipeline=echo"),
-    "document's weights of losses": ("echo_document_losses", "pipeline=echo"),
-    "three tokens per frame": ("echo_three_streams", "pipeline=echo"),
+    "ours without guidance, as long as the others": ("echo_short", *UNGUIDED),
+    "the same, objects move untouched": ("echo_short", *UNGUIDED, "pipeline.rest=null"),
+    "the same, guided by contacts": ("echo_short", "pipeline=echo"),
+    "document's frame": ("echo_window", *UNGUIDED),
+    "no canonical frame": ("echo_world", *UNGUIDED),
+    "no contacts": ("echo_without_contacts", *UNGUIDED),
+    "no humans alone": ("echo_without_people", *UNGUIDED),
+    "no auxiliary losses": ("echo_without_auxiliary", *UNGUIDED),
+    "document's weights of losses": ("echo_document_losses", *UNGUIDED),
+    "three tokens per frame": ("echo_three_streams", *UNGUIDED),
     "BoDiffusion-style + object": ("bodiffusion_object", "pipeline=bodiffusion_object"),
 }
 SETTINGS = {
     "ours": ("pipeline=echo",),
     "objects move untouched": ("pipeline=echo", "pipeline.rest=null"),
     "told where objects stand at first": ("pipeline=echo", "pipeline.placed=true"),
-    "guided by contacts": ("pipeline=echo_guided",),
+    "not guided by contacts": UNGUIDED,
     "not hung from the head": ("pipeline=echo", "pipeline.hang=false"),
     "steps evenly spaced": ("pipeline=echo", "pipeline.spacing=1.0"),
     "the stochastic posterior": ("pipeline=echo", "pipeline.eta=1.0"),
@@ -142,23 +143,19 @@ def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple
     """Tables 3 and S2: a share of one modality's frames is given."""
     store, names = recordings_of(options, "simulated_objects")
     methods = [
-        Method(f"{100 * share:g} % of {modality}", options.checkpoint, observed=(modality, share))
-        for modality, shares in SHARES.items() for share in shares
-    ]  # fmt: skip
-    guided = ("pipeline=echo_guided",)
-    methods = [
         Method("nothing", options.checkpoint),
-        Method("nothing, guided", options.checkpoint, guided),
-        *methods,
-        Method("100 % of contact, guided", options.checkpoint, guided, ("contact", 1.0)),
-    ]
+        *(Method(f"{100 * share:g} % of {modality}", options.checkpoint, observed=(modality, share))
+          for modality, shares in SHARES.items() for share in shares),
+        Method("nothing, not guided", options.checkpoint, UNGUIDED),
+        Method("100 % of contact, not guided", options.checkpoint, UNGUIDED, ("contact", 1.0)),
+    ]  # fmt: skip
     return f"Tables 3, S2: observed, {options.split}", OBJECTS, _scores(methods, options, progress, store, names)  # fmt: skip
 
 
 def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 2: people without objects."""
     store, names = recordings_of(options, "cmu")
-    names_of = ("ours, as long as the others", "no humans alone", "BoDiffusion-style + object")
+    names_of = ("ours without guidance, as long as the others", "no humans alone", "BoDiffusion-style + object")
     methods = [
         Method("ours", options.checkpoint),
         *_trained({name: ABLATIONS[name] for name in names_of}, options, progress),

@@ -9,7 +9,7 @@ from carried_box import box_mesh, boxes, carrying, drawn_echo, scenario_of, thin
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.data.echo_features import OBJECT_SIZE, Body
 from wearcap.geometry.rigid import Rigid
-from wearcap.pipelines.echo import guided_by
+from wearcap.pipelines.echo import pulled_by
 from wearcap.pipelines.echo_guidance import Guidance, GuidedScene
 from wearcap.pipelines.echo_told import Observed, lane_of
 from wearcap.pipelines.hmd2 import head_path
@@ -32,7 +32,7 @@ def scene_of(frame: str = "own", shift=(0.0, 0.0, 0.0), lift: float = 0.0, conta
         contact = torch.full((1, FRAMES, BODY_POINTS + 4), -0.9)
         contact[..., LEFT_HAND] = contact[..., BODY_POINTS:] = 0.9
     raw = torch.cat([echo.features.encode_body(body, at), echo.features.encode_object(box, at), contact], -1)
-    scene = GuidedScene(echo.net, echo.features, told, at, *guided_by([motion.skeleton], [{}], [lane.objects]))  # fmt: skip
+    scene = GuidedScene(echo.net, echo.features, told, at, *pulled_by([motion.skeleton], [{}], [lane.objects]))  # fmt: skip
     return scene, echo.net.motion_normalizer(raw)
 
 
@@ -142,6 +142,18 @@ def test_a_guided_capture_is_another_one(settings):
     before, after = (motion.object_motion["box_1"].t_world_body for motion in (plain, guided))
     assert after.isfinite().all()
     assert not torch.allclose(before, after, atol=1e-3)
+
+
+def test_a_network_without_contacts_is_not_guided():
+    echo = drawn_echo(guidance=Guidance(threshold=0.0))
+    assert echo.guided_by is not None
+    assert "Guidance" in echo.settings()["guidance"]
+    without = replace(echo, contacts=False)
+    assert without.guided_by is None
+    assert without.settings()["guidance"] == "None"
+    recording = carrying(0.8)
+    plain, asked = (one.capture_scenarios([scenario_of(recording)], [0])[0] for one in (replace(without, guidance=None), without))  # fmt: skip
+    assert torch.equal(plain.t_world_root, asked.t_world_root)
 
 
 def test_each_lane_is_pulled_at_its_own_objects():

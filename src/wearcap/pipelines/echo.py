@@ -60,7 +60,7 @@ class Echo:
     """Objects stay where they are in frames in which nothing touches them with this probability (ours); None: they are as
     drawn (the document), and so they are where the network knows no contacts."""
     guidance: Guidance | None = None
-    """None: the prediction is left as it is."""
+    """None: the prediction is left as it is, and so it is where the network knows no contacts."""
     acts: str | Sequence[Mapping[str, Any]] | ActSearch = "truth"
     """Which object is active when: "truth", as the recording's interactions say; "none": the human alone; a list of
     {object, start_s, stop_s}; or a search."""
@@ -101,6 +101,11 @@ class Echo:
     def rests_below(self) -> float | None:
         """`rest`, where the network knows contacts."""
         return self.rest if self.contacts else None
+
+    @property
+    def guided_by(self) -> Guidance | None:
+        """`guidance`, where the network knows contacts."""
+        return self.guidance if self.contacts else None
 
     def prepare(self) -> None:
         """Bring the network to its device and into the form it runs in; what is exported or compiled is made once."""
@@ -195,8 +200,8 @@ class Echo:
         queue = EchoQueue(self, skeletons, seeds)
         if self.rewindow is not None:
             queue = Rewindow(self, skeletons, seeds, self.rewindow)
-        if self.guidance is not None:
-            queue.guided = guided_by(skeletons, shapes, objects)
+        if self.guided_by is not None:
+            queue.guided = pulled_by(skeletons, shapes, objects)
         return queue
 
     def denoiser(self, queue: EchoQueue, told: Told, frame: Rigid) -> tuple[Denoise, Amend | None]:
@@ -209,9 +214,10 @@ class Echo:
             self.prepare()
         assert self._runner is not None
         denoise = self._runner.begin(condition, told.object_code, told.has_object, told.valid)
-        if self.guidance is None or queue.guided is None:
+        guidance = self.guided_by
+        if guidance is None or queue.guided is None:
             return denoise, None
-        guidance, (surfaces, objects) = self.guidance, queue.guided
+        surfaces, objects = queue.guided
         scene = GuidedScene(self.net, self.features, told, frame, surfaces, objects)
         return denoise, lambda x0_hat: guidance.amended(x0_hat, scene)
 
@@ -220,7 +226,7 @@ class Echo:
         return {
             "pipeline": "echo", "context": str(self.context), "per_frame": str(self.per_frame), "spacing": str(self.spacing),
             "eta": str(self.eta), "step": self.step, "rewindow": str(self.rewindow), "hang": str(self.hang),
-            "rest": str(self.rests_below), "placed": str(self.placed), "guidance": str(self.guidance), "acts": "search" if isinstance(self.acts, ActSearch) else str(self.acts),
+            "rest": str(self.rests_below), "placed": str(self.placed), "guidance": str(self.guided_by), "acts": "search" if isinstance(self.acts, ActSearch) else str(self.acts),
         }  # fmt: skip
 
 
@@ -240,7 +246,7 @@ def motion_of(lane: Lane, said: Said, hung: bool, provenance: dict[str, str]) ->
     return replace(motion, R_parent_joint=R, t_world_root=t)
 
 
-def guided_by(
+def pulled_by(
     skeletons: Sequence[Skeleton],
     shapes: Sequence[dict[str, float]],
     objects: Sequence[Sequence[ObjectShape]],

@@ -23,7 +23,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.models.echo import MODALITIES
 from wearcap.models.onnx_runner import undisturbed
-from wearcap.pipelines.echo import Echo, guided_by, motion_of, stretch_seed
+from wearcap.pipelines.echo import Echo, motion_of, pulled_by, stretch_seed
 from wearcap.pipelines.echo_queue import EchoQueue, Said, Told
 from wearcap.pipelines.echo_rest import Resting
 from wearcap.pipelines.echo_told import MAX_GAP_S, Lane, wrist_poses
@@ -138,7 +138,7 @@ class EchoSession:
             check_object(item, f"object {name!r}")
             self._shapes[name] = self._reader(item)
             if self._queue is not None and self._queue.guided is not None:
-                self._queue.guided = guided_by([self.wearer.skeleton], [dict(self.wearer.shape)], [list(self._shapes.values())])  # fmt: skip
+                self._queue.guided = pulled_by([self.wearer.skeleton], [dict(self.wearer.shape)], [list(self._shapes.values())])  # fmt: skip
         return self._shapes[name]
 
     def poses(self, ended: bool = False) -> Motion | None:
