@@ -155,7 +155,11 @@ def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple
 def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 2: people without objects."""
     store, names = recordings_of(options, "cmu")
-    names_of = ("ours without guidance, as long as the others", "no humans alone", "BoDiffusion-style + object")
+    names_of = (
+        "ours without guidance, as long as the others",
+        "no humans alone",
+        "BoDiffusion-style + object",
+    )
     methods = [
         Method("ours", options.checkpoint),
         *_trained({name: ABLATIONS[name] for name in names_of}, options, progress),
