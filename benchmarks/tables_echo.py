@@ -142,14 +142,16 @@ def _trained(
 def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Tables 3 and S2: a share of one modality's frames is given."""
     store, names = recordings_of(options, "simulated_objects")
-    methods = [
-        Method("nothing", options.checkpoint),
-        *(Method(f"{100 * share:g} % of {modality}", options.checkpoint, observed=(modality, share))
-          for modality, shares in SHARES.items() for share in shares),
-        Method("nothing, not guided", options.checkpoint, UNGUIDED),
-        Method("100 % of contact, not guided", options.checkpoint, UNGUIDED, ("contact", 1.0)),
-    ]  # fmt: skip
+    rows = [None, *((modality, share) for modality, shares in SHARES.items() for share in shares)]
+    methods = [Method(_given(row), options.checkpoint, UNGUIDED, row) for row in rows]
+    methods += [
+        Method(f"{_given(row)}, guided", options.checkpoint, observed=row) for row in (None, ("contact", 1.0))
+    ]
     return f"Tables 3, S2: observed, {options.split}", OBJECTS, _scores(methods, options, progress, store, names)  # fmt: skip
+
+
+def _given(row: tuple[str, float] | None) -> str:
+    return "nothing" if row is None else f"{100 * row[1]:g} % of {row[0]}"
 
 
 def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:

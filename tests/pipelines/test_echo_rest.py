@@ -8,7 +8,7 @@ from wearcap.body.contact_points import BODY_POINTS
 from wearcap.data.echo_features import CONTACTS
 from wearcap.geometry import rotation
 from wearcap.pipelines.echo_queue import Said, Told
-from wearcap.pipelines.echo_rest import Resting, rested
+from wearcap.pipelines.echo_rest import INSIDE, Resting, inside, rested
 
 TOUCH = 0.7
 ACTS = [-1, 0, 0, 0, 0, 0, 0, 1, 1, 1, -1, 1, 1, 1, 0, 0]
@@ -53,6 +53,29 @@ def test_objects_move_while_they_are_touched_alone():
     found = rested(told, said, TOUCH)
     assert places(found) == MOVED
     assert found.contact_prob is said.contact_prob
+
+
+def test_poses_from_within_a_contact_count():
+    """The ends of one are left out, but not where it may have begun before the recording, or go on after it."""
+    long = 2 * INSIDE + 4
+    touched = torch.zeros(1, 100, dtype=torch.bool)
+    touched[0, 5 : 5 + long] = True
+    assert inside(touched)[0].nonzero()[:, 0].tolist() == [5 + INSIDE + k for k in range(4)]
+    touched[0, 40:47] = True
+    assert inside(touched)[0, 35:50].nonzero()[:, 0].tolist() == [8]
+    touched[0, 80:] = True
+    assert inside(touched)[0, 60:].nonzero()[:, 0].tolist() == list(range(20 + INSIDE, 40))
+    assert inside(touched.flip(1)).equal(inside(touched).flip(1))
+    assert inside(torch.ones(2, 7, dtype=torch.bool)).all()
+    assert not inside(torch.zeros(2, 7, dtype=torch.bool)).any()
+
+
+def test_an_object_waits_where_it_is_drawn_within_the_contact():
+    stop = 10 + 3 * INSIDE
+    told, said = frames([0] * 60, list(range(10, stop)))
+    way = rested(told, said, TOUCH).t_world_object[0, :, 0].long().tolist()
+    first, last = 10 + INSIDE, stop - 1 - INSIDE
+    assert way == [min(max(k, first), last) for k in range(60)]
 
 
 def test_an_observed_pose_is_believed_without_a_contact():
