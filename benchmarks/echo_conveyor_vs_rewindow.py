@@ -1,9 +1,8 @@
 """ECHO's conveyor against windows that are denoised from scratch (h = 10): time per frame, and error of both.
 
-Both have the context and the steps of `pipeline=echo`, in the same lanes, in turn. Windows need all steps (112) for 10
-frames, the conveyor two for each: 5.6 times as many, less its queue. value: the
-conveyor's ms per frame and lane, once its window is full; baseline: the windows'; ratio = baseline / value, to be at
-least `goal`. Where there is a checkpoint `echo` and the test split of datasets/simulated_objects, also E_v2v (cm)
+Both have the context and the steps of `pipeline=echo`, no guidance, in the same lanes, in turn. Windows need all steps
+(112) for 10 frames, the conveyor two for each: 5.6 times as many, less its queue. value: the conveyor's ms per frame
+and lane, once its window is full; baseline: the windows'; ratio = baseline / value, to be at least `goal`. Where there is a checkpoint `echo` and the test split of datasets/simulated_objects, also E_v2v (cm)
 and MPJPE (mm) over the beginnings of some of its recordings: value the conveyor's, baseline the windows', ratio =
 value / baseline, to be at most `goal`.
 """
@@ -29,7 +28,7 @@ DATASET = Path(__file__).resolve().parents[1] / "datasets" / "simulated_objects"
 
 
 def measure(lanes: int = 4, rounds: int = 6, recordings: int = 4, seconds: float = 20.0) -> list[dict]:
-    conveyor = pipeline_of("echo")
+    conveyor = pipeline_of("echo", guidance=None)
     windows = replace(conveyor, rewindow=STRIDE)
     rows = [_time(conveyor, windows, lanes, rounds)]
     if NAME in shared_checkpoints() and (DATASET / "manifest.json").is_file():

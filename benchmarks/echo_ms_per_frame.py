@@ -22,7 +22,7 @@ def measure(frames: int = 200, lanes: tuple[int, ...] = (1, 8), device: str = "c
     if device == "cuda" and without_cuda("echo_ms_per_frame"):
         return []
     runtime = "compile" if device == "cuda" else "eager"
-    pipeline = pipeline_of("echo", device, "echo_full", runtime=runtime)
+    pipeline = pipeline_of("echo", device, "echo_full", runtime=runtime, guidance=None)
     rows = []
     for count in lanes:
         value = _milliseconds(pipeline, frames, count)
