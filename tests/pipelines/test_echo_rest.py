@@ -1,5 +1,7 @@
 """Objects rest while nothing touches them: where they were touched last, and before that where they will be."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 
@@ -8,7 +10,7 @@ from wearcap.body.contact_points import BODY_POINTS
 from wearcap.data.echo_features import CONTACTS
 from wearcap.geometry import rotation
 from wearcap.pipelines.echo_queue import Said, Told
-from wearcap.pipelines.echo_rest import INSIDE, Resting, inside, rested
+from wearcap.pipelines.echo_rest import FADE, INSIDE, Resting, inside, rested
 
 TOUCH = 0.7
 ACTS = [-1, 0, 0, 0, 0, 0, 0, 1, 1, 1, -1, 1, 1, 1, 0, 0]
@@ -78,6 +80,56 @@ def test_an_object_waits_where_it_is_drawn_within_the_contact():
     assert way == [min(max(k, first), last) for k in range(60)]
 
 
+def again(observed=()) -> tuple[Told, Said, int]:
+    """Frames with two contacts and a rest between, and the first frame of the second."""
+    back = 70
+    return *frames([0] * 140, [*range(10, 50), *range(back, 140)], observed), back
+
+
+def test_an_object_that_is_touched_again_comes_from_where_it_was_left():
+    """Without a jump, though it is drawn elsewhere."""
+    told, said, back = again()
+    found = rested(told, said, TOUCH)
+    way = found.t_world_object[0, :, 0]
+    left, begin = 49 - INSIDE, back + INSIDE
+    assert way[left : begin + 1].tolist() == [left] * (begin + 1 - left)
+    assert way[begin + FADE :].tolist() == list(range(begin + FADE, 140))
+    assert (way.diff() >= 0).all()
+    assert way.diff().max() <= 1 + (begin - left) / FADE + 1e-4
+    R = found.R_world_object[0]
+    steps = rotation.log(R[1:] @ R[:-1].mT).norm(dim=-1)
+    assert steps.max() <= 0.1 + torch.pi / FADE + 1e-4, "it turns the shorter way round"
+
+
+def test_frame_by_frame_it_comes_from_there_too():
+    told, said, back = again()
+    step, way = Resting(TOUCH), []
+    for k in range(140):
+        one = slice(k, k + 1)
+        way.append(
+            step(told.frames(one), Said(*(field[:, one] for field in said))).t_world_object[0, 0, 0].item()
+        )
+    assert way[49 : back + 1] == [49.0] * (back + 1 - 49)
+    assert way[back + FADE :] == list(range(back + FADE, 140))
+    assert max(b - a for a, b in pairwise(way)) <= 1 + (back - 49) / FADE + 1e-4
+
+
+def test_from_an_observed_pose_on_nothing_fades():
+    """What is seen, and what is drawn after it, stays as it is."""
+    seen = 85
+    told, said, _ = again(observed=[seen])
+    way = rested(told, said, TOUCH).t_world_object[0, :, 0]
+    assert way[seen:].tolist() == list(range(seen, 140))
+    assert way[seen - 1] < seen - 1
+    step, streamed = Resting(TOUCH), []
+    for k in range(140):
+        one = slice(k, k + 1)
+        streamed.append(
+            step(told.frames(one), Said(*(field[:, one] for field in said))).t_world_object[0, 0, 0].item()
+        )
+    assert streamed[seen:] == list(range(seen, 140))
+
+
 def test_an_observed_pose_is_believed_without_a_contact():
     told, said = frames(observed=[6, 9])
     assert places(rested(told, said, TOUCH)) == [0, 3, 3, 3, 4, 4, 6, 9, 9, 9, 10, 11, 11, 11, 6, 15]
@@ -103,7 +155,9 @@ def test_frame_by_frame_it_is_the_same_from_the_first_contact_on():
     for k in range(len(ACTS)):
         one = slice(k, k + 1)
         way.append(step(told.frames(one), Said(*(field[:, one] for field in said))).t_world_object[0, 0, 0])
-    assert [int(x) for x in way] == [0, 1, 2, *MOVED[3:7], 7, 8, 9, *MOVED[10:]]
+    assert [int(x) for x in way] == [0, 1, 2, *MOVED[3:7], 7, 8, 9, *MOVED[10:15], 4], (
+        "the last is touched, and still left"
+    )
 
 
 @pytest.mark.parametrize("settings", [{"rest": None}, {"contacts": False}])
