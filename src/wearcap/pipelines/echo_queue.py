@@ -118,12 +118,18 @@ class EchoQueue:
 
     def run(self, whole: Told) -> Said:
         """All frames of some lanes, to the end."""
-        count, out = whole.valid.shape[1], []
-        for frame in range(count + self.belt.ramp - 1):
+        count, first = whole.valid.shape[1], self.belt.ramp - 1
+        out = None
+        for frame in range(count + first):
             said = self.push(whole.frames(slice(frame, frame + 1)) if frame < count else self.padding())
-            if said is not None:
-                out.append(said)
-        return Said(*(torch.cat(fields, 1) for fields in zip(*out)))
+            if said is None:
+                continue
+            if out is None:  # room for all: small pieces that stay scatter the memory between them
+                out = Said(*(field.new_empty(len(field), count, *field.shape[2:]) for field in said))
+            for kept, field in zip(out, said):
+                kept[:, frame - first] = field[:, 0]
+        assert out is not None
+        return out
 
     def padding(self) -> Told:
         """A frame behind the end of all lanes: the last one again, not valid."""
