@@ -2,9 +2,9 @@
 
 Both have the context and the steps of `pipeline=echo`, no guidance, in the same lanes, in turn. Windows need all steps
 (112) for 10 frames, the conveyor two for each: 5.6 times as many, less its queue. value: the conveyor's ms per frame
-and lane, once its window is full; baseline: the windows'; ratio = baseline / value, to be at least `goal`. Where there is a checkpoint `echo` and the test split of datasets/simulated_objects, also E_v2v (cm)
-and MPJPE (mm) over the beginnings of some of its recordings: value the conveyor's, baseline the windows', ratio =
-value / baseline, to be at most `goal`.
+and lane, once its window is full; baseline: the windows'; ratio = baseline / value, to be at least `goal`. Where there is
+a checkpoint `echo` and the test split of datasets/simulated_objects, also E_v2v (cm) and MPJPE (mm) over the beginnings
+of some of its recordings: value the conveyor's, baseline the windows', ratio = value / baseline, to be at most `goal`.
 """
 
 import statistics
