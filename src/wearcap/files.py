@@ -2,13 +2,18 @@
 
 import errno
 import hashlib
+import json
 import os
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from wearcap.errors import WearcapError
+
+MAX_JSON_DEPTH = 64
+"""Deepest nesting of JSON that is read; what wearcap writes stays below 16."""
 
 
 @contextmanager
@@ -43,6 +48,35 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a text file atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def parse_json(text: str | bytes, where: str | Path) -> Any:
+    """Content of JSON text that may come from a stranger.
+
+    Raises WearcapError for text that is no JSON, not UTF-8, or nested deeper than `MAX_JSON_DEPTH`.
+    """
+    try:
+        content = json.loads(text)
+    except RecursionError as error:
+        raise _too_deep(where) from error
+    except ValueError as error:  # JSONDecodeError and UnicodeDecodeError are ValueErrors
+        raise WearcapError(f"not readable JSON ({error})"[:300], where=where, expected="a whole JSON text") from error  # fmt: skip
+    level = [content]
+    for _ in range(MAX_JSON_DEPTH):
+        level = [
+            inner
+            for outer in level
+            if isinstance(outer, dict | list)
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+            if isinstance(inner, dict | list)
+        ]
+        if not level:
+            return content
+    raise _too_deep(where)
+
+
+def _too_deep(where: str | Path) -> WearcapError:
+    return WearcapError("JSON that is nested too deeply", where=where, expected=f"at most {MAX_JSON_DEPTH} levels")  # fmt: skip
 
 
 def sha256_of(path: str | Path) -> str:

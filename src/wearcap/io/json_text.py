@@ -1,20 +1,16 @@
 """JSON files that strangers wrote."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from wearcap.errors import WearcapError
+from wearcap.files import parse_json
 from wearcap.io.text import read_text
 
 
 def read_json(path: str | Path) -> Any:
-    """Content of a JSON file. Raises WearcapError when it is missing, empty, binary or no JSON."""
-    try:
-        return json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise WearcapError(f"not readable JSON ({error})"[:300], where=path, expected="a whole JSON file",
-                           fix="Fetch it again.") from error  # fmt: skip
+    """Content of a JSON file. Raises WearcapError when it is missing, empty, binary, no JSON or nested too deeply."""
+    return parse_json(read_text(path), path)
 
 
 def read_json_object(path: str | Path) -> dict[str, Any]:
