@@ -10,7 +10,8 @@ from rich.console import Console
 
 from wearcap.errors import WearcapError
 from wearcap.io.environment import read_environment
-from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
+from wearcap.models.build import build
+from wearcap.models.checkpoint import read_checkpoint
 from wearcap.optimize.latent_motion import LatentSolver, LatentWeights
 from wearcap.pipelines.contact_prediction import ContactPredictor
 from wearcap.pipelines.echo import Echo
@@ -60,9 +61,10 @@ NETWORKS: dict[str, tuple[type[System], str]] = {
 def load_system(checkpoint: str | Path) -> tuple[System, dict[str, Any]]:
     """The trained system (averaged weights, evaluation mode) and the config it was trained with."""
     config, state = read_checkpoint(checkpoint)
-    system = instantiate(config["model"], _convert_="all")
-    load_checkpoint(system, state, checkpoint)
-    return system.eval(), config
+    system = build(config["model"], state, checkpoint)
+    if not isinstance(system, System):
+        raise WearcapError(f"a checkpoint of {type(system).__name__} alone", where=checkpoint, expected="one of `wearcap train`")  # fmt: skip
+    return system, config
 
 
 def load_pipeline(

@@ -12,7 +12,7 @@ from rich import print as show
 from wearcap.cli.conf import hydra_main
 from wearcap.data.surroundings import embeddings_of
 from wearcap.recording.store import RecordingStore
-from wearcap.training.checkpoint import ConfigInCheckpoint
+from wearcap.training.checkpoint import ConfigInCheckpoint, RunCheckpointIO
 from wearcap.training.run import fit, keep_freed_memory, record_run, resume_path
 
 HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
@@ -39,7 +39,9 @@ def train(config: DictConfig) -> float:
     if config.early_stop:
         callbacks.append(EarlyStopping("val/loss", patience=config.early_stop))
     loggers = [instantiate(logger, _convert_="all") for logger in (config.logger or {}).values() if logger]
-    trainer: lightning.Trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers or False)
+    trainer: lightning.Trainer = instantiate(
+        config.trainer, callbacks=callbacks, logger=loggers or False, plugins=[RunCheckpointIO(run)]
+    )
     show(f"[bold]{config.name}[/bold] in {run}" + (f", going on from {resume}" if resume else ""))
     fit(system, data, trainer, resume)
     last = run / "checkpoints" / "last.ckpt"

@@ -11,9 +11,8 @@ from rich.progress import track
 from safetensors.torch import save_file
 from torch import Tensor
 
-from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
-from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
+from wearcap.models.checkpoint import load_network
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import HeadStream, PointCloud
 from wearcap.recording.store import Entry, RecordingStore
@@ -33,15 +32,7 @@ class PlaceCodes:
     @cached_property
     def encoder(self) -> VoxelAutoencoder:
         """The network, in evaluation mode. Raises WearcapError when the checkpoint is missing or another network's."""
-        config, state = read_checkpoint(self.checkpoint)
-        if "voxel" not in config["model"].get("_target_", ""):
-            raise WearcapError("codes of points need a voxel autoencoder", where=self.checkpoint,
-                               expected="a checkpoint of experiment=voxel_autoencoder")  # fmt: skip
-        settings = {key: value for key, value in config["model"]["net"].items() if key[0] != "_"}
-        net = VoxelAutoencoder(**settings)
-        own = {name.removeprefix("net."): value for name, value in state.items() if name.startswith("net.")}
-        load_checkpoint(net, own, self.checkpoint)
-        return net.requires_grad_(False).eval()
+        return load_network(self.checkpoint, VoxelAutoencoder, "voxel_autoencoder").requires_grad_(False)
 
     @property
     def size(self) -> int:

@@ -1,37 +1,41 @@
 """Checkpoints that carry the config they were trained with, read without executing anything from them.
 
 Two kinds of file: a run's `.ckpt`, and the `.safetensors` that is shared: averaged weights and statistics, the model's
-config as JSON in the metadata. Those of `checkpoints/` go by name.
+config as JSON in the metadata. Those of `checkpoints/` go by name. Both carry checksums that every reading verifies.
 """
 
-import ast
+import hashlib
 import json
 import pickle
 import re
-from collections.abc import Iterator
+import zipfile
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import safetensors
 import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-import wearcap
 from wearcap.errors import WearcapError, nearest
-from wearcap.files import atomic_path, resource
+from wearcap.files import atomic_path, parse_json, resource
+from wearcap.models.build import build, check_config
+
+Network = TypeVar("Network", bound=nn.Module)
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 """How weights may be stored in a shared file."""
 
-_PACKAGE = Path(wearcap.__file__).parent
+MAX_CONFIG_BYTES = 1 << 20
+"""Longest config (1 MiB of JSON) that a checkpoint may carry; a training run's has 10 kB."""
+
 _NAME = re.compile(r"[\w-]+")
 _SUFFIX = ".safetensors"
 _KEY = "wearcap_checkpoint"
-_PARTS = re.compile(r"(wearcap\.(?:body|data|diffusion|models|scene|training)(?:\.[a-z]\w*)+)\.([A-Za-z]\w*)")
-_OPTIMIZERS = re.compile(r"torch\.optim\.(lr_scheduler\.)?[A-Z][A-Za-z]+|prodigyopt\.Prodigy")
-_FUNCTIONS = ("wearcap.body.skeleton", "wearcap.body.skeletons", "wearcap.training.schedules")
-"""Modules whose functions, too, may be parts of a model; of all others, classes alone."""
+_DIGEST = "sha256"
+"""Key, beside the model's config, of the checksum of config and weights."""
 
 
 def shared_checkpoints() -> dict[str, Path]:
@@ -54,94 +58,123 @@ def checkpoint_file(path: str | Path) -> Path:
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """(config, averaged weights) of a run's `.ckpt`, of a shared `.safetensors`, or of a name in `checkpoints/`.
 
-    Weights stored in half the width come back as float32. Raises WearcapError when the file is missing, cut short or
-    foreign, or when its model is to be made of anything but wearcap's networks.
+    The config is plain data, its `model` what `wearcap.models.build` accepts. Weights stored in half the width come
+    back as float32. Raises WearcapError when the file is missing, damaged or foreign, when its checksums do not fit,
+    and when its model is to be made of anything but wearcap's networks.
     """
     path = checkpoint_file(path)
     if not path.is_file():
         raise WearcapError("no such checkpoint", where=path)
-    config, state = _read_shared(path) if path.suffix == _SUFFIX else _read_run(path)
-    for target in _targets(config.get("model")):
-        if not _is_ours(target):
-            raise WearcapError(f"the model is to be made of {target!r}, which is no part of wearcap's models", where=path,
-                               expected="networks, features and optimisers of wearcap and PyTorch alone")  # fmt: skip
-    return config, state
-
-
-def _read_run(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
-        raise WearcapError("not a readable checkpoint", where=path,
-                           expected="a complete .ckpt file of `wearcap train`, with tensors and plain values only",
-                           ) from error  # fmt: skip
-    try:
-        saved = checkpoint if isinstance(checkpoint, dict) else {}
-        return dict(json.loads(saved["wearcap"]["config"])), dict(saved["state_dict"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise WearcapError("a checkpoint, but not of wearcap", where=path,
-                           expected="a .ckpt file that `wearcap train` wrote") from error  # fmt: skip
-
-
-def _read_shared(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    try:
-        with safetensors.safe_open(str(path), framework="pt") as file:
-            metadata = file.metadata() or {}
-        state = load_file(path)
-    except (safetensors.SafetensorError, OSError, RuntimeError) as error:
+    text, state = _read_shared(path) if path.suffix == _SUFFIX else _read_run(path)
+    if len(text) > MAX_CONFIG_BYTES:
         raise WearcapError(
-            "not a readable checkpoint", where=path, expected="a complete .safetensors file"
-        ) from error
-    try:
-        config = json.loads(metadata[_KEY])
-    except KeyError as error:
-        raise WearcapError("a .safetensors file, but not a checkpoint of wearcap", where=path,
-                           expected="one that `wearcap export format=safetensors` wrote") from error  # fmt: skip
-    except json.JSONDecodeError as error:
-        raise WearcapError("the checkpoint's config cannot be read", where=path, expected="JSON in the metadata") from error  # fmt: skip
+            f"a config of {len(text)} bytes", where=path, expected=f"{MAX_CONFIG_BYTES} at most"
+        )
+    config = parse_json(text, path)
     if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
         raise WearcapError("a checkpoint without its model's config", where=path, expected="JSON with a key 'model'")  # fmt: skip
+    if (digest := config.pop(_DIGEST, None)) is not None and digest != _digest(config, state):
+        raise WearcapError("its checksum differs from its content", where=path, fix="Fetch the file again.")
+    check_config(config["model"], path)
     halves = (torch.float16, torch.bfloat16)
     return config, {name: v.float() if v.dtype in halves else v for name, v in state.items()}
 
 
-def _targets(config: Any) -> Iterator[str]:
-    """What a config asks to be called, anywhere in it."""
-    if isinstance(config, dict):
-        if "_target_" in config:
-            yield str(config["_target_"])
-        for value in config.values():
-            yield from _targets(value)
-    elif isinstance(config, list):
-        for value in config:
-            yield from _targets(value)
+def read_run_file(path: str | Path) -> dict[str, Any]:
+    """Everything that a run's `.ckpt` holds: tensors and plain values alone.
 
-
-def _is_ours(target: str) -> bool:
-    """Whether a target is a class of the model's floors (or a function of `_FUNCTIONS`), defined where it says.
-
-    Read from the source, not imported: a network is then loaded without what only its training needs.
+    Raises WearcapError for a file that is damaged (by the checksums of its parts), compressed or no checkpoint, and for
+    a pickle that asks for anything but data.
     """
-    if _OPTIMIZERS.fullmatch(target):
-        return True
-    named = _PARTS.fullmatch(target)
-    if named is None:
-        return False
-    module, name = named.groups()
-    source = _PACKAGE.joinpath(*module.split(".")[1:]).with_suffix(".py")
-    kinds = (ast.ClassDef, ast.FunctionDef) if module in _FUNCTIONS else ast.ClassDef
-    body = ast.parse(source.read_text(encoding="utf-8")).body if source.is_file() else []
-    return any(isinstance(part, kinds) and part.name == name for part in body)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+                raise ValueError("compressed parts")
+            if (damaged := archive.testzip()) is not None:
+                raise ValueError(f"{damaged} is damaged")
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(saved, dict):
+            raise ValueError("no dictionary")
+        return saved
+    except PermissionError as error:
+        raise WearcapError("no permission to read it", where=path) from error
+    except (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, NotImplementedError, RuntimeError, EOFError,
+            OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, MemoryError) as error:  # fmt: skip
+        raise WearcapError(
+            f"not a readable checkpoint ({' '.join(str(error).split())[:120] or type(error).__name__})", where=path,
+            expected="a complete .ckpt file of `wearcap train`, with tensors and plain values only",
+        ) from error  # fmt: skip
 
 
-def load_checkpoint(system: nn.Module, state: dict[str, Tensor], path: str | Path) -> None:
-    """Load a checkpoint's weights into the model its config describes. Raises WearcapError when they do not fit."""
-    own = system.state_dict()
-    wrong = sorted(set(own) ^ set(state)) or [k for k in own if own[k].shape != state[k].shape]
-    if wrong:
-        raise WearcapError(f"{len(wrong)} weights do not fit this model, such as {wrong[0]!r}", where=path,
-                           expected="a checkpoint of the same model", fix="Check which model it was trained for.")  # fmt: skip
-    system.load_state_dict(state)
+def _read_run(path: Path) -> tuple[str, dict[str, Tensor]]:
+    saved = read_run_file(path)
+    try:
+        text, state = saved["wearcap"]["config"], dict(saved["state_dict"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _foreign(path) from error
+    if not isinstance(text, str) or not all(_is_plain(name, value) for name, value in state.items()):
+        raise _foreign(path)
+    return text, state
+
+
+def _is_plain(name: Any, value: Any) -> bool:
+    """Whether a weight is a tensor whose memory is in the file: none that repeats a few numbers over any size."""
+    return (
+        isinstance(name, str) and isinstance(value, Tensor) and value.device.type == "cpu"
+        and value.layout == torch.strided and not value.is_quantized
+        and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
+    )  # fmt: skip
+
+
+def _foreign(path: Path) -> WearcapError:
+    return WearcapError("a checkpoint, but not of wearcap", where=path, expected="a .ckpt file that `wearcap train` wrote")  # fmt: skip
+
+
+def _read_shared(path: Path) -> tuple[str, dict[str, Tensor]]:
+    try:
+        with safetensors.safe_open(str(path), framework="pt") as file:
+            metadata = file.metadata() or {}
+        state = load_file(path)
+    except PermissionError as error:
+        raise WearcapError("no permission to read it", where=path) from error
+    except (safetensors.SafetensorError, OSError, RuntimeError, ValueError, KeyError) as error:
+        raise WearcapError(
+            "not a readable checkpoint", where=path, expected="a complete .safetensors file"
+        ) from error
+    if _KEY not in metadata:
+        raise WearcapError("a .safetensors file, but not a checkpoint of wearcap", where=path,
+                           expected="one that `wearcap export format=safetensors` wrote")  # fmt: skip
+    return metadata[_KEY], state
+
+
+def _digest(config: Mapping[str, Any], state: Mapping[str, Tensor]) -> str:
+    """Hex SHA-256 of a config and of named tensors, as a shared file stores them."""
+    digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
+    for name, value in sorted(state.items()):
+        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+        digest.update(value.contiguous().reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+def load_network(path: str | Path, kind: type[Network], experiment: str, *, part: str = "net") -> Network:
+    """A network of a checkpoint's model with its weights, in evaluation mode.
+
+    `part`: where it stands, in the model's config and in the names of the weights. Raises WearcapError as
+    `read_checkpoint` and `build` do, and when another network than `kind` stands there.
+    """
+    config, state = read_checkpoint(path)
+    found: Any = config["model"]
+    for key in part.split("."):
+        found = found.get(key) if isinstance(found, dict) else None
+    target = found.get("_target_") if isinstance(found, dict) else None
+    if target != f"{kind.__module__}.{kind.__qualname__}":
+        raise WearcapError(f"a checkpoint of {target or 'another model'}, not of {kind.__qualname__}", where=path,
+                           expected=f"one of `wearcap train experiment={experiment}`")  # fmt: skip
+    network = build(
+        {key: value for key, value in found.items() if key != "_partial_"}, state, path, prefix=f"{part}."
+    )
+    assert isinstance(network, kind)
+    return network
 
 
 def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float32") -> None:
@@ -168,9 +201,11 @@ def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float
         if value.is_floating_point() and not value.isfinite().all():
             raise WearcapError(f"weight {name!r} is not finite as {str(value.dtype).removeprefix('torch.')}", where=source,
                                expected="a trained model", fix="Choose dtype=float32, or another checkpoint.")  # fmt: skip
+    shared = _shareable(config)
+    about = json.dumps(shared | {_DIGEST: _digest(shared, narrow)}, sort_keys=True)
     with atomic_path(target) as temporary:
         tensors = {name: value.contiguous().clone() for name, value in narrow.items()}
-        temporary.write_bytes(save(tensors, {_KEY: json.dumps(_shareable(config), sort_keys=True)}))
+        temporary.write_bytes(save(tensors, {_KEY: about}))
 
 
 def _shareable(config: dict[str, Any]) -> dict[str, Any]:

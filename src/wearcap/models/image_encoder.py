@@ -10,8 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from wearcap.errors import WearcapError
-from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
+from wearcap.models.checkpoint import load_network
 
 
 @runtime_checkable
@@ -115,15 +114,4 @@ class EgoViewEncoder(nn.Module):
     @classmethod
     def load(cls, checkpoint: str | Path) -> "EgoViewEncoder":
         """From a checkpoint of `wearcap train experiment=egoview`. Raises WearcapError for any other file."""
-        config, state = read_checkpoint(checkpoint)
-        settings = dict(config.get("model", {}).get("net", {}))
-        kind = str(settings.pop("_target_", "")).rpartition(".")[2]
-        if kind != cls.__name__:
-            raise WearcapError(f"a checkpoint of {kind or 'another model'}", where=checkpoint,
-                               expected="one of `wearcap train experiment=egoview`")  # fmt: skip
-        encoder = cls(**settings)
-        weights = {
-            name.removeprefix("net."): value for name, value in state.items() if name.startswith("net.")
-        }
-        load_checkpoint(encoder, weights, checkpoint)
-        return encoder.eval()
+        return load_network(checkpoint, cls, "egoview")

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wearcap.errors import WearcapError
-from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
+from wearcap.models.checkpoint import load_network
 from wearcap.models.point_sampling import ball_query, rows_at, spread_first
 
 _LEAST_M = 1e-9
@@ -208,12 +208,4 @@ def load_object_encoder(path: str | Path) -> PointNeXt:
 
     Raises WearcapError when the checkpoint is missing, damaged or another network's.
     """
-    config, state = read_checkpoint(path)
-    if "object_encoding" not in config["model"].get("_target_", ""):
-        raise WearcapError("clouds of objects need an object encoder", where=path,
-                           expected="a checkpoint of experiment=object_encoder")  # fmt: skip
-    settings = {key: value for key, value in config["model"]["net"]["encoder"].items() if key[0] != "_"}
-    encoder, prefix = PointNeXt(**settings), "net.encoder."
-    own = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-    load_checkpoint(encoder, own, path)
-    return encoder.requires_grad_(False).eval()
+    return load_network(path, PointNeXt, "object_encoder", part="net.encoder").requires_grad_(False)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -11,7 +12,8 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.data.contact_features import FEATURES, PoseFeatures, in_skeleton, pose_frames, worn
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import interpolate
-from wearcap.models.checkpoint import load_checkpoint, read_checkpoint
+from wearcap.models.build import build
+from wearcap.models.checkpoint import read_checkpoint
 from wearcap.models.contact import FRAMES, REACH, ContactNetwork
 from wearcap.models.contact_sequence import ContactSequence
 from wearcap.models.contact_transformer import ContactTransformer
@@ -134,14 +136,21 @@ def load_detector(path: str | Path) -> ContactDetector:
     """The detector of a checkpoint of `wearcap train`. Raises WearcapError when it holds another model."""
     config, state = read_checkpoint(path)
     model = config["model"]
-    net, features = dict(model.get("net", {})), dict(model.get("features", {}))
-    kinds = [str(part.pop("_target_", "")).rpartition(".")[2] for part in (net, features)]
-    if kinds[0] not in NETWORKS or kinds[1] not in FEATURES:
+    net, features, classes, fps = (model.get(key) for key in ("net", "features", "classes", "fps"))
+    kinds = [_class_name(part) for part in (net, features)]
+    if (
+        kinds[0] not in NETWORKS
+        or kinds[1] not in FEATURES
+        or not (isinstance(classes, list) and isinstance(fps, int | float))
+    ):
         raise WearcapError(f"a checkpoint of {kinds[0] or 'another model'}", where=path,
                            expected=f"a contact network: {' or '.join(NETWORKS)}")  # fmt: skip
-    net.pop("_partial_", None)
-    encoder, classes = FEATURES[kinds[1]](**features), tuple(model["classes"])
-    network = NETWORKS[kinds[0]](inputs=encoder.size, classes=len(classes), **net)
-    weights = {name.removeprefix("net."): value for name, value in state.items() if name.startswith("net.")}
-    load_checkpoint(network, weights, path)
-    return ContactDetector(network.eval(), encoder, classes, model["fps"])
+    encoder = FEATURES[kinds[1]](**{key: value for key, value in features.items() if key != "_target_"})
+    net = {key: value for key, value in net.items() if key != "_partial_"}
+    network = build(net | {"inputs": encoder.size, "classes": len(classes)}, state, path, prefix="net.")
+    return ContactDetector(network, encoder, tuple(classes), fps)
+
+
+def _class_name(part: Any) -> str:
+    """Name of the class that a part of a config is made of, "" where it is no part."""
+    return str(part.get("_target_", "")).rpartition(".")[2] if isinstance(part, dict) else ""

@@ -14,6 +14,7 @@ import torch
 from wearcap.data.datamodule import SeededWindows
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
+from wearcap.training.checkpoint import require_resumable
 
 
 @runtime_checkable
@@ -22,11 +23,15 @@ class System(Protocol):
 
     def set_statistics(self, dataset: Any) -> None: ...
 
+    def state_dict(self) -> dict[str, Any]: ...
+
 
 def fit(system: System, data: SeededWindows, trainer: lightning.Trainer, resume: Path | None = None) -> None:
     """Train from scratch or go on from a checkpoint; a run that was killed repeats nothing and misses nothing."""
     if resume is None:
         system.set_statistics(data.dataset("train"))
+    else:
+        require_resumable(resume, system.state_dict())
     trainer.fit(system, datamodule=data, ckpt_path=resume, weights_only=True)
 
 

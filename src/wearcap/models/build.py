@@ -1,0 +1,195 @@
+"""Networks from a checkpoint's config, which is plain data that a stranger may have written.
+
+Nothing in the config is resolved or imported: `_target_` is a key of a closed table of classes, `${` is refused, and the
+model is first rehearsed on PyTorch's meta device, where tensors have shapes and no memory. Only a model whose weights
+have the names and shapes of the file's tensors is then built.
+"""
+
+import importlib
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from wearcap.errors import WearcapError
+
+TARGETS: dict[str, tuple[str, ...]] = {
+    "wearcap.body.skeleton": ("xsens23",),
+    "wearcap.data.contact_features": ("HandViews", "SmplAngles"),
+    "wearcap.data.echo_features": ("EchoFeatures",),
+    "wearcap.data.features": ("HeadFeatures",),
+    "wearcap.data.motion_features": ("MotionFeatures",),
+    "wearcap.data.tracked_points": ("TrackedPoints",),
+    "wearcap.data.watch_features": ("WatchFeatures",),
+    "wearcap.diffusion.levels": ("LevelMix",),
+    "wearcap.diffusion.schedule": ("CosineSchedule", "LinearSchedule"),
+    "wearcap.models.contact_sequence": ("ContactSequence",),
+    "wearcap.models.contact_transformer": ("ContactTransformer",),
+    "wearcap.models.denoiser": ("MotionDenoiser",),
+    "wearcap.models.echo": ("EchoDenoiser",),
+    "wearcap.models.image_encoder": ("EgoViewEncoder",),
+    "wearcap.models.motion_autoencoder": ("MotionAutoencoder",),
+    "wearcap.models.motion_manifold": ("MotionManifold",),
+    "wearcap.models.point_encoder": ("ObjectNetwork", "PointNeXt"),
+    "wearcap.models.pose_regressor": ("PoseRegressor",),
+    "wearcap.models.voxel_autoencoder": ("VoxelAutoencoder",),
+    "wearcap.models.watch_estimator": ("LastPoseEstimator", "TwoStageEstimator"),
+    "wearcap.training.contact_detection": ("ContactDetection",),
+    "wearcap.training.echo_diffusion": ("EchoDiffusion",),
+    "wearcap.training.egoview": ("EgoView",),
+    "wearcap.training.motion_autoencoder": ("MotionEncoding",),
+    "wearcap.training.motion_diffusion": ("MotionDiffusion",),
+    "wearcap.training.motion_manifold": ("ManifoldTraining",),
+    "wearcap.training.object_encoding": ("ObjectEncoding",),
+    "wearcap.training.pose_regression": ("PoseRegression",),
+    "wearcap.training.schedules": ("warmup_cosine",),
+    "wearcap.training.voxel_reconstruction": ("VoxelReconstruction",),
+    "wearcap.training.watch_regression": ("WatchRegression",),
+    "prodigyopt": ("Prodigy",),
+    "torch.optim": ("ASGD", "Adadelta", "Adagrad", "Adam", "AdamW", "Adamax", "LBFGS", "NAdam", "RAdam", "RMSprop", "SGD"),
+    "torch.optim.lr_scheduler": (
+        "ConstantLR", "CosineAnnealingLR", "CosineAnnealingWarmRestarts", "CyclicLR", "ExponentialLR", "LinearLR",
+        "MultiStepLR", "OneCycleLR", "PolynomialLR", "StepLR",
+    ),
+}  # fmt: skip
+"""What a model may be made of: classes (and two functions that return plain objects) by the module that defines them."""
+
+_BY_NAME = {f"{module}.{name}": (module, name) for module, names in TARGETS.items() for name in names}
+_TARGET, _PARTIAL = "_target_", "_partial_"
+MAX_VALUES, MAX_TEXT = 10_000, 1000
+"""Most values of a model's config, and longest text (characters) in it; those we share have 150 values at most."""
+MAX_SIZE = 1 << 20
+"""Largest whole number of a config but seeds: widths, windows, counts of layers."""
+MAX_CALLS = 20_000
+"""Most tensor operations that building a model takes; the largest of ours takes 400."""
+ALLOWANCE = 1 << 26
+"""Bytes (64 MiB) that building may take beyond what follows from the size of the file's weights."""
+TIMES_WEIGHTS = 8
+"""What building writes altogether, as a multiple of the weights: 2.5 for ours: each is made, then filled."""
+
+
+def check_config(config: Any, where: str | Path) -> None:
+    """Raise WearcapError unless a model's config is plain data: no interpolation, known targets, sizes within limits."""
+    count, rest = 0, [("model", config)]
+    while rest:
+        key, value = rest.pop()
+        count += 1
+        if count > MAX_VALUES:
+            raise _refused(f"more than {MAX_VALUES} values", where)
+        if isinstance(value, dict):
+            _check_keys(value, where)
+            rest += value.items()
+        elif isinstance(value, list):
+            rest += [(key, item) for item in value]
+        else:
+            _check_value(key, value, where)
+
+
+def _check_keys(part: dict[str, Any], where: str | Path) -> None:
+    for key in part:
+        if "${" in key or (key.startswith("_") and key not in (_TARGET, _PARTIAL)):
+            raise _refused(f"the key {key[:80]!r}", where)
+    if _PARTIAL in part and not (isinstance(part[_PARTIAL], bool) and _TARGET in part):
+        raise _refused(f"{_PARTIAL}: {str(part[_PARTIAL])[:80]!r}", where)
+    if _TARGET in part and part[_TARGET] not in (_BY_NAME if isinstance(part[_TARGET], str) else ()):
+        raise WearcapError(
+            f"the model is to be made of {str(part[_TARGET])[:80]!r}, which is no part of wearcap's models",
+            where=where, expected="networks, features and optimisers of wearcap and PyTorch alone",
+        )  # fmt: skip
+
+
+def _check_value(key: str, value: Any, where: str | Path) -> None:
+    if isinstance(value, str) and ("${" in value or len(value) > MAX_TEXT):
+        raise _refused(f"{key}: {value[:80]!r}", where)
+    if isinstance(value, int) and abs(value) > (1 << 63 if key == "seed" else MAX_SIZE):
+        raise _refused(f"{key}: {str(value)[:80]}", where)
+    if isinstance(value, float) and not math.isfinite(value):
+        raise _refused(f"{key}: {value}", where)
+
+
+def _refused(what: str, where: str | Path) -> WearcapError:
+    return WearcapError(
+        f"the model's config has {what}", where=where,
+        expected="plain values: numbers, text without ${…}, lists, and parts of wearcap's models",
+    )  # fmt: skip
+
+
+def build(
+    config: dict[str, Any], state: Mapping[str, Tensor], where: str | Path, *, prefix: str = ""
+) -> nn.Module:
+    """The module that a config describes, filled with the weights of a file, in evaluation mode.
+
+    `prefix`: only weights whose names begin so are the module's ("net."). Raises WearcapError for a config that
+    `check_config` refuses, that cannot be built or takes more memory than the file's weights explain, and for weights
+    of other names or shapes.
+    """
+    check_config(config, where)
+    own = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+    needed = sum(value.numel() * value.element_size() for value in own.values())
+    try:
+        with torch.device("meta"), _Rehearsal(ALLOWANCE + TIMES_WEIGHTS * needed):
+            rehearsed = _made(config)
+        if not isinstance(rehearsed, nn.Module):
+            raise TypeError(f"a {type(rehearsed).__name__}, no network")
+        check_weights(rehearsed.state_dict(), own, where)
+        module: nn.Module = _made(config)
+    except WearcapError as error:
+        raise error if error.where else _unbuildable(error, where) from error
+    except Exception as error:  # what constructors say of arguments that no release of ours wrote is anything
+        raise _unbuildable(error, where) from error
+    module.load_state_dict(own)
+    return module.eval()
+
+
+def _unbuildable(error: Exception, where: str | Path) -> WearcapError:
+    return WearcapError(
+        f"its model cannot be built ({' '.join(str(error).split())[:200] or type(error).__name__})", where=where,
+        expected="a checkpoint of this version of wearcap",
+    )  # fmt: skip
+
+
+def check_weights(own: Mapping[str, Tensor], state: Mapping[str, Tensor], where: str | Path) -> None:
+    """Raise WearcapError unless the weights of a file have the names and shapes of a model's own."""
+    wrong = sorted(set(own) ^ set(state)) or [name for name in own if own[name].shape != state[name].shape]
+    if wrong:
+        raise WearcapError(
+            f"{len(wrong)} weights do not fit this model, such as {wrong[0][:80]!r}", where=where,
+            expected="a checkpoint of the same model", fix="Check which model it was trained for.",
+        )  # fmt: skip
+
+
+def _made(value: Any) -> Any:
+    """A config with every part that has a target called, inner parts first."""
+    if isinstance(value, list):
+        return [_made(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    arguments = {key: _made(item) for key, item in value.items() if key not in (_TARGET, _PARTIAL)}
+    if _TARGET not in value:
+        return arguments
+    module, name = _BY_NAME[value[_TARGET]]
+    target: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return partial(target, **arguments) if value.get(_PARTIAL, False) else target(**arguments)
+
+
+class _Rehearsal(TorchDispatchMode):
+    """Counts what tensor operations would write, and ends those that go beyond a number of bytes or of calls."""
+
+    def __init__(self, max_bytes: int):
+        super().__init__()
+        self.bytes_left, self.calls_left = max_bytes, MAX_CALLS
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        self.calls_left -= 1
+        for tensor in made if isinstance(made, tuple | list) else (made,):
+            if isinstance(tensor, Tensor):
+                self.bytes_left -= tensor.numel() * tensor.element_size()
+        if self.bytes_left < 0 or self.calls_left < 0:
+            raise WearcapError("a model that is much larger than its weights")
+        return made
