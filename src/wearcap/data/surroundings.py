@@ -1,5 +1,6 @@
 """What the windows of a recording tell beside the head's path: the points around the body, the head camera's pictures."""
 
+import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -70,6 +71,9 @@ class Surroundings:
 
 NOTHING = Surroundings()
 
+_ENCODER_NAME = re.compile(r"[\w.-]+")
+"""A name becomes a value of the training's config, where `${…}` would be resolved."""
+
 
 def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]:
     """Full name (`NAME-FINGERPRINT` of its weights) and dimension of the embeddings that data sets have of an encoder,
@@ -80,6 +84,10 @@ def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]
     kinds: set[tuple[str, int]] = set()
     for file in (_open(store.path_of(name)) for store in stores for name in store.names()):
         full = _pictured(file.path)
+        if full is not None and not _ENCODER_NAME.fullmatch(full):
+            raise WearcapError(
+                f"embeddings of {full[:80]!r}", where=file.path, expected="the plain name of an encoder"
+            )
         if full is not None and (full == encoder or full.startswith(f"{encoder}-")):
             kinds.add((full, file.tensor("camera.embedding").shape[1]))
     if len(kinds) != 1:

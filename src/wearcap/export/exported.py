@@ -1,7 +1,5 @@
 """Opening exported networks: each becomes a function from named tensors to a tensor."""
 
-import json
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +7,7 @@ import torch
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.export.archive import check_archive
 
 Run = Callable[..., Tensor]
 """Called with the network's arguments by name."""
@@ -40,32 +39,20 @@ def open_onnx(path: str | Path) -> Run:
 
 
 def open_pt2(path: str | Path) -> Run:
-    """A torch.export archive on the CPU. Raises WearcapError when it is missing, not readable or holds pickles.
-
-    PyTorch parses the archive's symbolic sizes with SymPy, so open only archives from people you trust.
+    """A torch.export archive on the CPU. Raises WearcapError when it is missing, not readable, or holds anything
+    that `check_archive` refuses: PyTorch alone would run code of it.
     """
     _require_file(path)
     try:
-        _refuse_pickles(path)
+        check_archive(path)
         module = torch.export.load(str(path)).module()
-    except (RuntimeError, ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
+    except WearcapError:
+        raise
+    except Exception as error:  # what PyTorch raises on a graph that it did not write is anything
         raise WearcapError(
             f"not a readable .pt2 archive ({_first_line(error)})", where=path, fix=_AGAIN
         ) from error
     return lambda **inputs: module(**inputs)
-
-
-def _refuse_pickles(path: str | Path) -> None:
-    """torch.export.load would unpickle example inputs, tensor subclasses and script objects; ours has none."""
-    with zipfile.ZipFile(path) as archive:
-        for entry in archive.infolist():
-            pickled = "/sample_inputs/" in entry.filename and entry.file_size > 0
-            if entry.filename.endswith("_config.json"):
-                config = json.loads(archive.read(entry))["config"]
-                pickled = any(payload.get("use_pickle") for payload in config.values())
-            if pickled:
-                raise WearcapError("the archive holds pickled objects", where=path,
-                                   expected="one that `wearcap export` wrote")  # fmt: skip
 
 
 def _require_file(path: str | Path) -> None:
