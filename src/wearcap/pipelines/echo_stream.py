@@ -126,7 +126,6 @@ class EchoSession:
 
     def _take(self, admitted: Admitted) -> None:
         if admitted.begins:
-            first = admitted.packets[0][0]
             if admitted.again:
                 if (motion := self._final(ended=True)) is not None:
                     self._finished.append(motion)
@@ -137,16 +136,16 @@ class EchoSession:
                 self._seen = []
             self._begin()
             for joint in self._wrists:
-                self._rejoin(joint, first)
+                self._rejoin(joint, None if admitted.again else admitted.packets[0][0])
         for time, pose in admitted.packets:
             self._track.take(time, pose)
 
-    def _rejoin(self, joint: str, time: float) -> None:
-        """Keep of a wrist what belongs to the clock that begins at a time."""
+    def _rejoin(self, joint: str, time: float | None) -> None:
+        """Keep of a wrist what belongs to the clock that begins at a time; None: nothing does."""
         known = self._wrists[joint]
-        kept = known[connected([pose[0] for pose in known], time)]
+        kept = [] if time is None else known[connected([pose[0] for pose in known], time)]
         refused = self._clocks[joint].set(kept[-1][0] if kept else None)
-        self._refuse(joint, refused + len(known) - len(kept))
+        self._refuse(joint, refused if time is None else refused + len(known) - len(kept))
         self._wrists[joint] = kept
 
     def _refuse(self, stream: str, count: int) -> None:

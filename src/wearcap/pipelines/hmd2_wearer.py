@@ -2,7 +2,7 @@
 
 from bisect import insort
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, SupportsFloat
 
 import torch
 from jaxtyping import Float, Float64
@@ -117,12 +117,13 @@ class WearerState:
         self.door.refuse("embedding", fault)
         return torch.full((size,), torch.nan)
 
-    def _floor_height(self, height: float | None) -> float | None:
+    def _floor_height(self, height: object) -> float | None:
         if height is None:
             return None
         if fault := number_fault(height, MAX_POSITION_M):
             self.door.refuse("floor height", fault)
             return None
+        assert isinstance(height, SupportsFloat)
         return float(height)
 
     def take(self, sensed: Sensed) -> None:

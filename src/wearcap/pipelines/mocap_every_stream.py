@@ -129,7 +129,7 @@ class MocapEverySession:
                 self._finished.append(motion)
             self._begin()
             for joint in self._samples:
-                self._rejoin(joint, admitted.packets[0][0])
+                self._rejoin(joint, None if admitted.again else admitted.packets[0][0])
         for time, (pose, points) in admitted.packets:
             self._track.take(time, pose)
             if points is not None and len(points):
@@ -137,12 +137,12 @@ class MocapEverySession:
         if len(self._points) > 1000:
             self._points = [torch.cat(self._points)[-MAX_POINTS:]]
 
-    def _rejoin(self, joint: str, time: float) -> None:
-        """Keep of a watch what belongs to the clock that begins at a time."""
+    def _rejoin(self, joint: str, time: float | None) -> None:
+        """Keep of a watch what belongs to the clock that begins at a time; None: nothing does."""
         samples = self._samples[joint]
-        kept = samples[connected([sample.timestamp for sample in samples], time)]
+        kept = [] if time is None else samples[connected([sample.timestamp for sample in samples], time)]
         refused = self._clocks[joint].set(kept[-1].timestamp if kept else None)
-        self._refuse(joint, refused + len(samples) - len(kept))
+        self._refuse(joint, refused if time is None else refused + len(samples) - len(kept))
         self._samples[joint] = kept
 
     def _refuse(self, joint: str, count: int) -> None:
