@@ -126,15 +126,6 @@ def test_what_cannot_be_followed_says_why():
         WearcapError, match="no scan of the scene, which the energy's term contact_plane needs"
     ):
         list(follow(hps(), parts, None))
-    with pytest.raises(WearcapError, match="pieces in order"):
-        list(
-            follow(
-                hps("problem@pipeline.energy=hps"),
-                [parts[1], parts[0]],
-                Scan(floor_points()),
-                settings=SETTINGS,
-            )
-        )
     never = pieces(hps_recording(seconds=3.0), lost=(0.0, 9.0))
     with pytest.raises(WearcapError, match="never localised"):
         list(follow(hps(), never, Scan(floor_points()), settings=SETTINGS))

@@ -1,6 +1,7 @@
 """`wearcap capture`: a recording goes in; motion files and a video come out."""
 
 import json
+from collections import Counter
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -126,9 +127,13 @@ def _live(pipeline: object, config: DictConfig, folder: Path) -> None:
     scan = None
     if config.scene is not None:
         scan = read_scan(cloud_file(config.scene), metres_per_unit=config.metres_per_unit)
-    for number, motion in enumerate(follow(pipeline, follow_pieces(source), scan, source)):
+    refused: Counter[str] = Counter()
+    pieces = follow_pieces(source, refused=refused)
+    for number, motion in enumerate(follow(pipeline, pieces, scan, source, refused=refused)):
         write_motion(motion, folder / f"motion-{number:06d}.npz")
         show(f"{motion.timestamps[-1].item():9.2f} s", flush=True)
+    for reason, count in refused.items():
+        show(f"refused {count} × {reason}")
     show(f"motion: {folder}")
 
 

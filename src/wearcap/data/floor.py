@@ -23,6 +23,8 @@ LOOK_FRAMES = 10
 """A tracked floor is looked at once in so many frames."""
 RECENT_S = 6.0
 """Stretch of the path that a tracked floor is found for."""
+_STOREYS_M = 30.0
+"""A path does not rise by so much in `RECENT_S`: what is further above or below was a mistake of the tracking."""
 _TILE_M = 2.5
 
 
@@ -111,7 +113,9 @@ class FloorTracker:
         self._path.append(head)
         points = self._around()
         if len(points) >= MIN_POINTS:
-            path, cloud = torch.from_numpy(np.array(self._path)), torch.from_numpy(points)
+            path = np.array(self._path)
+            path = torch.from_numpy(path[np.abs(path[:, 2] - head[2]) <= _STOREYS_M])
+            cloud = torch.from_numpy(points)
             with suppress(WearcapError):  # none of them lies beneath the path: the last answer stands
                 self._height = float(estimate_floor(cloud, path, self.stature).height[-1])
         else:

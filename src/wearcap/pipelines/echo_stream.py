@@ -34,8 +34,22 @@ from wearcap.recording import Motion
 from wearcap.recording.acts import SAME_S
 from wearcap.scene.environment import Environment
 from wearcap.scene.object_mesh import check_object
+from wearcap.sensors.packets import (
+    CONNECTED_S,
+    MAX_WAITING,
+    OFF_THE_CLOCK,
+    Admitted,
+    Clock,
+    HeadDoor,
+    connected,
+    owned_pose,
+    pose_fault,
+    time_fault,
+)
 
 WRISTS = POINTS[1:]
+MAX_SEEN = 1000
+"""Sights of objects that wait for their frames; the oldest make room."""
 ASIDE_M, BELOW = 0.25, 0.47
 """Where a wrist hangs: beside the head (m), and below it as a share of the head's height."""
 
@@ -54,7 +68,11 @@ class EchoWearer:
 
 
 class EchoSession:
-    """A streaming capture of one wearer among some objects."""
+    """A streaming capture of one wearer among some objects.
+
+    What cannot be true (`sensors.packets`) is `refused`. Where the head device's clock goes back for good, the capture
+    begins anew as a new session would, with the object that was active; everything else is on that clock.
+    """
 
     def __init__(
         self, pipeline: Echo, wearer: EchoWearer, environment: Environment | None = None, seed: int = 0
@@ -69,66 +87,131 @@ class EchoSession:
         self._environment, self._reader = environment, pipeline.reader()
         self._shapes: dict[str, ObjectShape] = {}
         """Objects that have been named so far, in that order."""
-        self._track = HeadTrack(pipeline.fps, 1)
+        self._door, self._track = HeadDoor(), HeadTrack(pipeline.fps, 1)
         self._wrists: dict[str, list[tuple[float, Tensor, Tensor]]] = {joint: [] for joint in WRISTS}
+        self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
         self._acts: list[tuple[float, str | None]] = []
         self._seen: list[tuple[float, str, Rigid]] = []
+        self._finished: list[Motion] = []
+        """Of before the clock went back, not given yet."""
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin anew: what was said of wrists and objects stays, and the counts."""
+        dropped, pipeline = self._track.dropped, self.pipeline
+        self._track = HeadTrack(pipeline.fps, 1)
+        self._track.dropped = dropped
         self._chunks: list[Chunk] = []
         self._queue: EchoQueue | None = None
         self._waiting: list[tuple[float, Told, Rigid]] = []
         """Times, what was told, and the head, of frames that are taken and not given yet."""
-        self._floor = FloorTracker(wearer.skeleton.height_of("head"), pipeline.fps)
+        self._floor = FloorTracker(self.wearer.skeleton.height_of("head"), pipeline.fps)
         threshold = pipeline.rests_below
         self._resting = None if threshold is None else Resting(threshold)
 
     @property
     def dropped(self) -> int:
-        """Head poses that came too late, twice, or were not finite."""
-        return self._track.dropped
+        """Head poses that came too late, twice, or were refused."""
+        return self._track.dropped + self._door.dropped
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """How many packets were refused, by reason: "left_wrist: not a rotation"."""
+        return dict(self._door.refused)
 
     def head(self, timestamp: float, T_world_device: Rigid | None) -> None:
         """Take in a moment of the head device: its pose, if tracking has one."""
-        self._track.take(timestamp, T_world_device)
+        if self._door.timely(timestamp):
+            self._take(self._door.admit(float(timestamp), self._door.pose(T_world_device)))
+
+    def _take(self, admitted: Admitted) -> None:
+        if admitted.begins:
+            if admitted.again:
+                if (motion := self._final(ended=True)) is not None:
+                    self._finished.append(motion)
+                active = next(
+                    (name for start, name in reversed(self._acts) if start <= self._track.newest), None
+                )
+                self._acts = [] if active is None else [(-math.inf, active)]
+                self._seen = []
+            self._begin()
+            for joint in self._wrists:
+                self._rejoin(joint, None if admitted.again else admitted.packets[0][0])
+        for time, pose in admitted.packets:
+            self._track.take(time, pose)
+
+    def _rejoin(self, joint: str, time: float | None) -> None:
+        """Keep of a wrist what belongs to the clock that begins at a time; None: nothing does."""
+        known = self._wrists[joint]
+        kept = [] if time is None else known[connected([pose[0] for pose in known], time)]
+        refused = self._clocks[joint].set(kept[-1][0] if kept else None)
+        self._refuse(joint, refused if time is None else refused + len(known) - len(kept))
+        self._wrists[joint] = kept
+
+    def _refuse(self, stream: str, count: int) -> None:
+        if count:
+            self._door.refuse(stream, OFF_THE_CLOCK, count)
 
     def wrist(self, joint: str, timestamp: float, T_world_joint: Rigid) -> None:
-        """Take in the pose of a wrist joint; what is not finite or comes twice is left out.
+        """Take in the pose of a wrist joint; what comes twice is left out.
 
         Raises WearcapError for another joint than the wrists.
         """
         if joint not in self._wrists:
             raise WearcapError(f"no tracked joint {joint!r}", expected=" or ".join(WRISTS))
-        known = self._wrists[joint]
-        R, t = T_world_joint.R.float().cpu(), T_world_joint.t.float().cpu()
-        if not (math.isfinite(timestamp) and R.isfinite().all() and t.isfinite().all()):
+        if fault := time_fault(timestamp) or pose_fault(T_world_joint):
+            self._door.refuse(joint, fault)
             return
-        place = bisect_left(known, timestamp, key=lambda pose: pose[0])
-        if place == len(known) or known[place][0] != timestamp:
-            known.insert(place, (timestamp, R, t))
+        leader = self._door.clock.newest
+        admitted = self._clocks[joint].admit(float(timestamp), owned_pose(T_world_joint), leader)
+        self._refuse(joint, admitted.refused)
+        if admitted.begins:
+            first = bisect_left(self._wrists[joint], admitted.packets[0][0], key=_time)
+            self._wrists[joint] = self._wrists[joint][: first if admitted.again else 0]
+        for time, T in admitted.packets:
+            known = self._wrists[joint]
+            place = bisect_left(known, time, key=_time)
+            if place == len(known) or known[place][0] != time:
+                known.insert(place, (time, T.R, T.t))
+                del known[:-MAX_WAITING]
 
     def activate(self, name: str | None, timestamp: float) -> None:
         """From a time (s) on this object is the active one; None: none is. Frames whose poses are not final yet, too.
 
         Raises WearcapError for an unknown object, and for one whose mesh or class cannot be used.
         """
+        if fault := time_fault(timestamp):
+            self._door.refuse("activate", fault)
+            return
         if name is not None:
             known = name in self._shapes
             self._shape(name)
             if self.pipeline.placed and not known and self._environment is not None:
                 # In the middle between then and one frame later: the first frame from then on is the one nearby.
                 soon = timestamp + 0.499 / self.pipeline.fps
-                self.see_object(name, soon, self._environment.by_name(name).T_world_object)
+                self._see(name, soon, self._environment.by_name(name).T_world_object)
         self._acts = [act for act in self._acts if act[0] < timestamp] + [(timestamp, name)]
+        del self._acts[:-MAX_WAITING]
         self._retell()
 
     def see_object(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
-        """An object's pose is known at a moment, from a camera for instance (ECHO §4.2); what is not finite is left out.
+        """An object's pose is known at a moment, from a camera for instance (ECHO §4.2).
 
         Raises as `activate` does.
         """
-        T = self._shape(name).centred(Rigid(T_world_object.R.float(), T_world_object.t.float()))
-        if math.isfinite(timestamp) and T.R.isfinite().all() and T.t.isfinite().all():
-            self._seen.append((timestamp, name, T))
-            self._retell()
+        self._shape(name)
+        newest = self._door.clock.newest
+        if fault := time_fault(timestamp) or pose_fault(T_world_object):
+            self._door.refuse(name, fault)
+        elif math.isfinite(newest) and abs(timestamp - newest) > CONNECTED_S:
+            self._refuse(name, 1)
+        else:
+            self._see(name, float(timestamp), owned_pose(T_world_object))
+
+    def _see(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
+        self._seen.append((timestamp, name, self._shape(name).centred(T_world_object)))
+        del self._seen[:-MAX_SEEN]
+        self._retell()
 
     def _shape(self, name: str) -> ObjectShape:
         if name not in self._shapes:
@@ -142,7 +225,16 @@ class EchoSession:
         return self._shapes[name]
 
     def poses(self, ended: bool = False) -> Motion | None:
-        """The frames that are final since the last time; `ended`: nothing more will come."""
+        """The frames that are final since the last time; `ended`: nothing more will come.
+
+        Where the head device's clock has gone back these are the frames before; call again for those with the new times.
+        """
+        if ended:
+            for time, pose in self._door.end():
+                self._track.take(time, pose)
+        return self._finished.pop(0) if self._finished else self._final(ended)
+
+    def _final(self, ended: bool) -> Motion | None:
         while (chunk := self._track.next(ended)) is not None:
             self._chunks.append(chunk)
         given: list[Motion] = []
@@ -291,3 +383,7 @@ class EchoSession:
         self._seen = [row for row in self._seen if row[0] > time - 1.0]
         past = [k for k, (start, _) in enumerate(self._acts) if start <= time]
         self._acts = self._acts[past[-1] :] if past else self._acts
+
+
+def _time(pose: tuple[float, Tensor, Tensor]) -> float:
+    return pose[0]

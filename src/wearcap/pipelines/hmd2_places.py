@@ -11,6 +11,9 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.voxels import VoxelGrid, VoxelMap
 
+MANY = 4
+"""So many times the points that a stream may keep are too many, even while the head is not tracked."""
+
 
 @dataclass(frozen=True)
 class Memory:
@@ -70,6 +73,20 @@ class Places:
         self.mapped = True
         self._map.add(points, seen)
         self._new.append((points, seen))
+        if len(self._map) > MANY * self.memory.max_points:
+            self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        """While no frame comes that would forget points, the newest packets of them stay."""
+        kept, count = [], 0
+        while self._new and (not kept or count + len(self._new[-1][0]) <= self.memory.max_points):
+            kept.append(self._new.pop())
+            count += len(kept[-1][0])
+        known = [_joined(self._known)]
+        self._map, self._new = VoxelMap(self.grid), kept[::-1]
+        for part in self._new:
+            self._map.add(*part)
+        self._begin(known, self._floor.state())
 
     def grids(
         self, T_world_device: Rigid, timestamps: Float64[Tensor, "time"]

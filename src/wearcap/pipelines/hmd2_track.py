@@ -39,7 +39,7 @@ class HeadTrack:
     def __init__(self, fps: float, stride: int):
         self.fps, self.stride = fps, stride
         self.dropped = 0
-        """Poses that came too late, twice, or were not finite."""
+        """Poses that came too late, or twice."""
         self._start: float | None = None
         """Time of frame 0: of the first pose."""
         self._next = 0
@@ -74,21 +74,20 @@ class HeadTrack:
         self._poses = list(zip(state["times"].tolist(), state["R"], state["t"]))
 
     def take(self, timestamp: float, T_world_device: Rigid | None) -> None:
-        """Take in a moment, with the device's pose if it is known. It may come after later ones, until their chunk is out."""
-        if not math.isfinite(timestamp):
-            self.dropped += 1
-            return
+        """Take in a moment, with the device's pose if it is known. It may come after later ones, until their chunk is out.
+
+        Both are finite: `sensors.packets` lets nothing else in.
+        """
         self.newest = max(self.newest, timestamp)
         if T_world_device is None:
             return
-        R, t = T_world_device.R.float().cpu(), T_world_device.t.float().cpu()
         place = bisect_right(self._poses, timestamp, key=lambda pose: pose[0])
         late = self._next > 0 and timestamp <= self._time(self._next - 1) + _SAME_S
         twice = place > 0 and self._poses[place - 1][0] == timestamp
-        if late or twice or not (R.isfinite().all() and t.isfinite().all()):
+        if late or twice:
             self.dropped += 1
         else:
-            self._poses.insert(place, (timestamp, R, t))
+            self._poses.insert(place, (timestamp, T_world_device.R, T_world_device.t))
 
     def next(self, ended: bool = False) -> Chunk | None:
         """The next chunk, once all its frames' times have passed; `ended`: nothing more will come."""

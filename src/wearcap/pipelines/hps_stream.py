@@ -4,6 +4,7 @@ A window of the newest seconds is solved again and again; frames older than `lag
 follow. Memory is that of a window, however long the recording.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,11 +19,16 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.optimize.hps import HpsData, HpsState
 from wearcap.pipelines.hps import HPS
+from wearcap.pipelines.hps_pieces import cut, follows, joined, localization_fault, more, suit_fault
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Localization
 from wearcap.scene.scan import Scan
 from wearcap.sensors.alignment import align_suit, estimate_head_camera, inliers
 from wearcap.sensors.initialization import Initialization, initialize
+from wearcap.sensors.packets import OFF_THE_CLOCK, WRONG_TYPE
+
+MAX_UNALIGNED_S = 600.0
+"""While nothing is localised, the newest so many seconds of the suit are kept."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,11 @@ class StreamSettings:
 
 
 class HpsStream:
-    """Feed `push` with pieces of a recording, in order; finished pieces of motion are returned."""
+    """Feed `push` with pieces of a recording, in order; finished pieces of motion are returned.
+
+    A piece that cannot be true (`sensors.packets`), or that does not follow the one before, is `refused`. Where two
+    pieces in a row follow each other and not those before, the clock has moved: a new stretch begins, aligned anew.
+    """
 
     def __init__(self, hps: HPS, about: Recording, scan: Scan | None, settings: StreamSettings | None = None):
         """`about` gives the wearer's shape and the camera with its mount; its streams are not read.
@@ -59,6 +69,18 @@ class HpsStream:
         self.hps, self.about, self.scan = hps, about, scan
         self.settings = settings or StreamSettings()
         self.mount = Rigid(about.camera.R_head_cam, about.camera.t_head_cam)
+        self.refused: Counter[str] = Counter()
+        """Pieces, or their localisation, that were refused, by reason: "suit: off the clock"."""
+        self._alone: tuple[Motion, Localization | None] | None = None
+        """The last piece, where it did not follow those before."""
+        self._given = False
+        """Whether any motion was handed out."""
+        self._like: Motion | None = None
+        """The first good piece: those to come have its joints and contacts."""
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin a stretch."""
         self.suit: Motion | None = None
         """What was pushed and is still needed, at the pipeline's rate."""
         self.seen: Localization | None = None
@@ -71,25 +93,94 @@ class HpsStream:
         self._solved_to = -torch.inf
 
     def push(self, suit: Motion, localization: Localization | None = None) -> Motion | None:
-        """Take in what is new of suit and localisation; returns the frames that have become final, if any."""
-        self.suit = suit if self.suit is None else _joined(self.suit, suit)
-        if localization is not None and len(localization.timestamps):
-            self.seen = localization if self.seen is None else _more(self.seen, localization)
+        """Take in what is new of suit and localisation; returns the frames that have become final, if any.
+
+        Where a new stretch begins these are the last ones of the stretch before.
+        """
+        fault = suit_fault(suit, self._like)
+        if fault is not None:
+            self.refused[f"suit: {fault}"] += 1
+            return None
+        if not len(suit):
+            return None
+        self._like = self._like or suit
+        localization = self._checked(localization, suit)
+        if self.suit is None or follows(self.suit, suit):
+            self._refuse_alone()
+            self._add(suit, localization)
+            return self._solve()
+        if self._alone is None or not follows(self._alone[0], suit):
+            self._refuse_alone()
+            self._alone = suit, localization
+            return None
+        (first, seen), self._alone = self._alone, None
+        left = self._end()
+        self._begin()
+        self._add(first, seen)
+        self._add(suit, localization)
+        return left
+
+    def _refuse_alone(self) -> None:
+        if self._alone is not None:
+            self.refused[f"suit: {OFF_THE_CLOCK}"] += 1
+            self._alone = None
+
+    def _checked(self, localization: Localization | None, suit: Motion) -> Localization | None:
+        """The localisation of a piece, or None where it cannot be used."""
+        if localization is None:
+            return None
+        if fault := localization_fault(localization, suit):
+            self.refused[f"localization: {fault}"] += 1
+            return None
+        return localization if len(localization.timestamps) else None
+
+    def _add(self, suit: Motion, localization: Localization | None) -> None:
+        self.suit = suit if self.suit is None else joined(self.suit, suit)
+        if (
+            localization is not None
+            and self.seen is not None
+            and localization.timestamps[0] <= self.seen.timestamps[-1]
+        ):
+            self.refused[f"localization: {OFF_THE_CLOCK}"] += 1
+        elif localization is not None:
+            self.seen = localization if self.seen is None else more(self.seen, localization)
+
+    def _solve(self) -> Motion | None:
+        """The frames that have become final."""
+        assert self.suit is not None
         newest = self.suit.timestamps[-1].item()
         if self.turn is None and not self._align():
+            self._forget(newest - MAX_UNALIGNED_S)
             return None
         if newest - self._solved_to < self.settings.advance_s:
             return None
         return self._advance(newest - self.settings.lag_s)
 
     def finish(self) -> Motion | None:
-        """The frames that are left when the recording has ended. Raises WearcapError when none was ever localised."""
-        if self.suit is None:
-            return None
-        if self.turn is None and not self._align(enough=False):
+        """The frames that are left when the recording has ended.
+
+        Raises WearcapError when every piece was refused, and when none was ever localised.
+        """
+        self._refuse_alone()
+        if self.suit is None and self.refused:
+            raise WearcapError(
+                f"no piece can be used ({', '.join(self.refused)})", where=self.about.name,
+                expected="finite poses of the suit at rising times",
+            )  # fmt: skip
+        motion = self._end()
+        if self.suit is not None and not self._given:
             raise WearcapError(
                 "the camera was never localised", expected="some localised frames", where=self.about.name
             )
+        return motion
+
+    def _end(self) -> Motion | None:
+        """The frames that are left of a stretch; none where it was never localised, which is counted."""
+        if self.suit is None:
+            return None
+        if self.turn is None and not self._align(enough=False):
+            self.refused["stretch: never localised"] += 1
+            return None
         return self._advance(self.suit.timestamps[-1].item() + 1.0)
 
     def _align(self, enough: bool = True) -> bool:
@@ -123,6 +214,7 @@ class HpsStream:
         new = (motion.timestamps > after + 0.5 / fps) & (motion.timestamps <= final_s)
         if not new.any():
             return None
+        self._given = True
         begin, stop = int(new.nonzero()[0]), int(new.nonzero()[-1]) + 1
         keep = int((settings.behind_s + 1.0) * fps)
         self.done = motion.sliced(max(0, stop - keep), stop)
@@ -185,7 +277,7 @@ class HpsStream:
         self.suit = self.suit.sliced(first, len(self.suit))
         if self.seen is not None:  # two stay, which tell the rate where nothing new comes
             first = int(torch.searchsorted(self.seen.timestamps, before_s))
-            self.seen = _cut(self.seen, max(min(first, len(self.seen.timestamps) - 2), 0))
+            self.seen = cut(self.seen, max(min(first, len(self.seen.timestamps) - 2), 0))
 
 
 def follow(
@@ -194,30 +286,51 @@ def follow(
     scan: Scan | None,
     folder: Path = Path(),
     settings: StreamSettings | None = None,
+    refused: Counter[str] | None = None,
 ) -> Iterator[Motion]:
     """Motion of a recording that is still being made, piece by piece; `folder` holds what pieces name.
 
     A piece's camera is localised where it brings pictures and no poses. Camera and suit must share a clock: claps
-    are heard too late. Raises WearcapError when they do not, a piece has no suit, or the energy asks for a scan.
+    are heard too late. `refused` counts what could not be used, by reason (`HpsStream.refused`).
+    Raises WearcapError when the clocks are not shared, the first piece has no suit or cannot be localised, or the
+    energy asks for a scan.
     """
     stream: HpsStream | None = None
+    refused = Counter() if refused is None else refused
     for piece in pieces:
-        if piece.suit is None:
+        if piece.suit is None and stream is None:
             raise WearcapError(
                 "no suit in this piece", where=piece.name, expected="a suit's motion in each piece"
             )
         if hps.synchronization.by_claps(piece):
             raise WearcapError("claps cannot bring a growing recording's clocks together", where=piece.name,
                                fix="Set the clocks before, and give pipeline.synchronization.clock=shared.")  # fmt: skip
+        if piece.suit is None:
+            refused[f"suit: {WRONG_TYPE}"] += 1
+            continue
+        fresh = stream is None
         if stream is None:
             stream = HpsStream(hps, piece, scan, settings)
-        seen = hps.localize(piece, folder) if piece.camera is not None else piece.localization
-        done = stream.push(piece.suit, seen)
+            stream.refused = refused
+        done = stream.push(piece.suit, _localized(hps, piece, folder, None if fresh else refused))
         if done is not None:
             yield done
     last = stream.finish() if stream is not None else None
     if last is not None:
         yield last
+
+
+def _localized(hps: HPS, piece: Recording, folder: Path, refused: Counter[str] | None) -> Localization | None:
+    """Where the camera was; what cannot be localised is counted, but without a counter raised."""
+    if piece.camera is None:
+        return piece.localization
+    try:
+        return hps.localize(piece, folder)
+    except WearcapError:
+        if refused is None:
+            raise
+        refused["localization: failed"] += 1
+        return None
 
 
 def _step(timestamps: Float64[Tensor, "time"]) -> float:
@@ -226,29 +339,3 @@ def _step(timestamps: Float64[Tensor, "time"]) -> float:
 
 def _inside(seen: Localization, motion: Motion) -> Tensor:
     return (seen.timestamps >= motion.timestamps[0]) & (seen.timestamps <= motion.timestamps[-1])
-
-
-def _joined(first: Motion, then: Motion) -> Motion:
-    """Two pieces of one motion. Raises WearcapError when the second does not follow the first."""
-    if len(then) and then.timestamps[0] <= first.timestamps[-1]:
-        raise WearcapError(f"a piece that begins at {then.timestamps[0]:.3f} s follows one that ends at {first.timestamps[-1]:.3f} s",
-                           expected="pieces in order, without overlap")  # fmt: skip
-    contact = first.contact_prob
-    if contact is not None and then.contact_prob is not None:
-        contact = torch.cat([contact, then.contact_prob])
-    return replace(
-        first, timestamps=torch.cat([first.timestamps, then.timestamps]), contact_prob=contact,
-        R_parent_joint=torch.cat([first.R_parent_joint, then.R_parent_joint]),
-        t_world_root=torch.cat([first.t_world_root, then.t_world_root]),
-    )  # fmt: skip
-
-
-def _more(first: Localization, then: Localization) -> Localization:
-    names = ("timestamps", "R_world_cam", "t_world_cam", "confidence")
-    return Localization(*(torch.cat([getattr(first, name), getattr(then, name)]) for name in names))
-
-
-def _cut(seen: Localization, first: int) -> Localization:
-    return Localization(
-        seen.timestamps[first:], seen.R_world_cam[first:], seen.t_world_cam[first:], seen.confidence[first:]
-    )

@@ -5,7 +5,7 @@ is the same. What a stream waits for beside its lookahead are the three frames t
 """
 
 import math
-from bisect import insort
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.watch_features import Sensed
+from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.pipelines.hmd2 import hang_from_head
 from wearcap.pipelines.hmd2_stream import joined
@@ -23,7 +24,24 @@ from wearcap.pipelines.hmd2_track import Chunk, HeadTrack
 from wearcap.pipelines.mocap_every import MocapEvery
 from wearcap.pipelines.mocap_every_windows import EstimatorWindows, Said
 from wearcap.recording import ImuStream, Motion
+from wearcap.sensors.packets import (
+    MAX_ACC_M_S2,
+    MAX_WAITING,
+    OFF_THE_CLOCK,
+    WRONG_TYPE,
+    Admitted,
+    Clock,
+    HeadDoor,
+    connected,
+    owned,
+    rotation_fault,
+    time_fault,
+    vector_fault,
+)
 from wearcap.sensors.watches import FILTER, MAX_GAP_S, WRISTS, filtered
+
+MAX_POINTS = 1_000_000
+"""Points that wait for the head's pose; the oldest make room."""
 
 
 class WatchSample(NamedTuple):
@@ -54,6 +72,8 @@ class MocapEverySession:
 
     Frames wait until both watches have said what they are told from; a watch that is silent for longer than
     `watches.MAX_GAP_S` is taken to rest as it was, without acceleration, and counted in `silent`.
+    What cannot be true (`sensors.packets`) is `refused`. Where the camera's clock goes back for good, the capture begins
+    anew as a new session would; the watches are on that clock.
     """
 
     def __init__(self, pipeline: MocapEvery, wearing: Wearing):
@@ -61,8 +81,19 @@ class MocapEverySession:
         self.pipeline, self.wearing = pipeline, wearing
         self.silent = 0
         """Frames for which a watch had nothing to say."""
+        self._door = HeadDoor()
         self._track = HeadTrack(pipeline.fps, pipeline.stride)
         self._samples: dict[str, list[WatchSample]] = {joint: [] for joint in WRISTS}
+        self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
+        self._finished: list[Motion] = []
+        """Of before the clock went back, not given yet."""
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin anew: what the watches said stays, and the counts."""
+        dropped = self._track.dropped
+        self._track = HeadTrack(self.pipeline.fps, self.pipeline.stride)
+        self._track.dropped = dropped
         self._chunks: list[Chunk] = []
         self._windows: EstimatorWindows | None = None
         self._begin_s = 0.0
@@ -73,8 +104,13 @@ class MocapEverySession:
 
     @property
     def dropped(self) -> int:
-        """Head poses that came too late, twice, or were not finite."""
-        return self._track.dropped
+        """Head poses that came too late, twice, or were refused."""
+        return self._track.dropped + self._door.dropped
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """How many packets, or parts of them, were refused, by reason: "left_wrist: out of range"."""
+        return dict(self._door.refused)
 
     def head(
         self,
@@ -83,24 +119,68 @@ class MocapEverySession:
         points_world: Float[Tensor, "point 3"] | None = None,
     ) -> None:
         """Take in a moment of the camera: its pose, if tracking has one, and points that are new."""
-        self._track.take(timestamp, T_world_device)
-        if points_world is not None and len(points_world):
-            self._points.append(points_world)
+        if self._door.timely(timestamp):
+            packet = self._door.pose(T_world_device), self._door.points(points_world)
+            self._take(self._door.admit(float(timestamp), packet))
+
+    def _take(self, admitted: Admitted) -> None:
+        if admitted.begins:
+            if admitted.again and (motion := self._final(ended=True)) is not None:
+                self._finished.append(motion)
+            self._begin()
+            for joint in self._samples:
+                self._rejoin(joint, None if admitted.again else admitted.packets[0][0])
+        for time, (pose, points) in admitted.packets:
+            self._track.take(time, pose)
+            if points is not None and len(points):
+                self._points.append(points)
+        if len(self._points) > 1000:
+            self._points = [torch.cat(self._points)[-MAX_POINTS:]]
+
+    def _rejoin(self, joint: str, time: float | None) -> None:
+        """Keep of a watch what belongs to the clock that begins at a time; None: nothing does."""
+        samples = self._samples[joint]
+        kept = [] if time is None else samples[connected([sample.timestamp for sample in samples], time)]
+        refused = self._clocks[joint].set(kept[-1].timestamp if kept else None)
+        self._refuse(joint, refused if time is None else refused + len(samples) - len(kept))
+        self._samples[joint] = kept
+
+    def _refuse(self, joint: str, count: int) -> None:
+        if count:
+            self._door.refuse(joint, OFF_THE_CLOCK, count)
 
     def watch(self, joint: str, samples: Sequence[WatchSample]) -> None:
-        """Take in what a watch said; samples that are not finite or come twice are left out."""
-        known = self._samples[joint]
+        """Take in what a watch said; samples that come twice are left out.
+
+        Raises WearcapError for another joint than the wrists.
+        """
+        if joint not in self._samples:
+            raise WearcapError(f"no watch on {joint!r}", expected=" or ".join(WRISTS))
+        clock = self._clocks[joint]
         for sample in samples:
-            finite = sample.R_world_imu.isfinite().all() and sample.acc_world.isfinite().all()
-            if (
-                math.isfinite(sample.timestamp)
-                and finite
-                and all(s.timestamp != sample.timestamp for s in known[-3:])
-            ):
-                insort(known, sample, key=lambda s: s.timestamp)
+            if fault := _fault(sample):
+                self._door.refuse(joint, fault)
+                continue
+            sample = WatchSample(float(sample.timestamp), owned(sample.R_world_imu), owned(sample.acc_world))
+            admitted = clock.admit(sample.timestamp, sample, self._door.clock.newest)
+            self._refuse(joint, admitted.refused)
+            if admitted.begins:
+                first = bisect_left(self._samples[joint], admitted.packets[0][0], key=_time)
+                self._samples[joint] = self._samples[joint][: first if admitted.again else 0]
+            for _, believed in admitted.packets:
+                _insert(self._samples[joint], believed)
 
     def poses(self, ended: bool = False) -> Motion | None:
-        """The frames that are final since the last time; `ended`: nothing more will come."""
+        """The frames that are final since the last time; `ended`: nothing more will come.
+
+        Where the camera's clock has gone back these are the frames before; call again for those with the new times.
+        """
+        if ended:
+            for time, (pose, _) in self._door.end():
+                self._track.take(time, pose)
+        return self._finished.pop(0) if self._finished else self._final(ended)
+
+    def _final(self, ended: bool) -> Motion | None:
         while (chunk := self._track.next(ended)) is not None:
             self._chunks.append(chunk)
         given: list[Motion] = []
@@ -192,3 +272,26 @@ class MocapEverySession:
         motion = Motion(times, self.wearing.skeleton, said.R_parent_joint, said.t_world_root,
                         said.contact_prob.repeat_interleave(2, -1), provenance=self.pipeline.settings())  # fmt: skip
         return [hang_from_head(motion, heads) if self.pipeline.hang else motion]
+
+
+def _time(sample: WatchSample) -> float:
+    return sample.timestamp
+
+
+def _fault(sample: object) -> str | None:
+    """What is wrong with a watch's sample."""
+    if not isinstance(sample, WatchSample):
+        return WRONG_TYPE
+    return (
+        time_fault(sample.timestamp)
+        or rotation_fault(sample.R_world_imu)
+        or vector_fault(sample.acc_world, MAX_ACC_M_S2)
+    )
+
+
+def _insert(known: list[WatchSample], sample: WatchSample) -> None:
+    """Put a sample where it belongs in time, unless there is one already."""
+    place = bisect_left(known, sample.timestamp, key=_time)
+    if place == len(known) or known[place].timestamp != sample.timestamp:
+        known.insert(place, sample)
+        del known[:-MAX_WAITING]

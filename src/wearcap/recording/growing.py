@@ -5,6 +5,7 @@ file `end` says that there are no more. The first piece tells about the wearer a
 """
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,13 +31,23 @@ def close_pieces(folder: str | Path) -> None:
     write_text(Path(folder) / END, "")
 
 
-def follow_pieces(folder: str | Path, patience_s: float = 60.0, poll_s: float = 0.1) -> Iterator[Recording]:
-    """Pieces as they appear, until `end`. Raises WearcapError when none comes for `patience_s`."""
+def follow_pieces(
+    folder: str | Path,
+    patience_s: float = 60.0,
+    poll_s: float = 0.1,
+    refused: Counter[str] | None = None,
+) -> Iterator[Recording]:
+    """Pieces as they appear, until `end`. A damaged file is counted in `refused`, and passed over.
+
+    Raises WearcapError when none comes for `patience_s`, and without `refused` for a damaged file.
+    """
     folder, number, since = Path(folder), 0, time.monotonic()
     while True:
         ended = (folder / END).exists()  # asked first: what was written before the end is still there
         if piece_path(folder, number).exists():
-            yield RecordingFile(piece_path(folder, number)).load()
+            piece = _read(piece_path(folder, number), refused)
+            if piece is not None:
+                yield piece
             number, since = number + 1, time.monotonic()
         elif ended:
             return
@@ -46,3 +57,13 @@ def follow_pieces(folder: str | Path, patience_s: float = 60.0, poll_s: float = 
                                fix="Is the recorder still running?")  # fmt: skip
         else:
             time.sleep(poll_s)
+
+
+def _read(path: Path, refused: Counter[str] | None) -> Recording | None:
+    try:
+        return RecordingFile(path).load()
+    except WearcapError:
+        if refused is None:
+            raise
+        refused["piece: damaged file"] += 1
+        return None

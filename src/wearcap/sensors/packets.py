@@ -1,0 +1,310 @@
+"""Packets of live devices, checked before a streaming session takes them in: nothing in them can end or poison it.
+
+The checks say what is wrong with a value, or None; `Clock` says which times are believed; `HeadDoor` puts both
+together for the head device, whose clock is the session's.
+"""
+
+import math
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeGuard
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.geometry.rigid import Rigid
+
+MAX_TIME_S = 1e10
+"""Beyond it a double no longer resolves a millionth of a second; Unix times are 1.7e9 s (1.7e12 are milliseconds)."""
+MAX_POSITION_M = 10_000.0
+"""From the world's origin, along each axis: there a float32 still resolves a millimetre."""
+MAX_JUMP_M = 100.0
+"""From one head pose to the next; `AGREEING` poses in a row that are further away are where the head is now."""
+MAX_ACC_M_S2 = 2_000.0
+"""Wearables' accelerometers saturate at 16 g (157 m/s²), those for impacts at 200 g."""
+MAX_FEATURE = 10_000.0
+"""Of an embedding; those of image encoders are around 1, or 10."""
+ROTATION_TOLERANCE = 0.02
+"""Of each entry of R Rᵀ - 1: matrices that were rounded to two digits pass, scales and shears do not."""
+AHEAD_S = 0.5
+"""A packet that is further ahead of its stream is alone until others agree; captures begin anew behind such gaps."""
+BEHIND_S = 1.0
+"""One that is further behind is so, too; poses are final by then."""
+AGREEING = 5
+"""Packets in a row, each later than the one before by `AGREEING_STEP_S` at most, that move a clock."""
+AGREEING_STEP_S = 1.0
+CONNECTED_S = 10.0
+"""Packets that came before the head's clock was known belong to it if no longer pause lies between."""
+MAX_WAITING = 100_000
+"""Packets of one stream that wait for others; a quarter of an hour at 100 Hz. The oldest make room."""
+
+WRONG_TYPE = "wrong type or shape"
+NOT_FINITE = "not finite"
+OUT_OF_RANGE = "out of range"
+NOT_A_ROTATION = "not a rotation"
+OFF_THE_CLOCK = "off the clock"
+
+
+def number_fault(value: object, limit: float) -> str | None:
+    """What is wrong with a number of magnitude up to `limit`."""
+    if not isinstance(value, float | int | np.floating | np.integer):
+        return WRONG_TYPE
+    if abs(value) <= limit:
+        return None
+    return OUT_OF_RANGE if abs(value) < math.inf else NOT_FINITE
+
+
+def time_fault(timestamp: object) -> str | None:
+    """What is wrong with a time (s)."""
+    return number_fault(timestamp, MAX_TIME_S)
+
+
+def vector_fault(value: object, limit: float) -> str | None:
+    """What is wrong with a vector "3" of components up to `limit`."""
+    if not _is_float(value, (3,)):
+        return WRONG_TYPE
+    return _values_fault(value.tolist(), limit)
+
+
+def rotation_fault(R: object) -> str | None:
+    """What is wrong with a rotation matrix "3 3"."""
+    if not _is_float(R, (3, 3)):
+        return WRONG_TYPE
+    rows = (ax, ay, az), (bx, by, bz), (cx, cy, cz) = R.tolist()
+    if fault := _values_fault([*rows[0], *rows[1], *rows[2]], 2.0):
+        return NOT_A_ROTATION if fault is OUT_OF_RANGE else fault
+    products = (
+        ax * ax + ay * ay + az * az - 1, bx * bx + by * by + bz * bz - 1, cx * cx + cy * cy + cz * cz - 1,
+        ax * bx + ay * by + az * bz, ax * cx + ay * cy + az * cz, bx * cx + by * cy + bz * cz,
+    )  # fmt: skip
+    right_handed = ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx) > 0
+    orthogonal = min(products) >= -ROTATION_TOLERANCE and max(products) <= ROTATION_TOLERANCE
+    return None if orthogonal and right_handed else NOT_A_ROTATION
+
+
+def pose_fault(pose: object) -> str | None:
+    """What is wrong with one pose in the world (R "3 3", t "3" in m)."""
+    if not isinstance(pose, Rigid):
+        return WRONG_TYPE
+    return rotation_fault(pose.R) or vector_fault(pose.t, MAX_POSITION_M)
+
+
+def embedding_fault(embedding: object, size: int) -> str | None:
+    """What is wrong with an embedding of `size` features."""
+    if not _is_float(embedding, (size,)):
+        return WRONG_TYPE
+    largest = embedding.detach().abs().max().item() if size else 0.0
+    return None if largest <= MAX_FEATURE else OUT_OF_RANGE if largest < math.inf else NOT_FINITE
+
+
+def rotations_fault(R: object, shape: Sequence[int]) -> str | None:
+    """What is wrong with many rotation matrices "*batch 3 3", all together."""
+    if not _is_float(R, tuple(shape)):
+        return WRONG_TYPE
+    R = R.detach().double()
+    if not R.isfinite().all():
+        return NOT_FINITE
+    skew = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
+    fine = bool((skew <= ROTATION_TOLERANCE).all() and (torch.linalg.det(R) > 0).all())
+    return None if fine else NOT_A_ROTATION
+
+
+def values_fault(values: object, shape: Sequence[int], limit: float) -> str | None:
+    """What is wrong with many values of magnitude up to `limit`, all together."""
+    if not _is_float(values, tuple(shape)):
+        return WRONG_TYPE
+    if (values.detach().abs() <= limit).all():
+        return None
+    return OUT_OF_RANGE if values.isfinite().all() else NOT_FINITE
+
+
+def usable_points(points: object) -> tuple[Float[Tensor, "point 3"] | None, str | None]:
+    """A copy of those points of the world (m) that are finite and within range, and what is wrong with the others."""
+    if not isinstance(points, Tensor) or points.ndim != 2 or not _is_float(points, (len(points), 3)):
+        return None, WRONG_TYPE
+    points = owned(points)
+    inside = (points.abs() <= MAX_POSITION_M).all(-1)
+    if inside.all():
+        return points, None
+    return points[inside], OUT_OF_RANGE if points.isfinite().all() else NOT_FINITE
+
+
+def owned(value: Tensor) -> Tensor:
+    """A copy (float32, CPU): the device may write its next packet into the same memory."""
+    return value.detach().to("cpu", torch.float32, copy=True)
+
+
+def owned_pose(pose: Rigid) -> Rigid:
+    """A copy of a pose (float32, CPU)."""
+    return Rigid(owned(pose.R), owned(pose.t))
+
+
+def connected(times: Sequence[float], at: float) -> slice:
+    """Of rising times (s) those around `at` without a pause of more than `CONNECTED_S`."""
+    first = stop = bisect_left(times, at)
+    while first > 0 and (times[first] if first < stop else at) - times[first - 1] <= CONNECTED_S:
+        first -= 1
+    last = at
+    while stop < len(times) and times[stop] - last <= CONNECTED_S:
+        last, stop = times[stop], stop + 1
+    return slice(first, stop)
+
+
+class Admitted(NamedTuple):
+    """What a clock says to a packet: those that are believed now, some of which may have waited for it."""
+
+    packets: list[tuple[float, Any]]
+    """Times (s) and packets, to be taken in this order."""
+    refused: int = 0
+    """How many had a wrong time: they were ahead, and alone."""
+    begins: bool = False
+    """Whether the clock begins with these packets, for the first time or anew."""
+    again: bool = False
+    """Whether what came before is believed, too: else it was a few packets at a wrong time."""
+
+
+class Clock:
+    """The time of one stream. A lone packet far from the others is refused; several that agree have moved the clock.
+
+    `leads`: it is the session's; else it goes back only to where the session's is.
+    """
+
+    def __init__(self, leads: bool = True):
+        self.leads = leads
+        self.newest = -math.inf
+        """Time (s) of the newest packet that is believed."""
+        self.taken = 0
+        """Packets that were believed since the clock began; no more than `AGREEING` are counted."""
+        self.waiting: list[tuple[float, Any]] = []
+        """Packets in a row that agree with each other alone, fewer than `AGREEING`."""
+
+    def admit(self, time: float, packet: Any, leader: float = -math.inf) -> Admitted:
+        """What is to be done with a packet at a time (s), and those that waited; `leader`: the session's newest time."""
+        newest = self.newest
+        begins = not self.taken
+        if begins or newest - BEHIND_S <= time <= max(newest, leader) + AHEAD_S:
+            late, refused = self.dismiss() if self.waiting else ([], 0)
+            self.newest, self.taken = max(newest, time), min(self.taken + 1, AGREEING)
+            return Admitted([*late, (time, packet)], refused, begins)
+        late, refused = [], 0
+        if self.waiting and not 0 < time - self.waiting[-1][0] <= AGREEING_STEP_S:
+            late, refused = self.dismiss()
+        self.waiting.append((time, packet))
+        if len(self.waiting) < AGREEING:
+            return Admitted(late, refused)
+        if time < newest and not self.leads and abs(time - leader) > CONNECTED_S:
+            self.waiting = []
+            return Admitted([], AGREEING)
+        return self._moved()
+
+    def _moved(self) -> Admitted:
+        packets, self.waiting = self.waiting, []
+        again = self.taken >= AGREEING
+        begins, refused = packets[0][0] < self.newest or not again, 0 if again else self.taken
+        self.newest, self.taken = packets[-1][0], AGREEING
+        return Admitted(packets, refused, begins, begins and again)
+
+    def dismiss(self) -> tuple[list[tuple[float, Any]], int]:
+        """Wait no longer: the packets that were merely late, and how many others are refused."""
+        waiting, self.waiting = self.waiting, []
+        late = [(time, packet) for time, packet in waiting if time < self.newest]
+        return late, len(waiting) - len(late)
+
+    def set(self, newest: float | None) -> int:
+        """Go on from a newest time, or begin with the next packet; returns how many waiting packets are refused."""
+        refused, self.waiting = len(self.waiting), []
+        self.newest, self.taken = (-math.inf, 0) if newest is None else (newest, AGREEING)
+        return refused
+
+
+@dataclass
+class HeadDoor:
+    """Where one wearer's head packets come in. What is refused is counted by reason, such as "head: not a rotation"."""
+
+    refused: Counter[str] = field(default_factory=Counter)
+    dropped: int = 0
+    """Head poses among them."""
+    clock: Clock = field(default_factory=Clock)
+    place: tuple[float, float, float] | None = None
+    """Of the last pose that was believed (m)."""
+    far: int = 0
+    """Poses since then that were too far from it."""
+
+    def pose(self, T_world_device: object) -> Rigid | None:
+        """A copy of the device's pose, or None where there is none that can be used."""
+        if T_world_device is None:
+            return None
+        fault = pose_fault(T_world_device)
+        if fault is None:
+            assert isinstance(T_world_device, Rigid)
+            pose = owned_pose(T_world_device)
+            x, y, z = pose.t.tolist()
+            self.far = (
+                0 if self.place is None or math.dist(self.place, (x, y, z)) <= MAX_JUMP_M else self.far + 1
+            )
+            if self.far in (0, AGREEING):
+                self.place, self.far = (x, y, z), 0
+                return pose
+            fault = OUT_OF_RANGE
+        self.refuse("head", fault)
+        self.dropped += 1
+        return None
+
+    def points(self, points_world: object) -> Float[Tensor, "point 3"] | None:
+        """A copy of those points (m) that can be used, or None where there are none."""
+        if points_world is None:
+            return None
+        points, fault = usable_points(points_world)
+        if fault:
+            self.refuse("points", fault)
+        return points
+
+    def timely(self, timestamp: object) -> bool:
+        """Whether a packet has a time at all."""
+        if fault := time_fault(timestamp):
+            self.refuse("head", fault)
+            self.dropped += 1
+        return fault is None
+
+    def admit(self, time: float, packet: Any) -> Admitted:
+        """The packets to be taken now that this one has come."""
+        admitted = self.clock.admit(time, packet)
+        self._count(admitted.refused)
+        return admitted
+
+    def end(self) -> list[tuple[float, Any]]:
+        """Nothing more will come: the packets that were merely late."""
+        late, refused = self.clock.dismiss()
+        self._count(refused)
+        return late
+
+    def refuse(self, stream: str, fault: str, count: int = 1) -> None:
+        """Count packets of a stream as refused."""
+        self.refused[f"{stream}: {fault}"] += count
+
+    def _count(self, refused: int) -> None:
+        if refused:
+            self.refuse("head", OFF_THE_CLOCK, refused)
+            self.dropped += refused
+
+
+def _is_float(value: object, shape: tuple[int, ...]) -> TypeGuard[Tensor]:
+    """Whether a value is a dense tensor of floats of this shape."""
+    return (
+        isinstance(value, Tensor)
+        and value.shape == shape
+        and value.is_floating_point()
+        and value.layout is torch.strided
+        and not value.is_meta
+    )
+
+
+def _values_fault(values: list[float], limit: float) -> str | None:
+    # Comparisons with NaN are false; min and max may pass over it.
+    if all(-limit <= value <= limit for value in values):
+        return None
+    return OUT_OF_RANGE if all(map(math.isfinite, values)) else NOT_FINITE

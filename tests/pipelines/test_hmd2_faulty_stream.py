@@ -1,0 +1,249 @@
+"""HMD²'s stream when its devices send what cannot be true, and when its saved file is damaged."""
+
+import json
+import math
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from test_hmd2_stream import IMAGE, WINDOW, moments, stream, surrounded, wearer
+
+from bad_packets import TIMES, VECTORS, Mutator, bad_poses, unchecked
+from wearcap.data.features import HeadFeatures
+from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.errors import WearcapError
+from wearcap.models.denoiser import MotionDenoiser
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.pipelines import hmd2_wearer
+from wearcap.pipelines.hmd2 import HMD2
+from wearcap.pipelines.hmd2_places import Memory
+from wearcap.pipelines.hmd2_stream import Sensed, Session
+from wearcap.recording import Motion
+from wearcap.sensors.packets import AGREEING
+
+FRAMES, FAULT = 80, 44
+EMBEDDINGS = VECTORS | {"longer": torch.zeros(IMAGE + 1), "nan": torch.full((IMAGE,), math.nan)}
+
+
+@pytest.fixture(scope="module")
+def hmd2():
+    torch.manual_seed(1)
+    places, features = VoxelAutoencoder().eval(), HeadFeatures(contacts=True, body=True)
+    net = MotionDenoiser(
+        features.motion_size, features.condition_size, WINDOW, 32, 1, 4, 64, 0.0, 4, blend=5,
+        points_size=places.size, image_size=IMAGE,
+    )  # fmt: skip
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, std=0.05)
+    given = {"place_encoder": places, "image_encoder": "eyes", "live": True, "fade": 6, "lookahead": 0}
+    return HMD2(
+        net, features, CosineSchedule(), wearer(surrounded(4)).skeleton, 60.0, stride=10, steps=2, **given
+    )
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return surrounded(FRAMES)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(hmd2, recording):
+    return stream(opened(hmd2, recording), moments(recording), moments(recording))
+
+
+def opened(hmd2, recording) -> Session:
+    return Session(hmd2, [wearer(recording), wearer(recording)], [3, 4])
+
+
+def push(session: Session, *told: list) -> list[Motion | None]:
+    return unchecked(session.push)(list(told))
+
+
+def run(session: Session, told: list[Sensed], shift: float = 0.0) -> list[Motion]:
+    """What the first of two wearers is given, in pieces; the second one says nothing."""
+    shifted = [moment._replace(timestamp=moment.timestamp + shift) for moment in told]
+    return [motion for moment in shifted if (motion := push(session, [moment], [])[0]) is not None]
+
+
+def assert_equal(motion: Motion, expected: Motion) -> None:
+    for name in ("timestamps", "R_parent_joint", "t_world_root", "contact_prob"):
+        assert torch.equal(getattr(motion, name), getattr(expected, name)), name
+
+
+def test_bad_packets_of_one_wearer_change_nothing_for_anybody(hmd2, recording, undisturbed):
+    told, session = moments(recording), opened(hmd2, recording)
+    good, before = recording.head.T_world_device[FAULT], told[FAULT - 1].timestamp
+    bad = [Sensed(time, good) for time in TIMES.values()]
+    bad += [Sensed(before + 1e-4 * k, pose) for k, pose in enumerate(bad_poses(good).values())]
+    bad += [Sensed(before, None, points_world=points) for points in VECTORS.values() if points is not None]
+    bad += [Sensed(before, None, floor_height=height) for name, height in TIMES.items() if height is not None and name != "ahead" and name != "far"]  # fmt: skip
+    bad += [Sensed(before, None, floor_height=1e9), None, "packet", (before, good)]
+    said = [[], []]
+    for frame, moment in enumerate(told):
+        first = [*bad, moment] if frame == FAULT else [moment]
+        for parts, motion in zip(said, push(session, first, [moment])):
+            parts += [] if motion is None else [motion]
+    for motions, expected in zip(said, undisturbed):
+        assert_equal(motions[0].sliced(0, 10), expected.sliced(0, 10))
+        assert sum(map(len, motions)) == FRAMES
+        for k, motion in enumerate(motions):
+            assert_equal(motion, expected.sliced(10 * k, 10 * k + 10))
+    first, second = session.refused
+    assert sum(first.values()) == len(bad)
+    assert session.dropped == [len(TIMES) + len(bad_poses(good)), 0]
+    assert second == {}
+
+
+def test_a_bad_picture_is_none_and_the_next_one_is_believed(hmd2, recording, undisturbed):
+    told, session = moments(recording), opened(hmd2, recording)
+    time = (FAULT - 0.5) / 60
+    bad = [Sensed(time, embedding=value) for value in EMBEDDINGS.values() if value is not None]
+    said = stream(session, told[:FAULT], told[:FAULT], ended=False)
+    push(session, bad, [])
+    said = stream(session, told[FAULT:], told[FAULT:])
+    assert_equal(said[0], undisturbed[0].sliced(40, FRAMES))
+    assert sum(session.refused[0].values()) == len(bad)
+
+
+def test_an_embedding_of_wrong_length_is_raised_at_first_and_disturbs_nothing(hmd2, recording, undisturbed):
+    told, session = moments(recording), opened(hmd2, recording)
+    wrong = told[0]._replace(embedding=torch.zeros(IMAGE + 1))
+    for _ in range(2):
+        with pytest.raises(WearcapError, match=f"an embedding of {IMAGE + 1} features at 0.000 s"):
+            session.push([[told[0]._replace(embedding=None)], [wrong]])
+    for motion, expected in zip(stream(session, told, told), undisturbed):
+        assert_equal(motion, expected)
+    session.push([[wrong], []])
+    assert session.refused[0]["embedding: wrong type or shape"] == 1
+
+
+@pytest.mark.parametrize("shift", [-1000.0, -1.1, 1000.0])
+def test_where_the_clock_moves_it_goes_on(hmd2, recording, shift):
+    """Back: exactly as a session that is new."""
+    session, fresh, told = opened(hmd2, recording), opened(hmd2, recording), moments(recording)
+    before = run(session, told[:75])
+    left = run(session, told, 75 / 60 + shift) + [
+        motion for motion in session.flush()[:1] if motion is not None
+    ]
+    expected = run(fresh, told, 75 / 60 + shift) + [
+        motion for motion in fresh.flush()[:1] if motion is not None
+    ]
+    assert all((motion.timestamps.diff() > 0).all() for motion in before + left)
+    assert sum(map(len, before + left)) == 75 + FRAMES
+    late, expected = _joined(left, FRAMES), _joined(expected, FRAMES)
+    if shift < 0:
+        for name in ("timestamps", "R_parent_joint", "t_world_root"):
+            assert torch.equal(late[name], expected[name])
+    else:
+        assert torch.allclose(late["timestamps"], expected["timestamps"], atol=1e-6)
+        assert late["R_parent_joint"].isfinite().all()
+    assert session.dropped == [0, 0]
+
+
+def _joined(parts: list[Motion], count: int) -> dict[str, torch.Tensor]:
+    """The last frames of several pieces."""
+    names = ("timestamps", "R_parent_joint", "t_world_root")
+    return {name: torch.cat([getattr(part, name) for part in parts])[-count:] for name in names}
+
+
+@pytest.mark.parametrize("waiting", [1, AGREEING - 1])
+def test_a_session_is_saved_while_its_clock_moves(hmd2, recording, tmp_path, waiting):
+    whole, told = opened(hmd2, recording), moments(recording)
+    pushed = [told[0]._replace(timestamp=math.nan), *told[:75]]
+    late = [moment._replace(timestamp=moment.timestamp + 900, floor_height=0.1) for moment in told]
+    run(whole, pushed)
+    run(whole, late[:waiting])
+    whole.save(tmp_path / "session.safetensors")
+    again = Session.load(tmp_path / "session.safetensors", hmd2)
+    assert again.refused == whole.refused == [{"head: not finite": 1}, {}]
+    assert again.dropped == whole.dropped == [1, 0]
+    expected, resumed = run(whole, late[waiting:]), run(again, late[waiting:])
+    assert len(expected) == len(resumed) > 5
+    for motion, other in zip(expected, resumed):
+        assert_equal(motion, other)
+
+
+def test_what_waits_for_a_lost_head_is_bounded(hmd2, recording, monkeypatch):
+    monkeypatch.setattr(hmd2_wearer, "MAX_WAITING", 30)
+    session = Session(hmd2, [wearer(recording)], [0], Memory(max_points=1000))
+    for k in range(200):
+        session.push([[Sensed(k / 60, None, torch.rand(100, 3), torch.zeros(IMAGE), 0.0)]])
+    state = session._lanes[0]
+    assert len(state.pictures) == len(state.floors) == 30
+    assert len(state.places._map) == sum(len(points) for points, _ in state.places._new) <= 4000
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_comes_it_goes_on(hmd2, recording, seed):
+    session, draw, told = opened(hmd2, recording), Mutator(seed), moments(recording)
+    fine = Session(hmd2, [wearer(recording)], [4])
+    for k in range(240):
+        good = told[k % FRAMES]
+        bad = Sensed(
+            draw.time(k / 60), draw.pose(good.T_world_device),
+            draw.one(VECTORS) if draw.bad() else good.points_world, draw.one(EMBEDDINGS) if draw.bad() and k else good.embedding,
+            draw.one(TIMES) if draw.bad() else None,
+        )  # fmt: skip
+        neighbour = [told[k]] if k < FRAMES else []
+        for motion in (said := push(session, [bad], neighbour)):
+            assert motion is None or motion.R_parent_joint.isfinite().all()
+            assert motion is None or motion.t_world_root.isfinite().all()
+        alone = fine.push([neighbour])[0]
+        assert (alone is None) == (said[1] is None)
+        assert alone is None or torch.allclose(alone.t_world_root, said[1].t_world_root, atol=1e-4)
+    well = run(session, told, 4.0)
+    assert max(motion.timestamps[-1].item() for motion in well) > 5.1
+    state = session._lanes[0]
+    assert len(state.pictures) + len(state.floors) + len(state.track._poses) < 300
+
+
+def damaged(tensors: dict, head: dict):
+    """Files with one thing wrong: a part missing, of another type or shape, or a foreign one."""
+    for name, tensor in tensors.items():
+        others = {key: value for key, value in tensors.items() if key != name}
+        if not name.startswith("0.door"):
+            yield f"no {name}", others, head
+        yield f"{name} of integers", others | {name: torch.zeros(tensor.shape, dtype=torch.int16)}, head
+        yield f"{name} of another shape", others | {name: torch.zeros(3, 7, dtype=tensor.dtype)}, head
+    yield "a foreign tensor", tensors | {"0.track.more": torch.zeros(3)}, head
+    for name in head:
+        yield f"no {name}", tensors, {key: value for key, value in head.items() if key != name}
+        if name != "embedded":
+            for value in (None, "text", [1, 2], {"a": {}}):
+                yield f"{name}: {value}", tensors, head | {name: value}
+    for name in head["wearers"][0]:
+        for value in (None, "text", [1, 2], {"$tensor": "nowhere"}, {"$type": "Skeleton"}):
+            yield f"{name}: {value}", tensors, head | {"wearers": [head["wearers"][0] | {name: value}]}
+
+
+def test_damaged_files_are_no_sessions(hmd2, recording, tmp_path):
+    session, path = Session(hmd2, [wearer(recording)], [0]), tmp_path / "session.safetensors"
+    told = moments(recording)
+    stream(session, told[:35], ended=False)
+    session.push([[told[40]._replace(timestamp=900.0)]])
+    session.save(path)
+    with safe_open(path, "pt") as file:
+        head = json.loads(file.metadata()["wearcap_stream"])
+    tensors, whole = load_file(path), path.read_bytes()
+    Session.load(path, hmd2)
+    count = 0
+    for what, part, about in damaged(tensors, head):
+        save_file(part, path, {"wearcap_stream": json.dumps(about)})
+        try:
+            Session.load(path, hmd2)
+        except WearcapError:
+            count += 1
+        else:
+            pytest.fail(f"{what}: taken for a session")
+    assert count > 100
+    for size in (0, 5, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(WearcapError, match="not a saved session"):
+            Session.load(path, hmd2)
+    for text in ("", "[]", "7", "[" * 5000, "{"):
+        save_file(tensors, path, {"wearcap_stream": text})
+        with pytest.raises(WearcapError, match="not a saved session"):
+            Session.load(path, hmd2)
+    with pytest.raises(WearcapError, match="not a saved session"):
+        Session.load(tmp_path / "nowhere", hmd2)
