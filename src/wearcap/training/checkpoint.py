@@ -1,5 +1,6 @@
 """What a training run puts into its checkpoints beside weights, and how their files are written and read."""
 
+import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,14 +42,10 @@ class RunCheckpointIO(CheckpointIO):
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
         """Write a checkpoint. Raises WearcapError when the disk is full or the folder cannot be written."""
+        content = io.BytesIO()  # PyTorch's own writing to a file says nothing of why it failed
+        torch.save(checkpoint, content)
         with atomic_path(path) as temporary:
-            try:
-                torch.save(checkpoint, temporary)
-            except (
-                RuntimeError
-            ) as error:  # PyTorch's writer says so of a full disk, without the system's error number
-                cause = error.__context__
-                raise cause if isinstance(cause, OSError) else OSError(None, _first_line(error)) from error
+            temporary.write_bytes(content.getbuffer())
 
     def load_checkpoint(
         self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
@@ -61,10 +58,6 @@ class RunCheckpointIO(CheckpointIO):
         path = Path(path).resolve()
         if self.folder in path.parents and path.suffix == ".ckpt":
             path.unlink(missing_ok=True)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
 TRAINING_STATE = ("state_dict", "optimizer_states", "lr_schedulers", "loops", "epoch", "global_step")
