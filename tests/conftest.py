@@ -4,6 +4,7 @@ WEARCAP_EXAMPLES=1000 makes the property tests and the fuzzing of the readers se
 """
 
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,9 @@ from hypothesis import settings
 from jaxtyping import install_import_hook
 
 install_import_hook("wearcap", "shapes.checker")
+
+# What tests remember of files (checksums) is not the user's; it goes with the system's temporary files.
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="wearcap-tests-")
 
 settings.register_profile("suite", max_examples=int(os.environ.get("WEARCAP_EXAMPLES", "25")), deadline=None)
 settings.load_profile("suite")

@@ -153,7 +153,7 @@ ROWS = {
     "train: three frames": (
         lambda data, ckpt, tmp, out: training(brief_dataset(tmp / "brief"), out), "no windows in split 'train'"),
     "train: cut short": (
-        lambda data, ckpt, tmp, out: training(truncated_dataset(tmp / "cut"), out), "not a readable recording"),
+        lambda data, ckpt, tmp, out: training(truncated_dataset(tmp / "cut"), out), "It was cut short or replaced"),
     "train: fps 0": (lambda data, ckpt, tmp, out: training(still_dataset(tmp / "still"), out), "0.0 frames per second"),
     "train: typo": (
         lambda data, ckpt, tmp, out: training(data, out, "trainer.max_step=3"), "Did you mean 'trainer.max_steps'"),

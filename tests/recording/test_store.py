@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
+import safetensors
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -31,6 +32,7 @@ from wearcap.recording import (
     Recording,
     RecordingStore,
 )
+from wearcap.recording import store as store_module
 from wearcap.recording.interactions import Interactions
 from wearcap.recording.serialize import dumps, flatten, unflatten
 from wearcap.recording.store import RecordingFile, save_recording
@@ -153,6 +155,68 @@ def test_the_manifest_says_what_the_file_is(store):
     assert store.names("val") == []
     with pytest.raises(WearcapError, match="no split 'trian'"):
         store.names("trian")
+
+
+HOSTILE = {
+    "more frames than bytes": ("frames", 10**12), "no frames": ("frames", -1), "frames as text": ("frames", "90"),
+    "a rate as text": ("fps", "60"), "a rate without end": ("fps", float("inf")), "no rate": ("fps", None),
+    "bytes as text": ("bytes", "1"), "a duration that is none": ("duration_s", float("nan")),
+    "another folder": ("file", "../other.safetensors"), "a split of its own": ("split", "every"), "true": ("frames", True),
+    "a list": ("subject", ["s1"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", HOSTILE)
+def test_a_manifest_is_not_taken_at_its_word(change, store):
+    key, value = HOSTILE[change]
+    manifest = json.loads(store.manifest_path.read_text())
+    manifest["recordings"]["all"][key] = value
+    store.manifest_path.write_text(json.dumps(manifest))
+    with pytest.raises(WearcapError, match=r"manifest\.json: not a readable manifest"):
+        RecordingStore.open(store.root)
+
+
+def test_a_manifest_that_is_nested_without_end_is_refused(store):
+    store.manifest_path.write_text('{"schema_version":1,"recordings":' + "[" * 100_000)
+    with pytest.raises(WearcapError, match="nested too deeply"):
+        RecordingStore.open(store.root)
+
+
+PARTS = {
+    "a motion for a head": lambda tree: tree.update(head=tree["motion"]),
+    "a tensor for a part": lambda tree: tree.update(motion={"$tensor": "motion.t_world_root"}),
+    "a list for a part": lambda tree: tree.update(points=[1, 2]),
+    "a text for a tensor": lambda tree: tree["motion"].update(t_world_root="far"),
+    "another shape": lambda tree: tree["motion"].update(t_world_root={"$tensor": "motion.R_parent_joint"}),
+    "a number for a name": lambda tree: tree.update(name=3),
+    "a part that is unknown": lambda tree: tree["motion"].update({"$type": "Path"}),
+    "names that are numbers": lambda tree: tree["skeleton"].update(joint_names={"$tuple": [1, 2]}),
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_of_another_kind_is_refused(part, tmp_path):
+    path = tmp_path / "x.safetensors"
+    save_recording(full_recording(), path)
+    with safetensors.safe_open(str(path), framework="pt") as file:
+        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        content = json.loads(file.metadata()["wearcap"])
+    PARTS[part](content["recording"])
+    save_file(tensors, path, {"wearcap": json.dumps(content)})
+    with pytest.raises(WearcapError, match=r"x\.safetensors: "):
+        RecordingFile(path).load()
+    for name in ("head", "motion", "points", "skeleton"):
+        with contextlib.suppress(WearcapError):
+            RecordingFile(path).part(name)
+
+
+def test_a_file_that_may_not_be_read_is_not_called_missing(store, monkeypatch):
+    def refused(*_args, **_options):
+        raise FileNotFoundError(f"No such file or directory: {store.path_of('all')}")
+
+    monkeypatch.setattr(store_module.safetensors, "safe_open", refused)
+    with pytest.raises(WearcapError, match=r"all\.safetensors: cannot be read"):
+        store.load("all")
 
 
 @pytest.mark.parametrize("name", ["", "..", "../up", "a/b", "/etc/x", ".hidden"])

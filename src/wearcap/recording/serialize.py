@@ -7,7 +7,9 @@ tensor is a reference. Only the classes in `KNOWN` can come back; nothing in a f
 import dataclasses
 import functools
 import json
-from typing import Any, get_args, get_type_hints
+from collections.abc import Mapping
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from torch import Tensor
 
@@ -64,8 +66,45 @@ def unflatten(tree: Any, fetch, known: dict[str, type] = KNOWN) -> Any:
         return items
     if tree["$type"] not in known:
         raise WearcapError(f"unknown part {tree['$type']!r}", expected=f"one of {', '.join(sorted(known))}")
-    _require_one_length(known[tree["$type"]], items)
-    return known[tree["$type"]](**items)
+    kind = known[tree["$type"]]
+    for name, item in items.items():
+        require_part(kind, name, item)
+    _require_one_length(kind, items)
+    return kind(**items)
+
+
+def require_part(kind: type, name: str, value: Any) -> None:
+    """Raise WearcapError unless a value is what a field of a dataclass is annotated with (tensors: type and shape)."""
+    hint = _hints(kind).get(name)
+    if hint is not None and not _fits(value, hint):
+        found = (
+            f"{value.dtype} of shape {list(value.shape)}"
+            if isinstance(value, Tensor)
+            else type(value).__name__
+        )
+        raise WearcapError(f"{kind.__name__}.{name} is a {found}", expected=str(hint)[:120])
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value that came out of a file has an annotated type, as far as containers' own items."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return True
+    if origin in (Union, UnionType):
+        return any(_fits(value, part) for part in inner)
+    if origin is tuple:
+        items = inner[:1] * len(value) if isinstance(value, tuple) and inner[1:] == (...,) else inner
+        return isinstance(value, tuple) and len(items) == len(value) and all(map(_fits, value, items))
+    if origin in (dict, Mapping):
+        return isinstance(value, dict) and all(_fits(item, inner[1]) for item in value.values())
+    if hint in (int, float):
+        return isinstance(value, int | hint) and not isinstance(value, bool)
+    return isinstance(value, origin or hint)
 
 
 def _require_one_length(kind: type, items: dict[str, Any]) -> None:
@@ -80,7 +119,7 @@ def _require_one_length(kind: type, items: dict[str, Any]) -> None:
 @functools.cache
 def _over_time(kind: type) -> tuple[str, ...]:
     """Fields annotated with the axis "time" first."""
-    hints = get_type_hints(kind)
+    hints = _hints(kind)
     shapes = {
         name: [getattr(part, "dim_str", "") for part in (get_args(hint) or (hint,))]
         for name, hint in hints.items()

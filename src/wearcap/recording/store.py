@@ -2,22 +2,28 @@
 
 import dataclasses
 import json
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import safetensors
 from safetensors.torch import save
 from torch import Tensor
 
+from wearcap.checksums import remembered_sha256
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, sha256_of, write_text
+from wearcap.files import atomic_path, parse_json, sha256_of, write_text
 from wearcap.recording.recording import Recording
-from wearcap.recording.serialize import dumps, flatten, unflatten
+from wearcap.recording.serialize import dumps, flatten, require_part, unflatten
 
 SCHEMA_VERSION = 1
 SPLITS = ("train", "val", "test")
+MANIFEST, FOLDER = "manifest.json", "recordings"
+MAX_FRAMES, MAX_FPS = 10**9, 1e5
+"""Most that a manifest may say of a recording: a week at 1.6 kHz."""
 
 
 @dataclass(frozen=True)
@@ -39,15 +45,25 @@ class Entry:
     """Hash of source bytes and preparation settings: prepare skips a recording whose hash is current."""
 
 
-class RecordingFile:
-    """One recording on disk, opened without reading its tensors; slices read nothing but themselves."""
+_MOST = {"frames": MAX_FRAMES, "fps": MAX_FPS, "duration_s": 1e9, "bytes": 1 << 50}
 
-    def __init__(self, path: str | Path):
+
+class RecordingFile:
+    """One recording on disk, opened without reading its tensors; slices read nothing but themselves.
+
+    A file in a data set is verified against the manifest's checksum when it is opened, once as long as it stays the
+    same (`wearcap.checksums`).
+    """
+
+    def __init__(self, path: str | Path, *, verify: bool = True):
+        """Raises WearcapError when the file is missing, damaged or foreign, or not the one that the manifest names."""
         self.path = Path(path)
+        if verify:
+            _verify(self.path)
         try:
             self._file = safetensors.safe_open(str(self.path), framework="pt")
         except FileNotFoundError as error:
-            raise WearcapError("no such recording", where=path) from error
+            raise self._missing(error) from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
             raise WearcapError(
                 "not a readable recording", where=path, expected="a complete .safetensors file",
@@ -57,10 +73,10 @@ class RecordingFile:
         if "wearcap" not in metadata:
             raise WearcapError("a .safetensors file, but not a recording", where=path,
                                expected="one that `wearcap prepare` wrote")  # fmt: skip
+        content = parse_json(metadata["wearcap"], path)
         try:
-            content = json.loads(metadata["wearcap"])
-            version, self._tree = content["schema_version"], content["recording"]
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            version, self._tree = content["schema_version"], dict(content["recording"])
+        except (KeyError, TypeError, ValueError) as error:
             raise self._unreadable(error) from error
         if version != SCHEMA_VERSION:
             raise WearcapError(f"schema version {version}", where=path,
@@ -86,7 +102,12 @@ class RecordingFile:
 
     def part(self, name: str):
         """One top-level part ("skeleton", "head", "motion" …), or None where the recording lacks it."""
-        return self._built(self._tree.get(name))
+        part = self._built(self._tree.get(name))
+        try:
+            require_part(Recording, name, part)
+        except WearcapError as error:
+            raise self._unreadable(error) from error
+        return part
 
     def load(self) -> Recording:
         recording = self._built(self._tree)
@@ -100,6 +121,12 @@ class RecordingFile:
         except (WearcapError, TypeError, ValueError, KeyError, AttributeError) as error:
             raise self._unreadable(error) from error
 
+    def _missing(self, error: OSError) -> WearcapError:
+        """safetensors calls a file that may not be read a missing one."""
+        if self.path.exists():
+            return WearcapError(f"cannot be read ({error.strerror or 'no permission'})", where=self.path)
+        return WearcapError("no such recording", where=self.path)
+
     def _unreadable(self, error: Exception) -> WearcapError:
         return WearcapError(f"its description is unreadable ({error})", where=self.path,
                             fix="Prepare this recording again.")  # fmt: skip
@@ -108,6 +135,35 @@ class RecordingFile:
         if key not in self.keys:
             raise WearcapError(f"this recording has no {key!r}", where=self.path,
                                expected=f"one of {', '.join(sorted(self.keys))}")  # fmt: skip
+
+
+def _verify(path: Path) -> None:
+    """Raise WearcapError when a file is not what the manifest of its data set says; other files have no checksum."""
+    manifest = path.parent.parent / MANIFEST
+    try:
+        if path.parent.name != FOLDER or not manifest.is_file() or not path.is_file():
+            return
+        found = manifest.stat()
+        entry = _entries(manifest, found.st_size, found.st_mtime_ns, found.st_ino).get(path.name)
+        if entry is not None and (size := path.stat().st_size) != entry.bytes:
+            raise WearcapError(f"{size} bytes long", where=path, expected=f"{entry.bytes} bytes, as the manifest says",
+                               fix="It was cut short or replaced: prepare it again.")  # fmt: skip
+        if entry is not None and remembered_sha256(path) != entry.sha256:
+            raise _differs(path)
+    except OSError as error:
+        raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
+
+
+def _differs(path: Path) -> WearcapError:
+    return WearcapError("its checksum differs from the manifest's", where=path,
+                        fix="It was damaged or replaced: prepare it again.")  # fmt: skip
+
+
+@lru_cache(maxsize=16)
+def _entries(manifest: Path, *stamp: int) -> Mapping[str, Entry]:
+    """Entries of a manifest by file name; `stamp` (size, time, inode) tells when it has to be read anew."""
+    entries = RecordingStore(manifest.parent).entries
+    return {recording_path(Path(), name).name: entry for name, entry in entries.items()}
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
@@ -129,35 +185,47 @@ class RecordingStore:
     @classmethod
     def open(cls, root: str | Path) -> "RecordingStore":
         """A store that must exist already."""
-        if not (Path(root) / "manifest.json").is_file():
+        if not (Path(root) / MANIFEST).is_file():
             raise WearcapError("no data set here", where=root, expected="a folder with a manifest.json",
                                fix="Make one with `wearcap prepare`.")  # fmt: skip
         return cls(root)
 
     @property
     def manifest_path(self) -> Path:
-        return self.root / "manifest.json"
+        return self.root / MANIFEST
 
     def _read_manifest(self) -> dict[str, Entry]:
+        path = self.manifest_path
         try:
-            manifest = json.loads(self.manifest_path.read_text(encoding="utf-8"))
-            version = manifest["schema_version"]
-            if version == SCHEMA_VERSION:
-                entries = {name: Entry(**entry) for name, entry in manifest["recordings"].items()}
-                for name, entry in entries.items():
-                    if self.root / entry.file != recording_path(self.root, name):
-                        raise ValueError(f"{name!r} lies at {entry.file!r}, outside this data set")
-                return entries
-        except (
-            ValueError,
-            KeyError,
-            TypeError,
-            AttributeError,
-        ) as error:  # JSON's and UTF-8's errors are ValueErrors
-            raise WearcapError(f"not a readable manifest ({error})", where=self.manifest_path,
+            manifest = parse_json(path.read_bytes(), path)
+        except OSError as error:
+            raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
+        version = manifest.get("schema_version") if isinstance(manifest, dict) else None
+        if version != SCHEMA_VERSION:
+            raise WearcapError(f"schema version {str(version)[:40]}", where=path,
+                               expected=f"version {SCHEMA_VERSION}", fix="Prepare the data set again.")  # fmt: skip
+        try:
+            return {name: self._entry(name, entry) for name, entry in manifest["recordings"].items()}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise WearcapError(f"not a readable manifest ({str(error)[:200]})", where=path,
                                fix="Delete it and prepare the data set again.") from error  # fmt: skip
-        raise WearcapError(f"schema version {version}", where=self.manifest_path,
-                           expected=f"version {SCHEMA_VERSION}", fix="Prepare the data set again.")  # fmt: skip
+
+    def _entry(self, name: str, row: dict[str, Any]) -> Entry:
+        """One row of the manifest. Raises ValueError or TypeError for values that no recording has."""
+        for field in dataclasses.fields(Entry):
+            value = row[field.name]
+            if type(value) is not field.type and not (field.type is float and type(value) is int):
+                raise ValueError(f"{field.name} of {name!r} is {str(value)[:40]!r}")
+            if field.type in (int, float) and not 0 <= value <= _MOST.get(field.name, math.inf):
+                raise ValueError(f"{field.name} of {name!r} is {value}")
+        entry = Entry(**row)
+        if self.root / entry.file != recording_path(self.root, name):
+            raise ValueError(f"{name!r} lies at {entry.file!r}, outside this data set")
+        if entry.split not in SPLITS:
+            raise ValueError(f"{name!r} is in split {entry.split[:40]!r}")
+        if entry.frames * entry.fps and entry.bytes < entry.frames:
+            raise ValueError(f"{name!r} has {entry.frames} frames in {entry.bytes} bytes")
+        return entry
 
     def names(self, split: str | None = None) -> list[str]:
         """Recordings of one split ("train", "val", "test"), or all, in order."""
@@ -180,38 +248,41 @@ class RecordingStore:
     def path_of(self, name: str) -> Path:
         return recording_path(self.root, name)
 
-    def open_file(self, name: str) -> RecordingFile:
-        """Open one recording for slicing. Raises WearcapError when it is missing, truncated or foreign."""
+    def require(self, name: str) -> None:
+        """Raise WearcapError when the data set has no recording of this name."""
         if name not in self.entries:
             raise WearcapError(f"no recording {name!r}", where=self.manifest_path,
                                expected=f"one of {len(self.entries)} recordings, as {self.names()[:3]}")  # fmt: skip
-        path = self.root / self.entries[name].file
-        if path.exists() and path.stat().st_size != self.entries[name].bytes:
-            raise WearcapError(f"{path.stat().st_size} bytes long", where=path,
-                               expected=f"{self.entries[name].bytes} bytes, as the manifest says",
-                               fix="It was cut short or replaced: prepare it again.")  # fmt: skip
-        return RecordingFile(path)
+
+    def open_file(self, name: str) -> RecordingFile:
+        """Open one recording for slicing. Raises WearcapError when it is missing, damaged or foreign."""
+        self.require(name)
+        return RecordingFile(self.root / self.entries[name].file)
 
     def load(self, name: str) -> Recording:
         return self.open_file(name).load()
 
     def verify(self) -> Iterator[tuple[str, WearcapError | None]]:
-        """Check every file against its checksum; yields (name, what is wrong or None)."""
-        for name, entry in sorted(self.entries.items()):
+        """Check every file against its checksum, whatever is remembered of it; yields (name, what is wrong or None)."""
+        for name in self.names():
             try:
-                self.open_file(name)
-                wrong = sha256_of(self.root / entry.file) != entry.sha256
-                yield name, WearcapError("its checksum differs from the manifest's", where=entry.file,
-                                         fix="Prepare it again.") if wrong else None  # fmt: skip
+                self.verify_one(name)
+                yield name, None
             except WearcapError as error:
                 yield name, error
+
+    def verify_one(self, name: str) -> None:
+        """Hash one file and open it. Raises WearcapError when it is missing, damaged, or not the manifest's."""
+        file = self.open_file(name)
+        if sha256_of(file.path) != self.entries[name].sha256:
+            raise _differs(file.path)
 
 
 def recording_path(root: Path, name: str) -> Path:
     """Where a data set keeps a recording. Raises WearcapError when the name is no plain file name."""
     if not name or Path(name).name != name or name.startswith("."):
         raise WearcapError(f"{name!r} cannot name a recording", expected="a plain file name")
-    return Path(root) / "recordings" / f"{name}.safetensors"
+    return Path(root) / FOLDER / f"{name}.safetensors"
 
 
 def entry_for(recording: Recording, root: Path, split: str, config_hash: str) -> Entry:

@@ -34,7 +34,7 @@ def embed_dataset(
         with progress_bar(len(store.entries), 0, progress) as advance:
             for name in store.names():
                 try:
-                    file = RecordingFile(store.path_of(name))
+                    file = RecordingFile(store.path_of(name), verify=_is_registered(store, name))
                     camera = file.part("camera")
                     if not isinstance(camera, CameraStream) or not (camera.video or camera.image_files):
                         report.notes[name] = "no head camera's pictures"
@@ -61,9 +61,15 @@ def embed_dataset(
 
 def _is_current(store: RecordingStore, name: str, camera: CameraStream, embedded_by: str) -> bool:
     """A run that was killed may have written a file that the manifest does not know yet: it is written again."""
-    known = store.path_of(name).stat().st_size == store.entries[name].bytes
+    known = _is_registered(store, name)
     both = camera.embedding is not None and camera.embedding_mirrored is not None
     return known and both and camera.embedding_name == embedded_by
+
+
+def _is_registered(store: RecordingStore, name: str) -> bool:
+    """Whether a recording's file is not younger than the manifest, which is written after it."""
+    path = store.path_of(name)
+    return not path.is_file() or path.stat().st_mtime_ns <= store.manifest_path.stat().st_mtime_ns
 
 
 def _embed(

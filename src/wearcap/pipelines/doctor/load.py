@@ -47,7 +47,7 @@ def patients(path: Path) -> list[Patient]:
     """All recordings in a path, in order of name. Raises WearcapError when there is none."""
     if not path.exists() and (path.parent / "manifest.json").is_file():
         store = RecordingStore.open(path.parent)
-        store.open_file(path.name)
+        store.require(path.name)
         return [Patient(path.name, partial(_read_stored, store, path.name))]
     if not path.exists():
         raise WearcapError("no such file or folder", where=path)
@@ -99,6 +99,8 @@ def _as_head(track: Trajectory) -> HeadStream:
 
 
 def _read_stored(store: RecordingStore, name: str) -> Loaded:
+    """A recording of a data set, its bytes hashed anew."""
+    store.verify_one(name)
     recording = store.load(name)
     return recording, check_files(recording, store.root)
 
