@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import re
+import socket
 import sys
 import threading
 from http import HTTPStatus
@@ -28,9 +29,13 @@ VIDEO_TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".
 MAX_SAVE_BYTES = 16 << 20
 PIECE_BYTES = 1 << 18
 MAX_CONNECTIONS = 32
-"""Connections at a time, each of which takes a thread; a browser opens six of them to a page."""
+"""Connections at a time, each of which takes a thread; a browser opens six of them to a page.
+
+Where more come, those that have not asked for anything yet, or not with the token, are closed first.
+"""
 IDLE_S = 30.0
 """A connection on which nothing moves for so long is closed. A browser opens it again when it needs it."""
+_CLOSE_S = 5.0
 _PORTS_TRIED = 50
 _GONE = (ConnectionError, TimeoutError)
 
@@ -76,6 +81,7 @@ class AnnotationServer:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
+    request_queue_size = 128  # a burst waits for its turn, instead of a second for the next try
     allow_reuse_address = os.name == "posix"
     desk: Desk
     guard: Guard
@@ -84,26 +90,55 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]):
         super().__init__(address, handler)
         self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        self._idle: dict[socket.socket, None] = {}
+        self._idle_lock = threading.Lock()
 
     def process_request(self, request: Any, client_address) -> None:
-        """Answer a connection in a thread of its own, or at once where there are too many."""
-        if not self._free.acquire(blocking=False):
+        """Answer a connection in a thread of its own; where there are too many, the longest idle one is closed."""
+        if not self._free.acquire(blocking=False) and not (
+            self._close_longest_idle() and self._free.acquire(timeout=_CLOSE_S)
+        ):
             with contextlib.suppress(OSError):
                 request.sendall(
                     b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
                 )
             return self.shutdown_request(request)
+        self.begin_idle(request)
         try:
             return super().process_request(request, client_address)
         except BaseException:  # no thread was to be had
-            self._free.release()
+            self._release(request)
             raise
 
     def process_request_thread(self, request, client_address) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._free.release()
+            self._release(request)
+
+    def begin_idle(self, connection: socket.socket) -> None:
+        """From now on a connection may be closed for another one."""
+        with self._idle_lock:
+            self._idle.setdefault(connection)
+
+    def end_idle(self, connection: socket.socket) -> bool:
+        """From now on a connection is kept open. False where it has been closed for another one already."""
+        with self._idle_lock:
+            return self._idle.pop(connection, False) is None
+
+    def _close_longest_idle(self) -> bool:
+        with self._idle_lock:
+            connection = next(iter(self._idle), None)
+            if connection is None:
+                return False
+            del self._idle[connection]
+        with contextlib.suppress(OSError):  # its thread wakes up and ends
+            connection.shutdown(socket.SHUT_RDWR)
+        return True
+
+    def _release(self, connection: socket.socket) -> None:
+        self.end_idle(connection)
+        self._free.release()
 
     def handle_error(self, request, client_address) -> None:
         """Browsers drop connections as they seek in a video, or let them lie; that is no news."""
@@ -121,6 +156,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def handle_one_request(self) -> None:
         self._granted: dict[str, str] = {}
+        self.server.begin_idle(self.connection)
         super().handle_one_request()
 
     def do_HEAD(self) -> None:
@@ -140,6 +176,8 @@ class _Handler(BaseHTTPRequestHandler):
         self._granted = {"Connection": "close"}
         try:
             self._granted = self.server.guard.admit(self.path, self.headers)
+            if not self.server.end_idle(self.connection):
+                raise ConnectionAbortedError("closed for another connection")
             action(self.path.partition("?")[0])
         except Refused as error:
             self.close_connection = True
