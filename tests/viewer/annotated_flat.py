@@ -68,10 +68,11 @@ def served(dataset: Path, output: Path, where: str = "", **options) -> Iterator[
 
 
 def ask(server: AnnotationServer, method: str, path: str, body: object = None, **headers: str):
-    """Status, headers and body of a request."""
-    connection = http.client.HTTPConnection("127.0.0.1", int(server.url.rsplit(":", 1)[1]), timeout=20)
+    """Status, headers and body of a request, with the cookie of a page that was opened by its address."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
     text = None if body is None else body if isinstance(body, str) else json.dumps(body)
-    given = ({"Content-Type": "application/json"} if text is not None else {}) | {
+    given = {"Cookie": f"wearcap_token_{server.port}={server.guard.token}"}
+    given |= ({"Content-Type": "application/json"} if text is not None else {}) | {
         key.replace("_", "-"): value for key, value in headers.items()
     }
     connection.request(method, path, text, given)

@@ -61,6 +61,10 @@ def click_hand(browser: Chromium, hand: str) -> None:
     browser.click(*browser.evaluate(f"annotator.handPosition('{hand}')"))
 
 
+def on_disk_at_all(output: Path) -> bool:
+    return (output / "r0.contacts.json").exists()
+
+
 def on_disk(output: Path, hand: str) -> list[list[float]]:
     return json.loads((output / "r0.contacts.json").read_text())["contacts"][f"{hand}_hand"]
 
@@ -174,15 +178,17 @@ def test_editing_by_keys_and_mouse(dataset, tmp_path):
 def test_labels_outlive_a_server_that_is_away_and_another_window(dataset, tmp_path):
     profile = tmp_path / "profile"
     with opened(dataset, tmp_path, profile) as (browser, server):
-        port = int(server.url.rsplit(":", 1)[1])
         server.stop()
         browser.key("End")
         browser.key("ArrowLeft", SHIFT)
         browser.key("a")
         browser.poll(lambda: "does not answer" in browser.text())
-        again = AnnotationServer(Desk.of(dataset / "r0", tmp_path), port)
-        assert again.url == server.url
+        again = AnnotationServer(Desk.of(dataset / "r0", tmp_path), server.port)
+        assert again.port == server.port
         try:
+            browser.poll(lambda: "open the address that it printed" in browser.text())
+            assert not on_disk_at_all(tmp_path)
+            browser.call("Target.createTarget", url=again.url)  # another window, as the command opens it
             assert saved(browser)
             assert len(on_disk(tmp_path, "left")) == 1
             AnnotationFile(tmp_path, CLOCK).save(labels([(1.0, 2.0)]), "", force=True)

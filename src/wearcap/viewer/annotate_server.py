@@ -1,23 +1,25 @@
 """The annotator's web server: the page's own files, a recording's numbers once, its video in ranges, and saves.
 
-It listens on this machine alone, and answers only pages that it sent itself.
+It listens on this machine alone, and answers only what its guard admits: its own page, opened with its token.
 """
 
+import contextlib
 import json
 import os
 import re
+import socket
 import sys
 import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from wearcap.errors import WearcapError
 from wearcap.io.contact_labels import annotation_of, hcontact_text
 from wearcap.viewer.annotate import Desk
 from wearcap.viewer.annotation_file import Conflict
+from wearcap.viewer.guard import Guard, Refused
 
 PAGE = Path(__file__).parent / "annotator"
 TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8",
@@ -26,8 +28,16 @@ VIDEO_TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".
                ".avi": "video/x-msvideo", ".ogv": "video/ogg"}  # fmt: skip
 MAX_SAVE_BYTES = 16 << 20
 PIECE_BYTES = 1 << 18
-_LOCAL = {"127.0.0.1", "localhost", "::1"}
+MAX_CONNECTIONS = 32
+"""Connections at a time, each of which takes a thread; a browser opens six of them to a page.
+
+Where more come, those that have not asked for anything yet, or not with the token, are closed first.
+"""
+IDLE_S = 30.0
+"""A connection on which nothing moves for so long is closed. A browser opens it again when it needs it."""
+_CLOSE_S = 5.0
 _PORTS_TRIED = 50
+_GONE = (ConnectionError, TimeoutError)
 
 
 class AnnotationServer:
@@ -35,21 +45,27 @@ class AnnotationServer:
 
     def __init__(self, desk: Desk, port: int = 8090):
         """Raises WearcapError when no port is free."""
+        self.guard = Guard("127.0.0.1")
         for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
             try:
-                self._server = _Server(("127.0.0.1", candidate), _Handler)
+                self._server = _Server((self.guard.host, candidate), _Handler)
                 break
             except OSError:
                 continue
         else:
             raise WearcapError(f"no free port from {port} on", fix="Give another one with --port.")
-        self._server.desk = desk
+        self._server.desk, self._server.guard = desk, self.guard
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 
     @property
+    def port(self) -> int:
+        return self._server.server_port
+
+    @property
     def url(self) -> str:
-        return f"http://127.0.0.1:{self._server.server_port}"
+        """The address to open; it holds the token without which the page does not answer."""
+        return self.guard.url(self.port)
 
     def wait(self) -> None:
         """Serve until interrupted."""
@@ -65,22 +81,83 @@ class AnnotationServer:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
+    request_queue_size = 128  # a burst waits for its turn, instead of a second for the next try
     allow_reuse_address = os.name == "posix"
     desk: Desk
+    guard: Guard
     stopped = False
 
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]):
+        super().__init__(address, handler)
+        self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        self._idle: dict[socket.socket, None] = {}
+        self._idle_lock = threading.Lock()
+
+    def process_request(self, request: Any, client_address) -> None:
+        """Answer a connection in a thread of its own; where there are too many, the longest idle one is closed."""
+        if not self._free.acquire(blocking=False) and not (
+            self._close_longest_idle() and self._free.acquire(timeout=_CLOSE_S)
+        ):
+            with contextlib.suppress(OSError):
+                request.sendall(
+                    b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+                )
+            return self.shutdown_request(request)
+        self.begin_idle(request)
+        try:
+            return super().process_request(request, client_address)
+        except BaseException:  # no thread was to be had
+            self._release(request)
+            raise
+
+    def process_request_thread(self, request, client_address) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._release(request)
+
+    def begin_idle(self, connection: socket.socket) -> None:
+        """From now on a connection may be closed for another one."""
+        with self._idle_lock:
+            self._idle.setdefault(connection)
+
+    def end_idle(self, connection: socket.socket) -> bool:
+        """From now on a connection is kept open. False where it has been closed for another one already."""
+        with self._idle_lock:
+            return self._idle.pop(connection, False) is None
+
+    def _close_longest_idle(self) -> bool:
+        with self._idle_lock:
+            connection = next(iter(self._idle), None)
+            if connection is None:
+                return False
+            del self._idle[connection]
+        with contextlib.suppress(OSError):  # its thread wakes up and ends
+            connection.shutdown(socket.SHUT_RDWR)
+        return True
+
+    def _release(self, connection: socket.socket) -> None:
+        self.end_idle(connection)
+        self._free.release()
+
     def handle_error(self, request, client_address) -> None:
-        """Browsers drop connections as they seek in a video; that is no news."""
-        if not isinstance(sys.exception(), ConnectionError):
+        """Browsers drop connections as they seek in a video, or let them lie; that is no news."""
+        if not isinstance(sys.exception(), _GONE):
             super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server: _Server  # pyright: ignore[reportIncompatibleVariableOverride]
+    timeout = IDLE_S
 
     def log_message(self, format: str, *args) -> None:
         """A line for every request helps nobody."""
+
+    def handle_one_request(self) -> None:
+        self._granted: dict[str, str] = {}
+        self.server.begin_idle(self.connection)
+        super().handle_one_request()
 
     def do_HEAD(self) -> None:
         self._answer(self._get)
@@ -92,22 +169,31 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(self._post)
 
     def _answer(self, action) -> None:
-        """Run an action; what a user can mend becomes {"error": …} with a fitting status."""
+        """Run an action that is admitted; what a user can mend becomes {"error": …} with a fitting status."""
         if self.server.stopped:
             self.close_connection = True
             return
+        self._granted = {"Connection": "close"}
         try:
-            if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in _LOCAL:
-                self._send_error(HTTPStatus.FORBIDDEN, "this page is for this machine alone")
-            else:
-                action(urlsplit(self.path).path)
+            self._granted = self.server.guard.admit(self.path, self.headers)
+            if not self.server.end_idle(self.connection):
+                raise ConnectionAbortedError("closed for another connection")
+            action(self.path.partition("?")[0])
+        except Refused as error:
+            self.close_connection = True
+            self._send_error(HTTPStatus.FORBIDDEN, str(error))
         except Conflict as error:
             self._send_error(HTTPStatus.CONFLICT, str(error))
         except (WearcapError, OSError) as error:
-            if isinstance(error, ConnectionError):
+            if isinstance(error, _GONE):
                 self.close_connection = True
             else:
                 self._send_error(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+
+    def end_headers(self) -> None:
+        for name, value in self._granted.items():
+            self.send_header(name, value)
+        super().end_headers()
 
     def _get(self, path: str) -> None:
         if path == "/recordings":
@@ -148,9 +234,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.close_connection = True  # until the body has been read
         if match is None or int(match[1]) >= len(self.server.desk.names):
             return self._send_error(HTTPStatus.NOT_FOUND, f"nothing to save at {path}")
-        origin = self.headers.get("Origin")
-        foreign = origin is not None and urlsplit(origin).netloc != self.headers.get("Host")
-        if foreign or self.headers.get_content_type() != "application/json":
+        if self.headers.get_content_type() != "application/json":
             return self._send_error(HTTPStatus.FORBIDDEN, "only this server's own page may save")
         if not length.isdecimal() or int(length) > MAX_SAVE_BYTES:
             return self._send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a save of {length or '?'} bytes")

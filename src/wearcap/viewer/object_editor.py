@@ -22,8 +22,10 @@ from wearcap.scene.environment import hinge_gap_m
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.scene.placing import hinge_places, snapped
 from wearcap.scene.scan import Scan
+from wearcap.viewer.guard import Guard
 from wearcap.viewer.object_editor_panels import HINTS, TOOLS, ObjectPanel, SelectPanel
 from wearcap.viewer.object_editor_view import EditorView, axis_toward, pose_of, ray_to
+from wearcap.viewer.page_server import start_server
 
 SNAP_M = 0.12
 SAVE_AFTER_S, TRY_AGAIN_S = 0.7, 10.0
@@ -48,7 +50,8 @@ class ObjectEditor:
         self._saved = self._shown = self.editing.revision
         self._selection = self.editing.selected
         self._changed_at, self._problem, self._stroke = 0.0, "", 0
-        self.server = viser.ViserServer(host=host, port=port, label="wearcap scene", verbose=False)
+        self.guard = Guard(host)
+        self.server = start_server(self.guard, port, "wearcap scene")
         self.server.scene.set_up_direction("+z")
         self.server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         self.view = EditorView(self.server, scan)
@@ -66,7 +69,8 @@ class ObjectEditor:
 
     @property
     def url(self) -> str:
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        """The address to open; it holds the token without which the page does not answer."""
+        return self.guard.url(self.server.get_port())
 
     def _add_controls(self, title: str) -> None:
         gui, points = self.server.gui, self.editing.scan.points

@@ -12,9 +12,11 @@ import viser
 from wearcap.errors import WearcapError
 from wearcap.recording import Motion, Recording
 from wearcap.scene.environment import Environment
+from wearcap.viewer.guard import Guard
 from wearcap.viewer.objects import ObjectsLayer
 from wearcap.viewer.page_layers import HeadLayer, Layer, Placed, add_points, read_scene
 from wearcap.viewer.page_motions import TRUTH, motions_shown, moving_objects, placed_motions, spacing_m
+from wearcap.viewer.page_server import start_server
 from wearcap.viewer.page_timeline import SPEEDS, Timeline
 
 UPDATES_PER_S = 30.0
@@ -37,7 +39,8 @@ class Page:
         self.timeline = _timeline(recording, motions)
         self._stopped = False
         scene = read_scene(folder / recording.scene) if recording.scene and folder is not None else None
-        self.server = viser.ViserServer(host=host, port=port, label="wearcap", verbose=False)
+        self.guard = Guard(host)
+        self.server = start_server(self.guard, port, "wearcap")
         self.server.scene.set_up_direction("+z")
         self.server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
         things = moving_objects(list(motions.values()), environment)
@@ -63,7 +66,8 @@ class Page:
 
     @property
     def url(self) -> str:
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        """The address to open; it holds the token without which the page does not answer."""
+        return self.guard.url(self.server.get_port())
 
     def _add_floor(self, recording: Recording) -> None:
         self.server.scene.add_grid(

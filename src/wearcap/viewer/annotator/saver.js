@@ -65,13 +65,13 @@ export class Saver {
       if (reply.ok) {
         this.base = answer.revision;
         if (version === this.version) this.done(); else this.keep();
+      } else if (reply.status === 403) { // another start has another token; its page brings it to this one too
+        this.later("not saved: the server was started anew, open the address that it printed");
       } else {
         this.refuse(reply.status, answer.error);
       }
     } catch {
-      this.failed = true;
-      this.show("failed", "not saved: the server does not answer, trying again");
-      if (!this.closed) this.plan(RETRY_MS);
+      this.later("not saved: the server does not answer, trying again");
     }
     this.busy = false;
     if (this.dirty && version !== this.version && !this.closed) this.plan(WAIT_MS);
@@ -81,6 +81,12 @@ export class Saver {
     this.dirty = this.failed = false;
     localStorage.removeItem(this.key);
     this.show("saved", "saved");
+  }
+
+  later(text) {
+    this.failed = true;
+    this.show("failed", text);
+    if (!this.closed) this.plan(RETRY_MS);
   }
 
   refuse(status, error) {

@@ -1,0 +1,108 @@
+"""Which requests a page in the browser answers: those that know its token, from its own pages, under its own name.
+
+Every page that is open in a browser can send requests to this machine. Three things keep the others out: the token in
+the address that a command prints, which its page then holds as a cookie; `Origin`, which browsers do not let a page
+choose; and `Host`, which shows when a foreign name was made to point here.
+"""
+
+import ipaddress
+import re
+import secrets
+import socket
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+from urllib.parse import parse_qs
+
+LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
+HEADERS = {
+    "Referrer-Policy": "same-origin",  # the address has the token in it
+    "X-Frame-Options": "DENY",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""Headers of every answer: they keep the token from leaving the page, and the page out of other pages."""
+_HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?")
+
+
+@runtime_checkable
+class Headers(Protocol):
+    """Headers of a request, as `http.server` and `websockets` have them."""
+
+    def get_all(self, name: str, /) -> list[str] | None: ...
+
+
+class Refused(Exception):
+    """A request that must not be answered, and why; to be sent with status 403."""
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Admits requests to the page that is served on the address `host`. Its token is secret."""
+
+    host: str
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
+
+    def url(self, port: int) -> str:
+        """The address to open, with the token."""
+        name = _plain(self.host)
+        if self._everywhere:
+            name = "::1" if name == "::" else "127.0.0.1"
+        return f"http://{f'[{name}]' if ':' in name else name}:{port}/?token={self.token}"
+
+    def admit(self, target: str, headers: Headers) -> dict[str, str]:
+        """Headers to send with the answer to a request for `target`. Raises Refused where it must not be answered."""
+        host = _single(headers, "Host") or ""
+        match = _HOST.fullmatch(host)
+        if match is None or not self._is_ours(_plain(match[1])):
+            raise Refused(f"this page has another address than {host[:80]!a}: open the one that was printed")
+        origin = _single(headers, "Origin")
+        if origin is not None and origin.lower() not in (f"http://{host}".lower(), f"https://{host}".lower()):
+            raise Refused("only this server's own page may speak to it")
+        cookie = f"wearcap_token_{match[2] or 80}"  # cookies ignore ports, and several pages may be open
+        if self._is_token(parse_qs(target.partition("?")[2]).get("token", [])):
+            return HEADERS | {"Set-Cookie": f"{cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"}
+        if self._is_token(_cookies(headers, cookie)):
+            return HEADERS
+        raise Refused("the token is missing or of an earlier start: open the whole address that was printed")
+
+    @property
+    def _everywhere(self) -> bool:
+        """Whether the page is served on all of the machine's addresses."""
+        address = _address(_plain(self.host))
+        return self.host == "" or (address is not None and address.is_unspecified)
+
+    def _is_ours(self, name: str) -> bool:
+        """Whether a name is one of the page's. No foreign name can be made an IP address, so any may be right."""
+        if name in LOOPBACK or name == _plain(self.host):
+            return True
+        return self._everywhere and (_address(name) is not None or name == socket.gethostname().lower())
+
+    def _is_token(self, given: list[str]) -> bool:
+        wanted = self.token.encode()
+        return any(secrets.compare_digest(each.encode(errors="replace"), wanted) for each in given)
+
+
+def _single(headers: Headers, name: str) -> str | None:
+    """A header's value. Raises Refused where there are two, of which each reader may take another one."""
+    values = headers.get_all(name) or []
+    if len(values) > 1:
+        raise Refused(f"{len(values)} headers {name}")
+    return values[0] if values else None
+
+
+def _cookies(headers: Headers, name: str) -> list[str]:
+    pairs = (pair.partition("=") for line in headers.get_all("Cookie") or [] for pair in line.split(";"))
+    return [value.strip() for key, _, value in pairs if key.strip() == name]
+
+
+def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(name)
+    except ValueError:
+        return None
+
+
+def _plain(name: str) -> str:
+    """A host's name or address in the one way it is compared: small letters, no brackets, shortest IPv6."""
+    name = name.strip("[]").lower()
+    address = _address(name)
+    return name if address is None else str(address)

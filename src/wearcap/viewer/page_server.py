@@ -1,0 +1,91 @@
+"""A viser server that answers only what its guard admits.
+
+viser itself answers every page of every site, and has no setting for that. What decides about a request is the
+`process_request` that it gives `websockets`; while it starts, ours goes before it.
+"""
+
+import socket
+import threading
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import Any
+
+import rich
+import viser
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from wearcap.errors import WearcapError
+from wearcap.viewer.guard import Guard, Refused
+
+_Answer = Callable[[ServerConnection, Request], Response | None]
+_starting = threading.Lock()
+
+
+def start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
+    """A server on the guard's host and the next free port.
+
+    Raises WearcapError where the host is no address of this machine, or viser cannot be guarded.
+    """
+    _check_host(guard.host)
+    hooked = False
+
+    def serve(*arguments: Any, **options: Any) -> Any:
+        nonlocal hooked
+        answer = options.get("process_request")
+        # Another thread may start a server of its own meanwhile.
+        if getattr(answer, "__module__", "").startswith("viser."):
+            options["process_request"] = _guarded(guard, answer)
+            hooked = True
+        return original(*arguments, **options)
+
+    console = rich.get_console()
+    with _starting:
+        quiet, console.quiet = console.quiet, True  # viser prints an address without the token
+        original = websockets.asyncio.server.serve
+        websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
+        try:
+            server = viser.ViserServer(host=guard.host, port=port, label=label, verbose=False)
+        finally:
+            websockets.asyncio.server.serve = original
+            console.quiet = quiet
+    if not hooked:  # nothing has been shown on it yet
+        server.stop()
+        raise WearcapError(f"viser {viser.__version__} does not let its pages be guarded against other sites",
+                           expected="a viser that serves through websockets.asyncio.server.serve",
+                           fix="Install the version that wearcap asks for: pip install 'viser>=1.1.1,<1.2'.")  # fmt: skip
+    return server
+
+
+def _check_host(host: str) -> None:
+    """Raises WearcapError where nothing can be served on a host; viser would try for ever."""
+    problem = ""
+    try:
+        places = socket.getaddrinfo(host or None, 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except OSError as error:
+        places, problem = [], str(error)
+    for family, kind, _, _, address in places:
+        try:
+            with socket.socket(family, kind) as probe:
+                return probe.bind(address)
+        except OSError as error:
+            problem = str(error)
+    raise WearcapError(f"cannot serve a page on {host!r} ({problem})", expected="a name or address of this machine",
+                       fix="Leave out --host for this machine alone, or give 0.0.0.0 for all of its addresses.")  # fmt: skip
+
+
+def _guarded(guard: Guard, answer: _Answer) -> _Answer:
+    """An answer to page requests and WebSocket handshakes (None: go on), after the guard has admitted them."""
+
+    def process_request(connection: ServerConnection, request: Request) -> Response | None:
+        try:
+            granted = guard.admit(request.path, request.headers)
+        except Refused as refused:
+            return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
+        response = answer(connection, request)
+        if response is not None:
+            response.headers.update(granted)
+        return response
+
+    return process_request
