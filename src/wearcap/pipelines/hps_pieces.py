@@ -21,7 +21,7 @@ MAX_PAUSE_S = 10.0
 """Behind a longer pause a piece is alone until the next one agrees; then a new stretch begins."""
 
 
-def suit_fault(suit: Motion, like: Motion | None) -> str | None:
+def suit_fault(suit: object, like: Motion | None) -> str | None:
     """What is wrong with a piece of a suit's motion beside an earlier good one."""
     if not isinstance(suit, Motion) or not isinstance(suit.timestamps, Tensor) or suit.timestamps.ndim != 1:
         return WRONG_TYPE
@@ -44,7 +44,7 @@ def _contact_fault(contact: object, count: int) -> str | None:
     return values_fault(contact, (count, *patches), 1.0)
 
 
-def localization_fault(seen: Localization, suit: Motion) -> str | None:
+def localization_fault(seen: object, suit: Motion) -> str | None:
     """What is wrong with the camera poses of a piece; rows that are not localised (confidence 0) may hold anything."""
     if not isinstance(seen, Localization) or not isinstance(seen.timestamps, Tensor):
         return WRONG_TYPE

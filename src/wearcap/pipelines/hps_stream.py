@@ -125,13 +125,14 @@ class HpsStream:
             self.refused[f"suit: {OFF_THE_CLOCK}"] += 1
             self._alone = None
 
-    def _checked(self, localization: Localization | None, suit: Motion) -> Localization | None:
+    def _checked(self, localization: object, suit: Motion) -> Localization | None:
         """The localisation of a piece, or None where it cannot be used."""
         if localization is None:
             return None
         if fault := localization_fault(localization, suit):
             self.refused[f"localization: {fault}"] += 1
             return None
+        assert isinstance(localization, Localization)
         return localization if len(localization.timestamps) else None
 
     def _add(self, suit: Motion, localization: Localization | None) -> None:
