@@ -8,7 +8,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "wearcap"
 ROOT = SOURCE.parents[1]
 FLOORS = (
-    ("errors", "files", "checksums"),
+    ("errors", "files", "checksums", "workers"),
     ("geometry",),
     ("body", "scene"),
     ("recording",),

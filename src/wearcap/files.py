@@ -4,44 +4,293 @@ import errno
 import hashlib
 import json
 import os
+import platform
+import re
+import time
 import uuid
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from wearcap.errors import WearcapError
 
+try:
+    import fcntl
+except ModuleNotFoundError:  # Windows
+    import msvcrt
+
+    fcntl = None
+
 MAX_JSON_DEPTH = 64
 """Deepest nesting of JSON that is read; what wearcap writes stays below 16."""
+
+LOCK = ".wearcap.lock"
+"""File in a folder that one process writes into, locked by it; it says who."""
+
+LOCK_PATIENCE_S, ORPHANS_PATIENCE_S = 2.0, 20.0
+"""How long to wait for a lock that is held, and for one that only workers of a process that has ended hold still."""
+
+_TEMPORARY = re.compile(r"\..+\.tmp-[0-9a-f]{8}(\.[^.]+)?")
+_OF_WRITES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it is synced and renamed there, on failure removed.
 
-    Raises WearcapError when the disk is full or the folder cannot be written.
+    The temporary file is locked while it is written, so that `remove_leftovers` can tell it from one whose writer was
+    killed; the first write into a folder removes those. Raises WearcapError when the disk is full or the folder cannot
+    be written; other errors of the `with` body, as of a source that it reads, pass as they are.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.tmp-{uuid.uuid4().hex[:8]}{path.suffix}")
+    claim = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise _explained(error, path) from error
+        with _explaining(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _remove_leftovers_once(str(path.parent.absolute()))
+            claim = _claim(temporary)
+        with _explaining(path, only_about=(temporary, path, path.parent)):
+            yield temporary
+        with _explaining(path):
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+            _sync_folder(path.parent)
     finally:
-        temporary.unlink(missing_ok=True) if path.parent.is_dir() else None
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if claim is not None:
+            os.close(claim)
+
+
+@contextmanager
+def _explaining(path: Path, only_about: tuple[Path, ...] | None = None) -> Iterator[None]:
+    """Turn an OSError into one that says why `path` cannot be written.
+
+    With `only_about`, only errors that name one of those paths, or name none and can only be a write's.
+    """
+    try:
+        yield
+    except OSError as error:
+        named = isinstance(error.filename, str | os.PathLike) and Path(error.filename) in (only_about or ())
+        if only_about is None or named or (error.filename is None and error.errno in _OF_WRITES):
+            raise _explained(error, path) from error
+        raise
 
 
 def _explained(error: OSError, path: Path) -> WearcapError:
-    if error.errno == errno.ENOSPC:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return WearcapError("the disk is full", where=path, fix="Free some space and run again.")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return WearcapError("no permission to write here", where=path, fix="Choose another output folder.")
     return WearcapError(f"cannot be written ({error.strerror or error})", where=path)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename in the folder survive a power cut, where the system can sync folders."""
+    if os.name != "posix":
+        return
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except PermissionError:  # a folder that may be written but not listed
+        return
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some network file systems refuse it
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _claim(temporary: Path) -> int | None:
+    """Create the file and hold a lock on it; the descriptor, or None where files cannot be locked."""
+    if fcntl is None:
+        return None
+    while True:
+        descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        except OSError:
+            os.close(descriptor)
+            return None
+        if os.fstat(descriptor).st_nlink:
+            return descriptor
+        os.close(descriptor)  # taken for a leftover in the moment before it was locked
+
+
+def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
+    """Remove temporary files of `atomic_path` whose writer was killed, from a folder or with `below` from all in it.
+
+    A file whose writer lives is locked by it and stays, and so do files of any other name, and all where the file system
+    has no locks.
+    """
+    for where, _, names in os.walk(folder):
+        for name in names:
+            if _TEMPORARY.fullmatch(name):
+                _remove_unless_locked(Path(where, name))
+        if not below:
+            return
+
+
+@lru_cache(maxsize=1024)
+def _remove_leftovers_once(folder: str) -> None:
+    remove_leftovers(folder)
+
+
+def _remove_unless_locked(path: Path) -> None:
+    with suppress(OSError):  # locked, removed by another, or not ours to remove
+        if fcntl is None:
+            path.unlink()  # Windows refuses this while a writer has it open
+            return
+        descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink()
+        finally:
+            os.close(descriptor)
+
+
+@contextmanager
+def folder_lock(folder: str | Path, purpose: str) -> Iterator[int | None]:
+    """Hold a folder for one writer; readers are not hindered. The lock ends with its process, however that one dies.
+
+    Yields the lock's descriptor: workers that inherit it (`wearcap.workers`) hold the lock until they end, too, so that
+    none writes after another run has taken the folder. Forked children do not hold it. Where the file system has no
+    locks, a warning is given, and None. Raises WearcapError that names the holder when another process has the folder,
+    and when the folder cannot be written.
+    """
+    path = Path(folder) / LOCK
+    with _explaining(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = _wait_for_lock(path)
+    if descriptor is None:
+        yield None
+        return
+    _HELD.add(descriptor)
+    try:
+        holder = {"pid": os.getpid(), "host": platform.node(), "purpose": purpose,
+                  "since": time.strftime("%Y-%m-%d %H:%M:%S")}  # fmt: skip
+        with _explaining(path.parent):
+            path.write_text(json.dumps(holder), encoding="utf-8")
+        yield descriptor
+    finally:
+        if descriptor in _HELD:  # a forked child does not hold it
+            _HELD.remove(descriptor)
+            _unlock(path, descriptor)
+
+
+_HELD: set[int] = set()
+"""Descriptors of the locks that this process has taken."""
+
+
+def _let_go_after_fork() -> None:
+    while _HELD:
+        os.close(_HELD.pop())  # the parent's own descriptor keeps the lock
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_let_go_after_fork)
+
+
+def _wait_for_lock(path: Path) -> int | None:
+    """Open and lock a file; None where files cannot be locked. Raises WearcapError when it stays locked by another."""
+    start = time.monotonic()
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            _lock(descriptor)
+            if os.path.samestat(os.fstat(descriptor), path.stat()):
+                return descriptor
+        except (BlockingIOError, FileNotFoundError):  # held, or removed by its holder, which has just ended
+            pass
+        except OSError as error:
+            os.close(descriptor)
+            path.unlink(missing_ok=True)
+            warnings.warn(
+                f"{path.parent}: this file system has no locks ({error.strerror}). "
+                "Let no other run write into this folder meanwhile.",
+                stacklevel=4,
+            )
+            return None
+        os.close(descriptor)
+        holder = _holder(path)
+        if time.monotonic() - start > (ORPHANS_PATIENCE_S if _has_ended(holder) else LOCK_PATIENCE_S):
+            raise _held_by(holder, path.parent)
+        time.sleep(0.05)
+
+
+def _lock(descriptor: int) -> None:
+    """Lock a file for this process. Raises BlockingIOError when another has it."""
+    if fcntl is not None:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    else:
+        try:
+            _lock_on_windows(descriptor, msvcrt.LK_NBLCK)
+        except PermissionError as error:
+            raise BlockingIOError(*error.args) from error
+
+
+def _unlock(path: Path, descriptor: int) -> None:
+    """Remove a lock's file, if it is still the one in the folder, and give the lock up for all who share it."""
+    with suppress(OSError):
+        if fcntl is not None and os.path.samestat(os.fstat(descriptor), path.stat()):
+            path.unlink()
+    with suppress(OSError):
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_UN)
+        else:
+            _lock_on_windows(descriptor, msvcrt.LK_UNLCK)
+    os.close(descriptor)
+    with suppress(OSError):
+        if fcntl is None:
+            path.unlink()  # Windows removes no open file
+
+
+def _lock_on_windows(descriptor: int, mode: int) -> None:
+    os.lseek(descriptor, 1 << 20, os.SEEK_SET)  # a byte beyond the text, which others must be able to read
+    msvcrt.locking(descriptor, mode, 1)
+
+
+def _holder(path: Path) -> dict[str, Any]:
+    """What a lock's file says of its holder; nothing in the moments while it is written."""
+    try:
+        holder = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return holder if isinstance(holder, dict) and isinstance(holder.get("pid"), int) else {}
+
+
+def _has_ended(holder: dict[str, Any]) -> bool:
+    """Whether the process that took a lock is known to be no more: workers of it hold the lock still."""
+    if os.name != "posix" or holder.get("host") != platform.node() or holder["pid"] <= 0:
+        return False
+    try:
+        os.kill(holder["pid"], 0)
+    except (ProcessLookupError, OverflowError):
+        return True
+    except PermissionError:
+        return False
+    return False
+
+
+def _held_by(holder: dict[str, Any], folder: Path) -> WearcapError:
+    pid, host = holder.get("pid", "unknown"), holder.get("host", "unknown")
+    who = (
+        f"process {pid} on {host}, {holder.get('purpose', 'unknown')}, since {holder.get('since', 'unknown')}"
+    )
+    if _has_ended(holder):
+        return WearcapError(f"workers of a run that has ended still write here ({who})", where=folder,
+                            expected="one run at a time in a folder",
+                            fix="Run again when they have ended, or end them.")  # fmt: skip
+    end = f"end it (kill {pid})" if host == platform.node() else f"end it on {host}"
+    return WearcapError(f"another run writes here ({who})", where=folder,
+                        expected="one run at a time in a folder",
+                        fix=f"Wait until it has ended, {end}, or choose another folder.")  # fmt: skip
 
 
 def write_text(path: str | Path, text: str) -> None:

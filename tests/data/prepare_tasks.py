@@ -59,5 +59,9 @@ def tasks(count: int, seconds: float = 0.0, **faults: str) -> list[Task]:
     ]
 
 
-if __name__ == "__main__":  # python prepare_tasks.py OUTPUT COUNT SECONDS
-    prepare(tasks(int(sys.argv[2]), float(sys.argv[3])), Path(sys.argv[1]), jobs=1, progress=False)
+def run(output: str, count: int, seconds: float = 0.0, jobs: int = 1, backend: str = "loky") -> None:
+    prepare(tasks(count, seconds), Path(output), jobs=jobs, backend=backend, progress=False)
+
+
+if __name__ == "__main__":  # python prepare_tasks.py OUTPUT COUNT SECONDS [JOBS [BACKEND]]
+    run(sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), int(*sys.argv[4:5] or [1]), *sys.argv[5:])

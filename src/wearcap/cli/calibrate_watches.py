@@ -17,6 +17,7 @@ from rich.table import Table
 
 from wearcap.cli.conf import hydra_main
 from wearcap.errors import WearcapError, nearest
+from wearcap.files import folder_lock
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.tum import read_tum
 from wearcap.io.watch_calibration_json import WornCalibration, write_watch_calibration
@@ -196,9 +197,10 @@ def _store(found: WornCalibration, logs: Logs, recording: Recording, where: Path
     if where.suffix == ".safetensors":
         save_recording(recording, where)
         return
-    store = RecordingStore.open(where.parent)
-    entry = store.entries[where.name]
-    store.add(recording, split=entry.split, config_hash=entry.config_hash)
+    with folder_lock(where.parent, "calibrate"):
+        store = RecordingStore.open(where.parent)
+        entry = store.entries[where.name]
+        store.add(recording, split=entry.split, config_hash=entry.config_hash)
 
 
 def _tell(checks: Sequence[StepCheck]) -> None:

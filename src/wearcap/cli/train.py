@@ -1,6 +1,7 @@
 """`wearcap train`: compose a config, build what it names, fit."""
 
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 
 import lightning
@@ -11,6 +12,7 @@ from rich import print as show
 
 from wearcap.cli.conf import hydra_main
 from wearcap.data.surroundings import embeddings_of
+from wearcap.files import folder_lock
 from wearcap.recording.store import RecordingStore
 from wearcap.training.checkpoint import ConfigInCheckpoint, RunCheckpointIO
 from wearcap.training.run import fit, keep_freed_memory, record_run, resume_path
@@ -43,7 +45,8 @@ def train(config: DictConfig) -> float:
         config.trainer, callbacks=callbacks, logger=loggers or False, plugins=[RunCheckpointIO(run)]
     )
     show(f"[bold]{config.name}[/bold] in {run}" + (f", going on from {resume}" if resume else ""))
-    fit(system, data, trainer, resume)
+    with folder_lock(run, "train") if trainer.is_global_zero else nullcontext():
+        fit(system, data, trainer, resume)
     last = run / "checkpoints" / "last.ckpt"
     if trainer.is_global_zero:
         show(

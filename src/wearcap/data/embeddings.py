@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from wearcap.errors import WearcapError
@@ -43,7 +43,7 @@ def embed_camera(
     if embeddings is None:
         embeddings = _embed(pictures(camera, folder), encoder)
         with atomic_path(kept) as temporary:
-            save_file(embeddings, temporary)
+            temporary.write_bytes(save(embeddings))  # save_file would leave a file of its own when killed
     count = len(embeddings["embedding"])
     if count != len(camera.timestamps):
         raise WearcapError(f"{count} pictures for {len(camera.timestamps)} timestamps", where=files[0],

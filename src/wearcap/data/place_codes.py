@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from jaxtyping import Float16
 from rich.progress import track
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from wearcap.files import atomic_path
@@ -68,7 +68,7 @@ class PlaceCodes:
         file = RecordingStore.open(root).open_file(Path(entry.file).stem)
         code, code_mirrored = place_codes(file.part("points"), file.part("head"), self.encoder)
         with atomic_path(path) as temporary:
-            save_file({"code": code, "code_mirrored": code_mirrored}, str(temporary))
+            temporary.write_bytes(save({"code": code, "code_mirrored": code_mirrored}))
 
 
 @torch.inference_mode()

@@ -6,7 +6,6 @@ that is finished, `model/`. A run that was stopped goes on where it was.
 
 import importlib
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -140,12 +139,13 @@ def _map(
                            expected="a textured, still scene, seen from places some way apart",
                            fix="Move the camera instead of turning it on the spot, or take more pictures a second (fps=…).")  # fmt: skip
     best = max(models.values(), key=lambda model: model.num_reg_images())
-    with tempfile.TemporaryDirectory(dir=folder) as temporary:
-        best.write(temporary)
-        (folder / MODEL).mkdir(exist_ok=True)
-        # images.bin says that the model is whole: it comes last.
-        for path in sorted(Path(temporary).iterdir(), key=lambda path: path.name == "images.bin"):
-            path.replace(folder / MODEL / path.name)
+    written = folder / "sparse" / "best"  # removed with the folder by the next run, if this one is killed
+    written.mkdir()
+    best.write(written)
+    (folder / MODEL).mkdir(exist_ok=True)
+    # images.bin says that the model is whole: it comes last.
+    for path in sorted(written.iterdir(), key=lambda path: path.name == "images.bin"):
+        path.replace(folder / MODEL / path.name)
     return folder / MODEL
 
 

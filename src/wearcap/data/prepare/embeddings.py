@@ -9,8 +9,9 @@ from pathlib import Path
 
 from wearcap.data.embeddings import embed_camera, embedding_name
 from wearcap.data.prepare.check import check_recording
-from wearcap.data.prepare.engine import REGISTER_EVERY_S, Report, progress_bar, remove_leftovers
+from wearcap.data.prepare.engine import REGISTER_EVERY_S, Report, progress_bar
 from wearcap.errors import WearcapError
+from wearcap.files import folder_lock, remove_leftovers
 from wearcap.models.image_encoder import ImageEncoder
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.store import Entry, RecordingFile, RecordingStore, entry_for, save_recording
@@ -24,10 +25,18 @@ def embed_dataset(
 
     Recordings that have them already are left as they are, so that a killed run goes on where it was. A recording whose
     pictures are missing or damaged is reported and stays as it was. The manifest's config hash stays: the source is
-    the same. `cache`: see `embed_camera`. Raises WearcapError when no recording has pictures.
+    the same. `cache`: see `embed_camera`. Raises WearcapError when no recording has pictures, and when another run writes
+    into the data set.
     """
-    store = RecordingStore.open(dataset)
-    remove_leftovers(store.root)
+    root = RecordingStore.open(dataset).root
+    with folder_lock(root, "prepare embeddings"):
+        remove_leftovers(root, below=True)
+        return _embed_all(RecordingStore.open(root), encoder, cache, overwrite, progress)
+
+
+def _embed_all(
+    store: RecordingStore, encoder: ImageEncoder, cache: str | Path | None, overwrite: bool, progress: bool
+) -> Report:
     name_of_all = embedding_name(encoder)
     report, waiting, written_at = Report(), dict[str, Entry](), time.monotonic()
     try:

@@ -6,7 +6,6 @@ moment, a data set is left with whole files and a whole manifest, and the next r
 
 import hashlib
 import json
-import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -19,14 +18,16 @@ from typing import Any
 import joblib
 import numba
 import torch
+from joblib.externals.loky import get_reusable_executor
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from wearcap.data.prepare.check import check_recording
 from wearcap.errors import WearcapError
-from wearcap.files import sha256_of
+from wearcap.files import folder_lock, remove_leftovers, sha256_of
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import Entry, RecordingStore, entry_for, recording_path, save_recording
+from wearcap.workers import bound_to_this_process
 
 BACKENDS = ("loky", "threading", "dask", "ray")
 REGISTER_EVERY_S = 1.0
@@ -37,8 +38,6 @@ NOTE = "note"
 
 MAX_REASON = 500
 """Longest reason (characters) that is told of a recording that failed."""
-
-_LEFTOVER = re.compile(r"\..+\.tmp-[0-9a-f]{8}(\..+)?")
 
 
 @dataclass(frozen=True)
@@ -77,8 +76,8 @@ def prepare(
     """Make every recording that is missing or out of date.
 
     `jobs` is joblib's (-1: all cores); with backend "dask" and no `scheduler` address, that many local workers.
-    A recording that cannot be made is reported and the rest goes on. Raises WearcapError when the output
-    cannot be written at all, and for an unknown backend or two tasks of one name.
+    A recording that cannot be made is reported and the rest goes on. Raises WearcapError when the output cannot be
+    written at all or another run writes there, and for an unknown backend or two tasks of one name.
     """
     if not tasks:
         raise WearcapError("nothing to prepare", fix="Check the source folder and its settings.")
@@ -88,16 +87,30 @@ def prepare(
         raise WearcapError(f"two sources give a recording the name {twice!r}", expected="unique names")
     if jobs == 0:
         raise WearcapError("0 jobs", expected="a number of jobs, or -1 for one per core")
-    store = RecordingStore(output)
-    store.register({})  # no permission or no space is better known now than after the first hour
-    remove_leftovers(store.root)
-    todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
-    report = Report(current=sorted(names - {task.name for task in todo}))
+    if backend not in BACKENDS:
+        raise WearcapError(f"no backend {backend!r}", expected=f"one of {', '.join(BACKENDS)}")
+    with folder_lock(output, "prepare") as lock:
+        store = RecordingStore(output)
+        store.register({})  # no permission or no space is better known now than after the first hour
+        remove_leftovers(store.root, below=True)
+        todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
+        current = sorted(names - {task.name for task in todo})
+        with _backend(backend, jobs, scheduler, lock) as as_generator:
+            outcomes = _outcomes(todo, store.root, jobs, as_generator)
+            return _collect(outcomes, store, current, len(tasks), progress)
+
+
+def _collect(
+    outcomes: Iterator[tuple[str, Entry | str, str]], store: RecordingStore, current: list[str], total: int,
+    progress: bool,
+) -> Report:  # fmt: skip
+    """Enter what workers have made in the manifest, and report."""
+    report = Report(current=current)
     waiting: dict[str, Entry] = {}
     written_at = time.monotonic()
     try:
-        with progress_bar(len(tasks), len(report.current), progress) as advance:
-            for name, outcome, note in _outcomes(todo, store.root, jobs, backend, scheduler):
+        with progress_bar(total, len(current), progress) as advance:
+            for name, outcome, note in outcomes:
                 if isinstance(outcome, Entry):
                     waiting[name] = outcome
                     report.written.append(name)
@@ -125,14 +138,6 @@ def _is_current(store: RecordingStore, task: Task) -> bool:
         return False
     path = store.root / entry.file
     return path.is_file() and path.stat().st_size == entry.bytes and sha256_of(path) == entry.sha256
-
-
-def remove_leftovers(root: Path) -> None:
-    """Temporary files of a run that was killed."""
-    for folder in (root, root / "recordings"):
-        for path in folder.glob(".*.tmp-*"):
-            if _LEFTOVER.fullmatch(path.name):
-                path.unlink(missing_ok=True)
 
 
 def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
@@ -165,26 +170,26 @@ def _one_thread() -> Iterator[None]:
 
 
 def _outcomes(
-    todo: list[Task], root: Path, jobs: int, backend: str, scheduler: str | None
+    todo: list[Task], root: Path, jobs: int, as_generator: bool
 ) -> Iterator[tuple[str, Entry | str, str]]:
     if not todo:
         return
-    with _backend(backend, jobs, scheduler) as as_generator:
-        chunk_size = len(todo) if as_generator else 64  # without a generator, results come chunk by chunk
-        parallel = joblib.Parallel(
-            n_jobs=jobs, batch_size=1, return_as="generator_unordered" if as_generator else "list"
-        )
-        for start in range(0, len(todo), chunk_size):
-            chunk = todo[start : start + chunk_size]
-            results: Any = parallel(joblib.delayed(_run)(task, root) for task in chunk)
-            yield from results
+    chunk_size = len(todo) if as_generator else 64  # without a generator, results come chunk by chunk
+    parallel = joblib.Parallel(
+        n_jobs=jobs, batch_size=1, return_as="generator_unordered" if as_generator else "list"
+    )
+    for start in range(0, len(todo), chunk_size):
+        chunk = todo[start : start + chunk_size]
+        results: Any = parallel(joblib.delayed(_run)(task, root) for task in chunk)
+        yield from results
 
 
 @contextmanager
-def _backend(backend: str, jobs: int, scheduler: str | None) -> Iterator[bool]:
-    """Make joblib's backend current; yields whether it can return results as they come."""
-    if backend not in BACKENDS:
-        raise WearcapError(f"no backend {backend!r}", expected=f"one of {', '.join(BACKENDS)}")
+def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -> Iterator[bool]:
+    """Make joblib's backend current; yields whether it can return results as they come.
+
+    Its local workers end with this process, and before the `lock` is given up.
+    """
     try:
         if backend == "dask":
             from dask.distributed import Client  # type: ignore[import-not-found]
@@ -199,9 +204,15 @@ def _backend(backend: str, jobs: int, scheduler: str | None) -> Iterator[bool]:
             register_ray()
             with joblib.parallel_config("ray"):
                 yield False
+        elif backend == "loky":
+            with joblib.parallel_config("loky", inner_max_num_threads=1, **bound_to_this_process(lock)):
+                try:
+                    yield True
+                finally:
+                    if joblib.effective_n_jobs(jobs) > 1:
+                        get_reusable_executor(reuse=True).shutdown(kill_workers=True)
         else:
-            inner = {"inner_max_num_threads": 1} if backend == "loky" else {}
-            with joblib.parallel_config(backend, **inner):
+            with joblib.parallel_config(backend):
                 yield True
     except ModuleNotFoundError as error:
         raise WearcapError(f"the backend {backend!r} needs the package {error.name!r}",

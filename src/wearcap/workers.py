@@ -1,0 +1,71 @@
+"""Worker processes that end with the process that started them, however that one ends.
+
+Imports nothing but the standard library, so that a worker is bound to its parent before it has loaded anything else.
+"""
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from multiprocessing import reduction
+from typing import Any
+
+POLL_S = 0.2
+"""How often a worker looks for its parent where the system does not end it by itself."""
+
+_PR_SET_PDEATHSIG = 1
+"""Of linux/prctl.h."""
+
+
+class Inherited:
+    """A file descriptor that a worker process inherits when this is among the arguments that it is started with."""
+
+    def __init__(self, descriptor: int | None):
+        self.descriptor = descriptor
+
+    def __reduce__(self):
+        shared = None if self.descriptor is None or os.name != "posix" else reduction.DupFd(self.descriptor)
+        return _inherited, (shared,)
+
+
+def _inherited(shared: Any) -> Inherited:
+    return Inherited(None if shared is None else shared.detach())
+
+
+def bound_to_this_process(lock: int | None) -> dict[str, Any]:
+    """What loky's `initializer` and `initargs` must be for workers that end with this process.
+
+    Until they have ended they hold `lock` (`wearcap.files.folder_lock`). The pool must be shut down before the thread
+    that uses it ends: Linux ends a worker with the thread that started it.
+    """
+    return {"initializer": end_with_parent, "initargs": (os.getpid(), Inherited(lock))}
+
+
+def end_with_parent(parent: int, lock: Inherited | None = None) -> None:
+    """In a worker: end at once when the parent has ended, whatever this process is doing.
+
+    Linux kills it, even within native code. Elsewhere a thread looks for the parent every `POLL_S`; native code that
+    holds Python's lock delays it.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.name == "posix" and os.getppid() != parent:
+        os._exit(1)  # it ended before this was said
+    if sys.platform != "linux":
+        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    if sys.platform == "win32":
+        import _winapi
+
+        synchronize = 0x00100000
+        with suppress(OSError):  # it has ended already
+            _winapi.WaitForSingleObject(_winapi.OpenProcess(synchronize, False, parent), _winapi.INFINITE)
+    else:
+        while os.getppid() == parent:
+            time.sleep(POLL_S)
+    os._exit(1)
