@@ -7,6 +7,7 @@ from pathlib import Path
 import lightning
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import EarlyStopping
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich import print as show
 
@@ -21,14 +22,22 @@ HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
 
 
 def train(config: DictConfig) -> float:
-    """Train what the config describes; returns the last validation loss (what a sweep minimises)."""
+    """Train what the config describes; returns the last validation loss (what a sweep minimises).
+
+    Raises WearcapError when another process trains in the run's folder.
+    """
+    run = Path(config.paths.run)
+    with folder_lock(run, "train") if rank_zero_only.rank == 0 else nullcontext():
+        return _train(config, run)
+
+
+def _train(config: DictConfig, run: Path) -> float:
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     keep_freed_memory()
     _name_embeddings(config)
     # A run's folder is its own; what Lightning deprecates within itself is not the user's to mend.
     warnings.filterwarnings("ignore", "Experiment logs directory")
     warnings.filterwarnings("ignore", ".*LeafSpec")
-    run = Path(config.paths.run)
     record_run(run, OmegaConf.to_yaml(config, resolve=True))
     resume = resume_path(config.resume, run, Path(config.paths.outputs) / "train" / config.name)
     data, system = instantiate(config.data, _convert_="all"), instantiate(config.model, _convert_="all")
@@ -45,8 +54,7 @@ def train(config: DictConfig) -> float:
         config.trainer, callbacks=callbacks, logger=loggers or False, plugins=[RunCheckpointIO(run)]
     )
     show(f"[bold]{config.name}[/bold] in {run}" + (f", going on from {resume}" if resume else ""))
-    with folder_lock(run, "train") if trainer.is_global_zero else nullcontext():
-        fit(system, data, trainer, resume)
+    fit(system, data, trainer, resume)
     last = run / "checkpoints" / "last.ckpt"
     if trainer.is_global_zero:
         show(
