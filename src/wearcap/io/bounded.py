@@ -82,9 +82,9 @@ def _lift(size: int) -> str:
     return f"If you trust it, lift the limit: wearcap --max-file-gib {max(1, math.ceil(2 * size / (1 << 30)))} VERB …"
 
 
-def file_size(path: str | Path) -> int:
-    """Bytes of a regular file. Raises WearcapError when it is missing, a folder, a pipe or device, or not allowed."""
-    with explained(path):
+def file_size(path: str | Path, kind: str = "file") -> int:
+    """Bytes of a regular file; `kind` is what a message calls it when it is missing. Raises WearcapError when it is missing, a folder, a pipe or device, or not allowed."""
+    with explained(path, kind):
         try:
             status = os.stat(path)
         except ValueError as error:  # a NUL, or what the file system's encoding does not have
@@ -93,18 +93,18 @@ def file_size(path: str | Path) -> int:
         if stat.S_ISDIR(mode):
             raise IsADirectoryError
         if not stat.S_ISREG(mode):
-            kind = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
-            raise WearcapError(f"a {kind}", where=path, expected="a regular file", fix="Copy its content to a file.")  # fmt: skip
+            found = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
+            raise WearcapError(f"a {found}", where=path, expected="a regular file", fix="Copy its content to a file.")  # fmt: skip
         return status.st_size
 
 
 @contextmanager
-def explained(path: str | Path) -> Iterator[None]:
+def explained(path: str | Path, kind: str = "file") -> Iterator[None]:
     """Turn what the operating system and unpackers say of a file into WearcapError."""
     try:
         yield
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise WearcapError("no such file", where=path) from error
+        raise WearcapError(f"no such {kind}", where=path) from error
     except PermissionError as error:
         raise WearcapError("no permission to read it", where=path, fix="Ask its owner, or change its mode (chmod).") from error  # fmt: skip
     except IsADirectoryError as error:
