@@ -175,7 +175,7 @@ def _read_list_rows(element: _Element, data: bytes, start: int, order: str, path
     if table is not None:
         return table, stop
     columns = {p.name: (bytearray(), array("q")) for p in element.properties}
-    plan = [(*columns[p.name], p.count_dtype and np.dtype(order + p.count_dtype), np.dtype(p.dtype).itemsize)
+    plan = [(*columns[p.name], np.dtype(order + p.count_dtype) if p.count_dtype else None, np.dtype(p.dtype).itemsize)
             for p in element.properties]  # fmt: skip
     for _ in range(element.count):
         for values, lengths, count_dtype, width in plan:
