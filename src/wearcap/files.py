@@ -302,10 +302,11 @@ def write_text(path: str | Path, text: str) -> None:
 def parse_json(text: str | bytes, where: str | Path) -> Any:
     """Content of JSON text that may come from a stranger.
 
-    Raises WearcapError for text that is no JSON, not UTF-8, or nested deeper than `MAX_JSON_DEPTH`.
+    Raises WearcapError for text that is no JSON, not UTF-8, nested deeper than `MAX_JSON_DEPTH`, or with whole numbers
+    beyond 64 bits.
     """
     try:
-        content = json.loads(text)
+        content = json.loads(text, parse_int=_whole_number)
     except RecursionError as error:
         raise _too_deep(where) from error
     except ValueError as error:  # JSONDecodeError and UnicodeDecodeError are ValueErrors
@@ -322,6 +323,13 @@ def parse_json(text: str | bytes, where: str | Path) -> Any:
         if not level:
             return content
     raise _too_deep(where)
+
+
+def _whole_number(text: str) -> int:
+    value = int(text)
+    if not -(1 << 63) <= value < 1 << 64:
+        raise ValueError(f"the whole number {text[:30]}… has more than 64 bits")
+    return value
 
 
 def _too_deep(where: str | Path) -> WearcapError:

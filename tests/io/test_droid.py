@@ -85,7 +85,7 @@ FAULTS = {
     "nan": ({"poses": np.full((6, 7), np.nan)}, "NaN"),
     "no quaternion": ({"poses": np.ones((6, 7))}, "norm 2.0000"),
     "still stamps": ({"tstamps": np.zeros(6)}, "timestamps that rise"),
-    "objects": ({"tstamps": np.array([None] * 6)}, "not a readable .npy file"),
+    "objects": ({"tstamps": np.array([None] * 6)}, "holds Python objects"),
     "text": ({"tstamps": np.array(["a"] * 6)}, "real numbers"),
     "disparities": ({"disps": np.ones((6, 48))}, r"shape \(6, 48\)"),
     "whole disparities": ({"disps": np.ones((6, 48, 64), int)}, "floats of shape"),

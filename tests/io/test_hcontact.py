@@ -121,10 +121,10 @@ def test_damaged_archives(tmp_path):
     with pytest.raises(WearcapError, match="no such file"):
         read_smpl_json(path)
     write_zip("{", path)
-    with pytest.raises(WearcapError, match="not a readable"):
+    with pytest.raises(WearcapError, match="not readable JSON"):
         read_smpl_json(path)
     write_zip(b"\xff\xfe\x00", path)
-    with pytest.raises(WearcapError, match="not a readable"):
+    with pytest.raises(WearcapError, match="not readable JSON"):
         read_smpl_json(path)
     path.write_bytes(path.read_bytes()[:40])
     with pytest.raises(WearcapError, match="not a readable"):

@@ -3,11 +3,13 @@
 import errno
 import importlib
 import importlib.util
+import os
 import sys
 import traceback
 
 from wearcap import __version__
 from wearcap.errors import WearcapError, nearest
+from wearcap.io.bounded import VARIABLE, gib_bytes
 
 VERBS = (
     "train", "evaluate", "capture", "export", "prepare", "view", "render", "annotate", "scene", "calibrate",
@@ -28,11 +30,12 @@ def usage() -> str:
     lines = [
         "wearcap: motion capture from what a person wears.",
         "",
-        "usage: wearcap [--debug] VERB [arguments]     wearcap VERB --help     wearcap --version",
+        "usage: wearcap [--debug] [--max-file-gib N] VERB [arguments]     wearcap VERB --help     wearcap --version",
         "",
         *(f"  {verb:10} {importlib.import_module(f'wearcap.cli.{verb}').HELP}" for verb in available()),
         "",
         "--debug shows the traceback of an error.",
+        "--max-file-gib N reads files of up to N GiB once unpacked, however tightly packed: for files that you trust.",
     ]
     return "\n".join(lines)
 
@@ -69,9 +72,27 @@ def explain(error: WearcapError | OSError) -> str:
     return f"{where}{error.strerror or error}."
 
 
+def _lift_limit(arguments: list[str]) -> list[str]:
+    """Set the limit of files' sizes that `--max-file-gib` gives, for worker processes too; the other arguments."""
+    option = "--max-file-gib"
+    place = next((i for i, word in enumerate(arguments) if word.split("=")[0] == option), None)
+    if place is None:
+        return arguments
+    word, *rest = arguments[place:]
+    value = word.partition("=")[2] if "=" in word else rest.pop(0) if rest else ""
+    gib_bytes(value, option)
+    os.environ[VARIABLE] = value
+    return arguments[:place] + rest
+
+
 def main(arguments: list[str] | None = None) -> None:
     """The console command. Exits with 0, 2 (an error a user can mend) or 130 (interrupted)."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        arguments = _lift_limit(arguments)
+    except WearcapError as error:
+        print(f"wearcap: {error}", file=sys.stderr)
+        sys.exit(USER_ERROR)
     verb = next((argument for argument in arguments if not argument.startswith("-")), None)
     if arguments[:1] == ["--version"]:
         print(f"wearcap {__version__}")

@@ -105,14 +105,18 @@ def read_objects(folder: str | Path) -> list[AdtObject]:
     objects = []
     for rows in np.split(order, np.unique(poses["object_uid"][order], return_index=True)[1][1:]):
         uid = bytes(poses["object_uid"][rows[0]])
-        about = instances.get(uid.decode())
+        name = uid.decode("latin-1")
+        about = instances.get(name)
         if about is None or uid not in box_of:
             continue
+        if not isinstance(about, dict):
+            raise WearcapError(f"object {name} is a {type(about).__name__}", where=folder / "instances.json",
+                               expected="its instance_name, category and motion_type")  # fmt: skip
         T_world_obj, times = _object_poses(
             {name: poses[name][rows] for name in (*names, "timestamp[ns]")}, poses_path
         )
         objects.append(AdtObject(
-            str(about.get("instance_name", uid.decode())), str(about.get("category", "")), about.get("motion_type") == "dynamic",
+            str(about.get("instance_name", name)), str(about.get("category", "")), about.get("motion_type") == "dynamic",
             torch.tensor(box_of[uid], dtype=torch.float32), T_world_obj, times,
         ))  # fmt: skip
     return objects
@@ -120,7 +124,10 @@ def read_objects(folder: str | Path) -> list[AdtObject]:
 
 def _object_poses(rows: dict[str, np.ndarray], where: Path) -> tuple[Rigid, Tensor | None]:
     """Poses in the z-up world; a timestamp of -1 stands for all time."""
-    times = np.array([int(t) for t in rows["timestamp[ns]"]], dtype=np.float64) * 1e-9
+    try:
+        times = rows["timestamp[ns]"].astype(np.float64) * 1e-9
+    except ValueError as error:
+        raise WearcapError(f"a time is no number ({error})"[:200], where=where, expected="nanoseconds, or -1") from error  # fmt: skip
     timeless = bool((times < 0).any())
     keep = slice(0, 1) if timeless else slice(None)
     t = np.stack([rows[f"t_wo_{axis}[m]"] for axis in "xyz"], 1)[keep]

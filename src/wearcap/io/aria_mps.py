@@ -26,6 +26,7 @@ MAX_INV_DIST_STD, MAX_DIST_STD = 0.005, 0.01
 T_HEAD_DEVICE = Rigid(torch.eye(3), torch.tensor([0.09, 0.0, 0.075]))
 """Assumed where nothing is calibrated: the pupils' midpoint before and above the head joint, axes parallel (ours)."""
 
+_MAX_DURATION_S = 12 * 3600
 R_CPF_DEVICE = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """House head axes (x forward, y left, z up) in the central pupil frame (x left, y up, z forward)."""
 
@@ -132,6 +133,9 @@ def head_stream(
     """
     if fps is not None:
         start, stop = trajectory.timestamps[0].item(), trajectory.timestamps[-1].item()
+        if stop - start > _MAX_DURATION_S:
+            raise WearcapError(f"poses over {(stop - start) / 3600:.3g} hours", expected="a recording of less than half a day",
+                               fix="A time stamp is damaged, or two recordings stand in one file: cut it.")  # fmt: skip
         count = int((stop - start) * fps + 1e-6) + 1
         trajectory = resample(trajectory, start + torch.arange(count, dtype=torch.float64) / fps)
     T_aria_cpf = T_aria_cpf or nominal_T_aria_cpf()

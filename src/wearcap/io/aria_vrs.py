@@ -17,6 +17,7 @@ from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.aria_mps import R_CPF_DEVICE, T_HEAD_DEVICE
+from wearcap.io.bounded import file_size
 from wearcap.io.video import write_frames
 from wearcap.recording import CameraStream, ImuStream
 
@@ -194,8 +195,7 @@ def _open(path: str | Path):
     if data_provider is None:
         raise WearcapError("reading VRS recordings needs projectaria-tools", where=path,
                            fix='Install it with `pip install "wearcap[aria]"` (about 1 GB).')  # fmt: skip
-    if not Path(path).is_file():
-        raise WearcapError("no such file", where=path)
+    file_size(path)
     provider = data_provider.create_vrs_data_provider(str(path))
     if provider is None:
         raise WearcapError(

@@ -6,7 +6,10 @@ the file's length scale (CMU: 1 unit = 0.0254 / 0.45 m).
 """
 
 import math
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +20,14 @@ from torch import Tensor
 from wearcap.body.skeleton import Site, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
-from wearcap.io.text import at_line, finite_floats, is_finite_number, read_text
+from wearcap.io.text import at_line, finite_floats, is_finite_number, numbered_lines
 from wearcap.recording.motion import Motion
 
 R_WORLD_FILE = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 """From the file's axes (x left, y up, z forward) into ours (x forward, y left, z up)."""
 
 INCH_M = 0.0254
+MAX_BONES = 2000
 ROTATIONS = ("rx", "ry", "rz")
 SIDES = {"l": "left", "r": "right"}
 END_SITES = {"toes": "toe_tip", "fingers": "fingertip", "thumb": "thumb_tip"}
@@ -67,7 +71,7 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     the ends of leaf bones are sites. Raises WearcapError naming file and line.
     """
     path = Path(path)
-    units, root, bones, hierarchy = _parse_asf(path, read_text(path).splitlines())
+    units, root, bones, hierarchy = _parse_asf(path)
     unit_m = INCH_M / units["length"] if unit_m is None else unit_m
     radians = bool(units["radians"])
     names, parents = _tree_order(path, bones, hierarchy)
@@ -136,13 +140,13 @@ def _euler(
 # --- ASF -----------------------------------------------------------------------------------------------------------
 
 
-def _parse_asf(path: Path, lines: list[str]):
+def _parse_asf(path: Path):
     """Sections of an ASF file: units, root, bones by name, hierarchy as (line, words)."""
     units, root = {"length": 1.0, "radians": 0.0}, _Bone("root", 1)
     bones: dict[str, _Bone] = {}
     hierarchy: list[tuple[int, list[str]]] = []
-    section, bone = "", None
-    for number, text in enumerate(lines, 1):
+    section, bone, number = "", None, 0
+    for number, text in numbered_lines(path):
         words = text.split("#")[0].split()
         if not words:
             continue
@@ -162,6 +166,8 @@ def _parse_asf(path: Path, lines: list[str]):
                 _read_bone(bone, words)
             elif section == ":hierarchy" and words[0] not in ("begin", "end"):
                 hierarchy.append((number, words))
+                if max(len(hierarchy), len(words)) > MAX_BONES:
+                    raise ValueError(f"more than {MAX_BONES} bones")
         except (ValueError, IndexError) as error:
             raise WearcapError(
                 f"cannot read {text.strip()[:80]!r} ({error})",
@@ -169,7 +175,7 @@ def _parse_asf(path: Path, lines: list[str]):
                 expected="Acclaim ASF",
             ) from error
     if bone is not None or not bones or not hierarchy:
-        raise WearcapError("bones or hierarchy are missing or cut short", where=at_line(path, len(lines)),
+        raise WearcapError("bones or hierarchy are missing or cut short", where=at_line(path, number),
                            expected="an ASF file with :bonedata and :hierarchy", fix="Fetch the file again.")  # fmt: skip
     return units, root, bones, hierarchy
 
@@ -210,6 +216,8 @@ def _read_bone(bone: _Bone, words: list[str]) -> None:
 def _close_bone(bones: dict[str, _Bone], bone: _Bone) -> None:
     if not bone.name or bone.name == "root" or bone.name in bones:
         raise ValueError(f"the bone begun in line {bone.line} has no name of its own")
+    if len(bones) >= MAX_BONES:
+        raise ValueError(f"more than {MAX_BONES} bones")
     bones[bone.name] = bone
 
 
@@ -294,39 +302,67 @@ def _heel(foot: Float[Tensor, "3"], shin: Float[Tensor, "3"]) -> tuple[float, ..
 
 
 def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Float64[Tensor, "time channel"]]:
-    """Frame numbers, joints in the file's order, and all channel values.
-
-    Every frame must be laid out like the first, which lets the whole file become one array.
-    """
-    lines = read_text(path).splitlines()
-    start = next(
-        (i for i, line in enumerate(lines) if line.strip() and line.strip()[0] not in "#:"), len(lines)
-    )
-    if (":DEGREES" if asf.radians else ":RADIANS") in {line.strip().upper() for line in lines[:start]}:
-        raise WearcapError(
-            "its angles are in another unit than the ASF's", where=path, expected="one unit in both"
-        )
-    first: list[tuple[int, list[str]]] = []
-    for number, line in enumerate(lines[start + 1 :], start + 2):
-        words = line.split()
-        if words and words[0][0].isdigit():
+    """Frame numbers, joints in the file's order, and all channel values; every frame must be laid out like the first."""
+    lines = _amc_lines(path, asf)
+    beginning = list(islice(lines, 1))
+    first, following = [], []
+    for number, words in lines:
+        if words[0][0].isdigit():
+            following = [(number, words)]
             break
-        first += [(number, words)] if words else []
-    joints = _layout_joints(path, asf, start + 1, first)
-    layout = [name for _, words in first for name in [words[0]] + [""] * (len(words) - 1)]
-    row = 1 + len(layout)
-    tokens = " ".join(lines[start:]).split()
-    columns = dict(enumerate(layout, 1))
+        first.append((number, words))
+        if len(first) > MAX_BONES:
+            raise WearcapError(f"more than {MAX_BONES} bones", where=at_line(path, number))
+    number = beginning[0][0] if beginning else 1
+    joints = _layout_joints(path, asf, number, first)
+    frames, values, place = array("q"), array("d"), 0
+    for row, (number, words) in enumerate(chain(beginning, first, following, lines)):
+        place = row % (len(first) + 1)
+        if place == 0:
+            _take_frame_number(frames, words, at_line(path, number))
+        else:
+            _take_values(values, words, first[place - 1][1], at_line(path, number))
+    if place < len(first):
+        raise WearcapError("the last frame is cut short", where=at_line(path, number),
+                           expected=f"{len(first)} bones per frame", fix="Fetch the file again.")  # fmt: skip
+    return np.array(frames), joints, torch.from_numpy(np.array(values).reshape(len(frames), -1))
+
+
+def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
+    """Numbers and words of the lines from the first frame on."""
+    begun = False
+    for number, line in numbered_lines(path):
+        words = line.split()
+        if not begun and line.strip().upper() == (":DEGREES" if asf.radians else ":RADIANS"):
+            raise WearcapError(
+                "its angles are in another unit than the ASF's", where=path, expected="one unit in both"
+            )
+        begun = begun or (bool(words) and words[0][0] not in "#:")
+        if begun and words:
+            yield number, words
+
+
+def _take_frame_number(frames: "array[int]", words: list[str], where: str) -> None:
+    sound = len(words) == 1 and words[0].isdecimal() and len(words[0]) <= 15
+    if not sound or (frames and int(words[0]) <= frames[-1]):
+        raise WearcapError(f"{' '.join(words)[:60]!r} where a frame number should stand", where=where,
+                           expected="rising frame numbers")  # fmt: skip
+    frames.append(int(words[0]))
+
+
+def _take_values(values: "array[float]", words: list[str], like: list[str], where: str) -> None:
+    """A bone's values, whose name and number must be those of the first frame."""
+    if words[0] != like[0] or len(words) != len(like):
+        raise WearcapError(f"{' '.join(words)[:60]!r} differs from the first frame", where=where,
+                           expected=f"{like[0]!r} with {len(like) - 1} values")  # fmt: skip
     try:
-        if len(tokens) % row or any(set(tokens[c::row]) != {name} for c, name in columns.items() if name):
-            raise ValueError("frames differ in layout")
-        frames = np.fromiter(map(int, tokens[::row]), np.int64)
-        values = np.stack([finite_floats(tokens[c::row]) for c, name in columns.items() if not name], -1)
-        if (np.diff(frames) <= 0).any():
-            raise ValueError("frame numbers do not rise")
-    except (ValueError, OverflowError) as error:
-        raise _explained(path, lines, start, [words for _, words in first]) from error
-    return frames, joints, torch.from_numpy(values)
+        found = [float(word) for word in words[1:]]
+    except ValueError:
+        found = [math.nan]
+    if not all(map(math.isfinite, found)):
+        bad = next(word for word in words[1:] if not is_finite_number(word))
+        raise WearcapError(f"{bad[:30]!r} is no finite number", where=where)
+    values.extend(found)
 
 
 def _layout_joints(path: Path, asf: AsfSkeleton, start: int, first: list[tuple[int, list[str]]]) -> list[int]:
@@ -344,22 +380,3 @@ def _layout_joints(path: Path, asf: AsfSkeleton, start: int, first: list[tuple[i
         raise WearcapError(f"the first frame lacks {sorted(moving - set(names))[:5]}", where=at_line(path, start),
                            expected="every bone that has channels in the ASF")  # fmt: skip
     return [asf.skeleton.index(name) for name in names]
-
-
-def _explained(path: Path, lines: list[str], start: int, first: list[list[str]]) -> WearcapError:
-    """Find the first line that breaks the first frame's layout."""
-    content = [(number, line.split()) for number, line in enumerate(lines[start:], start + 1) if line.strip()]
-    before = -1.0
-    for i, (number, words) in enumerate(content):
-        where, told = at_line(path, number), " ".join(words)[:60]
-        like = first[i % (len(first) + 1) - 1]
-        if i % (len(first) + 1) == 0:
-            if len(words) > 1 or not words[0].isdecimal() or len(words[0]) > 15 or int(words[0]) <= before:
-                return WearcapError(f"{told!r} where a frame number should stand", where=where, expected="rising frame numbers")  # fmt: skip
-            before = int(words[0])
-        elif words[0] != like[0] or len(words) != len(like):
-            return WearcapError(f"{told!r} differs from the first frame", where=where, expected=f"{like[0]!r} with {len(like) - 1} values")  # fmt: skip
-        elif bad := [word for word in words[1:] if not is_finite_number(word)]:
-            return WearcapError(f"{bad[0][:30]!r} is no finite number", where=where)
-    return WearcapError("the last frame is cut short", where=at_line(path, len(lines)),
-                        expected=f"{len(first)} bones per frame", fix="Fetch the file again.")  # fmt: skip

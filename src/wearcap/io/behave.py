@@ -7,6 +7,7 @@ for preparation to take out by the feet. Poses place a mesh whose vertices' mean
 mesh that was registered: other resolutions of an object have another mean.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,8 @@ def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
 
     Raises WearcapError where it is missing, and for what `check_object_mesh` refuses.
     """
+    if not re.fullmatch(r"[\w-]{1,64}", object_name):
+        raise WearcapError(f"an object named {object_name[:60]!r}", where=root, expected="one of BEHAVE's names, as boxlarge")  # fmt: skip
     path = behave_mesh_path(root, object_name)
     if not path.is_file():
         raise WearcapError(f"no mesh of {object_name}", where=path, expected="objects/OBJECT/OBJECT_f1000.ply",

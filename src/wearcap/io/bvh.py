@@ -20,7 +20,7 @@ from wearcap.geometry.rotation import about_axis
 from wearcap.io.bvh_check import check_body
 from wearcap.io.bvh_parse import BvhJoint, parse_hierarchy, parse_motion
 from wearcap.io.frame_grid import even_frames, nominal_fps
-from wearcap.io.text import read_text
+from wearcap.io.text import numbered_lines
 from wearcap.recording.motion import Motion
 
 END_SITES = {
@@ -57,9 +57,9 @@ def read_bvh(
     """
     path = Path(path)
     R_world_file = _axes(path, up, forward)
-    text = read_text(path).splitlines()
-    joints, motion_line = parse_hierarchy(path, text)
-    step_s, values = parse_motion(path, text, motion_line, sum(len(joint.channels) for joint in joints))
+    lines = numbered_lines(path)
+    joints, motion_line = parse_hierarchy(path, lines)
+    step_s, values = parse_motion(path, lines, motion_line, sum(len(joint.channels) for joint in joints))
     for joint in joints:
         joint.offset = list((offsets or {}).get(joint.name, joint.offset))
     translation, R = _channels(joints, values)

@@ -1,6 +1,9 @@
 """The two halves of a BVH file, HIERARCHY and MOTION, as they stand: the file's units, axes and channel order."""
 
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +13,8 @@ from wearcap.io.text import at_line, finite_floats, is_finite_number
 
 CHANNELS = {f"{axis}{kind}": (kind[0], axis) for axis in "xyz" for kind in ("position", "rotation")}
 MAX_JOINTS = 2000
+_MAX_WORDS = 64
+"""Of a joint's name."""
 _END_SITE = -1
 """Stands for an End Site among the open blocks."""
 
@@ -27,45 +32,68 @@ class BvhJoint:
     end: list[float] | None = None
 
 
-def parse_hierarchy(path: Path, lines: list[str]) -> tuple[list[BvhJoint], int]:
-    """Joints with parents first, and the index of the MOTION line."""
-    motion_line = next((i for i, line in enumerate(lines) if line.strip().upper() == "MOTION"), len(lines))
-    tokens = [(word, number) for number, line in enumerate(lines[:motion_line], 1)
-              for word in line.replace("{", " { ").replace("}", " } ").split()]  # fmt: skip
+def parse_hierarchy(path: Path, lines: Iterator[tuple[int, str]]) -> tuple[list[BvhJoint], int]:
+    """Joints with parents first, and the number of the MOTION line, up to which the lines are used up."""
+    words = _Words(lines)
     joints: list[BvhJoint] = []
     blocks: list[int] = []
-    i, line = 0, 1
+    line = 1
     try:
-        while i < len(tokens):
-            word, line = tokens[i]
-            key, i = word.upper(), i + 1
+        for word in words:
+            key, line = word.upper(), words.line
             if key in ("ROOT", "JOINT", "END"):
-                brace = next(k for k in range(i, len(tokens)) if tokens[k][0] == "{")
-                name = " ".join(token for token, _ in tokens[i:brace])
-                blocks.append(_begin(joints, blocks, key, name, line))
-                i = brace + 1
+                blocks.append(_begin(joints, blocks, key, words.name(), line))
             elif key == "OFFSET":
-                offset = finite_floats(token for token, _ in tokens[i : i + 3]).tolist()
-                _place(joints, blocks, offset)
-                i += 3
+                _place(joints, blocks, finite_floats(islice(words, 3)).tolist())
             elif key == "CHANNELS":
-                count = int(tokens[i][0])
-                names = [token.lower() for token, _ in tokens[i + 1 : i + 1 + count]]
-                _add_channels(joints, blocks, count, names)
-                i += 1 + count
+                count = int(next(words))
+                if not 0 <= count <= len(CHANNELS):
+                    raise ValueError(f"CHANNELS {count}")
+                _add_channels(joints, blocks, count, [name.lower() for name in islice(words, count)])
             elif key == "}":
                 blocks.pop()
             elif key != "HIERARCHY":
                 raise ValueError(f"unknown word {word[:30]!r}")
     except (ValueError, IndexError, StopIteration) as error:
-        raise WearcapError(f"the hierarchy is broken here ({str(error) or 'it ends too early'})",
+        raise WearcapError(f"the hierarchy is broken here ({str(error) or 'it ends too early'})"[:200],
                            where=at_line(path, line), expected="BVH") from error  # fmt: skip
-    if not joints or blocks or motion_line == len(lines):
-        raise WearcapError("no complete HIERARCHY followed by MOTION", where=at_line(path, max(motion_line, 1)),
+    if not joints or blocks or not words.motion_line:
+        raise WearcapError("no complete HIERARCHY followed by MOTION", where=at_line(path, words.line),
                            expected="a whole BVH file", fix="Fetch it again.")  # fmt: skip
     if len({joint.name for joint in joints}) < len(joints):
         raise WearcapError("two joints share a name", where=path, expected="unique joint names")
-    return joints, motion_line
+    return joints, words.motion_line
+
+
+class _Words:
+    """The words of a hierarchy one after another, until the line MOTION; `line` is where the last one stands."""
+
+    def __init__(self, lines: Iterator[tuple[int, str]]):
+        self.line, self.motion_line = 1, 0
+        self._words = self._split(lines)
+
+    def _split(self, lines: Iterator[tuple[int, str]]) -> Iterator[str]:
+        for number, line in lines:
+            self.line = number
+            if line.strip().upper() == "MOTION":
+                self.motion_line = number
+                return
+            yield from line.replace("{", " { ").replace("}", " } ").split()
+
+    def name(self) -> str:
+        """The words until a block opens."""
+        words: list[str] = []
+        while (word := next(self)) != "{":
+            if len(words) == _MAX_WORDS:
+                raise ValueError("a name without an end")
+            words.append(word)
+        return " ".join(words)
+
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        return next(self._words)
 
 
 def _begin(joints: list[BvhJoint], blocks: list[int], key: str, name: str, line: int) -> int:
@@ -99,39 +127,39 @@ def _add_channels(joints: list[BvhJoint], blocks: list[int], count: int, names: 
     joints[blocks[-1]].channels = [CHANNELS[name] for name in names]
 
 
-def parse_motion(path: Path, lines: list[str], start: int, channels: int) -> tuple[float, np.ndarray]:
+def parse_motion(
+    path: Path, lines: Iterator[tuple[int, str]], motion_line: int, channels: int
+) -> tuple[float, np.ndarray]:
     """Time step (s) and values "time channel"."""
-    content = [(number, line) for number, line in enumerate(lines[start + 1 :], start + 2) if line.strip()]
+    lines = ((number, line) for number, line in lines if line.strip())
     try:
-        (line, first), (line, second) = content[:2]
+        (_, first), (line, second) = next(lines), next(lines)
         count = int(first.lower().split("frames:")[1])
         step_s = float(second.lower().split("frame time:")[1])
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, StopIteration) as error:
         raise WearcapError(
-            "no 'Frames:' and 'Frame Time:' below MOTION", where=at_line(path, start + 1)
+            "no 'Frames:' and 'Frame Time:' below MOTION", where=at_line(path, motion_line)
         ) from error
     if not 1e-5 <= step_s <= 10:
         raise WearcapError(
             f"frame time {step_s} s", where=at_line(path, line), expected="seconds per frame, above 0"
         )
-    try:
-        values = finite_floats(" ".join(text for _, text in content[2:]).split())
-        if len(values) != count * channels or count < 1:
-            raise ValueError("wrong number of values")
-    except ValueError as error:
-        raise _explained(path, content[2:], count, channels) from error
-    return step_s, values.reshape(count, channels)
-
-
-def _explained(path: Path, rows: list[tuple[int, str]], count: int, channels: int) -> WearcapError:
-    """Find the first line of the motion that is wrong."""
-    for number, text in rows:
+    values, odd, rows = array("d"), None, 0
+    for number, text in lines:
         words = text.split()
-        if bad := [word for word in words if not is_finite_number(word)]:
-            return WearcapError(f"{bad[0][:30]!r} is no finite number", where=at_line(path, number))
-        if len(words) != channels:
-            return WearcapError(f"{len(words)} values", where=at_line(path, number),
-                                expected=f"{channels}, one per channel of the hierarchy")  # fmt: skip
-    return WearcapError(
-        f"{len(rows)} frames", where=path, expected=f"{count} frames, as the file says (at least one)"
-    )
+        rows += 1
+        try:
+            values.extend(finite_floats(words))
+        except ValueError as error:
+            bad = next(word for word in words if not is_finite_number(word))
+            raise WearcapError(f"{bad[:30]!r} is no finite number", where=at_line(path, number)) from error
+        if len(words) != channels and odd is None:
+            odd = WearcapError(f"{len(words)} values", where=at_line(path, number),
+                               expected=f"{channels}, one per channel of the hierarchy")  # fmt: skip
+        if len(values) > count * channels:
+            break
+    if len(values) != count * channels or not values:
+        raise odd or WearcapError(
+            f"{rows} frames", where=path, expected=f"{count} frames, as the file says (at least one)"
+        )
+    return step_s, np.asarray(values).reshape(count, channels)

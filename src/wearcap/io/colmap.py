@@ -6,6 +6,7 @@ The model's unit and axes are left as they are: structure from motion knows neit
 
 import math
 import struct
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +19,12 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.text import at_line, finite_floats, read_bytes, read_text
+from wearcap.io.bounded import read_bytes
+from wearcap.io.text import at_line, finite_floats, numbered_lines
 from wearcap.recording.photo import Photo
 
 _MAX_BYTES = 1 << 34
+"""Largest binary file that is read (16 GiB)."""
 _MODELS = {
     "SIMPLE_PINHOLE": ("pinhole", 3), "PINHOLE": ("pinhole", 4), "SIMPLE_RADIAL": ("opencv", 4),
     "RADIAL": ("opencv", 5), "OPENCV": ("opencv", 8), "OPENCV_FISHEYE": ("fisheye", 8),
@@ -160,7 +163,7 @@ def _camera(model: str, width: int, height: int, values: list[float], where: str
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Where each line stands and its words, without comments; empty lines come, too."""
-    for number, line in enumerate(read_text(path).split("\n"), 1):
+    for number, line in numbered_lines(path):
         if not line.startswith("#"):
             yield at_line(path, number), line.split()
 
@@ -211,21 +214,21 @@ def _read_images_txt(path: Path) -> list[_Image]:
 
 
 def _read_points_txt(path: Path) -> _Points:
-    numbers, xyz, rgb = [], [], []
+    numbers, xyz, rgb = array("q"), array("d"), bytearray()
     for where, words in _lines(path):
         if words:
             try:
-                numbers.append(np.int64(words[0]))
-                xyz.append([float(word) for word in words[1:4]])
-                rgb.append([int(word) for word in words[4:7]])
-                if len(xyz[-1]) < 3 or len(rgb[-1]) < 3 or not all(0 <= value < 256 for value in rgb[-1]):
-                    raise ValueError("too few numbers, or colours beyond 0…255")
+                if len(words) < 7:
+                    raise ValueError("too few numbers")
+                numbers.append(int(words[0]))
+                xyz.extend(map(float, words[1:4]))
+                rgb += bytes(map(int, words[4:7]))  # refuses what is beyond 0…255
             except (ValueError, IndexError, OverflowError) as error:
                 raise _damaged(where, error, "POINT3D_ID X Y Z R G B ERROR TRACK…") from error
     return _checked_points(numbers, xyz, rgb, path)
 
 
-def _checked_points(numbers: list, xyz: list, rgb: list, path: Path) -> _Points:
+def _checked_points(numbers: "array[int]", xyz: "array[float]", rgb: bytearray, path: Path) -> _Points:
     points = _Points(
         np.array(numbers, np.int64), np.array(xyz, np.float64).reshape(-1, 3),
         np.array(rgb, np.uint8).reshape(-1, 3),
@@ -242,7 +245,7 @@ class _Cursor:
     """Reads structures one after another and says which part of the file ended too early."""
 
     def __init__(self, path: Path):
-        self.path, self.data, self.place = path, read_bytes(path, _MAX_BYTES), 0
+        self.path, self.data, self.place = path, read_bytes(path, usual=_MAX_BYTES), 0
 
     def take(self, form: str, part: str) -> tuple:
         try:
@@ -300,13 +303,13 @@ def _read_images_bin(path: Path) -> list[_Image]:
 
 def _read_points_bin(path: Path) -> _Points:
     cursor = _Cursor(path)
-    numbers, xyz, rgb = [], [], []
+    numbers, xyz, rgb = array("q"), array("d"), bytearray()
     (count,) = cursor.take("Q", "its count")
     for row in range(count):
         where = f"point {row + 1} of {count}"
         number, x, y, z, red, green, blue, _, length = cursor.take("q3d3BdQ", where)
         cursor.rows(length, np.dtype("<i4, <i4"), where)
         numbers.append(number)
-        xyz.append((x, y, z))
-        rgb.append((red, green, blue))
+        xyz.extend((x, y, z))
+        rgb += bytes((red, green, blue))
     return _checked_points(numbers, xyz, rgb, path)

@@ -2,42 +2,43 @@
 
 import csv
 import difflib
-import gzip
-import lzma
+import io
 import warnings
-import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
 from wearcap.errors import WearcapError
+from wearcap.io.bounded import open_bytes
 
-_OPENERS = {".gz": gzip.open, ".xz": lzma.open}
+MAX_BYTES = 1 << 31
+"""Largest table that is taken into memory as a whole (2 GiB: two hours of poses at 1 kHz)."""
+MAX_STREAMED_BYTES = 1 << 36
+"""Largest table that is read in pieces (64 GiB)."""
+MAX_LINE = 1 << 16
 
 
 @contextmanager
-def open_text(path: str | Path) -> Iterator[IO[str]]:
-    """Open a text file for reading, decompressing by its suffix.
+def open_text(path: str | Path, usual: int = MAX_BYTES) -> Iterator[Iterator[str]]:
+    """Lines of a text file (UTF-8), unpacked by its suffix.
 
-    Raises WearcapError when it is missing, not text, or its compressed data is damaged or cut short; errors of
-    this kind that show only while reading inside the `with` block are named too.
+    Raises WearcapError as `open_bytes` does, for what is no text and for lines longer than `MAX_LINE`; errors that show
+    only while reading inside the `with` block are named too.
     """
-    path = Path(path)
     try:
-        with _OPENERS.get(path.suffix, open)(path, "rt", encoding="utf-8", newline="") as file:
-            yield file
-    except FileNotFoundError as error:
-        raise WearcapError("no such file", where=path) from error
+        with open_bytes(path, usual=usual) as file:
+            yield _lines(io.TextIOWrapper(file, "utf-8", newline=""), path)
     except UnicodeDecodeError as error:
         raise WearcapError("not a text file", where=path, expected="UTF-8 text") from error
-    except (EOFError, gzip.BadGzipFile, lzma.LZMAError, zlib.error) as error:
-        raise WearcapError(f"its compressed data is damaged or cut short ({error})", where=path,
-                           fix="Copy or download the file again.") from error  # fmt: skip
-    except OSError as error:
-        raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
+
+
+def _lines(file: io.TextIOWrapper, path: str | Path) -> Iterator[str]:
+    while line := file.readline(MAX_LINE):
+        if len(line) == MAX_LINE:
+            raise WearcapError(f"a line longer than {MAX_LINE} characters", where=path, expected="a table as text")  # fmt: skip
+        yield line
 
 
 def read_header(path: str | Path) -> list[str]:
@@ -79,7 +80,7 @@ def iter_columns(
                                fix=f"The nearest is {near[0]!r}." if near else "")  # fmt: skip
     kinds = dict.fromkeys(columns, "f8") | dict.fromkeys(text, "S64") | dict.fromkeys(whole, "i8")
     done = 0
-    with open_text(path) as file:
+    with open_text(path, MAX_BYTES if rows is None else MAX_STREAMED_BYTES) as file:
         next(file)
         while True:
             table = _read_rows(file, path, header, kinds, rows, done)

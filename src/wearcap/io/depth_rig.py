@@ -16,6 +16,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
+from wearcap.io.bounded import file_size
 from wearcap.io.photos import read_photos, write_photos
 from wearcap.io.poses import check_rising
 from wearcap.io.text import read_text
@@ -67,6 +68,7 @@ def read_depth_rig(folder: str | Path) -> DepthRigFiles:
 def read_depth(path: str | Path, camera: Camera) -> UInt16[np.ndarray, "height width"]:
     """A depth image (mm, 0: no return). Raises WearcapError for a damaged file, colours, 8 bits, another size than
     the calibration's, and values that cannot be millimetres."""
+    file_size(path)
     try:
         with Image.open(path) as image:
             mode, (width, height) = image.mode, image.size

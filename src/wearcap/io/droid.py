@@ -5,7 +5,6 @@ of the frames that SLAM was given, `disps.npy` (N, H, W) inverse depths, `intrin
 of the pictures' size. Unit and axes of the world are SLAM's own: neither metres nor gravity.
 """
 
-import tokenize
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,14 +17,12 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.npz import require
+from wearcap.io.npz import map_npy, require
 from wearcap.io.poses import check_finite, check_rising, checked_trajectory
 from wearcap.recording import PointCloud
 
 REDUCED = 8
 """SLAM works on pictures so many times smaller; its intrinsics are theirs."""
-_DAMAGE = (ValueError, EOFError, OSError, SyntaxError, TypeError, OverflowError, tokenize.TokenError)
-"""What numpy raises on files that are cut short or tampered with."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +79,10 @@ def read_droid(
 
 def _load(path: Path) -> np.ndarray:
     """A .npy file, mapped: its size is checked before anything is reserved."""
-    if not path.is_file():
+    if not path.exists():
         raise WearcapError("no such file", where=path, expected="a reconstruction of DROID-SLAM",
                            fix="Run it with --reconstruction_path.")  # fmt: skip
-    try:
-        return np.load(path, mmap_mode="r", allow_pickle=False)
-    except _DAMAGE as error:
-        raise WearcapError(f"not a readable .npy file ({error})"[:300], where=path,
-                           expected="an array of numbers", fix="Fetch the file again.") from error  # fmt: skip
+    return map_npy(path)
 
 
 def _trajectory(poses: np.ndarray, seconds: np.ndarray, folder: Path) -> Trajectory:

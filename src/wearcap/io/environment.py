@@ -123,7 +123,13 @@ def _freedom(row: Any, where: str) -> Freedom:
 
 
 def _mesh(name: Any, path: Path, where: str) -> Mesh:
-    inside = isinstance(name, str) and name and "\0" not in name and "\\" not in name
+    inside = (
+        isinstance(name, str)
+        and name
+        and "\0" not in name
+        and "\\" not in name
+        and len(name.encode(errors="replace")) < 256
+    )
     if not inside or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
         raise WearcapError(f"mesh {name!r}", where=where, expected="a .ply file below the environment's folder",
                            fix="Copy it there and name it relatively, as objects/sofa_1.ply.")  # fmt: skip

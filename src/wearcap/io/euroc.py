@@ -1,5 +1,6 @@
 """EuRoC trajectories: CSV of `#timestamp [ns], p x y z [m], q w x y z`, more columns (velocity, biases) may follow."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,14 @@ def read_euroc(path: str | Path) -> Trajectory:
 
     Raises WearcapError for fewer than 8 columns, NaN, unsorted times, quaternions far from unit norm.
     """
-    with open_text(path) as file:
-        lines = [line for line in file if line.strip() and not line.startswith("#")]
-    if not lines:
-        raise WearcapError("no poses in the file", where=path, expected="lines of at least 8 numbers")
     try:
-        table = np.loadtxt(lines, delimiter=",", ndmin=2, usecols=range(8))
+        with open_text(path) as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # numpy's own word on an empty file; ours follows
+            lines = (line for line in file if line.strip() and not line.startswith("#"))
+            table = np.loadtxt(lines, delimiter=",", ndmin=2, usecols=range(8))
     except ValueError as error:
         raise WearcapError(f"not an EuRoC trajectory ({error})", where=path,
                            expected="timestamp [ns], x, y, z, qw, qx, qy, qz in every line") from error  # fmt: skip
+    if not len(table):
+        raise WearcapError("no poses in the file", where=path, expected="lines of at least 8 numbers")
     return checked_trajectory(table[:, 0] * 1e-9, table[:, 1:4], table[:, 4:8], path)

@@ -6,6 +6,7 @@ x keep their sign, those about y and z change it, so R = Ry(-y) Rx(x) Rz(-z). SM
 io/amass.py; here the world's too, for Unity's world is y up.
 """
 
+from array import array
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.hps import FPS, PELVIS_SMPL
 from wearcap.io.smpl_axes import A
-from wearcap.io.text import at_line, finite_floats, is_finite_number, read_text
+from wearcap.io.text import at_line, finite_floats, numbered_lines
 from wearcap.recording import Motion
 
 _ARM = ("collar", "shoulder", "elbow", "wrist", "hand")
@@ -66,20 +67,24 @@ def rotations_from_unity(angles_deg: Float[Tensor, "*batch 3"]) -> Float[Tensor,
 
 
 def _table(path: str | Path, widths: tuple[int, ...]) -> np.ndarray:
-    lines = [
-        (number, line.split()) for number, line in enumerate(read_text(path).splitlines(), 1) if line.strip()
-    ]
-    if len(lines) > 1 and len(lines[-1][1]) < len(lines[0][1]):
-        del lines[-1]  # the recorder stops in the middle of a line
-    if not lines:
-        raise WearcapError("no lines of numbers", where=path)
-    width = len(lines[0][1])
-    for number, tokens in lines:
+    values, width = array("d"), 0
+    short: WearcapError | None = None
+    for number, line in numbered_lines(path):
+        tokens = line.split()
+        if not tokens:
+            continue
+        if short is not None:
+            raise short
+        width = width or len(tokens)
         if width not in widths or len(tokens) != width:
-            raise WearcapError(f"{len(tokens)} numbers", where=at_line(path, number),
-                               expected=" or ".join(map(str, widths)))  # fmt: skip
-    try:
-        return finite_floats(token for _, tokens in lines for token in tokens).reshape(len(lines), width)
-    except ValueError as error:
-        wrong = next(number for number, tokens in lines if not all(map(is_finite_number, tokens)))
-        raise WearcapError(f"what is no finite number ({error})", where=at_line(path, wrong)) from error
+            short = WearcapError(f"{len(tokens)} numbers", where=at_line(path, number), expected=" or ".join(map(str, widths)))  # fmt: skip
+            if len(tokens) >= width:
+                raise short
+            continue  # the recorder stops in the middle of a line: only the last may be short
+        try:
+            values.extend(finite_floats(tokens))
+        except ValueError as error:
+            raise WearcapError(f"what is no finite number ({error})"[:200], where=at_line(path, number)) from error  # fmt: skip
+    if not values:
+        raise WearcapError("no lines of numbers", where=path)
+    return np.asarray(values).reshape(-1, width)

@@ -7,10 +7,13 @@ from wearcap.errors import WearcapError
 from wearcap.files import parse_json
 from wearcap.io.text import read_text
 
+MAX_BYTES = 1 << 28
+"""Largest JSON that is read (256 MiB): as Python's objects it takes up to twenty times as much."""
 
-def read_json(path: str | Path) -> Any:
-    """Content of a JSON file. Raises WearcapError when it is missing, empty, binary, no JSON or nested too deeply."""
-    return parse_json(read_text(path), path)
+
+def read_json(path: str | Path, max_bytes: int | None = None) -> Any:
+    """Content of a JSON file. Raises WearcapError as `read_text` does, and when it is no JSON or nested too deeply."""
+    return parse_json(read_text(path, max_bytes, MAX_BYTES), path)
 
 
 def read_json_object(path: str | Path) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from wearcap.recording import CameraStream, HeadStream, ImuStream, PointCloud, R
 
 FPS = 30.0
 """Of the pictures that SLAM was given."""
+_MAX_CONFIG_BYTES = 1 << 16
 TRAJECTORY, CONFIG, MARKS = "cam_traj.pkl", "config.yaml", "camera_calib.pkl"
 POINTS, VIDEO = "sfm/pointcloud/pcd_results.ply", "video/ego_video.MP4"
 UNDISTORTED, LENS = "sfm/undistort_calib.txt", "sfm/calib.txt"
@@ -152,8 +153,12 @@ def _config(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        content = yaml.safe_load(read_text(path))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        text = read_text(path, usual=_MAX_CONFIG_BYTES)
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise WearcapError("it refers to its own parts (&name, *name)", where=path, expected="plain keys with values",
+                               fix="Write them out: such references can blow up.")  # fmt: skip
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
         raise WearcapError(f"not readable YAML ({' '.join(str(error).split())})"[:300], where=path) from error
     if not isinstance(content, dict | None):
         raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="keys with values")

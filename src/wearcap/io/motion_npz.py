@@ -5,14 +5,13 @@ everything that is no array), and for tools that know AMASS' keys `trans`, `pose
 parent, in this skeleton's joints and axes), `mocap_framerate` and `joint_names`.
 """
 
-import json
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path
+from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.frame_grid import nominal_fps
@@ -50,7 +49,7 @@ def read_motion(path: str | Path) -> Motion:
         raise WearcapError("an .npz file, but not of ours", where=path, expected="one that write_motion wrote",
                            fix="AMASS files are read by io.amass.")  # fmt: skip
     try:
-        tree = json.loads(str(arrays.pop("wearcap")))
+        tree = parse_json(str(arrays.pop("wearcap")), path)
         version = tree["schema"]
         if version != SCHEMA:
             raise WearcapError(f"schema version {version}", where=path, expected=f"version {SCHEMA}")

@@ -4,6 +4,7 @@ MVN's segment frames are parallel to the world (x forward, y left, z up) in the 
 segment's position is its joint's, so orientations are taken as they are.
 """
 
+import io
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -22,11 +23,16 @@ from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import FOOT_PATCHES, Site, Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
-from wearcap.io.text import finite_floats, open_bytes
+from wearcap.io.bounded import open_bytes
+from wearcap.io.text import finite_floats
 from wearcap.recording import ImuStream, Motion, Recording
 
 MAX_BYTES = 1 << 34
 """Largest unpacked file that is read (16 GiB: two hours at 240 Hz)."""
+_MAX_ELEMENTS = 100_000
+_CHUNK, _MAX_SILENCE = 1 << 16, 1 << 26
+_MAX_NUMBER = 64
+"""Characters of a number at most."""
 
 _SIDED = {"shoulder": "collar", "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist", "upperleg": "hip",
           "lowerleg": "knee", "foot": "ankle", "toe": "toe"}  # fmt: skip
@@ -70,7 +76,7 @@ class _File:
     frames: dict[str, list[np.ndarray]] = field(default_factory=lambda: {name: [] for name in _FIELDS})
 
 
-def read_mvnx(path: str | Path) -> Recording:
+def read_mvnx(path: str | Path, max_bytes: int | None = None) -> Recording:
     """Read an .mvnx file (plain, .gz or .xz): `motion` (xsens23 with the wearer's bones, contacts in FOOT_PATCHES order)
     and the sensors as `imu` streams named by their joint.
 
@@ -79,8 +85,9 @@ def read_mvnx(path: str | Path) -> Recording:
     """
     file = _File(Path(path))
     try:
-        with open_bytes(path, MAX_BYTES) as source:
-            for element in _elements(iterparse(source, events=("start", "end"), forbid_dtd=True)):
+        with open_bytes(path, max_bytes, MAX_BYTES) as source:
+            chunks = _Chunks(source)
+            for element in _elements(iterparse(chunks, events=("start", "end"), forbid_dtd=True), chunks):
                 _take(file, element)
     except DefusedXmlException as error:
         raise WearcapError("it declares a document type or entities", where=path, expected="plain MVNX as MVN exports it",
@@ -96,11 +103,33 @@ def read_mvnx(path: str | Path) -> Recording:
 # --- from XML to lists ---------------------------------------------------------------------------------------
 
 
-def _elements(events: Iterator[tuple[str, Element]]) -> Iterator[Element]:
+class _Chunks:
+    """Reads that double until an element begins or ends: expat scans a long tag or comment anew with every read."""
+
+    def __init__(self, source: io.BufferedReader):
+        self._source, self._size = source, _CHUNK
+
+    def read(self, _size: int) -> bytes:
+        content = self._source.read(self._size)
+        self._size *= 2
+        if self._size > _MAX_SILENCE:
+            raise ValueError(f"{_MAX_SILENCE} bytes without an element")
+        return content
+
+    def restart(self) -> None:
+        self._size = _CHUNK
+
+
+def _elements(events: Iterator[tuple[str, Element]], chunks: _Chunks) -> Iterator[Element]:
     """Complete elements of interest; frames are forgotten once they are used, so that memory stays flat."""
     frames: Element | None = None
+    held = 0
     for event, element in events:
+        chunks.restart()
         name = _name(element)
+        held += event == "start"
+        if held > _MAX_ELEMENTS:
+            raise ValueError(f"more than {_MAX_ELEMENTS} elements beside its frames")
         if event == "start" and name == "frames":
             frames = element
         elif (event == "start" and name == "subject") or (
@@ -109,6 +138,7 @@ def _elements(events: Iterator[tuple[str, Element]]) -> Iterator[Element]:
             yield element
             if name == "frame" and frames is not None:
                 frames.clear()
+                held = 0
 
 
 def _name(element: Element) -> str:
@@ -148,16 +178,10 @@ def _take_frame(file: _File, element: Element) -> None:
     kind = element.get("type", "normal")
     if kind not in (*_REST_TYPES, "normal"):
         return
+    _require_segments(file)
     values = {
-        name: finite_floats((child.text or "").split())
-        for child in element
-        if (name := _name(child)) in _FIELDS
+        name: _field(file, name, child.text or "") for child in element if (name := _name(child)) in _FIELDS
     }
-    for name, found in values.items():
-        things, width = _FIELDS[name]
-        count = len(getattr(file, things)) or len(FOOT_PATCHES) * (things == "contacts")
-        if len(found) != count * width:
-            raise ValueError(f"{name} with {len(found)} values where {count * width} belong")
     if kind in _REST_TYPES:
         file.rest[kind] = values
     else:
@@ -172,14 +196,33 @@ def _take_frame(file: _File, element: Element) -> None:
             file.frames[name].append(found.astype(np.float32) if name != "position" else found)
 
 
+def _require_segments(file: _File) -> None:
+    if missing := sorted(set(_JOINT_OF) - set(file.segments)):
+        raise WearcapError(f"segments {missing[:5]} are missing", where=file.path,
+                           expected="the 23 segments of a full-body suit")  # fmt: skip
+
+
+def _field(file: _File, name: str, text: str) -> np.ndarray:
+    """The numbers of one of a frame's fields."""
+    things, width = _FIELDS[name]
+    count = width * (len(getattr(file, things)) or len(FOOT_PATCHES) * (things == "contacts"))
+    if len(text) > 1000 + _MAX_NUMBER * count:
+        raise ValueError(f"{name} with {len(text)} characters where {count} numbers belong")
+    found = finite_floats(text.split())
+    if len(found) != count:
+        raise ValueError(f"{name} with {len(found)} values where {count} belong")
+    return found
+
+
 # --- from lists to a Recording ---------------------------------------------------------------------------------
 
 
 def _recording(file: _File) -> Recording:
-    missing = sorted(set(_JOINT_OF) - set(file.segments))
-    if missing or not file.fps:
-        what = f"segments {missing[:5]} are missing" if missing else "no subject with a frame rate"
-        raise WearcapError(what, where=file.path, expected="the 23 segments of a full-body suit")
+    _require_segments(file)
+    if not file.fps:
+        raise WearcapError(
+            "no subject with a frame rate", where=file.path, expected='<subject frameRate="60">'
+        )
     if not file.index:
         raise WearcapError("no frames of motion", where=file.path, expected='frames of type "normal"')
     timestamps = _timestamps(file)

@@ -1,5 +1,6 @@
-"""Arrays from .npz files of strangers: no pickles, no sizes that the file cannot hold."""
+"""Arrays from .npz and .npy files of strangers: no pickles, no sizes that the file cannot hold."""
 
+import io
 import lzma
 import math
 import struct
@@ -13,56 +14,106 @@ import numpy as np
 from numpy.lib import format as npy
 
 from wearcap.errors import WearcapError
+from wearcap.io.bounded import Budget, explained, file_size
 
 MAX_BYTES = 1 << 32
-"""Largest array that is read (4 GiB)."""
+"""Largest sum of the arrays that are read of one file (4 GiB)."""
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, ValueError, OSError,
-           NotImplementedError, RuntimeError, SyntaxError, tokenize.TokenError, KeyError, TypeError,
-           OverflowError)  # fmt: skip
+_MAX_HEADER = 1 << 14
+_CHUNK = 1 << 20
+DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, ValueError, OSError,
+          NotImplementedError, RuntimeError, SyntaxError, tokenize.TokenError, LookupError, TypeError,
+          OverflowError, MemoryError, AttributeError)  # fmt: skip
 """What zipfile and numpy raise on files that are cut short or tampered with."""
 
 
-def read_npz(path: str | Path, keys: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+def read_npz(
+    path: str | Path, keys: Iterable[str] | None = None, max_bytes: int | None = None
+) -> dict[str, np.ndarray]:
     """The arrays of an .npz file, of those named in `keys` the ones that are there (None: all).
 
-    Raises WearcapError for a missing or damaged file, and for an array of Python objects.
+    Raises WearcapError for a missing or damaged file, for an array of Python objects, and where the arrays that are
+    asked for hold more than `max_bytes` together.
     """
     path = Path(path)
-    if not path.is_file():
-        raise WearcapError("no such file", where=path)
+    budget = Budget(path, file_size(path), MAX_BYTES, max_bytes)
     name = ""
     try:
         with zipfile.ZipFile(path) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             arrays = {}
             for name in members if keys is None else [key for key in keys if key in members]:
-                arrays[name] = _read_member(archive, members[name], path, name)
+                arrays[name] = _read_member(archive, members[name], path, name, budget)
             return arrays
-    except _DAMAGE as error:
+    except PermissionError:
+        with explained(path):
+            raise
+    except DAMAGE as error:
         where = f"{path}, array {name!r}" if name else path
-        raise WearcapError(f"not a readable .npz file ({error})", where=where, expected="arrays saved by NumPy",
+        raise WearcapError(f"not a readable .npz file ({error})"[:300], where=where, expected="arrays saved by NumPy",
                            fix="Fetch the file again.") from error  # fmt: skip
 
 
-def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, name: str) -> np.ndarray:
+def _read_member(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, name: str, budget: Budget
+) -> np.ndarray:
     with archive.open(info) as file:
-        version = npy.read_magic(file)
-        if version not in _HEADERS:
-            raise ValueError(f"array format {version}")
-        shape, fortran, dtype = _HEADERS[version](file)
-        if dtype.hasobject:
-            raise WearcapError(f"array {name!r} holds Python objects", where=path, expected="plain numbers or text",
-                               fix="Such arrays can run code when they are loaded and are never read.")  # fmt: skip
+        head = io.BytesIO(file.read(_MAX_HEADER))
+        shape, fortran, dtype = _header(head, f"{path}, array {name!r}")
         size = math.prod(shape) * dtype.itemsize
-        if any(length < 0 for length in shape) or size > MAX_BYTES or size != info.file_size - file.tell():
+        if size != info.file_size - head.tell():
             raise ValueError(f"an array of shape {shape} in {info.file_size} bytes")
-        content = file.read(size)
-    if len(content) != size:
-        raise ValueError("its data ends too early")
-    array = np.frombuffer(content, dtype)
-    return array.reshape(shape, order="F" if fortran else "C").copy(order="C")
+        budget.spend(size)
+        array = np.empty(math.prod(shape), dtype)
+        _fill(memoryview(array.view(np.uint8)) if size else memoryview(bytearray()), head, file)
+    return array.reshape(shape, order="F").copy(order="C") if fortran else array.reshape(shape)
+
+
+def _header(head: io.BytesIO, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, order and type of an array, from the beginning of its file."""
+    version = npy.read_magic(head)
+    if version not in _HEADERS:
+        raise ValueError(f"array format {version}")
+    shape, fortran, dtype = _HEADERS[version](head)
+    if dtype.hasobject:
+        raise WearcapError("it holds Python objects", where=where, expected="plain numbers or text",
+                           fix="Such arrays can run code when they are loaded and are never read.")  # fmt: skip
+    if any(length < 0 for length in shape):
+        raise ValueError(f"an array of shape {shape}")
+    return shape, fortran, dtype
+
+
+def _fill(view: memoryview, head: io.BytesIO, rest: io.BufferedIOBase) -> None:
+    """Fill an array's memory piece by piece, so that nothing large is there twice."""
+    place = 0
+    while place < len(view):
+        content = head.read(_CHUNK) or rest.read(min(_CHUNK, len(view) - place))
+        if not content:
+            raise ValueError("its data ends too early")
+        view[place : place + len(content)] = content
+        place += len(content)
+
+
+def map_npy(path: str | Path) -> np.ndarray:
+    """The array of an .npy file, mapped: nothing is reserved for what the file does not hold.
+
+    Raises WearcapError for a missing or damaged file, and for an array of Python objects.
+    """
+    file_size(path)
+    try:
+        with open(path, "rb") as file:
+            head = io.BytesIO(file.read(_MAX_HEADER))
+        shape, fortran, dtype = _header(head, str(path))
+        if not math.prod(shape) * dtype.itemsize:
+            return np.zeros(shape, dtype)
+        return np.memmap(path, dtype, "r", head.tell(), shape, "F" if fortran else "C")
+    except PermissionError:
+        with explained(path):
+            raise
+    except DAMAGE as error:
+        raise WearcapError(f"not a readable .npy file ({error})"[:300], where=path,
+                           expected="an array of numbers", fix="Fetch the file again.") from error  # fmt: skip
 
 
 def require(

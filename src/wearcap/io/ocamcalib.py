@@ -16,10 +16,14 @@ from defusedxml.ElementTree import fromstring
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.text import at_line, finite_floats, read_text
+from wearcap.io.text import at_line, finite_floats, numbered_lines, read_text
 
 POWERS = 10
 """k1…k10: NavVis' lenses are met within 0.002 px at 4592 px width."""
+_MAX_BYTES = 1 << 24
+"""Largest calibration that is read (16 MiB; they take kilobytes)."""
+_MAX_SIDE = 1 << 20
+"""Largest width and height of an image (pixels)."""
 MAX_MISFIT_PX = 0.5
 MAX_DISAGREEMENT_PX = 3.0
 """Between the two polynomials of a file, which are fits to each other."""
@@ -50,9 +54,9 @@ class OCamModel:
         """
         c, d, e = self.affine
         determinant = c - d * e
-        if not (self.width > 0 and self.height > 0 and 0.1 < determinant < 10):
+        if not (0 < self.width <= _MAX_SIDE and 0 < self.height <= _MAX_SIDE and 0.1 < determinant < 10):
             raise WearcapError(f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}",
-                               where=where, expected="positive sizes, c near 1, d and e near 0")  # fmt: skip
+                               where=where, expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0")  # fmt: skip
         if not (0 <= self.row < self.height and 0 <= self.column < self.width):
             raise WearcapError(f"its centre, row {self.row:g} and column {self.column:g}, lies outside the image of "
                                f"{self.height} rows and {self.width} columns", where=where,
@@ -73,7 +77,9 @@ class OCamModel:
     def _curve(self, determinant: float, where: str | Path) -> tuple[np.ndarray, np.ndarray]:
         """Radii ρ (pixels) as far as the image's furthest corner, and their angles θ from the axis (rad)."""
         c, d, e = self.affine
-        corners = np.array([(row, column) for row in (0, self.height - 1) for column in (0, self.width - 1)])
+        corners = np.array(
+            [(row, column) for row in (0, self.height - 1) for column in (0, self.width - 1)], np.float64
+        )
         offset = corners - (self.row, self.column)
         u = (offset[:, 0] - d * offset[:, 1]) / determinant
         v = (c * offset[:, 1] - e * offset[:, 0]) / determinant
@@ -111,7 +117,7 @@ def read_ocamcalib(path: str | Path) -> OCamModel:
     """
     rows = [
         (number, line.split())
-        for number, line in enumerate(read_text(path).splitlines(), 1)
+        for number, line in numbered_lines(path, usual=_MAX_BYTES)
         if line.strip() and not line.lstrip().startswith(("#", "%"))
     ]
     if len(rows) < len(_TEXT_LINES):
@@ -141,7 +147,7 @@ def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
     Raises WearcapError for damaged XML, document types and entities, no cameras, and naming the camera for missing
     or wrong numbers.
     """
-    text = read_text(path)
+    text = read_text(path, usual=_MAX_BYTES)
     try:
         root = fromstring(text, forbid_dtd=True)
     except DefusedXmlException as error:

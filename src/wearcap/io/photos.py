@@ -11,7 +11,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.camera_json import camera_from_row, camera_row
-from wearcap.io.text import read_text
+from wearcap.io.json_text import read_json
 from wearcap.recording.photo import Photo
 
 FILE_NAME = "photos.json"
@@ -30,10 +30,10 @@ def read_photos(folder: str | Path) -> list[Photo]:
     folder = Path(folder)
     path = folder / FILE_NAME
     try:
-        rows = json.loads(read_text(path))["photos"]
+        rows = read_json(path)["photos"]
         if not isinstance(rows, list):
             raise TypeError("its 'photos' are no list")
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (KeyError, TypeError) as error:
         raise WearcapError(
             f"not a readable list of photos ({error})", where=path, expected=_EXAMPLE
         ) from error

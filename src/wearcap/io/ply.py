@@ -1,6 +1,11 @@
 """PLY files (ASCII, binary little and big endian): points with colours, and triangle meshes."""
 
+import io
+import warnings
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +13,7 @@ from jaxtyping import Float32, Int32, UInt8
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
+from wearcap.io.bounded import read_bytes
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -16,6 +22,8 @@ _TYPES = {
 }  # fmt: skip
 _BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER_BYTES = 1 << 16
+_MAX_EVEN_BYTES = 1 << 28
+"""Largest row that is read as one field of NumPy's, whose sizes are 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -43,18 +51,25 @@ class _Element:
     properties: list[_Property]
 
 
+@dataclass(frozen=True)
+class _Lists:
+    """The lists of a property one after another."""
+
+    values: np.ndarray
+    lengths: np.ndarray
+
+
 def read_ply(path: str | Path) -> Ply:
     """Read a PLY file. Raises WearcapError when it is no PLY, cut short, without x y z, or its numbers are NaN."""
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
+    data = read_bytes(path)
     byte_order, elements, body = _parse_header(data, path)
     if byte_order == "=":
-        tables = _read_ascii(elements, data[body:], path)
+        tables = _read_ascii(elements, memoryview(data)[body:], path)
     else:
         tables = _read_binary(elements, data, body, byte_order, path)
-    vertex = tables.get("vertex", {})
+    vertex = {
+        name: column for name, column in tables.get("vertex", {}).items() if isinstance(column, np.ndarray)
+    }
     if not {"x", "y", "z"} <= set(vertex):
         raise WearcapError("no vertices with x, y, z", where=path, expected="a PLY with `element vertex`")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is refused below
@@ -105,16 +120,26 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
             elif words[:1] == ["element"]:
                 elements.append(_Element(words[1], int(words[2]), []))
             elif words[:2] == ["property", "list"]:
+                if _TYPES[words[2]][0] == "f":
+                    raise ValueError(f"a list whose length is a {words[2]}")
                 elements[-1].properties.append(_Property(words[4], _TYPES[words[3]], _TYPES[words[2]]))
             elif words[:1] == ["property"]:
                 elements[-1].properties.append(_Property(words[2], _TYPES[words[1]]))
     except (KeyError, IndexError, ValueError) as error:
         raise WearcapError(
-            f"its header cannot be understood ({error})", where=path, expected="a PLY 1.0 header"
+            f"its header cannot be understood ({error})"[:200], where=path, expected="a PLY 1.0 header"
         ) from error
-    if not byte_order or any(element.count < 0 for element in elements):
+    names = [
+        [element.name for element in elements],
+        *([p.name for p in element.properties] for element in elements),
+    ]
+    if any(len(set(group)) < len(group) or any(name.startswith("#") for name in group) for group in names):
+        raise WearcapError("its header names a part twice", where=path, expected="a PLY 1.0 header")
+    if not byte_order or any(not 0 <= element.count < 1 << 48 for element in elements):
         raise WearcapError(
-            "its header names no format, or a negative count", where=path, expected="a PLY 1.0 header"
+            "its header names no format, or an impossible or negative count",
+            where=path,
+            expected="a PLY 1.0 header",
         )
     return byte_order, elements, newline + 1
 
@@ -135,12 +160,12 @@ def _read_binary(elements: list[_Element], data: bytes, start: int, order: str, 
 
 def _read_fixed_rows(element: _Element, data: bytes, start: int, order: str, path) -> tuple[dict, int]:
     dtype = np.dtype([(p.name, order + p.dtype) for p in element.properties])
+    if not dtype.itemsize:
+        return {}, start
     stop = start + element.count * dtype.itemsize
     if stop > len(data):
         raise _cut_short(path, element)
-    rows = (
-        np.frombuffer(data, dtype, element.count, start) if dtype.itemsize else np.empty(element.count, dtype)
-    )
+    rows = np.frombuffer(data, dtype, element.count, start)
     return {p.name: rows[p.name] for p in element.properties}, stop
 
 
@@ -149,75 +174,114 @@ def _read_list_rows(element: _Element, data: bytes, start: int, order: str, path
     table, stop = _read_even_lists(element, data, start, order)
     if table is not None:
         return table, stop
-    columns: dict[str, list] = {p.name: [] for p in element.properties}
-    try:
-        for _ in range(element.count):
-            for p in element.properties:
-                length = 1
-                if p.count_dtype:
-                    length = int(np.frombuffer(data, order + p.count_dtype, 1, start)[0])
-                    start += np.dtype(p.count_dtype).itemsize
-                columns[p.name].append(np.frombuffer(data, order + p.dtype, length, start))
-                start += length * np.dtype(p.dtype).itemsize
-    except ValueError as error:
-        raise _cut_short(path, element) from error
-    return columns, start
+    columns = {p.name: (bytearray(), array("q")) for p in element.properties}
+    plan = [(*columns[p.name], np.dtype(order + p.count_dtype) if p.count_dtype else None, np.dtype(p.dtype).itemsize)
+            for p in element.properties]  # fmt: skip
+    for _ in range(element.count):
+        for values, lengths, count_dtype, width in plan:
+            length = 1
+            if count_dtype:
+                length = _length(data, start, count_dtype)
+                start += count_dtype.itemsize
+                lengths.append(length)
+            stop = start + length * width
+            if length < 0 or stop > len(data):
+                raise _cut_short(path, element)
+            values += data[start:stop]
+            start = stop
+    table = {}
+    for p in element.properties:
+        values, lengths = columns[p.name]
+        found = np.frombuffer(values, order + p.dtype)
+        table[p.name] = _Lists(found, np.array(lengths, np.int64)) if p.count_dtype else found
+    return table, start
+
+
+def _length(data: bytes, place: int, dtype: np.dtype) -> int:
+    """Length of the list that begins here; -1 where the data ends."""
+    if place + dtype.itemsize > len(data):
+        return -1
+    return int(np.frombuffer(data, dtype, 1, place)[0])
 
 
 def _read_even_lists(element: _Element, data: bytes, start: int, order: str) -> tuple[dict | None, int]:
     fields, position = [], start
     for p in element.properties:
         if p.count_dtype:
-            if position + np.dtype(p.count_dtype).itemsize > len(data) or not element.count:
+            count_dtype = np.dtype(order + p.count_dtype)
+            length = _length(data, position, count_dtype)
+            position += count_dtype.itemsize + length * np.dtype(p.dtype).itemsize
+            if length < 0 or position > min(len(data), start + _MAX_EVEN_BYTES):
                 return None, start
-            length = int(np.frombuffer(data, order + p.count_dtype, 1, position)[0])
-            fields += [(f"#{p.name}", order + p.count_dtype), (p.name, order + p.dtype, (length,))]
+            fields += [(f"#{p.name}", count_dtype), (p.name, order + p.dtype, (length,))]
         else:
+            position += np.dtype(p.dtype).itemsize
             fields.append((p.name, order + p.dtype))
-        position = start + np.dtype(fields).itemsize
     dtype = np.dtype(fields)
     stop = start + element.count * dtype.itemsize
     if stop > len(data):
         return None, start
     rows = np.frombuffer(data, dtype, element.count, start)
-    even = all(
-        (rows[f"#{p.name}"] == dtype[p.name].shape[0]).all() for p in element.properties if p.count_dtype
-    )
-    return ({p.name: rows[p.name] for p in element.properties}, stop) if even else (None, start)
+    table = {}
+    for p in element.properties:
+        table[p.name] = values = rows[p.name]
+        if p.count_dtype:
+            if (rows[f"#{p.name}"] != values.shape[1]).any():
+                return None, start
+            table[p.name] = _Lists(values.reshape(-1), np.full(len(rows), values.shape[1]))
+    return table, stop
 
 
-def _read_ascii(elements: list[_Element], body: bytes, path) -> dict[str, dict]:
-    lines = body.decode("ascii", errors="replace").split("\n")
-    lines = [line for line in lines if line.strip()]
-    tables, start = {}, 0
+def _read_ascii(elements: list[_Element], body: memoryview, path) -> dict[str, dict]:
+    text = io.TextIOWrapper(io.BytesIO(body), "ascii", errors="replace", newline="\n")
+    lines = (line for line in text if line.strip())
+    tables = {}
     for element in elements:
-        rows = lines[start : start + element.count]
-        start += element.count
-        if len(rows) < element.count:
-            raise _cut_short(path, element)
+        if element.count == 0:
+            tables[element.name] = {}
+            continue
+        listed = any(p.count_dtype for p in element.properties)
         try:
-            tables[element.name] = _ascii_table(element, rows)
-        except (ValueError, IndexError) as error:
+            table, rows = (_ascii_lists if listed else _ascii_table)(element, lines)
+        except (ValueError, IndexError, OverflowError) as error:
             raise WearcapError(
-                f"a {element.name} row is not as the header says ({error})", where=path
+                f"a {element.name} row is not as the header says ({error})"[:200], where=path
             ) from error
+        if rows < element.count:
+            raise _cut_short(path, element)
+        tables[element.name] = table
     return tables
 
 
-def _ascii_table(element: _Element, rows: list[str]) -> dict:
-    if not any(p.count_dtype for p in element.properties):
-        values = np.array([row.split() for row in rows], dtype=np.float64).reshape(len(rows), -1)
-        return {p.name: values[:, i].astype(p.dtype) for i, p in enumerate(element.properties)}
-    columns: dict[str, list] = {p.name: [] for p in element.properties}
-    for row in rows:
-        words = row.split()
+def _ascii_table(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
+    with warnings.catch_warnings(), np.errstate(invalid="ignore", over="ignore"):
+        warnings.simplefilter("ignore", UserWarning)  # numpy's own word on a file that ends here
+        values = np.loadtxt(islice(lines, element.count), ndmin=2, comments=None)
+        return {p.name: values[:, i].astype(p.dtype) for i, p in enumerate(element.properties) if len(values)}, len(values)  # fmt: skip
+
+
+def _ascii_lists(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
+    columns = {p.name: (array("d"), array("q")) for p in element.properties}
+    rows = 0
+    for line in islice(lines, element.count):
+        words, place = line.split(), 0
         for p in element.properties:
-            length = int(words.pop(0)) if p.count_dtype else 1
-            if length > len(words):
-                raise ValueError(f"{length} values announced, {len(words)} there")
-            columns[p.name].append(np.array(words[:length], dtype=np.float64))
-            del words[:length]
-    return columns
+            values, lengths = columns[p.name]
+            length = 1
+            if p.count_dtype:
+                length, place = int(words[place]), place + 1
+                lengths.append(length)
+            if not 0 <= length <= len(words) - place:
+                raise ValueError(f"{length} values announced, {len(words) - place} there")
+            values.extend(map(float, words[place : place + length]))
+            place += length
+        rows += 1
+    table = {}
+    for p in element.properties:
+        values, lengths = columns[p.name]
+        found = np.array(values, np.float64)
+        table[p.name] = _Lists(found, np.array(lengths, np.int64)) if p.count_dtype else found
+    return table, rows
 
 
 def _colors(vertex: dict) -> np.ndarray | None:
@@ -229,23 +293,22 @@ def _colors(vertex: dict) -> np.ndarray | None:
         if set(names) <= set(vertex):
             colors = np.stack([vertex[name] for name in names], 1)
             scale = 255 if colors.dtype.kind == "f" and colors.max(initial=0) <= 1 else 1
-            return np.clip(colors * scale, 0, 255).astype(np.uint8)
+            with np.errstate(over="ignore"):
+                return np.clip(np.nan_to_num(colors * scale), 0, 255).astype(np.uint8)
     return None
 
 
 def _triangles(face: dict, vertices: int, path) -> np.ndarray | None:
     corners = face.get("vertex_indices", face.get("vertex_index"))
-    if corners is None or not len(corners):
+    if not isinstance(corners, _Lists) or not len(corners.lengths):
         return None
-    if isinstance(corners, np.ndarray):
-        fans = [
-            np.stack([corners[:, 0], corners[:, i], corners[:, i + 1]], 1)
-            for i in range(1, corners.shape[1] - 1)
-        ]
-    else:
-        fans = [np.array([[polygon[0], polygon[i], polygon[i + 1]] for i in range(1, len(polygon) - 1)]).reshape(-1, 3)
-                for polygon in corners]  # fmt: skip
-    faces = np.concatenate([np.empty((0, 3)), *fans]).astype(np.int64)
-    if len(faces) and (faces.min() < 0 or faces.max() >= vertices):
-        raise WearcapError(f"a face names vertex {faces.max()}, there are {vertices}", where=path)
+    triangles = np.maximum(corners.lengths - 2, 0)
+    first = np.repeat(np.cumsum(corners.lengths) - corners.lengths, triangles)
+    k = np.arange(len(first)) - np.repeat(np.cumsum(triangles) - triangles, triangles) + 1
+    faces = np.stack([corners.values[first], corners.values[first + k], corners.values[first + k + 1]], 1)
+    low, high = faces.min(initial=0), faces.max(initial=-1)
+    if not (low >= 0 and high < vertices):
+        raise WearcapError(
+            f"a face names vertex {high if low >= 0 else low:g}, there are {vertices}", where=path
+        )
     return faces.astype(np.int32)

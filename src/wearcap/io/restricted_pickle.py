@@ -14,28 +14,34 @@ import pickle
 import re
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from wearcap.errors import WearcapError
-from wearcap.io.text import read_bytes
+from wearcap.io.bounded import Budget, counted, explained, file_size
 
 MAX_BYTES = 1 << 33
 """Largest pickle that is read, once unpacked (8 GiB)."""
+
+_MAX_DEPTH = 64
+_MAX_ITEMS = 1 << 24
+_MAX_STEPS = 1 << 24
+"""Opcodes of a pickle: each may put an object of a hundred bytes into memory, and takes half a microsecond."""
 
 _DTYPE = re.compile(r"[<>=|]?(b1|\?|[biuf][1248]|f16|[SU]\d{1,6})")
 _ADMITTED = (bool, int, float, complex, str, bytes, bytearray, type(None), np.generic)
 
 
-def read_pickle(path: str | Path) -> Any:
+def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
     """The content of a pickle or joblib file (packed or not): numbers, str, bytes, lists, tuples, dicts, arrays.
 
     Python 2's byte strings come as str (Latin-1). Raises WearcapError naming the class or function when the file
     holds anything else, and when it is damaged.
     """
-    content = _unpacked(read_bytes(path, MAX_BYTES), path)
+    content = _unpacked(path, max_bytes)
     try:
         value = _Unpickler(io.BytesIO(content), encoding="latin1").load()
         _require_plain(value)
@@ -52,36 +58,61 @@ class _RefusedError(Exception):
     """Something that is never admitted."""
 
 
-def _unpacked(content: bytes, path: str | Path) -> bytes:
+def _unpacked(path: str | Path, max_bytes: int | None) -> bytes:
     """joblib packs whole files; their first bytes tell how."""
-    try:
-        if content[:1] == b"x":
-            unpacked = zlib.decompressobj().decompress(content, MAX_BYTES + 1)
-        else:
-            packers = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
-            if content[:2] not in packers:
+    packed = Budget(path, file_size(path), MAX_BYTES, max_bytes)
+    packed.spend(file_size(path))
+    with explained(path), open(path, "rb") as file:
+        begin = file.peek(2)
+        packers = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
+        if begin[:1] == b"x":
+            file = _Inflated(file)
+        elif begin[:2] in packers:
+            file = packers[begin[:2]](file)
+        with counted(file, Budget(path, file_size(path), MAX_BYTES, max_bytes)) as reader:
+            content = reader.read()
+    if not content:
+        raise WearcapError("the file is empty", where=path)
+    return content
+
+
+class _Inflated(io.BufferedIOBase):
+    """What a stream packed by zlib unpacks to."""
+
+    def __init__(self, file: io.BufferedIOBase):
+        self._file, self._unpacker, self._rest = file, zlib.decompressobj(), b""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        assert size
+        while not self._unpacker.eof:
+            packed = self._rest or self._file.read(1 << 16)
+            content = self._unpacker.decompress(packed, size)
+            self._rest = self._unpacker.unconsumed_tail
+            if content or not packed:
                 return content
-            with packers[content[:2]](io.BytesIO(content)) as file:
-                unpacked = file.read(MAX_BYTES + 1)
-    except (OSError, EOFError, zlib.error, lzma.LZMAError) as error:
-        raise WearcapError(
-            f"not a complete packed file ({error})", where=path, fix="Fetch it again."
-        ) from error
-    if len(unpacked) > MAX_BYTES:
-        raise WearcapError(f"unpacks to more than {MAX_BYTES} bytes", where=path)
-    return unpacked
+        return b""
 
 
 def _require_plain(value: Any) -> None:
-    """Refuse what is left of half-built objects and of names that were never called."""
-    waiting, seen = [value], set()
-    while waiting:
-        item = waiting.pop()
-        if isinstance(item, list | tuple | dict) and id(item) not in seen:
-            seen.add(id(item))
-            waiting += [*item.keys(), *item.values()] if isinstance(item, dict) else item
-        elif not isinstance(item, (*_ADMITTED, list, tuple, dict, np.ndarray)):
-            raise _RefusedError(f"it holds a {getattr(item, '__name__', type(item).__name__)}")
+    """Refuse what is left of half-built objects and of names that were never called, and what unfolds without end.
+
+    A list may stand in many others, or in itself: it counts as often as it is met.
+    """
+    level, count = [value], 0
+    for _ in range(_MAX_DEPTH):
+        inner: list[Any] = []
+        for item in level:
+            if isinstance(item, list | tuple | dict):
+                count += len(item)
+                if count > _MAX_ITEMS:
+                    raise _RefusedError(f"it holds more than {_MAX_ITEMS} items")
+                inner += [*item.keys(), *item.values()] if isinstance(item, dict) else item
+            elif not isinstance(item, (*_ADMITTED, np.ndarray)):
+                raise _RefusedError(f"it holds a {getattr(item, '__name__', type(item).__name__)}")
+        if not inner:
+            return
+        level = inner
+    raise _RefusedError(f"it holds lists within lists, {_MAX_DEPTH} deep")
 
 
 # --- what the admitted names stand for -----------------------------------------------------------------------
@@ -107,13 +138,19 @@ def _encode(text: str, encoding: str = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-def _array(buffer: Any, dtype: Any, shape: Any, order: str = "C") -> np.ndarray:
-    data = buffer.encode("latin1") if isinstance(buffer, str) else bytes(buffer)
+def _checked(buffer: Any, dtype: Any, shape: Any) -> tuple[bytes, tuple[int, ...]]:
+    """The bytes and shape of an array that they can fill."""
+    data = buffer.encode("latin1") if isinstance(buffer, str) else buffer
     shape = (shape,) if isinstance(shape, int) else tuple(shape)
     if not isinstance(dtype, np.dtype) or dtype.hasobject or any(length < 0 for length in shape):
         raise ValueError("an array without a numeric type and shape")
-    if math.prod(shape) * dtype.itemsize != len(data):
-        raise ValueError(f"an array of shape {shape} from {len(data)} bytes")
+    if not isinstance(data, bytes | bytearray) or math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"an array of shape {shape} from other bytes")
+    return bytes(data), shape
+
+
+def _array(buffer: Any, dtype: Any, shape: Any, order: str = "C") -> np.ndarray:
+    data, shape = _checked(buffer, dtype, shape)
     array = np.frombuffer(data, dtype) if data else np.zeros(0, dtype)
     return array.reshape(shape, order="F" if order == "F" else "C").copy(order="C")
 
@@ -154,12 +191,24 @@ _PythonUnpickler: Any = getattr(pickle, "_Unpickler")  # noqa: B009
 """The pure Python one, for its opcodes can be replaced one by one."""
 
 
+def _stepping(load: Callable[[Any], None]) -> Callable[[Any], None]:
+    """An opcode that is counted."""
+
+    def step(self: Any) -> None:
+        self.steps += 1
+        if self.steps > _MAX_STEPS:
+            raise ValueError(f"more than {_MAX_STEPS} steps")
+        load(self)
+
+    return step
+
+
 class _Unpickler(_PythonUnpickler):
     dispatch: ClassVar[dict[int, Any]] = dict(_PythonUnpickler.dispatch)
 
     def __init__(self, file: io.BytesIO, *, encoding: str):
         super().__init__(file, encoding=encoding)
-        self._source = file
+        self._source, self.steps = file, 0
 
     def find_class(self, module: str, name: str) -> Any:
         found = _NAMES.get(module, {}).get(name)
@@ -176,8 +225,8 @@ class _Unpickler(_PythonUnpickler):
         target = self.stack[-1]
         if isinstance(target, np.ndarray):
             _, shape, dtype, fortran, data = state
-            filled = _array(data, dtype, shape, "F" if fortran else "C")
-            target.__setstate__((1, filled.shape, filled.dtype, False, filled.tobytes()))
+            data, shape = _checked(data, dtype, shape)
+            target.__setstate__((1, shape, dtype, bool(fortran), data))
         elif isinstance(target, np.dtype):
             self._set_byte_order(target, state)
         elif isinstance(target, _JoblibArray):
@@ -231,3 +280,4 @@ class _Unpickler(_PythonUnpickler):
         pickle.READONLY_BUFFER,
     ):
         dispatch[opcode[0]] = refuse
+    dispatch = {opcode: _stepping(load) for opcode, load in dispatch.items()}

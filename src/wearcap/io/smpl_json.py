@@ -4,9 +4,7 @@ The world is metric and z up, joint frames are SMPL's (x left, y up, z forward) 
 the root joint itself. Fingers may be relative to SMPL+H's mean hand, which the files do not say.
 """
 
-import json
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,11 +14,12 @@ import torch
 
 from wearcap.body.skeletons import smpl24, smplh52
 from wearcap.errors import WearcapError
-from wearcap.io.json_text import read_json
-from wearcap.io.npz import require
+from wearcap.files import parse_json
+from wearcap.io.bounded import Budget, counted, explained, file_size
+from wearcap.io.json_text import MAX_BYTES, read_json
+from wearcap.io.npz import DAMAGE, require
 from wearcap.io.poses import check_rising
 from wearcap.io.smpl_axes import rotations_from_smpl, shape_from_betas
-from wearcap.io.text import MAX_BYTES
 from wearcap.recording.motion import Motion
 
 _BODY = 63
@@ -89,6 +88,7 @@ def _rotations(arrays: dict[str, np.ndarray]) -> torch.Tensor:
 
 def _unzipped(path: Path) -> Any:
     """Content of the one JSON file in an archive."""
+    budget = Budget(path, file_size(path), MAX_BYTES)
     try:
         with zipfile.ZipFile(path) as archive:
             members = [
@@ -96,23 +96,19 @@ def _unzipped(path: Path) -> Any:
                 for info in archive.infolist()
                 if not info.is_dir() and not info.filename.startswith("__MACOSX")
             ]
-            if len(members) != 1 or members[0].file_size > MAX_BYTES:
-                raise WearcapError(f"an archive of {len(members)} files", where=path,
-                                   expected=f"one JSON file of at most {MAX_BYTES} bytes")  # fmt: skip
-            return json.loads(archive.read(members[0]))
-    except FileNotFoundError as error:
-        raise WearcapError("no such file", where=path) from error
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        EOFError,
-        ValueError,
-        RecursionError,
-        RuntimeError,
-        OSError,
-    ) as error:
+            if len(members) != 1:
+                raise WearcapError(
+                    f"an archive of {len(members)} files", where=path, expected="one JSON file"
+                )
+            with archive.open(members[0]) as file, counted(file, budget) as reader:
+                content = reader.read()
+    except PermissionError:
+        with explained(path):
+            raise
+    except DAMAGE as error:
         raise WearcapError(f"not a readable .json.zip file ({error})"[:300], where=path, expected=_EXPECTED,
                            fix="Fetch it again.") from error  # fmt: skip
+    return parse_json(content, path)
 
 
 def _frames(content: Any, path: Path) -> tuple[list[dict], dict]:

@@ -1,8 +1,7 @@
 """Reading text files that strangers wrote: plain, .gz or .xz, of bounded size, with errors that name the line."""
 
-import gzip
-import lzma
-import zlib
+import codecs
+import io
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,67 +9,65 @@ from pathlib import Path
 import numpy as np
 
 from wearcap.errors import WearcapError
+from wearcap.io.bounded import open_bytes, read_bytes
 
 MAX_BYTES = 1 << 29
-"""Largest unpacked size that is read (512 MiB: over an hour of 120 Hz motion as text)."""
+"""Largest text that is taken into memory as a whole (512 MiB: over an hour of 120 Hz motion)."""
+MAX_STREAMED_BYTES = 1 << 32
+"""Largest text that is read line by line (4 GiB)."""
+MAX_LINE = 1 << 24
+"""Longest line (characters): COLMAP lists all points of a picture in one."""
 
 
-@contextmanager
-def open_bytes(path: str | Path, max_bytes: int = MAX_BYTES) -> Iterator["BoundedReader"]:
-    """Open a file for reading bytes, unpacked when its name ends in .gz or .xz.
-
-    Raises WearcapError, while opening or while reading inside the `with` block, when the file is missing, larger than
-    `max_bytes` once unpacked, or not what its name says.
-    """
-    path = Path(path)
-    opener = {".gz": gzip.open, ".xz": lzma.open}.get(path.suffix, open)
-    try:
-        with opener(path, "rb") as file:
-            yield BoundedReader(file, path, max_bytes)
-    except FileNotFoundError as error:
-        raise WearcapError("no such file", where=path) from error
-    except (lzma.LZMAError, gzip.BadGzipFile, zlib.error, EOFError) as error:
-        raise WearcapError(
-            f"not a complete {path.suffix} file ({error})", where=path, fix="Fetch it again."
-        ) from error
-    except OSError as error:
-        raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
+def _as_latin1(error: UnicodeError) -> tuple[str, int]:
+    """Bytes that are no UTF-8, read as Latin-1."""
+    assert isinstance(error, UnicodeDecodeError)
+    return error.object[error.start : error.end].decode("latin-1"), error.end
 
 
-class BoundedReader:
-    """A file's `read` that stops where a small packed file would fill the memory."""
-
-    def __init__(self, file, path: Path, max_bytes: int):
-        self._file, self._path, self._left, self._max = file, path, max_bytes, max_bytes
-
-    def read(self, size: int = -1) -> bytes:
-        content = self._file.read(self._left + 1 if size < 0 else size)
-        self._left -= len(content)
-        if self._left < 0:
-            raise WearcapError(
-                f"unpacks to more than {self._max} bytes", where=self._path, expected="a smaller file"
-            )
-        return content
+codecs.register_error("wearcap.latin1", _as_latin1)
 
 
-def read_bytes(path: str | Path, max_bytes: int = MAX_BYTES) -> bytes:
-    """Content of a file. Raises WearcapError as `open_bytes` does, and when it is empty."""
-    with open_bytes(path, max_bytes) as file:
-        content = file.read()
-    if not content:
-        raise WearcapError("the file is empty", where=path)
-    return content
-
-
-def read_text(path: str | Path) -> str:
+def read_text(path: str | Path, max_bytes: int | None = None, usual: int = MAX_BYTES) -> str:
     """Text of a file (UTF-8, else Latin-1). Raises WearcapError as `read_bytes` does, and for binary content."""
-    content = read_bytes(path)
+    content = read_bytes(path, max_bytes, usual)
     if b"\0" in content:
         raise WearcapError("binary content", where=path, expected="a text file")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
         return content.decode("latin-1")
+
+
+@contextmanager
+def open_lines(path: str | Path, usual: int = MAX_STREAMED_BYTES) -> Iterator[Iterator[str]]:
+    """A text's lines one after another (UTF-8; other bytes are taken as Latin-1).
+
+    Raises WearcapError as `open_bytes` does, while opening or inside the `with` block, for binary content and for
+    lines longer than `MAX_LINE`.
+    """
+    with open_bytes(path, usual=usual) as file:
+        yield _lines(io.TextIOWrapper(file, "utf-8-sig", errors="wearcap.latin1"), path)
+
+
+def _lines(file: io.TextIOWrapper, path: str | Path) -> Iterator[str]:
+    number = 0
+    while line := file.readline(MAX_LINE):
+        number += 1
+        if "\0" in line:
+            raise WearcapError("binary content", where=at_line(path, number), expected="a text file")
+        if len(line) == MAX_LINE and not line.endswith("\n"):
+            raise WearcapError(f"a line longer than {MAX_LINE} characters", where=at_line(path, number),
+                               expected="a text file")  # fmt: skip
+        yield line
+    if not number:
+        raise WearcapError("the file is empty", where=path)
+
+
+def numbered_lines(path: str | Path, usual: int = MAX_STREAMED_BYTES) -> Iterator[tuple[int, str]]:
+    """Lines of a text with their numbers, counted from 1. Raises WearcapError as `open_lines` does."""
+    with open_lines(path, usual) as lines:
+        yield from enumerate(lines, 1)
 
 
 def at_line(path: str | Path, line: int) -> str:

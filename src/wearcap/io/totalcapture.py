@@ -4,6 +4,7 @@ Both worlds have y up and are turned by +90° about x. A sensor's orientation is
 left, y up, z forward), so that it is mounted on our joint's axes by `io.smpl_axes.A`; accelerations are free of gravity.
 """
 
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from torch import Tensor
 from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.io.bounded import Budget, file_size
 from wearcap.io.npz import read_npz, require
 from wearcap.io.restricted_pickle import read_pickle
 from wearcap.io.smpl_axes import A, rotations_from_smpl
@@ -204,10 +206,14 @@ def _arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _torch_content(path: Path) -> Any:
+    budget = Budget(path, file_size(path))
     try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                budget.spend(sum(info.file_size for info in archive.infolist()))
         return torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise WearcapError("no such file", where=path) from error
+    except WearcapError:
+        raise
     except Exception as error:  # the opcodes are the file's own program: there is no telling what they break
         raise WearcapError(f"not a readable PyTorch file ({' '.join(str(error).split())[:120]})", where=path,
                            expected="a dict of tensors, without code") from error  # fmt: skip

@@ -1,5 +1,6 @@
 """TUM trajectories: lines of `timestamp tx ty tz qx qy qz qw`, `#` begins a comment."""
 
+from array import array
 from pathlib import Path
 
 import numpy as np
@@ -17,19 +18,20 @@ def read_tum(path: str | Path) -> Trajectory:
 
     Raises WearcapError for lines without 8 numbers, NaN, unsorted times, quaternions far from unit norm.
     """
+    values = array("d")
     with open_text(path) as file:
-        rows = [line.split("#")[0].replace(",", " ").split() for line in file]
-    rows = [(number, row) for number, row in enumerate(rows, 1) if row]
-    if not rows:
+        for number, line in enumerate(file, 1):
+            row = line.split("#")[0].replace(",", " ").split()
+            if row and len(row) != 8:
+                raise WearcapError(f"line {number} has {len(row)} fields", where=path,
+                                   expected="timestamp tx ty tz qx qy qz qw")  # fmt: skip
+            try:
+                values.extend(map(float, row))
+            except ValueError as error:
+                raise WearcapError(f"line {number}: {error}"[:200], where=path, expected="lines of 8 numbers") from error  # fmt: skip
+    if not values:
         raise WearcapError("no poses in the file", where=path, expected="lines of 8 numbers")
-    for number, row in rows:
-        if len(row) != 8:
-            raise WearcapError(f"line {number} has {len(row)} fields", where=path,
-                               expected="timestamp tx ty tz qx qy qz qw")  # fmt: skip
-    try:
-        table = np.array([row for _, row in rows], dtype=np.float64)
-    except ValueError as error:
-        raise WearcapError(str(error), where=path, expected="lines of 8 numbers") from error
+    table = np.asarray(values).reshape(-1, 8)
     return checked_trajectory(table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]], path)
 
 

@@ -7,11 +7,14 @@ from pathlib import Path
 
 import av
 import numpy as np
+from av.container import InputContainer
+from av.video.stream import VideoStream
 from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
+from wearcap.io.bounded import file_size
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
@@ -19,11 +22,10 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
 
     Raises WearcapError when the file is missing or no picture.
     """
+    file_size(path, "picture")
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
-    except FileNotFoundError as error:
-        raise WearcapError("no such picture", where=path) from error
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise WearcapError(f"not a readable picture ({error})", where=path, expected="a JPEG or PNG file") from error  # fmt: skip
 
@@ -36,11 +38,10 @@ def read_frames(
     Times are those written in the file; where it has none, frames follow its average rate.
     Raises WearcapError when the file is missing, damaged or without pictures.
     """
+    file_size(path, "video")
     try:
-        with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise WearcapError("a file without pictures", where=path, expected="a video")
-            stream = container.streams.video[0]
+        with av.open(str(path), metadata_errors="replace") as container:
+            stream = _pictures_of(container, path)
             stream.thread_type = "AUTO"
             rate = float(stream.average_rate or 30)
             begin: float | None = None
@@ -54,11 +55,21 @@ def read_frames(
                     yield time - begin, frame.to_ndarray(format="rgb24")
             if number < 0:
                 raise WearcapError("a video without frames", where=path)
-    except FileNotFoundError as error:
-        raise WearcapError("no such video", where=path) from error
     except (av.FFmpegError, OSError) as error:
         raise WearcapError(f"not a readable video ({error})", where=path, expected="a complete MP4, MKV or AVI file",
                            fix="Play it in a video player, or copy it again.") from error  # fmt: skip
+
+
+def _pictures_of(container: InputContainer, path: str | Path) -> VideoStream:
+    """The stream of a video's pictures."""
+    if not container.streams.video:
+        raise WearcapError("a file without pictures", where=path, expected="a video")
+    stream = container.streams.video[0]
+    if stream.codec_context is None:
+        raise WearcapError(
+            "pictures packed in a way that is not known", where=path, expected="a video in H.264, say"
+        )
+    return stream
 
 
 @dataclass(frozen=True)
@@ -74,16 +85,13 @@ class VideoInfo:
 
 def video_info(path: str | Path) -> VideoInfo:
     """Size, average rate and length of a video. Raises WearcapError as `read_frames` does."""
+    file_size(path, "video")
     try:
-        with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise WearcapError("a file without pictures", where=path, expected="a video")
-            stream = container.streams.video[0]
+        with av.open(str(path), metadata_errors="replace") as container:
+            stream = _pictures_of(container, path)
             fps = float(stream.average_rate or 30)
             frames = stream.frames or round((container.duration or 0) / av.time_base * fps)
             return VideoInfo(stream.width, stream.height, fps, frames)
-    except FileNotFoundError as error:
-        raise WearcapError("no such video", where=path) from error
     except (av.FFmpegError, OSError) as error:
         raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error
 
