@@ -91,6 +91,8 @@ def video_info(path: str | Path) -> VideoInfo:
             stream = _pictures_of(container, path)
             fps = float(stream.average_rate or 30)
             frames = stream.frames or round((container.duration or 0) / av.time_base * fps)
+            if not (stream.width > 0 and stream.height > 0):
+                raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path, expected="a video")  # fmt: skip
             return VideoInfo(stream.width, stream.height, fps, frames)
     except (av.FFmpegError, OSError) as error:
         raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error
