@@ -283,7 +283,8 @@ def test_every_kind_of_cmu_trial_becomes_a_recording(real_data):
     tasks = cmu_tasks(
         real_data / "cmu_mocap", splits, SETTINGS, BvhSettings(0.01, "y", "z"), config.amc_fps, "CMU"
     )
-    assert len(tasks) == 240
+    indices = [path.read_text(encoding="utf-8") for path in (real_data / "cmu_mocap").glob("index*.csv")]
+    assert len(tasks) == sum(len(text.splitlines()) - 1 for text in indices) >= 240
     by_name = {task.name: task for task in tasks}
     for name in ("35_01", "12_01", "05_10", "03_01"):
         task = by_name[name]

@@ -2,7 +2,6 @@
 
 import gzip
 import lzma
-import time
 
 import numpy as np
 import pytest
@@ -284,9 +283,11 @@ def test_cmu_positions_equal_the_documented_formula(real_data):
 
 @pytest.mark.real
 def test_every_cmu_trial_is_read_as_a_person(real_data):
-    trials = sorted((real_data / "cmu_mocap" / "trials").glob("*/*.amc.xz"))
-    assert len(trials) == 235
-    frames, started = 0, time.process_time()
+    folder = real_data / "cmu_mocap"
+    trials = sorted(folder.glob("trials/*/*.amc.xz"))
+    indices = [path.read_text(encoding="utf-8") for path in folder.glob("index*.csv")]
+    assert len(trials) == sum(text.count(".amc.xz,") for text in indices) >= 235
+    frames = 0
     for trial in trials:
         motion = read_amc(read_asf(next(trial.parent.glob("*.asf"))), trial)
         frames += len(motion)
@@ -295,4 +296,3 @@ def test_every_cmu_trial_is_read_as_a_person(real_data):
         assert 1.3 < height < 2.0, trial
         assert motion.t_world_root[:, 2].median() > 0.25, trial
     assert frames > 200_000
-    assert time.process_time() - started < 120

@@ -319,9 +319,9 @@ def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Flo
     for row, (number, words) in enumerate(chain(beginning, first, following, lines)):
         place = row % (len(first) + 1)
         if place == 0:
-            _take_frame_number(frames, words, at_line(path, number))
+            _take_frame_number(frames, words, path, number)
         else:
-            _take_values(values, words, first[place - 1][1], at_line(path, number))
+            _take_values(values, words, first[place - 1][1], path, number)
     if place < len(first):
         raise WearcapError("the last frame is cut short", where=at_line(path, number),
                            expected=f"{len(first)} bones per frame", fix="Fetch the file again.")  # fmt: skip
@@ -342,26 +342,26 @@ def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
-def _take_frame_number(frames: "array[int]", words: list[str], where: str) -> None:
+def _take_frame_number(frames: "array[int]", words: list[str], path: Path, line: int) -> None:
     sound = len(words) == 1 and words[0].isdecimal() and len(words[0]) <= 15
     if not sound or (frames and int(words[0]) <= frames[-1]):
-        raise WearcapError(f"{' '.join(words)[:60]!r} where a frame number should stand", where=where,
+        raise WearcapError(f"{' '.join(words)[:60]!r} where a frame number should stand", where=at_line(path, line),
                            expected="rising frame numbers")  # fmt: skip
     frames.append(int(words[0]))
 
 
-def _take_values(values: "array[float]", words: list[str], like: list[str], where: str) -> None:
+def _take_values(values: "array[float]", words: list[str], like: list[str], path: Path, line: int) -> None:
     """A bone's values, whose name and number must be those of the first frame."""
     if words[0] != like[0] or len(words) != len(like):
-        raise WearcapError(f"{' '.join(words)[:60]!r} differs from the first frame", where=where,
+        raise WearcapError(f"{' '.join(words)[:60]!r} differs from the first frame", where=at_line(path, line),
                            expected=f"{like[0]!r} with {len(like) - 1} values")  # fmt: skip
     try:
-        found = [float(word) for word in words[1:]]
+        found = list(map(float, words[1:]))
     except ValueError:
         found = [math.nan]
     if not all(map(math.isfinite, found)):
         bad = next(word for word in words[1:] if not is_finite_number(word))
-        raise WearcapError(f"{bad[:30]!r} is no finite number", where=where)
+        raise WearcapError(f"{bad[:30]!r} is no finite number", where=at_line(path, line))
     values.extend(found)
 
 
