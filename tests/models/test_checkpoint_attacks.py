@@ -194,6 +194,13 @@ def test_giant_sizes_take_no_memory(tmp_path):
     assert json.loads(process.stdout) < 150, "MiB"
 
 
+def test_long_trainings_and_any_seed_are_no_giants(tmp_path):
+    config, state = read_checkpoint("hmd2")
+    model = config["model"] | {"seed": 2**62}
+    model["scheduler"] |= {"total": 10**9}
+    load_system(checkpoint(tmp_path / "x.safetensors", model, state))
+
+
 def test_weights_that_repeat_themselves_without_memory_are_refused(tmp_path):
     state = {"net.weight": torch.zeros(1).expand(1 << 20, 1 << 20)}
     torch.save(

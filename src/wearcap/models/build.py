@@ -64,7 +64,9 @@ _TARGET, _PARTIAL = "_target_", "_partial_"
 MAX_VALUES, MAX_TEXT = 10_000, 1000
 """Most values of a model's config, and longest text (characters) in it; those we share have 150 values at most."""
 MAX_SIZE = 1 << 20
-"""Largest whole number of a config but seeds: widths, windows, counts of layers."""
+"""Largest whole number of a config: widths, windows, counts of layers."""
+_ANY_SIZE = ("seed", "optimizer", "scheduler")
+"""Parts whose numbers take no memory: seeds, counts of steps."""
 MAX_CALLS = 20_000
 """Most tensor operations that building a model takes; the largest of ours takes 400."""
 ALLOWANCE = 1 << 26
@@ -83,7 +85,7 @@ def check_config(config: Any, where: str | Path) -> None:
             raise _refused(f"more than {MAX_VALUES} values", where)
         if isinstance(value, dict):
             _check_keys(value, where)
-            rest += value.items()
+            rest += [(key if key in _ANY_SIZE else inner, item) for inner, item in value.items()]
         elif isinstance(value, list):
             rest += [(key, item) for item in value]
         else:
@@ -106,7 +108,7 @@ def _check_keys(part: dict[str, Any], where: str | Path) -> None:
 def _check_value(key: str, value: Any, where: str | Path) -> None:
     if isinstance(value, str) and ("${" in value or len(value) > MAX_TEXT):
         raise _refused(f"{key}: {value[:80]!r}", where)
-    if isinstance(value, int) and abs(value) > (1 << 63 if key == "seed" else MAX_SIZE):
+    if isinstance(value, int) and abs(value) > (1 << 63 if key in _ANY_SIZE else MAX_SIZE):
         raise _refused(f"{key}: {str(value)[:80]}", where)
     if isinstance(value, float) and not math.isfinite(value):
         raise _refused(f"{key}: {value}", where)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from wearcap.errors import WearcapError
-from wearcap.files import write_text
+from wearcap.files import atomic_path, write_text
 from wearcap.io.contact_labels import LabelClock, Labels, annotation_of, parse_labels
 from wearcap.io.json_text import read_json
 
@@ -77,8 +77,8 @@ class AnnotationFile:
     def _back_up(self, revision: str) -> None:
         copy = self.path.parent / "backups" / f"{self.clock.name}.{revision}.contacts.json"
         if not copy.exists():
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            copy.write_bytes(self.path.read_bytes())
+            with atomic_path(copy) as temporary:
+                temporary.write_bytes(self.path.read_bytes())
 
 
 def _digest(data: bytes) -> str:
