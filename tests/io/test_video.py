@@ -104,6 +104,14 @@ def test_a_header_with_more_frames_than_bytes_is_refused(tmp_path):
         video_info(tmp_path / "a.mp4")
 
 
+def test_pictures_of_a_video_that_are_too_large_are_refused(tmp_path, monkeypatch):
+    write_video(tmp_path / "a.mp4")
+    monkeypatch.setattr("wearcap.io.video.MAX_PIXELS", 48 * 63)
+    for read in (video_info, lambda path: list(read_frames(path))):
+        with pytest.raises(WearcapError, match="pictures of 64x48 pixels"):
+            read(tmp_path / "a.mp4")
+
+
 def test_written_pictures_come_back(tmp_path):
     shades = [np.full((32, 48, 3), 20 * k, np.uint8) for k in range(9)]
     assert write_frames(tmp_path / "a.mp4", iter(shades), 29.97) == 9

@@ -16,6 +16,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
+from wearcap.io.bounded import explained
 from wearcap.io.image_file import open_image
 from wearcap.io.photos import read_photos, write_photos
 from wearcap.io.poses import check_rising
@@ -52,7 +53,8 @@ def read_depth_rig(folder: str | Path) -> DepthRigFiles:
     timestamps = _timestamps(folder / "timestamps.txt")
     cameras = []
     for row in read_photos(folder):
-        empty, depth = (tuple(sorted((row.file / part).glob("*.png"))) for part in ("empty", "depth"))
+        with explained(row.file):
+            empty, depth = (tuple(sorted((row.file / part).glob("*.png"))) for part in ("empty", "depth"))
         if not empty:
             raise WearcapError("no images of the empty scene", where=row.file / "empty",
                                expected="16-bit PNG files", fix="Record the scene without the person.")  # fmt: skip

@@ -4,6 +4,7 @@ Pillow guesses the format from the content, whatever the name says, and for some
 (Ghostscript for EPS); half a megabyte of PNG may unpack to gigabytes.
 """
 
+import io
 import struct
 import zlib
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from pathlib import Path
 from PIL import Image
 
 from wearcap.errors import WearcapError
-from wearcap.io.bounded import Budget, file_size
+from wearcap.io.bounded import Budget, file_size, read_bytes
 
 FORMATS = ("BMP", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
 _PIXEL_BYTES = 4
@@ -30,12 +31,11 @@ def open_image(path: str | Path, max_bytes: int | None = None) -> Iterator[Image
     or unpacks to more than `max_bytes`, by default as far as `Budget` goes.
     """
     budget = Budget(path, file_size(path, "picture"), max_bytes=max_bytes)
+    content = io.BytesIO(read_bytes(path, max_bytes))  # no chunk of it can be longer than what is there
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with Image.open(content, formats=FORMATS) as image:
             budget.spend(_PIXEL_BYTES * image.width * image.height)
             yield image
-    except PermissionError as error:
-        raise WearcapError("no permission to read it", where=path, fix="Ask its owner, or change its mode (chmod).") from error  # fmt: skip
     except _DAMAGE as error:
         raise WearcapError(f"not a readable picture ({error})"[:300], where=path, expected="a JPEG or PNG file",
                            fix="Copy it again.") from error  # fmt: skip

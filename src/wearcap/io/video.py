@@ -16,6 +16,8 @@ from wearcap.files import atomic_path
 from wearcap.io.bounded import file_size
 from wearcap.io.image_file import open_image
 
+MAX_PIXELS = 1 << 26
+"""Of a video's picture (8192 x 8192)."""
 _MAX_FPS = 10_000
 
 
@@ -67,6 +69,10 @@ def _pictures_of(container: InputContainer, path: str | Path) -> VideoStream:
         raise WearcapError(
             "pictures packed in a way that is not known", where=path, expected="a video in H.264, say"
         )
+    stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # for sizes that only the pictures tell
+    if stream.width * stream.height > MAX_PIXELS:
+        raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path,
+                           expected=f"at most {MAX_PIXELS} pixels", fix="Scale the video down.")  # fmt: skip
     return stream
 
 
