@@ -29,6 +29,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import av
 import torch
 from fuzz_files import READERS
 from fuzz_mutate import mutated
@@ -57,7 +58,8 @@ def outcome(read, folder: Path) -> str:
     except WearcapError as error:
         cause: BaseException | None = error
         while cause is not None:
-            if isinstance(cause, MemoryError):
+            # FFmpeg calls it lack of memory when a header asks for more than it ever reserves.
+            if isinstance(cause, MemoryError) and not isinstance(cause, av.FFmpegError):
                 return "memory"
             cause = cause.__cause__ or cause.__context__
         return "refused"

@@ -137,6 +137,14 @@ def test_hostile_files(tmp_path):
             read_closed_loop(tmp_path / name)
 
 
+def test_two_poses_a_century_apart_are_not_resampled(tmp_path):
+    table = [row | {"tracking_timestamp_us": k * 3 * 10**15} for k, row in enumerate(rows(2))]
+    write(tmp_path / "closed_loop_trajectory.csv", table)
+    with pytest.raises(WearcapError, match=r"trajectory\.csv: poses over 8.33e\+05 hours"):
+        read_mps(tmp_path)
+    assert len(read_mps(tmp_path, fps=None).head.timestamps) == 2
+
+
 def test_y_up_world_is_turned(tmp_path):
     table = rows(gravity_y_world=-9.81, gravity_z_world=0, ty_world_device=1.6, tz_world_device=0.25)
     read = read_closed_loop(write(tmp_path / "t.csv", table), up="y")

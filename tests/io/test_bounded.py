@@ -124,7 +124,7 @@ def test_the_limit_is_lifted_by_the_user(little_free, tmp_path, monkeypatch):
 
 def test_the_option_of_the_command_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv(bounded.VARIABLE, "")  # so that it is put back
-    (tmp_path / "t.txt").write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(500)))
+    (tmp_path / "t.txt").write_text("".join(f"{k / 50} 0 0 0 0 0 0 1\n" for k in range(500)))
     assert exit_main("--max-file-gib", "1e-6", "doctor", "--json", str(tmp_path / "t.txt")) == 1
     assert "larger than 1.048 KiB once unpacked" in capsys.readouterr().out
     assert exit_main("--max-file-gib=1", "doctor", str(tmp_path / "t.txt")) == 0

@@ -38,6 +38,13 @@ def test_what_was_written_is_read(folder: Path):
     assert read_depths((), LENS).shape == (0, 12, 16)
 
 
+def test_a_folder_that_no_system_can_have_is_named(folder: Path):
+    path = folder / "photos.json"
+    path.write_text(path.read_text().replace('"k1"', f'"{"k" * 70_000}"'))
+    with pytest.raises(WearcapError, match="File name too long"):
+        read_depth_rig(folder)
+
+
 def test_a_camera_without_empty_frames_or_with_frames_missing_is_named(folder: Path):
     (folder / "k1" / "depth" / "000001.png").unlink()
     with pytest.raises(WearcapError, match="k1.*2 depth images for 3 times"):

@@ -1,12 +1,15 @@
 """Videos and pictures that were written on the spot."""
 
+import struct
+import zlib
+
 import av
 import numpy as np
 import pytest
 from PIL import Image
 
 from wearcap.errors import WearcapError
-from wearcap.io.video import read_frames, read_image, write_frames
+from wearcap.io.video import read_frames, read_image, video_info, write_frames
 
 
 def write_video(path, count: int = 12, rate: int = 25) -> None:
@@ -61,6 +64,52 @@ def test_pictures_are_not_turned_by_what_their_exif_says(tmp_path):
     (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:60])
     with pytest.raises(WearcapError, match="not a readable picture"):
         read_image(tmp_path / "b.png")
+
+
+def png(width: int, height: int) -> bytes:
+    """A black picture in a few bytes per thousand pixels."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        )
+
+    head = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    pixels = zlib.compress(bytes((width + 7) // 8 * height + height), 9)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
+def test_a_small_picture_that_unpacks_to_gigabytes_is_refused_unread(tmp_path, monkeypatch):
+    (tmp_path / "a.png").write_bytes(png(8000, 8000))
+    with pytest.raises(WearcapError, match="more than 100 times its size.*--max-file-gib"):
+        read_image(tmp_path / "a.png")
+    monkeypatch.setenv("WEARCAP_MAX_FILE_GIB", "1")
+    assert read_image(tmp_path / "a.png").shape == (8000, 8000, 3)
+
+
+def test_no_program_is_started_for_a_picture(tmp_path, monkeypatch):
+    monkeypatch.setattr("subprocess.Popen", lambda *_, **__: pytest.fail("a program was started"))
+    (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n")
+    with pytest.raises(WearcapError, match="not a readable picture.*identify"):
+        read_image(tmp_path / "a.png")
+
+
+def test_a_header_with_more_frames_than_bytes_is_refused(tmp_path):
+    write_video(tmp_path / "a.mp4")
+    content = bytearray((tmp_path / "a.mp4").read_bytes())
+    place = content.index(b"stts") + 12  # how many frames last how long
+    content[place : place + 4] = struct.pack(">I", 1 << 30)
+    (tmp_path / "a.mp4").write_bytes(content)
+    with pytest.raises(WearcapError, match="announces 1073741824 frames"):
+        video_info(tmp_path / "a.mp4")
+
+
+def test_pictures_of_a_video_that_are_too_large_are_refused(tmp_path, monkeypatch):
+    write_video(tmp_path / "a.mp4")
+    monkeypatch.setattr("wearcap.io.video.MAX_PIXELS", 48 * 63)
+    for read in (video_info, lambda path: list(read_frames(path))):
+        with pytest.raises(WearcapError, match="pictures of 64x48 pixels"):
+            read(tmp_path / "a.mp4")
 
 
 def test_written_pictures_come_back(tmp_path):

@@ -61,7 +61,7 @@ def read_adt(folder: str | Path, *, fps: float | None = None, T_aria_cpf: Rigid 
     skeletons = sorted(folder.glob("Skeleton_*.json"))
     objects = read_objects(folder) if (folder / "scene_objects.csv").is_file() else []
     return Recording(
-        name=folder.resolve().name, head=head_stream(trajectory, fps=fps, T_aria_cpf=T_aria_cpf),
+        name=folder.resolve().name, head=head_stream(trajectory, fps=fps, T_aria_cpf=T_aria_cpf, where=folder),
         cues=read_skeleton(skeletons[0]) if skeletons else {},
         object_motion={o.name: _path(o) for o in objects if o.moves and o.timestamps is not None},
         location=str(read_json_object(folder / "metadata.json").get("scene", "")) if (folder / "metadata.json").is_file() else "",

@@ -125,16 +125,18 @@ def head_stream(
     fps: float | None,
     T_aria_cpf: Rigid | None = None,
     T_head_device: Rigid | None = None,
+    where: str | Path | None = None,
 ) -> HeadStream:
     """Head stream of a trajectory of the `aria` frame, turned to head axes at the pupils' midpoint.
 
     `fps` resamples evenly from the first timestamp (Hz; None keeps the file's 1 kHz). `T_aria_cpf` defaults to the
-    nominal CAD pose, `T_head_device` to `T_HEAD_DEVICE`.
+    nominal CAD pose, `T_head_device` to `T_HEAD_DEVICE`. Raises WearcapError, naming `where`, for poses over more than
+    half a day.
     """
     if fps is not None:
         start, stop = trajectory.timestamps[0].item(), trajectory.timestamps[-1].item()
         if stop - start > _MAX_DURATION_S:
-            raise WearcapError(f"poses over {(stop - start) / 3600:.3g} hours", expected="a recording of less than half a day",
+            raise WearcapError(f"poses over {(stop - start) / 3600:.3g} hours", where=where, expected="a recording of less than half a day",
                                fix="A time stamp is damaged, or two recordings stand in one file: cut it.")  # fmt: skip
         count = int((stop - start) * fps + 1e-6) + 1
         trajectory = resample(trajectory, start + torch.arange(count, dtype=torch.float64) / fps)
@@ -217,7 +219,7 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
     if path is None:
         raise WearcapError("no closed_loop_trajectory.csv (plain, .gz or .xz)", where=folder,
                            expected="the output folder of Aria's MPS")  # fmt: skip
-    head = head_stream(read_closed_loop(path).T_world_aria, fps=fps, T_aria_cpf=T_aria_cpf)
+    head = head_stream(read_closed_loop(path).T_world_aria, fps=fps, T_aria_cpf=T_aria_cpf, where=path)
     return Recording(
         name=Path(folder).resolve().name, head=head, points=read_mps_points(folder), source="Aria MPS"
     )

@@ -83,7 +83,10 @@ def _lift(size: int) -> str:
 
 
 def file_size(path: str | Path, kind: str = "file") -> int:
-    """Bytes of a regular file; `kind` is what a message calls it when it is missing. Raises WearcapError when it is missing, a folder, a pipe or device, or not allowed."""
+    """Bytes of a regular file; `kind` is what a message calls it when it is missing.
+
+    Raises WearcapError when it is missing, a folder, a pipe or device, or not allowed.
+    """
     with explained(path, kind):
         try:
             status = os.stat(path)

@@ -16,7 +16,8 @@ from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.bounded import file_size
+from wearcap.io.bounded import explained
+from wearcap.io.image_file import open_image
 from wearcap.io.photos import read_photos, write_photos
 from wearcap.io.poses import check_rising
 from wearcap.io.text import read_text
@@ -52,7 +53,8 @@ def read_depth_rig(folder: str | Path) -> DepthRigFiles:
     timestamps = _timestamps(folder / "timestamps.txt")
     cameras = []
     for row in read_photos(folder):
-        empty, depth = (tuple(sorted((row.file / part).glob("*.png"))) for part in ("empty", "depth"))
+        with explained(row.file):
+            empty, depth = (tuple(sorted((row.file / part).glob("*.png"))) for part in ("empty", "depth"))
         if not empty:
             raise WearcapError("no images of the empty scene", where=row.file / "empty",
                                expected="16-bit PNG files", fix="Record the scene without the person.")  # fmt: skip
@@ -68,19 +70,15 @@ def read_depth_rig(folder: str | Path) -> DepthRigFiles:
 def read_depth(path: str | Path, camera: Camera) -> UInt16[np.ndarray, "height width"]:
     """A depth image (mm, 0: no return). Raises WearcapError for a damaged file, colours, 8 bits, another size than
     the calibration's, and values that cannot be millimetres."""
-    file_size(path)
-    try:
-        with Image.open(path) as image:
-            mode, (width, height) = image.mode, image.size
-            if (width, height) != (camera.width, camera.height):
-                raise WearcapError(f"an image of {width}x{height} pixels", where=path,
-                                   expected=f"{camera.width}x{camera.height}, as its camera is calibrated")  # fmt: skip
-            if mode not in ("I;16", "I;16B", "I"):
-                raise WearcapError(f"not a depth image (mode {mode})", where=path,
-                                   expected="one channel of 16 bits, millimetres")  # fmt: skip
-            depth = np.asarray(image).astype(np.int64)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise WearcapError(f"not a readable image ({error})", where=path, fix="Copy it again.") from error
+    with open_image(path) as image:
+        mode, (width, height) = image.mode, image.size
+        if (width, height) != (camera.width, camera.height):
+            raise WearcapError(f"an image of {width}x{height} pixels", where=path,
+                               expected=f"{camera.width}x{camera.height}, as its camera is calibrated")  # fmt: skip
+        if mode not in ("I;16", "I;16B", "I"):
+            raise WearcapError(f"not a depth image (mode {mode})", where=path,
+                               expected="one channel of 16 bits, millimetres")  # fmt: skip
+        depth = np.asarray(image).astype(np.int64)
     measured = depth[depth > 0]
     if len(measured) and not 100 < np.median(measured) < _FARTHEST_MM:
         raise WearcapError(f"its middle depth is {np.median(measured):.0f}", where=path,

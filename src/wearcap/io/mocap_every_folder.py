@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.files import MAX_JSON_DEPTH
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
@@ -154,15 +155,25 @@ def _config(path: Path) -> dict[str, Any]:
         return {}
     try:
         text = read_text(path, usual=_MAX_CONFIG_BYTES)
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
-            raise WearcapError("it refers to its own parts (&name, *name)", where=path, expected="plain keys with values",
-                               fix="Write them out: such references can blow up.")  # fmt: skip
+        _require_plain_yaml(text, path)
         content = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
         raise WearcapError(f"not readable YAML ({' '.join(str(error).split())})"[:300], where=path) from error
     if not isinstance(content, dict | None):
         raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="keys with values")
     return content or {}
+
+
+def _require_plain_yaml(text: str, path: Path) -> None:
+    """Refuse what makes YAML's parser run wild: references to its own parts, and depth, which costs time squared."""
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise WearcapError("it refers to its own parts (&name, *name)", where=path, expected="plain keys with values",
+                               fix="Write them out: such references can blow up.")  # fmt: skip
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_JSON_DEPTH:
+            raise WearcapError("YAML that is nested too deeply", where=path, expected=f"at most {MAX_JSON_DEPTH} levels")  # fmt: skip
 
 
 def _marks(path: Path) -> dict[str, Any]:

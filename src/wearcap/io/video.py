@@ -10,24 +10,24 @@ import numpy as np
 from av.container import InputContainer
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.io.bounded import file_size
+from wearcap.io.image_file import open_image
+
+MAX_PIXELS = 1 << 26
+"""Of a video's picture (8192 x 8192)."""
+_MAX_FPS = 10_000
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
     """Pixels of an image file as they are stored: calibrations speak of these, so no EXIF turn is applied.
 
-    Raises WearcapError when the file is missing or no picture.
+    Raises WearcapError as `open_image` does.
     """
-    file_size(path, "picture")
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise WearcapError(f"not a readable picture ({error})", where=path, expected="a JPEG or PNG file") from error  # fmt: skip
+    with open_image(path) as image:
+        return np.asarray(image.convert("RGB"))
 
 
 def read_frames(
@@ -69,6 +69,10 @@ def _pictures_of(container: InputContainer, path: str | Path) -> VideoStream:
         raise WearcapError(
             "pictures packed in a way that is not known", where=path, expected="a video in H.264, say"
         )
+    stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # for sizes that only the pictures tell
+    if stream.width * stream.height > MAX_PIXELS:
+        raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path,
+                           expected=f"at most {MAX_PIXELS} pixels", fix="Scale the video down.")  # fmt: skip
     return stream
 
 
@@ -85,7 +89,7 @@ class VideoInfo:
 
 def video_info(path: str | Path) -> VideoInfo:
     """Size, average rate and length of a video. Raises WearcapError as `read_frames` does."""
-    file_size(path, "video")
+    size = file_size(path, "video")
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             stream = _pictures_of(container, path)
@@ -93,6 +97,9 @@ def video_info(path: str | Path) -> VideoInfo:
             frames = stream.frames or round((container.duration or 0) / av.time_base * fps)
             if not (stream.width > 0 and stream.height > 0):
                 raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path, expected="a video")  # fmt: skip
+            if not (0 < fps <= _MAX_FPS and 0 <= frames <= size):
+                raise WearcapError(f"a header that announces {frames} frames at {fps:.6g} per second", where=path,
+                                   expected="no more frames than bytes", fix="The file was damaged: copy it again.")  # fmt: skip
             return VideoInfo(stream.width, stream.height, fps, frames)
     except (av.FFmpegError, OSError) as error:
         raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error

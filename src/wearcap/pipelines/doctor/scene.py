@@ -6,10 +6,10 @@ import numpy as np
 import safetensors
 import torch
 from jaxtyping import Float32
-from PIL import Image
 
 from wearcap.errors import WearcapError
 from wearcap.io.hps_scene import CLOUD, is_hps_scene, read_hps_scene
+from wearcap.io.image_file import open_image
 from wearcap.io.photos import FILE_NAME, read_photos
 from wearcap.io.scan import read_scan
 from wearcap.localization.visual_map import VisualMap
@@ -142,10 +142,10 @@ def check_photos(photos: list[Photo], scan: Scan | None) -> list[Finding]:
 def _sizes(photos: list[Photo]) -> list[Finding]:
     for photo in photos:
         try:
-            with Image.open(photo.file) as image:
+            with open_image(photo.file) as image:
                 size = image.size
-        except (OSError, Image.DecompressionBombError) as error:
-            return [Finding("error", "photos: files", "a photo cannot be read", f"{photo.file.name}: {error}", "Fetch it again.")]  # fmt: skip
+        except WearcapError as error:
+            return [Finding("error", "photos: files", "a photo cannot be read", f"{photo.file.name}: {error.what}", "Fetch it again.")]  # fmt: skip
         if size != (photo.camera.width, photo.camera.height):
             return [Finding("error", "photos: size", "image size and calibration differ",
                             f"{photo.file.name} has {size[0]}x{size[1]} pixels, its camera {photo.camera.width}x{photo.camera.height}",
