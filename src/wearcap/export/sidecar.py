@@ -10,7 +10,7 @@ from wearcap.body.skeleton import Site, Skeleton
 from wearcap.diffusion.schedule import CosineSchedule, LinearSchedule
 from wearcap.errors import WearcapError
 from wearcap.export.network import ExportReport
-from wearcap.files import sha256_of, write_text
+from wearcap.files import parse_json, sha256_of, write_text
 
 VERSION = 4
 SCHEDULES = {cls.__name__: cls for cls in (CosineSchedule, LinearSchedule)}
@@ -63,14 +63,10 @@ def read_sidecar(path: str | Path, network: str) -> dict:
     """The sidecar of a model file. Raises WearcapError when it is missing, foreign, or of another network or file."""
     sidecar = sidecar_path(path)
     try:
-        tree = json.loads(sidecar.read_text(encoding="utf-8"))
+        tree = parse_json(sidecar.read_bytes(), sidecar)
     except FileNotFoundError as error:
         raise WearcapError("no such sidecar", where=sidecar, expected="the .json file that `wearcap export` wrote "
                            "beside the model", fix="Copy both files.") from error  # fmt: skip
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise WearcapError(
-            f"not a readable sidecar ({error})", where=sidecar, fix="Export the model again."
-        ) from error
     if not isinstance(tree, dict) or tree.get("wearcap_export") != VERSION:
         raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
     # The first sidecars did not say: all were denoisers'.

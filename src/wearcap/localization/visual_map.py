@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64, Int8, Int32, Int64
 from safetensors.numpy import save
 
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path
+from wearcap.files import atomic_path, parse_json
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.localization.landmarks import Landmarks
@@ -100,7 +100,7 @@ class VisualMap:
             raise WearcapError("a .safetensors file, but not a visual map", where=path,
                                expected="one that `wearcap scene` wrote")  # fmt: skip
         try:
-            header = json.loads(metadata["wearcap_map"])
+            header = parse_json(metadata["wearcap_map"], path)
             if header["schema_version"] != SCHEMA_VERSION:
                 raise WearcapError(f"a map of version {header['schema_version']}", where=path,
                                    expected=f"version {SCHEMA_VERSION}", fix="Build it again: wearcap scene.")  # fmt: skip

@@ -18,7 +18,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import HeadFeatures
 from wearcap.data.statistics import MIN_SCALE
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path
+from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
 from wearcap.pipelines.hmd2 import HeadPath, hang_from_head, head_path
 from wearcap.recording import Motion, Recording, RecordingStore
@@ -265,7 +265,7 @@ def _save(
 def _load(path: str | Path, kind: str) -> tuple[tuple[str, ...], float, dict[str, Tensor]]:
     try:
         with safetensors.safe_open(str(path), framework="pt") as file:
-            about = json.loads((file.metadata() or {}).get("baseline", "{}"))
+            about = parse_json((file.metadata() or {}).get("baseline", "{}"), path)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (OSError, safetensors.SafetensorError) as error:
         raise WearcapError(f"not a readable baseline ({error})", where=path, expected="what `save` of one wrote") from error  # fmt: skip

@@ -1,6 +1,5 @@
 """What can be examined in a path: data sets, recording files, MPS folders, scenes, environments, motion capture files."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +16,7 @@ from wearcap.io.asf_amc import read_amc, read_asf
 from wearcap.io.bvh import read_bvh
 from wearcap.io.euroc import read_euroc
 from wearcap.io.hps_sequence import hps_names, is_hps, read_hps_sequence
+from wearcap.io.json_text import read_json_object
 from wearcap.io.motion_npz import read_motion
 from wearcap.io.mvnx import read_mvnx
 from wearcap.io.npz import read_npz
@@ -137,8 +137,8 @@ def _mps_summary(folder: Path) -> list[Finding]:
     if path is None:
         return []
     try:
-        parts = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        parts = read_json_object(path)
+    except WearcapError as error:
         return [Finding("warning", "MPS summary", "cannot be read", str(error))]
     failed = [
         name
