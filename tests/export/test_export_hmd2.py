@@ -186,7 +186,7 @@ def test_hostile_model_files_are_named(tmp_path, exports, format):
     with pytest.raises(WearcapError, match="no such sidecar"):
         hmd2.load_exported_hmd2(path)
     path.with_suffix(".json").write_text("{")
-    with pytest.raises(WearcapError, match="not a readable sidecar"):
+    with pytest.raises(WearcapError, match="not readable JSON"):
         hmd2.load_exported_hmd2(path)
     about = json.loads(exports[format][0].with_suffix(".json").read_text())
     about["model"]["sha256"] = "0" * 64
