@@ -55,11 +55,15 @@ def read_motion(path: str | Path) -> Motion:
             raise WearcapError(f"schema version {version}", where=path, expected=f"version {SCHEMA}")
         motion = unflatten(tree["motion"], lambda key: torch.from_numpy(arrays[key]))
         _check(motion, path)
+    except WearcapError as error:
+        raise error if error.where else _damaged(error, path) from error
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError) as error:
-        raise WearcapError(
-            f"its description is damaged ({error})", where=path, fix="Capture it again."
-        ) from error
+        raise _damaged(error, path) from error
     return motion
+
+
+def _damaged(error: Exception, path: str | Path) -> WearcapError:
+    return WearcapError(f"its description is damaged ({error})", where=path, fix="Capture it again.")
 
 
 def _check(motion: Motion, path: str | Path) -> None:

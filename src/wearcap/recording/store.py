@@ -45,7 +45,7 @@ class Entry:
     """Hash of source bytes and preparation settings: prepare skips a recording whose hash is current."""
 
 
-_MOST = {"frames": MAX_FRAMES, "fps": MAX_FPS, "duration_s": 1e9, "bytes": 1 << 50}
+_MOST = {"frames": MAX_FRAMES, "fps": MAX_FPS, "duration_s": 1e11, "bytes": 1 << 50}
 
 
 class RecordingFile:
