@@ -87,7 +87,7 @@ def test_made_once_per_encoder_and_recording(store, tmp_path):
 def test_another_networks_checkpoint_is_refused(tmp_path):
     content = {"config": json.dumps({"model": {"_target_": "wearcap.training.egoview.EgoView"}})}
     torch.save({"wearcap": content, "state_dict": {}}, tmp_path / "x.ckpt")
-    with pytest.raises(WearcapError, match="voxel autoencoder"):
+    with pytest.raises(WearcapError, match="not of VoxelAutoencoder"):
         _ = PlaceCodes(tmp_path / "x.ckpt").encoder
 
 
