@@ -120,5 +120,5 @@ def test_what_is_refused():
         PointNeXt(strides=[2, 2], blocks=[0], neighbours=[8, 8])
     with pytest.raises(WearcapError, match="clouds of 4 points"):
         network()(torch.zeros(1, 4, 3, dtype=torch.float64))
-    with pytest.raises(WearcapError, match="need an object encoder"):
+    with pytest.raises(WearcapError, match="another model, not of PointNeXt"):
         load_object_encoder("voxel_autoencoder")
