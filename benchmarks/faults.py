@@ -271,12 +271,14 @@ def kill_one(writer: Writer, folder: Path, wait_s: float) -> tuple[bool, str]:
 @contextlib.contextmanager
 def _temporary_elsewhere() -> Iterator[Path]:
     """A folder to write in, with TMPDIR on another file system."""
-    with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
+    outputs = Path("outputs/benchmarks")
+    outputs.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=outputs) as folder:
         before = os.environ.get("TMPDIR")
         if Path("/dev/shm").is_dir():
             os.environ["TMPDIR"] = "/dev/shm"
         try:
-            yield Path(folder)
+            yield Path(folder).resolve()
         finally:
             os.environ.pop("TMPDIR") if before is None else os.environ.update(TMPDIR=before)
 
