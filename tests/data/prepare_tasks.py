@@ -1,6 +1,7 @@
 """Small deterministic recordings for the tests of the preparation engine (imported by its workers)."""
 
 import os
+import re
 import signal
 import sys
 import time
@@ -40,6 +41,9 @@ class Make:
             raise WearcapError("cut short", where=f"{self.name}.amc")
         if self.fault == "bug":
             raise ZeroDivisionError("division by zero")
+        if self.fault == "stuck":  # in native code that holds Python's lock, for hours
+            print("stuck", flush=True)
+            re.match(r"(a+)+$", "a" * 40 + "b")
         if self.fault == "killed":
             os.kill(os.getpid(), signal.SIGKILL)
         made = recording(self.name, self.seed, 3 if self.fault == "short" else 120,

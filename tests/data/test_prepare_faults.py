@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +17,7 @@ import pytest
 from prepare_tasks import tasks
 
 from wearcap import files
-from wearcap.data.prepare import prepare
+from wearcap.data.prepare import engine, prepare
 from wearcap.errors import WearcapError
 from wearcap.files import LOCK, sha256_of, write_text
 from wearcap.recording import RecordingStore
@@ -123,6 +123,67 @@ def test_workers_end_with_a_killed_run_and_the_next_one_has_the_folder_alone(alo
         assert len(made(tmp_path)) < 12
     prepare(tasks(12), tmp_path, jobs=1, progress=False)
     assert digests(tmp_path) == digests(alone)
+
+
+STUCK = """
+import sys
+from prepare_tasks import tasks
+from wearcap.data.prepare import engine, prepare
+prepare(tasks(2, r00="stuck", r01="stuck"), sys.argv[1], jobs=2, progress=False)
+"""
+
+
+@linux
+def test_workers_end_within_native_code(tmp_path):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(Path(__file__).parent)])}
+    command = [sys.executable, "-c", STUCK, tmp_path]
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+    children = []
+    assert process.stdout is not None
+    try:
+        assert [process.stdout.readline() for _ in range(2)] == ["stuck\n"] * 2
+        children += descendants(process.pid)
+        process.kill()
+        process.wait()
+        wait_until(lambda: not any(map(lives, children)), 2.0)
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        for child in filter(lives, children):
+            os.kill(child, signal.SIGKILL)
+
+
+@linux
+@pytest.mark.filterwarnings("ignore:.*have been cancelled")
+def test_an_interrupted_run_ends_its_workers_before_it_gives_the_folder_up(tmp_path, monkeypatch):
+    before, after = set(descendants(os.getpid())), []
+
+    @contextmanager
+    def noted(*arguments):
+        with files.folder_lock(*arguments) as lock:
+            try:
+                yield lock
+            finally:
+                after.extend(
+                    Path(f"/proc/{pid}/cmdline") for pid in descendants(os.getpid()) if pid not in before
+                )
+                after[:] = [path for path in after if path.exists() and "popen_loky" in path.read_text()]
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(engine, "folder_lock", noted)
+    monkeypatch.setattr(engine, "progress_bar", lambda *arguments: nullcontext(interrupt))
+    with pytest.raises(KeyboardInterrupt):
+        prepare(tasks(6, 0.2), tmp_path, jobs=2, progress=False)
+    assert not after
+
+
+def test_nothing_to_do_starts_no_workers(tmp_path, monkeypatch):
+    prepare(tasks(2), tmp_path, jobs=1, progress=False)
+    monkeypatch.setattr(engine, "_backend", None)
+    assert prepare(tasks(2), tmp_path, jobs=2, backend="dask", progress=False).current == ["r00", "r01"]
 
 
 @posix

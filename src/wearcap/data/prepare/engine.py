@@ -8,9 +8,9 @@ import hashlib
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import BrokenExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -95,8 +95,7 @@ def prepare(
         remove_leftovers(store.root, below=True)
         todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
         current = sorted(names - {task.name for task in todo})
-        with _backend(backend, jobs, scheduler, lock) as as_generator:
-            outcomes = _outcomes(todo, store.root, jobs, as_generator)
+        with closing(_outcomes(todo, store.root, jobs, backend, scheduler, lock)) as outcomes:
             return _collect(outcomes, store, current, len(tasks), progress)
 
 
@@ -170,18 +169,19 @@ def _one_thread() -> Iterator[None]:
 
 
 def _outcomes(
-    todo: list[Task], root: Path, jobs: int, as_generator: bool
-) -> Iterator[tuple[str, Entry | str, str]]:
+    todo: list[Task], root: Path, jobs: int, backend: str, scheduler: str | None, lock: int | None
+) -> Generator[tuple[str, Entry | str, str], None, None]:
     if not todo:
         return
-    chunk_size = len(todo) if as_generator else 64  # without a generator, results come chunk by chunk
-    parallel = joblib.Parallel(
-        n_jobs=jobs, batch_size=1, return_as="generator_unordered" if as_generator else "list"
-    )
-    for start in range(0, len(todo), chunk_size):
-        chunk = todo[start : start + chunk_size]
-        results: Any = parallel(joblib.delayed(_run)(task, root) for task in chunk)
-        yield from results
+    with _backend(backend, jobs, scheduler, lock) as as_generator:
+        chunk_size = len(todo) if as_generator else 64  # without a generator, results come chunk by chunk
+        parallel = joblib.Parallel(
+            n_jobs=jobs, batch_size=1, return_as="generator_unordered" if as_generator else "list"
+        )
+        for start in range(0, len(todo), chunk_size):
+            chunk = todo[start : start + chunk_size]
+            results: Any = parallel(joblib.delayed(_run)(task, root) for task in chunk)
+            yield from results
 
 
 @contextmanager
