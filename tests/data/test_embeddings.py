@@ -94,6 +94,14 @@ def test_what_was_embedded_is_not_embedded_again(tmp_path):
     assert (tmp_path / "elsewhere/embeddings-corners-00000000").is_dir()
 
 
+def test_a_cached_file_has_the_usual_permissions(tmp_path):
+    """safetensors' own writer lets nobody else read its files, and leaves `.tmpXXXXXX` when it is killed."""
+    write_video(tmp_path / "videos/a.mp4", 20)
+    embed_camera(stream(20, video="videos/a.mp4"), tmp_path, Corners())
+    kept = next((tmp_path / "cache/embeddings-corners-00000000").iterdir())
+    assert kept.stat().st_mode == (tmp_path / "videos/a.mp4").stat().st_mode
+
+
 def test_image_files_of_several_sizes(tmp_path):
     names = []
     for number, size in enumerate([(30, 20), (30, 20), (16, 40)]):
