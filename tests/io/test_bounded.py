@@ -206,6 +206,16 @@ def test_an_array_larger_than_its_archive(tmp_path):
     refused(read_npz, tmp_path / "a.npz", "shape", most_mib=10)
 
 
+@pytest.mark.parametrize("order", "<>")
+def test_characters_that_are_none(tmp_path, order):
+    """Python ends with a SystemError where such text is made a string."""
+    text = np.array([0x61, 0x7FFFFFFF], f"{order}u4").view(f"{order}U1")
+    np.savez(tmp_path / "a.npz", a=text)
+    refused(read_npz, tmp_path / "a.npz", "characters")
+    np.savez(tmp_path / "a.npz", a=np.array(["aä\U0001f600"], f"{order}U3"))
+    assert str(read_npz(tmp_path / "a.npz")["a"][0]) == "aä\U0001f600"
+
+
 def test_lenses_of_impossible_images():
     model = OCamModel((-200.0, 0.0, 1e-3), (), 2.0, 2.0, (1.0, 0.0, 0.0), width=10**300, height=10**300)
     with pytest.raises(WearcapError, match="sizes of 1 to"):

@@ -4,6 +4,7 @@ import io
 import lzma
 import math
 import struct
+import sys
 import tokenize
 import zipfile
 import zlib
@@ -67,6 +68,12 @@ def _read_member(
         budget.spend(size)
         array = np.empty(math.prod(shape), dtype)
         _fill(memoryview(array.view(np.uint8)) if size else memoryview(bytearray()), head, file)
+    if (
+        dtype.kind == "U"
+        and size
+        and (array.view(np.dtype("u4").newbyteorder(dtype.byteorder)) > sys.maxunicode).any()
+    ):
+        raise ValueError("text with characters that are none")
     return array.reshape(shape, order="F").copy(order="C") if fortran else array.reshape(shape)
 
 
