@@ -17,6 +17,10 @@ from wearcap.recording.recording import Cue
 AXES = "xyz"
 
 
+MAX_PLACE = 1e9
+"""Farthest place (m or pixels); larger numbers need not be finite as float32."""
+
+
 def read_keypoints(path: str | Path) -> dict[str, Cue]:
     """Cues by joint, their times rising. Rows with a confidence of 0 say nothing and are left out.
 
@@ -32,7 +36,11 @@ def read_keypoints(path: str | Path) -> dict[str, Cue]:
     for wrong, what, expected in (
         (~np.isfinite(times), "a timestamp that is no time", "seconds"),
         (~((confidence >= 0) & (confidence <= 1)), "a confidence that is none", "0 to 1"),
-        (said & ~np.isfinite(points).all(-1), "a place that is none", "numbers, or a confidence of 0"),
+        (
+            said & ~(np.abs(points) <= MAX_PLACE).all(-1),
+            "a place that is none",
+            "numbers, or a confidence of 0",
+        ),
         (joints == "", "no joint", "a joint's name"),
     ):
         if wrong.any():
