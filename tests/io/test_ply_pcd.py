@@ -53,6 +53,22 @@ def test_every_encoding_reads_alike(tmp_path, kind):
     assert ply.faces.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3]]
 
 
+@pytest.mark.parametrize(
+    ("name", "code"), [("uchar", "B"), ("ushort", "H"), ("uint", "I"), ("char", "b"), ("int", "i")]
+)
+def test_corners_of_every_whole_type_are_read(tmp_path, name, code):
+    header = ("ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+              f"property float z\nelement face 1\nproperty list uchar {name} vertex_indices\nend_header\n")  # fmt: skip
+    for corner in (1, 3):
+        face = struct.pack(f"<B3{code}", 3, 0, 2, corner)
+        (tmp_path / "a.ply").write_bytes(header.encode() + struct.pack("<9f", *range(9)) + face)
+        if corner == 1:
+            assert read_ply(tmp_path / "a.ply").faces.tolist() == [[0, 2, 1]]
+        else:
+            with pytest.raises(WearcapError, match="a face names vertex 3, there are 3"):
+                read_ply(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize("part", ["points", "colors", "all"])
 def test_round_trip(tmp_path, part):
     ply = Ply(

@@ -306,8 +306,8 @@ def _triangles(face: dict, vertices: int, path) -> np.ndarray | None:
     first = np.repeat(np.cumsum(corners.lengths) - corners.lengths, triangles)
     k = np.arange(len(first)) - np.repeat(np.cumsum(triangles) - triangles, triangles) + 1
     faces = np.stack([corners.values[first], corners.values[first + k], corners.values[first + k + 1]], 1)
-    low, high = faces.min(initial=0), faces.max(initial=-1)
-    if not (low >= 0 and high < vertices):
+    if len(faces) and not (faces.min() >= 0 and faces.max() < vertices):
+        low, high = faces.min(), faces.max()
         raise WearcapError(
             f"a face names vertex {high if low >= 0 else low:g}, there are {vertices}", where=path
         )
