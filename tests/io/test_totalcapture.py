@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import zipfile
 from contextlib import suppress
 
 import numpy as np
@@ -172,6 +173,24 @@ def test_hostile_file_is_named(tmp_path, fault, monkeypatch):
         read_totalcapture(tmp_path / "a.pkl")
     assert "a.pkl" in str(caught.value)
     assert not (tmp_path / "evil").exists()
+
+
+def test_files_of_old_pytorch_are_read(tmp_path):
+    tensors = {name: torch.from_numpy(array) for name, array in recorded(frames=60).items()}
+    torch.save(tensors, tmp_path / "a.pt", _use_new_zipfile_serialization=False)
+    assert tuple(read_totalcapture(tmp_path / "a.pt").imu) == TOTALCAPTURE
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_long_word_in_a_pytorch_file_takes_no_time(tmp_path, packed):
+    content = b"\x80\x02c" + b"x" * 200_000 + b"\ny\n."
+    (tmp_path / "a.pt").write_bytes(content)
+    if packed:
+        with zipfile.ZipFile(tmp_path / "a.pt", "w") as archive:
+            archive.writestr("a/data.pkl", content)
+            archive.writestr("a/version", "3")
+    with pytest.raises(WearcapError, match="not a readable PyTorch file.*a word longer than"):
+        read_totalcapture(tmp_path / "a.pt")
 
 
 def test_other_faults(tmp_path, monkeypatch):

@@ -4,6 +4,8 @@ Both worlds have y up and are turned by +90° about x. A sensor's orientation is
 left, y up, z forward), so that it is mounted on our joint's axes by `io.smpl_axes.A`; accelerations are free of gravity.
 """
 
+import io
+import pickletools
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -48,6 +50,10 @@ _MAX_DEG = 30.0
 _GRAVITY = 5.0
 """m/s² of mean acceleration that only gravity explains."""
 _NOT_ORTHONORMAL = 0.02
+_MAX_STEPS, _MAX_WORD = 100_000, 1000
+"""Of the pickle that describes a PyTorch file's tensors; a dozen tensors take some hundred."""
+_PICKLES_OF_OLD_FILES = 5
+"""Before the numbers of a file that is no archive: a mark, a version, the system, the content, and its storages."""
 
 
 @dataclass(frozen=True)
@@ -211,12 +217,33 @@ def _torch_content(path: Path) -> Any:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 budget.spend(sum(info.file_size for info in archive.infolist()))
+        _require_short_words(path)
         return torch.load(path, map_location="cpu", weights_only=True)
     except WearcapError:
         raise
     except Exception as error:  # the opcodes are the file's own program: there is no telling what they break
         raise WearcapError(f"not a readable PyTorch file ({' '.join(str(error).split())[:120]})", where=path,
                            expected="a dict of tensors, without code") from error  # fmt: skip
+
+
+def _require_short_words(path: Path) -> None:
+    """Refuse long words and programs: torch searches its own messages, which repeat them, in time squared."""
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                if name.rpartition("/")[2] == "data.pkl":
+                    _walk(io.BytesIO(archive.read(name)))
+    else:
+        with open(path, "rb") as file:
+            for _ in range(_PICKLES_OF_OLD_FILES):
+                _walk(file)
+
+
+def _walk(stream: io.BufferedIOBase) -> None:
+    """Go through one pickle without running it."""
+    for step, (_, argument, _) in enumerate(pickletools.genops(stream)):
+        if step > _MAX_STEPS or (isinstance(argument, str | bytes) and len(argument) > _MAX_WORD):
+            raise ValueError(f"more than {_MAX_STEPS} steps, or a word longer than {_MAX_WORD} characters")
 
 
 def _wanted(arrays: dict[str, np.ndarray], name: str, path: Path) -> np.ndarray:
