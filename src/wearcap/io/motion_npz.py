@@ -56,7 +56,9 @@ def read_motion(path: str | Path) -> Motion:
         motion = unflatten(tree["motion"], lambda key: torch.from_numpy(arrays[key]))
         _check(motion, path)
     except WearcapError as error:
-        raise error if error.where else _damaged(error, path) from error
+        if error.where:
+            raise
+        raise _damaged(error, path) from error
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError) as error:
         raise _damaged(error, path) from error
     return motion

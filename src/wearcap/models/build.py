@@ -141,7 +141,9 @@ def build(
         check_weights(rehearsed.state_dict(), own, where)
         module: nn.Module = _made(config)
     except WearcapError as error:
-        raise error if error.where else _unbuildable(error, where) from error
+        if error.where:
+            raise
+        raise _unbuildable(error, where) from error
     except Exception as error:  # what constructors say of arguments that no release of ours wrote is anything
         raise _unbuildable(error, where) from error
     module.load_state_dict(own)
