@@ -99,6 +99,8 @@ class Reader:
 
 LENS = Camera("pinhole", 16, 12, 12.0, 12.0, 7.5, 5.5)
 POSE = Rigid(torch.eye(3), torch.tensor([1.0, 2.0, 3.0]))
+FRAMES = 12
+"""Of data sets whose files are long: short ones show the same faults sooner."""
 TUM = "".join(f"{0.1 * k:.1f} {k} 2 3 0 0 0 1\n" for k in range(12))
 EUROC = "#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z\n" + "".join(
     f"{10**9 * k},{k},0,0,1,0,0,0\n" for k in range(1, 9)
@@ -295,13 +297,13 @@ READERS: dict[str, Reader] = {
     "depth_image": _made("d.png", lambda path: depth_rig.write_depth(path, np.full((12, 16), 2000, np.uint16)),
                          lambda path: depth_rig.read_depth(path, LENS)),
     "droid": Reader(test_droid.reconstruction, lambda folder: droid.read_droid(folder, 10.0)),
-    "egohoi": Reader(test_egohoi.write_set, lambda folder: egohoi.read_egohoi(folder, test_egohoi.ONE)),
+    "egohoi": Reader(lambda folder: test_egohoi.write_set(folder, FRAMES), lambda folder: egohoi.read_egohoi(folder, test_egohoi.ONE)),
     "egohoi_locations": _one("l.json", json.dumps(test_egohoi.SLID), egohoi.read_object_locations),
     "egohoi_npz": _made("o.npz", lambda path: np.savez(path, translations=np.zeros((4, 3)), timestamps=np.arange(4.0),
                                                        quaternions=np.tile([1.0, 0, 0, 0], (4, 1))), egohoi.read_object_npz),
     "environment": Reader(_environment, environment.read_environment),
     "euroc": _one("e.csv", EUROC, euroc.read_euroc),
-    "hcontact": Reader(test_hcontact.write_set, lambda folder: hcontact.read_hcontact(folder, test_hcontact.DOOR)),
+    "hcontact": Reader(lambda folder: test_hcontact.write_set(folder, frames=FRAMES), lambda folder: hcontact.read_hcontact(folder, test_hcontact.DOOR)),
     "hcontact_split": _one("s.json", json.dumps({"window_radius": 30, "train": [31, 99], "valid": [], "test": [150]}), hcontact.read_hcontact_split),
     "hps_motion": _made("m.pkl", lambda path: hps_files.write_smpl(hps_files.motion(4), path), hps.read_hps_motion),
     "hps_subject": _one("s.json", json.dumps({"betas": [0.1] * 10, "gender": "male", "root_to_heel": 0.93}), hps.read_hps_subject),
@@ -309,7 +311,7 @@ READERS: dict[str, Reader] = {
     "hps_localization": _made("l.json", lambda path: hps_files.write_localization(hps_files.motion(20), path, 3, (4,)), hps.read_hps_localization),
     "hps_cameras": _one("c.json", json.dumps(hps_files.CAMERA), hps.read_hps_cameras),
     "hps_scene": Reader(hps_files.write_scan, hps_scene.read_hps_scene),
-    "hps_sequence": Reader(hps_files.write_hps, lambda folder: hps_sequence.read_hps_sequence(folder, hps_files.NAME)),
+    "hps_sequence": Reader(lambda folder: hps_files.write_hps(folder, frames=FRAMES), lambda folder: hps_sequence.read_hps_sequence(folder, hps_files.NAME)),
     "hps_unity": Reader(lambda folder: hps_files.write_unity(hps_files.motion(4), folder, "u"),
                         lambda folder: hps_unity.read_unity_motion(folder / "u_pose.txt", folder / "u_trans.txt")),
     "json_text": _one("a.json", '{"a": [1, 2.5, null], "b": {"c": "x"}}', json_text.read_json_object),

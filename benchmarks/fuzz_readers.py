@@ -56,17 +56,26 @@ def outcome(read, folder: Path) -> str:
     except TooSlowError:
         return "slow"
     except WearcapError as error:
-        cause: BaseException | None = error
-        while cause is not None:
-            # FFmpeg calls it lack of memory when a header asks for more than it ever reserves.
-            if isinstance(cause, MemoryError) and not isinstance(cause, av.FFmpegError):
-                return "memory"
-            cause = cause.__cause__ or cause.__context__
-        return "refused"
+        # FFmpeg calls it lack of memory when a header asks for more than it ever reserves.
+        lacking = any(
+            isinstance(cause, MemoryError) and not isinstance(cause, av.FFmpegError)
+            for cause in _causes(error)
+        )
+        return "memory" if lacking else "refused"
     except MemoryError:
         return "memory"
     except Exception as error:
         return f"{type(error).__name__} at {_place(error)}"
+
+
+def _causes(error: BaseException) -> list[BaseException]:
+    """An error and what led to it; errors that are each other's causes are listed once."""
+    causes: list[BaseException] = []
+    cause: BaseException | None = error
+    while cause is not None and not any(cause is seen for seen in causes):
+        causes.append(cause)
+        cause = cause.__cause__ or cause.__context__
+    return causes
 
 
 def _place(error: Exception) -> str:
@@ -160,7 +169,7 @@ def block(name: str, seed: int, first: int, last: int, kept: Path) -> tuple[Coun
             if found is not None:
                 worker.join()
                 return counts + found, max(peak, used)
-        ended = "hung" if worker.is_alive() else f"process ended with {worker.exitcode}"
+        ended = "hangs" if worker.is_alive() else f"process ended with {worker.exitcode}"
         worker.kill()
         worker.join()
         number = int(place[0])

@@ -106,9 +106,9 @@ def write_scan(folder: Path) -> None:
     write_ply(Ply(points, np.full(points.shape, 128, np.uint8)), folder / "pointcloud.ply")
 
 
-def write_hps(root: Path, name: str = NAME, scan: bool = True) -> Motion:
+def write_hps(root: Path, name: str = NAME, scan: bool = True, frames: int = FRAMES) -> Motion:
     """A whole sequence; returns its motion. The suit wanders off: its world is turned and shifted."""
-    truth = motion()
+    truth = motion(frames)
     write_smpl(truth, root / "hps_smpl" / f"{name}.pkl")
     subject = {"betas": [0.1 * k for k in range(10)], "gender": "male", "root_to_heel": 0.93}
     for folder, content in (
@@ -119,7 +119,7 @@ def write_hps(root: Path, name: str = NAME, scan: bool = True) -> Motion:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(content))
     write_localization(truth, root / "head_camera_localizations" / f"{name}.json")
-    write_unity(motion(IMU_START + FRAMES, seed=1), root / "hps_txt", name)
+    write_unity(motion(IMU_START + frames, seed=1), root / "hps_txt", name)
     (root / "head_camera_videos").mkdir(exist_ok=True)
     (root / "head_camera_videos" / "cameras.json").write_text(json.dumps(CAMERA))
     if scan:

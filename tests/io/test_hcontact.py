@@ -27,9 +27,9 @@ DOOR, SOFA = "SUB5_TUB_2OG_door.00", "SUB9_TUB_2OG_sofamove.00"
 CONTACTS = {"contacts": {"left_hand": [[0.5, 1.0]], "right_hand": [[0.5, 1.0], [1.5, 0.0]]}}
 
 
-def write_set(root, names=(DOOR,), contacts=CONTACTS):
+def write_set(root, names=(DOOR,), contacts=CONTACTS, frames=120):
     for seed, name in enumerate(names):
-        write_zip(smpl_content(motion(seed=seed)), root / "body" / f"{name}.json.zip")
+        write_zip(smpl_content(motion(frames, seed)), root / "body" / f"{name}.json.zip")
         write_json(contacts, root / "contacts" / f"{name}.json")
 
 
