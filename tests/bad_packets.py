@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from wearcap.geometry.rigid import Rigid
+from wearcap.recording import Motion
 
 TIMES = {
     "nan": math.nan, "infinite": math.inf, "absurd": 1e18, "milliseconds": 1.7e12, "far": 1e9, "ahead": 100.0,
@@ -40,6 +41,12 @@ def broken(value: Any, **parts: Any) -> Any:
     for name in (field.name for field in fields(value)):
         object.__setattr__(copy, name, parts.get(name, getattr(value, name)))
     return copy
+
+
+def given(session: Any, ended: bool = False) -> list[Motion]:
+    """What a session hands out at one call: one motion or none."""
+    motion = session.poses(ended=ended)
+    return [] if motion is None else [motion]
 
 
 def bad_poses(good: Rigid) -> dict[str, Any]:

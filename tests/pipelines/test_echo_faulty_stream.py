@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from bad_packets import TIMES, Mutator, bad_poses, unchecked
+from bad_packets import TIMES, Mutator, bad_poses, given, unchecked
 from carried_box import boxes, carrying, drawn_echo
 from wearcap.pipelines import echo_stream
 from wearcap.pipelines.echo_stream import WRISTS, EchoSession, EchoWearer
@@ -35,12 +35,11 @@ def feed(session, recording, frame: int, shift: float = 0.0, tracked: bool = Tru
     session.head(time, recording.head.T_world_device[frame])
     for joint in WRISTS if tracked else ():
         session.wrist(joint, time, recording.motion.joint(joint)[frame])
-    motion = session.poses()
-    return [] if motion is None else [motion]
+    return given(session)
 
 
 def rest(session) -> list[Motion]:
-    return [motion for motion in (session.poses(ended=True), session.poses(ended=True)) if motion is not None]
+    return given(session, ended=True) + given(session, ended=True)
 
 
 def whole(session, recording, happen=None) -> Motion:

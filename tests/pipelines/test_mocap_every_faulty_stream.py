@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bad_packets import ROTATIONS, TIMES, VECTORS, Mutator, bad_poses, unchecked
+from bad_packets import ROTATIONS, TIMES, VECTORS, Mutator, bad_poses, given, unchecked
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -48,8 +48,7 @@ def feed(session, recording, frame: int, shift: float = 0.0, watched: bool = Tru
                 (stream.timestamps[new] + shift).tolist(), stream.R_world_imu[new], stream.acc_world[new]
             )
             session.watch(joint, [WatchSample(*row) for row in rows])
-    motion = session.poses()
-    return [] if motion is None else [motion]
+    return given(session)
 
 
 def whole(session, recording, happen=None, frames=range(FRAMES)) -> Motion:
@@ -58,10 +57,7 @@ def whole(session, recording, happen=None, frames=range(FRAMES)) -> Motion:
         if happen is not None and frame == FAULT:
             happen(session)
         parts += feed(session, recording, frame)
-    parts += [
-        motion for motion in (session.poses(ended=True), session.poses(ended=True)) if motion is not None
-    ]
-    return joined(parts)
+    return joined(parts + given(session, ended=True) + given(session, ended=True))
 
 
 @pytest.fixture(scope="module")

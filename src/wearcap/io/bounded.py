@@ -2,7 +2,7 @@
 
 A packed file of kilobytes may unpack to all memory there is. What is read is counted against a limit of bytes, and,
 beyond `FREE_BYTES`, of the ratio to the packed bytes. `wearcap --max-file-gib N` (for worker processes the environment
-variable `WEARCAP_MAX_FILE_GIB`) or a reader's `max_bytes` replaces both: the user has said how much may be read.
+variable `WEARCAP_MAX_FILE_GIB`) or a reader's `max_bytes` replaces both: the user decides how much may be read.
 """
 
 import gzip

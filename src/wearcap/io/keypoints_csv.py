@@ -15,8 +15,6 @@ from wearcap.io.csv_table import read_columns, read_header
 from wearcap.recording.recording import Cue
 
 AXES = "xyz"
-
-
 MAX_PLACE = 1e9
 """Farthest place (m or pixels); larger numbers need not be finite as float32."""
 
