@@ -63,13 +63,15 @@ OPENED = locations(pose(1.9, 60.0, HINGE), pose(0.0), hinge=HINGE)
 def write_set(root, frames=120):
     for name in (SOFA, DOOR, TABLE):
         write_ply(Ply(CORNERS), root / "object_models" / f"{name}.ply")
-    write_json(older(motion(frames, hands=False)), root / "smpl_motions" / f"{ONE}.json")
+    write_json(older(motion(frames, hands=False, fps=frames / 2)), root / "smpl_motions" / f"{ONE}.json")
     write_json({"betas": [0.1, 0.2], "gender": "male"}, root / "smpl_shapes" / "SUB1.json")
     write_json(SLID, root / "object_locations" / f"{ONE}.json")
     write_json(
         contact((0.5, 1.0, "left", "right"), (1.0, 1.5, "right")), root / "gt_contacts" / f"{ONE}.json"
     )
-    write_zip(smpl_content(motion(frames, seed=1)), root / "smpl_motions" / f"{SEVERAL}.json.zip")
+    write_zip(
+        smpl_content(motion(frames, seed=1, fps=frames / 2)), root / "smpl_motions" / f"{SEVERAL}.json.zip"
+    )
     write_json(OPENED, root / "object_locations" / SEVERAL / f"{DOOR}.json")
     write_json(SLID, root / "object_locations" / SEVERAL / f"{TABLE}.json")
     write_json(contact((1.0, 1.5, "right"), (1.6, 1.7)), root / "gt_contacts" / SEVERAL / f"{DOOR}.json")

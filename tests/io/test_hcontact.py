@@ -29,7 +29,7 @@ CONTACTS = {"contacts": {"left_hand": [[0.5, 1.0]], "right_hand": [[0.5, 1.0], [
 
 def write_set(root, names=(DOOR,), contacts=CONTACTS, frames=120):
     for seed, name in enumerate(names):
-        write_zip(smpl_content(motion(frames, seed)), root / "body" / f"{name}.json.zip")
+        write_zip(smpl_content(motion(frames, seed, fps=frames / 2)), root / "body" / f"{name}.json.zip")
         write_json(contacts, root / "contacts" / f"{name}.json")
 
 
