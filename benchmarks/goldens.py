@@ -5,7 +5,7 @@
     python benchmarks/goldens.py --list              the cases
 
 A case prepares data, trains a few steps, captures, streams, evaluates or exports. Of each array that comes out the file
-holds a SHA-256 and 48 values spread over it, so that another CPU, which sums in another order, can be told from
+holds a SHA-256 and 16 values spread over it, so that another CPU, which sums in another order, can be told from
 another result: a case is "equal" where all hashes are, else "close" within `--tolerance`, else it differs.
 """
 
@@ -42,7 +42,7 @@ from wearcap.training.loggers import read_metrics
 
 FOLDER = Path(__file__).resolve().parent
 GOLDENS = FOLDER / "goldens.json"
-VALUES = 48
+VALUES = 16
 Arrays = dict[str, np.ndarray]
 
 DATA = {

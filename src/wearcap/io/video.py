@@ -105,6 +105,14 @@ def video_info(path: str | Path) -> VideoInfo:
         raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error
 
 
+def video_encoder(crf: int) -> tuple[str, dict[str, str]]:
+    """Name and options of an encoder with which equal pictures give equal bytes; `crf` is H.264's quality, smaller is better."""
+    if "libx264" not in av.codecs_available:
+        return "mpeg4", {"threads": "1"}
+    # With x264's mbtree the bytes differ from one process to the next.
+    return "libx264", {"crf": str(crf), "preset": "veryfast", "threads": "1", "x264-params": "mbtree=0"}
+
+
 def write_frames(
     path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 3"]], fps: float, crf: int = 18
 ) -> int:
@@ -114,8 +122,7 @@ def write_frames(
     """
     count = 0
     with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
-        codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
-        options = {"crf": str(crf), "preset": "veryfast", "threads": "1"}
+        codec, options = video_encoder(crf)
         stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001), options=options)
         assert isinstance(stream, av.VideoStream)
         size = (0, 0)

@@ -6,20 +6,18 @@ simulated surroundings.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int32, UInt8
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path
 from wearcap.geometry import raster, rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
+from wearcap.io.video import write_frames
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream
 from wearcap.sensors.noise import smooth_noise
@@ -35,7 +33,6 @@ EGO_CAMERA = Camera("pinhole", 96, 72, 36.8, 36.8, 47.5, 35.5)
 EGO_FPS = 30.0
 PITCH_DEG, MOUNT_DEG, MOUNT_M = (10.0, 15.0), 1.5, 0.004
 """Range of the camera's tilt downwards, and deviations of how it is mounted besides."""
-_CRF = 18
 _CHUNK = 128
 """Frames whose bodies are skinned at once."""
 _VIEW = View(np.eye(3), EGO_CAMERA.fx, EGO_CAMERA.cx, EGO_CAMERA.cy, EGO_CAMERA.width, EGO_CAMERA.height)
@@ -92,16 +89,8 @@ def write_ego_video(
     stream = CameraStream(
         times, EGO_CAMERA, *_mount(t_head_device, rng), video=f"{file.parent.name}/{file.name}"
     )
-    with atomic_path(file) as temporary, av.open(str(temporary), "w", format="mp4") as container:
-        codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
-        options = {"crf": str(_CRF), "preset": "veryfast", "threads": "1"}
-        rate = Fraction(motion.fps / every).limit_denominator(1001)
-        video = container.add_stream(codec, rate=rate, options=options)
-        assert isinstance(video, av.VideoStream)
-        video.width, video.height, video.pix_fmt = EGO_CAMERA.width, EGO_CAMERA.height, "yuv420p"
-        for picture in ego_frames(world, motion, shape, stream, rng):
-            container.mux(video.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        container.mux(video.encode(None))
+    frames = ego_frames(world, motion, shape, stream, rng)
+    write_frames(file, frames, motion.fps / every)
     return stream
 
 

@@ -15,6 +15,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.io.video import video_encoder
 from wearcap.sensors.noise import smooth_noise
 from wearcap.simulation.views import Development, Scenery, render_view
 
@@ -87,12 +88,8 @@ def write_head_video(
         )  # fmt: skip
     fps = 1.0 / times.diff().median().item()
     with atomic_path(file) as temporary, av.open(str(temporary), "w", format="mp4") as container:
-        codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
-        stream = container.add_stream(
-            codec,
-            rate=Fraction(fps).limit_denominator(1001),
-            options={"crf": str(filming.crf), "preset": "veryfast"},
-        )
+        codec, options = video_encoder(filming.crf)
+        stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001), options=options)
         assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
         sound = container.add_stream("aac", rate=SOUND_HZ, layout="mono")
