@@ -11,10 +11,10 @@ import time
 import planted
 import torch
 
-from wearcap.data.contact_features import HandViews, SmplAngles
-from wearcap.models.contact_sequence import ContactSequence
-from wearcap.models.contact_transformer import ContactTransformer
-from wearcap.pipelines.contact_prediction import ContactDetector, ContactPredictor
+from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactPredictor
+from wearcap.systems.ireplica.contact_sequence import ContactSequence
+from wearcap.systems.ireplica.contact_transformer import ContactTransformer
+from wearcap.systems.ireplica.features import HandViews, SmplAngles
 
 SECONDS = 60.0
 

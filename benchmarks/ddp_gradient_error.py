@@ -21,7 +21,7 @@ from wearcap.cli.conf import compose
 from wearcap.data.datamodule import MotionWindows
 from wearcap.data.statistics import collate
 from wearcap.data.windows import SeededSampler, Window
-from wearcap.training.motion_diffusion import MotionDiffusion
+from wearcap.systems.hmd2.training import MotionDiffusion
 
 PROCESSES = 2
 JOINT_BATCH = 8

@@ -5,9 +5,9 @@ from gait_statistics import FPS, Clip, is_walking, windows_of
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from wearcap.data.features import HeadFeatures
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.systems.hmd2.features import HeadFeatures
 
 BATCH = 64
 

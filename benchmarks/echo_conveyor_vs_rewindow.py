@@ -17,11 +17,11 @@ import torch
 from echo_runs import NAME, figure, lanes_of, pipeline_of
 
 from wearcap.models.checkpoint import shared_checkpoints
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_dataset import EchoOnDataset
-from wearcap.pipelines.echo_queue import EchoQueue, Told
-from wearcap.pipelines.echo_rewindow import Rewindow
 from wearcap.recording import Recording, RecordingStore
+from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.echo.queue import EchoQueue, Told
+from wearcap.systems.echo.rewindow import Rewindow
 
 STRIDE = 10
 DATASET = Path(__file__).resolve().parents[1] / "datasets" / "simulated_objects"

@@ -12,7 +12,7 @@ import torch
 from echo_runs import figure, lanes_of, pipeline_of
 from online import without_cuda
 
-from wearcap.pipelines.echo import Echo
+from wearcap.systems.echo.pipeline import Echo
 
 DOCUMENT_MS = 13.73
 GOAL_MS = 1.4

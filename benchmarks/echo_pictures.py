@@ -11,14 +11,14 @@ import torch
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
-from wearcap.data.echo_objects import ObjectShape
 from wearcap.geometry.trajectory import resample
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_dataset import EchoOnDataset
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.acts import Act, true_acts
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
+from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.systems.echo.objects import ObjectShape
+from wearcap.systems.echo.pipeline import Echo
 from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
 

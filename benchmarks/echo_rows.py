@@ -7,12 +7,12 @@ import torch
 
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_dataset import EchoOnDataset
-from wearcap.pipelines.echo_evaluation import Truth, observed_share
-from wearcap.pipelines.echo_told import Lane, Scenario, lane_of
-from wearcap.pipelines.hmd2 import head_path
 from wearcap.recording import Motion, RecordingStore
+from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.systems.echo.observations import Lane, Scenario, lane_of
+from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.echo.scores import Truth, observed_share
+from wearcap.tracking.head_path import head_path
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
 from wearcap.models.checkpoint import shared_checkpoints
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_queue import Told
-from wearcap.pipelines.echo_stream import EchoSession, EchoWearer
-from wearcap.pipelines.echo_told import Scenario, lane_of
-from wearcap.pipelines.hmd2 import head_path
 from wearcap.scene.environment import Environment
 from wearcap.simulation.things import make_thing
+from wearcap.systems.echo.observations import Scenario, lane_of
+from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.echo.queue import Told
+from wearcap.systems.echo.stream import EchoSession, EchoWearer
+from wearcap.tracking.head_path import head_path
 
 NAME = "echo"
 FPS = 30.0

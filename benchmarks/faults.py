@@ -27,19 +27,19 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, export, train
-from wearcap.data.features import HeadFeatures
-from wearcap.data.prepare.engine import Task, prepare
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.export.exported import open_exported
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.bvh import read_bvh
-from wearcap.io.contact_labels import LabelClock
-from wearcap.io.motion_npz import read_motion
+from wearcap.io.formats.bvh import read_bvh
+from wearcap.io.formats.contact_labels import LabelClock
+from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import read_checkpoint, read_run_file
-from wearcap.models.denoiser import MotionDenoiser
-from wearcap.pipelines.hmd2 import HMD2
-from wearcap.pipelines.hmd2_stream import Sensed, Session, Wearer
+from wearcap.prepare.engine import Task, prepare
 from wearcap.recording import RecordingStore
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.stream import Sensed, Session, Wearer
 from wearcap.training.checkpoint import RunCheckpointIO
 from wearcap.training.loggers import read_metrics
 from wearcap.viewer.annotation_file import AnnotationFile

@@ -29,15 +29,16 @@ from safetensors.torch import load_file
 from wearcap.cli import capture, evaluate, export, prepare, train
 from wearcap.cli.conf import compose
 from wearcap.cli.load import environment_of, load_pipeline
-from wearcap.io.motion_npz import read_motion
-from wearcap.pipelines.echo_stream import EchoSession, EchoWearer
-from wearcap.pipelines.hmd2_stream import Sensed, Session, Wearer, joined
-from wearcap.pipelines.hps_stream import follow
-from wearcap.pipelines.mocap_every_stream import MocapEverySession, WatchSample, Wearing
+from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import true_acts
 from wearcap.recording.locate import load_recording
 from wearcap.recording.serialize import flatten
+from wearcap.recording.timing import joined
+from wearcap.systems.echo.stream import EchoSession, EchoWearer
+from wearcap.systems.hmd2.stream import Sensed, Session, Wearer
+from wearcap.systems.hps.stream import follow
+from wearcap.systems.mocap_every.stream import MocapEverySession, WatchSample, Wearing
 from wearcap.training.loggers import read_metrics
 
 FOLDER = Path(__file__).resolve().parent

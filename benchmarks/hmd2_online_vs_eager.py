@@ -10,8 +10,8 @@ from dataclasses import fields
 from online import Streamed, figure, pipeline_of
 
 from wearcap.diffusion.sampler import step_levels
-from wearcap.models.denoiser_runtime import StepRunner
-from wearcap.pipelines.hmd2 import HMD2
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.step_runner import StepRunner
 
 STEPS = 20
 

@@ -8,9 +8,10 @@ import torch
 
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline, load_realism
+from wearcap.evaluation.baselines import MeanPose, NearestWindow
+from wearcap.evaluation.evaluate import evaluate
+from wearcap.metrics.scores import score
 from wearcap.metrics.table import Row, Summary, aggregate
-from wearcap.pipelines.baselines import MeanPose, NearestWindow
-from wearcap.pipelines.evaluation import evaluate, score
 from wearcap.recording import Motion, Recording, RecordingStore
 
 BASELINES = {"mean pose": MeanPose, "nearest window": NearestWindow}

@@ -11,13 +11,13 @@ import torch
 from online import Walk
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.features import HeadFeatures
 from wearcap.diffusion.schedule import CosineSchedule
-from wearcap.models.denoiser import MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.pipelines.hmd2 import HMD2
-from wearcap.pipelines.hmd2_places import Memory
-from wearcap.pipelines.hmd2_stream import Session, Wearer
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.places import Memory
+from wearcap.systems.hmd2.stream import Session, Wearer
 
 
 def measure(minutes: int = 60, settle: int = 10, max_points: int = 100_000) -> list[dict]:

@@ -18,7 +18,7 @@ from wearcap.cli.conf import compose
 from wearcap.data.features import LIMBS
 from wearcap.data.windows import Window
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.training.motion_diffusion import MotionDiffusion
+from wearcap.systems.hmd2.training import MotionDiffusion
 
 PEAK_TFLOPS = {"H200": 989.0, "H100": 989.0, "A100": 312.0}
 BATCH = 512

@@ -16,9 +16,9 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
-from wearcap.pipelines.hps_evaluation import HpsTruth, nearest_frames
 from wearcap.recording import Motion
 from wearcap.simulation.depth_rig import look_at
+from wearcap.systems.hps.scores import HpsTruth, nearest_frames
 from wearcap.viewer.picture import captioned, save_png
 
 COLORS = {

@@ -14,7 +14,10 @@ from hydra.utils import instantiate
 
 from wearcap.cli.conf import compose
 from wearcap.metrics.surface import FootSurface
-from wearcap.pipelines.hps_evaluation import (
+from wearcap.recording import Motion
+from wearcap.runtime.stages import Source, run_stages
+from wearcap.simulation.localization_noise import with_outage
+from wearcap.systems.hps.scores import (
     HpsScores,
     HpsTruth,
     Outage,
@@ -22,9 +25,6 @@ from wearcap.pipelines.hps_evaluation import (
     planted_outages,
     score_hps,
 )
-from wearcap.pipelines.stages import Source, run_stages
-from wearcap.recording import Motion
-from wearcap.simulation.localization_noise import with_outage
 
 ROWS = {
     "IMU": "hps_imu",

@@ -12,13 +12,12 @@ import numpy as np
 import torch
 
 from wearcap.body.anny_body import anny_body
-from wearcap.data.prepare.engine import content_hash
-from wearcap.data.prepare.simulated import source_files
 from wearcap.files import write_text
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.pointcloud import voxel_downsample
-from wearcap.io.ply import Ply, read_ply, write_ply
-from wearcap.pipelines.hps_evaluation import RigCloud, nearest_frames, visit_times
+from wearcap.io.formats.ply import Ply, read_ply, write_ply
+from wearcap.prepare.engine import content_hash
+from wearcap.prepare.simulated import source_files
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, save_recording
 from wearcap.scene.scan import Scan
@@ -29,6 +28,7 @@ from wearcap.simulation.hps import HpsConfig, simulate_hps
 from wearcap.simulation.scan import scan_world
 from wearcap.simulation.views import Scenery
 from wearcap.simulation.world import World
+from wearcap.systems.hps.scores import RigCloud, nearest_frames, visit_times
 
 MICROPHONE_S = 0.002
 """Deviation of a clap's time as a camera's microphone gives it."""

@@ -16,11 +16,11 @@ from wearcap.cli.conf import compose
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.pipelines.hps_stream import HpsStream
 from wearcap.recording import CameraStream, Localization, Motion, Recording
 from wearcap.scene.scan import Scan
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.simulate import SimulationConfig, simulate_recording
+from wearcap.systems.hps.stream import HpsStream
 
 MOUNT = Rigid(R_DEVICE_CAM, torch.tensor([0.09, 0.0, 0.09]))
 

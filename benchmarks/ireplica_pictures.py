@@ -12,9 +12,9 @@ import torch
 from ireplica_runs import Case, pipeline_of
 
 from wearcap.body.anny_body import anny_body
-from wearcap.data.prepare.clean import at_times
 from wearcap.metrics.interaction import handlings
 from wearcap.recording import Motion, RecordingStore
+from wearcap.recording.timing import at_times
 from wearcap.scene.environment import Environment
 from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png

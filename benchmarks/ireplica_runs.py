@@ -12,26 +12,26 @@ from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
 from wearcap.cli.conf import compose
-from wearcap.data.prepare.clean import resampled
 from wearcap.geometry import rotation
-from wearcap.io.environment import read_environment
-from wearcap.pipelines.contact_intervals import ContactSettings
-from wearcap.pipelines.contact_prediction import ContactPredictor
-from wearcap.pipelines.ireplica import IReplica
-from wearcap.pipelines.ireplica_baselines import (
+from wearcap.io.formats.environment import read_environment
+from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.recording.interactions import Interactions
+from wearcap.recording.timing import resampled
+from wearcap.runtime.stages import Source
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import CONTACT_CLASSES
+from wearcap.sensors.noise import smooth_noise
+from wearcap.systems.ireplica.contact_intervals import ContactSettings
+from wearcap.systems.ireplica.contact_prediction import ContactPredictor
+from wearcap.systems.ireplica.object_tracker import ObjectTracker
+from wearcap.systems.ireplica.pipeline import IReplica
+from wearcap.systems.ireplica.published import (
     held_when_near,
     interpolated_objects,
     nearness,
     static_objects,
 )
-from wearcap.pipelines.ireplica_evaluation import score_interactions
-from wearcap.pipelines.object_tracker import ObjectTracker
-from wearcap.pipelines.stages import Source
-from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.recording.interactions import Interactions
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import CONTACT_CLASSES
-from wearcap.sensors.noise import smooth_noise
+from wearcap.systems.ireplica.scores import score_interactions
 
 ON_BENT_PATH = (
     "as published", "as published, w/o contact corr.", "ours, on the bent path", "ours, on the bent path, w/o contact corr.",

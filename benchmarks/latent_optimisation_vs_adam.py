@@ -20,11 +20,11 @@ from wearcap.cli.conf import compose
 from wearcap.cli.load import load_system
 from wearcap.geometry import rotation
 from wearcap.models.checkpoint import shared_checkpoints
-from wearcap.models.motion_manifold import MotionManifold
-from wearcap.optimize.latent_motion import LatentSolver
-from wearcap.pipelines.visual_cues import VisualCues
 from wearcap.recording import Motion, Recording
 from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
+from wearcap.systems.mocap_every.energy import LatentSolver
+from wearcap.systems.mocap_every.manifold import MotionManifold
+from wearcap.systems.mocap_every.visual_cues import VisualCues
 
 NAME = "motion_manifold"
 OFF_DEG = 15.0

@@ -20,7 +20,7 @@ from lightning.pytorch import Callback
 from omegaconf import DictConfig
 
 from wearcap.cli.conf import compose
-from wearcap.training.motion_diffusion import MotionDiffusion
+from wearcap.systems.hmd2.training import MotionDiffusion
 
 WARM_UP = 5
 

@@ -11,10 +11,10 @@ from dataclasses import replace
 from mocap_every_runs import figure, pipeline_of, watched
 
 from wearcap.geometry.rigid import Rigid
-from wearcap.models.onnx_runner import undisturbed
-from wearcap.pipelines.mocap_every import MocapEvery
-from wearcap.pipelines.mocap_every_stream import MocapEverySession, WatchSample, Wearing
 from wearcap.recording import Recording
+from wearcap.runtime.onnx import undisturbed
+from wearcap.systems.mocap_every.pipeline import MocapEvery
+from wearcap.systems.mocap_every.stream import MocapEverySession, WatchSample, Wearing
 
 
 def measure(duration_s: float = 30.0, repeats: int = 3) -> list[dict]:

@@ -15,14 +15,14 @@ from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import interpolate_held
 from wearcap.metrics.floor import floor_error_m, stood_on
 from wearcap.metrics.position import joint_error_cm
+from wearcap.metrics.scores import score_in_world, truth_at
 from wearcap.metrics.table import Row, evaluate_motion
-from wearcap.optimize.latent_motion import LatentSolver
-from wearcap.pipelines.evaluation import score_in_world, truth_at
-from wearcap.pipelines.mocap_every import Captured, MocapEvery
-from wearcap.pipelines.visual_cues import at_frames
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
 from wearcap.sensors.noise import smooth_noise
+from wearcap.systems.mocap_every.energy import LatentSolver
+from wearcap.systems.mocap_every.pipeline import Captured, MocapEvery
+from wearcap.systems.mocap_every.visual_cues import at_frames
 
 NEAR_M = 0.03
 SLAM_DEG, SLAM_M, SLAM_PERIOD_S = 2.4, 0.05, 4.0

@@ -11,9 +11,9 @@ from planted import swinging
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
 from wearcap.models.checkpoint import shared_checkpoints
-from wearcap.pipelines.mocap_every import MocapEvery
 from wearcap.recording import Recording
 from wearcap.sensors.imu import synthesize_imu
+from wearcap.systems.mocap_every.pipeline import MocapEvery
 
 NAME = "mocap_every"
 __all__ = ["figure", "pipeline_of", "watched"]

@@ -13,14 +13,14 @@ from planted import swinging
 from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
-from wearcap.data.features import HeadFeatures
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.checkpoint import shared_checkpoints
-from wearcap.models.denoiser import MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.pipelines.hmd2 import HMD2
-from wearcap.pipelines.hmd2_stream import Sensed, Session, Wearer
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.stream import Sensed, Session, Wearer
 
 EXPERIMENTS = {"small": "hmd2", "full": "hmd2_full"}
 """Of the same name: configs, and checkpoints where they exist."""

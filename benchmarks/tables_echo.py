@@ -21,10 +21,10 @@ from tabling import finite, recordings_of
 from wearcap.cli.conf import compose
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
-from wearcap.pipelines.echo_baselines import NearestEcho, RigidWrist
-from wearcap.pipelines.echo_dataset import EchoOnDataset
-from wearcap.pipelines.echo_evaluation import MEASURES, score_echo
 from wearcap.recording import RecordingStore
+from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.systems.echo.published import NearestEcho, RigidWrist
+from wearcap.systems.echo.scores import MEASURES, score_echo
 
 OBJECTS = MEASURES
 HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_s3", "true_jitter_m_s3")

@@ -11,10 +11,10 @@ from tabling import finite, new_table
 from torch.utils.data import DataLoader
 
 from wearcap.cli.load import load_system
-from wearcap.data.ego_frames import POINTS, EgoFrame, EgoFrames
 from wearcap.data.windows import Source
 from wearcap.files import write_text
-from wearcap.training.egoview import EgoView, view_scores
+from wearcap.systems.hmd2.egoview_frames import POINTS, EgoFrame, EgoFrames
+from wearcap.systems.hmd2.egoview_training import EgoView, view_scores
 
 COLUMNS = {
     "hand_share": "hands seen", "hand_average_precision": "AP", "hand_error_cm": "hand (cm)",

@@ -18,9 +18,9 @@ from rich.table import Table
 from tabling import cell, finite, new_table, summarize
 
 from wearcap.files import write_text
-from wearcap.pipelines.hps_evaluation import in_order
 from wearcap.simulation.hps import HpsConfig
 from wearcap.simulation.hps_session import Protocol
+from wearcap.systems.hps.scores import in_order
 
 DOCUMENT = {
     "stand": {

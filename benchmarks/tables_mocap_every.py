@@ -20,7 +20,7 @@ from wearcap.cli.load import load_visual_cues
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
 from wearcap.models.checkpoint import checkpoint_file
-from wearcap.optimize.latent_motion import LatentSolver
+from wearcap.systems.mocap_every.energy import LatentSolver
 
 BODY = (
     "r_mpjpe_cm", "mpjpe_cm", "mpjve_cm_s", "root_cm", "jitter_ratio", "upper_pe_cm", "lower_pe_cm", "hand_pe_cm",

@@ -19,10 +19,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from wearcap.cli.load import load_system
-from wearcap.data.object_clouds import CloudAugmentation, generate_clouds
 from wearcap.files import write_text
 from wearcap.models.point_encoder import bounds, to_unit_sphere
-from wearcap.training.object_encoding import ObjectEncoding
+from wearcap.simulation.object_clouds import generate_clouds
+from wearcap.systems.echo.object_clouds import CloudAugmentation
+from wearcap.systems.echo.object_training import ObjectEncoding
 
 VIEWS = {"as it is": None, "about the vertical": 0.0, "in any way": 1.0}
 

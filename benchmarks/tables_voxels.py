@@ -20,11 +20,11 @@ from tabling import finite, new_table
 from torch import Tensor
 
 from wearcap.data.place_codes import PlaceCodes
-from wearcap.data.voxel_windows import PlaceDataset
 from wearcap.data.windows import Source
 from wearcap.files import write_text
 from wearcap.metrics.occupancy import distance_mae_cm, held_distance_mae_cm, occupancy_iou
 from wearcap.scene.voxels import VoxelGrid
+from wearcap.systems.hmd2.point_codes_windows import PlaceDataset
 from wearcap.viewer.picture import save_png
 
 Rebuild = Callable[[Tensor], Tensor]

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, find_gaps, resample
-from wearcap.io.watch_log import read_watch_log
+from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.sensors.watches import MAX_GAP_S
 from wearcap.viewer.picture import save_png
 

@@ -9,21 +9,21 @@ import torch
 from boxes import box_mesh as mesh_between
 from walking_person import SEAT, walk
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
-from wearcap.data.echo_features import CONTACTS, OBJECT_SIZE, EchoFeatures
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.environment import write_environment
-from wearcap.models.echo import EchoDenoiser
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_told import Scenario
+from wearcap.io.formats.environment import write_environment
 from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Recording, RecordingStore
 from wearcap.recording.acts import true_acts
 from wearcap.recording.interactions import Interactions
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, EchoFeatures
+from wearcap.systems.echo.model import EchoDenoiser
+from wearcap.systems.echo.observations import Scenario
+from wearcap.systems.echo.pipeline import Echo
 
 WINDOW, FPS = 16, 30.0
 CLASSES = ("box", "chair")

@@ -14,8 +14,8 @@ import torch
 
 from command_line import exit_code, files_in
 from wearcap.cli import train
-from wearcap.io.bvh import write_bvh
-from wearcap.io.motion_npz import write_motion
+from wearcap.io.formats.bvh import write_bvh
+from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import RecordingStore
 from wearcap_testing import recording_of, small_dataset, suited, swaying_motion
 

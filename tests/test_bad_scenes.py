@@ -12,7 +12,7 @@ import torch
 from command_line import exit_code, files_in
 from wearcap.cli import main as cli
 from wearcap.geometry.mesh import Mesh
-from wearcap.io.environment import write_environment
+from wearcap.io.formats.environment import write_environment
 from wearcap.recording import ImuStream, Localization, RecordingStore
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject

@@ -4,10 +4,10 @@ import torch
 
 from walking_person import SEAT, inertial, room, walk
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
-from wearcap.data.watch_features import WatchFeatures
-from wearcap.models.watch_estimator import TwoStageEstimator
-from wearcap.pipelines.mocap_every import MocapEvery
 from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Recording
+from wearcap.systems.mocap_every.features import WatchFeatures
+from wearcap.systems.mocap_every.model import TwoStageEstimator
+from wearcap.systems.mocap_every.pipeline import MocapEvery
 
 WINDOW, FPS = 16, 30.0
 

@@ -150,7 +150,7 @@ def test_head_level_finds_a_planted_tilt():
 @pytest.mark.parametrize("trial", ["07_01", "09_01", "16_11"])
 def test_cmu_round_trip(real_data, trial):
     """CMU → xsens23 → CMU: joints within millimetres on the way and back."""
-    from wearcap.io.asf_amc import read_amc, read_asf
+    from wearcap.io.formats.asf_amc import read_amc, read_asf
 
     folder = real_data / "cmu_mocap" / "trials" / f"{int(trial[:2]):03d}"
     asf = read_asf(next(folder.glob("*.asf")))

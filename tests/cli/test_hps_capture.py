@@ -12,8 +12,8 @@ from wearcap.cli import capture, evaluate
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.camera_json import write_camera
-from wearcap.io.motion_npz import read_motion
+from wearcap.io.formats.camera_json import write_camera
+from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording.locate import load_recording
 
 

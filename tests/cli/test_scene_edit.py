@@ -7,8 +7,8 @@ import torch
 from wearcap.cli import scene
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
-from wearcap.io.environment import write_environment
-from wearcap.io.ply import Ply, write_ply
+from wearcap.io.formats.environment import write_environment
+from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.viewer.object_editor import ObjectEditor

@@ -11,9 +11,9 @@ from pathlib import Path
 import torch
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.prepare import Task, content_hash, prepare
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import exp
+from wearcap.prepare import Task, content_hash, prepare
 from wearcap.recording import Motion, Recording
 
 

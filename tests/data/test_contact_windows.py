@@ -9,12 +9,12 @@ import torch
 from contact_motion import CLASSES, bending, bending_dataset, bending_recording
 from wearcap.body.skeleton import xsens23
 from wearcap.body.skeletons import smpl24, smplh52
-from wearcap.data.contact_features import HandViews, SmplAngles, in_skeleton, pose_frames, worn
-from wearcap.data.contact_windows import Augmentation, ContactDataset, interpolated, pose_errors
 from wearcap.data.windows import Source, mirrored_rotations
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import RecordingStore
+from wearcap.systems.ireplica.features import HandViews, SmplAngles, in_skeleton, pose_frames, worn
+from wearcap.systems.ireplica.training_windows import Augmentation, ContactDataset, interpolated, pose_errors
 
 QUIET = Augmentation(mirror=False, noise_deg=0.0, stretch=1.0, drop=0.0)
 

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from carried_box import CLASSES, carrying, small_features
-from wearcap.data.echo_features import OBJECT_SIZE, Body, ThreePoints
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
+from wearcap.systems.echo.features import OBJECT_SIZE, Body, ThreePoints
 
 FRAMES = ("own", "window", "world")
 TURN = Rigid(rotation.about_axis("z", torch.tensor(1.3)), torch.tensor([5.0, -3.0, 0.7]))

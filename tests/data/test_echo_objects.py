@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from carried_box import HALF, MIDDLE, box_mesh, carrying, small_features, thing
-from wearcap.data.echo_objects import ObjectReader, body_contact, object_poses
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.scene.environment import Environment
+from wearcap.systems.echo.objects import ObjectReader, body_contact, object_poses
 
 POSE = Rigid(rotation.exp(torch.tensor([[0.3, -0.9, 0.4], [1.0, 0.2, 0.0]])), torch.tensor([[0.5, 2.0, 1.0], [0.0, 0.1, -0.3]]))  # fmt: skip
 

@@ -18,13 +18,13 @@ from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, contact_points
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
-from wearcap.data.echo_features import POINTS
-from wearcap.data.echo_objects import ObjectReader, ObjectShape, body_contact
-from wearcap.data.echo_windows import EchoDataset, echo_track, mirror_window
 from wearcap.data.statistics import collate
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
+from wearcap.systems.echo.features import POINTS
+from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact
+from wearcap.systems.echo.training_windows import EchoDataset, echo_track, mirror_window
 from wearcap_testing import small_dataset
 
 SKELETON = xsens23()

@@ -13,11 +13,11 @@ from PIL import Image
 
 from wearcap.cli import prepare
 from wearcap.data.embeddings import embed_camera, embedding_name
-from wearcap.data.prepare import embeddings
-from wearcap.data.prepare.embeddings import embed_dataset
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.models.image_encoder import EgoViewEncoder
+from wearcap.prepare import embeddings
+from wearcap.prepare.embeddings import embed_dataset
 from wearcap.recording import RecordingStore, serialize
 from wearcap.recording.recording import CameraStream
 from wearcap_testing import small_dataset

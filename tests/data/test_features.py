@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.features import HeadFeatures, body_size
+from wearcap.data.features import body_size
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.systems.hmd2.features import HeadFeatures
 
 FPS = 60.0
 

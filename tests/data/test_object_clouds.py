@@ -4,15 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from wearcap.data.object_clouds import (
-    CloudAugmentation,
-    ObjectClouds,
-    generate_clouds,
-    object_cloud,
-    random_rotation,
-)
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
+from wearcap.simulation.object_clouds import generate_clouds
+from wearcap.systems.echo.object_clouds import CloudAugmentation, ObjectClouds, object_cloud, random_rotation
 
 CLASSES = ["box", "chair", "drawer", "door"]
 
@@ -106,7 +101,7 @@ def test_a_datamodule_keeps_its_objects_in_a_file(tmp_path):
         "steps_per_epoch": 2,
         "points": 64,
     }
-    data = ObjectClouds(str(tmp_path), **settings)
+    data = ObjectClouds(str(tmp_path), generate_clouds, **settings)
     data.setup("fit")
     batches = list(data.train_dataloader())
     assert len(batches) == 2
@@ -119,6 +114,9 @@ def test_a_datamodule_keeps_its_objects_in_a_file(tmp_path):
     made = (tmp_path / "train.safetensors").stat().st_mtime_ns
     data.dataset("train")
     assert (tmp_path / "train.safetensors").stat().st_mtime_ns == made
-    assert len(ObjectClouds(str(tmp_path), **settings | {"per_class": 4}).dataset("train")) == 16
+    assert (
+        len(ObjectClouds(str(tmp_path), generate_clouds, **settings | {"per_class": 4}).dataset("train"))
+        == 16
+    )
     with pytest.raises(WearcapError, match="'chair'"):
-        ObjectClouds(str(tmp_path), **settings | {"classes": ["chairr"]})
+        ObjectClouds(str(tmp_path), generate_clouds, **settings | {"classes": ["chairr"]}).dataset("train")

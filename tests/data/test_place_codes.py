@@ -8,12 +8,12 @@ import torch
 from safetensors.torch import load_file
 
 from wearcap.data.place_codes import PlaceCodes
-from wearcap.data.voxel_windows import PlaceDataset
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import PointCloud, RecordingStore
 from wearcap.scene.voxels import VoxelGrid, mirrored, voxelize
+from wearcap.systems.hmd2.point_codes_windows import PlaceDataset
 from wearcap_testing import recording_of, swaying_motion
 
 
@@ -39,7 +39,7 @@ def store(tmp_path_factory) -> RecordingStore:
 def checkpoint(path, seed: int, **settings):
     torch.manual_seed(seed)
     net = VoxelAutoencoder(**settings)
-    model = {"_target_": "wearcap.training.voxel_reconstruction.VoxelReconstruction",
+    model = {"_target_": "wearcap.systems.hmd2.point_codes_training.VoxelReconstruction",
              "net": {"_target_": "wearcap.models.voxel_autoencoder.VoxelAutoencoder", **settings}}  # fmt: skip
     state = {f"net.{name}": value for name, value in net.state_dict().items()}
     torch.save({"wearcap": {"config": json.dumps({"model": model})}, "state_dict": state}, path)
@@ -85,7 +85,7 @@ def test_made_once_per_encoder_and_recording(store, tmp_path):
 
 
 def test_another_networks_checkpoint_is_refused(tmp_path):
-    content = {"config": json.dumps({"model": {"_target_": "wearcap.training.egoview.EgoView"}})}
+    content = {"config": json.dumps({"model": {"_target_": "wearcap.systems.hmd2.egoview_training.EgoView"}})}
     torch.save({"wearcap": content, "state_dict": {}}, tmp_path / "x.ckpt")
     with pytest.raises(WearcapError, match="not of VoxelAutoencoder"):
         _ = PlaceCodes(tmp_path / "x.ckpt").encoder

@@ -8,8 +8,8 @@ import torch
 import captured_motion as captured
 from wearcap.cli.conf import compose
 from wearcap.cli.prepare import run
-from wearcap.data.prepare import cmu_surrounded
-from wearcap.data.prepare.mocap import nominal_head
+from wearcap.prepare import cmu_surrounded
+from wearcap.prepare.mocap import nominal_head
 from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.serialize import flatten

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from prepare_tasks import tasks
 
-from wearcap.data.prepare import content_hash, prepare, read_splits
 from wearcap.errors import WearcapError
 from wearcap.files import sha256_of
+from wearcap.prepare import content_hash, prepare, read_splits
 from wearcap.recording import RecordingStore
 
 

@@ -17,9 +17,9 @@ import pytest
 from prepare_tasks import tasks
 
 from wearcap import files
-from wearcap.data.prepare import engine, prepare
 from wearcap.errors import WearcapError
 from wearcap.files import LOCK, sha256_of, write_text
+from wearcap.prepare import engine, prepare
 from wearcap.recording import RecordingStore
 
 posix = pytest.mark.skipif(os.name != "posix", reason="SIGKILL")
@@ -128,7 +128,8 @@ def test_workers_end_with_a_killed_run_and_the_next_one_has_the_folder_alone(alo
 STUCK = """
 import sys
 from prepare_tasks import tasks
-from wearcap.data.prepare import engine, prepare
+from wearcap.prepare import engine
+from wearcap.prepare import prepare
 prepare(tasks(2, r00="stuck", r01="stuck"), sys.argv[1], jobs=2, progress=False)
 """
 

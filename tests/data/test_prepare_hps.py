@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from wearcap.cli import prepare as verb
-from wearcap.data.prepare.clean import resampled
 from wearcap.errors import WearcapError
 from wearcap.recording import Motion, RecordingStore
+from wearcap.recording.timing import resampled
 from wearcap_testing import swaying_motion
 
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from wearcap.cli import prepare
-from wearcap.data.prepare import keypoints
-from wearcap.data.prepare.keypoints import Found, Recorded, Simulated, keypoints_dataset
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.keypoints_csv import write_keypoints
-from wearcap.io.video import write_frames
+from wearcap.io.formats.keypoints_csv import write_keypoints
+from wearcap.io.formats.video import write_frames
 from wearcap.localization.keypoints import Keypoint
+from wearcap.prepare import keypoints
+from wearcap.prepare.keypoints import Found, Recorded, Simulated, keypoints_dataset
 from wearcap.recording import CameraStream, Cue, Recording, RecordingStore
 from wearcap.sensors.keypoints import ACTION_CAMERA
 from wearcap_testing import small_dataset

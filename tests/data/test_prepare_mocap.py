@@ -10,16 +10,17 @@ import torch
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.cli import prepare as verb
 from wearcap.cli.conf import compose, splits_dir
-from wearcap.data.prepare import check_recording, read_splits
-from wearcap.data.prepare.amass import amass_tasks
-from wearcap.data.prepare.clean import CleaningLimits, resampled, without_glitches
-from wearcap.data.prepare.cmu import BvhSettings, Trial, cmu_tasks
-from wearcap.data.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.amass import write_amass
-from wearcap.io.text import read_bytes
+from wearcap.io.datasets.amass import write_amass
+from wearcap.io.formats.text import read_bytes
+from wearcap.prepare import check_recording, read_splits
+from wearcap.prepare.amass import amass_tasks
+from wearcap.prepare.clean import CleaningLimits, without_glitches
+from wearcap.prepare.cmu import BvhSettings, Trial, cmu_tasks
+from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording import Motion, RecordingStore
+from wearcap.recording.timing import resampled
 
 LIMITS = CleaningLimits(8.0, 15.0, 0.5, 0.06, 0.12)
 SETTINGS = MocapSettings(60.0, (0.09, 0.0, 0.09), LIMITS)

@@ -9,7 +9,7 @@ import torch
 
 from wearcap.cli import prepare as verb
 from wearcap.cli.main import run_verb
-from wearcap.io.restricted_pickle import read_pickle
+from wearcap.io.formats.restricted_pickle import read_pickle
 from wearcap.recording import RecordingStore
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from wearcap.cli import prepare as verb
 from wearcap.errors import WearcapError
-from wearcap.io import aria_vrs
+from wearcap.io.devices import aria_vrs
 from wearcap.recording import RecordingStore
 
 

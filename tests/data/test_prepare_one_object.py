@@ -9,13 +9,13 @@ import torch
 
 from wearcap.cli.conf import splits_dir
 from wearcap.cli.main import run_verb
-from wearcap.data.prepare import check_recording, read_splits
-from wearcap.data.prepare.omomo import check_rate
-from wearcap.data.prepare.one_object import ground_rotation
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.environment import read_environment
-from wearcap.io.omomo import read_omomo
+from wearcap.io.datasets.omomo import read_omomo
+from wearcap.io.formats.environment import read_environment
+from wearcap.prepare import check_recording, read_splits
+from wearcap.prepare.omomo import check_rate
+from wearcap.prepare.one_object import ground_rotation
 from wearcap.recording.store import RecordingStore
 
 

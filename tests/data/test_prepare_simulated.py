@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from wearcap.cli.conf import compose, splits_dir
-from wearcap.data.prepare import read_splits
-from wearcap.data.prepare.simulated import simulated_tasks
 from wearcap.errors import WearcapError
 from wearcap.files import sha256_of
+from wearcap.prepare import read_splits
+from wearcap.prepare.simulated import simulated_tasks
 from wearcap.recording import RecordingStore
 
 

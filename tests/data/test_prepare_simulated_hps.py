@@ -6,11 +6,11 @@ import pytest
 from hydra.utils import instantiate
 
 from wearcap.cli.conf import compose, splits_dir
-from wearcap.data.prepare.engine import prepare
-from wearcap.data.prepare.simulated_hps import simulated_hps_tasks
-from wearcap.data.prepare.splits import read_splits
 from wearcap.errors import WearcapError
-from wearcap.io.photos import read_photos
+from wearcap.io.formats.photos import read_photos
+from wearcap.prepare.engine import prepare
+from wearcap.prepare.simulated_hps import simulated_hps_tasks
+from wearcap.prepare.splits import read_splits
 from wearcap.recording.store import RecordingStore
 
 

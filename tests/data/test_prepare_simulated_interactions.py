@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from wearcap.data.prepare.engine import prepare
-from wearcap.data.prepare.simulated_interactions import simulated_interactions_tasks
-from wearcap.data.prepare.splits import read_splits
 from wearcap.errors import WearcapError
-from wearcap.io.environment import read_environment
-from wearcap.io.ply import read_ply
+from wearcap.io.formats.environment import read_environment
+from wearcap.io.formats.ply import read_ply
+from wearcap.prepare.engine import prepare
+from wearcap.prepare.simulated_interactions import simulated_interactions_tasks
+from wearcap.prepare.splits import read_splits
 from wearcap.recording.store import RecordingStore
 
 SPLITS = read_splits(Path(__file__).parents[2] / "data_prep/splits/simulated.csv")

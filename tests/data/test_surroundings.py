@@ -6,12 +6,12 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from wearcap.data.floor import floor_from_path, floor_from_points, tracked_floor
 from wearcap.data.surroundings import Surroundings, embeddings_of, latest_before
 from wearcap.data.windows import Source, WindowDataset
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.recording import CameraStream, PointCloud, RecordingStore
+from wearcap.tracking.floor import floor_from_path, floor_from_points, tracked_floor
 from wearcap_testing import recording_of, swaying_motion
 
 SIZE = 5

@@ -8,10 +8,18 @@ import torch
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import xsens23
 from wearcap.data.statistics import collate
-from wearcap.data.watch_features import ENDS, Sensed, WatchFeatures, to_world
-from wearcap.data.watch_windows import Variation, WatchDataset, WatchWindow, mirror, scaled, turned, watched
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
+from wearcap.systems.mocap_every.features import ENDS, Sensed, WatchFeatures, to_world
+from wearcap.systems.mocap_every.training_windows import (
+    Variation,
+    WatchDataset,
+    WatchWindow,
+    mirror,
+    scaled,
+    turned,
+    watched,
+)
 from wearcap_testing import small_dataset
 
 SKELETON = xsens23()

@@ -3,15 +3,15 @@
 import pytest
 import torch
 
-from wearcap.body.hang import hang
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import xsens23
 from wearcap.data.datamodule import MotionWindows
-from wearcap.data.features import HeadFeatures
-from wearcap.data.statistics import collate, feature_statistics
+from wearcap.data.statistics import collate
 from wearcap.data.windows import FixedSampler, SeededSampler, Source, WindowDataset, mirror_window
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
+from wearcap.systems.hmd2.features import HeadFeatures, feature_statistics
+from wearcap.tracking.anchor import hang
 from wearcap_testing import small_dataset
 
 

@@ -15,9 +15,9 @@ from wearcap.export import echo as export
 from wearcap.export.echo import encoder_path, export_echo, load_exported_echo
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_guidance import Guidance
 from wearcap.recording.store import RecordingFile
+from wearcap.systems.echo.guidance import Guidance
+from wearcap.systems.echo.pipeline import Echo
 
 FORMATS = ("onnx", "pt2")
 

@@ -10,17 +10,18 @@ import torch
 from torch import nn
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.features import HeadFeatures
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.export import exported, hmd2, network
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
-from wearcap.models.denoiser import MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.pipelines.hmd2 import HMD2, head_path
 from wearcap.recording import CameraStream, HeadStream, PointCloud, Recording
 from wearcap.recording.store import RecordingFile, save_recording
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.tracking.head_path import head_path
 
 WINDOW, IMAGE = 24, 8
 FORMATS = ("onnx", "pt2")

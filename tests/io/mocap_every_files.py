@@ -8,8 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from test_watch_log import moved, sensor_log
 
-from wearcap.io.ply import Ply, write_ply
-from wearcap.io.video import write_frames
+from wearcap.io.formats.ply import Ply, write_ply
+from wearcap.io.formats.video import write_frames
 
 SCALE = 2.5
 """Metres per unit of SLAM."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wearcap.io.ocamcalib import OCamModel
+from wearcap.io.formats.ocamcalib import OCamModel
 
 
 def lens(scale: float = 1.0) -> OCamModel:

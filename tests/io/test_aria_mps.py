@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.io import csv_table
-from wearcap.io.aria_mps import (
+from wearcap.io.devices.aria_mps import (
     R_CPF_DEVICE,
     head_stream,
     nominal_T_aria_cpf,
@@ -21,6 +20,7 @@ from wearcap.io.aria_mps import (
     read_points,
     turn_up,
 )
+from wearcap.io.formats import csv_table
 
 HEADER = (
     "graph_uid,tracking_timestamp_us,utc_timestamp_ns,tx_world_device,ty_world_device,tz_world_device,"

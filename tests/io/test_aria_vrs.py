@@ -9,9 +9,9 @@ from PIL import Image
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io import aria_vrs
-from wearcap.io.aria_mps import nominal_T_aria_cpf
-from wearcap.io.video import read_frames
+from wearcap.io.devices import aria_vrs
+from wearcap.io.devices.aria_mps import nominal_T_aria_cpf
+from wearcap.io.formats.video import read_frames
 
 needs_aria = pytest.mark.skipif(
     importlib.util.find_spec("projectaria_tools") is None,

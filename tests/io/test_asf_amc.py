@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wearcap.errors import WearcapError
-from wearcap.io.asf_amc import read_amc, read_asf
+from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.recording import Motion
 
 ASF = """# comment

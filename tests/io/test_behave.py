@@ -21,8 +21,8 @@ from one_object_files import (
 from boxes import BOX_FACES
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.behave import R_WORLD_CAMERA, behave_mesh_path, behave_names, read_behave
-from wearcap.io.ply import Ply
+from wearcap.io.datasets.behave import R_WORLD_CAMERA, behave_mesh_path, behave_names, read_behave
+from wearcap.io.formats.ply import Ply
 
 
 def test_body_and_object_of_a_sequence(tmp_path):

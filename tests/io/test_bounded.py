@@ -14,26 +14,26 @@ import numpy as np
 import pytest
 
 from wearcap.errors import WearcapError
-from wearcap.io import bounded
-from wearcap.io.asf_amc import read_asf
-from wearcap.io.bvh import read_bvh
-from wearcap.io.colmap import read_colmap
-from wearcap.io.euroc import read_euroc
-from wearcap.io.json_text import read_json
-from wearcap.io.mocap_every_folder import _config
-from wearcap.io.mvnx import read_mvnx
-from wearcap.io.npz import map_npy, read_npz
-from wearcap.io.ocamcalib import OCamModel
-from wearcap.io.pcd import read_pcd
-from wearcap.io.photos import read_photos
-from wearcap.io.ply import read_ply
-from wearcap.io.restricted_pickle import read_pickle
-from wearcap.io.smpl_json import read_smpl_json
-from wearcap.io.text import read_text
-from wearcap.io.totalcapture import read_totalcapture
-from wearcap.io.tum import read_tum
-from wearcap.io.video import read_frames, read_image, video_info
-from wearcap.io.wavefront import read_obj
+from wearcap.io.datasets.mocap_every_folder import _config
+from wearcap.io.datasets.totalcapture import read_totalcapture
+from wearcap.io.formats import bounded
+from wearcap.io.formats.asf_amc import read_asf
+from wearcap.io.formats.bvh import read_bvh
+from wearcap.io.formats.colmap import read_colmap
+from wearcap.io.formats.euroc import read_euroc
+from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.mvnx import read_mvnx
+from wearcap.io.formats.npz import map_npy, read_npz
+from wearcap.io.formats.ocamcalib import OCamModel
+from wearcap.io.formats.pcd import read_pcd
+from wearcap.io.formats.photos import read_photos
+from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.restricted_pickle import read_pickle
+from wearcap.io.formats.smpl_json import read_smpl_json
+from wearcap.io.formats.text import read_text
+from wearcap.io.formats.tum import read_tum
+from wearcap.io.formats.video import read_frames, read_image, video_info
+from wearcap.io.formats.wavefront import read_obj
 
 MIB = 1 << 20
 READERS = {
@@ -234,7 +234,7 @@ def test_deep_json(tmp_path, text):
     with zipfile.ZipFile(tmp_path / "a.json.zip", "w") as archive:
         archive.writestr("data.json", text)
     np.savez(tmp_path / "a.npz", wearcap=np.array(text))
-    from wearcap.io.motion_npz import read_motion
+    from wearcap.io.formats.motion_npz import read_motion
 
     for read, path in ((read_json, "a.json"), (read_smpl_json, "a.json"), (read_smpl_json, "a.json.zip"),
                        (read_photos, "."), (read_motion, "a.npz")):  # fmt: skip
@@ -283,7 +283,7 @@ def test_a_file_that_may_not_be_read(tmp_path, name, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("wearcap.io.bounded.os.stat", refuse)
+    monkeypatch.setattr("wearcap.io.formats.bounded.os.stat", refuse)
     assert "chmod" in refused(READERS[name], tmp_path / name, "no permission")
 
 

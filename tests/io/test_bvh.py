@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from wearcap.body.skeleton import Site, Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.bvh import read_bvh, read_cmu_bvh, write_bvh
+from wearcap.io.formats.bvh import read_bvh, read_cmu_bvh, write_bvh
 from wearcap.recording import Motion
 
 BVH = """HIERARCHY

@@ -11,7 +11,7 @@ from hostile import fuzz, mutated, mutated_bytes
 from hypothesis import given
 
 from wearcap.errors import WearcapError
-from wearcap.io.colmap import read_colmap
+from wearcap.io.formats.colmap import read_colmap
 
 CAMERAS = {
     1: ("SIMPLE_PINHOLE", 0, [500.0, 320.0, 240.0]),

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wearcap.errors import WearcapError
-from wearcap.io.contact_labels import (
+from wearcap.io.formats.contact_labels import (
     Label,
     LabelClock,
     annotation_of,

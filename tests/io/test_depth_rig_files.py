@@ -10,7 +10,7 @@ from PIL import Image
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.depth_rig import read_depth, read_depth_rig, read_depths, write_depth, write_depth_rig
+from wearcap.io.devices.depth_rig import read_depth, read_depth_rig, read_depths, write_depth, write_depth_rig
 
 LENS = Camera("pinhole", 16, 12, 12.0, 12.0, 7.5, 5.5)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from wearcap.errors import WearcapError
-from wearcap.io.droid import DroidPoints, read_droid
+from wearcap.io.formats.droid import DroidPoints, read_droid
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 

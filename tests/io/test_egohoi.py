@@ -14,8 +14,7 @@ from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.contact_labels import LabelClock
-from wearcap.io.egohoi import (
+from wearcap.io.datasets.egohoi import (
     egohoi_names,
     read_egohoi,
     read_egohoi_contacts,
@@ -23,8 +22,9 @@ from wearcap.io.egohoi import (
     read_object_npz,
     write_object_npz,
 )
-from wearcap.io.environment import read_environment
-from wearcap.io.ply import Ply, read_ply, write_ply
+from wearcap.io.formats.contact_labels import LabelClock
+from wearcap.io.formats.environment import read_environment
+from wearcap.io.formats.ply import Ply, read_ply, write_ply
 from wearcap.recording.store import RecordingStore
 
 ONE, SEVERAL = "SUB1_MPI_BIB_EG_sofa.06", "SUB6_TUB_2OG_multiroom.03"

@@ -12,8 +12,8 @@ from hypothesis import given
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
-from wearcap.io.environment import read_environment, write_environment
-from wearcap.io.ply import Ply, read_ply, write_ply
+from wearcap.io.formats.environment import read_environment, write_environment
+from wearcap.io.formats.ply import Ply, read_ply, write_ply
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 

@@ -15,7 +15,7 @@ from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.gltf import write_glb
+from wearcap.io.formats.gltf import write_glb
 from wearcap.recording import Motion
 
 COMPONENTS = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

@@ -10,17 +10,17 @@ from hostile import fuzz, mutated
 from hypothesis import given
 
 from wearcap.cli.main import run_verb
-from wearcap.data.prepare.hcontact import hcontact_tasks
-from wearcap.data.prepare.splits import read_splits
 from wearcap.errors import WearcapError
-from wearcap.io.hcontact import (
+from wearcap.io.datasets.hcontact import (
     activity_of,
     hcontact_names,
     location_of,
     read_hcontact,
     read_hcontact_split,
 )
-from wearcap.io.smpl_json import read_smpl_json
+from wearcap.io.formats.smpl_json import read_smpl_json
+from wearcap.prepare.hcontact import hcontact_tasks
+from wearcap.prepare.splits import read_splits
 from wearcap.recording.store import RecordingStore
 
 DOOR, SOFA = "SUB5_TUB_2OG_door.00", "SUB9_TUB_2OG_sofamove.00"

@@ -16,7 +16,7 @@ from hypothesis import given
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.hps import (
+from wearcap.io.datasets.hps import (
     read_hps_cameras,
     read_hps_localization,
     read_hps_motion,
@@ -24,7 +24,7 @@ from wearcap.io.hps import (
     read_hps_subject,
     resampled_localization,
 )
-from wearcap.io.hps_unity import read_unity_motion, rotations_from_unity
+from wearcap.io.datasets.hps_unity import read_unity_motion, rotations_from_unity
 from wearcap.recording import Localization
 
 # Single files ------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from hostile import fuzz, mutated
 from hypothesis import given
 
 from wearcap.errors import WearcapError
-from wearcap.io.keypoints_csv import read_keypoints, write_keypoints
+from wearcap.io.formats.keypoints_csv import read_keypoints, write_keypoints
 from wearcap.recording import Cue
 
 HEADER = "timestamp,joint,x,y,confidence\n"

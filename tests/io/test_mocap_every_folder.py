@@ -15,7 +15,7 @@ from mocap_every_files import BOARD_M, FIX, SCALE, SHUTTER_S, cloud, truth, worl
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.mocap_every_folder import (
+from wearcap.io.datasets.mocap_every_folder import (
     BoardWalks,
     is_mocap_every_folder,
     mocap_every_files,

@@ -16,8 +16,8 @@ from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.motion_npz import read_motion, write_motion
-from wearcap.io.npz import read_npz, require
+from wearcap.io.formats.motion_npz import read_motion, write_motion
+from wearcap.io.formats.npz import read_npz, require
 from wearcap.recording import Motion
 from wearcap.recording.interactions import Interactions
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.mvnx import read_mvnx
+from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.recording import Motion
 
 SEGMENTS = {

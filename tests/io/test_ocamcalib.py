@@ -11,7 +11,7 @@ from hypothesis import given
 from ocam_files import lens, text_of, xml_of
 
 from wearcap.errors import WearcapError
-from wearcap.io.ocamcalib import OCamModel, read_ocamcalib, read_sensor_frame
+from wearcap.io.formats.ocamcalib import OCamModel, read_ocamcalib, read_sensor_frame
 
 
 def direct_rays(model: OCamModel, pixels: np.ndarray) -> np.ndarray:

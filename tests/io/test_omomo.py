@@ -22,8 +22,8 @@ from one_object_files import (
 
 from wearcap.body.skeletons import smplx22
 from wearcap.errors import WearcapError
-from wearcap.io.amass import PELVIS_SMPLX
-from wearcap.io.omomo import omomo_take, read_omomo
+from wearcap.io.datasets.amass import PELVIS_SMPLX
+from wearcap.io.datasets.omomo import omomo_take, read_omomo
 
 
 def take_of(root, fps=30.0):

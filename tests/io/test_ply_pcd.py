@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wearcap.errors import WearcapError
-from wearcap.io.pcd import lzf_decompress, read_pcd
-from wearcap.io.ply import Ply, read_ply, write_ply
+from wearcap.io.formats.pcd import lzf_decompress, read_pcd
+from wearcap.io.formats.ply import Ply, read_ply, write_ply
 
 CLOUD = Ply(
     np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32),

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wearcap.errors import WearcapError
-from wearcap.io.restricted_pickle import read_pickle
+from wearcap.io.formats.restricted_pickle import read_pickle
 
 VALUE = {
     "seq_name": "sub1_largebox_000",

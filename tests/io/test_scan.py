@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from wearcap.errors import WearcapError
-from wearcap.io.ply import Ply, write_ply
-from wearcap.io.scan import read_scan, unit_fault
+from wearcap.io.formats.ply import Ply, write_ply
+from wearcap.io.formats.scan import read_scan, unit_fault
 
 
 def room(spacing_m: float = 0.03, side_m: float = 6.0) -> np.ndarray:

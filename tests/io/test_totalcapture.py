@@ -15,8 +15,15 @@ from hypothesis import strategies as st
 from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.smpl_axes import A
-from wearcap.io.totalcapture import DIP_IMU, R_UP, TOTALCAPTURE, as_watches, read_dip_imu, read_totalcapture
+from wearcap.io.datasets.totalcapture import (
+    DIP_IMU,
+    R_UP,
+    TOTALCAPTURE,
+    as_watches,
+    read_dip_imu,
+    read_totalcapture,
+)
+from wearcap.io.formats.smpl_axes import A
 from wearcap.recording import Motion
 from wearcap_testing import swaying_motion
 

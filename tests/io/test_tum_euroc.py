@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.euroc import read_euroc
-from wearcap.io.tum import read_tum, write_tum
+from wearcap.io.formats.euroc import read_euroc
+from wearcap.io.formats.tum import read_tum, write_tum
 
 
 def random_track(n=30):

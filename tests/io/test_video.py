@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from wearcap.errors import WearcapError
-from wearcap.io.video import read_frames, read_image, video_info, write_frames
+from wearcap.io.formats.video import read_frames, read_image, video_info, write_frames
 
 
 def write_video(path, count: int = 12, rate: int = 25) -> None:
@@ -106,7 +106,7 @@ def test_a_header_with_more_frames_than_bytes_is_refused(tmp_path):
 
 def test_pictures_of_a_video_that_are_too_large_are_refused(tmp_path, monkeypatch):
     write_video(tmp_path / "a.mp4")
-    monkeypatch.setattr("wearcap.io.video.MAX_PIXELS", 48 * 63)
+    monkeypatch.setattr("wearcap.io.formats.video.MAX_PIXELS", 48 * 63)
     for read in (video_info, lambda path: list(read_frames(path))):
         with pytest.raises(WearcapError, match="pictures of 64x48 pixels"):
             read(tmp_path / "a.mp4")

@@ -9,7 +9,7 @@ import torch
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.watch_log import G_M_S2, read_watch_log
+from wearcap.io.devices.watch_log import G_M_S2, read_watch_log
 from wearcap.recording import ImuStream
 
 

@@ -8,7 +8,7 @@ from one_object_files import CORNERS, obj_text
 
 from boxes import BOX_FACES
 from wearcap.errors import WearcapError
-from wearcap.io.wavefront import read_obj
+from wearcap.io.formats.wavefront import read_obj
 
 
 def test_a_box(tmp_path):

@@ -13,7 +13,7 @@ from wearcap.cli import calibrate as verb
 from wearcap.cli import main as cli
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.camera_json import read_camera, write_camera
+from wearcap.io.formats.camera_json import read_camera, write_camera
 from wearcap.localization.checkerboard import (
     Board,
     View,

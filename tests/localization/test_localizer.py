@@ -284,7 +284,7 @@ def test_a_cloud_without_colour_maps_but_is_not_pictured(mapper):
 
 
 def test_an_image_file_reads_as_rgb(tmp_path):
-    from wearcap.io.video import read_image
+    from wearcap.io.formats.video import read_image
 
     Image.fromarray(np.full((4, 6), 7, np.uint8)).save(tmp_path / "gray.png")
     assert read_image(tmp_path / "gray.png").tolist() == [[[7] * 3] * 6] * 4

@@ -12,7 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.colmap import Tracks
+from wearcap.io.formats.colmap import Tracks
 from wearcap.localization.absolute_pose import Fit, lens_of, pose_covariance, ransac_pose, refined_pose
 from wearcap.localization.features import Features, RootSift, root
 from wearcap.localization.landmarks import from_bytes, merge, to_bytes

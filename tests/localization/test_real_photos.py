@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from wearcap.geometry import rotation
-from wearcap.io.colmap import read_colmap
-from wearcap.io.video import read_image
+from wearcap.io.formats.colmap import read_colmap
+from wearcap.io.formats.video import read_image
 from wearcap.localization.features import RootSift
 from wearcap.localization.localizer import Localizer
 from wearcap.localization.map_builder import build_map

@@ -15,11 +15,11 @@ from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
-from wearcap.io.camera_json import read_camera, write_camera
-from wearcap.io.colmap import read_colmap
-from wearcap.io.ply import read_ply
-from wearcap.io.tum import read_tum
-from wearcap.io.video import write_frames
+from wearcap.io.formats.camera_json import read_camera, write_camera
+from wearcap.io.formats.colmap import read_colmap
+from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.tum import read_tum
+from wearcap.io.formats.video import write_frames
 from wearcap.localization import tracking
 from wearcap.localization.structure import MappingSettings, colmap_camera
 from wearcap.localization.tracking import TrackSettings, track_pictures

@@ -162,7 +162,7 @@ def changed(value, path: tuple, number: int):
 MEMORY = """
 import resource, sys, json
 from wearcap.cli.load import load_system
-import wearcap.training.echo_diffusion, wearcap.training.motion_diffusion
+import wearcap.systems.echo.training, wearcap.systems.hmd2.training
 from wearcap.errors import WearcapError
 load_system("hmd2")  # what a network of ours takes, with all imports
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -16,8 +16,12 @@ from wearcap.models.build import check_weights
 from wearcap.models.checkpoint import read_checkpoint, share_checkpoint
 
 MODEL = {
-    "_target_": "wearcap.training.contact_detection.ContactDetection",
-    "net": {"_target_": "wearcap.models.contact_sequence.ContactSequence", "_partial_": True, "width": 40},
+    "_target_": "wearcap.systems.ireplica.training.ContactDetection",
+    "net": {
+        "_target_": "wearcap.systems.ireplica.contact_sequence.ContactSequence",
+        "_partial_": True,
+        "width": 40,
+    },
     "skeleton": {"_target_": "wearcap.body.skeleton.xsens23"},
     "optimizer": {"_target_": "torch.optim.AdamW", "lr": 1e-3},
     "scheduler": {"_target_": "wearcap.training.schedules.warmup_cosine", "_partial_": True},
@@ -180,7 +184,7 @@ def test_files_that_are_no_checkpoints_are_named(tmp_path):
 @pytest.mark.parametrize("kind", ["ckpt", "safetensors"])
 def test_a_config_that_asks_for_anything_but_our_models_is_refused(kind, target, tmp_path):
     model = MODEL | {
-        "net": {"_target_": "wearcap.models.denoiser.MotionDenoiser", "x": [{"_target_": target}]}
+        "net": {"_target_": "wearcap.systems.hmd2.model.MotionDenoiser", "x": [{"_target_": target}]}
     }
     path = tmp_path / f"bad.{kind}"
     if kind == "ckpt":

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from wearcap.models.denoiser import Conditions, MotionDenoiser, Normalizer
+from wearcap.models.layers import Normalizer
+from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
 
 
 def small(**changes) -> MotionDenoiser:

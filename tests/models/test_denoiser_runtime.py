@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.models.denoiser import Conditions, MotionDenoiser
-from wearcap.models.denoiser_runtime import StepRunner
+from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
+from wearcap.systems.hmd2.step_runner import StepRunner
 
 LEVELS = torch.tensor([1.0, 0.6, 0.2])
 

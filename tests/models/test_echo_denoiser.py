@@ -6,7 +6,7 @@ from hydra.utils import instantiate
 
 from carried_box import WINDOW, small_features, small_net
 from wearcap.cli.conf import compose
-from wearcap.models.echo import MODALITIES, EchoDenoiser
+from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
 
 FEATURES = small_features()
 

@@ -11,8 +11,8 @@ import torch
 
 from carried_box import WINDOW, drawn_echo, small_features, small_net
 from wearcap.errors import WearcapError
-from wearcap.models import echo_runtime
-from wearcap.models.echo_runtime import EchoPlans, EchoRunner
+from wearcap.systems.echo import step_runner as echo_runtime
+from wearcap.systems.echo.step_runner import EchoPlans, EchoRunner
 
 
 def levels_of(lanes: int, frames: int, start: int) -> torch.Tensor:

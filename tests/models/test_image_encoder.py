@@ -67,7 +67,7 @@ def test_fingerprints_tell_weights_apart(encoder):
 
 
 def test_a_foreign_checkpoint_is_named(tmp_path):
-    config = json.dumps({"model": {"net": {"_target_": "wearcap.models.denoiser.MotionDenoiser"}}})
+    config = json.dumps({"model": {"net": {"_target_": "wearcap.systems.hmd2.model.MotionDenoiser"}}})
     torch.save({"wearcap": {"config": config}, "state_dict": {}}, tmp_path / "other.ckpt")
     with pytest.raises(WearcapError, match="a checkpoint of .*MotionDenoiser, not of EgoViewEncoder"):
         EgoViewEncoder.load(tmp_path / "other.ckpt")

@@ -8,8 +8,8 @@ import torch
 
 from wearcap.body.skeleton import xsens23
 from wearcap.models.checkpoint import read_checkpoint, share_checkpoint, shared_checkpoints
-from wearcap.pipelines.contact_prediction import ContactPredictor
 from wearcap.recording import Motion
+from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 
 FOLDER = Path(__file__).parents[2] / "checkpoints"
 CONTACTS = {

@@ -10,8 +10,8 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.metrics.physics import jitter_m_s3
-from wearcap.models.motion_manifold import MotionManifold
-from wearcap.optimize.latent_motion import (
+from wearcap.recording import Cue, Motion
+from wearcap.systems.mocap_every.energy import (
     LatentSolver,
     LatentWeights,
     PixelCue,
@@ -25,8 +25,8 @@ from wearcap.optimize.latent_motion import (
     pose_error,
     solve_latent,
 )  # fmt: skip
-from wearcap.pipelines.visual_cues import VisualCues, at_frames
-from wearcap.recording import Cue, Motion
+from wearcap.systems.mocap_every.manifold import MotionManifold
+from wearcap.systems.mocap_every.visual_cues import VisualCues, at_frames
 from wearcap_testing import recording_of, swaying_motion
 
 SKELETON = xsens23()

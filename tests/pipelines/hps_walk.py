@@ -11,7 +11,7 @@ from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.ply import Ply, write_ply
+from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.recording import (
     CameraStream,
     ContactTrack,

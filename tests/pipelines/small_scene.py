@@ -10,8 +10,8 @@ from PIL import Image
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis
-from wearcap.io.photos import write_photos
-from wearcap.io.ply import Ply, write_ply
+from wearcap.io.formats.photos import write_photos
+from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.recording.photo import Photo
 
 LEVEL = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])

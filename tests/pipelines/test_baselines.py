@@ -8,10 +8,10 @@ import torch
 
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
+from wearcap.evaluation import baselines
+from wearcap.evaluation.baselines import MeanPose, NearestWindow
 from wearcap.geometry import rotation
 from wearcap.metrics.position import mpjpe_cm
-from wearcap.pipelines import baselines
-from wearcap.pipelines.baselines import MeanPose, NearestWindow
 from wearcap.recording import FloorTrack, HeadStream, Motion, Recording, RecordingStore
 
 FPS = 30.0

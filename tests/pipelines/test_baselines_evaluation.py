@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.evaluation.baselines import MeanPose, NearestWindow
+from wearcap.evaluation.evaluate import evaluate
+from wearcap.metrics.scores import score
 from wearcap.metrics.table import aggregate
-from wearcap.pipelines.baselines import MeanPose, NearestWindow
-from wearcap.pipelines.evaluation import evaluate, score
 from wearcap.recording import ContactTrack
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.pipelines.contact_intervals import (
+from wearcap.systems.ireplica.contact_intervals import (
     ContactInterval,
     ContactSettings,
     ContactStream,

@@ -10,13 +10,13 @@ from contact_motion import bending
 from wearcap.body.retarget import fit_offsets, retarget
 from wearcap.body.skeleton import xsens23
 from wearcap.body.skeletons import smpl24
-from wearcap.data.contact_features import HandViews, SmplAngles
-from wearcap.data.prepare.clean import resampled
 from wearcap.errors import WearcapError
-from wearcap.models.contact_sequence import ContactSequence
-from wearcap.models.contact_transformer import ContactTransformer
-from wearcap.pipelines.contact_prediction import ContactDetector, ContactPredictor
 from wearcap.recording import Motion
+from wearcap.recording.timing import resampled
+from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactPredictor
+from wearcap.systems.ireplica.contact_sequence import ContactSequence
+from wearcap.systems.ireplica.contact_transformer import ContactTransformer
+from wearcap.systems.ireplica.features import HandViews, SmplAngles
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ import torch
 from walking_person import MOUNT, sound_recording
 from wearcap.body.skeleton import xsens23
 from wearcap.cli.doctor import main
+from wearcap.doctor import Finding, Report, examine
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.tum import write_tum
-from wearcap.pipelines.doctor import Finding, Report, examine
+from wearcap.io.formats.tum import write_tum
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import save_recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu

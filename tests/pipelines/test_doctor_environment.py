@@ -9,9 +9,9 @@ import torch
 
 from boxes import box_mesh
 from wearcap.cli.main import run_verb
-from wearcap.io.environment import write_environment
-from wearcap.pipelines.doctor import Finding, examine
-from wearcap.pipelines.doctor.environment import check_environment
+from wearcap.doctor import Finding, examine
+from wearcap.doctor.environment import check_environment
+from wearcap.io.formats.environment import write_environment
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 

@@ -11,14 +11,14 @@ from PIL import Image
 from small_scene import LEVEL, inverted, room_cloud, write_room
 
 from walking_person import sound_recording
+from wearcap.doctor import Finding, examine
+from wearcap.doctor.localized import check_contact_prob
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rotation import about_axis
-from wearcap.io.photos import write_photos
-from wearcap.io.ply import Ply, write_ply
+from wearcap.io.formats.photos import write_photos
+from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.localization.landmarks import Landmarks
 from wearcap.localization.visual_map import VisualMap
-from wearcap.pipelines.doctor import Finding, examine
-from wearcap.pipelines.doctor.localized import check_contact_prob
 from wearcap.recording import CameraStream, Localization, Recording, RecordingStore
 
 CAMERA = Camera("opencv", 64, 48, 40.0, 40.0, 31.5, 23.5, (0.0, 0.0, 0.0, 0.0))

@@ -7,18 +7,18 @@ import torch
 
 from carried_box import FPS, GRIP, WINDOW, boxes, carrying, drawn_echo, scenario_of
 from wearcap.body.contact_points import BODY_POINTS
-from wearcap.data.echo_features import CONTACTS, Body
 from wearcap.diffusion.process import add_noise
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_queue import EchoQueue, Told
-from wearcap.pipelines.echo_rewindow import Rewindow
-from wearcap.pipelines.echo_told import Observed, lane_of
-from wearcap.pipelines.hmd2 import head_path
 from wearcap.recording import Motion
+from wearcap.systems.echo.features import CONTACTS, Body
+from wearcap.systems.echo.observations import Observed, lane_of
+from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.echo.queue import EchoQueue, Told
+from wearcap.systems.echo.rewindow import Rewindow
+from wearcap.tracking.head_path import head_path
 
 TWO = (("box_1", "left", 0.1, 0.35), ("box_2", "right", 0.6, 0.8))
 FRAMES = ("own", "window", "world")

@@ -17,18 +17,18 @@ from carried_box import (
     scenario_of,
     small_features,
 )
-from wearcap.data.echo_features import CONTACTS
-from wearcap.data.echo_windows import EchoDataset
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.metrics.objects import vertex_error_cm
-from wearcap.pipelines.echo_baselines import NearestEcho, RigidWrist
-from wearcap.pipelines.echo_dataset import EchoOnDataset
-from wearcap.pipelines.echo_evaluation import MEASURES, MODALITIES, observed_share, score_echo, truth_of
-from wearcap.pipelines.echo_told import lane_of
-from wearcap.pipelines.hmd2 import head_path
 from wearcap.recording import RecordingStore
+from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.systems.echo.features import CONTACTS
+from wearcap.systems.echo.observations import lane_of
+from wearcap.systems.echo.published import NearestEcho, RigidWrist
+from wearcap.systems.echo.scores import MEASURES, MODALITIES, observed_share, score_echo, truth_of
+from wearcap.systems.echo.training_windows import EchoDataset
+from wearcap.tracking.head_path import head_path
 
 RECORDING = carrying(1.5)
 TIMES = RECORDING.motion.timestamps

@@ -7,13 +7,13 @@ import torch
 
 from carried_box import box_mesh, boxes, carrying, drawn_echo, scenario_of, thing
 from wearcap.body.contact_points import BODY_POINTS
-from wearcap.data.echo_features import OBJECT_SIZE, Body
 from wearcap.geometry.rigid import Rigid
-from wearcap.pipelines.echo import pulled_by
-from wearcap.pipelines.echo_guidance import Guidance, GuidedScene
-from wearcap.pipelines.echo_told import Observed, lane_of
-from wearcap.pipelines.hmd2 import head_path
 from wearcap.scene.environment import Environment
+from wearcap.systems.echo.features import OBJECT_SIZE, Body
+from wearcap.systems.echo.guidance import Guidance, GuidedScene
+from wearcap.systems.echo.observations import Observed, lane_of
+from wearcap.systems.echo.pipeline import pulled_by
+from wearcap.tracking.head_path import head_path
 
 FRAMES = 8
 LEFT_HAND = slice(0, 7)

@@ -7,10 +7,10 @@ import torch
 
 from carried_box import carrying, drawn_echo, scenario_of
 from wearcap.body.contact_points import BODY_POINTS
-from wearcap.data.echo_features import CONTACTS
 from wearcap.geometry import rotation
-from wearcap.pipelines.echo_queue import Said, Told
-from wearcap.pipelines.echo_rest import FADE, INSIDE, Resting, inside, rested
+from wearcap.systems.echo.features import CONTACTS
+from wearcap.systems.echo.queue import Said, Told
+from wearcap.systems.echo.static_objects import FADE, INSIDE, Resting, inside, rested
 
 TOUCH = 0.7
 ACTS = [-1, 0, 0, 0, 0, 0, 0, 1, 1, 1, -1, 1, 1, 1, 0, 0]

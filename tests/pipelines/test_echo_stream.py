@@ -9,11 +9,11 @@ from carried_box import CARRIED, boxes, carrying, drawn_echo, scenario_of, thing
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
-from wearcap.pipelines.echo_stream import EchoSession, EchoWearer
-from wearcap.pipelines.hmd2_stream import joined
 from wearcap.recording import Motion
 from wearcap.recording.acts import active_at
+from wearcap.recording.timing import joined
 from wearcap.scene.environment import Environment
+from wearcap.systems.echo.stream import EchoSession, EchoWearer
 
 TWO = (("box_1", "left", 0.1, 0.4), ("box_2", "right", 0.7, 0.9))
 WRISTS = ("left_wrist", "right_wrist")

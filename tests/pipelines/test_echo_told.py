@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from carried_box import MIDDLE, box_mesh, boxes, carrying, drawn_echo, scenario_of, thing
-from wearcap.data.echo_features import CONTACTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.pipelines.echo_told import WRISTS, Observed, lane_of, wrist_poses
-from wearcap.pipelines.hmd2 import head_path
 from wearcap.recording.acts import Act
 from wearcap.scene.environment import Environment
+from wearcap.systems.echo.features import CONTACTS
+from wearcap.systems.echo.observations import WRISTS, Observed, lane_of, wrist_poses
+from wearcap.tracking.head_path import head_path
 
 RECORDING = carrying(1.0)
 TIMES = RECORDING.motion.timestamps

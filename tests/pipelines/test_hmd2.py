@@ -6,15 +6,16 @@ import pytest
 import torch
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.features import HeadFeatures
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
+from wearcap.evaluation.evaluate import evaluate
 from wearcap.geometry.camera import Camera
-from wearcap.models.denoiser import MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.pipelines.evaluation import evaluate
-from wearcap.pipelines.hmd2 import HMD2, hang_from_head
 from wearcap.recording import CameraStream, PointCloud, Recording
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.tracking.anchor import hang_from_head
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 IMAGE_SIZE = 6

@@ -10,17 +10,17 @@ from safetensors.torch import load_file, save_file
 from test_hmd2_stream import IMAGE, WINDOW, moments, stream, surrounded, wearer
 
 from bad_packets import TIMES, VECTORS, Mutator, bad_poses, unchecked
-from wearcap.data.features import HeadFeatures
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
-from wearcap.models.denoiser import MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.pipelines import hmd2_wearer
-from wearcap.pipelines.hmd2 import HMD2
-from wearcap.pipelines.hmd2_places import Memory
-from wearcap.pipelines.hmd2_stream import Sensed, Session
 from wearcap.recording import Motion
 from wearcap.sensors.packets import AGREEING
+from wearcap.systems.hmd2 import wearer as hmd2_wearer
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.places import Memory
+from wearcap.systems.hmd2.stream import Sensed, Session
 
 FRAMES, FAULT = 80, 44
 EMBEDDINGS = VECTORS | {"longer": torch.zeros(IMAGE + 1), "nan": torch.full((IMAGE,), math.nan)}

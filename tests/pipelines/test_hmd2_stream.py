@@ -7,17 +7,17 @@ import pytest
 import torch
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.features import HeadFeatures
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.models.denoiser import MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.pipelines.hmd2 import HMD2
-from wearcap.pipelines.hmd2_places import Memory
-from wearcap.pipelines.hmd2_stream import Sensed, Session, Wearer
 from wearcap.recording import CameraStream, Motion, PointCloud, Recording
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.places import Memory
+from wearcap.systems.hmd2.stream import Sensed, Session, Wearer
 from wearcap_testing import recording_of, swaying_motion
 
 WINDOW, IMAGE = 60, 8

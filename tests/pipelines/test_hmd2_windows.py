@@ -5,8 +5,8 @@ import torch
 from test_hmd2 import pipeline, seeing_recording
 
 from wearcap.errors import WearcapError
-from wearcap.pipelines.hmd2 import head_path
-from wearcap.pipelines.hmd2_windows import Frames, advance, joined
+from wearcap.systems.hmd2.windows import Frames, advance, joined
+from wearcap.tracking.head_path import head_path
 
 
 def test_what_is_new_goes_on_from_what_is_known_and_fades_into_what_is_said():

@@ -10,7 +10,10 @@ from wearcap.body.anny_body import anny_body
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
-from wearcap.pipelines.hps_evaluation import (
+from wearcap.recording import Motion, Recording
+from wearcap.recording.recording import ContactTrack, Intervals
+from wearcap.scene.scan import Scan
+from wearcap.systems.hps.scores import (
     HpsTruth,
     RigCloud,
     disturbance,
@@ -24,9 +27,6 @@ from wearcap.pipelines.hps_evaluation import (
     travelled_m,
     visit_times,
 )
-from wearcap.recording import Motion, Recording
-from wearcap.recording.recording import ContactTrack, Intervals
-from wearcap.scene.scan import Scan
 
 SECONDS, FPS, SPEED = 2.0, 60.0, 0.5
 

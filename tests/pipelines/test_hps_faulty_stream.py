@@ -14,11 +14,11 @@ from bad_packets import Mutator, broken, unchecked
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.optimize.solution import Solution
-from wearcap.pipelines import hps_stream
-from wearcap.pipelines.hps import HPS
-from wearcap.pipelines.hps_stream import HpsStream, StreamSettings, follow
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import close_pieces, follow_pieces, piece_path, write_piece
+from wearcap.systems.hps import stream as hps_stream
+from wearcap.systems.hps.pipeline import HPS
+from wearcap.systems.hps.stream import HpsStream, StreamSettings, follow
 
 SETTINGS = StreamSettings(start_s=1.0, window_s=3.0)
 SECONDS, FAULT = 8, 4

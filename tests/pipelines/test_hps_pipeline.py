@@ -12,6 +12,7 @@ from hps_walk import CLAPS_S, MOUNT, floor_points, hps_dataset, hps_recording
 from PIL import Image
 
 from wearcap.errors import WearcapError
+from wearcap.evaluation.evaluate import evaluate
 from wearcap.localization.features import RootSift
 from wearcap.localization.map_builder import MapSettings, build_map
 from wearcap.localization.point_map import PointMapper
@@ -20,15 +21,14 @@ from wearcap.optimize.costs import Loss
 from wearcap.optimize.hps import HpsEnergy
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
-from wearcap.pipelines import hps as hps_module
-from wearcap.pipelines.bent_suit import BentSuit
-from wearcap.pipelines.evaluation import evaluate
-from wearcap.pipelines.hps import HPS, at_frames
-from wearcap.pipelines.hps_baselines import HpsBaseline
-from wearcap.pipelines.hps_camera import MapLocalization, Synchronization
-from wearcap.pipelines.stages import StagedCapture
 from wearcap.recording import Motion, Recording
+from wearcap.runtime.stages import StagedCapture
 from wearcap.scene.scan import Scan
+from wearcap.systems.hps import pipeline as hps_module
+from wearcap.systems.hps.camera import MapLocalization, Synchronization
+from wearcap.systems.hps.pipeline import HPS, at_frames
+from wearcap.systems.hps.published import HpsBaseline
+from wearcap.systems.ireplica.bent_suit import BentSuit
 
 ENERGY = HpsEnergy(
     {"self": 220.0, "hold": 9.0, "translation_step": 1e4, "root_step": 1e5, "head_step": 6e4, "pose": 400.0,

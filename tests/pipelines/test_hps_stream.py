@@ -9,11 +9,11 @@ from hydra.utils import instantiate
 
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
-from wearcap.pipelines.hps import HPS
-from wearcap.pipelines.hps_stream import HpsStream, StreamSettings, follow
 from wearcap.recording import Recording
 from wearcap.recording.growing import close_pieces, follow_pieces, piece_path, write_piece
 from wearcap.scene.scan import Scan
+from wearcap.systems.hps.pipeline import HPS
+from wearcap.systems.hps.stream import HpsStream, StreamSettings, follow
 
 SETTINGS = StreamSettings(start_s=2.0, window_s=6.0)
 
@@ -87,7 +87,7 @@ def test_a_camera_that_falls_silent_for_longer_than_a_window_is_bridged_too():
 
 
 def test_no_more_than_a_window_is_kept(monkeypatch):
-    from wearcap.pipelines import hps_stream
+    from wearcap.systems.hps import stream as hps_stream
 
     kept = []
     push = hps_stream.HpsStream.push

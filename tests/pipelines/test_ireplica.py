@@ -11,25 +11,25 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rotation import about_axis
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.contact_labels import LabelClock, labels_of
-from wearcap.io.environment import write_environment
+from wearcap.io.formats.contact_labels import LabelClock, labels_of
+from wearcap.io.formats.environment import write_environment
 from wearcap.metrics.interaction import summary
 from wearcap.optimize.contact_correction import OffsetSettings
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
-from wearcap.pipelines.attachment import AttachmentSettings
-from wearcap.pipelines.digest import digest
-from wearcap.pipelines.hand_snapping import HandSnapping
-from wearcap.pipelines.ireplica import IReplica
-from wearcap.pipelines.ireplica_baselines import held_when_near, interpolated_objects, static_objects
-from wearcap.pipelines.ireplica_evaluation import score_interactions
-from wearcap.pipelines.object_tracker import PALMS, ObjectTracker
-from wearcap.pipelines.snapping import BendCorrection, HingeFit, SnapCorrection, fit_about_hinge
-from wearcap.pipelines.stages import Source
 from wearcap.recording import Motion, Recording
 from wearcap.recording.interactions import Interactions
+from wearcap.runtime.digest import digest
+from wearcap.runtime.stages import Source
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.systems.ireplica.attachment import AttachmentSettings
+from wearcap.systems.ireplica.hand_snapping import HandSnapping
+from wearcap.systems.ireplica.object_tracker import PALMS, ObjectTracker
+from wearcap.systems.ireplica.pipeline import IReplica
+from wearcap.systems.ireplica.published import held_when_near, interpolated_objects, static_objects
+from wearcap.systems.ireplica.scores import score_interactions
+from wearcap.systems.ireplica.snapping import BendCorrection, HingeFit, SnapCorrection, fit_about_hinge
 
 FPS, FRAMES = 60.0, 360
 TAKE, LEAVE = 60, 240

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from watched_walk import WINDOW, drawn_pipeline, watched_walk
-from wearcap.data.watch_features import WatchFeatures
 from wearcap.data.windows import mirrored_name
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
-from wearcap.models.watch_estimator import LastPoseEstimator
-from wearcap.pipelines.evaluation import score_in_world
+from wearcap.metrics.scores import score_in_world
 from wearcap.recording import HeadStream
+from wearcap.systems.mocap_every.features import WatchFeatures
+from wearcap.systems.mocap_every.model import LastPoseEstimator
 
 
 @pytest.fixture(scope="module")

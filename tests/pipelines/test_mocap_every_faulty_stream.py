@@ -10,12 +10,12 @@ from bad_packets import ROTATIONS, TIMES, VECTORS, Mutator, bad_poses, given, un
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.pipelines import mocap_every_stream
-from wearcap.pipelines.hmd2_stream import joined
-from wearcap.pipelines.mocap_every_stream import MocapEverySession, WatchSample, Wearing
 from wearcap.recording import Motion
+from wearcap.recording.timing import joined
 from wearcap.sensors.packets import AGREEING
 from wearcap.sensors.watches import WRISTS
+from wearcap.systems.mocap_every import stream as mocap_every_stream
+from wearcap.systems.mocap_every.stream import MocapEverySession, WatchSample, Wearing
 
 FRAMES, FAULT = 60, 33
 

@@ -5,8 +5,8 @@ import torch
 
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.geometry.rigid import Rigid
-from wearcap.pipelines.mocap_every_stream import MocapEverySession, WatchSample, Wearing
 from wearcap.recording import Motion
+from wearcap.systems.mocap_every.stream import MocapEverySession, WatchSample, Wearing
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.tracked_points import TrackedPoints, encode_pose
 from wearcap.errors import WearcapError
+from wearcap.evaluation.evaluate import Pipeline
 from wearcap.models.pose_regressor import PoseRegressor
-from wearcap.pipelines.evaluation import Pipeline
-from wearcap.pipelines.pose_regressor import PoseRegressorCapture
+from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, encode_pose
+from wearcap.systems.hmd2.pose_regressor.pipeline import PoseRegressorCapture
 from wearcap_testing import recording_of, swaying_motion
 
 HANDS = ("head", "left_wrist", "right_wrist")

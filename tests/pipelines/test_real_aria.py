@@ -9,25 +9,25 @@ import torch
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from wearcap.body.hang import hang
 from wearcap.body.skeleton import xsens23
-from wearcap.data.features import HeadFeatures
 from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.doctor import examine
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate, resample
-from wearcap.io.adt import read_adt
-from wearcap.io.aria_mps import read_closed_loop, read_mps
+from wearcap.io.datasets.adt import read_adt
+from wearcap.io.devices.aria_mps import read_closed_loop, read_mps
 from wearcap.metrics.cues import cue_errors_cm
-from wearcap.models.denoiser import MotionDenoiser
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.pipelines.doctor import examine
-from wearcap.pipelines.hmd2 import HMD2
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording
 from wearcap.scene.floor import estimate_floor
 from wearcap.scene.voxels import VoxelGrid, VoxelMap, voxelize
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.tracking.anchor import hang
 from wearcap.viewer.head_path import draw_head_path
 from wearcap.viewer.picture import contact_sheet
 

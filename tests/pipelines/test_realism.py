@@ -12,13 +12,13 @@ import torch
 from wearcap.body.skeleton import xsens23
 from wearcap.data.motion_features import MotionFeatures
 from wearcap.errors import WearcapError
+from wearcap.evaluation import realism
+from wearcap.evaluation.realism import Realism
 from wearcap.geometry import rotation
 from wearcap.metrics.distribution import diversity, frechet_distance
+from wearcap.metrics.scores import score
 from wearcap.metrics.table import Row
 from wearcap.models.motion_autoencoder import MotionAutoencoder
-from wearcap.pipelines import realism
-from wearcap.pipelines.evaluation import score
-from wearcap.pipelines.realism import Realism
 from wearcap.recording import Motion, Recording
 from wearcap_testing import recording_of, swaying_motion
 

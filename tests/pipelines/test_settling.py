@@ -1,7 +1,7 @@
 import torch
 
-from wearcap.pipelines.contact_intervals import ContactInterval
-from wearcap.pipelines.settling import chains, settled
+from wearcap.systems.ireplica.contact_intervals import ContactInterval
+from wearcap.systems.ireplica.settling import chains, settled
 
 FPS = 60.0
 LEFT, RIGHT, BOTH = (True, False), (False, True), (True, True)

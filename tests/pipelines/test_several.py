@@ -8,14 +8,14 @@ import torch
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.models.motion_manifold import MotionManifold
-from wearcap.optimize.latent_motion import LatentSolver, LatentWeights
-from wearcap.pipelines.hmd2 import hang_from_head
-from wearcap.pipelines.several import capture_session, read_view, simulated_views, write_view
-from wearcap.pipelines.visual_cues import VisualCues
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.simulation.simulate import SimulationConfig
 from wearcap.simulation.two_wearers import simulate_two_wearers
+from wearcap.systems.mocap_every.energy import LatentSolver, LatentWeights
+from wearcap.systems.mocap_every.manifold import MotionManifold
+from wearcap.systems.mocap_every.sessions import capture_session, read_view, simulated_views, write_view
+from wearcap.systems.mocap_every.visual_cues import VisualCues
+from wearcap.tracking.anchor import hang_from_head
 
 
 @pytest.fixture(scope="module")

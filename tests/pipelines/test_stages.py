@@ -13,8 +13,8 @@ from rich.console import Console
 from torch import nn
 
 from wearcap.errors import WearcapError
-from wearcap.pipelines.digest import code_digest, digest
-from wearcap.pipelines.stages import Stage, StageCache, run_stages
+from wearcap.runtime.digest import code_digest, digest
+from wearcap.runtime.stages import Stage, StageCache, run_stages
 from wearcap.sensors.clock import Clock
 
 CLOCK = Clock(torch.tensor([1.5, 9.0]).double(), torch.tensor([0.5, 8.0]).double(), 0.1, 0.0, 2)

@@ -134,7 +134,7 @@ def test_floor_from_the_eyes_alone():
 @pytest.mark.real
 def test_real_room(real_data):
     """Aria's sample: the trajectory begins at z = 0 with the wearer standing; the floor is one level beneath."""
-    from wearcap.io.aria_mps import read_mps
+    from wearcap.io.devices.aria_mps import read_mps
 
     recording = read_mps(real_data / "aria_mps")
     assert recording.head is not None

@@ -7,7 +7,7 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.pcd import read_pcd
+from wearcap.io.formats.pcd import read_pcd
 from wearcap.sensors.registration import register
 
 

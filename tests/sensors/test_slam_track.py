@@ -111,7 +111,7 @@ def test_short_tracks(length):
 @pytest.mark.real
 def test_a_real_wearer_is_left_alone(real_data):
     """A Project Aria path at 30 Hz: nothing is cut, and planted outliers fall alone."""
-    from wearcap.io.aria_mps import read_closed_loop
+    from wearcap.io.devices.aria_mps import read_closed_loop
 
     path = next((real_data / "aria_mps").rglob("closed_loop_trajectory.csv*"))
     whole = read_closed_loop(path).T_world_aria

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.watch_features import synthetic_wrists
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis, geodesic
 from wearcap.recording import ImuStream
 from wearcap.sensors.watches import WRISTS, filtered, watches_at
+from wearcap.systems.mocap_every.features import synthetic_wrists
 from wearcap_testing import swaying_motion
 
 CLOCK = torch.arange(90, dtype=torch.float64) / 30 + 1.0

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import captured_motion as captured
-from wearcap.data.prepare.clean import CleaningLimits
-from wearcap.data.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.geometry.triangle_distance import TriangleIndex
-from wearcap.io.asf_amc import read_amc, read_asf
+from wearcap.io.formats.asf_amc import read_amc, read_asf
+from wearcap.prepare.clean import CleaningLimits
+from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.simulation.body_space import LIMBS, BodySpace, limb_ends
 from wearcap.simulation.outline import points_in_convex
 from wearcap.simulation.supports import PELVIS_OVER_SEAT_M, find_sits, find_treads

@@ -16,8 +16,8 @@ from wearcap.cli.load import load_pipeline, load_system
 from wearcap.errors import WearcapError
 from wearcap.metrics.detection import average_precision
 from wearcap.models.checkpoint import read_checkpoint
-from wearcap.pipelines.contact_prediction import ContactPredictor
 from wearcap.recording import RecordingStore
+from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("contact_*.yaml"))
 

@@ -13,17 +13,17 @@ from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import conf_dir
 from wearcap.cli.load import load_system
-from wearcap.data.echo_features import OBJECT_SIZE
-from wearcap.data.echo_windows import EchoDataset, EchoWindow
 from wearcap.data.statistics import collate
 from wearcap.data.windows import Source
 from wearcap.diffusion.levels import LevelMix
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.motion_npz import read_motion
-from wearcap.models.echo import EchoDenoiser
-from wearcap.training.echo_diffusion import EchoDiffusion
+from wearcap.io.formats.motion_npz import read_motion
+from wearcap.systems.echo.features import OBJECT_SIZE
+from wearcap.systems.echo.model import EchoDenoiser
+from wearcap.systems.echo.training import EchoDiffusion
+from wearcap.systems.echo.training_windows import EchoDataset, EchoWindow
 from wearcap_testing import small_dataset
 
 EXPERIMENTS = sorted(

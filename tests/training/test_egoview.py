@@ -10,8 +10,6 @@ import pytest
 import torch
 
 from wearcap.cli import train
-from wearcap.data.ego_augment import half_mirrored, relit, turned
-from wearcap.data.ego_frames import HANDS, POINTS, EgoFrame, EgoFrames, limb_points
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -21,7 +19,9 @@ from wearcap.models.image_encoder import EgoViewEncoder
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.recording import CameraStream
 from wearcap.sensors.slam import R_DEVICE_CAM
-from wearcap.training.egoview import view_scores
+from wearcap.systems.hmd2.egoview_augmentation import half_mirrored, relit, turned
+from wearcap.systems.hmd2.egoview_frames import HANDS, POINTS, EgoFrame, EgoFrames, limb_points
+from wearcap.systems.hmd2.egoview_training import view_scores
 from wearcap_testing import recording_of, swaying_motion
 
 CAMERA = Camera.pinhole(96, 72, 85)

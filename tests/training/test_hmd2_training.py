@@ -13,7 +13,7 @@ from wearcap.cli.load import load_system
 from wearcap.data.place_codes import PlaceCodes
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.motion_npz import read_motion
+from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
 from wearcap_testing import recording_of, swaying_motion
 

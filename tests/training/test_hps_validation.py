@@ -13,9 +13,9 @@ from torch import nn
 from wearcap.optimize.banded import BandedSettings, solve_banded
 from wearcap.optimize.costs import Loss
 from wearcap.optimize.hps import HpsEnergy
-from wearcap.pipelines.hps import HPS
 from wearcap.recording import Localization, Recording
-from wearcap.training.hps_validation import HpsValidation
+from wearcap.systems.hps.pipeline import HPS
+from wearcap.systems.hps.training import HpsValidation
 
 SQUARES = ("self", "hold", "translation_step", "root_step", "head_step", "pose", "slide", "contact_plane")
 PIPELINE = HPS(
@@ -103,7 +103,7 @@ def test_the_weights_of_each_epoch_are_captured(data):
 def test_a_recording_without_truth_has_no_error(data, tmp_path):
     from hps_walk import hps_dataset, hps_recording
 
-    from wearcap.training.hps_validation import validated
+    from wearcap.systems.hps.training import validated
 
     hps_dataset(tmp_path, replace(hps_recording("walk", 4.0), motion=None))
     scores = validated(PIPELINE, f"{tmp_path}/walk")

@@ -11,20 +11,20 @@ import torch
 
 from contact_motion import CLASSES, bending_recording
 from wearcap.body.kinematics import site_positions
-from wearcap.data.contact_features import HandViews
-from wearcap.data.datamodule import ContactWindows
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.environment import write_environment
-from wearcap.models.contact_sequence import ContactSequence
-from wearcap.pipelines.ireplica import IReplica
-from wearcap.pipelines.object_tracker import PALMS, ObjectTracker
+from wearcap.io.formats.environment import write_environment
 from wearcap.recording import CameraStream, Localization, Recording, RecordingStore
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.training.contact_detection import ContactDetection
-from wearcap.training.ireplica_validation import IReplicaValidation, fit
+from wearcap.systems.ireplica.contact_sequence import ContactSequence
+from wearcap.systems.ireplica.features import HandViews
+from wearcap.systems.ireplica.object_tracker import PALMS, ObjectTracker
+from wearcap.systems.ireplica.pipeline import IReplica
+from wearcap.systems.ireplica.training import ContactDetection
+from wearcap.systems.ireplica.training_windows import ContactWindows
+from wearcap.systems.ireplica.validation import IReplicaValidation, fit
 
 
 class TrueMotion:

@@ -5,12 +5,12 @@ import torch
 from torch import nn
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.features import HeadFeatures
 from wearcap.data.statistics import collate
 from wearcap.data.windows import Source, WindowDataset
 from wearcap.diffusion.schedule import CosineSchedule
-from wearcap.models.denoiser import MotionDenoiser
-from wearcap.training.motion_diffusion import MotionDiffusion
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.training import MotionDiffusion
 from wearcap_testing import small_dataset
 
 

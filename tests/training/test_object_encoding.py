@@ -11,7 +11,7 @@ from wearcap.cli import export, train
 from wearcap.cli.conf import conf_dir
 from wearcap.cli.load import load_system
 from wearcap.models.point_encoder import load_object_encoder
-from wearcap.training.object_encoding import ObjectEncoding, instance_loss
+from wearcap.systems.echo.object_training import ObjectEncoding, instance_loss
 from wearcap.training.run import resume_path
 
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("object_encoder*.yaml"))

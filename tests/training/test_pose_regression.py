@@ -14,11 +14,11 @@ from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_system
 from wearcap.data.statistics import collate
-from wearcap.data.tracked_points import TrackedPoints, encode_pose
 from wearcap.data.windows import Source, WindowDataset
 from wearcap.errors import WearcapError
 from wearcap.models.pose_regressor import PoseRegressor
-from wearcap.training.pose_regression import PoseRegression
+from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, encode_pose
+from wearcap.systems.hmd2.pose_regressor.training import PoseRegression
 from wearcap_testing import small_dataset
 
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]

@@ -13,16 +13,16 @@ from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_system, load_visual_cues
 from wearcap.data.statistics import collate
-from wearcap.data.watch_features import ENDS, WatchFeatures
-from wearcap.data.watch_windows import WatchDataset
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
-from wearcap.io.amass import read_amass
-from wearcap.io.motion_npz import read_motion
-from wearcap.models.motion_manifold import MotionManifold
-from wearcap.models.watch_estimator import Estimate, LastPoseEstimator, TwoStageEstimator
-from wearcap.training.motion_manifold import ManifoldTraining
-from wearcap.training.watch_regression import WatchRegression
+from wearcap.io.datasets.amass import read_amass
+from wearcap.io.formats.motion_npz import read_motion
+from wearcap.systems.mocap_every.features import ENDS, WatchFeatures
+from wearcap.systems.mocap_every.manifold import MotionManifold
+from wearcap.systems.mocap_every.manifold_training import ManifoldTraining
+from wearcap.systems.mocap_every.model import Estimate, LastPoseEstimator, TwoStageEstimator
+from wearcap.systems.mocap_every.training import WatchRegression
+from wearcap.systems.mocap_every.training_windows import WatchDataset
 from wearcap_testing import small_dataset
 
 EXPERIMENTS = (

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from wearcap.geometry.camera import Camera
-from wearcap.io.contact_labels import Label, LabelClock, annotation_of
+from wearcap.io.formats.contact_labels import Label, LabelClock, annotation_of
 from wearcap.recording import CameraStream, RecordingStore
 from wearcap.recording.interactions import Interactions
 from wearcap.viewer.annotate import Desk

@@ -13,9 +13,9 @@ from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.cli.annotate import main as annotate
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
-from wearcap.io.contact_labels import Label, read_contact_labels
-from wearcap.io.environment import write_environment
-from wearcap.io.motion_npz import write_motion
+from wearcap.io.formats.contact_labels import Label, read_contact_labels
+from wearcap.io.formats.environment import write_environment
+from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject

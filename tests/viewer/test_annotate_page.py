@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from annotated_flat import CLOCK, FPS, TIMES, labels, served, write_flat
 
-from wearcap.io.contact_labels import LabelClock, read_contact_labels
+from wearcap.io.formats.contact_labels import LabelClock, read_contact_labels
 from wearcap.viewer.annotate import Desk
 from wearcap.viewer.annotate_server import AnnotationServer
 from wearcap.viewer.annotation_file import AnnotationFile

@@ -15,8 +15,8 @@ from wearcap.cli.motions import read_motions
 from wearcap.cli.view import main as view
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.environment import write_environment
-from wearcap.io.motion_npz import write_motion
+from wearcap.io.formats.environment import write_environment
+from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.interactions import Interactions
 from wearcap.scene.environment import Environment

@@ -24,7 +24,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from wearcap.errors import WearcapError
-from wearcap.io.environment import FILE_NAME
+from wearcap.io.formats.environment import FILE_NAME
 from wearcap.recording import PointCloud, Recording, RecordingStore
 from wearcap.scene.scan import Scan
 from wearcap.scene.selection import Box

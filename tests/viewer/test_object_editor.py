@@ -14,7 +14,7 @@ from scanned_room import CHAIR, DOOR_X, DOOR_Y, SOFA, scanned_room
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.environment import read_environment, write_environment
+from wearcap.io.formats.environment import read_environment, write_environment
 from wearcap.scene.editing import points_world
 from wearcap.scene.environment import Environment
 from wearcap.scene.placing import hinge_places

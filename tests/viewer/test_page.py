@@ -11,7 +11,7 @@ from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
 from wearcap.cli.view import main as view
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.motion_npz import write_motion
+from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import ContactTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.locate import dataset_folder
 from wearcap.viewer.page import Page
@@ -152,7 +152,7 @@ def test_the_verb_shows_a_stored_recording_with_its_scene(tmp_path, monkeypatch,
 
 @pytest.mark.real
 def test_aria_recording_is_shown(real_data):
-    from wearcap.io.aria_mps import read_mps
+    from wearcap.io.devices.aria_mps import read_mps
 
     recording = read_mps(real_data / "aria_mps")
     page = Page(recording, port=18095)

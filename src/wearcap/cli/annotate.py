@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> None:
 
 
 def _annotate(options: argparse.Namespace) -> None:
-    from wearcap.io.motion_npz import read_motion
+    from wearcap.io.formats.motion_npz import read_motion
     from wearcap.viewer.annotate import Desk
     from wearcap.viewer.annotate_server import AnnotationServer
 
@@ -71,7 +71,7 @@ def _annotate(options: argparse.Namespace) -> None:
 
 def _start_from(desk: "Desk", source: str) -> None:
     """Write labels to start from; labels that are there already are never replaced."""
-    from wearcap.io.contact_labels import annotation_of
+    from wearcap.io.formats.contact_labels import annotation_of
     from wearcap.viewer.annotation_start import starting_labels
 
     if len(desk.names) > 1 and source != "recording":
@@ -100,7 +100,7 @@ def _export(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
 
     from wearcap.files import write_text
-    from wearcap.io.contact_labels import hcontact_text
+    from wearcap.io.formats.contact_labels import hcontact_text
     from wearcap.viewer.annotate import Desk
 
     desk = Desk.of(options.recording, options.output)

@@ -12,8 +12,8 @@ from rich import print as show
 from rich.table import Table
 
 from wearcap.cli.conf import hydra_main
-from wearcap.io.camera_json import write_camera
-from wearcap.io.pictures import read_pictures
+from wearcap.io.formats.camera_json import write_camera
+from wearcap.io.formats.pictures import read_pictures
 from wearcap.localization.checkerboard import Board, Calibration, calibrate_from_pictures
 
 HELP = (

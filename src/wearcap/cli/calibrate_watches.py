@@ -19,9 +19,9 @@ from wearcap.cli.conf import hydra_main
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import folder_lock
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.tum import read_tum
-from wearcap.io.watch_calibration_json import WornCalibration, write_watch_calibration
-from wearcap.io.watch_log import read_watch_log
+from wearcap.io.devices.watch_calibration_json import WornCalibration, write_watch_calibration
+from wearcap.io.devices.watch_log import read_watch_log
+from wearcap.io.formats.tum import read_tum
 from wearcap.recording import FloorTrack, ImuStream, Recording, RecordingStore
 from wearcap.recording.locate import load_recording
 from wearcap.recording.store import save_recording

@@ -15,20 +15,20 @@ from wearcap.cli.conf import hydra_main
 from wearcap.cli.load import LearnedPipeline, environment_of, load_pipeline, staged
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.io.amass import write_amass
-from wearcap.io.bvh import write_bvh
-from wearcap.io.gltf import write_glb
-from wearcap.io.motion_npz import write_motion
-from wearcap.io.scan import read_scan
-from wearcap.io.scene_folder import cloud_file
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_dataset import EchoOnDataset
-from wearcap.pipelines.hps import HPS
-from wearcap.pipelines.hps_stream import follow
+from wearcap.io.datasets.amass import write_amass
+from wearcap.io.formats.bvh import write_bvh
+from wearcap.io.formats.gltf import write_glb
+from wearcap.io.formats.motion_npz import write_motion
+from wearcap.io.formats.scan import read_scan
+from wearcap.io.formats.scene_folder import cloud_file
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.scene.environment import Environment
+from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.hps.pipeline import HPS
+from wearcap.systems.hps.stream import follow
 from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
 from wearcap.viewer.video import write_video

@@ -9,7 +9,7 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from wearcap.pipelines.doctor import Report, examine
+from wearcap.doctor import Report, examine
 
 HELP = "say what a recording holds, what looks wrong in it, and how to mend it"
 _COLOR = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}

@@ -10,16 +10,17 @@ from rich.progress import Progress
 from wearcap.cli.conf import hydra_main
 from wearcap.cli.load import LearnedPipeline, load_pipeline, load_realism, staged, trained_on
 from wearcap.errors import WearcapError
+from wearcap.evaluation.baselines import MeanPose, NearestWindow
+from wearcap.evaluation.evaluate import Pipeline, evaluate
+from wearcap.evaluation.realism import Realism
+from wearcap.metrics.scores import Measure, score, score_in_world
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, write_scores
-from wearcap.pipelines.baselines import MeanPose, NearestWindow
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_dataset import EchoOnDataset
-from wearcap.pipelines.evaluation import Measure, Pipeline, evaluate, score, score_in_world
-from wearcap.pipelines.ireplica import IReplica
-from wearcap.pipelines.ireplica_evaluation import with_interactions
-from wearcap.pipelines.mocap_every import MocapEvery
-from wearcap.pipelines.realism import Realism
 from wearcap.recording import RecordingStore
+from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.ireplica.pipeline import IReplica
+from wearcap.systems.ireplica.scores import with_interactions
+from wearcap.systems.mocap_every.pipeline import MocapEvery
 
 OURS = "wearcap"
 """Name of the checkpoint's method in the table."""

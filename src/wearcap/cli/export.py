@@ -12,11 +12,11 @@ from wearcap.export.hmd2 import export_hmd2
 from wearcap.export.mocap_every import export_mocap_every
 from wearcap.export.network import ExportReport
 from wearcap.models.checkpoint import share_checkpoint
-from wearcap.pipelines.contact_prediction import load_detector
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.hmd2 import HMD2
-from wearcap.pipelines.mocap_every import MocapEvery
-from wearcap.training.contact_detection import ContactDetection
+from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.ireplica.contact_prediction import load_detector
+from wearcap.systems.ireplica.training import ContactDetection
+from wearcap.systems.mocap_every.pipeline import MocapEvery
 
 HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2|safetensors"
 

@@ -9,31 +9,31 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from wearcap.errors import WearcapError
-from wearcap.io.environment import read_environment
+from wearcap.evaluation.realism import Realism
+from wearcap.io.formats.environment import read_environment
 from wearcap.models.build import build
 from wearcap.models.checkpoint import read_checkpoint
-from wearcap.optimize.latent_motion import LatentSolver, LatentWeights
-from wearcap.pipelines.contact_prediction import ContactPredictor
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.hmd2 import HMD2
-from wearcap.pipelines.mocap_every import MocapEvery
-from wearcap.pipelines.pose_regressor import PoseRegressorCapture
-from wearcap.pipelines.realism import Realism
-from wearcap.pipelines.stages import StagedCapture, StagedPipeline
-from wearcap.pipelines.visual_cues import VisualCues
 from wearcap.recording.locate import dataset_folder
 from wearcap.recording.recording import Recording
+from wearcap.runtime.stages import StagedCapture, StagedPipeline
 from wearcap.scene.environment import Environment
-from wearcap.training.contact_detection import ContactDetection
-from wearcap.training.echo_diffusion import EchoDiffusion
-from wearcap.training.egoview import EgoView
+from wearcap.systems.echo.object_training import ObjectEncoding
+from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.echo.training import EchoDiffusion
+from wearcap.systems.hmd2.egoview_training import EgoView
+from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.point_codes_training import VoxelReconstruction
+from wearcap.systems.hmd2.pose_regressor.pipeline import PoseRegressorCapture
+from wearcap.systems.hmd2.pose_regressor.training import PoseRegression
+from wearcap.systems.hmd2.training import MotionDiffusion
+from wearcap.systems.ireplica.contact_prediction import ContactPredictor
+from wearcap.systems.ireplica.training import ContactDetection
+from wearcap.systems.mocap_every.energy import LatentSolver, LatentWeights
+from wearcap.systems.mocap_every.manifold_training import ManifoldTraining
+from wearcap.systems.mocap_every.pipeline import MocapEvery
+from wearcap.systems.mocap_every.training import WatchRegression
+from wearcap.systems.mocap_every.visual_cues import VisualCues
 from wearcap.training.motion_autoencoder import MotionEncoding
-from wearcap.training.motion_diffusion import MotionDiffusion
-from wearcap.training.motion_manifold import ManifoldTraining
-from wearcap.training.object_encoding import ObjectEncoding
-from wearcap.training.pose_regression import PoseRegression
-from wearcap.training.voxel_reconstruction import VoxelReconstruction
-from wearcap.training.watch_regression import WatchRegression
 
 System = (
     MotionDiffusion

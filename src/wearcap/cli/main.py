@@ -9,7 +9,7 @@ import traceback
 
 from wearcap import __version__
 from wearcap.errors import WearcapError, nearest
-from wearcap.io.bounded import VARIABLE, gib_bytes
+from wearcap.io.formats.bounded import VARIABLE, gib_bytes
 
 VERBS = (
     "train", "evaluate", "capture", "export", "prepare", "view", "render", "annotate", "scene", "calibrate",

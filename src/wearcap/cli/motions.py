@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from wearcap.errors import WearcapError
-from wearcap.io.motion_npz import read_motion
+from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording.motion import Motion
 
 RESERVED = ("truth", "over", "beside")

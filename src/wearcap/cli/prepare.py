@@ -7,9 +7,9 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from wearcap.cli.conf import compose, conf_dir, explained, nearest, splits_dir
-from wearcap.data.prepare.engine import Report, prepare
-from wearcap.data.prepare.splits import read_splits
 from wearcap.errors import WearcapError
+from wearcap.prepare.engine import Report, prepare
+from wearcap.prepare.splits import read_splits
 from wearcap.recording.store import SPLITS, RecordingStore
 
 HELP = "make a data set: wearcap prepare simulated, wearcap prepare cmu source=DIR"

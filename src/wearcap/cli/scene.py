@@ -16,9 +16,9 @@ from rich.table import Table
 from wearcap.cli.conf import hydra_main
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.colmap import Tracks
-from wearcap.io.scene_folder import read_scene
-from wearcap.io.video import read_image
+from wearcap.io.formats.colmap import Tracks
+from wearcap.io.formats.scene_folder import read_scene
+from wearcap.io.formats.video import read_image
 from wearcap.localization.localizer import Localizer
 from wearcap.localization.map_builder import build_map, extended
 from wearcap.localization.visual_map import VisualMap

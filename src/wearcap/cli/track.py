@@ -12,8 +12,8 @@ from rich.progress import Progress
 
 from wearcap.cli.conf import hydra_main
 from wearcap.errors import WearcapError
-from wearcap.io.camera_json import read_camera
-from wearcap.io.colmap import read_colmap
+from wearcap.io.formats.camera_json import read_camera
+from wearcap.io.formats.colmap import read_colmap
 from wearcap.localization.structure import Advance
 from wearcap.localization.tracking import (
     Track,

@@ -1,5 +1,4 @@
-"""Windows, features, DataModules, and the preparation of data sets.
+"""Windows of recordings, drawn for training, and the DataModules around them.
 
-What a network sees and says are its `*_features.py`; `*_windows.py` draw them from recordings, for `datamodule.py`.
-Open `windows.py` and `features.py` (HMD²) first: the other systems' are made alike. `prepare/` makes the data sets.
+Open `windows.py` first: each system's `training_windows.py` is made alike. Where recordings come from: `wearcap.prepare`.
 """

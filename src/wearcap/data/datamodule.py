@@ -7,8 +7,6 @@ import lightning
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from wearcap.data.contact_features import PoseFeatures
-from wearcap.data.contact_windows import NONE, Augmentation, ContactDataset
 from wearcap.data.statistics import collate
 from wearcap.data.surroundings import NOTHING, Surroundings
 from wearcap.data.windows import FixedSampler, SeededSampler, Source, WindowDataset
@@ -119,40 +117,4 @@ class MotionWindows(SeededWindows):
             sources, split, window=self.window, stride=self.stride, fps=self.fps, mirror=self.augment and train,
             balance=self.balance if train else 1.0, surroundings=self.surroundings,
             beginnings=self.beginnings if train else 0.0,
-        )  # fmt: skip
-
-
-class ContactWindows(SeededWindows):
-    """Windows of poses with the truth about hand contact, for contact detection."""
-
-    def __init__(
-        self,
-        sources: dict[str, dict | None],
-        features: PoseFeatures,
-        classes: list[str],
-        window: int,
-        stride: int,
-        fps: float,
-        batch_size: int,
-        steps_per_epoch: int | None = None,
-        val_windows: int | None = None,
-        workers: int = 0,
-        seed: int = 0,
-        stream: str = "suit",
-        augmentation: Augmentation = NONE,
-        balance: float = 1.0,
-        val_sources: dict[str, dict | None] | None = None,
-    ):
-        """See `SeededWindows` and `ContactDataset`; `augmentation` and `balance` are for training alone."""
-        super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
-        self.features, self.classes = features, tuple(classes)
-        self.window, self.stride, self.fps, self.stream = window, stride, fps, stream
-        self.augmentation, self.balance = augmentation, balance
-
-    def dataset(self, split: str) -> ContactDataset:
-        train = split == "train"
-        return ContactDataset(
-            self.sources if train else self.val_sources, split, window=self.window, stride=self.stride, fps=self.fps,
-            classes=self.classes, skeleton=self.features.skeleton, stream=self.stream,
-            augmentation=self.augmentation if train else NONE, balance=self.balance if train else 1.0,
         )  # fmt: skip

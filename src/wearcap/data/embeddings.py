@@ -14,7 +14,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, sha256_of
-from wearcap.io.video import read_frames, read_image
+from wearcap.io.formats.video import read_frames, read_image
 from wearcap.models.image_encoder import ImageEncoder
 from wearcap.recording.recording import CameraStream
 

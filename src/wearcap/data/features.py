@@ -1,14 +1,10 @@
 """What the head-driven networks see and say: head paths to conditions, poses to vectors and back."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
-from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
 
 FEET = 2
 LIMBS = {
@@ -18,99 +14,6 @@ LIMBS = {
     "trunk": ("l5", "l3", "t12", "t8", "neck", "head"),
 }
 """What of a body's size is told, by the joints whose bones add up to it."""
-
-
-@dataclass(frozen=True)
-class HeadFeatures:
-    """Encodes a head path (thesis §6.1: p = {t, R, v, ω}) and body poses in a gravity-keeping frame.
-
-    frame "window": yaw and horizontal position of the window's first frame are removed (the document, as we read
-    it). frame "heading": every frame's own head yaw is removed and no absolute position enters (ours; the root's
-    rotation is told relative to where the head points, so nothing has to be re-expressed when windows move).
-    height "relative": height of the head over its first frame's; "floor": over the floor (m); "stature": over the
-    floor, as a share of the head's height in the rest pose.
-    """
-
-    frame: str = "heading"
-    height: str = "stature"
-    joints: int = 23
-    contacts: bool = False
-    """Whether the motion carries the contact of both feet, too (EDGE; ours), as ±1."""
-    body: bool = False
-    """Whether the condition tells the wearer's size (ours): stature, length of leg, of arm and of trunk."""
-
-    def __post_init__(self):
-        for name, allowed in (("frame", ("heading", "window")), ("height", ("stature", "floor", "relative"))):
-            if getattr(self, name) not in allowed:
-                raise WearcapError(f"head features have no {name} {getattr(self, name)!r}",
-                                   expected=f"one of {', '.join(allowed)}")  # fmt: skip
-
-    @property
-    def condition_size(self) -> int:
-        return (13 if self.frame == "heading" else 15) + (len(LIMBS) if self.body else 0)
-
-    @property
-    def motion_size(self) -> int:
-        return 6 * self.joints + (FEET if self.contacts else 0)
-
-    def frame_of(self, R_world_head: Float[Tensor, "batch time 3 3"]) -> Float[Tensor, "batch #time 3 3"]:
-        """R_world_canonical of every frame (one for all frames when the frame is the window's)."""
-        if self.frame == "window":
-            R_world_head = R_world_head[:, :1]
-        return rotation.about_axis("z", rotation.yaw_of(R_world_head))
-
-    def condition(
-        self,
-        R_world_head: Float[Tensor, "batch time 3 3"],
-        t_world_head: Float[Tensor, "batch time 3"],
-        floor_height: Float[Tensor, "batch time"],
-        size: Float[Tensor, "batch limb"],
-        fps: float,
-    ) -> Float[Tensor, "batch time condition"]:
-        """Features of a head path; `size` holds the wearer's `body_size` (m)."""
-        R_canonical_world = self.frame_of(R_world_head).transpose(-1, -2)
-        velocity = first_repeated(t_world_head.diff(dim=1)) * fps
-        step = rotation.log(R_world_head[:, :-1].transpose(-1, -2) @ R_world_head[:, 1:]) * fps
-        angular_head = first_repeated(step)
-        R_canonical_head = R_canonical_world @ R_world_head
-        velocity = (R_canonical_world @ velocity[..., None])[..., 0]
-        angular = (R_canonical_head @ angular_head[..., None])[..., 0]
-        offset = R_canonical_world @ (t_world_head - t_world_head[:, :1])[..., None]
-        height = offset[..., 2:, 0]
-        if self.height != "relative":
-            height = (t_world_head[..., 2] - floor_height)[..., None]
-        if self.height == "stature":
-            height = height / size[:, None, :1]
-        horizontal = [offset[..., :2, 0]] if self.frame == "window" else []
-        told = [size[:, None].expand(-1, height.shape[1], -1)] if self.body else []
-        return torch.cat(
-            [*horizontal, height, rotation.rot6d_from_matrix(R_canonical_head), velocity, angular, *told], -1
-        )
-
-    def encode(
-        self,
-        R_parent_joint: Float[Tensor, "batch time joint 3 3"],
-        R_world_head: Float[Tensor, "batch time 3 3"],
-        foot_contact: Float[Tensor, "batch time foot"],
-    ) -> Float[Tensor, "batch time motion"]:
-        """Local rotations as 6D, the root's in the canonical frame (thesis: F = 23 × 6), and contact where asked for."""
-        R_root = self.frame_of(R_world_head).transpose(-1, -2) @ R_parent_joint[:, :, 0]
-        R = torch.cat([R_root[:, :, None], R_parent_joint[:, :, 1:]], 2)
-        motion = rotation.rot6d_from_matrix(R).flatten(-2)
-        return torch.cat([motion, 2 * foot_contact - 1], -1) if self.contacts else motion
-
-    def decode(
-        self, motion: Float[Tensor, "batch time motion"], R_world_head: Float[Tensor, "batch time 3 3"]
-    ) -> tuple[Float[Tensor, "batch time joint 3 3"], Float[Tensor, "batch time foot"]]:
-        """The inverse of `encode`: R_parent_joint, the root's entry in the world; and contact (0 where it is not told)."""
-        R = rotation.matrix_from_rot6d(motion[..., : 6 * self.joints].unflatten(-1, (-1, 6)))
-        R_root = self.frame_of(R_world_head) @ R[:, :, 0]
-        contact = (
-            (motion[..., 6 * self.joints :] + 1) / 2
-            if self.contacts
-            else motion.new_zeros(*motion.shape[:2], FEET)
-        )
-        return torch.cat([R_root[:, :, None], R[:, :, 1:]], 2), contact.clamp(0, 1)
 
 
 def body_size(skeleton: Skeleton) -> Float[Tensor, "limb"]:

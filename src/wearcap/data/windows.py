@@ -13,13 +13,13 @@ from torch.utils.data import Dataset, Sampler
 
 from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, Skeleton
 from wearcap.data.features import FEET, body_size
-from wearcap.data.floor import floor_from_path, floor_from_points
 from wearcap.data.surroundings import NOTHING, Surroundings
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.metrics import physics
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
+from wearcap.tracking.floor import floor_from_path, floor_from_points
 
 MIN_FRAMES = 10
 """Shortest beginning of a capture that is trained on."""

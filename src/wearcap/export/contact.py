@@ -7,14 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from wearcap.data.contact_features import FEATURES
 from wearcap.export.exported import Run, open_exported
 from wearcap.export.network import ExportReport, export_network
 from wearcap.export.sidecar import header, read_sidecar, write_sidecar
 from wearcap.geometry import rotation
-from wearcap.models.contact import FRAMES, ContactNetwork
-from wearcap.pipelines.contact_prediction import ContactDetector
 from wearcap.recording.interactions import HANDS
+from wearcap.systems.ireplica.contact_network import FRAMES, ContactNetwork
+from wearcap.systems.ireplica.contact_prediction import ContactDetector
+from wearcap.systems.ireplica.features import FEATURES
 
 MAX_ERROR = 1e-5
 

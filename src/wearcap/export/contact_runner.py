@@ -7,14 +7,14 @@ Poses come one by one and wait for the 30 that follow; the state is the last 61 
 
 import torch
 
-from wearcap.data.contact_features import pose_frames
 from wearcap.errors import WearcapError
 from wearcap.export import command
 from wearcap.export.contact import load_exported_contact
 from wearcap.files import write_text
-from wearcap.pipelines.contact_prediction import ContactStream
 from wearcap.recording.interactions import HANDS
 from wearcap.recording.store import RecordingFile
+from wearcap.systems.ireplica.contact_prediction import ContactStream
+from wearcap.systems.ireplica.features import pose_frames
 
 
 def main(arguments: list[str]) -> None:

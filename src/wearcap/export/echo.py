@@ -19,7 +19,6 @@ from torch.nn import functional as F
 
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
-from wearcap.data.echo_features import POINTS, EchoFeatures
 from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError
 from wearcap.export import command
@@ -35,15 +34,16 @@ from wearcap.export.sidecar import (
     write_sidecar,
 )
 from wearcap.files import atomic_path, sha256_of
-from wearcap.io.environment import read_environment
-from wearcap.models.denoiser import Normalizer
-from wearcap.models.echo import MODALITIES, EchoDenoiser, EchoPlan
+from wearcap.io.formats.environment import read_environment
+from wearcap.models.layers import Normalizer
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.pipelines.echo import Echo
-from wearcap.pipelines.echo_guidance import Guidance
 from wearcap.recording import Recording
 from wearcap.recording.locate import dataset_folder
 from wearcap.recording.store import RecordingFile, save_recording
+from wearcap.systems.echo.features import POINTS, EchoFeatures
+from wearcap.systems.echo.guidance import Guidance
+from wearcap.systems.echo.model import MODALITIES, EchoDenoiser, EchoPlan
+from wearcap.systems.echo.pipeline import Echo
 
 MAX_ERROR = 1e-4
 _CONVEYOR = ("context", "per_frame", "spacing", "eta", "step", "rewindow", "hang", "rest")

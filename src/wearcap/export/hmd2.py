@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.features import LIMBS, HeadFeatures
+from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError
 from wearcap.export import command
 from wearcap.export.exported import Run, open_exported
@@ -29,12 +29,14 @@ from wearcap.export.sidecar import (
     skeleton_to_json,
     write_sidecar,
 )
-from wearcap.models.denoiser import Conditions, LevelPlan, MotionDenoiser, Normalizer
+from wearcap.models.layers import Normalizer
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.pipelines.hmd2 import HMD2
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, save_recording
 from wearcap.scene.voxels import VoxelGrid
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import Conditions, LevelPlan, MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2
 
 MAX_ERROR = 1e-4
 

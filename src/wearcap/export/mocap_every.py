@@ -12,16 +12,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from wearcap.data.watch_features import WatchFeatures
 from wearcap.errors import WearcapError
 from wearcap.export import command
 from wearcap.export.exported import Run, open_exported
 from wearcap.export.network import ExportReport, export_network
 from wearcap.export.sidecar import header, read_sidecar, skeleton_from_json, skeleton_to_json, write_sidecar
-from wearcap.models.watch_estimator import FEET, Estimate, TrainedEstimator, WatchEstimator
-from wearcap.pipelines.mocap_every import MocapEvery
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, save_recording
+from wearcap.systems.mocap_every.features import WatchFeatures
+from wearcap.systems.mocap_every.model import FEET, Estimate, TrainedEstimator, WatchEstimator
+from wearcap.systems.mocap_every.pipeline import MocapEvery
 
 MAX_ERROR = 1e-4
 

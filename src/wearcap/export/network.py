@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from wearcap.errors import WearcapError
 from wearcap.export.exported import RUN_BY_FORMAT
 from wearcap.files import atomic_path
-from wearcap.models.onnx_runner import quiet
+from wearcap.runtime.onnx import quiet
 
 TIMED_RUNS = 5
 

@@ -25,7 +25,7 @@ class Camera:
     model: str
     """"pinhole" (no distortion), "opencv" (k1 k2 p1 p2 [k3]), "fisheye" (equidistant, k1…k4), "fisheye624"
     (Project Aria: k0…k5, p0 p1, s0…s3) or "ocam" (Scaramuzza's fisheye: affine c d e, then k1…k10 of
-    θ + k1 θ² + … + k10 θ¹¹; io/ocamcalib.py makes them from OCamCalib's polynomials)."""
+    θ + k1 θ² + … + k10 θ¹¹; io/formats/ocamcalib.py makes them from OCamCalib's polynomials)."""
     width: int
     height: int
     fx: float

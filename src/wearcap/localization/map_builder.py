@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.colmap import Tracks
-from wearcap.io.video import read_image
+from wearcap.io.formats.colmap import Tracks
+from wearcap.io.formats.video import read_image
 from wearcap.localization.features import Extractor, Features, GlobalDescriptor
 from wearcap.localization.landmarks import from_bytes, merge, to_bytes
 from wearcap.localization.picture import check_size, features_within, flat_picture

@@ -74,7 +74,7 @@ class EgoViewEncoder(nn.Module):
     """A small residual network over 96x72 pixels of a head camera; where things are is kept up to the bottleneck.
 
     Embeddings have zero mean and unit variance over their features. Its name says what it is not: a stand-in for a
-    large pretrained encoder, trained on where a wearer's own limbs are seen (training/egoview.py).
+    large pretrained encoder, trained on where a wearer's own limbs are seen (systems/hmd2/egoview_training.py).
     """
 
     name = "egoview"

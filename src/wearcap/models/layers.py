@@ -95,3 +95,90 @@ class AdaptiveBlock(nn.Module):
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = plan.chunk(6, -1)
         x = x + gate_a * self.attention(self.norm_attention(x) * (1 + scale_a) + shift_a, mask)
         return x + gate_m * self.mlp(self.norm_mlp(x) * (1 + scale_m) + shift_m)
+
+
+class Normalizer(nn.Module):
+    """Per-feature mean and scale, kept with the weights so that a checkpoint carries its own statistics."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size))
+
+    def set(self, mean: Float[Tensor, "feature"], scale: Float[Tensor, "feature"]) -> None:
+        self.mean.copy_(mean)
+        self.scale.copy_(scale)
+
+    def forward(self, x: Float[Tensor, "*batch feature"]) -> Float[Tensor, "*batch feature"]:
+        return (x - self.mean) / self.scale
+
+    def inverse(self, x: Float[Tensor, "*batch feature"]) -> Float[Tensor, "*batch feature"]:
+        return x * self.scale + self.mean
+
+
+class TemporalBlend(nn.Module):
+    """A learned weighted mean of neighbouring frames, the same for all features; it never looks at padding."""
+
+    def __init__(self, frames: int, spread: float = 1.5):
+        """`frames` (odd) are blended; the weights start as a Gaussian of `spread` frames."""
+        super().__init__()
+        offset = torch.arange(frames) - frames // 2
+        self.weight = nn.Parameter(-0.5 * (offset / spread) ** 2)
+
+    def forward(
+        self, x: Float[Tensor, "batch time feature"], valid: Bool[Tensor, "batch time"]
+    ) -> Float[Tensor, "batch time feature"]:
+        kernel = self.weight.softmax(0)
+        # As a matrix over frames: on the CPU much faster than a convolution of so many channels one by one.
+        frame = torch.arange(x.shape[1], device=x.device)
+        place = frame - frame[:, None] + len(kernel) // 2
+        near = (place >= 0) & (place < len(kernel))
+        band = (kernel[place.clamp(0, len(kernel) - 1)] * near).to(x.dtype)
+        mask = valid.to(x.dtype)[..., None]
+        return band @ (x * mask) / (band @ mask).clamp_min(1e-3)
+
+
+class Widening(nn.Conv1d):
+    """A convolution over frames that gives one vector per token, as one product: on the CPU several times faster."""
+
+    def __init__(self, size: int, width: int, frames_per_token: int, context: int = 0, bias: bool = True):
+        """Each token sees its own frames and `context` before and behind them."""
+        super().__init__(size, width, frames_per_token + 2 * context, frames_per_token, context, bias=bias)
+
+    def forward(self, frames: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch token width"]:
+        padded = F.pad(frames, (0, 0, self.padding[0], self.padding[0]))
+        seen = padded.unfold(1, self.kernel_size[0], self.stride[0])
+        return F.linear(seen.flatten(-2), self.weight.flatten(1), self.bias)
+
+
+class MotionEncoder(nn.Module):
+    """x_t as one vector per token, scaled by what its noise level makes it worth (ours).
+
+    Concatenated with the conditions instead, the noise of high levels drowns them: the network then needs several
+    times the steps to read the gait from the head.
+    """
+
+    def __init__(self, size: int, width: int, frames_per_token: int):
+        super().__init__()
+        self.frames_per_token = frames_per_token
+        self.linear = nn.Linear(frames_per_token * size, width)
+        self.worth = nn.Linear(width, width)
+        nn.init.zeros_(self.worth.weight)
+        nn.init.zeros_(self.worth.bias)
+
+    def plan(self, level: Float[Tensor, "batch #token width"]) -> Float[Tensor, "batch #token width"]:
+        """What x_t is worth at a level, per channel."""
+        return 1 + self.worth(F.silu(level))
+
+    def forward(
+        self,
+        x_t: Float[Tensor, "batch time motion"],
+        worth: Float[Tensor, "#batch #token width"],
+        valid: Bool[Tensor, "batch time"],
+    ) -> Float[Tensor, "batch token width"]:
+        batch, time, _ = x_t.shape
+        tokens = (x_t * valid[..., None]).reshape(batch, time // self.frames_per_token, -1)
+        return self.linear(tokens) * worth

@@ -5,7 +5,7 @@ from itertools import pairwise
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from wearcap.models.denoiser import Normalizer
+from wearcap.models.layers import Normalizer
 
 
 class MotionAutoencoder(nn.Module):

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from wearcap.models.denoiser import Normalizer
+from wearcap.models.layers import Normalizer
 
 
 class _Layer(nn.Module):

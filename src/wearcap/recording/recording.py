@@ -152,7 +152,7 @@ class Recording:
     scene: str | None = None
     """File of the surroundings' geometry (.ply or .glb), relative to the data set's directory."""
     environment: str | None = None
-    """File of the objects that can be moved (`io.environment`), relative to the data set's directory."""
+    """File of the objects that can be moved (`io.formats.environment`), relative to the data set's directory."""
     # true
     motion: Motion | None = None
     contacts: ContactTrack | None = None
@@ -183,3 +183,7 @@ class Recording:
         return max((s[-1].item() for s in spans), default=0.0) - min(
             (s[0].item() for s in spans), default=0.0
         )
+
+
+MIN_DURATION_S = 0.25
+"""Shorter recordings hold no motion worth a window."""

@@ -17,7 +17,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import raster, rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.video import write_frames
+from wearcap.io.formats.video import write_frames
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream
 from wearcap.sensors.noise import smooth_noise

@@ -15,7 +15,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.io.video import video_encoder
+from wearcap.io.formats.video import video_encoder
 from wearcap.sensors.noise import smooth_noise
 from wearcap.simulation.views import Development, Scenery, render_view
 

@@ -17,9 +17,9 @@ from wearcap.files import atomic_path, write_text
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.photos import FILE_NAME, write_photos
-from wearcap.io.ply import Ply, write_ply
-from wearcap.io.scene_folder import CLOUD
+from wearcap.io.formats.photos import FILE_NAME, write_photos
+from wearcap.io.formats.ply import Ply, write_ply
+from wearcap.io.formats.scene_folder import CLOUD
 from wearcap.recording.photo import Photo
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.scan import Scanner, place_stations, scan_world

@@ -1,7 +1,7 @@
 """Surroundings for a motion that was captured in an empty hall: a room or a street that fits what the person does.
 
 Walls and furniture stand beside the way, some within arm's reach, and nothing ever meets the body; beneath sitters
-stands a seat, beneath climbers a step. The floor is at z = 0, where `data.prepare.mocap` puts it.
+stands a seat, beneath climbers a step. The floor is at z = 0, where `prepare.mocap` puts it.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,4 @@
-"""LightningModules, loss terms, callbacks, checkpoints.
+"""What every training shares: the base of LightningModules, loss terms, callbacks, checkpoints, and a run's folder.
 
-One module per network, each its losses and nothing of its optimiser (`base.py`); open `motion_diffusion.py` (HMD²)
-first, and `run.py` for what surrounds a run: its folder, its resumption, its record. Validation through whole
-pipelines are callbacks: `callbacks.py`, `hps_validation.py`, `ireplica_validation.py`.
+Each system's losses stand in its own `training.py`; `run.py` is what surrounds a run: its folder, resumption, record.
 """

@@ -40,6 +40,10 @@ class Measured(GivenOptimizer):
         """The loss and whatever else is worth a curve."""
         raise NotImplementedError
 
+    def pipeline_parts(self) -> dict[str, Any]:
+        """What a pipeline around this network is made with, beside its own settings."""
+        raise NotImplementedError
+
     def _step(self, batch: tuple[Tensor, ...], stage: str) -> Tensor:
         measured = self.measure(batch)
         self.log_dict(

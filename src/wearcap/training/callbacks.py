@@ -1,19 +1,18 @@
 """Callbacks: they watch a training run and never define what is measured."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 import lightning
 import torch
 from lightning.pytorch import Callback
 
+from wearcap.metrics.scores import score
 from wearcap.metrics.table import aggregate
-from wearcap.pipelines.evaluation import score
-from wearcap.pipelines.hmd2 import HMD2
-from wearcap.recording import Recording, RecordingStore
-from wearcap.training.motion_diffusion import MotionDiffusion
-from wearcap.viewer.picture import contact_sheet, save_png
+from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.training.base import Measured
 
 
 def is_due(trainer: lightning.Trainer, every_n_epochs: int) -> bool:
@@ -21,6 +20,12 @@ def is_due(trainer: lightning.Trainer, every_n_epochs: int) -> bool:
     last = trainer.max_steps > 0 and trainer.global_step >= trainer.max_steps
     due = last or (trainer.current_epoch + 1) % every_n_epochs == 0
     return due and trainer.is_global_zero and not trainer.sanity_checking
+
+
+class Captures(Protocol):
+    """A pipeline around the network that is trained."""
+
+    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]: ...
 
 
 class CaptureValidation(Callback):
@@ -31,18 +36,19 @@ class CaptureValidation(Callback):
 
     def __init__(
         self,
-        pipeline: Callable[..., HMD2],
+        pipeline: Callable[..., Captures],
         folder: str,
         recordings: int = 4,
         max_seconds: float = 20.0,
         every_n_epochs: int = 5,
-        picture: bool = True,
+        draw: Callable[[Path, dict[str, Motion]], None] | None = None,
     ):
+        """`pipeline` is made with the module's `pipeline_parts`; `draw` writes a picture of motions by their labels."""
         self.pipeline, self.folder = pipeline, Path(folder)
         self.recordings, self.max_seconds, self.every_n_epochs = recordings, max_seconds, every_n_epochs
-        self.picture = picture
+        self.draw = draw
 
-    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: MotionDiffusion) -> None:
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: Measured) -> None:
         if not is_due(trainer, self.every_n_epochs):
             return
         pipeline = self.pipeline(**pl_module.pipeline_parts(), device=str(pl_module.device))
@@ -51,10 +57,10 @@ class CaptureValidation(Callback):
         rows = [score(m, r, r.name, 0) for m, r in zip(motions, recordings)]
         for key, summary in aggregate(rows).items():
             pl_module.log(f"capture/{key}", summary.mean, rank_zero_only=True)
-        pl_module.net.train()
-        if self.picture:
+        pl_module.get_submodule("net").train()
+        if self.draw is not None:
             path = self.folder / f"step_{trainer.global_step:06d}_{recordings[0].name}.png"
-            save_png(path, contact_sheet({"truth": recordings[0].motion, "capture": motions[0]}))
+            self.draw(path, {"truth": recordings[0].motion, "capture": motions[0]})
 
     def _recordings(self, root: str) -> list[Recording]:
         """Validation recordings spread over the list, cut to their first seconds: a look, not the evaluation."""

@@ -12,9 +12,9 @@ from jaxtyping import Float32, Float64
 
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
-from wearcap.io.contact_labels import LabelClock
-from wearcap.io.environment import read_environment
-from wearcap.io.video import video_info
+from wearcap.io.formats.contact_labels import LabelClock
+from wearcap.io.formats.environment import read_environment
+from wearcap.io.formats.video import video_info
 from wearcap.recording.interactions import HANDS
 from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.recording.motion import Motion

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from wearcap.errors import WearcapError
-from wearcap.io.contact_labels import annotation_of, hcontact_text
+from wearcap.io.formats.contact_labels import annotation_of, hcontact_text
 from wearcap.viewer.annotate import Desk
 from wearcap.viewer.annotation_file import Conflict
 from wearcap.viewer.guard import Guard, Refused

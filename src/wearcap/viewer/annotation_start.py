@@ -7,13 +7,13 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.io.contact_labels import LabelClock, Labels, labels_of, parse_labels
-from wearcap.io.json_text import read_json
-from wearcap.io.motion_npz import read_motion
-from wearcap.pipelines.contact_intervals import ContactSettings, active, contact_intervals
+from wearcap.io.formats.contact_labels import LabelClock, Labels, labels_of, parse_labels
+from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
+from wearcap.systems.ireplica.contact_intervals import ContactSettings, active, contact_intervals
 
 
 def starting_labels(source: str | Path, recording: Recording, clock: LabelClock) -> Labels:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.environment import MAX_HINGE_GAP_M, read_environment, write_environment
+from wearcap.io.formats.environment import MAX_HINGE_GAP_M, read_environment, write_environment
 from wearcap.scene.editing import ObjectEditing, points_world
 from wearcap.scene.environment import hinge_gap_m
 from wearcap.scene.objects import Freedom, SceneObject

@@ -216,3 +216,8 @@ def save_png(path: str | Path, image: UInt8[np.ndarray, "height width 3"]) -> No
     """Write a PNG atomically."""
     with atomic_path(path) as temporary:
         Image.fromarray(image).save(temporary, format="PNG")
+
+
+def save_sheet(path: str | Path, motions: dict[str, Motion]) -> None:
+    """Write a contact sheet of motions, by their labels, as PNG."""
+    save_png(path, contact_sheet(motions))

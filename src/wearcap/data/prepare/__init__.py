@@ -1,7 +1,0 @@
-"""Preparation: sources in, a data set of recordings out."""
-
-from wearcap.data.prepare.check import check_recording
-from wearcap.data.prepare.engine import Report, Task, content_hash, prepare
-from wearcap.data.prepare.splits import Splits, read_splits
-
-__all__ = ["Report", "Splits", "Task", "check_recording", "content_hash", "prepare", "read_splits"]

@@ -1,0 +1,198 @@
+"""What can be examined in a path: data sets, recording files, MPS folders, scenes, environments, motion capture files."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from wearcap.doctor.environment import is_environment, read_environment_file
+from wearcap.doctor.localized import check_files
+from wearcap.doctor.report import Finding
+from wearcap.doctor.scene import is_map, is_scene, read_map, read_scene
+from wearcap.doctor.timing import check_clock
+from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.datasets.adt import is_adt, read_adt
+from wearcap.io.datasets.amass import read_amass
+from wearcap.io.datasets.hps_sequence import hps_names, is_hps, read_hps_sequence
+from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
+from wearcap.io.devices.aria_mps import find_mps_file, head_stream, is_mps_folder, read_closed_loop, read_mps
+from wearcap.io.formats.asf_amc import read_amc, read_asf
+from wearcap.io.formats.bvh import read_bvh
+from wearcap.io.formats.euroc import read_euroc
+from wearcap.io.formats.json_text import read_json_object
+from wearcap.io.formats.motion_npz import read_motion
+from wearcap.io.formats.mvnx import read_mvnx
+from wearcap.io.formats.npz import read_npz
+from wearcap.io.formats.pcd import read_pcd
+from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.tum import read_tum
+from wearcap.recording import HeadStream, Motion, PointCloud, Recording, RecordingStore
+from wearcap.recording.store import RecordingFile
+
+Loaded = tuple[Recording, list[Finding]]
+
+
+@dataclass(frozen=True)
+class Patient:
+    """One recording to examine; `load` reads it, with findings of its own (a file's raw clock, a service's report)."""
+
+    name: str
+    load: Callable[[], Loaded]
+
+
+def patients(path: Path) -> list[Patient]:
+    """All recordings in a path, in order of name. Raises WearcapError when there is none."""
+    if not path.exists() and (path.parent / "manifest.json").is_file():
+        store = RecordingStore.open(path.parent)
+        store.require(path.name)
+        return [Patient(path.name, partial(_read_stored, store, path.name))]
+    if not path.exists():
+        raise WearcapError("no such file or folder", where=path)
+    if path.is_file():
+        if _kind(path) is None:
+            raise WearcapError(
+                "a kind of file that the doctor does not know", where=path, expected=", ".join(_READERS)
+            )
+        return [Patient(path.name, partial(_read_file, path))]
+    if (path / "manifest.json").is_file():
+        store = RecordingStore.open(path)
+        return [Patient(name, partial(_read_stored, store, name)) for name in store.names()]
+    for is_kind, read in _FOLDERS:
+        if is_kind(path):
+            return [Patient(path.resolve().name, partial(read, path))]
+    if is_hps(path):
+        return [Patient(name, partial(_read_hps, path, name)) for name in hps_names(path)]
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) in _MOTIONS]
+    if not files:
+        raise WearcapError("nothing to examine here", where=path,
+                           expected=f"a data set (manifest.json), an MPS, Nymeria, ADT or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), or files like {', '.join(_MOTIONS)}")  # fmt: skip
+    return [Patient(file.relative_to(path).as_posix(), partial(_read_file, file)) for file in files]
+
+
+def _kind(path: Path) -> str | None:
+    """The suffix that says how to read a file, compression left aside."""
+    suffixes = [suffix.lower() for suffix in path.suffixes if suffix.lower() not in (".gz", ".xz")]
+    return suffixes[-1] if suffixes and suffixes[-1] in _READERS else None
+
+
+def _read_file(path: Path) -> Loaded:
+    content = _READERS[_kind(path) or ""](path)
+    name = path.name
+    if isinstance(content, tuple):
+        return content
+    if isinstance(content, Recording):
+        return content, []
+    if isinstance(content, Motion):
+        return Recording(name=name, motion=content, skeleton=content.skeleton), []
+    if isinstance(content, Trajectory):
+        return Recording(name=name, head=_as_head(content)), [
+            Finding("note", "head: axes", "taken as the head's own pose", "a trajectory file does not name its axes",
+                    "x forward, y left, z up is assumed.")]  # fmt: skip
+    return Recording(name=name, points=PointCloud(torch.from_numpy(content.points))), []
+
+
+def _as_head(track: Trajectory) -> HeadStream:
+    return HeadStream(track.timestamps, track.R_world_body, track.t_world_body, torch.eye(3), torch.zeros(3))
+
+
+def _read_stored(store: RecordingStore, name: str) -> Loaded:
+    """A recording of a data set, its bytes hashed anew."""
+    store.verify_one(name)
+    recording = store.load(name)
+    return recording, check_files(recording, store.root)
+
+
+def _read_hps(root: Path, name: str) -> Loaded:
+    recording = read_hps_sequence(root, name)
+    return recording, check_files(recording, root)
+
+
+def _read_place(folder: Path) -> Loaded:
+    """A scene, an environment, or both in one folder."""
+    recording, findings = read_scene(folder) if is_scene(folder) else (Recording(folder.resolve().name), [])
+    return recording, [*findings, *(read_environment_file(folder)[1] if is_environment(folder) else [])]
+
+
+def _read_mps(folder: Path) -> Loaded:
+    """An MPS folder at 60 Hz, with the raw file's clock, quality score, and what the service says of itself."""
+    path = find_mps_file(folder, ("closed_loop_trajectory.csv",))
+    assert path is not None, "is_mps_folder has seen it"
+    raw = read_closed_loop(path)
+    findings = check_clock("closed-loop file", raw.T_world_aria.timestamps)
+    quality = raw.quality.median().item()
+    low = (raw.quality < 0.5).float().mean().item()
+    findings.append(
+        Finding("warning" if low > 0.1 else "ok", "closed-loop file: quality",
+                "MPS trusts its poses little" if low > 0.1 else "MPS trusts its poses",
+                f"median score {quality:.2f}, {100 * low:.0f} % below 0.5"))  # fmt: skip
+    findings.append(Finding("ok", "closed-loop file: gravity", "points along -z", "9.81 m/s²"))
+    return read_mps(folder), [*findings, *_mps_summary(folder)]
+
+
+def _mps_summary(folder: Path) -> list[Finding]:
+    path = find_mps_file(folder, ("summary.json",))
+    if path is None:
+        return []
+    try:
+        parts = read_json_object(path)
+    except WearcapError as error:
+        return [Finding("warning", "MPS summary", "cannot be read", str(error))]
+    failed = [
+        name
+        for name, part in parts.items()
+        if isinstance(part, dict) and part.get("status", "SUCCESS") != "SUCCESS"
+    ]
+    if failed:
+        return [
+            Finding("error", "MPS summary", "MPS reports failures", ", ".join(failed), "Request MPS again.")
+        ]
+    return [
+        Finding(
+            "ok", "MPS summary", "MPS reports success", ", ".join(name for name in parts if name != "version")
+        )
+    ]
+
+
+def _read_recording(path: Path) -> Recording | Loaded:
+    """A recording, or a visual map."""
+    return read_map(path) if is_map(path) else RecordingFile(path).load()
+
+
+def _read_amc(path: Path) -> Motion:
+    """An AMC with the ASF beside it: the only one, or the one whose name it begins with."""
+    beside = sorted(file for file in path.parent.iterdir() if ".asf" in file.suffixes)
+    stem = path.name.split(".")[0]
+    named = [file for file in beside if stem.startswith(file.name.split(".")[0])]
+    if not (named or len(beside) == 1):
+        raise WearcapError("no skeleton for this motion", where=path, expected="an .asf file beside it")
+    return read_amc(read_asf((named or beside)[-1]), path)
+
+
+def _read_csv(path: Path) -> Recording | Trajectory:
+    if "closed_loop" in path.name or "aria_trajectory" in path.name:
+        track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z").T_world_aria
+        return Recording(name=path.name, head=head_stream(track, fps=None), source="Aria MPS")
+    return read_euroc(path)
+
+
+def _read_npz(path: Path) -> Recording | Motion:
+    """A motion of ours, Nymeria's suit data, or an AMASS file, by the arrays it holds."""
+    if path.name == "xdata.npz":
+        return read_xdata(path)[0]
+    return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)
+
+
+_FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Loaded]], ...] = (
+    (is_nymeria, lambda folder: (read_nymeria(folder), [])),
+    (is_mps_folder, _read_mps),
+    (is_adt, lambda folder: (read_adt(folder), [])),
+    (lambda folder: is_scene(folder) or is_environment(folder), _read_place),
+)
+_MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _read_npz}
+_READERS: dict[str, Callable] = {
+    **_MOTIONS, ".safetensors": _read_recording, ".csv": _read_csv, ".txt": read_tum, ".tum": read_tum,
+    ".ply": read_ply, ".pcd": read_pcd, ".json": read_environment_file,
+}  # fmt: skip

@@ -1,0 +1,1 @@
+"""Scores of captures over whole data sets, and the baselines beside them."""

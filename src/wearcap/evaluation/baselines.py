@@ -1,0 +1,275 @@
+"""What a learned pipeline must beat: the mean pose, and the training window with the most similar head path.
+
+Both see what HMD² sees (the head's path, the floor, the body's size) and hang from the measured head as it does.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import safetensors
+import torch
+from jaxtyping import Float, Int64
+from safetensors.torch import save
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.data.statistics import MIN_SCALE
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path, parse_json
+from wearcap.geometry import rotation
+from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.tracking.anchor import hang_from_head
+from wearcap.tracking.head_path import HeadPath, head_path
+
+QUERY_BATCH = 256
+
+
+class _Baseline:
+    """The coat that `evaluation.evaluate` expects."""
+
+    def __call__(self, recording: Recording) -> Motion:
+        raise NotImplementedError
+
+    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
+        """One motion per recording; nothing is drawn, so seeds change nothing."""
+        return [self(recording) for recording in recordings]
+
+
+@dataclass(frozen=True, eq=False)
+class MeanPose(_Baseline):
+    """One pose for every frame: the chordal mean over the training split, turned to where the head looks."""
+
+    joint_names: tuple[str, ...]
+    fps: float
+    R_parent_joint: Float[Tensor, "joint 3 3"]
+    """The root's entry is its rotation in the head's heading frame (yaw of the head, z up)."""
+
+    @classmethod
+    def fit(cls, stores: Sequence[RecordingStore]) -> "MeanPose":
+        """Average the training splits. Raises WearcapError when they are empty or their skeletons differ."""
+        total: Tensor = torch.zeros(())
+        names, fps = (), 0.0
+        for path, R_parent_joint in _training_motions(stores):
+            total = total + _in_heading(R_parent_joint, path.T_world_head.R).double().sum(0)
+            names, fps = path.skeleton.joint_names, _fps_of(path)
+        return cls(names, fps, torch.stack([rotation.mean_rotation(R[None]) for R in total]).float())
+
+    def __call__(self, recording: Recording) -> Motion:
+        """The mean pose hung from the recording's head."""
+        path = _query_path(recording, self.joint_names, self.fps)
+        R = self.R_parent_joint.repeat(len(path.timestamps), 1, 1, 1)
+        return _hung(path, R, "mean_pose")
+
+    def save(self, path: str | Path) -> None:
+        """Write as .safetensors."""
+        _save(path, "mean_pose", self.joint_names, self.fps, {"R_parent_joint": self.R_parent_joint})
+
+    @classmethod
+    def load(cls, path: str | Path) -> "MeanPose":
+        names, fps, tensors = _load(path, "mean_pose")
+        return cls(names, fps, **tensors)
+
+
+@dataclass(frozen=True, eq=False)
+class NearestWindow(_Baseline):
+    """Pastes, for each window of the head's path, the poses of the training window with the nearest head path.
+
+    Windows overlap by half and are cross-faded. A path is described in the frame of its window's first head (yaw and
+    horizontal position removed), with the head's height as a share of the wearer's, sampled every `sample` frames;
+    every channel is standardised, and the distance is Euclidean.
+    """
+
+    joint_names: tuple[str, ...]
+    fps: float
+    window: int
+    sample: int
+    mean: Float[Tensor, "channel"]
+    scale: Float[Tensor, "channel"]
+    descriptor: Float[Tensor, "window feature"]
+    first_frame: Int64[Tensor, "window"]
+    last_frame: Int64[Tensor, "window"]
+    """Last frame of the recording that a window is from: shorter recordings hold their last pose."""
+    pose: Float[Tensor, "frame motion"]
+    """6D rotations of all training frames, the root's in the head's heading frame; half precision."""
+
+    @classmethod
+    def fit(
+        cls,
+        stores: Sequence[RecordingStore],
+        window_s: float = 1.0,
+        stride_s: float = 0.05,
+        sample_s: float = 0.1,
+    ) -> "NearestWindow":
+        """Describe the training splits' windows, `stride_s` apart. Raises WearcapError as `MeanPose.fit` does.
+
+        The defaults are the best of 0.5, 0.75, 1, 1.5, 2 and 4 s on the validation split of CMU.
+        """
+        channels, poses, first, last = [], [], [], []
+        names, fps, window, sample, frames = (), 0.0, 0, 0, 0
+        for path, R_parent_joint in _training_motions(stores):
+            names, fps = path.skeleton.joint_names, _fps_of(path)
+            window, sample = round(window_s * fps), max(1, round(sample_s * fps))
+            starts = torch.arange(0, max(len(path.timestamps) - window, 0) + 1, max(1, round(stride_s * fps)))
+            channels.append(_describe(path, starts, window, sample))
+            R_heading = _in_heading(R_parent_joint, path.T_world_head.R)
+            poses.append(rotation.rot6d_from_matrix(R_heading).flatten(-2).half())
+            first.append(starts + frames)
+            frames += len(path.timestamps)
+            last.append(torch.full_like(starts, frames - 1))
+        raw = torch.cat(channels)
+        flat = raw.flatten(0, 1)
+        mean, scale = flat.mean(0), flat.std(0).clamp_min(MIN_SCALE)
+        descriptor = ((raw - mean) / scale).flatten(1)
+        return cls(
+            names, fps, window, sample, mean, scale, descriptor, torch.cat(first), torch.cat(last), torch.cat(poses)
+        )  # fmt: skip
+
+    def __call__(self, recording: Recording) -> Motion:
+        """The pasted motion hung from the recording's head."""
+        path = _query_path(recording, self.joint_names, self.fps)
+        count = len(path.timestamps)
+        end = max(count - self.window, 0)
+        starts = torch.unique(
+            torch.cat([torch.arange(0, end, max(1, self.window // 2)), torch.tensor([end])])
+        )
+        found = self._nearest(_describe(path, starts, self.window, self.sample))
+        pose = self._pasted(starts, found, count)
+        return _hung(path, rotation.matrix_from_rot6d(pose.unflatten(-1, (-1, 6))), "nearest_window")
+
+    def _nearest(self, raw: Float[Tensor, "query sample channel"]) -> Int64[Tensor, "query"]:
+        query = ((raw - self.mean) / self.scale).flatten(1)
+        half_squares = 0.5 * self.descriptor.square().sum(-1)
+        return torch.cat(
+            [(part @ self.descriptor.T - half_squares).argmax(-1) for part in query.split(QUERY_BATCH)]
+        )
+
+    def _pasted(
+        self, starts: Int64[Tensor, "query"], found: Int64[Tensor, "query"], count: int
+    ) -> Float[Tensor, "time motion"]:
+        """Cross-fade the found windows' poses, each weighed by a triangle over its window."""
+        offset = torch.arange(self.window)
+        source = torch.minimum(self.first_frame[found, None] + offset, self.last_frame[found, None])
+        target = starts[:, None] + offset
+        inside = target < count
+        weight = (torch.minimum(offset + 1, self.window - offset).float() / self.window).expand_as(target)[
+            inside
+        ]
+        total = torch.zeros(count).index_add(0, target[inside], weight)
+        blended = torch.zeros(count, self.pose.shape[1]).index_add(
+            0, target[inside], self.pose[source[inside]].float() * weight[:, None]
+        )
+        return blended / total[:, None]
+
+    def save(self, path: str | Path) -> None:
+        """Write as .safetensors."""
+        names = ("mean", "scale", "descriptor", "first_frame", "last_frame", "pose")
+        tensors = {name: getattr(self, name) for name in names}
+        shape = torch.tensor([self.window, self.sample])
+        _save(path, "nearest_window", self.joint_names, self.fps, {**tensors, "shape": shape})
+
+    @classmethod
+    def load(cls, path: str | Path) -> "NearestWindow":
+        names, fps, tensors = _load(path, "nearest_window")
+        window, sample = tensors.pop("shape").tolist()
+        return cls(names, fps, window, sample, **tensors)
+
+
+def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPath, Tensor]]:
+    """(head path, R_parent_joint) of every training recording, both at the recording's own frame rate."""
+    first: tuple[tuple[str, ...], float] | None = None
+    for store in stores:
+        for name in store.names("train"):
+            recording, fps = _read(store, name), store.entries[name].fps
+            if recording.head is None or recording.motion is None or len(recording.motion) < 2:
+                continue
+            path = head_path(recording, recording.motion.skeleton, fps)
+            kind = (recording.motion.skeleton.joint_names, fps)
+            first = first or kind
+            if kind != first or len(path.timestamps) != len(recording.motion):
+                raise WearcapError(
+                    f"recording {name!r} does not fit the others", where=store.root,
+                    expected=f"the joints of the first at {first[1]} Hz, head and motion on one clock",
+                    fix="Prepare the data sets alike.",
+                )  # fmt: skip
+            yield path, recording.motion.R_parent_joint
+    if first is None:
+        raise WearcapError("no training recordings with head and motion",
+                           where=", ".join(str(store.root) for store in stores),
+                           expected="a training split of recordings with both")  # fmt: skip
+
+
+def _read(store: RecordingStore, name: str) -> Recording:
+    """The parts that a baseline learns from; clouds and images stay on the disk."""
+    file = store.open_file(name)
+    floor = file.part("floor")
+    points = file.part("points") if floor is None else None
+    return Recording(name, head=file.part("head"), motion=file.part("motion"), floor=floor, points=points)
+
+
+def _fps_of(path: HeadPath) -> float:
+    return round(1.0 / path.timestamps.diff().median().item(), 4)
+
+
+def _query_path(recording: Recording, joint_names: tuple[str, ...], fps: float) -> HeadPath:
+    skeleton: Skeleton | None = recording.skeleton or (
+        recording.motion.skeleton if recording.motion else None
+    )
+    if skeleton is None or skeleton.joint_names != joint_names:
+        raise WearcapError("its skeleton is not the one of the training data", where=recording.name,
+                           expected=f"joints {', '.join(joint_names)}")  # fmt: skip
+    return head_path(recording, skeleton, fps)
+
+
+def _in_heading(
+    R_parent_joint: Float[Tensor, "time joint 3 3"], R_world_head: Float[Tensor, "time 3 3"]
+) -> Float[Tensor, "time joint 3 3"]:
+    """Local rotations, the root's seen from the head's heading."""
+    R_heading_world = rotation.about_axis("z", -rotation.yaw_of(R_world_head))
+    return torch.cat([(R_heading_world @ R_parent_joint[:, 0])[:, None], R_parent_joint[:, 1:]], 1)
+
+
+def _describe(
+    path: HeadPath, starts: Int64[Tensor, "window"], window: int, sample: int
+) -> Float[Tensor, "window sample channel"]:
+    """Head features (thesis §6.1) of windows of one path, every `sample`-th frame of each."""
+    frames = (starts[:, None] + torch.arange(window)).clamp_max(len(path.timestamps) - 1)
+    features = HeadFeatures(frame="window", height="stature")
+    stature = torch.full((len(starts), 1), path.stature)
+    T_world_head = path.T_world_head[frames]
+    channels = features.condition(
+        T_world_head.R, T_world_head.t, path.floor_height[frames], stature, _fps_of(path)
+    )
+    return channels[:, ::sample]
+
+
+def _hung(path: HeadPath, R_heading: Float[Tensor, "time joint 3 3"], name: str) -> Motion:
+    """Turn the root from the head's heading into the world and hang the body from the head."""
+    R_world_heading = rotation.about_axis("z", rotation.yaw_of(path.T_world_head.R))
+    R = torch.cat([(R_world_heading @ R_heading[:, 0])[:, None], R_heading[:, 1:]], 1)
+    origin = torch.zeros(len(path.timestamps), 3)
+    motion = Motion(path.timestamps, path.skeleton, R, origin, provenance={"pipeline": name})
+    return hang_from_head(motion, path.T_world_head)
+
+
+def _save(
+    path: str | Path, kind: str, joint_names: tuple[str, ...], fps: float, tensors: dict[str, Tensor]
+) -> None:
+    about = json.dumps({"kind": kind, "joint_names": joint_names, "fps": fps}, sort_keys=True)
+    content = save({name: value.contiguous() for name, value in tensors.items()}, {"baseline": about})
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _load(path: str | Path, kind: str) -> tuple[tuple[str, ...], float, dict[str, Tensor]]:
+    try:
+        with safetensors.safe_open(str(path), framework="pt") as file:
+            about = parse_json((file.metadata() or {}).get("baseline", "{}"), path)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, safetensors.SafetensorError) as error:
+        raise WearcapError(f"not a readable baseline ({error})", where=path, expected="what `save` of one wrote") from error  # fmt: skip
+    if about.get("kind") != kind:
+        raise WearcapError(f"holds {about.get('kind', 'no baseline')}", where=path, expected=kind)
+    return tuple(about["joint_names"]), about["fps"], tensors

@@ -1,0 +1,90 @@
+"""Whether captured motions are distributed as true ones are: FID and Diversity (thesis §6.4; Guo et al. 2020)."""
+
+import math
+from collections import defaultdict
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.data.motion_features import MotionFeatures, Movement
+from wearcap.metrics.distribution import diversity, frechet_distance
+from wearcap.metrics.scores import Measure, comparable
+from wearcap.metrics.table import Summary, summarize
+from wearcap.models.motion_autoencoder import MotionAutoencoder
+from wearcap.recording import Motion, Recording
+
+MIN_WINDOWS = 2000
+"""Fewer windows say nothing about a distribution."""
+ENCODED_AT_ONCE = 512
+
+
+class Realism:
+    """Gathers windows of captures and of their truth, in the latent space of a motion autoencoder, by method and seed.
+
+    Windows are `stride_s` apart and lie in one recording; captures hang from the true head, as for position errors,
+    and stand over the same floor as their truth.
+    """
+
+    def __init__(self, net: MotionAutoencoder, features: MotionFeatures, stride_s: float = 1.0):
+        self.net, self.features = net.eval(), features
+        self.stride = round(stride_s * features.fps / features.every)
+        self._true: dict[tuple[str, int], tuple[Tensor, Tensor]] = {}
+        self._seen: defaultdict[str, dict[int, dict[str, tuple[Tensor, Tensor]]]]
+        self._seen = defaultdict(lambda: defaultdict(dict))
+
+    def beside(self, measure: Measure, method: str) -> Measure:
+        """A measure that also takes every motion it scores into the distribution of `method`."""
+
+        def both(motion: Motion, recording: Recording, name: str, seed: int):
+            self.add(motion, recording, name, seed, method)
+            return measure(motion, recording, name, seed)
+
+        return both
+
+    def add(self, motion: Motion, recording: Recording, name: str, seed: int, method: str) -> None:
+        """Take one capture in. Raises WearcapError as `score` does, and for motions of another rate than the network's."""
+        hung, truth, _ = comparable(motion, recording, name)
+        key = (name, len(truth))
+        if key not in self._true:
+            whole = self.features.movement(truth)
+            self._true[key] = whole.floor_height, self._encode(whole)
+        floor_height, latent_true = self._true[key]
+        latent = self._encode(self.features.movement(hung, floor_height))
+        self._seen[method][seed][name] = latent, latent_true
+
+    @torch.inference_mode()
+    def _encode(self, whole: Movement) -> Float[Tensor, "window latent"]:
+        windows = whole.windows(self.net.frames, self.stride)
+        latents = [torch.zeros(0, self.net.latent)]
+        for start in range(0, len(windows.joints), ENCODED_AT_ONCE):
+            part = Movement(*(field[start : start + ENCODED_AT_ONCE] for field in windows))
+            latents.append(self.net.encode(self.features.encode(part)))
+        return torch.cat(latents)
+
+    def windows(self, method: str) -> int:
+        """Windows of a method's smallest seed."""
+        return min((len(self._sets(method, seed)[0]) for seed in self._seen[method]), default=0)
+
+    def _sets(self, method: str, seed: int) -> tuple[Tensor, Tensor]:
+        """Latent vectors of all captured and of all true windows, in the order of the recordings' names."""
+        pairs = [pair for _, pair in sorted(self._seen[method][seed].items())]
+        return torch.cat([latent for latent, _ in pairs]), torch.cat([true for _, true in pairs])
+
+    def scores(self, method: str) -> dict[str, Summary]:
+        """`fid`, `diversity` and `truth_diversity`, over seeds; NaN where there are fewer than `MIN_WINDOWS`."""
+        values: dict[str, list[float]] = {"fid": [], "diversity": [], "truth_diversity": []}
+        enough = self.windows(method) >= MIN_WINDOWS
+        for seed in self._seen[method]:
+            captured, true = self._sets(method, seed)
+            found = (frechet_distance(captured, true), diversity(captured), diversity(true)) if enough else ()
+            for name, value in zip(values, found or [math.nan] * 3):
+                values[name].append(float(value))
+        return {name: summarize(per_seed) for name, per_seed in values.items()}
+
+    def notice(self, method: str) -> str | None:
+        """What to tell a reader of NaN, if anything."""
+        found = self.windows(method)
+        if found >= MIN_WINDOWS:
+            return None
+        return f"{method}: {found} windows are too few for FID and Diversity (at least {MIN_WINDOWS})"

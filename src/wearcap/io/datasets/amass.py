@@ -1,0 +1,127 @@
+"""AMASS: SMPL+H `.npz` files and SMPL-X "stageii" files in; AMASS-style SMPL+H files out.
+
+AMASS' world is metric and z up; its joint frames are SMPL's (`io.formats.smpl_axes`). SMPL turns about its pelvis but places its
+template's origin, so the pelvis stands at `trans` + J₀ with J₀ the template's pelvis in SMPL's own axes.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.skeletons import smplh52, smplx22
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
+from wearcap.geometry import rotation
+from wearcap.io.formats.frame_grid import even_frames, nominal_fps
+from wearcap.io.formats.npz import read_npz, require
+from wearcap.io.formats.smpl_axes import A, rotations_from_smpl, shape_from_arrays
+from wearcap.recording import Motion, Recording
+
+PELVIS_SMPLH = (-0.0022, -0.2408, 0.0286)
+PELVIS_SMPLX = (0.0031, -0.3514, 0.0120)
+"""J₀ of the mean bodies (m); a person's own differs by a few centimetres with the betas."""
+
+_KEYS = ("trans", "poses", "root_orient", "pose_body", "betas", "gender", "mocap_framerate", "mocap_frame_rate",
+         "surface_model_type")  # fmt: skip
+_RATES = ("mocap_framerate", "mocap_frame_rate")
+_SMPLX_BODY = 66
+
+
+def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] | None = None) -> Recording:
+    """Read one AMASS file as a Recording with `motion` (smplh52 or smplx22), betas in `shape`, gender in provenance.
+
+    `t_template_pelvis` is J₀ (m) where the user's body model gives it; by default the mean body's. The skeleton keeps
+    its standard bone lengths. Raises WearcapError for missing arrays, wrong shapes, NaN, a rate of zero, or `shape.npz`.
+    """
+    path = Path(path)
+    arrays = read_npz(path, _KEYS)
+    if "poses" not in arrays and "pose_body" not in arrays:
+        raise WearcapError("holds no poses", where=path, expected="a motion file of AMASS (poses, trans, mocap_framerate)",
+                           fix="shape.npz files beside the motions hold none: leave them out.")  # fmt: skip
+    fps = _rate(arrays, path)
+    stageii = _is_smplx(arrays)
+    skeleton = smplx22() if stageii else smplh52()
+    pelvis = t_template_pelvis or (PELVIS_SMPLX if stageii else PELVIS_SMPLH)
+    R = rotations_from_smpl(_axis_angles(arrays, path, stageii))
+    t_root = torch.from_numpy(arrays["trans"].astype(np.float64)) + torch.tensor(pelvis, dtype=torch.float64)
+    gender = _text(arrays.get("gender"))
+    provenance = {"source": path.name, "format": "amass", **({"gender": gender} if gender else {})}
+    motion = Motion(torch.arange(len(R), dtype=torch.float64) / fps, skeleton, R.float(), t_root.float(), provenance=provenance)  # fmt: skip
+    return Recording(
+        path.stem, motion=motion, skeleton=skeleton, shape=shape_from_arrays(arrays, path), subject=path.absolute().parent.name,
+        source="AMASS",
+    )  # fmt: skip
+
+
+def write_amass(
+    motion: Motion,
+    path: str | Path,
+    gender: str = "neutral",
+    betas: Float[Tensor, "feature"] | None = None,
+    t_template_pelvis: tuple[float, float, float] = PELVIS_SMPLH,
+) -> None:
+    """Write a motion of an SMPL skeleton as an AMASS SMPL+H file; hands it lacks stay flat, gaps in time are held.
+
+    Raises WearcapError for another skeleton or values that are not finite.
+    """
+    target = smplh52()
+    if set(motion.skeleton.joint_names[:22]) != set(target.joint_names[:22]):
+        raise WearcapError(f"a motion of skeleton {motion.skeleton.name!r}", where=path, expected="one of SMPL's skeletons",
+                           fix='Retarget it to "smplh52" first (body.retarget).')  # fmt: skip
+    if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
+        raise WearcapError("the motion holds NaN or infinite values", where=path, expected="finite poses")
+    frames, fps = even_frames(motion)
+    source = motion.R_parent_joint[frames].double()
+    R = torch.eye(3, dtype=torch.float64).repeat(len(frames), len(target), 1, 1)
+    known = [name for name in target.joint_names if name in motion.skeleton.joint_names]
+    R[:, target.indices(*known)] = source[:, motion.skeleton.indices(*known)]
+    R = torch.cat([R[:, :1] @ A, A.T @ R[:, 1:] @ A], 1)
+    trans = motion.t_world_root[frames].double() - torch.tensor(t_template_pelvis, dtype=torch.float64)
+    shape = np.zeros(16)
+    if betas is not None:
+        shape[: len(betas[:16])] = betas[:16].double().numpy()
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, trans=trans.numpy(), gender=np.array(gender), mocap_framerate=np.array(fps), betas=shape,
+                 dmpls=np.zeros((len(frames), 8)), poses=rotation.log(R).flatten(1).numpy())  # fmt: skip
+
+
+def _rate(arrays: dict[str, np.ndarray], path: Path) -> float:
+    found = [arrays[key] for key in _RATES if key in arrays]
+    if not found or found[0].size != 1 or not np.issubdtype(found[0].dtype, np.number):
+        raise WearcapError(
+            "no frame rate", where=path, expected="mocap_framerate or mocap_frame_rate, one number"
+        )
+    fps = float(found[0].reshape(-1)[0].real)
+    if not (np.isfinite(fps) and 0 < fps < 1e5):
+        raise WearcapError(f"a frame rate of {fps} Hz", where=path, expected="a positive number")
+    return nominal_fps(fps)
+
+
+def _is_smplx(arrays: dict[str, np.ndarray]) -> bool:
+    model = _text(arrays.get("surface_model_type")).lower()
+    return "pose_body" in arrays or "mocap_frame_rate" in arrays or model.startswith("smplx")
+
+
+def _axis_angles(arrays: dict[str, np.ndarray], path: Path, stageii: bool) -> Float[Tensor, "time joint 3"]:
+    """Rotation vectors of the root and the joints of our skeleton, in SMPL's axes."""
+    if stageii and "pose_body" in arrays:
+        require(arrays, path, trans=("time", 3), root_orient=("time", 3), pose_body=("time", _SMPLX_BODY - 3))
+        vectors = np.concatenate([arrays["root_orient"], arrays["pose_body"]], -1)
+    else:
+        width = 165 if stageii else 156
+        require(arrays, path, trans=("time", 3), poses=("time", width))
+        vectors = arrays["poses"][:, : _SMPLX_BODY if stageii else width]
+    if len(vectors) == 0:
+        raise WearcapError("no frames", where=path)
+    return torch.from_numpy(vectors.astype(np.float64)).unflatten(1, (-1, 3))
+
+
+def _text(array: np.ndarray | None) -> str:
+    """A string that was saved as str or bytes."""
+    if array is None or array.size != 1 or array.dtype.kind not in "SU":
+        return ""
+    value = array.reshape(-1)[0]
+    return value.decode("latin-1") if isinstance(value, bytes) else str(value)

@@ -1,0 +1,192 @@
+"""BEHAVE at 30 frames per second: a person and one of twenty objects, fitted to four depth cameras' pictures.
+
+Folders as they unpack: `sequences/DATE_SUBJECT_OBJECT[_ACT]/` (or `behave-30fps-params-v1/…`) with `info.json`,
+`smpl_fit_all.npz` and `object_fit_all.npz`, and `objects/OBJECT/` with the meshes. The world is the frame of one of the
+cameras (x right, y down, z forward), which hangs nearly level; here z is up, and what is left of the camera's tilt is
+for preparation to take out by the feet. Poses place a mesh whose vertices' mean is at the origin, and that of the very
+mesh that was registered: other resolutions of an object have another mean.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from wearcap.body.skeletons import smplh52
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.datasets.amass import PELVIS_SMPLH
+from wearcap.io.datasets.one_object import OneObject, smpl_motion
+from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.npz import read_npz, require
+from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.poses import check_rising
+from wearcap.io.formats.smpl_axes import shape_from_betas
+from wearcap.scene.object_mesh import centered, check_object_mesh
+
+FPS = 30
+"""Of the release that has `smpl_fit_all.npz`; the older one keeps a frame per second in folders."""
+BODY_FILE, OBJECT_FILE, INFO_FILE = "smpl_fit_all.npz", "object_fit_all.npz", "info.json"
+R_WORLD_CAMERA = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""From the camera's axes (x right, y down, z forward) into x forward, y left, z up."""
+
+_FOLDERS = ("sequences", "behave-30fps-params-v1")
+_REGISTERED = {
+    "chairblack": "chairblack_f2500.ply", "chairwood": "chairwood_f2500.ply", "monitor": "monitor_closed_f1000.ply",
+    "tablesquare": "tablesquare_f2000.ply",
+}  # fmt: skip
+"""Meshes that were registered; all other objects' are OBJECT_f1000.ply."""
+_OFF_GRID = 0.1
+"""How far (frames) a time may lie from a multiple of 1/30 s: they are rounded to milliseconds."""
+_COLOR = np.array([0.7, 0.7, 0.7], np.float32)
+
+
+def behave_folder(root: str | Path) -> Path:
+    """The folder of sequences. Raises WearcapError where there is none with fits at 30 frames per second."""
+    folders = [Path(root) / name for name in _FOLDERS]
+    found = [folder for folder in folders if _names(folder)]
+    if not found:
+        raise WearcapError("no sequences", where=root, expected=f"sequences/NAME/{BODY_FILE} and {OBJECT_FILE}",
+                           fix="Give BEHAVE's folder as source=DIR, with the parameters of all frames (30 fps) in it.")  # fmt: skip
+    return found[0]
+
+
+def behave_names(root: str | Path) -> list[str]:
+    """Names of all sequences with fits, in order. Raises WearcapError where there are none."""
+    return _names(behave_folder(root))
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(
+        {path.parent.name for file in (BODY_FILE, OBJECT_FILE) for path in folder.glob(f"*/{file}")}
+    )
+
+
+def read_behave(root: str | Path, name: str) -> OneObject:
+    """Read one sequence: smplh52 and its object, z up, times as in the file (s); frames that were not fitted are gaps.
+
+    Raises WearcapError for an unknown sequence, missing or damaged files, NaN, wrong shapes, body and object of
+    different frames, times that are not 1/30 s apart, and for the mesh what `check_object_mesh` refuses.
+    """
+    if name not in behave_names(root):
+        raise WearcapError(f"no sequence {name!r}", where=root, expected=f"sequences/{name}/{BODY_FILE}")
+    parts = name.split("_")
+    if len(parts) < 3:
+        raise WearcapError("not named as BEHAVE's are", where=behave_folder(root) / name,
+                           expected="a folder DATE_SUBJECT_OBJECT, such as Date01_Sub01_boxlarge_hand")  # fmt: skip
+    folder = behave_folder(root) / name
+    body = read_npz(folder / BODY_FILE, ("poses", "trans", "betas", "frame_times"))
+    thing = read_npz(folder / OBJECT_FILE, ("angles", "trans", "frame_times"))
+    frames = require(body, folder / BODY_FILE, poses=("time", 156), trans=("time", 3))["time"]
+    require(thing, folder / OBJECT_FILE, angles=("time", 3), trans=("time", 3))
+    times = _common_times(body, thing, folder, frames)
+    object_name, gender = _about(read_json(folder / INFO_FILE), folder / INFO_FILE)
+    provenance = {"source": name, "format": "behave", **({"gender": gender} if gender else {})}
+    pelvis = body["trans"].astype(np.float64) + PELVIS_SMPLH
+    rotvec = torch.from_numpy(body["poses"].astype(np.float64)).unflatten(1, (-1, 3))
+    motion = smpl_motion(times, smplh52(), rotvec, torch.from_numpy(pelvis), provenance)
+    R = rotation.exp(torch.from_numpy(thing["angles"].astype(np.float64)))
+    path = Trajectory(times, R.float(), torch.from_numpy(thing["trans"].astype(np.float32)))
+    take = OneObject(
+        name, motion, object_name, path, read_behave_mesh(root, object_name), _shape(body, folder / BODY_FILE, frames),
+        subject=parts[1], activity="_".join(parts[2:]), location=parts[0],
+    )  # fmt: skip
+    return take.turned(R_WORLD_CAMERA)
+
+
+def behave_mesh_path(root: str | Path, object_name: str) -> Path:
+    """Where the mesh lies that an object's poses belong to."""
+    return Path(root) / "objects" / object_name / _REGISTERED.get(object_name, f"{object_name}_f1000.ply")
+
+
+def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
+    """The registered mesh of an object, centred on the mean of its vertices as the poses expect.
+
+    Raises WearcapError where it is missing, and for what `check_object_mesh` refuses.
+    """
+    if not re.fullmatch(r"[\w-]{1,64}", object_name):
+        raise WearcapError(f"an object named {object_name[:60]!r}", where=root, expected="one of BEHAVE's names, as boxlarge")  # fmt: skip
+    path = behave_mesh_path(root, object_name)
+    if not path.is_file():
+        raise WearcapError(f"no mesh of {object_name}", where=path, expected="objects/OBJECT/OBJECT_f1000.ply",
+                           fix="Unpack BEHAVE's objects.zip beside the sequences.")  # fmt: skip
+    ply = read_ply(path)
+    faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
+    mesh = Mesh(ply.points, faces, _COLOR if ply.colors is None else ply.colors.astype(np.float32) / 255)
+    if len(mesh.vertices):
+        mesh, _ = centered(mesh)
+    check_object_mesh(mesh, path)
+    return mesh
+
+
+def _common_times(
+    body: dict[str, np.ndarray], thing: dict[str, np.ndarray], folder: Path, frames: int
+) -> torch.Tensor:
+    """Times (s) of the object's frames, which must be the body's too."""
+    if not frames:
+        raise WearcapError("no frames", where=folder / BODY_FILE, expected="poses of at least one frame")
+    if len(thing["angles"]) != frames:
+        raise WearcapError(f"the object has {len(thing['angles'])} frames, the body {frames}", where=folder,
+                           expected=f"as many in {OBJECT_FILE} as in {BODY_FILE}", fix="Fetch both files again.")  # fmt: skip
+    times = _times(thing, folder / OBJECT_FILE, frames)
+    if "frame_times" in body:
+        other = _times(body, folder / BODY_FILE, frames)
+        apart = np.flatnonzero(other != times)
+        if len(apart):
+            raise WearcapError(
+                f"the body's frame {apart[0]} is of {other[apart[0]]:.3f} s, the object's of {times[apart[0]]:.3f} s",
+                where=folder, expected="the same frame_times in both files", fix="Fetch both files again.",
+            )  # fmt: skip
+    return torch.from_numpy(times)
+
+
+def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np.ndarray, "time"]:
+    """Seconds of `frame_times` ("t0003.033"), brought to whole frames. Raises WearcapError for another rate than 30."""
+    told = arrays.get("frame_times")
+    if told is None or told.shape != (frames,) or told.dtype.kind not in "US":
+        raise WearcapError(f"frame_times is {'missing' if told is None else f'{told.dtype} {told.shape}'}", where=path,
+                           expected=f'{frames} texts such as "t0003.033" (s)')  # fmt: skip
+    texts = [text.decode("latin-1") if isinstance(text, bytes) else str(text) for text in told]
+    try:
+        seconds = np.array([float(text.removeprefix("t")) for text in texts])
+    except ValueError as error:
+        raise WearcapError(f"frame_times cannot be read ({error})"[:200], where=path,
+                           expected='texts such as "t0003.033" (s)') from error  # fmt: skip
+    if not (np.abs(seconds) < 1e6).all():
+        raise WearcapError("frame_times holds NaN or infinity", where=path, expected="seconds")
+    grid = np.rint(seconds * FPS)
+    step = float(np.median(np.diff(grid))) if frames > 1 else 1.0
+    if np.abs(seconds * FPS - grid).max() > _OFF_GRID or step != 1.0:
+        rate = 1 / max(float(np.median(np.abs(np.diff(seconds)))), 1e-6) if frames > 1 else 0.0
+        raise WearcapError(f"frames come at {rate:.4g} per second", where=path, expected=f"{FPS} per second",
+                           fix="Use the release of all frames (30 fps), not the one of one frame per second.")  # fmt: skip
+    check_rising(grid / FPS, path)
+    return grid / FPS
+
+
+def _about(info: Any, path: Path) -> tuple[str, str]:
+    """The object's name and the gender."""
+    if not isinstance(info, dict) or not isinstance(info.get("cat"), str) or not info["cat"].isidentifier():
+        raise WearcapError(
+            "does not name the object", where=path, expected='{"cat": "boxlarge", "gender": "male", …}'
+        )
+    gender = info.get("gender")
+    return info["cat"], gender if isinstance(gender, str) else ""
+
+
+def _shape(body: dict[str, np.ndarray], path: Path, frames: int) -> dict[str, float]:
+    """The mean of the betas that were fitted frame by frame."""
+    if "betas" not in body:
+        return {}
+    if body["betas"].ndim == 2:
+        require(body, path, betas=(frames, "feature"))
+        mean = body["betas"].mean(0)
+    else:
+        require(body, path, betas=("feature",))
+        mean = body["betas"]
+    return shape_from_betas(mean)

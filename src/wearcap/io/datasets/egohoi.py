@@ -1,0 +1,292 @@
+"""The EgoHOI data set: objects with annotated poses, contacts with them, and the body that HPS captured.
+
+Folders as it unpacks: `smpl_motions/SEQ.json[.zip]`, `smpl_shapes/SUBx.json`, `object_models/OBJECT.ply`, and
+`object_locations` and `gt_contacts` with SEQ.json for one object, SEQ/OBJECT.json for several. A model's vertices are in
+the scan's axes; a pose turns them about the scan's origin and then moves them. Here an object's origin is its `center`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
+from wearcap.geometry import rotation
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.datasets.hcontact import activity_of, location_of
+from wearcap.io.datasets.hps import read_hps_subject
+from wearcap.io.datasets.hps_sequence import subject_of
+from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
+from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.npz import read_npz, require
+from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.poses import checked_trajectory
+from wearcap.io.formats.smpl_axes import shape_from_betas
+from wearcap.io.formats.smpl_json import read_smpl_json
+from wearcap.recording.interactions import HANDS, Interactions
+from wearcap.recording.recording import Recording
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Freedom, SceneObject
+
+MOTION_TYPES = ("hinge", "along_floor", "free", "absent")
+"""The published configurations' words, and one for what is mapped but was not there."""
+_CONTACTS = ("gt_contacts", "contacts")
+_COLOR = np.array([0.7, 0.7, 0.7], np.float32)
+
+
+@dataclass(frozen=True)
+class AnnotatedObject:
+    """Where an object was found, as annotated a few times in a sequence."""
+
+    center: tuple[float, float, float]
+    """Of the model, in its own (the scan's) axes (m): origin of our object's axes."""
+    hinge: tuple[float, float, float] | None
+    """A point of its vertical axis in the world (m)."""
+    trajectory: Trajectory
+    """Sparse: one pose per annotation."""
+
+
+@dataclass(frozen=True)
+class EgoHoi:
+    """One sequence and its objects."""
+
+    recording: Recording
+    environment: Environment
+
+
+def egohoi_names(root: str | Path) -> list[str]:
+    """Names of all sequences with a body, in order."""
+    files = [path.name for path in Path(root).glob("smpl_motions/*.json*")]
+    return sorted({name.removesuffix(".zip").removesuffix(".json") for name in files})
+
+
+def read_egohoi(
+    root: str | Path, name: str, motion_types: Mapping[str, str] | None = None, object_name: str | None = None
+) -> EgoHoi:
+    """Read a sequence: `motion` (HPS's estimate), `object_motion` (sparse truth), `interactions`, and the environment.
+
+    `motion_types` gives the type (of `MOTION_TYPES`) by patterns of object names, the first that matches; by default
+    what has a hinge turns and the rest slides. `object_name` is that of a sequence with one object, where its own name
+    does not tell. Raises WearcapError for an unknown sequence, type or model, a hinged object without a hinge, and for
+    labels that end before they start, overlap, lie outside the motion or name unknown parts.
+    """
+    root = Path(root)
+    if name not in egohoi_names(root):
+        raise WearcapError(f"no sequence {name!r}", where=root, expected=f"smpl_motions/{name}.json.zip or .json",
+                           fix=f"There are {len(egohoi_names(root))}, such as {egohoi_names(root)[:3]}.")  # fmt: skip
+    packed = root / "smpl_motions" / f"{name}.json.zip"
+    body = read_smpl_json(packed if packed.is_file() else packed.with_suffix(""))
+    clock = LabelClock.of(name, body.motion.timestamps)
+    objects, paths, contacts = [], {}, []
+    for thing, (locations, labels) in _object_files(root, name, object_name).items():
+        annotated = read_object_locations(locations)
+        kind = _motion_type(thing, annotated, motion_types or {}, locations)
+        if kind == "absent":
+            continue
+        item = scene_object(thing, annotated, root / "object_models" / f"{thing}.ply", kind, clock.start_s)
+        objects.append(item)
+        paths[thing] = annotated.trajectory
+        if labels is not None:
+            contacts.append(read_egohoi_contacts(labels, clock, thing, item.freedom.contact_class))
+    interactions = _joined(contacts) if contacts else None
+    if interactions is not None:
+        labels_of(interactions, clock)  # refuses a hand that holds two things at once
+    shape = root / "smpl_shapes" / f"{subject_of(name)}.json"
+    betas = body.shape or (shape_from_betas(read_hps_subject(shape).betas) if shape.is_file() else {})
+    recording = Recording(
+        name, motion=body.motion, object_motion=paths, interactions=interactions, skeleton=body.motion.skeleton,
+        shape=betas, subject=subject_of(name), location=location_of(name), activity=activity_of(name), source="EgoHOI",
+    )  # fmt: skip
+    return EgoHoi(recording, Environment(tuple(objects)))
+
+
+def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, tuple[Path, Path | None]]:
+    """Files of locations and of contacts (where there are any) by object."""
+    several, single = root / "object_locations" / name, root / "object_locations" / f"{name}.json"
+    if several.is_dir():
+        found = {path.stem: (path, Path(name) / path.name) for path in sorted(several.glob("*.json"))}
+    elif single.is_file():
+        found = {object_name or _only_object(root, name): (single, Path(single.name))}
+    else:
+        raise WearcapError(
+            "no object locations of this sequence", where=single, expected=f"this file, or a folder {several}"
+        )
+    places = {thing: [root / folder / labels for folder in _CONTACTS] for thing, (_, labels) in found.items()}
+    return {thing: (path, next((place for place in places[thing] if place.is_file()), None))
+            for thing, (path, _) in found.items()}  # fmt: skip
+
+
+def _only_object(root: Path, name: str) -> str:
+    """The model that a sequence of one object is named after."""
+    stem = name.split(".")[0].removeprefix(f"{subject_of(name)}_")
+    models = sorted(path.stem for path in root.glob("object_models/*.ply"))
+    fitting = [stem] if stem in models else [model for model in models if model.startswith(stem)]
+    if len(fitting) != 1:
+        raise WearcapError(f"{len(fitting)} models fit the sequence {name!r}", where=root / "object_models",
+                           expected=f"{stem}.ply", fix=f"Give its object's name: one of {', '.join(fitting or models)}.")  # fmt: skip
+    return fitting[0]
+
+
+def _motion_type(thing: str, annotated: AnnotatedObject, motion_types: Mapping[str, str], where: Path) -> str:
+    default = "along_floor" if annotated.hinge is None else "hinge"
+    kind = next((kind for pattern, kind in motion_types.items() if fnmatchcase(thing, pattern)), default)
+    if kind not in MOTION_TYPES:
+        raise WearcapError(f"motion type {kind!r} of {thing}", expected=f"one of {', '.join(MOTION_TYPES)}")
+    if kind == "hinge" and annotated.hinge is None:
+        raise WearcapError(f"{thing} is to turn about a hinge and has none", where=where, expected='"hinge": [x, y, z]',
+                           fix="Give it another motion type.")  # fmt: skip
+    return kind
+
+
+def read_object_locations(path: str | Path) -> AnnotatedObject:
+    """Read {center, hinge where it has one, locations: [{time, position, quaternion (wxyz)}]}.
+
+    Raises WearcapError for missing keys, NaN, quaternions that are none, two poses at one time, or no pose at all.
+    """
+    content = read_json(path)
+    try:
+        rows = sorted(content["locations"], key=lambda row: row["time"])
+        times, positions, quaternions = (
+            np.array([row[key] for row in rows], np.float64) for key in ("time", "position", "quaternion")
+        )
+        center = np.array(content["center"], np.float64)
+        hinge = np.array(content["hinge"], np.float64) if content.get("hinge") is not None else None
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise _not_locations(path, f"{type(error).__name__}: {error}") from error
+    points = [center] if hinge is None else [center, hinge]
+    if positions.shape != (len(rows), 3) or quaternions.shape != (len(rows), 4) or not rows:
+        raise _not_locations(path, f"{len(rows)} of shapes {positions.shape}, {quaternions.shape}")
+    if any(point.shape != (3,) or not (np.abs(point) < 1e6).all() for point in points):
+        raise _not_locations(path, "center or hinge is no point")
+    checked_trajectory(times, positions, quaternions, path)
+    trajectory = _about_center(times, positions, quaternions, center)
+    return AnnotatedObject(_triple(center), None if hinge is None else _triple(hinge), trajectory)
+
+
+def _not_locations(path: str | Path, detail: str) -> WearcapError:
+    return WearcapError(f"no object locations ({detail})"[:300], where=path,
+                        expected='{"center": [x, y, z], "locations": [{"time", "position", "quaternion"}]}')  # fmt: skip
+
+
+def _triple(point: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = point.tolist()
+    return x, y, z
+
+
+def _about_center(
+    times: Float64[np.ndarray, "time"], positions: Float64[np.ndarray, "time 3"],
+    quat_wxyz: Float64[np.ndarray, "time 4"], center: Float64[np.ndarray, "3"],
+) -> Trajectory:  # fmt: skip
+    """R·v + p of a vertex v is R·(v - c) + (p + R·c): the second is where the centre is."""
+    R = rotation.matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz))
+    t = torch.from_numpy(positions) + R @ torch.from_numpy(center)
+    return Trajectory(torch.from_numpy(times), R.float(), t.float())
+
+
+def scene_object(
+    name: str, annotated: AnnotatedObject, model: str | Path, motion_type: str, start_s: float
+) -> SceneObject:
+    """An object of our kind, where it was last seen at `start_s`, or else first. Raises WearcapError without its model."""
+    if not Path(model).is_file():
+        raise WearcapError(f"no model of {name}", where=model, expected="object_models/OBJECT.ply")
+    ply = read_ply(model)
+    if not len(ply.points):
+        raise WearcapError("an empty model", where=model, expected="at least one point")
+    vertices = (ply.points.astype(np.float64) - annotated.center).astype(np.float32)
+    color = _COLOR if ply.colors is None else ply.colors.astype(np.float32) / 255
+    mesh = Mesh(vertices, np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces, color)
+    freedom = Freedom({"hinge": "hinge", "along_floor": "plane", "free": "free"}[motion_type],
+                      annotated.hinge if motion_type == "hinge" else None)  # fmt: skip
+    seen = max(int(torch.searchsorted(annotated.trajectory.timestamps, start_s, right=True)) - 1, 0)
+    first = annotated.trajectory.T_world_body[seen]
+    return SceneObject(name, name.rpartition("_")[2], mesh, first.R, first.t, freedom)
+
+
+def read_egohoi_contacts(
+    path: str | Path, clock: LabelClock, object_name: str, contact_class: str
+) -> Interactions:
+    """Read {"interactions": [{start, end, parts}]} with one object; stretches without parts hold nothing.
+
+    Raises WearcapError for labels that end before they start, that overlap or lie outside the motion, for parts that
+    are no hands, and for NaN.
+    """
+    content = read_json(path)
+    rows = content.get("interactions") if isinstance(content, dict) else None
+    if not isinstance(rows, list):
+        raise WearcapError(
+            "no contact labels", where=path, expected='{"interactions": [{"start", "end", "parts"}]}'
+        )
+    parts: dict[str, list[list[Any]]] = {f"{hand}_hand": [] for hand in HANDS}
+    for number, row in enumerate(rows):
+        if not isinstance(row, dict) or not isinstance(row.get("parts"), list):
+            raise WearcapError(
+                f"interaction {number} is {row!r}"[:200], where=path, expected='{"start", "end", "parts"}'
+            )
+        start, end = row.get("start"), row.get("end")
+        if isinstance(start, int | float) and isinstance(end, int | float) and end < start:
+            raise WearcapError(f"interaction {number} ends before it starts: {start} to {end} s", where=path,
+                               expected="start < end", fix="Exchange the two, if that is what was meant.")  # fmt: skip
+        for part in row["parts"]:
+            if part not in parts:
+                raise WearcapError(
+                    f"interaction {number} is with {part!r}", where=path, expected=" or ".join(parts)
+                )
+            parts[part].append([start, end])
+    named = {key: {hand: [text] * len(spans) for hand, spans in parts.items()}
+             for key, text in (("objects", object_name), ("classes", contact_class))}  # fmt: skip
+    return interactions_of(parse_labels({"contacts": parts, **named}, clock, where=path))
+
+
+def _joined(parts: list[Interactions]) -> Interactions:
+    """All objects' interactions by their start."""
+    start, stop, hands = (
+        torch.cat([getattr(part, key) for part in parts]) for key in ("start_s", "stop_s", "hands")
+    )
+    names, kinds = ([text for part in parts for text in getattr(part, key)] for key in ("objects", "classes"))
+    order = torch.argsort(start, stable=True)
+    index = order.tolist()
+    return Interactions(start[order], stop[order], hands[order], tuple(names[k] for k in index), tuple(kinds[k] for k in index))  # fmt: skip
+
+
+def write_object_npz(
+    trajectory: Trajectory, path: str | Path, center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> None:
+    """Write an object's path as the published tracker does: `translations`, `quaternions` (wxyz), `timestamps`.
+
+    `center`: origin of our object's axes in its model's. Raises WearcapError for poses that are not finite.
+    """
+    R, t = trajectory.R_world_body.double(), trajectory.t_world_body.double()
+    if not (R.isfinite().all() and t.isfinite().all() and trajectory.timestamps.isfinite().all()):
+        raise WearcapError(
+            "the object's path holds NaN or infinite values", where=path, expected="finite poses"
+        )
+    moved = t - R @ _double(center)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, version=np.array(2), type=np.array("sequential"), translations=moved.numpy(),
+                            quaternions=rotation.quat_wxyz_from_matrix(R).numpy(), timestamps=trajectory.timestamps.numpy())  # fmt: skip
+
+
+def read_object_npz(path: str | Path, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Trajectory:
+    """Read what `write_object_npz` or the published tracker wrote. Raises WearcapError for missing arrays, NaN, times that
+    do not rise, quaternions that are none."""
+    arrays = read_npz(path, ("translations", "quaternions", "timestamps"))
+    require(arrays, path, translations=("time", 3), quaternions=("time", 4), timestamps=("time",))
+    times, positions, quaternions = (
+        arrays[key].astype(np.float64) for key in ("timestamps", "translations", "quaternions")
+    )
+    if not len(times):
+        raise WearcapError("a path without poses", where=path, expected="at least one")
+    checked_trajectory(times, positions, quaternions, path)
+    return _about_center(times, positions, quaternions, _double(center).numpy())
+
+
+def _double(point: tuple[float, float, float]) -> Float[Tensor, "3"]:
+    return torch.tensor(point, dtype=torch.float64)

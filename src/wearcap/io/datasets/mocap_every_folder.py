@@ -1,0 +1,255 @@
+"""MocapEvery's capture folder: a SLAM trajectory and points, the head camera's video, and two watches' logs.
+
+Camera poses are of an OpenCV camera in SLAM's own world, whose unit and axes are arbitrary until the board says them
+(appendix C.2): its wearer's camera was carried along the board's x and y edge, whose lengths are known.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.files import MAX_JSON_DEPTH
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.datasets.hps import nominal_mount
+from wearcap.io.devices.watch_log import WRISTS, read_watch_log
+from wearcap.io.formats.npz import require
+from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.poses import checked_trajectory
+from wearcap.io.formats.restricted_pickle import read_pickle
+from wearcap.io.formats.text import finite_floats, read_text
+from wearcap.io.formats.video import video_info
+from wearcap.recording import CameraStream, HeadStream, ImuStream, PointCloud, Recording
+
+FPS = 30.0
+"""Of the pictures that SLAM was given."""
+_MAX_CONFIG_BYTES = 1 << 16
+TRAJECTORY, CONFIG, MARKS = "cam_traj.pkl", "config.yaml", "camera_calib.pkl"
+POINTS, VIDEO = "sfm/pointcloud/pcd_results.ply", "video/ego_video.MP4"
+UNDISTORTED, LENS = "sfm/undistort_calib.txt", "sfm/calib.txt"
+LOGS = ("watch_sensorlog_1.csv", "watch_sensorlog_2.csv")
+"""Of the left and of the right wrist."""
+_SLAM_PIXELS = 384 * 512
+"""DROID-SLAM shrinks pictures to about so many pixels, and cuts both sides down to multiples of 8."""
+
+
+@dataclass(frozen=True)
+class BoardWalks:
+    """How the camera was carried over the calibration board: from where to where (SLAM's units), and what was measured."""
+
+    x_slam: Float[Tensor, "end 3"]
+    y_slam: Float[Tensor, "end 3"]
+    length_m: tuple[float, float]
+    """Along x and along y."""
+    height_m: float
+    """Of the camera above the floor where the walk along y begins."""
+
+
+@dataclass(frozen=True)
+class MocapEveryFolder:
+    """What a capture folder holds, in SLAM's own world."""
+
+    name: str
+    T_slam_cam: Trajectory
+    """30 Hz from the shutter's time (s since 1970, as the watches' clocks say), or from 0 where none is noted."""
+    camera: Camera | None = None
+    """Of the pictures that SLAM was given: undistorted and small."""
+    lens: Camera | None = None
+    """Of the video itself."""
+    points_slam: Float[Tensor, "point 3"] | None = None
+    video: Path | None = None
+    imu: dict[str, ImuStream] | None = None
+    board: BoardWalks | None = None
+
+
+def is_mocap_every_folder(folder: str | Path) -> bool:
+    """Whether a folder holds a camera trajectory of such a capture."""
+    return (Path(folder) / TRAJECTORY).is_file()
+
+
+def mocap_every_files(folder: str | Path) -> list[Path]:
+    """The files that are read of a folder."""
+    names = (TRAJECTORY, CONFIG, MARKS, POINTS, UNDISTORTED, LENS, *LOGS, VIDEO)
+    return [path for name in names if (path := Path(folder) / name).is_file()]
+
+
+def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
+    """Read a capture folder; everything but the trajectory may be missing.
+
+    Raises WearcapError for a trajectory that is no (T, 7) array of position and unit quaternion (x, y, z, w), for
+    pickles that hold anything but data, and for any other file that is there and not as documented.
+    """
+    folder = Path(folder)
+    config, marks = _config(folder / CONFIG), _marks(folder / MARKS)
+    track = _trajectory(folder / TRAJECTORY, _shutter(config, marks, folder))
+    video = folder / VIDEO if (folder / VIDEO).is_file() else None
+    size = None if video is None else (video_info(video).width, video_info(video).height)
+    points = read_ply(folder / POINTS).points if (folder / POINTS).is_file() else None
+    return MocapEveryFolder(
+        folder.resolve().name, track, _undistorted(folder / UNDISTORTED, size), _lens(folder / LENS, size),
+        None if points is None else torch.from_numpy(points), video,
+        {joint: read_watch_log(folder / log, joint) for joint, log in zip(WRISTS, LOGS) if (folder / log).is_file()},
+        _board(track, config, marks, folder),
+    )  # fmt: skip
+
+
+def mocap_every_recording(
+    folder: MocapEveryFolder, scale: float = 1.0, T_world_slam: Rigid | None = None
+) -> Recording:
+    """The capture in the world p_world = T_world_slam @ (scale · p_slam); by default in SLAM's own.
+
+    The device sits where the camera does, with the head's axes (x forward, y left, z up), and both on the head as
+    `hps.nominal_mount` says. Watches are as read: their headings, mounts and clocks are not calibrated.
+    """
+    T_world_slam = T_world_slam or Rigid.identity()
+    track = folder.T_slam_cam
+    T_world_cam = T_world_slam @ Rigid(track.R_world_body, scale * track.t_world_body)
+    R_head_cam, t_head_cam = nominal_mount()
+    points = folder.points_slam
+    cloud = None if points is None else PointCloud(T_world_slam @ (scale * points))  # pyright: ignore[reportArgumentType]
+    return Recording(
+        folder.name,
+        head=HeadStream(track.timestamps, T_world_cam.R @ R_head_cam.mT, T_world_cam.t, torch.eye(3), t_head_cam),
+        imu=folder.imu or {}, camera=_camera_stream(folder, Rigid(R_head_cam, t_head_cam)), points=cloud,
+        source="MocapEvery capture folder",
+    )  # fmt: skip
+
+
+def _camera_stream(folder: MocapEveryFolder, T_head_cam: Rigid) -> CameraStream | None:
+    """The video with its lens where both are there, else the camera of SLAM's pictures."""
+    track = folder.T_slam_cam
+    if folder.video is not None and folder.lens is not None:
+        info = video_info(folder.video)
+        count = int((track.timestamps[-1] - track.timestamps[0]).item() * info.fps + 1.5)
+        count = min(count, info.frames) if info.frames else count
+        times = track.timestamps[0] + torch.arange(count, dtype=torch.float64) / info.fps
+        return CameraStream(times, folder.lens, T_head_cam.R, T_head_cam.t, video=str(folder.video.resolve()))
+    if folder.camera is None:
+        return None
+    return CameraStream(track.timestamps, folder.camera, T_head_cam.R, T_head_cam.t)
+
+
+def _trajectory(path: Path, start_s: float) -> Trajectory:
+    content = read_pickle(path)
+    table = np.asarray(content) if isinstance(content, np.ndarray | list) else np.zeros(0)
+    require({"poses": table}, path, poses=("time", 7))
+    if not len(table):
+        raise WearcapError("no poses", where=path, expected="a row of 7 numbers per picture")
+    if abs(table[0, 3]) > 0.9999 > abs(table[0, 6]):
+        raise WearcapError("the first quaternion is the identity with the scalar first", where=path,
+                           expected="x y z, then qx qy qz qw", fix="Move the scalar to the end of the rows.")  # fmt: skip
+    times = start_s + np.arange(len(table)) / FPS
+    return checked_trajectory(times, table[:, :3], table[:, [6, 3, 4, 5]], path)
+
+
+def _config(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        text = read_text(path, usual=_MAX_CONFIG_BYTES)
+        _require_plain_yaml(text, path)
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
+        raise WearcapError(f"not readable YAML ({' '.join(str(error).split())})"[:300], where=path) from error
+    if not isinstance(content, dict | None):
+        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="keys with values")
+    return content or {}
+
+
+def _require_plain_yaml(text: str, path: Path) -> None:
+    """Refuse what makes YAML's parser run wild: references to its own parts, and depth, which costs time squared."""
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise WearcapError("it refers to its own parts (&name, *name)", where=path, expected="plain keys with values",
+                               fix="Write them out: such references can blow up.")  # fmt: skip
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_JSON_DEPTH:
+            raise WearcapError("YAML that is nested too deeply", where=path, expected=f"at most {MAX_JSON_DEPTH} levels")  # fmt: skip
+
+
+def _marks(path: Path) -> dict[str, Any]:
+    """Times at which the wearer did what calibrates: x and y (start, stop), and the shutter's (s)."""
+    content = read_pickle(path) if path.is_file() else {}
+    if not isinstance(content, dict):
+        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="a dict of times")
+    return content
+
+
+def _shutter(config: dict[str, Any], marks: dict[str, Any], folder: Path) -> float:
+    noted = marks.get("shutter")
+    noted = config.get("cam_shutter_timestamp") if noted is None else noted
+    return 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
+
+
+def _board(
+    track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path
+) -> BoardWalks | None:
+    measured = config.get("cam_scale_origin")
+    if measured is None or not {"x", "y"} <= marks.keys():
+        return None
+    if not isinstance(measured, dict) or not {"dist", "height"} <= measured.keys():
+        raise WearcapError("cam_scale_origin lacks a number", where=folder / CONFIG, expected="dist: [x, y] and height (m)")  # fmt: skip
+    length = _numbers(measured["dist"], 2, "cam_scale_origin.dist", folder / CONFIG)
+    (height,) = _numbers([measured["height"]], 1, "cam_scale_origin.height", folder / CONFIG)
+    if min(*length, height) <= 0:
+        raise WearcapError(f"distances {length} and height {height}", where=folder / CONFIG, expected="metres above 0")  # fmt: skip
+    ends = []
+    for name in ("x", "y"):
+        times = torch.tensor(_numbers(marks[name], 2, name, folder / MARKS), dtype=torch.float64)
+        if not ((times >= track.timestamps[0] - 1) & (times <= track.timestamps[-1] + 1)).all():
+            raise WearcapError(f"{name} at {times.tolist()} s", where=folder / MARKS,
+                               expected=f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path")  # fmt: skip
+        ends.append(track.t_world_body[(track.timestamps[None] - times[:, None]).abs().argmin(1)])
+    return BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
+
+
+def _numbers(values: Any, count: int, what: str, where: Path) -> list[float]:
+    try:
+        found = [float(value) for value in values]
+    except (TypeError, ValueError, OverflowError):
+        found = []
+    if len(found) != count or not np.isfinite(found).all():
+        raise WearcapError(f"{what} is {str(values)[:60]}", where=where, expected=f"{count} finite numbers")
+    return found
+
+
+def _intrinsics(path: Path, counts: tuple[int, ...]) -> list[float]:
+    try:
+        values = finite_floats(read_text(path).split()).tolist()
+    except ValueError as error:
+        raise WearcapError(f"not a list of numbers ({error})", where=path, expected="fx fy cx cy") from error
+    if len(values) not in counts:
+        raise WearcapError(f"{len(values)} numbers", where=path, expected=f"{' or '.join(map(str, counts))}: fx fy cx cy and distortion")  # fmt: skip
+    return values
+
+
+def _undistorted(path: Path, video: tuple[int, int] | None) -> Camera | None:
+    """The pinhole camera of SLAM's pictures, whose size follows from the video's, else from the principal point."""
+    if not path.is_file():
+        return None
+    fx, fy, cx, cy = _intrinsics(path, (4,))
+    width, height = round(cx / 4) * 8, round(cy / 4) * 8
+    if video is not None:
+        shrink = np.sqrt(_SLAM_PIXELS / (video[0] * video[1]))
+        width, height = (int(side * shrink) // 8 * 8 for side in video)
+    if not (0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height):
+        raise WearcapError(f"principal point {cx:.1f}, {cy:.1f}", where=path,
+                           expected=f"one near the middle of {width}x{height} pixels")  # fmt: skip
+    return Camera("pinhole", width, height, fx, fy, cx, cy)
+
+
+def _lens(path: Path, video: tuple[int, int] | None) -> Camera | None:
+    """Calibration of the video's own pictures (OpenCV: k1 k2 p1 p2 [k3]), where it lies beside the other."""
+    if not path.is_file() or video is None:
+        return None
+    fx, fy, cx, cy, *bent = _intrinsics(path, (4, 8, 9))
+    return Camera("opencv" if bent else "pinhole", *video, fx, fy, cx, cy, tuple(bent))

@@ -1,0 +1,260 @@
+"""Nymeria and NymeriaPlus: Xsens body motion beside Project Aria's head trajectory and points, one folder per sequence.
+
+The suit's data has its own clock and a drifting world of its own; both are brought to the head device's
+(io/devices/head_alignment.py), whose world is metric with z up.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from wearcap.body.kinematics import local_rotations
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
+from wearcap.body.skeletons import smpl24
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, interpolate
+from wearcap.io.datasets.amass import PELVIS_SMPLH
+from wearcap.io.devices.aria_mps import (
+    T_HEAD_DEVICE,
+    find_mps_file,
+    head_stream,
+    read_closed_loop,
+    read_mps_points,
+)
+from wearcap.io.devices.aria_vrs import extract_video
+from wearcap.io.devices.head_alignment import align_head, clock_offset
+from wearcap.io.formats.json_text import read_json_object
+from wearcap.io.formats.npz import read_npz, require
+from wearcap.io.formats.smpl_axes import rotations_from_smpl
+from wearcap.recording import ContactTrack, HeadStream, Motion, Recording
+
+SUIT_HZ = 240.0
+_STEP_TOLERANCE_S = 1e-3
+_DRIFT_TOLERANCE_S = 0.01
+MAX_RESIDUAL_M = 0.25
+"""A suit whose aligned head stays further from the device than this (median) is not aligned at all."""
+
+
+def is_nymeria(folder: str | Path) -> bool:
+    """Whether a folder is a Nymeria sequence with body motion."""
+    return (Path(folder) / "body" / "xdata.npz").is_file()
+
+
+def head_vrs(folder: str | Path) -> Path:
+    """Where the head device's own recording lies, if it was downloaded."""
+    return Path(folder) / "recording_head" / "data" / "data.vrs"
+
+
+def read_xdata(path: str | Path) -> tuple[Motion, ContactTrack | None]:
+    """Read `body/xdata.npz` as it is: the suit's own clock and world, 240 Hz, with its foot contacts.
+
+    Time steps more than 1 ms off become nominal, zero quaternions the one before. Bone lengths are the median of the
+    segments' distances. Raises WearcapError for missing or misshapen arrays, NaN, another frame rate, or cleaned
+    timestamps that end more than 10 ms from the file's.
+    """
+    keys = ("timestamps_us", "segment_tXYZ", "segment_qWXYZ", "frameRate", "foot_contacts")
+    arrays = read_npz(path, keys)
+    count = len(xsens23())
+    sizes = require(
+        arrays,
+        path,
+        timestamps_us=("time",),
+        segment_tXYZ=("time", 3 * count),
+        segment_qWXYZ=("time", 4 * count),
+    )
+    if sizes["time"] < 2:
+        raise WearcapError(f"{sizes['time']} frames", where=path, expected="at least 2")
+    if "frameRate" in arrays and abs(float(arrays["frameRate"].reshape(-1)[0]) - SUIT_HZ) > 1:
+        raise WearcapError(
+            f"frame rate {arrays['frameRate'].reshape(-1)[0]}", where=path, expected=f"{SUIT_HZ:g} Hz"
+        )
+    timestamps = _clean_timestamps(arrays["timestamps_us"].astype(np.float64) * 1e-6, path)
+    quat = _filled_quaternions(arrays["segment_qWXYZ"].reshape(-1, count, 4).astype(np.float64))
+    R_world_joint = rotation.matrix_from_quat_wxyz(torch.from_numpy(quat))
+    position = torch.from_numpy(arrays["segment_tXYZ"].reshape(-1, count, 3).astype(np.float64))
+    skeleton = _measured_skeleton(R_world_joint, position)
+    motion = Motion(
+        torch.from_numpy(timestamps), skeleton, local_rotations(skeleton, R_world_joint).float(), position[:, 0].float(),
+        provenance={"source": Path(path).name, "format": "nymeria"},
+    )  # fmt: skip
+    return motion, _contacts(arrays, motion, path)
+
+
+def _clean_timestamps(seconds: np.ndarray, path: str | Path) -> np.ndarray:
+    steps = np.diff(seconds)
+    steps[np.abs(steps - 1 / SUIT_HZ) > _STEP_TOLERANCE_S] = 1 / SUIT_HZ
+    cleaned = seconds[0] + np.concatenate([[0.0], steps.cumsum()])
+    if abs(cleaned[-1] - seconds[-1]) > _DRIFT_TOLERANCE_S:
+        raise WearcapError(f"after cleaning, time ends {cleaned[-1] - seconds[-1]:+.3f} s from the file's own", where=path,
+                           expected=f"steady {SUIT_HZ:g} Hz", fix="Frames were lost: cut the sequence there.")  # fmt: skip
+    return cleaned
+
+
+def _filled_quaternions(quat: np.ndarray) -> np.ndarray:
+    """Zero quaternions become the same segment's previous one (at the beginning: no rotation)."""
+    bad = np.linalg.norm(quat, axis=-1) < 0.5
+    frame = np.where(bad, -1, np.arange(len(quat))[:, None])
+    latest = np.maximum.accumulate(frame, axis=0)
+    filled = np.take_along_axis(quat, np.maximum(latest, 0)[..., None], axis=0)
+    filled[latest < 0] = (1.0, 0.0, 0.0, 0.0)
+    return filled
+
+
+def _measured_skeleton(R_world_joint: Tensor, position: Tensor) -> Skeleton:
+    """The wearer's bone offsets: where each segment begins in its parent's axes, the median over a thousand frames."""
+    skeleton = xsens23()
+    frames = torch.linspace(0, len(position) - 1, min(len(position), 1000)).long()
+    parents = list(skeleton.parents[1:])
+    apart = position[frames][:, 1:] - position[frames][:, parents]
+    offsets = (R_world_joint[frames][:, parents].mT @ apart[..., None])[..., 0].median(0).values
+    return skeleton.with_offsets(torch.cat([torch.zeros(1, 3), offsets.float()]))
+
+
+def _contacts(arrays: dict[str, np.ndarray], motion: Motion, path: str | Path) -> ContactTrack | None:
+    if "foot_contacts" not in arrays:
+        return None
+    contact = arrays["foot_contacts"]
+    if contact.shape != (len(motion), len(FOOT_PATCHES)):
+        raise WearcapError(f"foot_contacts has shape {contact.shape}", where=path,
+                           expected=f"({len(motion)}, {len(FOOT_PATCHES)})")  # fmt: skip
+    return ContactTrack(motion.timestamps, FOOT_PATCHES, torch.from_numpy(contact > 0.5))
+
+
+def read_smpl_neutral(path: str | Path) -> Motion:
+    """Read NymeriaPlus' `body/xdata_smpl_neutral.npz`: SMPL poses that are in the Aria world already.
+
+    The skeleton keeps its standard bone lengths. Raises WearcapError for missing or misshapen arrays or NaN.
+    """
+    arrays = read_npz(path, ("timestamps", "global_orient", "body_pose", "transl"))
+    require(
+        arrays,
+        path,
+        timestamps=("time",),
+        global_orient=("time", 3),
+        body_pose=("time", 69),
+        transl=("time", 3),
+    )
+    axis_angle = np.concatenate([arrays["global_orient"], arrays["body_pose"]], 1).reshape(-1, 24, 3)
+    R = rotations_from_smpl(torch.from_numpy(axis_angle.astype(np.float64)))
+    t_root = torch.from_numpy(arrays["transl"].astype(np.float64)) + torch.tensor(
+        PELVIS_SMPLH, dtype=torch.float64
+    )
+    timestamps = torch.from_numpy(arrays["timestamps"].astype(np.float64) * 1e-6)
+    return Motion(timestamps, smpl24(), R.float(), t_root.float(), provenance={"source": Path(path).name})
+
+
+def read_nymeria(
+    folder: str | Path, *, fps: float = 60.0, clock_offset_s: float | None = None, video: Path | None = None
+) -> Recording:
+    """Recording of one sequence folder: head stream, points, and the suit's motion in the head device's world and clock.
+
+    All streams at `fps` (Hz) on the device's clock, cut to what suit and device share. `clock_offset_s` is added to the
+    suit's (time code) timestamps; by default it is found by correlating head turns, to a few milliseconds.
+    With `video`, the head's colour camera (`recording_head/data/data.vrs`) is written there as an MP4, undistorted and
+    upright; that needs projectaria-tools. Raises WearcapError when a part is missing or suit and device cannot be aligned.
+    """
+    folder = Path(folder)
+    slam = folder / "recording_head" / "mps" / "slam"
+    path = find_mps_file(slam, ("closed_loop_trajectory.csv",))
+    if path is None or not is_nymeria(folder):
+        raise WearcapError("not a complete Nymeria sequence", where=folder,
+                           expected="body/xdata.npz and recording_head/mps/slam/closed_loop_trajectory.csv")  # fmt: skip
+    suit, contacts = read_xdata(folder / "body" / "xdata.npz")
+    device = head_stream(read_closed_loop(path).T_world_aria, fps=None)
+    try:
+        motion, contact, head = _on_device(suit, contacts, device, fps, clock_offset_s)
+    except WearcapError as error:
+        raise WearcapError(error.what, where=folder, expected=error.expected, fix=error.fix) from error
+    about = read_metadata(folder)
+    camera = None if video is None else extract_video(
+        head_vrs(folder), video, between=(head.timestamps[0].item(), head.timestamps[-1].item()),
+        T_head_device=Rigid(head.R_head_device, head.t_head_device),
+    )  # fmt: skip
+    return Recording(
+        name=folder.resolve().name, head=head, motion=motion, contacts=contact, camera=camera, skeleton=motion.skeleton,
+        points=read_mps_points(slam), source="Nymeria", license="Nymeria dataset licence", **about,
+    )  # fmt: skip
+
+
+def _on_device(
+    suit: Motion, contacts: ContactTrack | None, device: HeadStream, fps: float, clock_offset_s: float | None
+) -> tuple[Motion, ContactTrack | None, HeadStream]:
+    """Suit motion and contacts in the device's world, clock and rate, and the head stream on the same frames."""
+    T_suit_head = suit.joint("head")
+    track = Trajectory(device.timestamps, device.R_world_device, device.t_world_device)
+    own = Trajectory(suit.timestamps, T_suit_head.R, T_suit_head.t)
+    offset = clock_offset(own, track) if clock_offset_s is None else clock_offset_s
+    own = Trajectory(own.timestamps + offset, own.R_world_body, own.t_world_body)
+    alignment = align_head(own, track, T_HEAD_DEVICE.t)
+    if alignment.residual_m > MAX_RESIDUAL_M:
+        raise WearcapError(f"the suit's head stays {100 * alignment.residual_m:.0f} cm from the device after alignment",
+                           expected="suit and device of the same wearer on one clock")  # fmt: skip
+    start = max(own.timestamps[0].item(), track.timestamps[0].item())
+    stop = min(own.timestamps[-1].item(), track.timestamps[-1].item())
+    times = start + torch.arange(int((stop - start) * fps) + 1, dtype=torch.float64) / fps
+    T_world_root = alignment.T_world_suit @ Rigid(
+        suit.R_parent_joint[:, 0].double(), suit.t_world_root.double()
+    )
+    R = torch.cat([T_world_root.R[:, None].float(), suit.R_parent_joint[:, 1:]], 1)
+    motion = Motion(
+        times, suit.skeleton, _resampled_rotations(own.timestamps, R, times),
+        interpolate(own.timestamps, T_world_root.t, times).float(),
+        provenance=suit.provenance | {
+            "clock_offset_s": f"{offset:.4f}", "head_residual_m": f"{alignment.residual_m:.4f}",
+            "head_residual_deg": f"{np.degrees(alignment.residual_rad):.2f}",
+        },
+    )  # fmt: skip
+    contact = (
+        None
+        if contacts is None
+        else ContactTrack(times, contacts.parts, _nearest(own.timestamps, contacts.contact, times))
+    )
+    seat = alignment.T_head_device
+    pose = Rigid(
+        _resampled_rotations(track.timestamps, track.R_world_body, times),
+        interpolate(track.timestamps, track.t_world_body, times),
+    )
+    return motion, contact, HeadStream(times, pose.R, pose.t, seat.R, seat.t)
+
+
+def _resampled_rotations(
+    timestamps: Float64[Tensor, "time"], R: Float[Tensor, "time *rest"], at: Float64[Tensor, "new_time"]
+) -> Float[Tensor, "new_time *rest"]:
+    """Rotations at other times: slerp between neighbours."""
+    after = torch.searchsorted(timestamps, at, right=True).clamp(1, len(timestamps) - 1)
+    blend = (
+        ((at - timestamps[after - 1]) / (timestamps[after] - timestamps[after - 1])).clamp(0, 1).to(R.dtype)
+    )
+    turn = rotation.log(R[after - 1].mT @ R[after])
+    return R[after - 1] @ rotation.exp(turn * blend.reshape(-1, *[1] * (turn.ndim - 1)))
+
+
+def _nearest(
+    timestamps: Float64[Tensor, "time"], value: Bool[Tensor, "time *rest"], at: Float64[Tensor, "new_time"]
+) -> Bool[Tensor, "new_time *rest"]:
+    return value[torch.searchsorted((timestamps[1:] + timestamps[:-1]) / 2, at)]
+
+
+def read_metadata(folder: Path) -> dict:
+    """Subject, location, activity and size from metadata.json where it is there, else subject from the folder's name."""
+    parts = folder.resolve().name.split("_")
+    about: dict = {"subject": "_".join(parts[2:4]) if len(parts) > 4 else "", "location": "", "activity": ""}
+    path = folder / "metadata.json"
+    if not path.is_file():
+        return about
+    content = read_json_object(path)
+    about["subject"] = str(content.get("participant_id") or content.get("fake_name") or about["subject"])
+    about["location"] = str(content.get("location", ""))
+    about["activity"] = str(content.get("script", ""))
+    size = {"height": ("participant_height_cm", 0.01), "weight": ("participant_weight_kg", 1.0)}
+    about["shape"] = {
+        name: float(content[key]) * unit
+        for name, (key, unit) in size.items()
+        if isinstance(content.get(key), int | float)
+    }
+    return about

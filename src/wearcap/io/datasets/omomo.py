@@ -1,0 +1,193 @@
+"""OMOMO: a person and one of fifteen objects, from optical motion capture.
+
+`train_diffusion_manip_seq_joints24.p` and `test_…` are joblib files of {number: sequence}, read with the restricted
+unpickler; `captured_objects/OBJECT_cleaned_simplified.obj` are the meshes. World: metres, z up. No file tells the frame
+rate. The root joint stands at `trans - trans2joint`. A vertex v of the file is at obj_scale · R · v + t: the meshes have
+a unit and an origin of their own, so here they are scaled to metres, centred on the mean of their vertices, and their
+paths are the centre's. Where an object's pose is missing its scale is 0. Of the two objects of two parts (mop, vacuum)
+`obj_rot` and `obj_trans` are the upper part's; here the whole mesh rides with it.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from wearcap.body.skeletons import smplx22
+from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.datasets.amass import PELVIS_SMPLX
+from wearcap.io.datasets.one_object import OneObject, smpl_motion
+from wearcap.io.formats.npz import require
+from wearcap.io.formats.restricted_pickle import read_pickle
+from wearcap.io.formats.smpl_axes import shape_from_arrays
+from wearcap.io.formats.wavefront import read_obj
+from wearcap.scene.object_mesh import centered, check_object_mesh
+
+FILES = ("train_diffusion_manip_seq_joints24.p", "test_diffusion_manip_seq_joints24.p")
+MESHES, MESH_ENDING = "captured_objects", "_cleaned_simplified.obj"
+TWO_PARTS = ("mop", "vacuum")
+
+_KEYS = ("trans", "root_orient", "pose_body", "betas", "trans2joint", "obj_rot", "obj_trans", "obj_scale")
+_LEAST_SCALE = 1e-8
+_SCALE_WITHIN = 0.2
+"""Share by which an object's scale may vary within a sequence: it is a rigid object."""
+_ORTHOGONAL_WITHIN = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class OmomoSequence:
+    """One sequence as the file has it; nothing but its name is checked yet."""
+
+    name: str
+    """SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000."""
+    where: str
+    arrays: dict[str, np.ndarray]
+    gender: str
+
+    @property
+    def subject(self) -> str:
+        return self.name.split("_")[0]
+
+    @property
+    def object_name(self) -> str:
+        return self.name.split("_")[1]
+
+
+def read_omomo(root: str | Path) -> list[OmomoSequence]:
+    """All sequences of those of `FILES` that are in a folder, by name.
+
+    Raises WearcapError where there is none of them, for damaged files and for anything but arrays in them (which is
+    never run), for what is no dict of sequences, and for sequences without a name such as sub1_largebox_000.
+    """
+    paths = [Path(root) / name for name in FILES if (Path(root) / name).is_file()]
+    if not paths:
+        raise WearcapError("no sequences", where=root, expected=" or ".join(FILES), fix="Give OMOMO's folder as source=DIR.")  # fmt: skip
+    found = [sequence for path in paths for sequence in _sequences(read_pickle(path), path)]
+    if not found:
+        raise WearcapError("files without sequences", where=root, expected="{number: {seq_name, trans, …}}")
+    return sorted(found, key=lambda sequence: sequence.name)
+
+
+def _sequences(content: Any, path: Path) -> list[OmomoSequence]:
+    if not isinstance(content, dict):
+        raise WearcapError(
+            f"it holds a {type(content).__name__}", where=path, expected="{number: {seq_name, trans, …}}"
+        )
+    found = []
+    for key, entry in content.items():
+        name = entry.get("seq_name") if isinstance(entry, dict) else None
+        if not isinstance(name, str) or len(name.split("_")) < 3 or not name.replace("_", "").isalnum():
+            raise WearcapError(f"sequence {key!r} is named {name!r}"[:200], where=path,
+                               expected="seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000")  # fmt: skip
+        arrays = {key: entry[key] for key in _KEYS if isinstance(entry.get(key), np.ndarray)}
+        gender = entry.get("gender", "")
+        if isinstance(gender, np.ndarray) and gender.size == 1:
+            gender = gender.reshape(-1)[0]
+        found.append(OmomoSequence(name, f"{path}, sequence {name}", arrays, str(gender) if isinstance(gender, str) else ""))  # fmt: skip
+    return found
+
+
+def omomo_mesh_path(root: str | Path, object_name: str) -> Path:
+    """Where an object's mesh lies."""
+    return Path(root) / MESHES / f"{object_name}{MESH_ENDING}"
+
+
+def omomo_take(sequence: OmomoSequence, root: str | Path, fps: float | int) -> OneObject:
+    """One sequence as smplx22 with its object, from 0 s at `fps` (which no file tells); frames without an object's pose
+    are gaps.
+
+    Raises WearcapError for missing arrays, wrong shapes, NaN, body and object of different lengths, rotations that are
+    none, a scale that changes, a missing mesh, and for the mesh what `check_object_mesh` refuses.
+    """
+    where, arrays = sequence.where, _flat(sequence.arrays)
+    require(arrays, where, trans=("time", 3), root_orient=("time", 3), pose_body=("time", 63))
+    require(arrays, where, obj_rot=("frame", 3, 3), obj_trans=("frame", 3), obj_scale=("frame",))
+    frames, others = len(arrays["trans"]), len(arrays["obj_trans"])
+    if frames != others or not frames:
+        raise WearcapError(f"the object has {others} frames, the body {frames}", where=where,
+                           expected="as many of both, and at least one", fix="Fetch the file again.")  # fmt: skip
+    times = torch.arange(frames, dtype=torch.float64) / fps
+    provenance = {
+        "source": sequence.name,
+        "format": "omomo",
+        **({"gender": sequence.gender} if sequence.gender else {}),
+    }
+    if sequence.object_name in TWO_PARTS:
+        provenance |= {"object": "of two parts, posed as its upper one"}
+    vectors = np.concatenate([arrays["root_orient"], arrays["pose_body"]], 1).astype(np.float64)
+    rotvec = torch.from_numpy(vectors).unflatten(1, (-1, 3))
+    motion = smpl_motion(times, smplx22(), rotvec, torch.from_numpy(_pelvis(arrays, where)), provenance)
+    known = arrays["obj_scale"] > _LEAST_SCALE
+    scale = _scale(arrays["obj_scale"][known], where)
+    mesh, center = _mesh(root, sequence.object_name, scale)
+    path = _path(arrays, times, torch.from_numpy(center), torch.from_numpy(known), where)
+    take = OneObject(sequence.name, motion, sequence.object_name, path, mesh, shape_from_arrays(arrays, where), sequence.subject,
+                     "_".join(sequence.name.split("_")[1:]))  # fmt: skip
+    return take.frames(torch.from_numpy(known))
+
+
+def _flat(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Columns where the public files have matrices of one column, and the body's joints as rows of numbers."""
+    flat = dict(arrays)
+    if "obj_trans" in flat and flat["obj_trans"].shape[1:] == (3, 1):
+        flat["obj_trans"] = flat["obj_trans"][:, :, 0]
+    if "pose_body" in flat and flat["pose_body"].shape[1:] == (21, 3):
+        flat["pose_body"] = flat["pose_body"].reshape(-1, 63)
+    return flat
+
+
+def _pelvis(arrays: dict[str, np.ndarray], where: str) -> Float64[np.ndarray, "time 3"]:
+    """Where the root joint is (m): from `trans2joint`, or else the mean body's."""
+    trans = arrays["trans"].astype(np.float64)
+    if "trans2joint" not in arrays:
+        return trans + PELVIS_SMPLX
+    offset = {"trans2joint": arrays["trans2joint"].reshape(-1)}
+    require(offset, where, trans2joint=(3,))
+    return trans - offset["trans2joint"].astype(np.float64)
+
+
+def _scale(scales: np.ndarray, where: str) -> float:
+    if not len(scales):
+        raise WearcapError(
+            "obj_scale is nowhere positive", where=where, expected="metres per unit of the mesh"
+        )
+    scale = float(np.median(scales))
+    if np.ptp(scales) > _SCALE_WITHIN * scale:
+        raise WearcapError(f"obj_scale runs from {scales.min():.4g} to {scales.max():.4g}", where=where,
+                           expected=f"one scale within {_SCALE_WITHIN:.0%}: a rigid object")  # fmt: skip
+    return scale
+
+
+def _mesh(root: str | Path, object_name: str, scale: float) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
+    """The mesh in metres about its centre, and where the centre is in the file's axes and unit."""
+    path = omomo_mesh_path(root, object_name)
+    if not path.is_file():
+        raise WearcapError(f"no mesh of {object_name}", where=path, expected=f"{MESHES}/OBJECT{MESH_ENDING}",
+                           fix="Unpack OMOMO's captured_objects beside the sequences.")  # fmt: skip
+    mesh, center = centered(read_obj(path))
+    mesh = Mesh((mesh.vertices.astype(np.float64) * scale).astype(np.float32), mesh.faces, mesh.color)
+    check_object_mesh(mesh, path)
+    return mesh, center
+
+
+def _path(
+    arrays: dict[str, np.ndarray], times: Tensor, center: Tensor, known: Tensor, where: str
+) -> Trajectory:
+    """Of the mesh's centre: scale · R · c + t."""
+    R = torch.from_numpy(arrays["obj_rot"].astype(np.float64))
+    away = (R.mT @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
+    bad = ((away > _ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)) & known
+    if bad.any():
+        raise WearcapError(f"obj_rot of frame {int(bad.nonzero()[0])} is no rotation ({int(bad.sum())} such frames)",
+                           where=where, expected="orthogonal matrices of determinant +1")  # fmt: skip
+    U, _, Vh = torch.linalg.svd(torch.where(known[:, None, None], R, torch.eye(3, dtype=R.dtype)))
+    R = U @ Vh
+    scale = torch.from_numpy(arrays["obj_scale"].astype(np.float64))
+    t = torch.from_numpy(arrays["obj_trans"].astype(np.float64)) + scale[:, None] * (R @ center)
+    return Trajectory(times, R.float(), t.float())

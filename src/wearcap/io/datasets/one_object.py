@@ -1,0 +1,60 @@
+"""What data sets of a person who handles one object have in common: body, object's path and mesh, on one clock."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.formats.smpl_axes import rotations_from_smpl
+from wearcap.recording.motion import Motion
+
+
+@dataclass(frozen=True, eq=False)
+class OneObject:
+    """One take: the body, and the object that is handled throughout. Timestamps of both agree; they may have gaps."""
+
+    name: str
+    motion: Motion
+    object_name: str
+    """The data set's own."""
+    path: Trajectory
+    """Of the mesh's axes in the world."""
+    mesh: Mesh
+    """In metres, the mean of its vertices at the origin."""
+    shape: dict[str, float]
+    subject: str
+    activity: str
+    location: str = ""
+
+    def turned(self, R_new_old: Float[Tensor, "3 3"]) -> "OneObject":
+        """The take in other world axes of the same origin."""
+        R_joints = self.motion.R_parent_joint
+        R_new = R_new_old.to(R_joints.dtype)
+        motion = replace(
+            self.motion, R_parent_joint=torch.cat([R_new @ R_joints[:, :1], R_joints[:, 1:]], 1),
+            t_world_root=self.motion.t_world_root @ R_new.mT,
+        )  # fmt: skip
+        path = self.path
+        turned = Trajectory(path.timestamps, R_new @ path.R_world_body, path.t_world_body @ R_new.mT)
+        return replace(self, motion=motion, path=turned)
+
+    def frames(self, chosen: slice | Bool[Tensor, "time"]) -> "OneObject":
+        """Some of the frames of both, by slice or mask."""
+        motion = replace(
+            self.motion, timestamps=self.motion.timestamps[chosen],
+            R_parent_joint=self.motion.R_parent_joint[chosen], t_world_root=self.motion.t_world_root[chosen],
+        )  # fmt: skip
+        return replace(self, motion=motion, path=self.path[chosen])
+
+
+def smpl_motion(
+    timestamps: Float64[Tensor, "time"], skeleton: Skeleton, rotvec: Float64[Tensor, "time joint 3"],
+    t_world_pelvis: Float64[Tensor, "time 3"], provenance: dict[str, str],
+) -> Motion:  # fmt: skip
+    """A motion of our skeleton from SMPL's rotation vectors (in SMPL's axes) and the pelvis' place (m)."""
+    R = rotations_from_smpl(rotvec)
+    return Motion(timestamps, skeleton, R.float(), t_world_pelvis.float(), provenance=provenance)

@@ -1,0 +1,1 @@
+"""Files that wearable devices and their services write."""

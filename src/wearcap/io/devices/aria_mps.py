@@ -1,0 +1,239 @@
+"""Project Aria's machine perception services (MPS): head trajectory and semi-dense points from CSV files.
+
+Frames: `aria` is MPS's own device frame (on Gen 1 glasses the left SLAM camera), `cpf` the central pupil frame
+(x left, y up, z forward, midway between the pupils), `device` that same point in the house's head axes
+(x forward, y left, z up), which is what a `HeadStream` holds.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.io.formats.csv_table import iter_columns, read_columns
+from wearcap.io.formats.poses import check_finite, checked_trajectory
+from wearcap.recording import HeadStream, PointCloud, Recording
+
+MAX_INV_DIST_STD, MAX_DIST_STD = 0.005, 0.01
+"""Semi-dense points with a larger standard deviation (1/m, m) are left out."""
+
+T_HEAD_DEVICE = Rigid(torch.eye(3), torch.tensor([0.09, 0.0, 0.075]))
+"""Assumed where nothing is calibrated: the pupils' midpoint before and above the head joint, axes parallel (ours)."""
+
+_MAX_DURATION_S = 12 * 3600
+R_CPF_DEVICE = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+"""House head axes (x forward, y left, z up) in the central pupil frame (x left, y up, z forward)."""
+
+_SUFFIXES = ("", ".gz", ".xz")
+_TRAJECTORY = ("closed_loop_trajectory.csv",)
+_POINTS = ("semidense_points.csv", "global_points.csv")
+_OBSERVATIONS = ("semidense_observations.csv",)
+_SUBFOLDERS = (".", "slam", "trajectory", "mps/slam", "mps/trajectory")
+
+
+def nominal_T_aria_cpf() -> Rigid:
+    """CAD pose of the central pupil frame in the device frame of Gen 1 glasses, small size ("DVT-S").
+
+    The large size differs by 2.4 mm; a VRS file's calibration gives the wearer's own (io/devices/aria_vrs.py).
+    Source: projectaria_tools, DeviceCadExtrinsics, row camera-slam-left (position, y axis, z axis in cpf).
+    """
+    y = torch.nn.functional.normalize(torch.tensor([0.793353, 0.0, -0.608761], dtype=torch.float64), dim=0)
+    z = torch.nn.functional.normalize(
+        torch.tensor([0.607927, -0.052336, 0.792266], dtype=torch.float64), dim=0
+    )
+    x = torch.linalg.cross(y, z)
+    R_cpf_aria = torch.stack([x, torch.linalg.cross(z, x), z], 1)
+    T_cpf_aria = Rigid(R_cpf_aria, torch.tensor([0.069051, 0.002372, 0.009254], dtype=torch.float64))
+    return T_cpf_aria.inverse().to(torch.float32)
+
+
+@dataclass(frozen=True)
+class MpsTrajectory:
+    """A closed-loop trajectory as the file has it: poses of the `aria` frame in a world with z up."""
+
+    T_world_aria: Trajectory
+    vel_aria: Float[Tensor, "time 3"]
+    """Velocity in the device's axes (m/s)."""
+    angvel_aria: Float[Tensor, "time 3"]
+    """Angular velocity in the device's axes (rad/s)."""
+    quality: Float[Tensor, "time"]
+    """MPS's own score, 0 … 1."""
+
+
+def read_closed_loop(path: str | Path, *, up: str = "z") -> MpsTrajectory:
+    """Read `closed_loop_trajectory.csv` (plain, .gz, .xz), the world's axis `up` ("z"; ADT: "y") turned to z.
+
+    Raises WearcapError for missing columns, NaN, unsorted times, quaternions far from unit norm, gravity that does
+    not point against `up`, and several unconnected world frames.
+    """
+    pose = [f"{part}_world_device" for part in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")]
+    velocity = [f"device_linear_velocity_{axis}_device" for axis in "xyz"]
+    spin = [f"angular_velocity_{axis}_device" for axis in "xyz"]
+    gravity = [f"gravity_{axis}_world" for axis in "xyz"]
+    time, quality = "tracking_timestamp_us", "quality_score"
+    table = read_columns(path, [time, *pose, *velocity, *spin, *gravity, quality], text=["graph_uid"])
+    columns = {key: np.stack([table[name] for name in names], 1)
+               for key, names in {"pose": pose, "velocity": velocity, "spin": spin, "gravity": gravity}.items()}  # fmt: skip
+    check_finite({**columns, quality: table[quality]}, path)
+    if len(graphs := np.unique(table["graph_uid"])) > 1:
+        raise WearcapError(f"{len(graphs)} unconnected world frames (graph_uid)", where=path, expected="one",
+                           fix="Keep the rows of one graph_uid.")  # fmt: skip
+    _check_gravity(columns["gravity"], up, path)
+    trajectory = checked_trajectory(table[time] * 1e-6, columns["pose"][:, :3], columns["pose"][:, 3:], path)
+    T_turned = Rigid(turn_up(up), torch.zeros(3)) @ trajectory.T_world_body
+    return MpsTrajectory(
+        Trajectory(trajectory.timestamps, T_turned.R, T_turned.t),
+        torch.tensor(columns["velocity"], dtype=torch.float32),
+        torch.tensor(columns["spin"], dtype=torch.float32),
+        torch.tensor(table[quality], dtype=torch.float32),
+    )
+
+
+def turn_up(up: str) -> Float[Tensor, "3 3"]:
+    """Rotation of a right-handed world whose `up` axis is "y" or "z" into one with z up (x stays x)."""
+    if up not in ("y", "z"):
+        raise WearcapError(f"up axis {up!r}", expected="'y' or 'z'")
+    if up == "z":
+        return torch.eye(3)
+    return torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def _check_gravity(gravity: np.ndarray, up: str, where: str | Path) -> None:
+    mean = gravity.mean(0)
+    length = np.linalg.norm(mean)
+    if not 9.7 < length < 9.9:
+        raise WearcapError(f"gravity is {length:.2f} m/s² long", where=where, expected="9.81 m/s²")
+    upward = -mean / length
+    if upward["xyz".index(up)] < 0.99:
+        axis = "xyz"[int(np.abs(upward).argmax())]
+        sign = "-" if upward["xyz".index(axis)] < 0 else "+"
+        raise WearcapError(
+            f"gravity {mean.round(2).tolist()} says that {sign}{axis} is up", where=where, expected=f"+{up} up",
+            fix="Read it with up='y'." if (axis, sign) == ("y", "+") else "Turn the world, or mend gravity's sign.",
+        )  # fmt: skip
+
+
+def head_stream(
+    trajectory: Trajectory,
+    *,
+    fps: float | None,
+    T_aria_cpf: Rigid | None = None,
+    T_head_device: Rigid | None = None,
+    where: str | Path | None = None,
+) -> HeadStream:
+    """Head stream of a trajectory of the `aria` frame, turned to head axes at the pupils' midpoint.
+
+    `fps` resamples evenly from the first timestamp (Hz; None keeps the file's 1 kHz). `T_aria_cpf` defaults to the
+    nominal CAD pose, `T_head_device` to `T_HEAD_DEVICE`. Raises WearcapError, naming `where`, for poses over more than
+    half a day.
+    """
+    if fps is not None:
+        start, stop = trajectory.timestamps[0].item(), trajectory.timestamps[-1].item()
+        if stop - start > _MAX_DURATION_S:
+            raise WearcapError(f"poses over {(stop - start) / 3600:.3g} hours", where=where, expected="a recording of less than half a day",
+                               fix="A time stamp is damaged, or two recordings stand in one file: cut it.")  # fmt: skip
+        count = int((stop - start) * fps + 1e-6) + 1
+        trajectory = resample(trajectory, start + torch.arange(count, dtype=torch.float64) / fps)
+    T_aria_cpf = T_aria_cpf or nominal_T_aria_cpf()
+    T_world_device = trajectory.T_world_body @ T_aria_cpf @ Rigid(R_CPF_DEVICE, torch.zeros(3))
+    T_head_device = T_head_device or T_HEAD_DEVICE
+    return HeadStream(
+        trajectory.timestamps, T_world_device.R, T_world_device.t, T_head_device.R, T_head_device.t
+    )
+
+
+def read_points(
+    path: str | Path,
+    *,
+    max_inv_dist_std: float = MAX_INV_DIST_STD,
+    max_dist_std: float = MAX_DIST_STD,
+    up: str = "z",
+    observations: str | Path | None = None,
+) -> PointCloud:
+    """Semi-dense points that MPS is sure of; confidence 1 - inv_dist_std / max_inv_dist_std (ours), 0 … 1.
+
+    `observations` is the file that says when points were seen (`semidense_observations.csv`, tens of millions of rows,
+    read in pieces): `first_seen` comes from it, and points that it does not name are left out.
+    Raises WearcapError for missing columns or NaN positions, and for the observations of another recording.
+    """
+    position = [f"p{axis}_world" for axis in "xyz"]
+    table = read_columns(path, [*position, "inv_dist_std", "dist_std"], whole=["uid"] if observations else [])
+    points = np.stack([table[name] for name in position], 1)
+    check_finite({"position": points}, path)
+    keep = (table["inv_dist_std"] < max_inv_dist_std) & (table["dist_std"] < max_dist_std)
+    first_seen = None
+    if observations is not None:
+        seen = _first_seen(observations, table["uid"])
+        keep &= np.isfinite(seen)
+        first_seen = torch.from_numpy(seen[keep])
+    confidence = 1 - table["inv_dist_std"][keep] / max_inv_dist_std
+    points_world = torch.tensor(points[keep], dtype=torch.float32) @ turn_up(up).T
+    return PointCloud(points_world, torch.tensor(confidence, dtype=torch.float32), first_seen)
+
+
+def _first_seen(path: str | Path, uid: np.ndarray) -> np.ndarray:
+    """When each point was first observed (s, the device's clock); infinite for points without an observation."""
+    order = np.argsort(uid, kind="stable")
+    known = uid[order]
+    first_us = np.full(len(uid), np.iinfo(np.int64).max)
+    for rows in iter_columns(path, [], whole=["uid", "frame_tracking_timestamp_us"]):
+        place = np.minimum(np.searchsorted(known, rows["uid"]), len(known) - 1)
+        named = known[place] == rows["uid"]
+        np.minimum.at(first_us, place[named], rows["frame_tracking_timestamp_us"][named])
+    if (first_us == np.iinfo(np.int64).max).all():
+        raise WearcapError(
+            "names none of the points", where=path, expected="the observations of the same recording"
+        )
+    seen = np.empty(len(uid))
+    seen[order] = np.where(first_us < np.iinfo(np.int64).max, first_us * 1e-6, np.inf)
+    return seen
+
+
+def find_mps_file(folder: str | Path, names: tuple[str, ...]) -> Path | None:
+    """First of `names` (plain, .gz, .xz) in an MPS folder or its usual subfolders; None where there is none."""
+    for subfolder in _SUBFOLDERS:
+        for name in names:
+            for suffix in _SUFFIXES:
+                if (path := Path(folder) / subfolder / f"{name}{suffix}").is_file():
+                    return path
+    return None
+
+
+def is_mps_folder(folder: str | Path) -> bool:
+    """Whether a folder holds a closed-loop trajectory."""
+    return find_mps_file(folder, _TRAJECTORY) is not None
+
+
+def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid | None = None) -> Recording:
+    """Recording of an MPS output folder: head stream at `fps` (Hz) and, where there are any, points.
+
+    Raises WearcapError when there is no closed-loop trajectory, or a file is not as documented.
+    """
+    path = find_mps_file(folder, _TRAJECTORY)
+    if path is None:
+        raise WearcapError("no closed_loop_trajectory.csv (plain, .gz or .xz)", where=folder,
+                           expected="the output folder of Aria's MPS")  # fmt: skip
+    head = head_stream(read_closed_loop(path).T_world_aria, fps=fps, T_aria_cpf=T_aria_cpf, where=path)
+    return Recording(
+        name=Path(folder).resolve().name, head=head, points=read_mps_points(folder), source="Aria MPS"
+    )
+
+
+def read_mps_points(folder: str | Path) -> PointCloud | None:
+    """Points of an MPS output folder, with the time of their first observation where that file is there, too."""
+    points = find_mps_file(folder, _POINTS)
+    if points is None:
+        return None
+    return read_points(points, observations=find_mps_file(folder, _OBSERVATIONS))
+
+
+def mps_files(folder: str | Path) -> list[Path]:
+    """The files that `read_mps` reads of a folder."""
+    found = (find_mps_file(folder, names) for names in (_TRAJECTORY, _POINTS, _OBSERVATIONS))
+    return [path for path in found if path is not None]

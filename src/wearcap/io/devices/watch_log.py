@@ -1,0 +1,127 @@
+"""Motion logs of a watch: SensorLog's CSV, and Sensor Logger's or Apple Watch's WristMotion.csv (MocapEvery §4.2).
+
+Both hold what Core Motion says: attitude, turn rate, the direction of gravity and the acceleration without it. What a
+file's numbers mean is found in the numbers: their unit by the length of gravity, whether the attitude leads from the
+watch to the world or back by which of the two turns gravity upright, and the sign by whether gravity points down
+(Core Motion, whose accelerations have the sign reversed: at rest it says -1 g along the axis that is up) or up.
+"""
+
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.rotation import matrix_from_quat_wxyz
+from wearcap.io.formats.csv_table import read_columns, read_header
+from wearcap.recording import ImuStream
+
+G_M_S2 = 9.80665
+MIN_RATE_HZ = 20.0
+UPRIGHT = 0.98
+"""Length of the mean direction of gravity in the world, and its share along z, that a sound log has at least."""
+WRISTS = ("left_wrist", "right_wrist")
+_XYZ = ("X", "Y", "Z")
+_SENSOR_LOGGER = {
+    "turn": [f"rotationRate{axis}" for axis in _XYZ], "gravity": [f"gravity{axis}" for axis in _XYZ],
+    "free": [f"acceleration{axis}" for axis in _XYZ], "quaternion": [f"quaternion{axis}" for axis in "WXYZ"],
+}  # fmt: skip
+_SENSOR_LOG = {
+    "turn": [f"motionRotationRate{axis}(rad/s)" for axis in _XYZ],
+    "whole": [f"accelerometerAcceleration{axis}(G)" for axis in _XYZ],
+    "free": [f"motionUserAcceleration{axis}(G)" for axis in _XYZ], "quaternion": [f"motionQuaternion{axis}(R)" for axis in "WXYZ"],
+}  # fmt: skip
+
+
+def read_watch_log(path: str | Path, joint: str) -> ImuStream:
+    """A watch's stream: attitude in a world whose z is up, free acceleration there (m/s²), what it felt itself, turn rate.
+
+    Timestamps are seconds since 1970. The world's heading is the watch's own and arbitrary.
+    Raises WearcapError for a joint that is no wrist, a file that is neither format, times that do not grow, values that
+    are not finite, gravity that is neither 1 g nor 9.8 m/s² long, or that no reading of the attitude turns upright.
+    """
+    if joint not in WRISTS:
+        raise WearcapError(f"a watch on {joint!r}", where=path, expected=" or ".join(WRISTS))
+    seconds, parts = _columns(path)
+    _require_times(seconds, path)
+    for name, values in parts.items():
+        if not np.isfinite(values).all():
+            row = int(np.flatnonzero(~np.isfinite(values).all(1))[0])
+            raise WearcapError(f"{name} of row {row} is not finite", where=path, expected="numbers")
+    gravity = parts["gravity"] if "gravity" in parts else parts["whole"] - parts["free"]
+    unit = _unit(gravity, path)
+    R, upright = _attitude(parts["quaternion"], gravity, path)
+    # Core Motion's gravity points down, and its accelerations are what would have to be undone.
+    free, felt = np.sign(upright) * unit * parts["free"], np.sign(upright) * unit * (parts["free"] + gravity)
+    turn = torch.from_numpy(parts["turn"]).float() if "turn" in parts else None
+    return ImuStream(
+        torch.from_numpy(seconds), joint, torch.from_numpy(R).float(), acc_world=torch.from_numpy(np.einsum("tij,tj->ti", R, free)).float(),
+        acc_imu=torch.from_numpy(felt).float(), gyro_imu=turn,
+    )  # fmt: skip
+
+
+def _columns(path: str | Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Time in seconds, and groups of columns."""
+    header = read_header(path)
+    if "quaternionW" in header:
+        groups, time = _SENSOR_LOGGER, "time"
+        table = read_columns(path, [name for group in groups.values() for name in group], whole=[time])
+        seconds = table[time] / 1e9
+    elif "motionQuaternionW(R)" in header:
+        # Which of Core Motion's other outputs are logged is the wearer's choice.
+        groups = {name: group for name, group in _SENSOR_LOG.items() if name != "turn" or set(group) <= set(header)}  # fmt: skip
+        time = "loggingTime(txt)"
+        table = read_columns(path, [name for group in groups.values() for name in group], text=[time])
+        seconds = np.array([_seconds(text, row, path) for row, text in enumerate(table[time])])
+    else:
+        raise WearcapError("not a watch's motion log", where=path,
+                           expected="SensorLog's CSV (motionQuaternionW(R), …) or WristMotion.csv (quaternionW, …)",
+                           fix="Switch on device motion when you record.")  # fmt: skip
+    return seconds, {name: np.stack([table[column] for column in group], 1) for name, group in groups.items()}
+
+
+def _seconds(text: bytes, row: int, path: str | Path) -> float:
+    try:
+        return datetime.fromisoformat(text.decode().strip().replace(" +", "+").replace(" -", "-")).timestamp()
+    except ValueError as error:
+        raise WearcapError(f"time {text.decode()!r} in row {row}", where=path,
+                           expected="such as 2024-05-01T12:00:00.123+02:00") from error  # fmt: skip
+
+
+def _require_times(seconds: np.ndarray, path: str | Path) -> None:
+    if len(seconds) < 2:
+        raise WearcapError(f"{len(seconds)} rows", where=path, expected="at least 2")
+    step = np.diff(seconds)
+    if (step <= 0).any():
+        row = int(np.flatnonzero(step <= 0)[0]) + 1
+        raise WearcapError(f"time does not grow at row {row} ({step[row - 1]:+.3f} s)", where=path,
+                           fix="Sort the rows by time and leave repeated ones out.")  # fmt: skip
+    if np.median(step) > 1 / MIN_RATE_HZ:
+        raise WearcapError(f"{1 / np.median(step):.1f} rows a second", where=path,
+                           expected=f"at least {MIN_RATE_HZ:g}", fix="Log at 30 Hz or more.")  # fmt: skip
+
+
+def _unit(gravity: np.ndarray, path: str | Path) -> float:
+    """m/s² per unit of the file's accelerations."""
+    length = float(np.median(np.linalg.norm(gravity, axis=1)))
+    for unit in (G_M_S2, 1.0):
+        if abs(length * unit / G_M_S2 - 1) < 0.1:
+            return unit
+    raise WearcapError(f"gravity of length {length:.3g}", where=path, expected="1 (g) or 9.8 (m/s²)")
+
+
+def _attitude(quaternion: np.ndarray, gravity: np.ndarray, path: str | Path) -> tuple[np.ndarray, float]:
+    """R_world_imu, and the share of gravity along the world's z: about 1 or -1."""
+    length = np.linalg.norm(quaternion, axis=1)
+    if (np.abs(length - 1) > 0.01).any():
+        row = int(np.argmax(np.abs(length - 1)))
+        raise WearcapError(f"attitude of length {length[row]:.3g} in row {row}", where=path, expected="1")
+    R = matrix_from_quat_wxyz(torch.from_numpy(quaternion)).numpy()
+    down = gravity / np.linalg.norm(gravity, axis=1, keepdims=True).clip(1e-9)
+    there, back = (float((turned @ down[..., None])[:, 2, 0].mean()) for turned in (R, R.swapaxes(1, 2)))
+    best = max(abs(there), abs(back))
+    if best < UPRIGHT:
+        raise WearcapError(f"the attitude turns gravity {best:.2f} upright", where=path, expected=f"at least {UPRIGHT}",
+                           fix="Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame.")  # fmt: skip
+    return (R, there) if abs(there) >= abs(back) else (np.ascontiguousarray(R.swapaxes(1, 2)), back)

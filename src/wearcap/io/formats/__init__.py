@@ -1,0 +1,1 @@
+"""Files that programs exchange: motions, meshes, clouds, pictures, tables."""

@@ -1,0 +1,382 @@
+"""Acclaim ASF (skeleton) and AMC (motion), the format of the CMU and HDM05 motion capture databases.
+
+A bone's rotation is L = C · R(dof) · C⁻¹ with C the bone's own axes in the bind pose; G = G_parent · L; a bone ends at
+its parent's end + G · direction · length. Files are y up with the body facing +z at rest, in degrees and inches over
+the file's length scale (CMU: 1 unit = 0.0254 / 0.45 m).
+"""
+
+import math
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import chain, islice
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from wearcap.body.skeleton import Site, Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry.rotation import about_axis
+from wearcap.io.formats.text import at_line, finite_floats, is_finite_number, numbered_lines
+from wearcap.recording.motion import Motion
+
+R_WORLD_FILE = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+"""From the file's axes (x left, y up, z forward) into ours (x forward, y left, z up)."""
+
+INCH_M = 0.0254
+MAX_BONES = 2000
+ROTATIONS = ("rx", "ry", "rz")
+SIDES = {"l": "left", "r": "right"}
+END_SITES = {"toes": "toe_tip", "fingers": "fingertip", "thumb": "thumb_tip"}
+HEEL_BACK, HEEL_DOWN = 0.35, 0.45
+"""Heel behind and below the ankle joint, as fractions of the foot bone (the file has no heel)."""
+
+
+@dataclass
+class _Bone:
+    name: str
+    line: int
+    direction: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    length: float = 0.0
+    axis_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    order: str = "xyz"
+    dof: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class AsfSkeleton:
+    """What an AMC file needs to know of its ASF; per joint in the order of `skeleton.joint_names`."""
+
+    skeleton: Skeleton
+    dof: tuple[tuple[str, ...], ...]
+    """Channels of each joint as the AMC lists them ("tx" … "rz")."""
+    order: tuple[str, ...]
+    """Order in which a joint's rotations act on the bone: "xyz" means Rz · Ry · Rx."""
+    R_bind_axis: Float64[Tensor, "joint 3 3"]
+    """C: each joint's own axes in the bind pose, in the file's axes."""
+    t_root: Float64[Tensor, "3"]
+    """Position of the root when its channels are zero, in the file's axes (m)."""
+    unit_m: float
+    radians: bool
+
+
+def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton:
+    """Read an .asf file (plain, .gz or .xz).
+
+    `unit_m` is the length of one unit in metres; by default an inch over the file's `length`. The skeleton is called
+    "cmu31" when its nodes are CMU's, else by the file's name; each joint is a node's START, rest is the bind pose, and
+    the ends of leaf bones are sites. Raises WearcapError naming file and line.
+    """
+    path = Path(path)
+    units, root, bones, hierarchy = _parse_asf(path)
+    unit_m = INCH_M / units["length"] if unit_m is None else unit_m
+    radians = bool(units["radians"])
+    names, parents = _tree_order(path, bones, hierarchy)
+    table = [root, *(bones[name] for name in names[1:])]
+    ends = torch.tensor([bone.direction for bone in table], dtype=torch.float64)
+    lengths = torch.tensor([bone.length for bone in table], dtype=torch.float64)
+    ends = ends * lengths[:, None] * unit_m @ R_WORLD_FILE.T
+    offsets = ends[[max(parent, 0) for parent in parents]]
+    offsets[0] = 0
+    leaves = {name: ends[joint] for joint, name in enumerate(names) if joint not in parents}
+    skeleton = Skeleton(
+        "cmu31" if set(names) == CMU_NODES else path.name.split(".")[0], tuple(names), tuple(parents),
+        offsets.float(), _sites(names, ends, leaves),
+    )  # fmt: skip
+    to_rad = 1.0 if radians else math.pi / 180
+    angles = to_rad * torch.tensor([bone.axis_deg for bone in table], dtype=torch.float64)
+    order = tuple(bone.order for bone in table)
+    return AsfSkeleton(
+        skeleton, tuple(bone.dof for bone in table), order, _euler(angles, order),
+        unit_m * torch.tensor(root.direction, dtype=torch.float64), unit_m, radians,
+    )  # fmt: skip
+
+
+def read_amc(asf: AsfSkeleton, path: str | Path, fps: float | int = 120) -> Motion:
+    """Read an .amc file (plain, .gz or .xz) of this skeleton; the format carries no frame rate, CMU's is 120.
+
+    Timestamps start at 0 and follow the file's frame numbers, so that dropped frames show as gaps.
+    Raises WearcapError naming file and line.
+    """
+    path = Path(path)
+    if not (math.isfinite(fps) and fps > 0):
+        raise WearcapError(f"frame rate {fps}", where=path, expected="a positive number of frames per second")
+    frames, joints, values = _parse_amc(path, asf)
+    channels = [(joint, dof) for joint in joints for dof in asf.dof[joint]]
+    angles = torch.zeros(len(values), len(asf.skeleton), 3, dtype=torch.float64)
+    t_root = asf.t_root.expand(len(values), 3).clone()
+    for column, (joint, dof) in enumerate(channels):
+        axis = "xyz".index(dof[1])
+        if dof[0] == "r":
+            angles[:, joint, axis] = values[:, column]
+        else:
+            t_root[:, axis] += asf.unit_m * values[:, column]
+    R = _euler(angles if asf.radians else angles * (math.pi / 180), asf.order)
+    C = asf.R_bind_axis
+    # The root's own axes are its starting orientation: they turn the body and are not undone.
+    undo = torch.cat([torch.eye(3, dtype=torch.float64)[None], C[1:].transpose(-1, -2)])
+    R = (R_WORLD_FILE @ C) @ R @ (undo @ R_WORLD_FILE.T)
+    return Motion(
+        torch.from_numpy((frames - frames[0]) / fps), asf.skeleton, R.float(), (t_root @ R_WORLD_FILE.T).float(),
+        provenance={"source": path.name, "format": "amc"},
+    )  # fmt: skip
+
+
+def _euler(
+    angles: Float[Tensor, "*batch joint 3"], order: tuple[str, ...]
+) -> Float[Tensor, "*batch joint 3 3"]:
+    """Product of the rotations about x, y, z (rad), the first axis of each joint's `order` acting first."""
+    R = torch.empty(*angles.shape, 3, dtype=angles.dtype)
+    for axes in set(order):
+        joints = [joint for joint, own in enumerate(order) if own == axes]
+        first, second, third = (about_axis(axis, angles[..., joints, "xyz".index(axis)]) for axis in axes)
+        R[..., joints, :, :] = third @ second @ first
+    return R
+
+
+# --- ASF -----------------------------------------------------------------------------------------------------------
+
+
+def _parse_asf(path: Path):
+    """Sections of an ASF file: units, root, bones by name, hierarchy as (line, words)."""
+    units, root = {"length": 1.0, "radians": 0.0}, _Bone("root", 1)
+    bones: dict[str, _Bone] = {}
+    hierarchy: list[tuple[int, list[str]]] = []
+    section, bone, number = "", None, 0
+    for number, text in numbered_lines(path):
+        words = text.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            if words[0].startswith(":"):
+                section, bone = words[0].lower(), None
+            elif section == ":units":
+                _read_unit(units, words)
+            elif section == ":root":
+                _read_root(root, words)
+            elif section == ":bonedata" and words[0] == "begin":
+                bone = _Bone("", number)
+            elif section == ":bonedata" and words[0] == "end" and bone is not None:
+                _close_bone(bones, bone)
+                bone = None
+            elif section == ":bonedata" and bone is not None:
+                _read_bone(bone, words)
+            elif section == ":hierarchy" and words[0] not in ("begin", "end"):
+                hierarchy.append((number, words))
+                if max(len(hierarchy), len(words)) > MAX_BONES:
+                    raise ValueError(f"more than {MAX_BONES} bones")
+        except (ValueError, IndexError) as error:
+            raise WearcapError(
+                f"cannot read {text.strip()[:80]!r} ({error})",
+                where=at_line(path, number),
+                expected="Acclaim ASF",
+            ) from error
+    if bone is not None or not bones or not hierarchy:
+        raise WearcapError("bones or hierarchy are missing or cut short", where=at_line(path, number),
+                           expected="an ASF file with :bonedata and :hierarchy", fix="Fetch the file again.")  # fmt: skip
+    return units, root, bones, hierarchy
+
+
+def _read_unit(units: dict[str, float], words: list[str]) -> None:
+    if words[0] == "length":
+        units["length"] = float(finite_floats(words[1:2])[0])
+        if not units["length"] > 0:
+            raise ValueError("the length unit must be positive")
+    elif words[0] == "angle":
+        units["radians"] = float(words[1].lower().startswith("rad"))
+
+
+def _read_root(root: _Bone, words: list[str]) -> None:
+    if words[0] == "order":
+        root.dof = _channels(words[1:], ("tx", "ty", "tz", *ROTATIONS))
+    elif words[0] == "axis":
+        root.order = _order(words[1])
+    elif words[0] == "position":
+        root.direction = _three(words[1:4])
+    elif words[0] == "orientation":
+        root.axis_deg = _three(words[1:4])
+
+
+def _read_bone(bone: _Bone, words: list[str]) -> None:
+    if words[0] == "name":
+        bone.name = words[1]
+    elif words[0] == "direction":
+        bone.direction = _three(words[1:4])
+    elif words[0] == "length":
+        bone.length = float(finite_floats(words[1:2])[0])
+    elif words[0] == "axis":
+        bone.axis_deg, bone.order = _three(words[1:4]), _order(words[4])
+    elif words[0] == "dof":
+        bone.dof = _channels(words[1:], ROTATIONS)
+
+
+def _close_bone(bones: dict[str, _Bone], bone: _Bone) -> None:
+    if not bone.name or bone.name == "root" or bone.name in bones:
+        raise ValueError(f"the bone begun in line {bone.line} has no name of its own")
+    if len(bones) >= MAX_BONES:
+        raise ValueError(f"more than {MAX_BONES} bones")
+    bones[bone.name] = bone
+
+
+def _three(words: list[str]) -> list[float]:
+    values = finite_floats(words)
+    if len(values) != 3:
+        raise ValueError("three numbers are needed")
+    return values.tolist()
+
+
+def _order(word: str) -> str:
+    if sorted(word.lower()) != ["x", "y", "z"]:
+        raise ValueError(f"axis order {word!r} is not a permutation of XYZ")
+    return word.lower()
+
+
+def _channels(words: list[str], known: tuple[str, ...]) -> tuple[str, ...]:
+    channels = tuple(word.lower() for word in words)
+    if len(set(channels)) != len(channels) or not set(channels) <= set(known):
+        raise ValueError(f"channels must be different ones of {' '.join(known)}")
+    return channels
+
+
+def _tree_order(path: Path, bones: dict[str, _Bone], hierarchy: list[tuple[int, list[str]]]):
+    """Names with parents before children (depth first, as the file lists them), and each one's parent."""
+    children: dict[str, list[str]] = {}
+    seen = {"root"}
+    for line, (parent, *below) in hierarchy:
+        for name in below:
+            if name not in bones or name in seen:
+                raise WearcapError(f"bone {name!r} is unknown or has two parents", where=at_line(path, line),
+                                   expected="every bone of :bonedata once below a parent")  # fmt: skip
+            seen.add(name)
+        children.setdefault(parent, []).extend(below)
+    names, parents = ["root"], [-1]
+    stack = [(name, 0) for name in reversed(children.get("root", []))]
+    while stack:
+        name, parent = stack.pop()
+        names.append(name)
+        parents.append(parent)
+        stack += [(child, len(names) - 1) for child in reversed(children.get(name, []))]
+    if missing := sorted(set(bones) - set(names)):
+        raise WearcapError(f"bones {missing[:5]} do not hang on the root", where=path,
+                           expected="one tree below 'root' in :hierarchy")  # fmt: skip
+    return names, parents
+
+
+CMU_NODES = {"root", "lowerback", "upperback", "thorax", "lowerneck", "upperneck", "head"} | {
+    side + part
+    for side in SIDES
+    for part in ("hipjoint", "femur", "tibia", "foot", "toes", "clavicle", "humerus", "radius", "wrist", "hand",
+                 "fingers", "thumb")
+}  # fmt: skip
+
+
+def _sites(names: list[str], ends: Tensor, leaves: dict[str, Tensor]) -> dict[str, Site]:
+    """Ends of the leaf bones, and for CMU's bone names the heels and palms."""
+    sites = {}
+    for name, end in leaves.items():
+        known = END_SITES.get(name[1:]) if name[0] in SIDES else None
+        site = f"{SIDES[name[0]]}_{known}" if known else "crown" if name == "head" else f"{name}_end"
+        sites[site] = Site(name, tuple(end.tolist()))
+    for letter, side in SIDES.items():
+        if {letter + "foot", letter + "tibia"} <= set(names):
+            sites[f"{side}_heel"] = Site(
+                letter + "foot", _heel(*(ends[names.index(letter + part)] for part in ("foot", "tibia")))
+            )
+        if letter + "hand" in names:
+            sites[f"{side}_palm"] = Site(letter + "hand", tuple(ends[names.index(letter + "hand")].tolist()))
+    return sites
+
+
+def _heel(foot: Float[Tensor, "3"], shin: Float[Tensor, "3"]) -> tuple[float, ...]:
+    """The heel from the ankle: backwards and down, where "down" runs on along the shin (bind poses stand astride)."""
+    down = shin / shin.norm().clamp(min=1e-9)
+    forward = foot - (foot @ down) * down
+    forward = forward / forward.norm().clamp(min=1e-9)
+    return tuple((foot.norm() * (HEEL_DOWN * down - HEEL_BACK * forward)).tolist())
+
+
+# --- AMC -----------------------------------------------------------------------------------------------------------
+
+
+def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Float64[Tensor, "time channel"]]:
+    """Frame numbers, joints in the file's order, and all channel values; every frame must be laid out like the first."""
+    lines = _amc_lines(path, asf)
+    beginning = list(islice(lines, 1))
+    first, following = [], []
+    for number, words in lines:
+        if words[0][0].isdigit():
+            following = [(number, words)]
+            break
+        first.append((number, words))
+        if len(first) > MAX_BONES:
+            raise WearcapError(f"more than {MAX_BONES} bones", where=at_line(path, number))
+    number = beginning[0][0] if beginning else 1
+    joints = _layout_joints(path, asf, number, first)
+    frames, values, place = array("q"), array("d"), 0
+    for row, (number, words) in enumerate(chain(beginning, first, following, lines)):
+        place = row % (len(first) + 1)
+        if place == 0:
+            _take_frame_number(frames, words, path, number)
+        else:
+            _take_values(values, words, first[place - 1][1], path, number)
+    if place < len(first):
+        raise WearcapError("the last frame is cut short", where=at_line(path, number),
+                           expected=f"{len(first)} bones per frame", fix="Fetch the file again.")  # fmt: skip
+    return np.array(frames), joints, torch.from_numpy(np.array(values).reshape(len(frames), -1))
+
+
+def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
+    """Numbers and words of the lines from the first frame on."""
+    begun = False
+    for number, line in numbered_lines(path):
+        words = line.split()
+        if not begun and line.strip().upper() == (":DEGREES" if asf.radians else ":RADIANS"):
+            raise WearcapError(
+                "its angles are in another unit than the ASF's", where=path, expected="one unit in both"
+            )
+        begun = begun or (bool(words) and words[0][0] not in "#:")
+        if begun and words:
+            yield number, words
+
+
+def _take_frame_number(frames: "array[int]", words: list[str], path: Path, line: int) -> None:
+    sound = len(words) == 1 and words[0].isdecimal() and len(words[0]) <= 15
+    if not sound or (frames and int(words[0]) <= frames[-1]):
+        raise WearcapError(f"{' '.join(words)[:60]!r} where a frame number should stand", where=at_line(path, line),
+                           expected="rising frame numbers")  # fmt: skip
+    frames.append(int(words[0]))
+
+
+def _take_values(values: "array[float]", words: list[str], like: list[str], path: Path, line: int) -> None:
+    """A bone's values, whose name and number must be those of the first frame."""
+    if words[0] != like[0] or len(words) != len(like):
+        raise WearcapError(f"{' '.join(words)[:60]!r} differs from the first frame", where=at_line(path, line),
+                           expected=f"{like[0]!r} with {len(like) - 1} values")  # fmt: skip
+    try:
+        found = list(map(float, words[1:]))
+    except ValueError:
+        found = [math.nan]
+    if not all(map(math.isfinite, found)):
+        bad = next(word for word in words[1:] if not is_finite_number(word))
+        raise WearcapError(f"{bad[:30]!r} is no finite number", where=at_line(path, line))
+    values.extend(found)
+
+
+def _layout_joints(path: Path, asf: AsfSkeleton, start: int, first: list[tuple[int, list[str]]]) -> list[int]:
+    """Joints of the first frame, which begins in line `start`, checked against the skeleton's channels."""
+    names = [words[0] for _, words in first]
+    for line, (name, *values) in first:
+        if name not in asf.skeleton.joint_names or names.count(name) > 1:
+            raise WearcapError(f"bone {name!r} is not in the ASF, or comes twice", where=at_line(path, line),
+                               expected="bones of the skeleton, once per frame", fix="Check that AMC and ASF belong together.")  # fmt: skip
+        if len(values) != (expected := len(asf.dof[asf.skeleton.index(name)])):
+            raise WearcapError(f"{len(values)} values for {name!r}", where=at_line(path, line),
+                               expected=f"{expected} as the ASF says")  # fmt: skip
+    moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
+    if not names or moving - set(names):
+        raise WearcapError(f"the first frame lacks {sorted(moving - set(names))[:5]}", where=at_line(path, start),
+                           expected="every bone that has channels in the ASF")  # fmt: skip
+    return [asf.skeleton.index(name) for name in names]

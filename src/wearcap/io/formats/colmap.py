@@ -1,0 +1,315 @@
+"""Models of COLMAP (text and binary): calibrated photos with their poses, and the tracks of 3D points they saw.
+
+COLMAP puts the centre of the first pixel at (0.5, 0.5); here it is at (0, 0), and pixels are shifted accordingly.
+The model's unit and axes are left as they are: structure from motion knows neither metres nor gravity.
+"""
+
+import math
+import struct
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import roma
+import torch
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
+from wearcap.io.formats.bounded import read_bytes
+from wearcap.io.formats.text import at_line, finite_floats, numbered_lines
+from wearcap.recording.photo import Photo
+
+_MAX_BYTES = 1 << 34
+"""Largest binary file that is read (16 GiB)."""
+_MODELS = {
+    "SIMPLE_PINHOLE": ("pinhole", 3), "PINHOLE": ("pinhole", 4), "SIMPLE_RADIAL": ("opencv", 4),
+    "RADIAL": ("opencv", 5), "OPENCV": ("opencv", 8), "OPENCV_FISHEYE": ("fisheye", 8),
+}  # fmt: skip
+"""Our model, and how many parameters COLMAP's has."""
+_BY_NUMBER = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """3D points of structure from motion, and where each was observed."""
+
+    points_world: Float64[np.ndarray, "point 3"]
+    colors: UInt8[np.ndarray, "point 3"]
+    photo: Int64[np.ndarray, "observation"]
+    """Number of the photo that holds the observation."""
+    point: Int64[np.ndarray, "observation"]
+    pixels: Float32[np.ndarray, "observation 2"]
+
+    def of_photos(self, chosen: Int64[np.ndarray, "chosen"]) -> "Tracks":
+        """The observations of some photos, which are numbered anew in the order given."""
+        order = np.argsort(chosen)
+        place = np.minimum(np.searchsorted(chosen[order], self.photo), max(len(chosen) - 1, 0))
+        keep = np.isin(self.photo, chosen)
+        return Tracks(self.points_world, self.colors, order[place[keep]], self.point[keep], self.pixels[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapModel:
+    """What a COLMAP model says: photos in the order of their names, and the tracks."""
+
+    photos: list[Photo]
+    tracks: Tracks
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    name: str
+    camera: int
+    quaternion_wxyz: tuple[float, ...]
+    translation: tuple[float, ...]
+    pixels: np.ndarray
+    point: np.ndarray
+    where: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    number: np.ndarray
+    xyz: np.ndarray
+    rgb: np.ndarray
+
+
+def read_colmap(folder: str | Path, images: str | Path | None = None) -> ColmapModel:
+    """Read cameras, images and points3D (.bin where it is there, else .txt) from a model's folder.
+
+    Without a points3D file, as some give poses alone, there are no tracks.
+    `images`: folder of the picture files (default: `images` beside the model, else the model's own folder).
+    Raises WearcapError for missing or truncated files, unknown camera models, and numbers that name nothing.
+    """
+    folder = Path(folder)
+    images = Path(images) if images is not None else _images_folder(folder)
+    binary = (folder / "images.bin").is_file()
+    if binary:
+        cameras = _read_cameras_bin(folder / "cameras.bin")
+        found = _read_images_bin(folder / "images.bin")
+    else:
+        cameras = _read_cameras_txt(folder / "cameras.txt")
+        found = _read_images_txt(folder / "images.txt")
+    found.sort(key=lambda image: image.name)
+    points = _Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    file = folder / ("points3D.bin" if binary else "points3D.txt")
+    if file.is_file():
+        points = (_read_points_bin if binary else _read_points_txt)(file)
+    photos = [_photo(image, cameras, images) for image in found]
+    return ColmapModel(photos, _tracks(found, points))
+
+
+def _images_folder(folder: Path) -> Path:
+    places = (folder / "images", folder.parent / "images", folder.parent.parent / "images")
+    return next((place for place in places if place.is_dir()), folder)
+
+
+def _photo(image: _Image, cameras: dict[int, Camera], images: Path) -> Photo:
+    if image.camera not in cameras:
+        raise WearcapError(f"image {image.name!r} names camera {image.camera}, which is not in the model",
+                           where=image.where, expected=f"one of {', '.join(map(str, sorted(cameras)))}")  # fmt: skip
+    wxyz = torch.tensor(image.quaternion_wxyz, dtype=torch.float64)
+    if not (wxyz.isfinite().all() and 0.9 < wxyz.norm() < 1.1 and all(map(math.isfinite, image.translation))):
+        raise WearcapError(f"image {image.name!r} has no valid pose", where=image.where,
+                           expected="a unit quaternion (w first) and a finite translation")  # fmt: skip
+    wxyz = wxyz / wxyz.norm()
+    R_cam_world = roma.unitquat_to_rotmat(wxyz[[1, 2, 3, 0]])
+    T_cam_world = Rigid(R_cam_world, torch.tensor(image.translation, dtype=torch.float64))
+    return Photo(images / image.name, cameras[image.camera], T_cam_world.inverse())
+
+
+def _tracks(images: list[_Image], points: _Points) -> Tracks:
+    """Observations of points that exist; their numbers become rows."""
+    order = np.argsort(points.number)
+    number = points.number[order]
+    photo = np.repeat(np.arange(len(images)), [len(image.point) for image in images])
+    pixels = np.concatenate([np.zeros((0, 2)), *(image.pixels for image in images)])
+    seen = np.concatenate([np.zeros(0, np.int64), *(image.point for image in images)])
+    place = np.minimum(np.searchsorted(number, seen), max(len(number) - 1, 0))
+    known = (seen >= 0) & (len(number) > 0) & (np.abs(pixels) < 1e6).all(1)
+    known[known] = number[place[known]] == seen[known]
+    return Tracks(
+        points.xyz, points.rgb, photo[known].astype(np.int64), order[place[known]].astype(np.int64),
+        (pixels[known] - 0.5).astype(np.float32),
+    )  # fmt: skip
+
+
+def _camera(model: str, width: int, height: int, values: list[float], where: str) -> Camera:
+    if model not in _MODELS:
+        raise WearcapError(f"camera model {model} is not supported", where=where,
+                           expected=f"one of {', '.join(_MODELS)}",
+                           fix="COLMAP's image_undistorter turns any model into PINHOLE.")  # fmt: skip
+    ours, count = _MODELS[model]
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise WearcapError(
+            f"camera model {model} with parameters {values}", where=where, expected=f"{count} finite numbers"
+        )
+    single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+    fx, fy, cx, cy, *lens = (values[:1] if single else []) + values
+    if ours == "opencv":
+        lens = [*lens, 0.0, 0.0, 0.0][:4]
+    return Camera(ours, width, height, fx, fy, cx - 0.5, cy - 0.5, tuple(lens))
+
+
+# Text
+
+
+def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Where each line stands and its words, without comments; empty lines come, too."""
+    for number, line in numbered_lines(path):
+        if not line.startswith("#"):
+            yield at_line(path, number), line.split()
+
+
+def _damaged(where: str | Path, error: Exception, expected: str) -> WearcapError:
+    return WearcapError(f"cannot be understood ({error})", where=where, expected=expected)
+
+
+def _read_cameras_txt(path: Path) -> dict[int, Camera]:
+    cameras = {}
+    for where, words in _lines(path):
+        if words:
+            try:
+                number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+                values = [float(word) for word in words[4:]]
+            except (ValueError, IndexError) as error:
+                raise _damaged(where, error, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…") from error
+            cameras[number] = _camera(model, width, height, values, where)
+    return cameras
+
+
+def _read_images_txt(path: Path) -> list[_Image]:
+    images = []
+    lines = _lines(path)
+    for where, words in lines:
+        if not words:
+            continue
+        try:
+            _, *pose, camera, name = [*words[:9], " ".join(words[9:])]
+            pose = [float(word) for word in pose]
+            if not name:
+                raise ValueError("no name")
+            place, second = next(lines, (where, None))
+            if second is None:
+                raise WearcapError(f"it ends after image {name!r}", where=where, expected="a line of its points",
+                                   fix="The file was cut short: copy it again.")  # fmt: skip
+            if len(second) % 3:
+                raise WearcapError(f"{len(second)} numbers for the points of image {name!r}", where=place,
+                                   expected="X Y POINT3D_ID for each point")  # fmt: skip
+            table = finite_floats(second).reshape(-1, 3)
+            images.append(_Image(name, int(camera), tuple(pose[:4]), tuple(pose[4:]),
+                                 table[:, :2], table[:, 2].astype(np.int64), where))  # fmt: skip
+        except (ValueError, IndexError) as error:
+            raise _damaged(
+                where, error, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points"
+            ) from error
+    return images
+
+
+def _read_points_txt(path: Path) -> _Points:
+    numbers, xyz, rgb = array("q"), array("d"), bytearray()
+    for where, words in _lines(path):
+        if words:
+            try:
+                if len(words) < 7:
+                    raise ValueError("too few numbers")
+                numbers.append(int(words[0]))
+                xyz.extend(map(float, words[1:4]))
+                rgb += bytes(map(int, words[4:7]))  # refuses what is beyond 0…255
+            except (ValueError, IndexError, OverflowError) as error:
+                raise _damaged(where, error, "POINT3D_ID X Y Z R G B ERROR TRACK…") from error
+    return _checked_points(numbers, xyz, rgb, path)
+
+
+def _checked_points(numbers: "array[int]", xyz: "array[float]", rgb: bytearray, path: Path) -> _Points:
+    points = _Points(
+        np.array(numbers, np.int64), np.array(xyz, np.float64).reshape(-1, 3),
+        np.array(rgb, np.uint8).reshape(-1, 3),
+    )  # fmt: skip
+    if not np.isfinite(points.xyz).all():
+        raise WearcapError("a point is NaN or infinite", where=path, expected="finite coordinates")
+    return points
+
+
+# Binary (little-endian, without padding)
+
+
+class _Cursor:
+    """Reads structures one after another and says which part of the file ended too early."""
+
+    def __init__(self, path: Path):
+        self.path, self.data, self.place = path, read_bytes(path, usual=_MAX_BYTES), 0
+
+    def take(self, form: str, part: str) -> tuple:
+        try:
+            values = struct.unpack_from("<" + form, self.data, self.place)
+        except struct.error as error:
+            raise self.cut_short(part) from error
+        self.place += struct.calcsize("<" + form)
+        return values
+
+    def rows(self, count: int, dtype: np.dtype, part: str) -> np.ndarray:
+        if count * dtype.itemsize > len(self.data) - self.place:
+            raise self.cut_short(part)
+        table = np.frombuffer(self.data, dtype, count, self.place)
+        self.place += count * dtype.itemsize
+        return table
+
+    def text(self, part: str) -> str:
+        stop = self.data.find(b"\0", self.place, self.place + 4096)
+        if stop < 0:
+            raise self.cut_short(part)
+        content, self.place = self.data[self.place : stop], stop + 1
+        return content.decode("utf-8", errors="replace")
+
+    def cut_short(self, part: str) -> WearcapError:
+        return WearcapError(f"it ends inside {part}", where=self.path, expected="a whole COLMAP file",
+                            fix="The file was cut short: copy it again.")  # fmt: skip
+
+
+def _read_cameras_bin(path: Path) -> dict[int, Camera]:
+    cursor, cameras = _Cursor(path), {}
+    (count,) = cursor.take("Q", "its count")
+    for row in range(count):
+        where = f"camera {row + 1} of {count}"
+        number, model, width, height = cursor.take("iiQQ", where)
+        name = _BY_NUMBER[model] if 0 <= model < len(_BY_NUMBER) else f"number {model}"
+        parameters = cursor.take(f"{_MODELS[name][1]}d", where) if name in _MODELS else ()
+        cameras[number] = _camera(name, width, height, list(parameters), str(path))
+    return cameras
+
+
+def _read_images_bin(path: Path) -> list[_Image]:
+    cursor, images = _Cursor(path), []
+    observation = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+    (count,) = cursor.take("Q", "its count")
+    for row in range(count):
+        where = f"image {row + 1} of {count}"
+        _, *pose, camera = cursor.take("I7dI", where)
+        name = cursor.text(where)
+        (length,) = cursor.take("Q", where)
+        table = cursor.rows(length, observation, where)
+        images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:]),
+                             table["xy"].astype(np.float64), table["point"].astype(np.int64), str(path)))  # fmt: skip
+    return images
+
+
+def _read_points_bin(path: Path) -> _Points:
+    cursor = _Cursor(path)
+    numbers, xyz, rgb = array("q"), array("d"), bytearray()
+    (count,) = cursor.take("Q", "its count")
+    for row in range(count):
+        where = f"point {row + 1} of {count}"
+        number, x, y, z, red, green, blue, _, length = cursor.take("q3d3BdQ", where)
+        cursor.rows(length, np.dtype("<i4, <i4"), where)
+        numbers.append(number)
+        xyz.extend((x, y, z))
+        rgb += bytes((red, green, blue))
+    return _checked_points(numbers, xyz, rgb, path)

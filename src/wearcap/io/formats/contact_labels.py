@@ -1,0 +1,242 @@
+"""When each hand holds something, as an annotator marked it: H-contact's JSON, and the same with what we know besides.
+
+H-contact: `{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}}` in seconds on the motion's clock; a
+label with end < start lasts until the recording ends. Our own files add `objects` and `classes` (one entry per label,
+"" where unknown) and the `recording` that the labels were made for.
+"""
+
+import itertools
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.files import write_text
+from wearcap.io.formats.json_text import read_json
+from wearcap.recording.interactions import HANDS, Interactions
+from wearcap.scene.objects import CONTACT_CLASSES
+
+SCHEMA = 1
+SLACK_S = 0.05
+"""How far a label may stand outside the recording: a video's and a suit's clocks seldom end together."""
+
+
+@dataclass(frozen=True)
+class LabelClock:
+    """The recording that labels belong to, and its span on its own clock (s)."""
+
+    name: str
+    frames: int
+    start_s: float
+    stop_s: float
+    """One frame after the last one, so that a contact that never ends holds the last frame too."""
+
+    @classmethod
+    def of(cls, name: str, timestamps: Float64[Tensor, "time"]) -> "LabelClock":
+        """Raises WearcapError for fewer than two frames."""
+        if len(timestamps) < 2:
+            raise WearcapError(
+                f"a motion of {len(timestamps)} frames", where=name, expected="at least two to label"
+            )
+        step = timestamps.diff().median().item()
+        return cls(name, len(timestamps), timestamps[0].item(), timestamps[-1].item() + step)
+
+
+@dataclass(frozen=True)
+class Label:
+    """One contact of one hand: start ≤ t < stop (s)."""
+
+    start_s: float
+    stop_s: float
+    object: str = ""
+    contact_class: str = ""
+
+
+Labels = dict[str, tuple[Label, ...]]
+"""Per hand of `HANDS`: labels in order, which do not overlap."""
+
+
+def read_contact_labels(path: str | Path, clock: LabelClock) -> Interactions:
+    """Contacts that H-contact, `wearcap annotate` or its export wrote.
+
+    Raises WearcapError when the file is damaged or belongs to another recording, and for labels that are empty,
+    overlap, or lie outside the recording.
+    """
+    return interactions_of(parse_labels(read_json(path), clock, where=path))
+
+
+def write_contact_labels(path: str | Path, interactions: Interactions, clock: LabelClock) -> None:
+    """Write H-contact's JSON (hands and times alone) atomically. Raises WearcapError for overlapping labels."""
+    write_text(path, hcontact_text(labels_of(interactions, clock), clock))
+
+
+def hcontact_text(labels: Labels, clock: LabelClock) -> str:
+    """H-contact's JSON: hands and times alone."""
+    return json.dumps({"contacts": hcontact_of(labels, clock)}, indent=1) + "\n"
+
+
+def hcontact_of(labels: Labels, clock: LabelClock) -> dict[str, list[list[float]]]:
+    """H-contact's `contacts`; a label that reaches the recording's end is written with end < start."""
+    return {
+        f"{hand}_hand": [
+            [label.start_s, label.stop_s if label.stop_s < clock.stop_s else min(-1.0, label.start_s - 1.0)]
+            for label in labels[hand]
+        ]
+        for hand in HANDS
+    }
+
+
+def annotation_of(labels: Labels, clock: LabelClock) -> dict[str, Any]:
+    """Our own file: H-contact's content, objects and classes beside it, and whose labels they are."""
+    return {
+        "schema_version": SCHEMA,
+        "recording": {
+            "name": clock.name,
+            "frames": clock.frames,
+            "start_s": clock.start_s,
+            "stop_s": clock.stop_s,
+        },
+        "contacts": hcontact_of(labels, clock),
+        "objects": {f"{hand}_hand": [label.object for label in labels[hand]] for hand in HANDS},
+        "classes": {f"{hand}_hand": [label.contact_class for label in labels[hand]] for hand in HANDS},
+    }
+
+
+def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Labels:
+    """Check what a label file says; `where` is named in errors. Raises WearcapError as `read_contact_labels`."""
+    contacts = content.get("contacts") if isinstance(content, dict) else None
+    names = [f"{hand}_hand" for hand in HANDS]
+    if not isinstance(contacts, dict) or not all(isinstance(contacts.get(name), list) for name in names):
+        raise WearcapError("no contact labels", where=where,
+                           expected='{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}} in seconds')  # fmt: skip
+    if "recording" in content:
+        _check_recording(content, clock, where)
+    labels: Labels = {}
+    for hand, name in zip(HANDS, names):
+        pairs = contacts[name]
+        objects, classes = (_texts(content, key, name, len(pairs), where) for key in ("objects", "classes"))
+        if unknown := set(classes) - {"", *CONTACT_CLASSES}:
+            raise WearcapError(f"class {unknown.pop()!r} in {name}", where=where,
+                               expected=f"one of {', '.join(CONTACT_CLASSES)}")  # fmt: skip
+        spans = [_span(pair, clock, f"{name} label {place}", where) for place, pair in enumerate(pairs)]
+        found = [Label(*span, thing, kind) for span, thing, kind in zip(spans, objects, classes)]
+        labels[hand] = tuple(sorted(found, key=lambda label: label.start_s))
+        _refuse_overlap(labels[hand], clock, name, where)
+    return labels
+
+
+def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> None:
+    if content.get("schema_version") != SCHEMA:
+        raise WearcapError(
+            f"schema version {content.get('schema_version')}", where=where, expected=f"version {SCHEMA}"
+        )
+    about = content["recording"]
+    try:
+        name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
+        same = all(abs(a - b) < 1e-3 for a, b in zip(span, (clock.start_s, clock.stop_s)))
+    except (KeyError, TypeError) as error:
+        raise WearcapError(f"does not say whose labels it holds ({error})", where=where) from error
+    if name != clock.name or frames != clock.frames or not same:
+        raise WearcapError(
+            f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s", where=where,
+            expected=f"{clock.name!r} with {clock.frames} frames from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
+            fix="Give another output folder, or move this file away.",
+        )  # fmt: skip
+
+
+def _texts(content: dict, key: str, name: str, count: int, where: str | Path) -> list[str]:
+    """One text per label of a hand; empty ones where the file has none."""
+    texts = content.get(key, {})
+    texts = texts.get(name, [""] * count) if isinstance(texts, dict) else None
+    if not isinstance(texts, list) or len(texts) != count or not all(isinstance(text, str) for text in texts):
+        raise WearcapError(f"{key} of {name} do not match its labels", where=where, expected=f"{count} texts")
+    return texts
+
+
+def _span(pair: Any, clock: LabelClock, label: str, where: str | Path) -> tuple[float, float]:
+    """Start and stop of a label within the recording; end < start lasts until its end."""
+    numbers = isinstance(pair, list) and len(pair) == 2 and all(type(value) in (int, float) for value in pair)
+    if not numbers or not all(math.isfinite(value) for value in pair):
+        raise WearcapError(f"{label} is {pair!r}"[:200], where=where, expected="[start, end] in seconds")
+    start, end = pair
+    if start == end:
+        raise WearcapError(f"{label} is empty: {start} to {end} s", where=where, expected="an end after the start",
+                           fix="Delete the label, or write an end before its start where it lasts to the end.")  # fmt: skip
+    stop = clock.stop_s if end < start else end
+    if not (
+        clock.start_s - SLACK_S <= start < clock.stop_s - 1e-9
+        and clock.start_s < stop <= clock.stop_s + SLACK_S
+    ):
+        raise WearcapError(f"{label} from {start} to {end} s lies outside the recording", where=where,
+                           expected=f"times from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
+                           fix="Is it the file of another recording?")  # fmt: skip
+    return max(float(start), clock.start_s), min(float(stop), clock.stop_s)
+
+
+def _refuse_overlap(labels: Sequence[Label], clock: LabelClock, name: str, where: str | Path) -> None:
+    for label, following in itertools.pairwise(labels):
+        if following.start_s < label.stop_s:
+            until = "to the end of the recording" if label.stop_s == clock.stop_s else f"to {label.stop_s} s"
+            raise WearcapError(
+                f"labels of {name} overlap: one from {label.start_s} {until}, the next from {following.start_s} s",
+                where=where, expected="one contact of a hand at a time",
+                fix="Give the first an end before the second starts (an end before its start means: until the end).",
+            )  # fmt: skip
+
+
+def interactions_of(labels: Labels) -> Interactions:
+    """Labels as interactions: hands that hold the same named object share one; where its hands change, a new begins."""
+    found: list[tuple[float, float, tuple[bool, ...], str, str]] = []
+    for thing in {(label.object, label.contact_class) for hand in HANDS for label in labels[hand]}:
+        held = [
+            [label for label in labels[hand] if (label.object, label.contact_class) == thing]
+            for hand in HANDS
+        ]
+        if not thing[0]:  # two hands at unknown things need not be at the same
+            for number, spans in enumerate(held):
+                one = tuple(other == number for other in range(len(HANDS)))
+                found += [(label.start_s, label.stop_s, one, *thing) for label in spans]
+            continue
+        edges = sorted({edge for spans in held for label in spans for edge in (label.start_s, label.stop_s)})
+        for start, stop in itertools.pairwise(edges):
+            hands = tuple(any(s.start_s <= start < s.stop_s for s in spans) for spans in held)
+            if any(hands):
+                found.append((start, stop, hands, *thing))
+    found.sort(key=lambda row: row[0])
+    column = lambda index: [row[index] for row in found]  # noqa: E731
+    return Interactions(
+        torch.tensor(column(0), dtype=torch.float64), torch.tensor(column(1), dtype=torch.float64),
+        torch.tensor(column(2), dtype=torch.bool).reshape(-1, len(HANDS)), tuple(column(3)), tuple(column(4)),
+    )  # fmt: skip
+
+
+def labels_of(interactions: Interactions, clock: LabelClock) -> Labels:
+    """Each hand's labels; stretches at the same named object that follow each other become one.
+
+    Raises WearcapError where a hand would hold two things at once, or outside the recording.
+    """
+    labels: Labels = {}
+    rows = list(zip(interactions.start_s.tolist(), interactions.stop_s.tolist(), interactions.hands.tolist(),
+                    interactions.objects, interactions.classes))  # fmt: skip
+    for number, hand in enumerate(HANDS):
+        joined: list[Label] = []
+        for start, stop, hands, thing, kind in sorted(rows, key=lambda row: row[0]):
+            if not hands[number]:
+                continue
+            span = _span([start, stop], clock, f"{hand}_hand's interaction", clock.name)
+            label = Label(*span, thing, kind)
+            last = joined[-1] if joined else None
+            if last and thing and (last.stop_s, last.object, last.contact_class) == (span[0], thing, kind):
+                joined[-1] = replace(last, stop_s=span[1])
+            else:
+                joined.append(label)
+        labels[hand] = tuple(joined)
+        _refuse_overlap(labels[hand], clock, f"{hand}_hand", clock.name)
+    return labels

@@ -1,0 +1,114 @@
+"""Columns of numbers from a CSV file with a header line, plain or compressed (.gz, .xz)."""
+
+import csv
+import difflib
+import io
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from wearcap.errors import WearcapError
+from wearcap.io.formats.bounded import open_bytes
+
+MAX_BYTES = 1 << 31
+"""Largest table that is taken into memory as a whole (2 GiB: two hours of poses at 1 kHz)."""
+MAX_STREAMED_BYTES = 1 << 36
+"""Largest table that is read in pieces (64 GiB)."""
+MAX_LINE = 1 << 16
+
+
+@contextmanager
+def open_text(path: str | Path, usual: int = MAX_BYTES) -> Iterator[Iterator[str]]:
+    """Lines of a text file (UTF-8), unpacked by its suffix.
+
+    Raises WearcapError as `open_bytes` does, for what is no text and for lines longer than `MAX_LINE`; errors that show
+    only while reading inside the `with` block are named too.
+    """
+    try:
+        with open_bytes(path, usual=usual) as file:
+            yield _lines(io.TextIOWrapper(file, "utf-8", newline=""), path)
+    except UnicodeDecodeError as error:
+        raise WearcapError("not a text file", where=path, expected="UTF-8 text") from error
+
+
+def _lines(file: io.TextIOWrapper, path: str | Path) -> Iterator[str]:
+    while line := file.readline(MAX_LINE):
+        if len(line) == MAX_LINE:
+            raise WearcapError(f"a line longer than {MAX_LINE} characters", where=path, expected="a table as text")  # fmt: skip
+        yield line
+
+
+def read_header(path: str | Path) -> list[str]:
+    """Column names of the first line. Raises WearcapError when the file is empty."""
+    with open_text(path) as file:
+        header = [name.strip() for name in next(csv.reader(file), [])]
+    if not any(header):
+        raise WearcapError("the file is empty", where=path, expected="a header line with column names")
+    return header
+
+
+def read_columns(
+    path: str | Path, columns: Sequence[str], *, text: Sequence[str] = (), whole: Sequence[str] = ()
+) -> dict[str, np.ndarray]:
+    """Named columns as float64 arrays, those in `text` as byte strings (at most 64 characters), in `whole` as int64.
+
+    Raises WearcapError for a missing column (with the nearest name that is there), a field that is no number
+    (with its line), or a file without rows.
+    """
+    return next(iter_columns(path, columns, text=text, whole=whole, rows=None))
+
+
+def iter_columns(
+    path: str | Path,
+    columns: Sequence[str],
+    *,
+    text: Sequence[str] = (),
+    whole: Sequence[str] = (),
+    rows: int | None = 1_000_000,
+) -> Iterator[dict[str, np.ndarray]]:
+    """As `read_columns`, but at most `rows` lines at a time, for files larger than memory."""
+    header = read_header(path)
+    wanted = [*columns, *text, *whole]
+    for name in wanted:
+        if name not in header:
+            near = difflib.get_close_matches(name, header, n=1)
+            raise WearcapError(f"no column {name!r}", where=path,
+                               expected=f"the columns {', '.join(wanted)}",
+                               fix=f"The nearest is {near[0]!r}." if near else "")  # fmt: skip
+    kinds = dict.fromkeys(columns, "f8") | dict.fromkeys(text, "S64") | dict.fromkeys(whole, "i8")
+    done = 0
+    with open_text(path, MAX_BYTES if rows is None else MAX_STREAMED_BYTES) as file:
+        next(file)
+        while True:
+            table = _read_rows(file, path, header, kinds, rows, done)
+            if not len(table) and not done:
+                raise WearcapError("a header line, but no rows", where=path)
+            if len(table):
+                yield {name: table[name] for name in wanted}
+            done += len(table)
+            if rows is None or len(table) < rows:
+                return
+
+
+def _read_rows(
+    file: Iterable[str],
+    path: str | Path,
+    header: list[str],
+    kinds: dict[str, str],
+    rows: int | None,
+    done: int,
+) -> np.ndarray:
+    """The next rows of an open file as a structured array; `done` were read before."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # numpy's own word on an empty file; ours follows
+        try:
+            return np.loadtxt(
+                file, dtype=np.dtype(list(kinds.items())), delimiter=",", usecols=[header.index(name) for name in kinds],
+                comments=None, ndmin=1, max_rows=rows,
+            )  # fmt: skip
+        except (ValueError, OverflowError) as error:
+            raise WearcapError(f"not a table of numbers ({error}; rows count from {f'row {done}' if done else 'after the header'})",
+                               where=path, expected=f"{len(header)} comma-separated fields in every line") from error  # fmt: skip

@@ -1,0 +1,234 @@
+"""Interactive environments as files: `environment.json` beside its objects' meshes (docs/environments.md)."""
+
+import json
+import math
+import re
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from wearcap.errors import WearcapError
+from wearcap.files import write_text
+from wearcap.geometry import rotation
+from wearcap.geometry.mesh import Mesh
+from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.ply import Ply, read_ply, write_ply
+from wearcap.scene.environment import Environment, hinge_gap_m
+from wearcap.scene.objects import FREEDOMS, Freedom, SceneObject
+
+SCHEMA = 1
+FILE_NAME = "environment.json"
+MAX_HINGE_GAP_M = 0.5
+"""A hinge further than this from its object's box, seen from above, is a mistake."""
+
+_KEYS = ("name", "category", "mesh", "R_world_object", "t_world_object", "freedom")
+_FREEDOM_KEYS = {
+    "plane": ("kind",), "free": ("kind",), "hinge": ("kind", "pivot", "limits_deg"), "axis": ("kind", "axis", "limits_m"),
+}  # fmt: skip
+_OPTIONAL = ("limits_deg", "limits_m")
+_ORTHOGONAL_WITHIN = 1e-3
+_LARGEST = float(np.finfo(np.float32).max)
+_COLOR = np.array([0.7, 0.7, 0.7], np.float32)
+"""Of meshes without any."""
+
+
+def read_environment(path: str | Path) -> Environment:
+    """Read an environment.json, or the one in a folder, with the meshes that it names.
+
+    Raises WearcapError for damaged JSON, another version, unknown or missing keys, a missing mesh, names that repeat,
+    numbers that are not finite, matrices that are no rotations, reversed limits, and a hinge far from its mesh.
+    """
+    path = Path(path)
+    path = path / FILE_NAME if path.is_dir() else path
+    content = read_json(path)
+    if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
+        raise WearcapError("not an environment", where=path, expected='{"schema_version": 1, "objects": […]}')
+    if content.get("schema_version") != SCHEMA:
+        raise WearcapError(f"schema version {content.get('schema_version')!r}", where=path, expected=str(SCHEMA),
+                           fix="Read it with the wearcap that wrote it, or update.")  # fmt: skip
+    _require_keys(content, ("schema_version", "objects"), path)
+    objects = tuple(_object(row, number, path) for number, row in enumerate(content["objects"]))
+    try:
+        return Environment(objects)
+    except WearcapError as error:
+        raise WearcapError(error.what, where=path, expected=error.expected) from error
+
+
+def write_environment(environment: Environment, path: str | Path) -> None:
+    """Write environment.json (`path`, or in that folder) and objects/NAME.ply; the list last, each file atomically.
+
+    Meshes keep colours of 8 bits. Raises WearcapError for what `read_environment` would refuse.
+    """
+    path = Path(path)
+    path = path if path.suffix == ".json" else path / FILE_NAME
+    rows, taken = [], set()
+    for item in environment.objects:
+        where = f"{path}: object {item.name!r}"
+        _check(item, where)
+        row = _row(item, f"objects/{_file_name(item.name, taken)}.ply", where)
+        rows.append(row)
+    for item, row in zip(environment.objects, rows):
+        write_ply(_ply(item.mesh), path.parent / row["mesh"])
+    lines = ",\n  ".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows)
+    write_text(path, f'{{"schema_version": {SCHEMA}, "objects": [\n  {lines}\n]}}\n')
+
+
+def _object(row: Any, number: int, path: Path) -> SceneObject:
+    named = isinstance(row, dict) and isinstance(row.get("name"), str) and row["name"].strip()
+    where = f"{path}: object {row['name']!r}" if named else f"{path}: object {number}"
+    if not named:
+        raise WearcapError(
+            "an object without a name", where=where, expected=f"an object with {', '.join(_KEYS)}"
+        )
+    if row.get("freedom") is None:
+        raise WearcapError("no degree of freedom", where=where, expected=f'"freedom": {{"kind": one of {", ".join(FREEDOMS)}}}',
+                           fix="What cannot move belongs to the scan and not among the objects.")  # fmt: skip
+    _require_keys(row, _KEYS, where)
+    if not isinstance(row["category"], str):
+        raise WearcapError(f"category {row['category']!r}", where=where, expected="text")
+    R = _rotation(row["R_world_object"], where)
+    t = torch.from_numpy(_numbers(row["t_world_object"], (3,), "t_world_object", where)).float()
+    item = SceneObject(
+        row["name"], row["category"], _mesh(row["mesh"], path, where), torch.from_numpy(R).float(), t,
+        _freedom(row["freedom"], where),
+    )  # fmt: skip
+    _check(item, where)
+    return item
+
+
+def _freedom(row: Any, where: str) -> Freedom:
+    kind = row.get("kind") if isinstance(row, dict) else None
+    if kind not in FREEDOMS:
+        raise WearcapError(
+            f"no degree of freedom {kind!r}", where=where, expected=f"one of {', '.join(FREEDOMS)}"
+        )
+    _require_keys(row, _FREEDOM_KEYS[kind], f"{where}, freedom")
+    pivot = None if kind != "hinge" else tuple(_numbers(row["pivot"], (3,), "pivot", where).tolist())
+    axis = None if kind != "axis" else tuple(_numbers(row["axis"], (3,), "axis", where).tolist())
+    limits = None
+    if (key := _FREEDOM_KEYS[kind][-1]) in row and key in _OPTIONAL and row[key] is not None:
+        limits = _numbers(row[key], (2,), key, where)
+        if limits[0] > limits[1]:
+            raise WearcapError(
+                f"{key} {limits.tolist()} are reversed", where=where, expected="[least, greatest]"
+            )
+        limits = tuple((np.radians(limits) if key == "limits_deg" else limits).tolist())
+    try:
+        return Freedom(kind, pivot, axis, limits)
+    except WearcapError as error:
+        raise WearcapError(error.what, where=where, expected=error.expected) from error
+
+
+def _mesh(name: Any, path: Path, where: str) -> Mesh:
+    inside = (
+        isinstance(name, str)
+        and name
+        and "\0" not in name
+        and "\\" not in name
+        and len(name.encode(errors="replace")) < 256
+    )
+    if not inside or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        raise WearcapError(f"mesh {name!r}", where=where, expected="a .ply file below the environment's folder",
+                           fix="Copy it there and name it relatively, as objects/sofa_1.ply.")  # fmt: skip
+    file = path.parent / name
+    if not file.is_file():
+        raise WearcapError(f"its mesh {name} is missing", where=where, expected=str(file),
+                           fix="Copy the folder objects/ together with the environment.")  # fmt: skip
+    ply = read_ply(file)
+    if not len(ply.points):
+        raise WearcapError("an empty mesh", where=file, expected="at least one point")
+    color = _COLOR if ply.colors is None else ply.colors.astype(np.float32) / 255
+    faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
+    return Mesh(ply.points, faces, color)
+
+
+def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
+    freedom, limits = item.freedom, item.freedom.limits
+    row: dict[str, Any] = {"kind": freedom.kind}
+    if freedom.pivot is not None:
+        row["pivot"] = list(freedom.pivot)
+    if freedom.axis is not None:
+        row["axis"] = list(freedom.axis)
+    if limits is not None and freedom.kind not in ("hinge", "axis"):
+        raise WearcapError(f"limits of an object that is {freedom.kind!r}", where=where,
+                           expected="limits of hinges and of slides along an axis alone")  # fmt: skip
+    if limits is not None:
+        hinge = freedom.kind == "hinge"
+        row["limits_deg" if hinge else "limits_m"] = [math.degrees(v) if hinge else v for v in limits]
+    return {
+        "name": item.name, "category": item.category, "mesh": mesh,
+        "R_world_object": [[_shortest(v) for v in line] for line in item.R_world_object.tolist()],
+        "t_world_object": [_shortest(v) for v in item.t_world_object.tolist()], "freedom": row,
+    }  # fmt: skip
+
+
+def _shortest(value: float) -> float:
+    """A number of single precision in as few digits as tell it apart."""
+    return float(f"{value:.9g}")
+
+
+def _file_name(name: str, taken: set[str]) -> str:
+    """A name that every file system takes, and that no other object of this environment has."""
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "object"
+    if re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", plain):
+        plain = f"{plain}_"
+    free, number = plain, 2
+    while free.lower() in taken:
+        free, number = f"{plain}-{number}", number + 1
+    taken.add(free.lower())
+    return free
+
+
+def _ply(mesh: Mesh) -> Ply:
+    """With a colour per vertex: faces that have their own get their own vertices too."""
+    vertices, faces, color = mesh.vertices, mesh.faces, mesh.color
+    if color.ndim == 2 and len(color) != len(vertices):
+        vertices, color = vertices[faces.ravel()], np.repeat(color, 3, axis=0)
+        faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+    colors = np.broadcast_to(np.clip(np.rint(color * 255), 0, 255).astype(np.uint8), vertices.shape)
+    return Ply(np.ascontiguousarray(vertices), np.ascontiguousarray(colors), faces if len(faces) else None)
+
+
+def _check(item: SceneObject, where: str) -> None:
+    """What cannot be true of an object, whoever made it."""
+    pose = [*item.R_world_object.flatten().tolist(), *item.t_world_object.tolist()]
+    freedom = [*(item.freedom.pivot or ()), *(item.freedom.axis or ()), *(item.freedom.limits or ())]
+    if not item.name.strip() or not len(item.mesh.vertices):
+        raise WearcapError(
+            "no name, or no points", where=where, expected="a named object with a mesh or a cloud"
+        )
+    if not (np.isfinite([*pose, *freedom]).all() and np.isfinite(item.mesh.vertices).all()):
+        raise WearcapError("numbers that are not finite", where=where, expected="finite coordinates (m)")
+    _rotation(item.R_world_object.tolist(), where)
+    gap = hinge_gap_m(item)
+    if gap > MAX_HINGE_GAP_M:
+        raise WearcapError(f"its hinge is {gap:.2f} m from its mesh, seen from above", where=where,
+                           expected=f"at most {MAX_HINGE_GAP_M} m", fix="The pivot is a point of the world, in metres.")  # fmt: skip
+
+
+def _rotation(value: Any, where: str) -> Float64[np.ndarray, "3 3"]:
+    """The rotation nearest to a matrix that is one but for its rounding."""
+    R = _numbers(value, (3, 3), "R_world_object", where)
+    if np.abs(R.T @ R - np.eye(3)).max() > _ORTHOGONAL_WITHIN or np.linalg.det(R) < 0:
+        raise WearcapError("R_world_object is no rotation", where=where,
+                           expected=f"an orthogonal matrix (within {_ORTHOGONAL_WITHIN}) of determinant +1")  # fmt: skip
+    return rotation.mean_rotation(torch.from_numpy(R)[None]).numpy()
+
+
+def _numbers(value: Any, shape: tuple[int, ...], key: str, where: str) -> Float64[np.ndarray, "..."]:
+    expected = f"{' x '.join(map(str, shape))} finite numbers"
+    leaves = np.array(value, dtype=object) if isinstance(value, list) else np.array(None)
+    plain = leaves.shape == shape and all(type(leaf) in (int, float) for leaf in leaves.flat)
+    if not plain or not all(abs(leaf) < _LARGEST for leaf in leaves.flat):
+        raise WearcapError(f"{key} is {value!r}"[:200], where=where, expected=expected)
+    return leaves.astype(np.float64)
+
+
+def _require_keys(row: dict, keys: tuple[str, ...], where: str | Path) -> None:
+    if unknown := sorted(set(row) - set(keys)):
+        raise WearcapError(f"unknown key {unknown[0]!r}", where=where, expected=f"only {', '.join(keys)}")
+    if missing := [key for key in keys if key not in row and key not in _OPTIONAL]:
+        raise WearcapError(f"no {missing[0]!r}", where=where, expected=", ".join(keys))

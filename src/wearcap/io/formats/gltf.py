@@ -1,0 +1,171 @@
+"""Motion as glTF 2.0 binary (.glb): an animated, skinned figure that Blender and web viewers open.
+
+One node per joint, with our axes and offsets, hangs on a node that turns z up into glTF's y up. The inverse bind
+matrices undo the rest pose with the root at the origin, which is how a body's vertices are given.
+"""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+from torch import Tensor
+
+from wearcap.body.model import BodyModel
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
+from wearcap.geometry import rotation
+from wearcap.io.formats.gltf_mesh import SkinnedMesh, skin_of, sticks
+from wearcap.recording.motion import Motion
+
+_Z_UP_XYZW = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
+"""Turns our z up into glTF's y up."""
+
+_COMPONENT = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
+_TYPE = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+_VERTICES, _INDICES = 34962, 34963
+_MATERIAL = {"name": "skin", "doubleSided": True, "pbrMetallicRoughness": {
+    "baseColorFactor": [0.62, 0.68, 0.76, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.7}}  # fmt: skip
+
+
+def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -> None:
+    """Write a motion and its body as .glb; without a body, sticks stand for the bones. Objects become empty nodes.
+
+    Animation time starts at 0. Raises WearcapError for a motion that is empty, not finite or not rising in time, and
+    for a body with other joints.
+    """
+    tracks = motion.object_motion or {}
+    clocks = [motion.timestamps, *(track.timestamps for track in tracks.values() if len(track))]
+    values = [motion.R_parent_joint, motion.t_world_root]
+    values += [v for track in tracks.values() for v in (track.R_world_body, track.t_world_body)]
+    if len(motion) == 0 or not all(value.isfinite().all() for value in (*values, *clocks)):
+        raise WearcapError(
+            "the motion is empty or holds NaN or infinite values", where=path, expected="finite poses"
+        )
+    if not all((clock.diff() > 0).all() for clock in clocks):
+        raise WearcapError("timestamps repeat or fall", where=path, expected="rising timestamps")
+    joints = len(motion.skeleton)
+    shown = sticks(motion.skeleton) if body is None else skin_of(body, motion.skeleton)
+    figure = _Figure(start_s=min(clock[0].item() for clock in clocks))
+    figure.nodes = _joint_nodes(motion)
+    figure.animate(
+        motion.timestamps, dict(enumerate(motion.R_parent_joint.unbind(1), 1)), {1: motion.t_world_root}
+    )
+    for name, track in tracks.items():
+        if len(track):
+            figure.nodes[0]["children"].append(len(figure.nodes))
+            figure.nodes.append({"name": name})
+            node = len(figure.nodes) - 1
+            figure.animate(track.timestamps, {node: track.R_world_body}, {node: track.t_world_body})
+    skin = {
+        "joints": list(range(1, 1 + joints)),
+        "skeleton": 1,
+        "inverseBindMatrices": figure.inverse_bind(shown),
+    }
+    figure.nodes.append({"name": "body", "mesh": 0, "skin": 0})
+    document = {
+        "asset": {"version": "2.0", "generator": "wearcap", "extras": dict(motion.provenance)},
+        "scene": 0, "scenes": [{"nodes": [0, len(figure.nodes) - 1]}], "nodes": figure.nodes,
+        "meshes": [{"name": "body", "primitives": [figure.primitive(shown)]}], "materials": [_MATERIAL],
+        "skins": [skin], "animations": [{"name": "motion", "samplers": figure.samplers, "channels": figure.channels}],
+    }  # fmt: skip
+    _write(path, document, figure)
+
+
+def _joint_nodes(motion: Motion) -> list[dict[str, Any]]:
+    """Node 0 turns the axes; joint k of the skeleton is node k + 1, posed as in the first frame."""
+    skeleton, quat_xyzw = motion.skeleton, _quat_xyzw(motion.R_parent_joint[0]).tolist()
+    offsets = skeleton.t_parent_joint.tolist()
+    offsets[0] = motion.t_world_root[0].tolist()
+    nodes: list[dict[str, Any]] = [{"name": "z_up", "rotation": _Z_UP_XYZW, "children": [1]}]
+    for joint, name in enumerate(skeleton.joint_names):
+        nodes.append({"name": name, "translation": offsets[joint], "rotation": quat_xyzw[joint]})
+        children = [1 + child for child, parent in enumerate(skeleton.parents) if parent == joint]
+        if children:
+            nodes[-1]["children"] = children
+    return nodes
+
+
+def _quat_xyzw(R: Float[Tensor, "element 3 3"]) -> Float32[np.ndarray, "element 4"]:
+    """Unit quaternions that never flip their sign from one element to the next."""
+    xyzw = rotation.quat_wxyz_from_matrix(R.double()).roll(-1, dims=-1).numpy()
+    flips = np.cumprod(np.where((xyzw[1:] * xyzw[:-1]).sum(-1) < 0, -1.0, 1.0))
+    xyzw[1:] *= flips[:, None]
+    return xyzw.astype(np.float32)
+
+
+class _Figure:
+    """The growing document: nodes, animation, and the binary chunk with the accessors that describe it."""
+
+    def __init__(self, start_s: float):
+        self.start_s = start_s
+        self.binary = bytearray()
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+        self.nodes: list[dict[str, Any]] = []
+        self.samplers: list[dict[str, Any]] = []
+        self.channels: list[dict[str, Any]] = []
+
+    def add(self, array: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
+        """Append one array, a row per element, with its bounds where the format wants them; returns its accessor."""
+        self.binary += b"\0" * (-len(self.binary) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": array.nbytes}
+        self.views.append(view | ({"target": target} if target else {}))
+        self.binary += np.ascontiguousarray(array).tobytes()
+        accessor = {"bufferView": len(self.views) - 1, "componentType": _COMPONENT[array.dtype.name],
+                    "count": len(array), "type": _TYPE[array.shape[1:]]}  # fmt: skip
+        if bounds:
+            accessor |= {
+                name: np.atleast_1d(value).tolist()
+                for name, value in (("min", array.min(0)), ("max", array.max(0)))
+            }
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+    def animate(
+        self,
+        timestamps: Float64[Tensor, "time"],
+        R: dict[int, Float[Tensor, "time 3 3"]],
+        t: dict[int, Float[Tensor, "time 3"]],
+    ) -> None:
+        """Key frames of nodes' rotations and translations on one clock."""
+        time = self.add((timestamps - self.start_s).float().numpy(), bounds=True)
+        keys = [(node, "translation", value.float().numpy()) for node, value in t.items()]
+        keys += [(node, "rotation", _quat_xyzw(value)) for node, value in R.items()]
+        for node, path, values in keys:
+            self.channels.append({"sampler": len(self.samplers), "target": {"node": node, "path": path}})
+            self.samplers.append({"input": time, "output": self.add(values), "interpolation": "LINEAR"})
+
+    def inverse_bind(self, skin: SkinnedMesh) -> int:
+        """Accessor of the matrices that bring rest vertices into each joint's frame (column-major)."""
+        matrices = np.tile(np.eye(4, dtype=np.float32), (len(skin.rest_joints), 1, 1))
+        matrices[:, 3, :3] = -skin.rest_joints.float().numpy()
+        return self.add(matrices)
+
+    def primitive(self, skin: SkinnedMesh) -> dict[str, Any]:
+        attributes = {
+            "POSITION": self.add(skin.mesh.vertices, _VERTICES, bounds=True),
+            "NORMAL": self.add(skin.normals, _VERTICES),
+            "JOINTS_0": self.add(skin.joints.astype(np.uint16), _VERTICES),
+            "WEIGHTS_0": self.add(skin.weights, _VERTICES),
+        }
+        indices = self.add(skin.mesh.faces.astype(np.uint32).reshape(-1), _INDICES)
+        return {"attributes": attributes, "indices": indices, "material": 0}
+
+
+def _write(path: str | Path, document: dict[str, Any], figure: _Figure) -> None:
+    """GLB: a header and two chunks, each padded to four bytes (glTF 2.0 §4.4)."""
+    document |= {
+        "buffers": [{"byteLength": len(figure.binary)}],
+        "bufferViews": figure.views,
+        "accessors": figure.accessors,
+    }
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary = bytes(figure.binary) + b"\0" * (-len(figure.binary) % 4)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary)))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)

@@ -1,0 +1,134 @@
+"""Our own motion file: one .npz that holds a Motion exactly, readable with nothing but NumPy.
+
+Arrays by the Motion's field names (`timestamps`, `R_parent_joint`, `skeleton.t_parent_joint`, …), `wearcap` (JSON with
+everything that is no array), and for tools that know AMASS' keys `trans`, `poses` (axis-angle of each joint in its
+parent, in this skeleton's joints and axes), `mocap_framerate` and `joint_names`.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path, parse_json
+from wearcap.geometry import rotation
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.formats.frame_grid import nominal_fps
+from wearcap.io.formats.npz import read_npz, require
+from wearcap.recording.interactions import HANDS, Interactions
+from wearcap.recording.motion import Motion
+from wearcap.recording.serialize import dumps, flatten, unflatten
+
+SCHEMA = 1
+
+
+def write_motion(motion: Motion, path: str | Path) -> None:
+    """Write a motion atomically; equal motions give equal bytes.
+
+    Raises WearcapError when it cannot be written, or holds NaN or infinite values.
+    """
+    tree, tensors = flatten(motion)
+    if bad := [key for key, tensor in tensors.items() if not tensor.isfinite().all()]:
+        raise WearcapError(f"{bad[0]!r} holds NaN or infinite values", where=path, expected="a finite motion")
+    arrays = {key: tensor.numpy() for key, tensor in sorted(tensors.items())}
+    arrays["wearcap"] = np.array(dumps({"schema": SCHEMA, "motion": tree}))
+    arrays["trans"] = arrays["t_world_root"]
+    arrays["poses"] = rotation.log(motion.R_parent_joint.double()).flatten(1).float().numpy()
+    arrays["joint_names"] = np.array(motion.skeleton.joint_names)
+    if len(motion) > 1:
+        arrays["mocap_framerate"] = np.array(nominal_fps(motion.fps))
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_motion(path: str | Path) -> Motion:
+    """Read what `write_motion` wrote. Raises WearcapError when it is missing, damaged, not finite or foreign."""
+    arrays = read_npz(path)
+    if "wearcap" not in arrays:
+        raise WearcapError("an .npz file, but not of ours", where=path, expected="one that write_motion wrote",
+                           fix="AMASS files are read by io.datasets.amass.")  # fmt: skip
+    try:
+        tree = parse_json(str(arrays.pop("wearcap")), path)
+        version = tree["schema"]
+        if version != SCHEMA:
+            raise WearcapError(f"schema version {version}", where=path, expected=f"version {SCHEMA}")
+        motion = unflatten(tree["motion"], lambda key: torch.from_numpy(arrays[key]))
+        _check(motion, path)
+    except WearcapError as error:
+        if error.where:
+            raise
+        raise _damaged(error, path) from error
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError) as error:
+        raise _damaged(error, path) from error
+    return motion
+
+
+def _damaged(error: Exception, path: str | Path) -> WearcapError:
+    return WearcapError(f"its description is damaged ({error})", where=path, fix="Capture it again.")
+
+
+def _check(motion: Motion, path: str | Path) -> None:
+    """What the container's annotations promise, for a file that may say anything."""
+    if not isinstance(motion, Motion):
+        raise WearcapError("holds no motion", where=path)
+    skeleton = motion.skeleton
+    arrays = {"timestamps": motion.timestamps, "R_parent_joint": motion.R_parent_joint,
+              "t_world_root": motion.t_world_root, "t_parent_joint": skeleton.t_parent_joint}  # fmt: skip
+    shapes: dict[str, tuple[int | str, ...]] = {
+        "timestamps": ("time",), "R_parent_joint": ("time", len(skeleton), 3, 3), "t_world_root": ("time", 3),
+        "t_parent_joint": (len(skeleton), 3),
+    }  # fmt: skip
+    if motion.contact_prob is not None:
+        arrays["contact_prob"], shapes["contact_prob"] = motion.contact_prob, ("time", "patch")
+    if motion.hand_contact_prob is not None:
+        arrays["hand_contact_prob"], shapes["hand_contact_prob"] = (
+            motion.hand_contact_prob,
+            ("time", len(HANDS)),
+        )
+    if motion.body_contact_prob is not None:
+        arrays["body_contact_prob"] = motion.body_contact_prob
+        shapes["body_contact_prob"] = ("time", "point")
+    if motion.interactions is not None:
+        _check_interactions(motion.interactions, path)
+    for name, track in (motion.object_motion or {}).items():
+        if not isinstance(track, Trajectory):
+            raise TypeError(f"object {name!r} has no trajectory")
+        clock = f"time of {name}"
+        arrays |= {
+            f"{name} timestamps": track.timestamps,
+            f"{name} R": track.R_world_body,
+            f"{name} t": track.t_world_body,
+        }
+        shapes |= {f"{name} timestamps": (clock,), f"{name} R": (clock, 3, 3), f"{name} t": (clock, 3)}
+    require({key: tensor.numpy() for key, tensor in arrays.items()}, path, **shapes)
+    if motion.timestamps.dtype != torch.float64 or not all(a.is_floating_point() for a in arrays.values()):
+        raise TypeError("arrays of another number type")
+    for site in skeleton.sites.values():
+        skeleton.index(site.joint)
+        if len(site.t_joint_site) != 3 or not all(np.isfinite(value) for value in site.t_joint_site):
+            raise ValueError("a site without a finite position")
+    if not all(isinstance(item, str) for pair in motion.provenance.items() for item in pair):
+        raise TypeError("provenance that is no text")
+
+
+def _check_interactions(held: Interactions, path: str | Path) -> None:
+    if not isinstance(held, Interactions) or held.hands.dtype != torch.bool:
+        raise TypeError("interactions that are none")
+    arrays = {
+        "start_s": held.start_s.numpy(),
+        "stop_s": held.stop_s.numpy(),
+        "hands": held.hands.numpy().astype(np.uint8),
+    }
+    count = require(
+        arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS))
+    )["interval"]
+    if {held.start_s.dtype, held.stop_s.dtype} != {torch.float64}:
+        raise TypeError("times of interactions of another number type")
+    for names in (held.objects, held.classes):
+        if (
+            not isinstance(names, tuple)
+            or len(names) != count
+            or not all(isinstance(name, str) for name in names)
+        ):
+            raise ValueError(f"names that do not match {count} interactions")

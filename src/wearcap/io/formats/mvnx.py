@@ -1,0 +1,334 @@
+"""Xsens MVNX: the suit's pose, foot contacts and sensors, as MVN exports them.
+
+MVN's segment frames are parallel to the world (x forward, y left, z up) in the T-pose, as those of `xsens23` are, and a
+segment's position is its joint's, so orientations are taken as they are.
+"""
+
+import io
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, ParseError
+
+import numpy as np
+import torch
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import iterparse
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.kinematics import local_rotations
+from wearcap.body.skeleton import FOOT_PATCHES, Site, Skeleton, xsens23
+from wearcap.errors import WearcapError
+from wearcap.geometry.rotation import matrix_from_quat_wxyz
+from wearcap.io.formats.bounded import open_bytes
+from wearcap.io.formats.text import finite_floats
+from wearcap.recording import ImuStream, Motion, Recording
+
+MAX_BYTES = 1 << 34
+"""Largest unpacked file that is read (16 GiB: two hours at 240 Hz)."""
+_MAX_ELEMENTS = 100_000
+_CHUNK, _MAX_SILENCE = 1 << 16, 1 << 26
+_MAX_NUMBER = 64
+"""Characters of a number at most."""
+
+_SIDED = {"shoulder": "collar", "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist", "upperleg": "hip",
+          "lowerleg": "knee", "foot": "ankle", "toe": "toe"}  # fmt: skip
+_JOINT_OF = {name: name for name in ("pelvis", "l5", "l3", "t12", "t8", "neck", "head")} | {
+    side + segment: f"{side}_{joint}" for side in ("left", "right") for segment, joint in _SIDED.items()
+}
+"""Segment or sensor label (lower case, no spaces) to joint."""
+
+_SITE_OF = {"ptopofhead": "crown"} | {
+    f"p{side}{point}": f"{side}_{site}"
+    for side in ("left", "right")
+    for point, site in (("heelfoot", "heel"), ("toe", "toe_tip"), ("topofhand", "fingertip"))
+}
+"""Anatomical points of the segments that are our sites."""
+
+_FIELDS = {
+    "orientation": ("segments", 4), "position": ("segments", 3), "footContacts": ("contacts", 1),
+    "sensorFreeAcceleration": ("sensors", 3), "sensorOrientation": ("sensors", 4),
+}  # fmt: skip
+"""What is read of each frame: of which things, and how many numbers for each."""
+
+_REST_TYPES = ("identity", "tpose")
+BONE_CHANGE_M = 0.02
+
+
+@dataclass
+class _File:
+    """What has been read so far."""
+
+    path: Path
+    fps: float = 0.0
+    segments: list[str] = field(default_factory=list)
+    points: dict[str, tuple[str, list[float]]] = field(default_factory=dict)
+    """Label of an anatomical point: its segment, and its position in it (m)."""
+    sensors: list[str] = field(default_factory=list)
+    contacts: list[str] = field(default_factory=list)
+    rest: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    """Fields of the identity and T-pose frames."""
+    index: list[int] = field(default_factory=list)
+    time_ms: list[float] = field(default_factory=list)
+    frames: dict[str, list[np.ndarray]] = field(default_factory=lambda: {name: [] for name in _FIELDS})
+
+
+def read_mvnx(path: str | Path, max_bytes: int | None = None) -> Recording:
+    """Read an .mvnx file (plain, .gz or .xz): `motion` (xsens23 with the wearer's bones, contacts in FOOT_PATCHES order)
+    and the sensors as `imu` streams named by their joint.
+
+    Raises WearcapError naming file and line or frame for damaged XML, document types and entities, missing segments,
+    wrong counts, NaN, and quaternions that are not of unit length. Warns when bones change length or times disagree.
+    """
+    file = _File(Path(path))
+    try:
+        with open_bytes(path, max_bytes, MAX_BYTES) as source:
+            chunks = _Chunks(source)
+            for element in _elements(iterparse(chunks, events=("start", "end"), forbid_dtd=True), chunks):
+                _take(file, element)
+    except DefusedXmlException as error:
+        raise WearcapError("it declares a document type or entities", where=path, expected="plain MVNX as MVN exports it",
+                           fix="Such declarations can blow up or fetch other files, and are never read.") from error  # fmt: skip
+    except ParseError as error:
+        raise WearcapError(f"broken XML ({error.msg})", where=path, expected="a whole MVNX file",
+                           fix="Export or copy it again.") from error  # fmt: skip
+    except (ValueError, LookupError) as error:
+        raise WearcapError(f"cannot be understood ({error})", where=file.path, expected="MVNX") from error
+    return _recording(file)
+
+
+# --- from XML to lists ---------------------------------------------------------------------------------------
+
+
+class _Chunks:
+    """Reads that double until an element begins or ends: expat scans a long tag or comment anew with every read."""
+
+    def __init__(self, source: io.BufferedReader):
+        self._source, self._size = source, _CHUNK
+
+    def read(self, _size: int) -> bytes:
+        content = self._source.read(self._size)
+        self._size *= 2
+        if self._size > _MAX_SILENCE:
+            raise ValueError(f"{_MAX_SILENCE} bytes without an element")
+        return content
+
+    def restart(self) -> None:
+        self._size = _CHUNK
+
+
+def _elements(events: Iterator[tuple[str, Element]], chunks: _Chunks) -> Iterator[Element]:
+    """Complete elements of interest; frames are forgotten once they are used, so that memory stays flat."""
+    frames: Element | None = None
+    held = 0
+    for event, element in events:
+        chunks.restart()
+        name = _name(element)
+        held += event == "start"
+        if held > _MAX_ELEMENTS:
+            raise ValueError(f"more than {_MAX_ELEMENTS} elements beside its frames")
+        if event == "start" and name == "frames":
+            frames = element
+        elif (event == "start" and name == "subject") or (
+            event == "end" and name in ("segment", "sensor", "contactDefinition", "frame")
+        ):
+            yield element
+            if name == "frame" and frames is not None:
+                frames.clear()
+                held = 0
+
+
+def _name(element: Element) -> str:
+    return element.tag.rsplit("}", 1)[-1] if isinstance(element.tag, str) else ""
+
+
+def _plain(label: str) -> str:
+    return label.replace(" ", "").replace("_", "").lower()
+
+
+def _take(file: _File, element: Element) -> None:
+    """Add one element to what is known."""
+    name = _name(element)
+    if name == "subject":
+        file.fps = float(finite_floats([element.get("frameRate", "")])[0])
+        if not 0 < file.fps < 1e5:
+            raise ValueError(f"a frame rate of {file.fps} Hz")
+    elif name == "segment":
+        label = _plain(element.attrib["label"])
+        file.segments.append(label)
+        for point in (child for child in element.iter() if _name(child) == "point"):
+            text = next((child.text or "" for child in point if _name(child) == "pos_b"), "")
+            file.points[_plain(point.attrib["label"])] = (label, finite_floats(text.split()).tolist())
+    elif name == "sensor":
+        file.sensors.append(_plain(element.attrib["label"]))
+    elif name == "contactDefinition":
+        file.contacts.append(_plain(element.attrib["label"]))
+    else:
+        try:
+            _take_frame(file, element)
+        except ValueError as error:
+            label = f"{element.get('type', 'normal')} frame {element.get('index', '')}".strip()
+            raise ValueError(f"{label}: {error}") from error
+
+
+def _take_frame(file: _File, element: Element) -> None:
+    kind = element.get("type", "normal")
+    if kind not in (*_REST_TYPES, "normal"):
+        return
+    _require_segments(file)
+    values = {
+        name: _field(file, name, child.text or "") for child in element if (name := _name(child)) in _FIELDS
+    }
+    if kind in _REST_TYPES:
+        file.rest[kind] = values
+    else:
+        present = {name for name, column in file.frames.items() if column} if file.index else set(values)
+        if set(values) != present or not {"orientation", "position"} <= present:
+            raise ValueError(
+                f"a frame with {sorted(values)} where {sorted(present | {'orientation', 'position'})} belong"
+            )
+        file.index.append(int(element.get("index") or len(file.index)))
+        file.time_ms.append(float(element.get("time") or "nan"))
+        for name, found in values.items():
+            file.frames[name].append(found.astype(np.float32) if name != "position" else found)
+
+
+def _require_segments(file: _File) -> None:
+    if missing := sorted(set(_JOINT_OF) - set(file.segments)):
+        raise WearcapError(f"segments {missing[:5]} are missing", where=file.path,
+                           expected="the 23 segments of a full-body suit")  # fmt: skip
+
+
+def _field(file: _File, name: str, text: str) -> np.ndarray:
+    """The numbers of one of a frame's fields."""
+    things, width = _FIELDS[name]
+    count = width * (len(getattr(file, things)) or len(FOOT_PATCHES) * (things == "contacts"))
+    if len(text) > 1000 + _MAX_NUMBER * count:
+        raise ValueError(f"{name} with {len(text)} characters where {count} numbers belong")
+    found = finite_floats(text.split())
+    if len(found) != count:
+        raise ValueError(f"{name} with {len(found)} values where {count} belong")
+    return found
+
+
+# --- from lists to a Recording ---------------------------------------------------------------------------------
+
+
+def _recording(file: _File) -> Recording:
+    _require_segments(file)
+    if not file.fps:
+        raise WearcapError(
+            "no subject with a frame rate", where=file.path, expected='<subject frameRate="60">'
+        )
+    if not file.index:
+        raise WearcapError("no frames of motion", where=file.path, expected='frames of type "normal"')
+    timestamps = _timestamps(file)
+    skeleton, rows = xsens23(), [file.segments.index(_label_of(name)) for name in xsens23().joint_names]
+    R_world = matrix_from_quat_wxyz(_quaternions(file, "orientation"))[:, rows].double()
+    t_world = torch.from_numpy(np.stack(file.frames["position"])).unflatten(1, (-1, 3))[:, rows]
+    skeleton = _fitted(file, skeleton, rows, R_world, t_world)
+    motion = Motion(
+        timestamps, skeleton, local_rotations(skeleton, R_world).float(), t_world[:, 0].float(),
+        contact_prob=_contacts(file), provenance={"source": file.path.name, "format": "mvnx"},
+    )  # fmt: skip
+    return Recording(file.path.name.split(".")[0], motion=motion, skeleton=skeleton, imu=_imu(file, timestamps), source="Xsens MVNX")  # fmt: skip
+
+
+def _label_of(joint: str) -> str:
+    return next(label for label, name in _JOINT_OF.items() if name == joint)
+
+
+def _timestamps(file: _File) -> Tensor:
+    """From the frame numbers, which unlike the times are not rounded to milliseconds."""
+    index = torch.tensor(file.index, dtype=torch.float64)
+    if not (index.diff() > 0).all():
+        raise WearcapError("frame numbers repeat or fall", where=file.path, expected="rising `index`")
+    timestamps = (index - index[0]) / file.fps
+    span_s = (file.time_ms[-1] - file.time_ms[0]) / 1000
+    if np.isfinite(span_s) and abs(span_s - timestamps[-1].item()) > 0.01 * span_s + 0.05:
+        warnings.warn(f"{file.path}: frame times span {span_s:.3f} s, but {len(index)} frames at {file.fps:g} Hz span "
+                      f"{timestamps[-1]:.3f} s; the frame rate is believed", stacklevel=4)  # fmt: skip
+    return timestamps
+
+
+def _quaternions(file: _File, name: str) -> Float[Tensor, "time segment 4"]:
+    quat_wxyz = torch.from_numpy(np.stack(file.frames[name])).unflatten(1, (-1, 4))
+    wrong = ((quat_wxyz.norm(dim=-1) - 1).abs() > 0.02).nonzero()
+    if len(wrong):
+        frame, element = wrong[0].tolist()
+        raise WearcapError(f"{name} {element} is no unit quaternion", where=f"{file.path}, frame {file.index[frame]}",
+                           expected="w x y z of length 1")  # fmt: skip
+    return quat_wxyz
+
+
+def _fitted(
+    file: _File,
+    skeleton: Skeleton,
+    rows: list[int],
+    R_world: Float[Tensor, "time joint 3 3"],
+    t_world: Float[Tensor, "time joint 3"],
+) -> Skeleton:
+    """The wearer's bones: from the identity or T-pose frame, else from the median over the motion."""
+    parents = [max(parent, 0) for parent in skeleton.parents]
+
+    def bones(R: Tensor, t: Tensor) -> Tensor:
+        return (R[..., parents, :, :].mT @ (t - t[..., parents, :])[..., None])[..., 0]
+
+    moving = bones(R_world, t_world)
+    offsets = moving.median(0).values
+    for kind in reversed(_REST_TYPES):
+        if {"orientation", "position"} <= set(file.rest.get(kind, {})):
+            R = matrix_from_quat_wxyz(torch.from_numpy(file.rest[kind]["orientation"]).unflatten(0, (-1, 4)))[
+                rows
+            ]
+            offsets = bones(R, torch.from_numpy(file.rest[kind]["position"]).unflatten(0, (-1, 3))[rows])
+    change = (moving - offsets).norm(dim=-1).amax(0)
+    if change.max() > BONE_CHANGE_M:
+        worst = skeleton.joint_names[int(change.argmax())]
+        warnings.warn(f"{file.path}: {worst!r} is up to {change.max():.3f} m away from where the wearer's bones put it",
+                      stacklevel=4)  # fmt: skip
+    fitted = skeleton.with_offsets(offsets.float())
+    points = {_SITE_OF[label]: Site(_JOINT_OF[segment], tuple(at)) for label, (segment, at) in file.points.items()
+              if label in _SITE_OF and segment in _JOINT_OF and len(at) == 3}  # fmt: skip
+    return replace(fitted, sites=fitted.sites | points)
+
+
+def _contacts(file: _File) -> Float[Tensor, "time patch"] | None:
+    """Foot contacts in FOOT_PATCHES order; files without definitions list them in that order already."""
+    if not file.frames["footContacts"]:
+        return None
+    contacts = torch.from_numpy(np.stack(file.frames["footContacts"]))
+    if not file.contacts:
+        return contacts
+    columns = []
+    for patch in FOOT_PATCHES:
+        side, part = patch.split("_")[:2]
+        found = [k for k, label in enumerate(file.contacts) if side in label and part in label]
+        if len(found) != 1:
+            raise WearcapError(
+                f"foot contacts {file.contacts}", where=file.path, expected="heel and toe of both feet"
+            )
+        columns.append(found[0])
+    return contacts[:, columns]
+
+
+def _imu(file: _File, timestamps: Tensor) -> dict[str, ImuStream]:
+    """One stream per sensor on a known segment, with free acceleration (m/s², world) and orientation."""
+    streams: dict[str, ImuStream] = {}
+    parts: dict[str, Any] = {}
+    if file.frames["sensorFreeAcceleration"]:
+        parts["acc_world"] = torch.from_numpy(np.stack(file.frames["sensorFreeAcceleration"])).unflatten(
+            1, (-1, 3)
+        )
+    if file.frames["sensorOrientation"]:
+        parts["R_world_imu"] = matrix_from_quat_wxyz(_quaternions(file, "sensorOrientation"))
+    for k, label in enumerate(file.sensors if parts else []):
+        if label in _JOINT_OF:
+            joint = _JOINT_OF[label]
+            streams[joint] = ImuStream(
+                timestamps, joint, **{name: part[:, k].contiguous() for name, part in parts.items()}
+            )
+    return streams

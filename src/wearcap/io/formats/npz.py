@@ -1,0 +1,150 @@
+"""Arrays from .npz and .npy files of strangers: no pickles, no sizes that the file cannot hold."""
+
+import io
+import lzma
+import math
+import struct
+import sys
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.lib import format as npy
+
+from wearcap.errors import WearcapError
+from wearcap.io.formats.bounded import Budget, explained, file_size
+
+MAX_BYTES = 1 << 32
+"""Largest sum of the arrays that are read of one file (4 GiB)."""
+
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+_MAX_HEADER = 1 << 14
+_CHUNK = 1 << 20
+DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, ValueError, OSError,
+          NotImplementedError, RuntimeError, SyntaxError, tokenize.TokenError, LookupError, TypeError,
+          OverflowError, MemoryError, AttributeError)  # fmt: skip
+"""What zipfile and numpy raise on files that are cut short or tampered with."""
+
+
+def read_npz(
+    path: str | Path, keys: Iterable[str] | None = None, max_bytes: int | None = None
+) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file, of those named in `keys` the ones that are there (None: all).
+
+    Raises WearcapError for a missing or damaged file, for an array of Python objects, and where the arrays that are
+    asked for hold more than `max_bytes` together.
+    """
+    path = Path(path)
+    budget = Budget(path, file_size(path), MAX_BYTES, max_bytes)
+    name = ""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            arrays = {}
+            for name in members if keys is None else [key for key in keys if key in members]:
+                arrays[name] = _read_member(archive, members[name], path, name, budget)
+            return arrays
+    except PermissionError:
+        with explained(path):
+            raise
+    except DAMAGE as error:
+        where = f"{path}, array {name!r}" if name else path
+        raise WearcapError(f"not a readable .npz file ({error})"[:300], where=where, expected="arrays saved by NumPy",
+                           fix="Fetch the file again.") from error  # fmt: skip
+
+
+def _read_member(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, name: str, budget: Budget
+) -> np.ndarray:
+    with archive.open(info) as file:
+        head = io.BytesIO(file.read(_MAX_HEADER))
+        shape, fortran, dtype = _header(head, f"{path}, array {name!r}")
+        size = math.prod(shape) * dtype.itemsize
+        if size != info.file_size - head.tell():
+            raise ValueError(f"an array of shape {shape} in {info.file_size} bytes")
+        budget.spend(size)
+        array = np.empty(math.prod(shape), dtype)
+        _fill(memoryview(array.view(np.uint8)) if size else memoryview(bytearray()), head, file)
+    if (
+        dtype.kind == "U"
+        and size
+        and (array.view(np.dtype("u4").newbyteorder(dtype.byteorder)) > sys.maxunicode).any()
+    ):
+        raise ValueError("text with characters that are none")
+    return array.reshape(shape, order="F").copy(order="C") if fortran else array.reshape(shape)
+
+
+def _header(head: io.BytesIO, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, order and type of an array, from the beginning of its file."""
+    version = npy.read_magic(head)
+    if version not in _HEADERS:
+        raise ValueError(f"array format {version}")
+    shape, fortran, dtype = _HEADERS[version](head)
+    if dtype.hasobject:
+        raise WearcapError("it holds Python objects", where=where, expected="plain numbers or text",
+                           fix="Such arrays can run code when they are loaded and are never read.")  # fmt: skip
+    if any(length < 0 for length in shape):
+        raise ValueError(f"an array of shape {shape}")
+    return shape, fortran, dtype
+
+
+def _fill(view: memoryview, head: io.BytesIO, rest: io.BufferedIOBase) -> None:
+    """Fill an array's memory piece by piece, so that nothing large is there twice."""
+    place = 0
+    while place < len(view):
+        content = head.read(_CHUNK) or rest.read(min(_CHUNK, len(view) - place))
+        if not content:
+            raise ValueError("its data ends too early")
+        view[place : place + len(content)] = content
+        place += len(content)
+
+
+def map_npy(path: str | Path) -> np.ndarray:
+    """The array of an .npy file, mapped: nothing is reserved for what the file does not hold.
+
+    Raises WearcapError for a missing or damaged file, and for an array of Python objects.
+    """
+    file_size(path)
+    try:
+        with open(path, "rb") as file:
+            head = io.BytesIO(file.read(_MAX_HEADER))
+        shape, fortran, dtype = _header(head, str(path))
+        if not math.prod(shape) * dtype.itemsize:
+            return np.zeros(shape, dtype)
+        return np.memmap(path, dtype, "r", head.tell(), shape, "F" if fortran else "C")
+    except PermissionError:
+        with explained(path):
+            raise
+    except DAMAGE as error:
+        raise WearcapError(f"not a readable .npy file ({error})"[:300], where=path,
+                           expected="an array of numbers", fix="Fetch the file again.") from error  # fmt: skip
+
+
+def require(
+    arrays: dict[str, np.ndarray], path: str | Path, **shapes: tuple[int | str, ...]
+) -> dict[str, int]:
+    """Check that arrays are there, finite numbers, and of one consistent shape; returns the named sizes.
+
+    `require(arrays, path, trans=("time", 3))` demands three columns and gives {"time": rows}.
+    """
+    sizes: dict[str, int] = {}
+    for key, shape in shapes.items():
+        if key not in arrays:
+            raise WearcapError(f"no array {key!r}", where=path, expected=f"{', '.join(shapes)} in this file")
+        array = arrays[key]
+        fits = array.ndim == len(shape) and all(
+            length == (sizes.setdefault(axis, length) if isinstance(axis, str) else axis)
+            for length, axis in zip(array.shape, shape)
+        )
+        if not fits:
+            words = ", ".join(f"{axis}={sizes[axis]}" if axis in sizes else str(axis) for axis in shape)
+            raise WearcapError(f"array {key!r} has shape {array.shape}", where=path, expected=f"({words})")
+        if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
+            raise WearcapError(f"array {key!r} is of type {array.dtype}", where=path, expected="real numbers")
+        if not np.isfinite(array).all():
+            row = np.argwhere(~np.isfinite(array))[0].tolist()
+            raise WearcapError(f"array {key!r} holds NaN or infinity, first at {row}", where=path, expected="finite numbers")  # fmt: skip
+    return sizes

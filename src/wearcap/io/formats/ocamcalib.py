@@ -1,0 +1,209 @@
+"""OCamCalib's fisheye calibrations: `calib_results.txt`, and NavVis' `sensor_frame.xml` (HPS and iReplica scans).
+
+Scaramuzza's camera sees a pixel at (row, column) under the direction (u, v, f(ρ)), f(ρ) = a₀ + a₁ρ + a₂ρ² + …, where
+ρ² = u² + v² and [row; column] = [c d; e 1] [u; v] + [xc; yc], counted from 0. Its axes are u down the image, v along
+it and w backwards (a₀ is negative): (v, u, -w) are OpenCV's. The file's second polynomial, in the angle
+atan(w / √(u² + v²)), is a fit to the inverse of the first.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree.ElementTree import Element, ParseError
+
+import numpy as np
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import fromstring
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+from wearcap.io.formats.text import at_line, finite_floats, numbered_lines, read_text
+
+POWERS = 10
+"""k1…k10: NavVis' lenses are met within 0.002 px at 4592 px width."""
+_MAX_BYTES = 1 << 24
+"""Largest calibration that is read (16 MiB; they take kilobytes)."""
+_MAX_SIDE = 1 << 20
+"""Largest width and height of an image (pixels)."""
+MAX_MISFIT_PX = 0.5
+MAX_DISAGREEMENT_PX = 3.0
+"""Between the two polynomials of a file, which are fits to each other."""
+_COUNTS = {"world2cam": (2, 64), "cam2world": (3, 64)}
+_TEXT_LINES = ("the direct polynomial", "the inverse polynomial", "the centre", "the affine parameters", "the image size")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class OCamModel:
+    """What a calibration holds, in OCamCalib's own convention."""
+
+    pol: tuple[float, ...]
+    """a₀, a₁ … of f(ρ) (pixels)."""
+    invpol: tuple[float, ...]
+    """Of ρ (pixels) in atan(w / √(u² + v²)), lowest power first; empty where the file has none."""
+    row: float
+    column: float
+    """The centre (pixels, from 0)."""
+    affine: tuple[float, float, float]
+    """c, d, e."""
+    width: int
+    height: int
+
+    def camera(self, where: str | Path = "OCamCalib model") -> Camera:
+        """The camera of model "ocam" that sees as this one does, within `MAX_MISFIT_PX`.
+
+        Raises WearcapError when the polynomials are none of a lens, or contradict each other.
+        """
+        c, d, e = self.affine
+        determinant = c - d * e
+        if not (0 < self.width <= _MAX_SIDE and 0 < self.height <= _MAX_SIDE and 0.1 < determinant < 10):
+            raise WearcapError(f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}",
+                               where=where, expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0")  # fmt: skip
+        if not (0 <= self.row < self.height and 0 <= self.column < self.width):
+            raise WearcapError(f"its centre, row {self.row:g} and column {self.column:g}, lies outside the image of "
+                               f"{self.height} rows and {self.width} columns", where=where,
+                               expected="row first, then column")  # fmt: skip
+        focal = -self.pol[0]
+        if focal <= 0:
+            raise WearcapError(f"its direct polynomial begins with {self.pol[0]:g}", where=where,
+                               expected="a negative number (the axis points backwards)")  # fmt: skip
+        rho, theta = self._curve(determinant, where)
+        powers, misfit = _fitted(rho / focal, theta)
+        if misfit * focal > MAX_MISFIT_PX:
+            raise WearcapError(f"its polynomial is met only within {misfit * focal:.2f} px", where=where,
+                               expected="a fisheye lens")  # fmt: skip
+        return Camera(
+            "ocam", self.width, self.height, focal, focal, self.column, self.row, (c, d, e, *powers)
+        )
+
+    def _curve(self, determinant: float, where: str | Path) -> tuple[np.ndarray, np.ndarray]:
+        """Radii ρ (pixels) as far as the image's furthest corner, and their angles θ from the axis (rad)."""
+        c, d, e = self.affine
+        corners = np.array(
+            [(row, column) for row in (0, self.height - 1) for column in (0, self.width - 1)], np.float64
+        )
+        offset = corners - (self.row, self.column)
+        u = (offset[:, 0] - d * offset[:, 1]) / determinant
+        v = (c * offset[:, 1] - e * offset[:, 0]) / determinant
+        rho = np.linspace(0, np.hypot(u, v).max(), 2000)
+        theta = np.arctan2(rho, -np.polynomial.polynomial.polyval(rho, self.pol))
+        falling = np.diff(theta) <= 0
+        last = int(falling.argmax()) if falling.any() else len(rho) - 1
+        # A lens whose polynomial turns within the image draws a circle smaller than the picture.
+        if last < len(rho) // 4:
+            raise WearcapError(f"its direct polynomial turns back {rho[last]:.0f} px from the centre", where=where,
+                               expected="angles that rise with the radius")  # fmt: skip
+        rho, theta = rho[: last + 1], theta[: last + 1]
+        if self.invpol:
+            disagreement = np.abs(np.polynomial.polynomial.polyval(theta - np.pi / 2, self.invpol) - rho)
+            central = disagreement[theta < 0.8 * theta[-1]]
+            if central.max() > MAX_DISAGREEMENT_PX:
+                raise WearcapError(f"its two polynomials differ by up to {central.max():.3g} px", where=where,
+                                   expected="two fits of one lens")  # fmt: skip
+        return rho, theta
+
+
+def _fitted(radius: np.ndarray, theta: np.ndarray) -> tuple[tuple[float, ...], float]:
+    """k1…k10 of radius = θ + k1 θ² + …, and the largest residual."""
+    share = theta / theta[-1]  # powers of numbers up to 1 keep the system solvable
+    basis = np.stack([share**power for power in range(2, POWERS + 2)], 1)
+    solution = np.linalg.lstsq(basis, radius - theta, rcond=None)[0]
+    misfit = float(np.abs(basis @ solution + theta - radius).max())
+    return tuple((solution / theta[-1] ** np.arange(2, POWERS + 2)).tolist()), misfit
+
+
+def read_ocamcalib(path: str | Path) -> OCamModel:
+    """Read `calib_results.txt` as OCamCalib exports it.
+
+    Raises WearcapError naming the line for missing lines, wrong counts and what is no number.
+    """
+    rows = [
+        (number, line.split())
+        for number, line in numbered_lines(path, usual=_MAX_BYTES)
+        if line.strip() and not line.lstrip().startswith(("#", "%"))
+    ]
+    if len(rows) < len(_TEXT_LINES):
+        raise WearcapError(f"it lacks {_TEXT_LINES[len(rows)]}", where=path, expected="calib_results.txt of OCamCalib: "
+                           f"lines of numbers for {', '.join(_TEXT_LINES)}")  # fmt: skip
+    values = []
+    for what, counted, (number, tokens) in zip(_TEXT_LINES, (True, True, False, False, False), rows):
+        try:
+            line = finite_floats(tokens)
+            if counted and (len(line) < 3 or line[0] != len(line) - 1):
+                raise ValueError(f"{len(line) - 1} coefficients where {line[0]:g} are announced")
+        except (ValueError, IndexError) as error:
+            raise WearcapError(f"{what} cannot be read ({error})", where=at_line(path, number)) from error
+        values.append(line[1:] if counted else line)
+    for what, count, line, (number, _) in zip(_TEXT_LINES[2:], (2, 3, 2), values[2:], rows[2:]):
+        if len(line) != count:
+            raise WearcapError(
+                f"{what} with {len(line)} numbers", where=at_line(path, number), expected=f"{count}"
+            )
+    pol, invpol, centre, affine, size = (tuple(line.tolist()) for line in values)
+    return OCamModel(pol, invpol, *centre, affine, width=int(size[1]), height=int(size[0]))  # pyright: ignore[reportArgumentType]
+
+
+def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
+    """Cameras of a NavVis `sensor_frame.xml` by name (cam0, cam1, …); `cx` there is the row, `cy` the column.
+
+    Raises WearcapError for damaged XML, document types and entities, no cameras, and naming the camera for missing
+    or wrong numbers.
+    """
+    text = read_text(path, usual=_MAX_BYTES)
+    try:
+        root = fromstring(text, forbid_dtd=True)
+    except DefusedXmlException as error:
+        raise WearcapError("it declares a document type or entities", where=path, expected="a plain sensor_frame.xml") from error  # fmt: skip
+    except (ParseError, ValueError) as error:
+        raise WearcapError(f"broken XML ({error})", where=path, expected="a whole sensor_frame.xml",
+                           fix="Copy it again.") from error  # fmt: skip
+    found: dict[str, OCamModel] = {}
+    for element in (item for item in root.iter() if _tag(item) == "CameraModel"):
+        name = _text(element, "SensorName", path)
+        where = f"{path}, camera {name!r}"
+        if _child(element, "OCamModel") is None:
+            continue  # other lens models stand beside OCamCalib's
+        if name in found:
+            raise WearcapError("the camera is there twice", where=where)
+        found[name] = _from_xml(element, where)
+    if not found:
+        raise WearcapError(
+            "no cameras", where=path, expected="CameraModel elements with an OCamModel (NavVis)"
+        )
+    return found
+
+
+def _from_xml(element: Element, where: str) -> OCamModel:
+    lens, size = _child(element, "OCamModel"), _child(element, "ImageSize")
+    if lens is None or size is None:
+        raise WearcapError("no ImageSize", where=where, expected="ImageSize with Width and Height")
+    polynomials = {}
+    for name, (least, most) in _COUNTS.items():
+        holder = _child(lens, name)
+        coefficients = [] if holder is None else [item.text or "" for item in holder if _tag(item) == "coeff"]
+        if not least <= len(coefficients) <= most and (name == "cam2world" or coefficients):
+            raise WearcapError(f"{name} with {len(coefficients)} coefficients", where=where, expected=f"at least {least}")  # fmt: skip
+        polynomials[name] = tuple(_number(item, name, where) for item in coefficients)
+    c, d, e, cx, cy = (_number(_text(lens, name, where), name, where) for name in ("c", "d", "e", "cx", "cy"))
+    width, height = (_number(_text(size, name, where), name, where) for name in ("Width", "Height"))
+    return OCamModel(polynomials["cam2world"], polynomials["world2cam"], cx, cy, (c, d, e), int(width), int(height))  # fmt: skip
+
+
+def _tag(element: Element) -> str:
+    return element.tag.rsplit("}", 1)[-1] if isinstance(element.tag, str) else ""
+
+
+def _child(element: Element, name: str) -> Element | None:
+    return next((item for item in element if _tag(item) == name), None)
+
+
+def _text(element: Element, name: str, where: str | Path) -> str:
+    child = _child(element, name)
+    if child is None or not (child.text or "").strip():
+        raise WearcapError(f"no {name}", where=where, expected="NavVis' layout of sensor_frame.xml")
+    return (child.text or "").strip()
+
+
+def _number(text: str, name: str, where: str) -> float:
+    try:
+        return float(finite_floats([text])[0])
+    except ValueError as error:
+        raise WearcapError(f"{name} is {text[:30]!r}", where=where, expected="a number") from error

@@ -1,0 +1,160 @@
+"""PCD point clouds (ASCII, binary, binary_compressed): x y z and, where there are any, colours."""
+
+import io
+import warnings
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from wearcap.errors import WearcapError
+from wearcap.io.formats.bounded import read_bytes
+from wearcap.io.formats.ply import Ply
+
+_MAX_HEADER_BYTES = 1 << 16
+_MAX_COUNT = 1 << 12
+"""Numbers of one field; the longest features that PCL knows hold some 2000."""
+_TYPES = {("F", 4): "<f4", ("F", 8): "<f8"} | {
+    (kind, size): f"<{letter}{size}" for kind, letter in (("I", "i"), ("U", "u")) for size in (1, 2, 4, 8)
+}
+
+
+def read_pcd(path: str | Path) -> Ply:
+    """Points of a PCD file (in the file's unit and axes); points that are NaN, PCL's "no return", are left out.
+
+    Raises WearcapError when it is no PCD, is cut short, has no x y z, or its compressed data is damaged.
+    """
+    data = read_bytes(path)
+    header, body = _parse_header(data, path)
+    dtype = _row_type(header, path)
+    count = int(header["POINTS"][0])
+    encoding = header["DATA"][0]
+    if encoding == "ascii":
+        rows = _ascii_rows(memoryview(data)[body:], dtype, count, path)
+    elif encoding == "binary":
+        _require(len(data) - body >= count * dtype.itemsize, path)
+        rows = np.frombuffer(data, dtype, count, body)
+    elif encoding == "binary_compressed":
+        rows = _compressed_rows(memoryview(data)[body:], dtype, count, path)
+    else:
+        raise WearcapError(f"DATA {encoding}", where=path, expected="ascii, binary or binary_compressed")
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is left out
+        points = np.stack([rows[axis] for axis in "xyz"], 1).astype(np.float32)
+    valid = np.isfinite(points).all(1)
+    packed = next(
+        (rows[name] for name in ("rgb", "rgba") if name in (dtype.names or ()) and dtype[name].itemsize == 4),
+        None,
+    )
+    colors = None if packed is None else _unpacked_colors(packed)[valid]
+    return Ply(points[valid], colors)
+
+
+def _parse_header(data: bytes, path: str | Path) -> tuple[dict[str, list[str]], int]:
+    header: dict[str, list[str]] = {}
+    start = 0
+    while "DATA" not in header:
+        stop = data.find(b"\n", start, _MAX_HEADER_BYTES)
+        if stop < 0:
+            raise WearcapError(
+                "not a PCD file, or its header is cut short", where=path, expected="lines up to `DATA`"
+            )
+        words = data[start:stop].decode("ascii", errors="replace").split("#")[0].split()
+        if words:
+            header[words[0]] = words[1:] or [""]
+        start = stop + 1
+    missing = {"FIELDS", "SIZE", "TYPE", "POINTS"} - set(header)
+    if missing or not (header["POINTS"][0].isdigit() and len(header["POINTS"][0]) < 15):
+        raise WearcapError(f"its header lacks {', '.join(sorted(missing)) or 'a count of points'}", where=path,
+                           expected="a PCD 0.7 header")  # fmt: skip
+    return header, start
+
+
+def _row_type(header: dict[str, list[str]], path: str | Path) -> np.dtype:
+    counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
+    fields = []
+    try:
+        for i, name in enumerate(header["FIELDS"]):
+            letter = _TYPES[header["TYPE"][i], int(header["SIZE"][i])]
+            if not 0 < int(counts[i]) <= _MAX_COUNT or (name in ("x", "y", "z") and int(counts[i]) != 1):
+                raise ValueError(f"COUNT {counts[i]} of {name}"[:60])
+            shape = (int(counts[i]),) if int(counts[i]) != 1 else ()
+            fields.append((f"_padding{i}" if name == "_" else name, letter, shape))
+        if not {"x", "y", "z"} <= {name for name, _, _ in fields}:
+            raise WearcapError("no fields x, y, z", where=path, expected="a point cloud")
+        return np.dtype(fields)
+    except (LookupError, ValueError, TypeError) as error:
+        raise WearcapError(f"its header cannot be understood ({error})"[:200], where=path,
+                           expected="a SIZE, TYPE and COUNT for every field") from error  # fmt: skip
+
+
+def _require(complete: bool, path: str | Path) -> None:
+    if not complete:
+        raise WearcapError("it holds fewer points than its header says", where=path,
+                           fix="The file was cut short: copy it again.")  # fmt: skip
+
+
+def _ascii_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path) -> np.ndarray:
+    text = io.TextIOWrapper(io.BytesIO(body), "ascii", errors="replace", newline="\n")
+    lines = islice((line for line in text if line.strip()), count)
+    try:
+        with warnings.catch_warnings(), np.errstate(over="ignore", invalid="ignore"):
+            warnings.simplefilter("ignore", UserWarning)  # numpy's own word on a file that ends here
+            rows = np.loadtxt(lines, dtype=dtype, ndmin=1, comments=None)
+    except (ValueError, OverflowError) as error:
+        raise WearcapError(f"a row is not as the header says ({error})"[:200], where=path) from error
+    _require(len(rows) == count, path)
+    return rows
+
+
+def _compressed_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path) -> np.ndarray:
+    """LZF data in which each field's values stand together."""
+    _require(len(body) >= 8, path)
+    compressed, size = (int(v) for v in np.frombuffer(body, "<u4", 2))
+    _require(len(body) >= 8 + compressed and size == count * dtype.itemsize, path)
+    try:
+        plain = lzf_decompress(body[8 : 8 + compressed], size)
+    except ValueError as error:
+        raise WearcapError(f"its compressed data is damaged ({error})", where=path,
+                           fix="Copy the file again.") from error  # fmt: skip
+    rows, start = np.empty(count, dtype), 0
+    for name in dtype.names or ():
+        width = dtype[name].itemsize
+        rows[name] = np.frombuffer(plain, dtype[name], count, start)
+        start += count * width
+    return rows
+
+
+def lzf_decompress(data: bytes | memoryview, size: int) -> bytes:
+    """Undo LZF: literal runs and back references. Raises ValueError when the data does not give `size` bytes."""
+    out = bytearray()
+    i = 0
+    try:
+        while i < len(data) and len(out) <= size:
+            control = data[i]
+            i += 1
+            if control < 32:
+                out += data[i : i + control + 1]
+                i += control + 1
+                continue
+            length = control >> 5
+            if length == 7:
+                length += data[i]
+                i += 1
+            start = len(out) - ((control & 31) << 8) - data[i] - 1
+            i += 1
+            if start < 0:
+                raise ValueError("a reference before the beginning")
+            length += 2
+            chunk = out[start : start + length]
+            out += (chunk * (length // len(chunk) + 1))[:length]  # a reference may run into what it writes
+    except IndexError as error:
+        raise ValueError("cut short") from error
+    if len(out) != size:
+        raise ValueError(f"{len(out)} bytes instead of {size}")
+    return bytes(out)
+
+
+def _unpacked_colors(packed: np.ndarray) -> np.ndarray:
+    """PCL packs 0x00RRGGBB into the bits of a float or an unsigned integer."""
+    bits = np.ascontiguousarray(packed).view("<u4")
+    return (np.stack([bits >> 16, bits >> 8, bits], 1) & 255).astype(np.uint8)

@@ -1,0 +1,283 @@
+"""Public pickles (HPS, DIP-IMU, OMOMO, cam_traj.pkl) without running what is in them.
+
+A pickle names classes and functions to call. Here a handful of names stand for functions of this file that build
+numeric arrays, scalars and bytes; every other name is refused before anything is called. joblib's files, where arrays'
+bytes stand between the opcodes, are read too.
+"""
+
+import bz2
+import gzip
+import io
+import lzma
+import math
+import pickle
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from wearcap.errors import WearcapError
+from wearcap.io.formats.bounded import Budget, counted, explained, file_size
+
+MAX_BYTES = 1 << 33
+"""Largest pickle that is read, once unpacked (8 GiB)."""
+
+_MAX_DEPTH = 64
+_MAX_ITEMS = 1 << 24
+_MAX_STEPS = 1 << 24
+"""Opcodes of a pickle: each may put an object of a hundred bytes into memory, and takes half a microsecond."""
+
+_DTYPE = re.compile(r"[<>=|]?(b1|\?|[biuf][1248]|f16|[SU]\d{1,6})")
+_ADMITTED = (bool, int, float, complex, str, bytes, bytearray, type(None), np.generic)
+
+
+def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
+    """The content of a pickle or joblib file (packed or not): numbers, str, bytes, lists, tuples, dicts, arrays.
+
+    Python 2's byte strings come as str (Latin-1). Raises WearcapError naming the class or function when the file
+    holds anything else, and when it is damaged.
+    """
+    content = _unpacked(path, max_bytes)
+    try:
+        value = _Unpickler(io.BytesIO(content), encoding="latin1").load()
+        _require_plain(value)
+        return value
+    except _RefusedError as error:
+        raise WearcapError(str(error), where=path, expected="numbers, text, lists, dicts and NumPy arrays only",
+                           fix="Anything else in a pickle can run code when it is loaded, and is never read.") from error  # fmt: skip
+    except Exception as error:  # the opcodes are the file's own program: there is no telling what they break
+        raise WearcapError(f"a damaged pickle ({type(error).__name__}: {error})"[:300], where=path,
+                           expected="a whole pickle file", fix="Fetch it again.") from error  # fmt: skip
+
+
+class _RefusedError(Exception):
+    """Something that is never admitted."""
+
+
+def _unpacked(path: str | Path, max_bytes: int | None) -> bytes:
+    """joblib packs whole files; their first bytes tell how."""
+    packed = Budget(path, file_size(path), MAX_BYTES, max_bytes)
+    packed.spend(file_size(path))
+    with explained(path), open(path, "rb") as file:
+        begin = file.peek(2)
+        packers = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
+        if begin[:1] == b"x":
+            file = _Inflated(file)
+        elif begin[:2] in packers:
+            file = packers[begin[:2]](file)
+        with counted(file, Budget(path, file_size(path), MAX_BYTES, max_bytes)) as reader:
+            content = reader.read()
+    if not content:
+        raise WearcapError("the file is empty", where=path)
+    return content
+
+
+class _Inflated(io.BufferedIOBase):
+    """What a stream packed by zlib unpacks to."""
+
+    def __init__(self, file: io.BufferedIOBase):
+        self._file, self._unpacker, self._rest = file, zlib.decompressobj(), b""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        assert size
+        while not self._unpacker.eof:
+            packed = self._rest or self._file.read(1 << 16)
+            content = self._unpacker.decompress(packed, size)
+            self._rest = self._unpacker.unconsumed_tail
+            if content or not packed:
+                return content
+        return b""
+
+
+def _require_plain(value: Any) -> None:
+    """Refuse what is left of half-built objects and of names that were never called, and what unfolds without end.
+
+    A list may stand in many others, or in itself: it counts as often as it is met.
+    """
+    level, count = [value], 0
+    for _ in range(_MAX_DEPTH):
+        inner: list[Any] = []
+        for item in level:
+            if isinstance(item, list | tuple | dict):
+                count += len(item)
+                if count > _MAX_ITEMS:
+                    raise _RefusedError(f"it holds more than {_MAX_ITEMS} items")
+                inner += [*item.keys(), *item.values()] if isinstance(item, dict) else item
+            elif not isinstance(item, (*_ADMITTED, np.ndarray)):
+                raise _RefusedError(f"it holds a {getattr(item, '__name__', type(item).__name__)}")
+        if not inner:
+            return
+        level = inner
+    raise _RefusedError(f"it holds lists within lists, {_MAX_DEPTH} deep")
+
+
+# --- what the admitted names stand for -----------------------------------------------------------------------
+
+
+class _NdarrayName:
+    """The name numpy.ndarray, which is only ever an argument."""
+
+
+class _JoblibArray:
+    """joblib's NumpyArrayWrapper: the bytes of the array follow it in the file."""
+
+
+def _dtype(code: Any, align: Any = False, copy: Any = True) -> np.dtype:
+    if not isinstance(code, str) or not _DTYPE.fullmatch(code):
+        raise _RefusedError(f"it holds an array of type {str(code)[:40]!r}")
+    return np.dtype(code, copy=True)
+
+
+def _encode(text: str, encoding: str = "latin1") -> bytes:
+    if encoding != "latin1":
+        raise _RefusedError(f"it holds bytes encoded as {encoding!r}")
+    return text.encode("latin1")
+
+
+def _checked(buffer: Any, dtype: Any, shape: Any) -> tuple[bytes, tuple[int, ...]]:
+    """The bytes and shape of an array that they can fill."""
+    data = buffer.encode("latin1") if isinstance(buffer, str) else buffer
+    shape = (shape,) if isinstance(shape, int) else tuple(shape)
+    if not isinstance(dtype, np.dtype) or dtype.hasobject or any(length < 0 for length in shape):
+        raise ValueError("an array without a numeric type and shape")
+    if not isinstance(data, bytes | bytearray) or math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"an array of shape {shape} from other bytes")
+    return bytes(data), shape
+
+
+def _array(buffer: Any, dtype: Any, shape: Any, order: str = "C") -> np.ndarray:
+    data, shape = _checked(buffer, dtype, shape)
+    array = np.frombuffer(data, dtype) if data else np.zeros(0, dtype)
+    return array.reshape(shape, order="F" if order == "F" else "C").copy(order="C")
+
+
+def _scalar(dtype: Any, data: Any) -> np.generic:
+    return _array(data, dtype, (1,))[0]
+
+
+def _empty_array(subtype: Any, shape: Any, code: Any) -> np.ndarray:
+    """numpy's _reconstruct: an empty array that a BUILD opcode fills."""
+    if subtype is not _NdarrayName:
+        raise _RefusedError("it holds a subclass of numpy.ndarray")
+    return np.ndarray((0,), np.int8)
+
+
+def _no_bytes(*arguments: Any) -> bytes:
+    if arguments:
+        raise _RefusedError("it calls builtins.bytes")
+    return b""
+
+
+_NUMPY = {"dtype": _dtype, "ndarray": _NdarrayName}
+_MULTIARRAY = {"_reconstruct": _empty_array, "scalar": _scalar}
+_NAMES: dict[str, dict[str, Any]] = {
+    "numpy": _NUMPY,
+    "numpy.core.multiarray": _MULTIARRAY,
+    "numpy._core.multiarray": _MULTIARRAY,
+    "numpy.core.numeric": {"_frombuffer": _array},
+    "numpy._core.numeric": {"_frombuffer": _array},
+    "_codecs": {"encode": _encode},
+    "builtins": {"bytes": _no_bytes},
+    "__builtin__": {"bytes": _no_bytes},
+    "joblib.numpy_pickle": {"NumpyArrayWrapper": _JoblibArray},
+}
+
+
+_PythonUnpickler: Any = getattr(pickle, "_Unpickler")  # noqa: B009
+"""The pure Python one, for its opcodes can be replaced one by one."""
+
+
+def _stepping(load: Callable[[Any], None]) -> Callable[[Any], None]:
+    """An opcode that is counted."""
+
+    def step(self: Any) -> None:
+        self.steps += 1
+        if self.steps > _MAX_STEPS:
+            raise ValueError(f"more than {_MAX_STEPS} steps")
+        load(self)
+
+    return step
+
+
+class _Unpickler(_PythonUnpickler):
+    dispatch: ClassVar[dict[int, Any]] = dict(_PythonUnpickler.dispatch)
+
+    def __init__(self, file: io.BytesIO, *, encoding: str):
+        super().__init__(file, encoding=encoding)
+        self._source, self.steps = file, 0
+
+    def find_class(self, module: str, name: str) -> Any:
+        found = _NAMES.get(module, {}).get(name)
+        if found is None:
+            raise _RefusedError(f"it names {module}.{name}")
+        return found
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise _RefusedError("it refers to objects outside the file")
+
+    def load_build(self) -> None:
+        """Fill an array or a byte order; nothing else has a state here."""
+        state = self.stack.pop()
+        target = self.stack[-1]
+        if isinstance(target, np.ndarray):
+            _, shape, dtype, fortran, data = state
+            data, shape = _checked(data, dtype, shape)
+            target.__setstate__((1, shape, dtype, bool(fortran), data))
+        elif isinstance(target, np.dtype):
+            self._set_byte_order(target, state)
+        elif isinstance(target, _JoblibArray):
+            self.stack[-1] = self._joblib_array(state)
+        else:
+            raise _RefusedError(f"it gives a state to a {type(target).__name__}")
+
+    def _set_byte_order(self, dtype: np.dtype, state: tuple) -> None:
+        order, parts = state[1], state[2:5]
+        if (
+            order not in ("<", ">", "|", "=")
+            or any(part is not None for part in parts)
+            or dtype.isbuiltin == 1
+        ):
+            raise _RefusedError("it holds an array of structures")
+        # Sizes count for text alone; numbers know theirs.
+        sizes = (dtype.itemsize, dtype.alignment) if dtype.kind in "SU" else (-1, -1)
+        dtype.__setstate__((3, order, None, None, None, *sizes, 0))  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _joblib_array(self, state: dict[str, Any]) -> np.ndarray:
+        dtype, shape = state["dtype"], tuple(state["shape"])
+        if not isinstance(dtype, np.dtype) or state["subclass"] is not _NdarrayName:
+            raise _RefusedError("it holds a subclass of numpy.ndarray")
+        if state.get("numpy_array_alignment_bytes") is not None:
+            self._source.read(self._source.read(1)[0])
+        size = math.prod(shape) * dtype.itemsize
+        if size < 0 or size > MAX_BYTES:
+            raise ValueError(f"an array of shape {shape}")
+        data = self._source.read(size)
+        if state["order"] == "F":
+            return _array(data, dtype, shape[::-1]).T.copy()
+        return _array(data, dtype, shape)
+
+    def load_bytearray8(self) -> None:
+        """As the original, but without reserving what the file cannot hold."""
+        (length,) = struct.unpack("<Q", self.read(8))
+        if length > self._source.getbuffer().nbytes:
+            raise ValueError("bytes beyond the end of the file")
+        self.append(bytearray(self.read(length)))
+
+    def refuse(self) -> None:
+        raise _RefusedError("it holds a set or an outside buffer")
+
+    dispatch[pickle.BUILD[0]] = load_build
+    dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8
+    for opcode in (
+        pickle.EMPTY_SET,
+        pickle.ADDITEMS,
+        pickle.FROZENSET,
+        pickle.NEXT_BUFFER,
+        pickle.READONLY_BUFFER,
+    ):
+        dispatch[opcode[0]] = refuse
+    dispatch = {opcode: _stepping(load) for opcode, load in dispatch.items()}

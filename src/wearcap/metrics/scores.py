@@ -1,0 +1,95 @@
+"""Scores of one capture against its recording's truth."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import nearest_frames
+from wearcap.metrics.position import mpjpe_cm, root_error_cm
+from wearcap.metrics.table import Row, evaluate_motion
+from wearcap.recording import Motion, Recording
+from wearcap.recording.timing import at_times
+from wearcap.tracking.anchor import hang_from_head
+
+Measure = Callable[[Motion, Recording, str, int], Row]
+"""Scores of a motion that was captured from a recording, by the recording's name and a seed."""
+
+
+def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
+    """All metrics of one capture at its own frames against its recording's truth.
+
+    Both are hung from the true head, but for `world_root_cm` and `world_mpjpe_cm`: these are measured where the capture
+    put the body in the world.
+    """
+    hung, truth, contact = comparable(motion, recording, name)
+    scores = evaluate_motion(hung, truth, contact)
+    joints, joints_true = motion.T_world_joint.t, truth.T_world_joint.t
+    scores["world_root_cm"] = root_error_cm(joints[:, 0], joints_true[:, 0]).item()
+    scores["world_mpjpe_cm"] = mpjpe_cm(joints, joints_true).item()
+    return Row(name, seed, len(truth), scores)
+
+
+def score_in_world(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
+    """All metrics of one capture where it put the body in the world, nothing hung or aligned (MocapEvery §4.1).
+
+    Beside them `r_mpjpe_cm`, both bodies moved to one root (r.MPJPE), and `right_hand_pe_cm`.
+    """
+    truth, contact = truth_at(motion, recording, name)
+    scores = evaluate_motion(motion, truth, contact)
+    joints, joints_true = motion.T_world_joint.t, truth.T_world_joint.t
+    scores["r_mpjpe_cm"] = mpjpe_cm(joints - joints[:, :1], joints_true - joints_true[:, :1]).item()
+    hand = truth.skeleton.index("right_wrist")
+    scores["right_hand_pe_cm"] = mpjpe_cm(joints[:, [hand]], joints_true[:, [hand]]).item()
+    return Row(name, seed, len(truth), scores)
+
+
+def comparable(
+    motion: Motion, recording: Recording, name: str
+) -> tuple[Motion, Motion, Bool[Tensor, "time patch"] | None]:
+    """A capture hung from the true head, the truth at the capture's frames, and the true contact of its feet.
+
+    Raises WearcapError when the recording has no true motion.
+    """
+    truth, contact = truth_at(motion, recording, name)
+    return hang_from_head(motion, truth.joint("head")), truth, contact
+
+
+def truth_at(
+    motion: Motion, recording: Recording, name: str
+) -> tuple[Motion, Bool[Tensor, "time patch"] | None]:
+    """The truth at the capture's frames, and the true contact of its feet.
+
+    Raises WearcapError when the recording has no true motion.
+    """
+    truth, contact = recording.motion, _foot_contact(recording)
+    if truth is None:
+        raise WearcapError("no true motion to compare with", where=name, expected="a recording with `motion`")
+    if _within(motion, truth):
+        frame = nearest_frames(truth.timestamps, motion.timestamps)
+        truth, contact = at_times(truth, motion.timestamps), None if contact is None else contact[frame]
+    return truth, contact
+
+
+def _within(motion: Motion, truth: Motion) -> bool:
+    """Whether a motion has another rate than the truth, and no frame outside its time."""
+    same = len(motion) == len(truth) and torch.allclose(
+        motion.timestamps, truth.timestamps, rtol=0, atol=1e-6
+    )
+    ends = truth.timestamps[[0, -1]] if len(truth) > 1 and len(motion) > 1 else None
+    return (
+        not same
+        and ends is not None
+        and bool(motion.timestamps[0] >= ends[0] - 1e-6 and motion.timestamps[-1] <= ends[1] + 1e-6)
+    )
+
+
+def _foot_contact(recording: Recording) -> Bool[Tensor, "time patch"] | None:
+    """True contact of the foot patches among the parts that a recording tracks (hands may be others)."""
+    track = recording.contacts
+    if track is None or not set(FOOT_PATCHES) <= set(track.parts):
+        return None
+    return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]

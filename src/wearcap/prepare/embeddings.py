@@ -1,0 +1,92 @@
+"""Image embeddings put into the recordings of a data set that stands already.
+
+No engine of tasks: what fails here must leave the recording in its data set, and a large encoder is loaded once.
+"""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from wearcap.data.embeddings import embed_camera, embedding_name
+from wearcap.errors import WearcapError
+from wearcap.files import folder_lock, remove_leftovers
+from wearcap.models.image_encoder import ImageEncoder
+from wearcap.prepare.check import check_recording
+from wearcap.prepare.engine import REGISTER_EVERY_S, Report, progress_bar
+from wearcap.recording.recording import CameraStream
+from wearcap.recording.store import Entry, RecordingFile, RecordingStore, entry_for, save_recording
+
+
+def embed_dataset(
+    dataset: str | Path, encoder: ImageEncoder, cache: str | Path | None = None, overwrite: bool = False,
+    progress: bool = True,
+) -> Report:  # fmt: skip
+    """Give every recording with a head camera's pictures their embeddings by `encoder`, rewriting its file.
+
+    Recordings that have them already are left as they are, so that a killed run goes on where it was. A recording whose
+    pictures are missing or damaged is reported and stays as it was. The manifest's config hash stays: the source is
+    the same. `cache`: see `embed_camera`. Raises WearcapError when no recording has pictures, and when another run writes
+    into the data set.
+    """
+    root = RecordingStore.open(dataset).root
+    with folder_lock(root, "prepare embeddings"):
+        remove_leftovers(root, below=True)
+        return _embed_all(RecordingStore.open(root), encoder, cache, overwrite, progress)
+
+
+def _embed_all(
+    store: RecordingStore, encoder: ImageEncoder, cache: str | Path | None, overwrite: bool, progress: bool
+) -> Report:
+    name_of_all = embedding_name(encoder)
+    report, waiting, written_at = Report(), dict[str, Entry](), time.monotonic()
+    try:
+        with progress_bar(len(store.entries), 0, progress) as advance:
+            for name in store.names():
+                try:
+                    file = RecordingFile(store.path_of(name), verify=_is_registered(store, name))
+                    camera = file.part("camera")
+                    if not isinstance(camera, CameraStream) or not (camera.video or camera.image_files):
+                        report.notes[name] = "no head camera's pictures"
+                    elif not overwrite and _is_current(store, name, camera, name_of_all):
+                        report.current.append(name)
+                    else:
+                        waiting[name] = _embed(
+                            store, name, file, encoder, None if cache is None else Path(cache)
+                        )
+                        report.written.append(name)
+                except WearcapError as error:
+                    report.failed[name] = str(error)
+                if time.monotonic() - written_at > REGISTER_EVERY_S:
+                    store.register(waiting)
+                    waiting, written_at = {}, time.monotonic()
+                advance()
+    finally:
+        store.register(waiting)
+    if len(report.notes) == len(store.entries):
+        raise WearcapError("no recording has a head camera's pictures", where=store.root,
+                           fix="Prepare it with them, as `wearcap prepare simulated camera=true` does.")  # fmt: skip
+    return report
+
+
+def _is_current(store: RecordingStore, name: str, camera: CameraStream, embedded_by: str) -> bool:
+    """A run that was killed may have written a file that the manifest does not know yet: it is written again."""
+    known = _is_registered(store, name)
+    both = camera.embedding is not None and camera.embedding_mirrored is not None
+    return known and both and camera.embedding_name == embedded_by
+
+
+def _is_registered(store: RecordingStore, name: str) -> bool:
+    """Whether a recording's file is not younger than the manifest, which is written after it."""
+    path = store.path_of(name)
+    return not path.is_file() or path.stat().st_mtime_ns <= store.manifest_path.stat().st_mtime_ns
+
+
+def _embed(
+    store: RecordingStore, name: str, file: RecordingFile, encoder: ImageEncoder, cache: Path | None
+) -> Entry:
+    recording, entry = file.load(), store.entries[name]
+    assert recording.camera is not None
+    recording = replace(recording, camera=embed_camera(recording.camera, store.root, encoder, cache))
+    check_recording(recording)
+    save_recording(recording, store.path_of(name))
+    return entry_for(recording, store.root, entry.split, entry.config_hash)

@@ -1,0 +1,229 @@
+"""One recording per task, through joblib: parallel, resumable, and the same bytes however it is run.
+
+A worker writes its recording's file; the parent enters it in the manifest as results arrive. Killed at any
+moment, a data set is left with whole files and a whole manifest, and the next run does only what is missing.
+"""
+
+import hashlib
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import BrokenExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numba
+import torch
+from joblib.externals.loky import get_reusable_executor
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from wearcap.errors import WearcapError
+from wearcap.files import folder_lock, remove_leftovers, sha256_of
+from wearcap.prepare.check import check_recording
+from wearcap.recording.recording import Recording
+from wearcap.recording.store import Entry, RecordingStore, entry_for, recording_path, save_recording
+from wearcap.workers import bound_to_this_process
+
+BACKENDS = ("loky", "threading", "dask", "ray")
+REGISTER_EVERY_S = 1.0
+"""The manifest is rewritten at most this often: a large data set's is megabytes long."""
+
+NOTE = "note"
+"""Key of a motion's provenance that the report repeats: what was cut, dropped or guessed."""
+
+MAX_REASON = 500
+"""Longest reason (characters) that is told of a recording that failed."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One recording to make. `make` must be picklable and deterministic."""
+
+    name: str
+    make: Callable[[], Recording]
+    split: str
+    hash: str
+    """Changes when the source's bytes or the settings do."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a run did, by recording name."""
+
+    written: list[str] = field(default_factory=list)
+    current: list[str] = field(default_factory=list)
+    """Left as they were: their hash is current and their file whole."""
+    failed: dict[str, str] = field(default_factory=dict)
+    """Name to reason."""
+    notes: dict[str, str] = field(default_factory=dict)
+
+
+def content_hash(*parts: Any) -> str:
+    """Hex digest (16 digits) of settings (anything JSON can hold) and of the bytes of files given as Path."""
+    plain = [sha256_of(part) if isinstance(part, Path) else part for part in parts]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def prepare(
+    tasks: list[Task], output: str | Path, *, jobs: int = -1, backend: str = "loky",
+    scheduler: str | None = None, overwrite: bool = False, progress: bool = True,
+) -> Report:  # fmt: skip
+    """Make every recording that is missing or out of date.
+
+    `jobs` is joblib's (-1: all cores); with backend "dask" and no `scheduler` address, that many local workers.
+    A recording that cannot be made is reported and the rest goes on. Raises WearcapError when the output cannot be
+    written at all or another run writes there, and for an unknown backend or two tasks of one name.
+    """
+    if not tasks:
+        raise WearcapError("nothing to prepare", fix="Check the source folder and its settings.")
+    names = {task.name for task in tasks}
+    if len(names) < len(tasks):
+        twice = Counter(task.name for task in tasks).most_common(1)[0][0]
+        raise WearcapError(f"two sources give a recording the name {twice!r}", expected="unique names")
+    if jobs == 0:
+        raise WearcapError("0 jobs", expected="a number of jobs, or -1 for one per core")
+    if backend not in BACKENDS:
+        raise WearcapError(f"no backend {backend!r}", expected=f"one of {', '.join(BACKENDS)}")
+    with folder_lock(output, "prepare") as lock:
+        store = RecordingStore(output)
+        store.register({})  # no permission or no space is better known now than after the first hour
+        remove_leftovers(store.root, below=True)
+        todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
+        current = sorted(names - {task.name for task in todo})
+        with closing(_outcomes(todo, store.root, jobs, backend, scheduler, lock)) as outcomes:
+            return _collect(outcomes, store, current, len(tasks), progress)
+
+
+def _collect(
+    outcomes: Iterator[tuple[str, Entry | str, str]], store: RecordingStore, current: list[str], total: int,
+    progress: bool,
+) -> Report:  # fmt: skip
+    """Enter what workers have made in the manifest, and report."""
+    report = Report(current=current)
+    waiting: dict[str, Entry] = {}
+    written_at = time.monotonic()
+    try:
+        with progress_bar(total, len(current), progress) as advance:
+            for name, outcome, note in outcomes:
+                if isinstance(outcome, Entry):
+                    waiting[name] = outcome
+                    report.written.append(name)
+                else:
+                    report.failed[name] = outcome
+                    store.entries.pop(name, None)  # of other settings: not what was asked for
+                if note:
+                    report.notes[name] = note
+                if time.monotonic() - written_at > REGISTER_EVERY_S:
+                    store.register(waiting)
+                    waiting, written_at = {}, time.monotonic()
+                advance()
+    except BrokenExecutor as error:
+        raise WearcapError("a worker process was killed (out of memory?)", where=store.root,
+                           fix="What is finished is kept: run again with fewer jobs.") from error  # fmt: skip
+    finally:
+        store.register(waiting)
+    report.written.sort()
+    return report
+
+
+def _is_current(store: RecordingStore, task: Task) -> bool:
+    entry = store.entries.get(task.name)
+    if entry is None or (entry.config_hash, entry.split) != (task.hash, task.split):
+        return False
+    path = store.root / entry.file
+    return path.is_file() and path.stat().st_size == entry.bytes and sha256_of(path) == entry.sha256
+
+
+def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
+    """In a worker: make, check and write one recording; (name, its entry or why there is none, note)."""
+    with _one_thread():
+        try:
+            recording = task.make()
+            if recording.name != task.name:
+                raise WearcapError(f"the source made a recording {recording.name!r}", expected=task.name)
+            check_recording(recording)
+        except Exception as error:
+            reason = str(error) if isinstance(error, WearcapError) else f"{type(error).__name__}: {error}"
+            return task.name, " ".join(reason.split())[:MAX_REASON], ""
+        save_recording(recording, recording_path(root, task.name))
+        note = recording.motion.provenance.get(NOTE, "") if recording.motion else ""
+        return task.name, entry_for(recording, root, task.split, task.hash), note
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Recordings are the unit of parallelism; and sums over threads differ in their last bits."""
+    before = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
+
+
+def _outcomes(
+    todo: list[Task], root: Path, jobs: int, backend: str, scheduler: str | None, lock: int | None
+) -> Generator[tuple[str, Entry | str, str], None, None]:
+    if not todo:
+        return
+    with _backend(backend, jobs, scheduler, lock) as as_generator:
+        chunk_size = len(todo) if as_generator else 64  # without a generator, results come chunk by chunk
+        parallel = joblib.Parallel(
+            n_jobs=jobs, batch_size=1, return_as="generator_unordered" if as_generator else "list"
+        )
+        for start in range(0, len(todo), chunk_size):
+            chunk = todo[start : start + chunk_size]
+            results: Any = parallel(joblib.delayed(_run)(task, root) for task in chunk)
+            yield from results
+
+
+@contextmanager
+def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -> Iterator[bool]:
+    """Make joblib's backend current; yields whether it can return results as they come.
+
+    Its local workers end with this process, and before the `lock` is given up.
+    """
+    try:
+        if backend == "dask":
+            from dask.distributed import Client  # type: ignore[import-not-found]
+
+            local = {"n_workers": joblib.cpu_count() if jobs < 1 else jobs, "threads_per_worker": 1,
+                     "dashboard_address": None}  # fmt: skip
+            with Client(scheduler) if scheduler else Client(**local), joblib.parallel_config("dask"):
+                yield True
+        elif backend == "ray":
+            from ray.util.joblib import register_ray  # type: ignore[import-not-found]
+
+            register_ray()
+            with joblib.parallel_config("ray"):
+                yield False
+        elif backend == "loky":
+            with joblib.parallel_config("loky", inner_max_num_threads=1, **bound_to_this_process(lock)):
+                try:
+                    yield True
+                finally:
+                    if joblib.effective_n_jobs(jobs) > 1:
+                        get_reusable_executor(reuse=True).shutdown(kill_workers=True)
+        else:
+            with joblib.parallel_config(backend):
+                yield True
+    except ModuleNotFoundError as error:
+        raise WearcapError(f"the backend {backend!r} needs the package {error.name!r}",
+                           fix=f"pip install {'wearcap[cluster]' if backend == 'dask' else 'ray'}") from error  # fmt: skip
+
+
+@contextmanager
+def progress_bar(total: int, done: int, visible: bool) -> Iterator[Callable[[], None]]:
+    """A bar of recordings on stderr; call what it yields for each one that is done."""
+    columns = (TextColumn("recordings"), BarColumn(), MofNCompleteColumn(), TextColumn("left:"),
+               TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True), disable=not visible) as bar:
+        line = bar.add_task("recordings", total=total, completed=done)
+        yield lambda: bar.advance(line)

@@ -1,0 +1,174 @@
+"""Keypoints of the head camera put beside the recordings of a data set: found in its pictures, recorded, or simulated.
+
+The new data set's recordings name videos and scenes where they are, in the old one.
+"""
+
+import os
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from wearcap.data.embeddings import pictures
+from wearcap.errors import WearcapError
+from wearcap.io.formats.keypoints_csv import read_keypoints
+from wearcap.localization.keypoint_flow import FlowSettings, tracked_cues
+from wearcap.localization.keypoints import RecordedDetections
+from wearcap.localization.mediapipe_hands import MediaPipeHands, find_model
+from wearcap.prepare.engine import Report, Task, content_hash, prepare
+from wearcap.recording.recording import CameraStream, Recording
+from wearcap.recording.store import RecordingFile, RecordingStore
+from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
+
+CAMERA_FPS = 30.0
+"""Of the camera that a recording without one is given."""
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Where keypoints come from; picklable."""
+
+    def __call__(self, recording: Recording, folder: Path) -> Recording:
+        """The recording, of the data set at `folder`, with its cues."""
+        ...
+
+    def settings(self, name: str) -> list[Any]:
+        """What the cues of the recording of this name depend on (`engine.content_hash`)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Found:
+    """Wrists that MediaPipe finds in the head camera's pictures, and optical flow follows where it misses them."""
+
+    model: str | None = None
+    flow: FlowSettings = field(default_factory=FlowSettings)
+
+    def __call__(self, recording: Recording, folder: Path) -> Recording:
+        camera = _camera(recording)
+        detector = MediaPipeHands(self.model)
+        cues = tracked_cues(pictures(camera, folder), camera.timestamps, detector, self.flow)
+        return replace(recording, cues=recording.cues | cues)
+
+    def settings(self, name: str) -> list[Any]:
+        return ["mediapipe", find_model(self.model), asdict(self.flow)]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Keypoints of files: `file`/NAME.csv for each recording, or `file` itself for the only one."""
+
+    file: str | None
+    flow: FlowSettings = field(default_factory=FlowSettings)
+
+    def __call__(self, recording: Recording, folder: Path) -> Recording:
+        cues = read_keypoints(self._of(recording.name))
+        if all(cue.points.shape[-1] == 2 for cue in cues.values()):
+            camera = _camera(recording)
+            if self.flow.reach and (camera.video or camera.image_files):
+                half_frame = 0.5 * camera.timestamps.diff().median().item()
+                detector = RecordedDetections(cues, half_frame)
+                cues = tracked_cues(pictures(camera, folder), camera.timestamps, detector, self.flow)
+        return replace(recording, cues=recording.cues | cues)
+
+    def settings(self, name: str) -> list[Any]:
+        file = self._of(name)
+        return ["recorded", file if file.is_file() else None, asdict(self.flow)]
+
+    def _of(self, name: str) -> Path:
+        if self.file is None:
+            raise WearcapError("no file of recorded keypoints", fix="Give file=PATH, a .csv or a folder of NAME.csv.")  # fmt: skip
+        return Path(self.file) / f"{name}.csv" if Path(self.file).is_dir() else Path(self.file)
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What a detector would find of the true motion; a recording without a head camera is given an action camera."""
+
+    joints: Sequence[str] = ("left_wrist", "right_wrist")
+    noise_px: float | int = 4.0
+    drop: float | int = 0.1
+    seed: int = 0
+
+    def __call__(self, recording: Recording, folder: Path) -> Recording:
+        motion = recording.motion
+        if motion is None:
+            raise WearcapError("no true motion to simulate keypoints of", where=recording.name,
+                               expected="motion capture, or another detector")  # fmt: skip
+        rng = np.random.default_rng([41, self.seed, zlib.crc32(recording.name.encode())])
+        every = max(1, round(motion.fps / CAMERA_FPS))
+        stream = recording.camera or action_camera(motion.timestamps[::every].contiguous())
+        joints = [joint for joint in self.joints if joint in motion.skeleton]
+        path = camera_path(motion, stream)
+        cues = seen_joints(motion, path, stream.camera, joints, self.noise_px, self.drop, rng)
+        return replace(recording, camera=stream, cues=recording.cues | cues)
+
+    def settings(self, name: str) -> list[Any]:
+        return ["simulated", asdict(self)]
+
+
+@dataclass(frozen=True)
+class WithKeypoints:
+    """One recording and where its keypoints come from; picklable, callable as a task."""
+
+    file: Path
+    folder: Path
+    output: Path
+    source: Source
+
+    def __call__(self) -> Recording:
+        recording = self.source(RecordingFile(self.file).load(), self.folder)
+        return _from_elsewhere(recording, os.path.relpath(self.folder, self.output))
+
+
+def keypoints_dataset(
+    dataset: str | Path, output: str | Path, detector: Source, *, jobs: int = 1, backend: str = "loky",
+    scheduler: str | None = None, overwrite: bool = False, progress: bool = True,
+) -> Report:  # fmt: skip
+    """Make a data set with the recordings of another and their keypoints, in the same splits.
+
+    Raises WearcapError when both are one folder, and for one file of keypoints with several recordings.
+    """
+    store = RecordingStore.open(dataset)
+    if Path(output).resolve() == store.root.resolve():
+        raise WearcapError(
+            "the new data set would replace the old one", where=output, expected="another folder"
+        )
+    file = detector.file if isinstance(detector, Recorded) else None
+    if file is not None and Path(file).is_file() and len(store.names()) > 1:
+        raise WearcapError(f"one file of keypoints for {len(store.names())} recordings", where=file,
+                           expected="a folder with NAME.csv for each")  # fmt: skip
+    tasks = []
+    for name in store.names():
+        entry = store.entries[name]
+        make = WithKeypoints(store.root / entry.file, store.root, Path(output), detector)
+        tasks.append(Task(name, make, entry.split, content_hash(entry.sha256, *detector.settings(name))))
+    return prepare(tasks, output, jobs=jobs, backend=backend, scheduler=scheduler, overwrite=overwrite, progress=progress)  # fmt: skip
+
+
+def _camera(recording: Recording) -> CameraStream:
+    if recording.camera is None:
+        raise WearcapError("no head camera", where=recording.name,
+                           expected="a recording with one, whose pixels keypoints are")  # fmt: skip
+    return recording.camera
+
+
+def _from_elsewhere(recording: Recording, way: str) -> Recording:
+    """The recording with its files named from another folder, `way` from there."""
+
+    def moved(name: str | None) -> str | None:
+        return name and Path(way, name).as_posix()
+
+    camera = recording.camera
+    if camera is not None:
+        files = camera.image_files
+        camera = replace(
+            camera, video=moved(camera.video),
+            image_files=None if files is None else tuple(Path(way, name).as_posix() for name in files),
+        )  # fmt: skip
+    return replace(
+        recording, camera=camera, scene=moved(recording.scene), environment=moved(recording.environment)
+    )

@@ -1,0 +1,1 @@
+"""How captures and networks run: stages with a cache, and ONNX Runtime."""

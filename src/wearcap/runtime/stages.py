@@ -1,0 +1,242 @@
+"""A pipeline's steps as stages: each one's result is kept by what it was made from, and made again only when that changes.
+
+A stage's key is a digest of its name, its sources, what it reads (settings, streams, files), and the results of the
+stages that it follows. A change therefore reaches the stages behind it, and only as far as results differ.
+"""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import safetensors
+from rich.console import Console
+from safetensors.torch import load, save
+
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path, write_text
+from wearcap.io.formats.scan import read_scan
+from wearcap.io.formats.scene_folder import cloud_file
+from wearcap.optimize.hps import HpsState
+from wearcap.optimize.solution import Solution
+from wearcap.recording import Motion, Recording
+from wearcap.recording.serialize import KNOWN, dumps, flatten, unflatten
+from wearcap.runtime.digest import code_digest, digest
+from wearcap.scene.scan import Scan
+from wearcap.sensors.clock import Clock
+from wearcap.sensors.initialization import Initialization
+
+RESULTS = KNOWN | {cls.__name__: cls for cls in (Clock, Initialization, Solution, HpsState)}
+"""What may come back from a cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A step that can be kept."""
+
+    name: str
+    make: Callable[[dict[str, Any]], Any]
+    """Given the results of earlier stages by name."""
+    reads: Callable[[], Sequence[Any]]
+    """All that decides the result but for earlier stages: settings, streams, and files as paths. Asked for only where
+    there is a cache."""
+    after: tuple[str, ...] = ()
+    """Earlier stages whose results it takes."""
+    code: tuple[str, ...] = ()
+    """Folders and modules of the package whose sources decide the result, too."""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A recording, and where the files lie that belong to it."""
+
+    recording: Recording
+    folder: Path = Path()
+    """The data set's."""
+    scan: Path | Scan | None = None
+    """The scene's cloud, or its file."""
+    metres_per_unit: float | int | None = None
+    """Of that file; None: it is in metres."""
+
+    def read_scan(self) -> Scan | None:
+        if isinstance(self.scan, Path):
+            unit = None if self.metres_per_unit is None else float(self.metres_per_unit)
+            return read_scan(self.scan, metres_per_unit=unit)
+        return self.scan
+
+
+@runtime_checkable
+class StagedPipeline(Protocol):
+    """A pipeline that is run stage by stage."""
+
+    @property
+    def name(self) -> str: ...
+
+    def stages(self, source: Source) -> list[Stage]:
+        """In order. Raises WearcapError when the recording lacks what the pipeline needs."""
+        ...
+
+    def motion_of(self, results: dict[str, Any]) -> Motion | None:
+        """The motion after the stages that were run; None where there is none yet."""
+        ...
+
+    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
+        """What the stages found, for JSON."""
+        ...
+
+
+@dataclass(frozen=True)
+class StageRun:
+    """How a stage's result came about."""
+
+    stage: str
+    seconds: float
+    """That making it took, now or when it was kept."""
+    reused: bool
+
+
+@dataclass(frozen=True)
+class StageCache:
+    """Results in a folder: per stage and key a .safetensors file, and a .json file that is written last."""
+
+    folder: Path
+
+    def read(self, stage: str, key: str) -> tuple[Any, str, float] | None:
+        """(result, its digest, seconds), or None when nothing is kept. Raises WearcapError when it is damaged."""
+        note, tensors = self._files(stage, key)
+        try:
+            kept = json.loads(note.read_text(encoding="utf-8"))
+            content = load(tensors.read_bytes())
+            value = unflatten(kept["result"], content.__getitem__, RESULTS).get("value")
+            found, seconds = digest(kept["result"], content), float(kept["seconds"])
+            expected = kept["digest"]
+        except FileNotFoundError:
+            if not note.exists():
+                return None
+            raise WearcapError("incomplete", where=tensors) from None
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, WearcapError,
+                safetensors.SafetensorError) as error:  # fmt: skip
+            raise WearcapError(f"damaged ({error})", where=note) from error
+        if found != expected:
+            raise WearcapError("damaged (its content is not what was written)", where=tensors)
+        return value, found, seconds
+
+    def write(self, stage: str, key: str, value: Any, seconds: float) -> str:
+        """Keep a result; its digest."""
+        note, tensors = self._files(stage, key)
+        tree, content = flatten({"value": value})
+        tree = json.loads(dumps(tree))
+        found = digest(tree, content)
+        kept = {"stage": stage, "key": key, "digest": found, "seconds": round(seconds, 3), "result": tree}
+        with atomic_path(tensors) as temporary:
+            temporary.write_bytes(save(content))
+        write_text(note, json.dumps(kept, indent=1) + "\n")
+        return found
+
+    def _files(self, stage: str, key: str) -> tuple[Path, Path]:
+        return tuple(self.folder / f"{stage}-{key[:16]}{ending}" for ending in (".json", ".safetensors"))  # pyright: ignore[reportReturnType]
+
+
+def run_stages(
+    stages: list[Stage],
+    cache: StageCache | None = None,
+    until: str | None = None,
+    console: Console | None = None,
+) -> tuple[dict[str, Any], list[StageRun]]:
+    """Results by stage, up to and with `until`, and how each came about; the console shows a line for each.
+
+    What the cache holds is reused, what it holds damaged is made again. Raises WearcapError for an unknown `until`.
+    """
+    names = [stage.name for stage in stages]
+    if until is not None and until not in names:
+        raise WearcapError(f"no stage {until!r}", expected=f"one of {', '.join(names)}")
+    console = console or Console(quiet=True)
+    results: dict[str, Any] = {}
+    digests: dict[str, str] = {}
+    runs = []
+    for stage in stages:
+        key = _key(stage, digests) if cache else ""
+        kept = _kept(stage, key, cache, console)
+        if kept is not None:
+            results[stage.name], digests[stage.name], seconds = kept
+        else:
+            if console.is_terminal:
+                console.print(f"{stage.name} …")
+            begin = time.perf_counter()
+            results[stage.name] = stage.make(results)
+            seconds = time.perf_counter() - begin
+            if cache:
+                digests[stage.name] = cache.write(stage.name, key, results[stage.name], seconds)
+        runs.append(StageRun(stage.name, round(seconds, 3), kept is not None))
+        console.print(
+            f"{stage.name}: {'reused' if kept is not None else f'{seconds:.1f} s'}", highlight=False
+        )
+        if stage.name == until:
+            break
+    return results, runs
+
+
+def _key(stage: Stage, digests: dict[str, str]) -> str:
+    followed = [digests[name] for name in stage.after]
+    return digest(stage.name, code_digest(*stage.code), list(stage.reads()), followed)
+
+
+def _kept(
+    stage: Stage, key: str, cache: StageCache | None, console: Console
+) -> tuple[Any, str, float] | None:
+    if cache is None:
+        return None
+    try:
+        return cache.read(stage.name, key)
+    except WearcapError as error:
+        console.print(
+            f"{stage.name}: {error.where} is {error.what}; it is made again", markup=False, soft_wrap=True
+        )
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class Captured:
+    """What came out, as far as the stages went."""
+
+    motion: Motion | None
+    report: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class StagedCapture:
+    """Runs a staged pipeline on recordings of a data set; wears the coat that evaluation expects."""
+
+    pipeline: StagedPipeline
+    folder: Path
+    """Of the data set."""
+    scene: Path | None = None
+    """The scene's folder or cloud; None: what each recording names."""
+    metres_per_unit: float | int | None = None
+    cache: Path | None = None
+    console: Console | None = None
+
+    def run(self, recording: Recording, until: str | None = None) -> Captured:
+        """One recording, up to and with the stage `until`."""
+        source = Source(recording, self.folder, self._scan(recording), self.metres_per_unit)
+        cache = None if self.cache is None else StageCache(self.cache / recording.name)
+        results, runs = run_stages(self.pipeline.stages(source), cache, until, self.console)
+        report = {
+            "pipeline": self.pipeline.name,
+            "recording": recording.name,
+            "stages": [vars(run) for run in runs],
+        }
+        return Captured(self.pipeline.motion_of(results), report | self.pipeline.report(source, results))  # fmt: skip
+
+    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
+        """One motion per recording; nothing is drawn, so seeds change nothing."""
+        motions = [self.run(recording).motion for recording in recordings]
+        return [motion for motion in motions if motion is not None]
+
+    def _scan(self, recording: Recording) -> Path | None:
+        """The scene's cloud. Raises WearcapError when the scene that was given has none."""
+        if self.scene is None:
+            return self.folder / recording.scene if recording.scene else None
+        return cloud_file(self.scene)

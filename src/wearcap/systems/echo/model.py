@@ -1,0 +1,144 @@
+"""ECHO's denoiser (ECHO §3.2): a diffusion transformer over human, object and contacts, each frame and modality with a
+noise level of its own."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from wearcap.models.layers import (
+    AdaptiveBlock,
+    LevelEmbedding,
+    MotionEncoder,
+    Normalizer,
+    TemporalBlend,
+    Widening,
+    attention_mask,
+)
+
+MODALITIES = ("human", "object", "contact")
+
+
+class EchoPlan(NamedTuple):
+    """What of a step depends on the noise levels alone."""
+
+    worth: tuple[Float[Tensor, "batch token width"], ...]
+    """Per modality."""
+    blocks: tuple[Float[Tensor, "batch token modulation"], ...]
+
+
+class EchoDenoiser(nn.Module):
+    """(x̂_H, x̂_O, x̂_I) = D(x_t, levels, E, C_O), the three modalities side by side in the features of a frame (eq. 7).
+
+    `streams` 1: one token per frame, the sum of what is known of it. 3: a token per frame and modality, which share the
+    frame's position. The active object is told with every frame (ours: the document has one for a window), so that a
+    wearer may turn from one to the next; where there is none, a learned null vector is. `blend`: see `MotionDenoiser`.
+    """
+
+    def __init__(
+        self,
+        human_size: int,
+        object_size: int,
+        contact_size: int,
+        condition_size: int,
+        object_condition_size: int,
+        window: int = 60,
+        width: int = 512,
+        layers: int = 10,
+        heads: int = 8,
+        feedforward: int = 2048,
+        dropout: float = 0.1,
+        streams: int = 1,
+        context: int = 7,
+        blend: int = 0,
+    ):
+        """`context`: frames before and behind its own that a token's condition sees."""
+        super().__init__()
+        if streams not in (1, len(MODALITIES)):
+            raise ValueError(f"{streams} streams, but there are {len(MODALITIES)} modalities")
+        self.window, self.streams = window, streams
+        self.sizes = (human_size, object_size, contact_size)
+        self.motion_normalizer = Normalizer(sum(self.sizes))
+        self.condition_normalizer = Normalizer(condition_size)
+        # One more channel says which frames exist: padding would else look like the mean condition.
+        self.widen = Widening(condition_size + 1, 2 * width, 1, context)
+        self.object = nn.Sequential(
+            nn.Linear(object_condition_size, width), nn.GELU(), nn.Linear(width, 2 * width)
+        )
+        self.no_object = nn.Parameter(torch.zeros(2 * width))
+        self.narrow = nn.Linear(2 * width, width)
+        self.motion_encoders = nn.ModuleList(MotionEncoder(size, width, 1) for size in self.sizes)
+        self.levels = nn.ModuleList(LevelEmbedding(width) for _ in self.sizes)
+        self.stream = nn.Parameter(0.02 * torch.randn(streams, width)) if streams > 1 else None
+        self.blocks = nn.ModuleList(
+            AdaptiveBlock(width, heads, feedforward, window, dropout, streams) for _ in range(layers)
+        )
+        self.norm = nn.LayerNorm(width)
+        self.heads = nn.ModuleList(nn.Linear(width, size) for size in self.sizes)
+        for head in self.heads:
+            nn.init.zeros_(head.weight)
+            nn.init.zeros_(head.bias)
+        self.blend = TemporalBlend(blend) if blend else None
+
+    def encode(
+        self,
+        condition: Float[Tensor, "batch time condition"],
+        thing: Float[Tensor, "batch time embedded"],
+        has_object: Bool[Tensor, "batch time"],
+        valid: Bool[Tensor, "batch time"],
+    ) -> Float[Tensor, "batch time width"]:
+        """What a window's frames are told, the same in every step. `thing`: their objects' codes, through `object`."""
+        mask = valid[..., None].to(condition.dtype)
+        wide = self.widen(torch.cat([self.condition_normalizer(condition) * mask, mask], -1))
+        thing = torch.where(has_object[..., None], thing, self.no_object)
+        return self.narrow(F.gelu(wide + thing))
+
+    def plan(self, level: Float[Tensor, "batch time modality"]) -> EchoPlan:
+        """The levels' part of a step; a queue that runs repeats it."""
+        embedded = [embed(level[..., k]) for k, embed in enumerate(self.levels)]
+        worth = tuple(encoder.plan(each) for encoder, each in zip(self.motion_encoders, embedded))
+        together = torch.stack(embedded).sum(0)
+        return EchoPlan(
+            worth, tuple(block.plan(together).repeat(1, self.streams, 1) for block in self.blocks)
+        )
+
+    def step(
+        self,
+        x_t: Float[Tensor, "batch time feature"],
+        plan: EchoPlan,
+        encoded: Float[Tensor, "batch time width"],
+        valid: Bool[Tensor, "batch time"],
+    ) -> Float[Tensor, "batch time feature"]:
+        """x̂0 in normalised space."""
+        parts = x_t.split(self.sizes, -1)
+        tokens = [
+            encoder(part, worth, valid)
+            for encoder, part, worth in zip(self.motion_encoders, parts, plan.worth)
+        ]
+        mask = attention_mask(valid.repeat(1, self.streams))
+        if self.stream is None:
+            token = encoded + torch.stack(tokens).sum(0)
+        else:
+            token = torch.cat([encoded + part + own for part, own in zip(tokens, self.stream)], 1)
+        for block, modulation in zip(self.blocks, plan.blocks):
+            token = block(token, modulation, mask)
+        said = self.norm(token).chunk(self.streams, 1)
+        x0_hat = torch.cat([head(said[k % self.streams]) for k, head in enumerate(self.heads)], -1)
+        return x0_hat if self.blend is None else self.blend(x0_hat, valid)
+
+    def forward(
+        self,
+        x_t: Float[Tensor, "batch time feature"],
+        level: Float[Tensor, "batch time modality"],
+        encoded: Float[Tensor, "batch time width"],
+        valid: Bool[Tensor, "batch time"],
+    ) -> Float[Tensor, "batch time feature"]:
+        """x̂0 in normalised space, from x_t and what `encode` said."""
+        return self.step(x_t, self.plan(level), encoded, valid)
+
+    def per_feature(self, level: Float[Tensor, "batch time modality"]) -> Float[Tensor, "batch time feature"]:
+        """A modality's level for each of its features."""
+        sizes = torch.tensor(self.sizes, device=level.device)
+        return level.repeat_interleave(sizes, -1, output_size=sum(self.sizes))

@@ -1,0 +1,135 @@
+"""Objects as ECHO is told them: class, extents and an encoder's feature; and as its losses see them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.skeleton import MIRROR
+from wearcap.data.surface_points import object_cloud
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.triangle_distance import TriangleIndex
+from wearcap.models.point_encoder import PointNeXt, cloud_extents
+from wearcap.recording.recording import Recording
+from wearcap.scene.environment import Environment, surface_index
+from wearcap.scene.objects import SceneObject
+from wearcap.systems.echo.features import EchoFeatures
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectShape:
+    """An object about the middle of its bounding box, in its own axes; its pose is that of this middle."""
+
+    name: str
+    category: str
+    mesh: Mesh
+    middle: Float[Tensor, "3"]
+    """In the axes and from the origin of its mesh (m)."""
+    cloud: Float[Tensor, "point 3"]
+    """Points of its surface about the middle (m)."""
+    code: Float[Tensor, "code"]
+    """What the network is told: class, extents, feature; or what it makes of them (`ObjectReader`)."""
+    code_mirrored: Float[Tensor, "code"]
+    """The same of the object seen in a mirror across its own y axis."""
+    surface: TriangleIndex
+
+    def centred(self, T_world_object: Rigid) -> Rigid:
+        """Pose of the middle, of the mesh's pose."""
+        return Rigid(T_world_object.R, T_world_object @ self.middle.to(T_world_object.t))
+
+    def of_mesh(self, T_world_middle: Rigid) -> Rigid:
+        """The inverse of `centred`."""
+        return Rigid(T_world_middle.R, T_world_middle @ -self.middle.to(T_world_middle.t))
+
+    @property
+    def mean(self) -> Float[Tensor, "3"]:
+        """Of the cloud's points (m)."""
+        return self.cloud.mean(0)
+
+    @property
+    def spread(self) -> Float[Tensor, "3 3"]:
+        """Mean outer product of the cloud's points with themselves (m²): rotations move points by it."""
+        return self.cloud.mT @ self.cloud / len(self.cloud)
+
+
+class ObjectReader:
+    """Makes objects into what the network is told, each mesh once."""
+
+    def __init__(
+        self, features: EchoFeatures, encoder: PointNeXt | None, embed: Callable[[Tensor], Tensor] | None = None
+    ):  # fmt: skip
+        """`encoder` None tells class and extents alone, where the features have no shape. `embed`: the network's layer on
+        codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
+        self.features, self.encoder, self._embed = features, encoder, embed
+        self.nothing: Float[Tensor, "code"] = self._told(torch.zeros(1, features.object_condition_size))[0]
+        """Stands where no object is active."""
+        self._known: dict[tuple[int, str], ObjectShape] = {}
+
+    @torch.inference_mode()
+    def __call__(self, item: SceneObject) -> ObjectShape:
+        """Raises WearcapError for a class that the model does not know."""
+        key = (id(item.mesh), item.category)
+        if key not in self._known:
+            self._known[key] = self._read(item)
+        known = self._known[key]
+        return ObjectShape(item.name, *(getattr(known, name) for name in ObjectShape.__dataclass_fields__ if name != "name"))  # fmt: skip
+
+    def _read(self, item: SceneObject) -> ObjectShape:
+        one_hot = self.features.class_code(item.category)
+        cloud = object_cloud(item.mesh)
+        middle = (cloud.max(0).values + cloud.min(0).values) / 2
+        both = torch.stack([cloud - middle, (cloud - middle) * torch.tensor(MIRROR)])
+        parts = [one_hot.expand(2, -1), cloud_extents(both)]
+        if self.encoder is not None and self.features.shape_size:
+            parts.append(self.encoder(both))
+        code, code_mirrored = self._told(torch.cat(parts, -1)).unbind(0)
+        return ObjectShape(
+            item.name, item.category, item.mesh, middle, both[0].clone(), code, code_mirrored, surface_index(item.mesh)
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def _told(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:
+        return (codes if self._embed is None else self._embed(codes)).clone()
+
+
+def object_poses(
+    recording: Recording, environment: Environment, name: str, shape: ObjectShape, take: Tensor
+) -> Rigid:
+    """True poses of an object's middle at some frames of the motion, which its trajectory shares the clock of.
+
+    An object without a trajectory stays where the environment has it.
+    """
+    track = recording.object_motion.get(name)
+    if track is None:
+        item = environment.by_name(name)
+        T = Rigid(
+            item.R_world_object.expand(len(take), 3, 3).clone(),
+            item.t_world_object.expand(len(take), 3).clone(),
+        )
+    else:
+        T = track.T_world_body[take]
+    return shape.centred(T)
+
+
+def body_contact(
+    points_world: Float[Tensor, "time point 3"], shape: ObjectShape, T_world_middle: Rigid, within_m: float
+) -> Tensor:
+    """Whether each contact point of the body is within τ_c (`within_m`) of the object's surface (ECHO §3.1).
+
+    Distances are exact, to the surface and not to its vertices (ours), which may be further apart than τ_c.
+    """
+    T_object_world = shape.of_mesh(T_world_middle).inverse()
+    R, t = T_object_world.R.double(), T_object_world.t.double()
+    local = (R[:, None] @ points_world.double()[..., None])[..., 0] + t[:, None]
+    low, high = shape.mesh.vertices.min(0) - within_m, shape.mesh.vertices.max(0) + within_m
+    flat = local.flatten(0, 1).numpy()
+    near = np.flatnonzero(((flat >= low) & (flat <= high)).all(1))
+    touches = torch.zeros(len(flat), dtype=torch.bool)
+    if len(near):
+        distance, _ = shape.surface.nearest(np.ascontiguousarray(flat[near]))
+        touches[torch.from_numpy(near)] = torch.from_numpy(distance) <= within_m
+    return touches.unflatten(0, local.shape[:2])

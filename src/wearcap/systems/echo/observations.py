@@ -1,0 +1,221 @@
+"""What ECHO is told of a recording, at its own rate: tracked points, floor, active objects, and what is observed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from wearcap.body.contact_points import BODY_POINTS
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, interpolate_held, resample
+from wearcap.recording.acts import NO_OBJECT, Act, active_at
+from wearcap.recording.motion import Motion
+from wearcap.recording.recording import Recording
+from wearcap.recording.timing import at_times
+from wearcap.scene.environment import Environment
+from wearcap.scene.object_mesh import check_object
+from wearcap.systems.echo.features import CONTACTS, POINTS
+from wearcap.systems.echo.model import MODALITIES
+from wearcap.systems.echo.objects import ObjectReader, ObjectShape
+from wearcap.systems.echo.queue import Told
+from wearcap.tracking.head_path import HeadPath
+
+WRISTS = POINTS[1:]
+MAX_GAP_S = 0.5
+SAME_S = 1e-4
+"""Times nearer than this are one."""
+SWAPPED_M = 0.02
+"""The left wrist is this far to the right of the right one, by the median, where the two are swapped."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Parts of the answer that are known beforehand, at whatever times they are (ECHO §4.2)."""
+
+    motion: Motion | None = None
+    """The body, at the frames in which it is known."""
+    object_motion: Mapping[str, Trajectory] = field(default_factory=dict)
+    """Objects' poses, likewise."""
+    contact_times: Float64[Tensor, "frame"] | None = None
+    contact: Float[Tensor, "frame contact"] | None = None
+    """64 body points on the active object, then `FOOT_PATCHES` on the floor: 1 touches."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """A recording, the objects in it, and when which of them is active."""
+
+    recording: Recording
+    environment: Environment | None = None
+    acts: tuple[Act, ...] = ()
+    """None: no object is active, and the human alone is captured."""
+    observed: Observed = field(default_factory=Observed)
+    placed: bool = False
+    """Whether objects are known to begin where the environment has them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """One scenario, ready for the queue."""
+
+    path: HeadPath
+    told: Told
+    """With a lane axis of one."""
+    objects: list[ObjectShape]
+
+
+def lane_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> Lane:
+    """What is told, frame by frame of the head's path.
+
+    Raises WearcapError for wrists that are not tracked or are swapped, for acts of unknown objects, for objects whose
+    mesh or class cannot be used, and for observations beyond the recording.
+    """
+    recording, count = scenario.recording, len(path.timestamps)
+    R, t = _tracked_points(recording, path)
+    names = list(dict.fromkeys(act.object for act in scenario.acts))
+    objects = _objects(scenario, names, reader)
+    active = active_at(scenario.acts, names, path.timestamps)
+    codes = torch.stack([*(shape.code for shape in objects), reader.nothing])
+    floor = path.floor_height
+    if recording.floor is not None:
+        floor = interpolate_held(recording.floor.timestamps, recording.floor.height, path.timestamps)
+    known = _observed(scenario, path, names, objects, active)
+    told = (R, t, floor.float(), active != NO_OBJECT, codes[active], active.float(), torch.ones(count, dtype=torch.bool))  # fmt: skip
+    return Lane(path, Told(*(part[None] for part in (*told, *known))), objects)
+
+
+def _tracked_points(
+    recording: Recording, path: HeadPath
+) -> tuple[Float[Tensor, "time point 3 3"], Float[Tensor, "time point 3"]]:
+    """Head as measured, wrists as tracked; those of the true motion where nothing tracks them."""
+    poses = [path.T_world_head]
+    truth = recording.motion
+    found = [joint for joint in WRISTS if joint in recording.tracked]
+    if len(found) == 1:
+        raise WearcapError(f"only {found[0]} is tracked", where=recording.name, expected=f"`tracked` poses of {' and '.join(WRISTS)}")  # fmt: skip
+    if found:
+        for joint in found:
+            track = recording.tracked[joint]
+            _require_times(track.timestamps, path, f"tracking of {joint}", recording.name)
+            poses.append(wrist_poses(track, path.timestamps))
+    elif truth is not None:
+        times = path.timestamps.clamp(truth.timestamps[0].item(), truth.timestamps[-1].item())
+        truth = at_times(truth, times)
+        poses += [truth.joint(joint) for joint in WRISTS]
+    else:
+        raise WearcapError("wrists are tracked by nothing in this recording", where=recording.name,
+                           expected=f"`tracked` poses of {' and '.join(WRISTS)}, or a true motion")  # fmt: skip
+    R, t = torch.stack([T.R.float() for T in poses], 1), torch.stack([T.t.float() for T in poses], 1)
+    if not (R.isfinite().all() and t.isfinite().all()):
+        raise WearcapError("poses of wrists that are NaN or infinite", where=recording.name, expected="finite poses")  # fmt: skip
+    heading = rotation.about_axis("z", rotation.yaw_of(R[:, 0]))
+    apart = (heading.mT @ (t[:, 1] - t[:, 2])[..., None])[:, 1, 0].median().item()
+    # Those of a true motion are no trackers: somebody crosses the arms.
+    if found and apart < -SWAPPED_M:
+        raise WearcapError(f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median", where=recording.name,
+                           expected="the left wrist on the left", fix="Swap the two trackers.")  # fmt: skip
+    return R, t
+
+
+def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
+    """Poses of a tracked wrist at any times: where it is not tracked for longer than `MAX_GAP_S`, and behind the end, it
+    rests where it was seen last."""
+    times = track.timestamps
+    inside = at.clamp(times[0].item(), times[-1].item())
+    last = (torch.searchsorted(times, inside + SAME_S, right=True) - 1).clamp_min(0)
+    gone = (times[(last + 1).clamp_max(len(times) - 1)] - times[last] > MAX_GAP_S) | (
+        inside - times[last] <= SAME_S
+    )
+    found = resample(track, inside).T_world_body if len(times) > 1 else track.T_world_body[last]
+    held = track.T_world_body[last]
+    return Rigid(
+        torch.where(gone[:, None, None], held.R, found.R), torch.where(gone[:, None], held.t, found.t)
+    )
+
+
+def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, where: str) -> None:
+    if len(times) < 2 or not (times.diff() > 0).all():
+        raise WearcapError(f"{what} at {len(times)} times that do not grow", where=where, expected="rising timestamps (s)")  # fmt: skip
+    late, early = times[0] - path.timestamps[0], path.timestamps[-1] - times[-1]
+    if max(late.item(), early.item()) > 0.5:
+        raise WearcapError(f"{what} from {times[0]:.2f} to {times[-1]:.2f} s", where=where,
+                           expected=f"all of {path.timestamps[0]:.2f} to {path.timestamps[-1]:.2f} s, as the head")  # fmt: skip
+
+
+def _objects(scenario: Scenario, names: list[str], reader: ObjectReader) -> list[ObjectShape]:
+    if names and scenario.environment is None:
+        raise WearcapError(f"acts of {names[0]!r}, but no objects", where=scenario.recording.name,
+                           expected="an environment with the objects' meshes", fix="Give environment=FILE.")  # fmt: skip
+    shapes = []
+    for name in names:
+        assert scenario.environment is not None
+        where = f"object {name!r} of {scenario.recording.name}"
+        try:
+            item = scenario.environment.by_name(name)
+            check_object(item, where)
+            shapes.append(reader(item))
+        except WearcapError as error:
+            raise WearcapError(error.what, where=where, expected=error.expected, fix=error.fix) from error
+    return shapes
+
+
+def _observed(
+    scenario: Scenario, path: HeadPath, names: list[str], objects: list[ObjectShape], active: Tensor
+) -> tuple[Tensor, ...]:
+    """Observed values at the frames next to them, and where there are any."""
+    count, seen, where = len(path.timestamps), scenario.observed, scenario.recording.name
+    joints = len(path.skeleton)
+    R, root = torch.eye(3).repeat(count, joints, 1, 1), torch.zeros(count, 3)
+    R_object, t_object = torch.eye(3).repeat(count, 1, 1), torch.zeros(count, 3)
+    contact, is_known = (
+        torch.zeros(count, CONTACTS),
+        torch.zeros(count, len(MODALITIES), dtype=torch.bool),
+    )
+    if seen.motion is not None:
+        at = _frames(seen.motion.timestamps, path, where)
+        if len(seen.motion.skeleton) != joints:
+            raise WearcapError(f"an observed body of {len(seen.motion.skeleton)} joints", where=where, expected=f"{joints}, as the wearer has")  # fmt: skip
+        R[at], root[at] = seen.motion.R_parent_joint.float(), seen.motion.t_world_root.float()
+        is_known[at, 0] = True
+    for name, track in seen.object_motion.items():
+        if name not in names:
+            raise WearcapError(f"an observed object {name!r}", where=where, expected=f"one of {', '.join(names) or 'no objects'}")  # fmt: skip
+        at, number = _frames(track.timestamps, path, where), names.index(name)
+        mine = active[at] == number
+        T = objects[number].centred(track.T_world_body)
+        R_object[at[mine]], t_object[at[mine]] = T.R[mine].float(), T.t[mine].float()
+        is_known[at[mine], 1] = True
+    if scenario.placed and scenario.environment is not None:
+        for number, name in enumerate(names):
+            first = (active == number).nonzero()[:1, 0]
+            if len(first) and not is_known[first, 1]:
+                T = objects[number].centred(scenario.environment.by_name(name).T_world_object)
+                R_object[first], t_object[first] = T.R.float(), T.t.float()
+                is_known[first, 1] = True
+    if seen.contact is not None and seen.contact_times is not None:
+        at = _frames(seen.contact_times, path, where)
+        if seen.contact.shape[1] != CONTACTS:
+            raise WearcapError(f"observed contacts of {seen.contact.shape[1]} points", where=where,
+                               expected=f"{BODY_POINTS} of the body and {len(FOOT_PATCHES)} of the feet")  # fmt: skip
+        contact[at] = seen.contact.float()
+        is_known[at, 2] = True
+    for value in (R, root, R_object, t_object, contact):
+        if not value.isfinite().all():
+            raise WearcapError("observations that are NaN or infinite", where=where, expected="finite values")
+    return R, root, R_object, t_object, contact, is_known
+
+
+def _frames(times: Float64[Tensor, "frame"], path: HeadPath, where: str) -> Tensor:
+    """Numbers of the frames next to some times. Raises WearcapError for times beyond the recording."""
+    clock = path.timestamps
+    step = (clock[1] - clock[0]).item() if len(clock) > 1 else 0.0
+    beyond = ~((times >= clock[0] - step) & (times <= clock[-1] + step))
+    if beyond.any():
+        raise WearcapError(f"an observation at {times[beyond][0].item():.2f} s, beyond the recording", where=where,
+                           expected=f"times from {clock[0].item():.2f} to {clock[-1].item():.2f} s")  # fmt: skip
+    return ((times - clock[0]) / max(step, 1e-9)).round().long().clamp(0, len(clock) - 1)

@@ -1,0 +1,186 @@
+"""What ECHO must beat: the training window whose three points moved most alike, and an object that is stuck to a wrist."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from wearcap.body.contact_points import BODY_POINTS
+from wearcap.data.features import body_size
+from wearcap.data.statistics import MIN_SCALE
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.models.point_encoder import PointNeXt
+from wearcap.recording import Motion
+from wearcap.systems.echo.features import EchoFeatures, ThreePoints
+from wearcap.systems.echo.objects import ObjectReader
+from wearcap.systems.echo.observations import Lane, Scenario, lane_of
+from wearcap.systems.echo.pipeline import motion_of, object_tracks
+from wearcap.systems.echo.queue import Said
+from wearcap.systems.echo.training_windows import EchoDataset, EchoTrack
+from wearcap.tracking.head_path import head_path
+
+NO_CLASS = "none"
+"""Stands for the class where no object is active."""
+
+
+def _own(features: EchoFeatures) -> EchoFeatures:
+    return replace(features, frame="own", body=True)
+
+
+def _channels(features: EchoFeatures, points: ThreePoints, floor_height: Tensor, size: Tensor) -> Float[Tensor, "time channel"]:  # fmt: skip
+    """What each frame's three points are like, seen from its own head: the condition without the head's way and heading
+    since the window began, and without the body's size."""
+    told = features.condition(ThreePoints(*(part[None] for part in points)), floor_height[None], size[None])[0]  # fmt: skip
+    return torch.cat([told[:, :36], told[:, 39:54], told[:, 56:57]], 1)
+
+
+@dataclass(frozen=True, eq=False)
+class NearestEcho:
+    """Pastes body, object and contacts of the training window with the most similar motion of head and wrists, among
+    those with an object of the same class, all seen from the head. Windows overlap by half and are cross-faded."""
+
+    features: EchoFeatures
+    encoder: PointNeXt | None
+    window: int
+    sample: int
+    mean: Float[Tensor, "channel"]
+    scale: Float[Tensor, "channel"]
+    descriptor: dict[str, Float[Tensor, "window feature"]]
+    """By class; `NO_CLASS` without an object."""
+    frames: dict[str, Int64[Tensor, "window"]]
+    """First frame of each window."""
+    said: Float[Tensor, "frame value"]
+
+    @classmethod
+    def fit(cls, dataset: EchoDataset, window: int = 30, stride: int = 3, sample: int = 3) -> "NearestEcho":
+        """Describe a training split's windows."""
+        features = _own(dataset.features)
+        channels, said, starts, labels, first = [], [], [], [], 0
+        for number in range(len(dataset.recordings)):
+            track = dataset.track(number)
+            count = len(track.floor_height)
+            channels.append(_channels(features, track.points, track.floor_height, track.size))
+            said.append(_said_of(features, track))
+            for start in range(0, count - window + 1, stride):
+                active = int(track.active[start + window // 2])
+                starts.append(first + start)
+                labels.append(track.objects[active].category if active >= 0 else NO_CLASS)
+            first += count
+        whole = torch.cat(channels)
+        mean, scale = whole.mean(0), whole.std(0).clamp_min(MIN_SCALE)
+        whole = (whole - mean) / scale
+        offsets = torch.arange(0, window, sample)
+        descriptor, frames = {}, {}
+        for name in sorted(set(labels)):
+            mine = torch.tensor([start for start, label in zip(starts, labels) if label == name])
+            descriptor[name], frames[name] = whole[mine[:, None] + offsets].flatten(1), mine
+        return cls(
+            features, dataset.encoder, window, sample, mean, scale, descriptor, frames, torch.cat(said)
+        )
+
+    def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
+        """One motion per scenario; nothing is drawn."""
+        reader = ObjectReader(self.features, self.encoder)
+        return [self._capture(scenario, reader) for scenario in scenarios]
+
+    def _capture(self, scenario: Scenario, reader: ObjectReader) -> Motion:
+        lane = lane_of(scenario, head_path(scenario.recording, scenario.recording.skeleton, self.features.fps), reader)  # fmt: skip
+        told, count = lane.told, len(lane.path.timestamps)
+        points = ThreePoints(*(part[0] for part in told.points))
+        size = body_size(lane.path.skeleton)
+        channels = (_channels(self.features, points, told.floor_height[0], size) - self.mean) / self.scale
+        total, weight = torch.zeros(count, self.said.shape[1]), torch.zeros(count, 1)
+        offsets = torch.arange(self.window)
+        triangle = torch.minimum(offsets + 1, self.window - offsets).float()[:, None] / self.window
+        for start in [*range(0, max(count - self.window, 0), self.window // 2), max(count - self.window, 0)]:
+            take = (start + offsets).clamp_max(count - 1)
+            active = int(told.object_number[0, take[self.window // 2]])
+            name = lane.objects[active].category if active >= 0 else NO_CLASS
+            name = name if name in self.descriptor else NO_CLASS
+            query = channels[take[:: self.sample]].flatten()
+            best = (self.descriptor[name] - query).square().sum(1).argmin()
+            pasted = self.said[self.frames[name][best] + offsets]
+            total.index_add_(0, take, pasted * triangle)
+            weight.index_add_(0, take, triangle)
+        return motion_of(lane, _decoded(self.features, total / weight, lane), True, {"pipeline": "nearest_echo"})  # fmt: skip
+
+
+def _said_of(features: EchoFeatures, track: EchoTrack) -> Float[Tensor, "time feature"]:
+    """A track's truth, seen from each frame's head."""
+    batch = lambda parts: type(parts)(*(part[None] for part in parts))  # noqa: E731
+    frame = features.canonical(batch(track.points))
+    T = Rigid(track.T_world_object.R[None], track.T_world_object.t[None])
+    return torch.cat(
+        [features.encode_body(batch(track.body), frame), features.encode_object(T, frame), track.contact[None]], -1
+    )[0]  # fmt: skip
+
+
+def _decoded(features: EchoFeatures, said: Float[Tensor, "time feature"], lane: Lane) -> Said:
+    frame = features.canonical(lane.told.points)
+    human, thing, contact = said[None].split((features.human_size, 9, said.shape[1] - features.human_size - 9), -1)  # fmt: skip
+    body, T = features.decode_body(human, frame), features.decode_object(thing, frame)
+    return Said(*body, T.R, T.t, contact)
+
+
+@dataclass(frozen=True, eq=False)
+class RigidWrist:
+    """Another method's body, with the object stuck to a wrist: where it is from that wrist on the average of its class,
+    in training frames in which that hand touches it. Of the two wrists it is the one that is nearer to where objects of
+    the class are on average, seen from the head, over each stretch in which the object is active."""
+
+    features: EchoFeatures
+    encoder: PointNeXt | None
+    place: dict[str, Float[Tensor, "3"]]
+    """Mean place of each class seen from the head (m)."""
+    offset: dict[str, Float[Tensor, "wrist 3"]]
+    """Mean way from each wrist to the object, in the head's heading (m)."""
+    turn: dict[str, Float[Tensor, "3 3"]]
+    """Mean orientation of each class in the head's heading."""
+
+    @classmethod
+    def fit(cls, dataset: EchoDataset) -> "RigidWrist":
+        """Average a training split."""
+        features = _own(dataset.features)
+        rows: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
+        for number in range(len(dataset.recordings)):
+            track = dataset.track(number)
+            frame = features.canonical(ThreePoints(*(part[None] for part in track.points)))
+            heading = frame.R[0]
+            for index, shape in enumerate(track.objects):
+                held = (track.active == index) & (track.contact[:, :BODY_POINTS].amax(1) > 0)
+                T, wrists = track.T_world_object[held], track.points.t_world_point[held, 1:]
+                back = heading[held].mT
+                place = (back @ (T.t - frame.t[0][held])[..., None])[..., 0]
+                offset = (back[:, None] @ (T.t[:, None] - wrists)[..., None])[..., 0]
+                rows.setdefault(shape.category, []).append((place, offset, back @ T.R))
+        place, offset, turn = {}, {}, {}
+        for name, parts in rows.items():
+            where, way, R = (torch.cat(each) for each in zip(*parts))
+            if len(where):
+                place[name], offset[name] = where.mean(0), way.mean(0)
+                turn[name] = rotation.mean_rotation(R)
+        if not place:
+            raise WearcapError("nothing is touched in these training windows", expected="recordings with objects in hands")  # fmt: skip
+        return cls(features, dataset.encoder, place, offset, turn)
+
+    def attached(self, motion: Motion, lane: Lane) -> Motion:
+        """The motion with its objects stuck to wrists."""
+        points = lane.told.points
+        frame = self.features.canonical(points)
+        heading, head = frame.R[0], frame.t[0]
+        count = len(head)
+        R, t = heading.clone(), head.clone()
+        for number, shape in enumerate(lane.objects):
+            rows = (lane.told.object_number[0] == number) & lane.told.has_object[0]
+            name = shape.category if shape.category in self.place else next(iter(self.place))
+            wrists = points.t_world_point[0, rows, 1:]
+            expected = head[rows] + (heading[rows] @ self.place[name])
+            wrist = int((wrists - expected[:, None]).norm(dim=-1).mean(0).argmin()) if rows.any() else 0
+            t[rows] = wrists[:, wrist] + heading[rows] @ self.offset[name][wrist]
+            R[rows] = heading[rows] @ self.turn[name]
+        said = Said(torch.zeros(1, count, 1, 3, 3), torch.zeros(1, count, 3), R[None], t[None], torch.zeros(1, count, 1))  # fmt: skip
+        return replace(motion, object_motion=object_tracks(lane, said), provenance={"pipeline": "rigid_wrist"})  # fmt: skip

@@ -1,0 +1,162 @@
+"""ECHO's tables: body, object and contacts of whole recordings against the truth; and what of the truth is observed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from torch import Tensor
+
+from wearcap.body.anny_body import anny_body
+from wearcap.body.contact_points import BODY_POINTS, TOUCH_M, contact_points
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, interpolate_held, nearest_frames, resample
+from wearcap.metrics.detection import detection_scores
+from wearcap.metrics.objects import (
+    center_error_cm,
+    foot_contact_share,
+    joint_step_error_mm,
+    quaternion_difference,
+    rotation_difference_deg,
+    vertex_error_cm,
+)
+from wearcap.metrics.physics import jitter_m_s3
+from wearcap.metrics.position import mpjpe_cm
+from wearcap.metrics.table import Row
+from wearcap.recording import Motion
+from wearcap.recording.acts import active_at
+from wearcap.recording.timing import at_times
+from wearcap.systems.echo.features import CONTACTS
+from wearcap.systems.echo.model import MODALITIES
+from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact
+from wearcap.systems.echo.observations import Observed, Scenario
+from wearcap.systems.echo.training_windows import foot_patches
+
+MEASURES = (
+    "mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "v2v_cm", "center_cm", "rotation_deg", "quaternion",
+    "touch_f1", "jitter_m_s3",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What is true of a scenario at a capture's frames."""
+
+    motion: Motion
+    floor_height: Float[Tensor, "time"]
+    objects: list[ObjectShape]
+    active: Int64[Tensor, "time"]
+    """Number of the active object in `objects`, -1 without one."""
+    T_world_object: list[Rigid]
+    """Of each object's middle, over time."""
+    touch: Bool[Tensor, "time point"]
+    """Whether the body's points are on the active object."""
+    foot_contact: Float[Tensor, "time patch"]
+
+
+def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: ObjectReader) -> Truth:
+    """The truth at some times. Raises WearcapError for a recording without a true motion or an object's true poses."""
+    recording, environment = scenario.recording, scenario.environment
+    if recording.motion is None:
+        raise WearcapError("no true motion to compare with", where=recording.name, expected="a recording with `motion`")  # fmt: skip
+    whole = recording.motion
+    times = timestamps.clamp(whole.timestamps[0].item(), whole.timestamps[-1].item())
+    motion = at_times(whole, times)
+    names = list(dict.fromkeys(act.object for act in scenario.acts))
+    active = active_at(scenario.acts, names, timestamps)
+    surface = contact_points(anny_body(motion.skeleton, recording.shape or None))
+    touch = torch.zeros(len(times), BODY_POINTS, dtype=torch.bool)
+    shapes, poses = [], []
+    for number, name in enumerate(names):
+        assert environment is not None
+        if name not in recording.object_motion:
+            raise WearcapError(f"no true poses of {name!r}", where=recording.name, expected="them in `object_motion`")  # fmt: skip
+        shape = reader(environment.by_name(name))
+        T = shape.centred(_poses_at(recording.object_motion[name], times))
+        rows = (active == number).nonzero()[:, 0]
+        touch[rows] = body_contact(surface.vertices(motion.T_world_joint[rows]), shape, T[rows], TOUCH_M)
+        shapes.append(shape)
+        poses.append(T)
+    floor = torch.zeros(len(times))
+    if recording.floor is not None:
+        floor = interpolate_held(recording.floor.timestamps, recording.floor.height, times).float()
+    nearest = nearest_frames(whole.timestamps, times)
+    return Truth(motion, floor, shapes, active, poses, touch, foot_patches(recording)[nearest].float())
+
+
+def _poses_at(track: Trajectory, times: Float64[Tensor, "time"]) -> Rigid:
+    inside = times.clamp(track.timestamps[0].item(), track.timestamps[-1].item())
+    return resample(track, inside).T_world_body
+
+
+def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
+    """ECHO's measures of one capture, in the world, nothing aligned: the body over all frames, the object over those
+    in which one is active."""
+    joints, true = motion.T_world_joint.t, truth.motion.T_world_joint.t
+    skeleton = motion.skeleton
+    scores = {
+        "mpjpe_mm": 10 * mpjpe_cm(joints, true).item(),
+        "mpjve_mm": joint_step_error_mm(joints, true).item(),
+        "foot_contact": foot_contact_share(skeleton, joints, truth.floor_height).item(),
+        "true_foot_contact": foot_contact_share(skeleton, true, truth.floor_height).item(),
+        "jitter_m_s3": jitter_m_s3(joints, motion.fps).item(),
+        "true_jitter_m_s3": jitter_m_s3(true, motion.fps).item(),
+    }
+    busy = truth.active >= 0
+    if busy.any():
+        scores["busy_mpjpe_mm"] = 10 * mpjpe_cm(joints[busy], true[busy]).item()
+        scores |= _object_scores(motion, truth)
+    if motion.body_contact_prob is not None and busy.any():
+        found = detection_scores(motion.body_contact_prob[busy].flatten(), truth.touch[busy].flatten())
+        precision, recall = found.precision, found.recall
+        scores["touch_f1"] = 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+    return Row(name, seed, len(motion), scores)
+
+
+def _object_scores(motion: Motion, truth: Truth) -> dict[str, float]:
+    """Means over the frames in which an object is active; nothing where the capture has no objects."""
+    parts: dict[str, list[Tensor]] = {}
+    for number, (shape, T_true) in enumerate(zip(truth.objects, truth.T_world_object)):
+        rows = (truth.active == number).nonzero()[:, 0]
+        track = (motion.object_motion or {}).get(shape.name)
+        if track is None or not len(rows):
+            continue
+        T_found = shape.centred(_poses_at(track, motion.timestamps[rows]))
+        true = T_true[rows]
+        for key, value in {
+            "v2v_cm": vertex_error_cm(T_found, true, shape.cloud),
+            "center_cm": center_error_cm(T_found, true, shape.cloud),
+            "rotation_deg": rotation_difference_deg(T_found, true),
+            "quaternion": quaternion_difference(T_found, true),
+        }.items():
+            parts.setdefault(key, []).append(value)
+    return {key: torch.cat(values).mean().item() for key, values in parts.items()}
+
+
+def observed_share(truth: Truth, modality: str, share: float, seed: int) -> Observed:
+    """A share of the frames of one modality as it truly was, drawn evenly at random (ECHO Tables 3, S2).
+
+    Raises WearcapError for an unknown modality.
+    """
+    if modality not in MODALITIES:
+        raise WearcapError(f"no modality {modality!r}", expected=f"one of {', '.join(MODALITIES)}")
+    rng = np.random.default_rng([17, seed])
+    count = len(truth.motion)
+    chosen = np.sort(rng.choice(count, max(1, round(share * count)), replace=False))
+    take = torch.from_numpy(chosen)
+    times = truth.motion.timestamps[take]
+    if modality == "human":
+        motion = Motion(times, truth.motion.skeleton, truth.motion.R_parent_joint[take], truth.motion.t_world_root[take])  # fmt: skip
+        return Observed(motion=motion)
+    if modality == "object":
+        tracks = {}
+        for number, shape in enumerate(truth.objects):
+            rows = take[truth.active[take] == number]
+            pose = shape.of_mesh(truth.T_world_object[number][rows])
+            tracks[shape.name] = Trajectory(truth.motion.timestamps[rows], pose.R, pose.t)
+        return Observed(object_motion=tracks)
+    contact = torch.cat([truth.touch.float(), truth.foot_contact], 1)[take]
+    assert contact.shape[1] == CONTACTS == BODY_POINTS + len(FOOT_PATCHES)
+    return Observed(contact_times=times, contact=contact)

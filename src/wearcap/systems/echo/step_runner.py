@@ -1,0 +1,197 @@
+"""The steps of ECHO's denoiser by the fastest means at hand: what levels ask for is kept, the rest runs in PyTorch or in
+ONNX Runtime."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from wearcap.errors import WearcapError, nearest
+from wearcap.runtime.onnx import missing_libraries, onnx_runner
+from wearcap.systems.echo.model import MODALITIES, EchoDenoiser, EchoPlan
+
+RUNTIMES = ("eager", "onnx", "compile")
+"""onnx: ONNX Runtime, on the CPU. compile: for a GPU, replayed as CUDA graphs. Both take some seconds to begin."""
+MOST_ROWS = 1024
+"""Triples of levels whose plans are kept: a queue has as many as steps, times what is known or absent."""
+MOST_WINDOWS = 8
+"""Windows of levels whose plans are kept side by side: a queue that runs repeats as many as it has steps per frame."""
+
+
+class EchoPlans:
+    """What levels ask of a network whose weights do not change, worked out once for every triple of them.
+
+    An object that comes into a window moves through it, so that hardly a window's levels are there twice; a frame's are.
+    """
+
+    def __init__(self, net: EchoDenoiser):
+        self.net, self._device = net, net.motion_normalizer.mean.device
+        with torch.no_grad():
+            probe = net.plan(torch.zeros(1, 1, len(MODALITIES), device=self._device))
+        self._worth = len(probe.worth)
+        self._sizes = [part.shape[-1] for part in (*probe.worth, *probe.blocks)]
+        self._number: dict[tuple[float, ...], int] = {}
+        self._rows = torch.zeros(0, sum(self._sizes), device=self._device)
+        self._windows: dict[bytes, Tensor] = {}
+
+    @property
+    def size(self) -> int:
+        """Columns of a plan."""
+        return sum(self._sizes)
+
+    @torch.no_grad()
+    def __call__(self, level: Float[Tensor, "lane frame modality"]) -> Float[Tensor, "#lane frame column"]:
+        """Of all lanes, or of one where all have the same levels (on the CPU)."""
+        if len(level) > 1 and (level == level[:1]).all():
+            level = level[:1]
+        key = bytes(str(tuple(level.shape)), "ascii") + level.numpy().tobytes()
+        if key not in self._windows:
+            if len(self._windows) >= MOST_WINDOWS:
+                self._windows.pop(next(iter(self._windows)))
+            self._windows[key] = self._of(level)
+        return self._windows[key]
+
+    def _of(self, level: Float[Tensor, "lane frame modality"]) -> Float[Tensor, "lane frame column"]:
+        triples = [tuple(row) for row in level.flatten(0, 1).tolist()]
+        if len(self._number) > MOST_ROWS:
+            self._number.clear()
+            self._rows = self._rows[:0]
+        fresh = list(dict.fromkeys(triple for triple in triples if triple not in self._number))
+        if fresh:
+            plan = self.net.plan(torch.tensor([fresh], device=self._device))
+            parts = [*plan.worth, *(block[:, : len(fresh)] for block in plan.blocks)]
+            self._number |= {triple: len(self._number) + k for k, triple in enumerate(fresh)}
+            self._rows = torch.cat([self._rows, torch.cat(parts, -1)[0]])
+        take = torch.tensor([self._number[triple] for triple in triples], device=self._device)
+        return self._rows[take].unflatten(0, level.shape[:2])
+
+    def plan(self, columns: Float[Tensor, "lane frame column"]) -> EchoPlan:
+        """As the network takes it."""
+        parts = columns.split(self._sizes, -1)
+        worth, blocks = parts[: self._worth], parts[self._worth :]
+        if self.net.streams > 1:
+            blocks = tuple(block.repeat(1, self.net.streams, 1) for block in blocks)
+        return EchoPlan(worth, blocks)
+
+
+class _StepGraph(nn.Module):
+    """One step, its levels' plan as one tensor."""
+
+    def __init__(self, plans: EchoPlans):
+        super().__init__()
+        self.net, self._plans = plans.net, (plans,)
+
+    def forward(
+        self,
+        x_t: Float[Tensor, "batch time feature"],
+        plan: Float[Tensor, "#batch time column"],
+        encoded: Float[Tensor, "batch time width"],
+        valid: Bool[Tensor, "batch time"],
+    ) -> Float[Tensor, "batch time feature"]:
+        return self.net.step(x_t, self._plans[0].plan(plan), encoded, valid)
+
+
+class _ToldGraph(nn.Module):
+    """What a window's frames are told."""
+
+    def __init__(self, net: EchoDenoiser):
+        super().__init__()
+        self.net = net
+
+    def forward(
+        self,
+        condition: Float[Tensor, "batch time condition"],
+        thing: Float[Tensor, "batch time embedded"],
+        has_object: Bool[Tensor, "batch time"],
+        valid: Bool[Tensor, "batch time"],
+    ) -> Float[Tensor, "batch time width"]:
+        return self.net.encode(condition, thing, has_object, valid)
+
+
+class EchoRunner:
+    """x̂0 of windows. The network's weights must not change while it is used."""
+
+    def __init__(self, net: EchoDenoiser, runtime: str = "eager"):
+        """Raises WearcapError for a runtime that is unknown, not installed, or not for the network's device."""
+        self._device = net.motion_normalizer.mean.device
+        require_runtime(runtime, self._device)
+        self.net, self.plans = net, EchoPlans(net)
+        step, told = _StepGraph(self.plans).eval(), _ToldGraph(net).eval()
+        self._step: Callable[..., Tensor] = step
+        self._told: Callable[..., Tensor] = told
+        if runtime == "onnx":
+            self._step, self._told = _onnx(net, self.plans.size, step, told)
+        elif runtime == "compile":
+            self._step, self._told = _compiled(step, self._device), _compiled(told, self._device)
+        self._window = None if runtime == "eager" else net.window
+
+    def begin(
+        self,
+        condition: Float[Tensor, "batch time condition"],
+        thing: Float[Tensor, "batch time embedded"],
+        has_object: Bool[Tensor, "batch time"],
+        valid: Bool[Tensor, "batch time"],
+    ) -> Callable[[Tensor, Tensor], Tensor]:
+        """x̂0 as a function of x_t "batch time feature" and levels "batch time modality"; what is told is encoded once.
+
+        Everything goes in and comes out on the CPU.
+        """
+        count = valid.shape[1]
+        told = [self._whole(part) for part in (condition, thing, has_object, valid)]
+        encoded, there = self._told(*told), told[-1]
+
+        def denoise(x_t: Tensor, level: Tensor) -> Tensor:
+            plan = self.plans(self._filled(level))
+            return self._step(self._whole(x_t), plan, encoded, there)[:, :count].float().cpu()
+
+        return denoise
+
+    def _whole(self, value: Tensor) -> Tensor:
+        """On the device; where the network takes whole windows alone, with frames behind the last that are not valid."""
+        return self._filled(value).to(self._device)
+
+    def _filled(self, value: Tensor) -> Tensor:
+        more = 0 if self._window is None else self._window - value.shape[1]
+        return F.pad(value, (0, 0) * (value.ndim - 2) + (0, more)) if more else value
+
+
+def require_runtime(runtime: str, device: str | torch.device) -> None:
+    """Raises WearcapError for a runtime that is unknown, not installed, or not for a device."""
+    if runtime not in RUNTIMES:
+        raise WearcapError(f"no runtime {runtime!r}", expected=f"one of {', '.join(RUNTIMES)}", fix=nearest(runtime, RUNTIMES))  # fmt: skip
+    missing = missing_libraries() if runtime == "onnx" else []
+    if missing or (runtime == "onnx" and torch.device(device).type != "cpu"):
+        raise WearcapError(
+            f"runtime 'onnx' needs {', '.join(missing)}" if missing else f"runtime 'onnx' on {device}",
+            expected="ONNX Runtime on the CPU", fix='Run: pip install "wearcap[export]", or choose pipeline.runtime=eager.',
+        )  # fmt: skip
+
+
+def _onnx(
+    net: EchoDenoiser, columns: int, step: nn.Module, told: nn.Module
+) -> tuple[Callable[..., Tensor], Callable[..., Tensor]]:
+    frames = 2, net.window
+    there = torch.ones(frames, dtype=torch.bool)
+    codes = {
+        "condition": torch.zeros(*frames, len(net.condition_normalizer.mean)),
+        "thing": torch.zeros(*frames, len(net.no_object)), "has_object": there, "valid": there.clone(),
+    }  # fmt: skip
+    inputs = {
+        "x_t": torch.zeros(*frames, sum(net.sizes)), "plan": torch.zeros(*frames, columns),
+        "encoded": torch.zeros(*frames, net.narrow.out_features), "valid": there,
+    }  # fmt: skip
+    run_step, run_told = onnx_runner(step, inputs), onnx_runner(told, codes)
+
+    def stepped(x_t: Tensor, plan: Tensor, encoded: Tensor, valid: Tensor) -> Tensor:
+        return run_step(x_t, plan.expand(len(x_t), -1, -1), encoded, valid)[0]
+
+    return stepped, lambda *given: run_told(*given)[0]
+
+
+def _compiled(graph: nn.Module, device: torch.device) -> Callable[..., Tensor]:
+    """Static shapes; on a GPU, replayed as CUDA graphs, which overwrite what they give out."""
+    mode = "reduce-overhead" if device.type == "cuda" else None
+    compiled = torch.compile(graph, dynamic=False, fullgraph=True, mode=mode)
+    return lambda *given: compiled(*given).clone()

@@ -1,0 +1,389 @@
+"""ECHO while things happen: tracked points go in as they come, bodies and objects come out frame by frame.
+
+What is said is what `Echo` says of the whole recording with the same seed, as far as it is known in time; a pose comes
+`Echo.latency_s` after its moment. Memory does not grow.
+"""
+
+import math
+from bisect import bisect_left
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording import Motion
+from wearcap.recording.acts import SAME_S
+from wearcap.recording.timing import joined
+from wearcap.runtime.onnx import undisturbed
+from wearcap.scene.environment import Environment
+from wearcap.scene.object_mesh import check_object
+from wearcap.sensors.packets import (
+    CONNECTED_S,
+    MAX_WAITING,
+    OFF_THE_CLOCK,
+    Admitted,
+    Clock,
+    HeadDoor,
+    connected,
+    owned_pose,
+    pose_fault,
+    time_fault,
+)
+from wearcap.systems.echo.features import CONTACTS, POINTS
+from wearcap.systems.echo.model import MODALITIES
+from wearcap.systems.echo.objects import ObjectShape
+from wearcap.systems.echo.observations import MAX_GAP_S, Lane, wrist_poses
+from wearcap.systems.echo.pipeline import Echo, motion_of, pulled_by, stretch_seed
+from wearcap.systems.echo.queue import EchoQueue, Said, Told
+from wearcap.systems.echo.static_objects import Resting
+from wearcap.tracking.floor import FloorTracker
+from wearcap.tracking.head_path import HeadPath
+from wearcap.tracking.head_track import Chunk, HeadTrack
+
+WRISTS = POINTS[1:]
+MAX_SEEN = 1000
+"""Sights of objects that wait for their frames; the oldest make room."""
+ASIDE_M, BELOW = 0.25, 0.47
+"""Where a wrist hangs: beside the head (m), and below it as a share of the head's height."""
+
+
+@dataclass(frozen=True, eq=False)
+class EchoWearer:
+    """Who wears the kit, and how the head device sits."""
+
+    skeleton: Skeleton
+    shape: Mapping[str, float] = field(default_factory=dict)
+    R_head_device: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
+    t_head_device: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
+    floor_m: float | None = None
+    """Height of the floor; None: the head's usual height in the last half minute, less that of one who stands. A capture
+    of the whole recording knows what comes, too."""
+
+
+class EchoSession:
+    """A streaming capture of one wearer among some objects.
+
+    What cannot be true (`sensors.packets`) is `refused`. Where the head device's clock goes back for good, the capture
+    begins anew as a new session would, with the object that was active; everything else is on that clock.
+    """
+
+    def __init__(
+        self, pipeline: Echo, wearer: EchoWearer, environment: Environment | None = None, seed: int = 0
+    ):
+        """Raises WearcapError for a pipeline without a conveyor."""
+        if pipeline.rewindow is not None:
+            raise WearcapError(f"a stream with rewindow={pipeline.rewindow}", expected="a conveyor: rewindow=null")  # fmt: skip
+        pipeline.prepare()
+        self.pipeline, self.wearer, self.seed = pipeline, wearer, seed
+        self.silent = 0
+        """Frames for which a wrist had nothing to say."""
+        self._environment, self._reader = environment, pipeline.reader()
+        self._shapes: dict[str, ObjectShape] = {}
+        """Objects that have been named so far, in that order."""
+        self._door, self._track = HeadDoor(), HeadTrack(pipeline.fps, 1)
+        self._wrists: dict[str, list[tuple[float, Tensor, Tensor]]] = {joint: [] for joint in WRISTS}
+        self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
+        self._acts: list[tuple[float, str | None]] = []
+        self._seen: list[tuple[float, str, Rigid]] = []
+        self._finished: list[Motion] = []
+        """Of before the clock went back, not given yet."""
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin anew: what was said of wrists and objects stays, and the counts."""
+        dropped, pipeline = self._track.dropped, self.pipeline
+        self._track = HeadTrack(pipeline.fps, 1)
+        self._track.dropped = dropped
+        self._chunks: list[Chunk] = []
+        self._queue: EchoQueue | None = None
+        self._waiting: list[tuple[float, Told, Rigid]] = []
+        """Times, what was told, and the head, of frames that are taken and not given yet."""
+        self._floor = FloorTracker(self.wearer.skeleton.height_of("head"), pipeline.fps)
+        threshold = pipeline.rests_below
+        self._resting = None if threshold is None else Resting(threshold)
+
+    @property
+    def dropped(self) -> int:
+        """Head poses that came too late, twice, or were refused."""
+        return self._track.dropped + self._door.dropped
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """How many packets were refused, by reason: "left_wrist: not a rotation"."""
+        return dict(self._door.refused)
+
+    def head(self, timestamp: float, T_world_device: Rigid | None) -> None:
+        """Take in a moment of the head device: its pose, if tracking has one."""
+        if self._door.timely(timestamp):
+            self._take(self._door.admit(float(timestamp), self._door.pose(T_world_device)))
+
+    def _take(self, admitted: Admitted) -> None:
+        if admitted.begins:
+            if admitted.again:
+                if (motion := self._final(ended=True)) is not None:
+                    self._finished.append(motion)
+                active = next(
+                    (name for start, name in reversed(self._acts) if start <= self._track.newest), None
+                )
+                self._acts = [] if active is None else [(-math.inf, active)]
+                self._seen = []
+            self._begin()
+            for joint in self._wrists:
+                self._rejoin(joint, None if admitted.again else admitted.packets[0][0])
+        for time, pose in admitted.packets:
+            self._track.take(time, pose)
+
+    def _rejoin(self, joint: str, time: float | None) -> None:
+        """Keep of a wrist what belongs to the clock that begins at a time; None: nothing does."""
+        known = self._wrists[joint]
+        kept = [] if time is None else known[connected([pose[0] for pose in known], time)]
+        refused = self._clocks[joint].set(kept[-1][0] if kept else None)
+        self._refuse(joint, refused if time is None else refused + len(known) - len(kept))
+        self._wrists[joint] = kept
+
+    def _refuse(self, stream: str, count: int) -> None:
+        if count:
+            self._door.refuse(stream, OFF_THE_CLOCK, count)
+
+    def wrist(self, joint: str, timestamp: float, T_world_joint: Rigid) -> None:
+        """Take in the pose of a wrist joint; what comes twice is left out.
+
+        Raises WearcapError for another joint than the wrists.
+        """
+        if joint not in self._wrists:
+            raise WearcapError(f"no tracked joint {joint!r}", expected=" or ".join(WRISTS))
+        if fault := time_fault(timestamp) or pose_fault(T_world_joint):
+            self._door.refuse(joint, fault)
+            return
+        leader = self._door.clock.newest
+        admitted = self._clocks[joint].admit(float(timestamp), owned_pose(T_world_joint), leader)
+        self._refuse(joint, admitted.refused)
+        if admitted.begins:
+            first = bisect_left(self._wrists[joint], admitted.packets[0][0], key=_time)
+            self._wrists[joint] = self._wrists[joint][: first if admitted.again else 0]
+        for time, T in admitted.packets:
+            known = self._wrists[joint]
+            place = bisect_left(known, time, key=_time)
+            if place == len(known) or known[place][0] != time:
+                known.insert(place, (time, T.R, T.t))
+                del known[:-MAX_WAITING]
+
+    def activate(self, name: str | None, timestamp: float) -> None:
+        """From a time (s) on this object is the active one; None: none is. Frames whose poses are not final yet, too.
+
+        Raises WearcapError for an unknown object, and for one whose mesh or class cannot be used.
+        """
+        if fault := time_fault(timestamp):
+            self._door.refuse("activate", fault)
+            return
+        if name is not None:
+            known = name in self._shapes
+            self._shape(name)
+            if self.pipeline.placed and not known and self._environment is not None:
+                # In the middle between then and one frame later: the first frame from then on is the one nearby.
+                soon = timestamp + 0.499 / self.pipeline.fps
+                self._see(name, soon, self._environment.by_name(name).T_world_object)
+        self._acts = [act for act in self._acts if act[0] < timestamp] + [(timestamp, name)]
+        del self._acts[:-MAX_WAITING]
+        self._retell()
+
+    def see_object(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
+        """An object's pose is known at a moment, from a camera for instance (ECHO §4.2).
+
+        Raises as `activate` does.
+        """
+        self._shape(name)
+        newest = self._door.clock.newest
+        if fault := time_fault(timestamp) or pose_fault(T_world_object):
+            self._door.refuse(name, fault)
+        elif math.isfinite(newest) and abs(timestamp - newest) > CONNECTED_S:
+            self._refuse(name, 1)
+        else:
+            self._see(name, float(timestamp), owned_pose(T_world_object))
+
+    def _see(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
+        self._seen.append((timestamp, name, self._shape(name).centred(T_world_object)))
+        del self._seen[:-MAX_SEEN]
+        self._retell()
+
+    def _shape(self, name: str) -> ObjectShape:
+        if name not in self._shapes:
+            if self._environment is None:
+                raise WearcapError(f"no object {name!r}", expected="a session with an environment")
+            item = self._environment.by_name(name)
+            check_object(item, f"object {name!r}")
+            self._shapes[name] = self._reader(item)
+            if self._queue is not None and self._queue.guided is not None:
+                self._queue.guided = pulled_by([self.wearer.skeleton], [dict(self.wearer.shape)], [list(self._shapes.values())])  # fmt: skip
+        return self._shapes[name]
+
+    def poses(self, ended: bool = False) -> Motion | None:
+        """The frames that are final since the last time; `ended`: nothing more will come.
+
+        Where the head device's clock has gone back these are the frames before; call again for those with the new times.
+        """
+        if ended:
+            for time, pose in self._door.end():
+                self._track.take(time, pose)
+        return self._finished.pop(0) if self._finished else self._final(ended)
+
+    def _final(self, ended: bool) -> Motion | None:
+        while (chunk := self._track.next(ended)) is not None:
+            self._chunks.append(chunk)
+        given: list[Motion] = []
+        with undisturbed(self.pipeline.runtime == "onnx"):
+            while self._chunks and (ended or self._told(self._chunks[0])):
+                given += self._advance(self._chunks.pop(0))
+            if ended or not (self._chunks or self._track.inside):
+                given += self._finish()
+        return joined(given)
+
+    def _told(self, chunk: Chunk) -> bool:
+        """Whether both wrists have said where they are at a frame, or are silent."""
+        time, head = chunk.timestamps[-1].item(), self._track.newest
+        newest = [poses[-1][0] if poses else -math.inf for poses in self._wrists.values()]
+        return all(last >= time - 1e-6 or head > max(time, last) + MAX_GAP_S for last in newest)
+
+    def _advance(self, chunk: Chunk) -> list[Motion]:
+        given: list[Motion] = []
+        if chunk.begins or self._queue is None:
+            given += self._finish()
+            skeleton = self.wearer.skeleton
+            self._queue = self.pipeline.queue(
+                [skeleton], [stretch_seed(self.seed, chunk.first)], [dict(self.wearer.shape)],
+                [list(self._shapes.values())],
+            )  # fmt: skip
+        mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
+        T_world_head = chunk.T_world_device @ mount
+        self._amend(chunk.amended @ mount)
+        time = chunk.timestamps[0].item()
+        told = self._frame(time, T_world_head)
+        said = self._queue.push(told)
+        self._waiting.append((time, told, T_world_head))
+        return given + self._give(said)
+
+    def _amend(self, T_world_head: Rigid) -> None:
+        """Put the head of the last frames where it turned out to have been."""
+        count = min(len(T_world_head.t), len(self._waiting))
+        for k in range(count):
+            time, told, _ = self._waiting[-count + k]
+            at = T_world_head[len(T_world_head.t) - count + k : len(T_world_head.t) - count + k + 1]
+            R, t = told.R_world_point.clone(), told.t_world_point.clone()
+            R[0, 0, 0], t[0, 0, 0] = at.R[0], at.t[0]
+            self._waiting[-count + k] = (time, told._replace(R_world_point=R, t_world_point=t), at)
+        if count:
+            self._retell()
+
+    def _finish(self) -> list[Motion]:
+        """The frames of a stretch that has ended."""
+        given: list[Motion] = []
+        while self._queue is not None and self._waiting:
+            given += self._give(self._queue.push(self._queue.padding()))
+        self._queue = None
+        return given
+
+    def _frame(self, time: float, T_world_head: Rigid) -> Told:
+        poses = [T_world_head, *(self._wrist_at(joint, time, T_world_head) for joint in WRISTS)]
+        R, t = torch.stack([T.R for T in poses], 1), torch.stack([T.t for T in poses], 1)
+        joints = len(self.wearer.skeleton)
+        one = torch.ones(1, dtype=torch.bool)
+        unseen = (torch.eye(3).repeat(1, joints, 1, 1), torch.zeros(1, 3), torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, CONTACTS))  # fmt: skip
+        floor = torch.full((1,), self.wearer.floor_m or 0.0)
+        if self.wearer.floor_m is None:
+            floor = self._floor.follow(T_world_head.t)
+        fields = (R, t, floor, *self._active(time), one, *unseen, torch.zeros(1, len(MODALITIES), dtype=torch.bool))  # fmt: skip
+        return self._observed(Told(*(value[None] for value in fields)), time)
+
+    def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Whether an object is active at a time, its code and its number."""
+        name = next((name for start, name in reversed(self._acts) if start <= time + SAME_S), None)
+        if name is None:
+            return torch.zeros(1, dtype=torch.bool), self._reader.nothing[None], torch.full((1,), -1.0)
+        number = torch.full((1,), float(list(self._shapes).index(name)))
+        return torch.ones(1, dtype=torch.bool), self._shapes[name].code[None], number
+
+    def _observed(self, told: Told, time: float) -> Told:
+        """With the active object's pose, where it was seen within half a frame: the one that is nearest in time."""
+        if not told.has_object.item():
+            return told
+        active, near = list(self._shapes)[int(told.object_number)], 0.5 / self.pipeline.fps + 1e-6
+        seen = [
+            (abs(at - time), T) for at, name, T in self._seen if name == active and abs(at - time) <= near
+        ]
+        if not seen:
+            return told
+        _, T = min(seen, key=lambda pair: pair[0])
+        known = told.is_known.clone()
+        known[..., 1] = True
+        return told._replace(R_world_object=T.R[None, None], t_world_object=T.t[None, None], is_known=known)
+
+    def _retell(self) -> None:
+        """What has become known of the frames that are on the conveyor."""
+        if self._queue is None or self._queue.told is None or not self._waiting:
+            return
+        whole, first = self._queue.told, self._queue.told.valid.shape[1] - len(self._waiting)
+        frames = [whole.frames(slice(k, k + 1)) for k in range(max(first, 0))]
+        for k, (time, told, head) in enumerate(self._waiting):
+            has, code, number = (value[None] for value in self._active(time))
+            changed = told._replace(
+                has_object=has,
+                object_code=code,
+                object_number=number,
+                is_known=torch.zeros_like(told.is_known),
+            )
+            changed = self._observed(changed, time)
+            self._waiting[k] = (time, changed, head)
+            frames.append(changed)
+        self._queue.told = Told(*(torch.cat(fields, 1) for fields in zip(*frames)))
+
+    def _hanging(self, joint: str, T_world_head: Rigid) -> Rigid:
+        """Of a wrist that has not been seen yet: beside the body, arms down."""
+        heading = rotation.about_axis("z", rotation.yaw_of(T_world_head.R))
+        aside = ASIDE_M if joint == WRISTS[0] else -ASIDE_M
+        below = torch.tensor([0.0, aside, -BELOW * self.wearer.skeleton.height_of("head")])
+        return Rigid(heading, T_world_head.t + (heading @ below[:, None])[..., 0])
+
+    def _wrist_at(self, joint: str, time: float, T_world_head: Rigid) -> Rigid:
+        known = self._wrists[joint]
+        if not known or known[-1][0] < time - MAX_GAP_S:
+            self.silent += 1
+        if not known:
+            return self._hanging(joint, T_world_head)
+        times, R, t = zip(*known)
+        track = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
+        pose = wrist_poses(track, torch.tensor([time], dtype=torch.float64))
+        # What came before the last second is asked for no more, but for where the wrist was when it began.
+        old = bisect_left(known, time - 1.0, key=lambda sample: sample[0]) - 1
+        self._wrists[joint] = known[max(old, 0) :]
+        return Rigid(pose.R.float(), pose.t.float())
+
+    def _give(self, said: Said | None) -> list[Motion]:
+        if said is None or not self._waiting:
+            return []
+        time, told, T_world_head = self._waiting.pop(0)
+        path = HeadPath(
+            torch.tensor([time], dtype=torch.float64), T_world_head, T_world_head, told.floor_height[0],
+            self.wearer.skeleton, ((0, 1),),
+        )  # fmt: skip
+        self._forget(time)
+        lane = Lane(path, told, list(self._shapes.values()))
+        if self._resting is not None:
+            said = self._resting(told, said)
+        return [motion_of(lane, said, self.pipeline.hang, self.pipeline.settings())]
+
+    def _forget(self, time: float) -> None:
+        """What no later frame asks for."""
+        self._seen = [row for row in self._seen if row[0] > time - 1.0]
+        past = [k for k, (start, _) in enumerate(self._acts) if start <= time]
+        self._acts = self._acts[past[-1] :] if past else self._acts
+
+
+def _time(pose: tuple[float, Tensor, Tensor]) -> float:
+    return pose[0]

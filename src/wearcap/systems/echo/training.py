@@ -1,0 +1,192 @@
+"""Training of ECHO: tri-variate diffusion of human, object and contacts (ECHO §3.2, eq. 5–7, 12, 13)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.contact_points import BODY_POINTS
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.skeleton import Skeleton
+from wearcap.data.statistics import MIN_SCALE, collate
+from wearcap.diffusion.levels import LevelMix
+from wearcap.diffusion.process import add_noise
+from wearcap.diffusion.schedule import Schedule
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.models.point_encoder import PointNeXt
+from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, Body, EchoFeatures
+from wearcap.systems.echo.model import EchoDenoiser
+from wearcap.systems.echo.training_windows import EchoDataset, EchoWindow
+from wearcap.training import losses
+from wearcap.training.base import SeededSteps, WeighedTerms
+
+
+class EchoDiffusion(SeededSteps, WeighedTerms):
+    """x0-prediction with a noise level for every frame and modality.
+
+    Loss terms, weighed by `loss_weights`: "human", "object" and "contact" are mean squares in normalised space (eq. 12's
+    first three; squares are ours: their minimum is the mean that the posterior step takes x̂0 for); "object_vertices"
+    (the root of the mean square over the surface, which needs no vertices), "joints" and "skate" are distances in metres
+    (its last three); "velocity" of the joints is ours. Frames without an active object have no part in what is said of
+    one.
+    """
+
+    def __init__(
+        self,
+        net: Callable[..., EchoDenoiser],
+        features: EchoFeatures,
+        schedule: Schedule,
+        skeleton: Skeleton,
+        loss_weights: dict[str, float],
+        levels: LevelMix,
+        optimizer: Callable[..., torch.optim.Optimizer],
+        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        encoder: PointNeXt | None = None,
+        contacts: bool = True,
+        seed: int = 0,
+    ):
+        """`encoder` (frozen) makes the objects' features. `contacts` False leaves that modality out, as a row of the
+        document does."""
+        super().__init__()
+        self.net = net(
+            human_size=features.human_size, object_size=OBJECT_SIZE, contact_size=CONTACTS,
+            condition_size=features.condition_size, object_condition_size=features.object_condition_size,
+        )  # fmt: skip
+        self.encoder = None if encoder is None else encoder.requires_grad_(False).eval()
+        self.features, self.schedule, self.skeleton, self.mix = features, schedule, skeleton, levels
+        self.loss_weights, self.contacts, self.seed = dict(loss_weights), contacts, seed
+        self._optimizer, self._scheduler = optimizer, scheduler
+        self._feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+
+    def set_statistics(self, dataset: EchoDataset, limit: int = 1500) -> None:
+        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        if dataset.features != self.features:
+            raise WearcapError("windows of other features than the model's", expected="data.features and model.features alike")  # fmt: skip
+        random = torch.Generator().manual_seed(0)
+        drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
+        rows: dict[str, list[Tensor]] = {"human": [], "object": [], "condition": []}
+        for first in range(0, limit, 100):
+            batch = collate(
+                [dataset[item] for item in zip(drawn[first : first + 100], range(first, first + 100))]
+            )
+            frame = self.features.canonical(batch.points)
+            rows["human"].append(self.features.encode_body(batch.body, frame)[batch.valid])
+            rows["object"].append(
+                self.features.encode_object(batch.T_world_object, frame)[batch.valid & batch.has_object]
+            )
+            rows["condition"].append(
+                self.features.condition(batch.points, batch.floor_height, batch.size)[batch.valid]
+            )
+        human, thing, condition = (torch.cat(part) for part in rows.values())
+        ranges = [self._range(human), self._range(thing)]
+        mean, scale = (torch.cat(part) for part in zip(*ranges))
+        contact = torch.zeros(CONTACTS), torch.ones(CONTACTS)
+        self.net.motion_normalizer.set(torch.cat([mean, contact[0]]), torch.cat([scale, contact[1]]))
+        self.net.condition_normalizer.set(condition.mean(0), condition.std(0).clamp_min(MIN_SCALE))
+        if self.encoder is not None and dataset.encoder is not None:
+            self.encoder.load_state_dict(dataset.encoder.state_dict())
+
+    def _range(self, rows: Float[Tensor, "row value"]) -> tuple[Tensor, Tensor]:
+        """Mean and scale per value; of vectors that move with the window (root and object) one scale, about zero, so
+        that noise stays noise when they are turned."""
+        if not len(rows):
+            return torch.zeros(rows.shape[1]), torch.ones(rows.shape[1])
+        mean, scale = rows.mean(0), rows.std(0).clamp_min(MIN_SCALE)
+        if self.features.moves:
+            for part in (slice(0, 3), slice(3, 9)):
+                mean[part], scale[part] = 0.0, rows[:, part].square().mean().sqrt()
+        return mean, scale
+
+    def pipeline_parts(self) -> dict[str, Any]:
+        """What an `Echo` pipeline is built around."""
+        return {
+            "net": self.net, "features": self.features, "schedule": self.schedule, "skeleton": self.skeleton,
+            "encoder": self.encoder, "contacts": self.contacts,
+        }  # fmt: skip
+
+    def train(self, mode: bool = True) -> "EchoDiffusion":
+        """The encoder of objects stays as it is."""
+        super().train(mode)
+        if self.encoder is not None:
+            self.encoder.eval()
+        return self
+
+    def _levels(self, batch: EchoWindow) -> Float[Tensor, "batch time modality"]:
+        """Of a batch; an object that is not there is noise alone."""
+        levels = self.mix.levels(batch.level_draws, batch.draws)
+        human, thing, contact = levels.unbind(-1)
+        thing = torch.where(batch.has_object, thing, 1.0)
+        contact = contact if self.contacts else torch.ones_like(contact)
+        return torch.stack([human, thing, contact], -1)
+
+    def _truth(self, batch: EchoWindow, frame: Rigid) -> Float[Tensor, "batch time feature"]:
+        """x0, normalised."""
+        human = self.features.encode_body(batch.body, frame)
+        thing = self.features.encode_object(batch.T_world_object, frame)
+        x0 = self.net.motion_normalizer(torch.cat([human, thing, 2 * batch.contact - 1], -1))
+        return torch.where(self._counts(batch), x0, self._blank(x0))
+
+    def _blank(self, x0: Tensor) -> Tensor:
+        """What stands for the object and the body's contacts where there is no object: nothing, and no contact."""
+        human, thing, contact = x0.split(self.net.sizes, -1)
+        return torch.cat([human, torch.zeros_like(thing), -torch.ones_like(contact)], -1)
+
+    def _counts(self, batch: EchoWindow) -> Tensor:
+        """Which features mean something: all with an object, human and feet without."""
+        always = torch.ones(sum(self.net.sizes), dtype=torch.bool, device=batch.valid.device)
+        first = self.net.sizes[0]
+        always[first : first + OBJECT_SIZE + BODY_POINTS] = False
+        return always | batch.has_object[..., None]
+
+    def terms(self, batch: EchoWindow) -> dict[str, Tensor]:
+        """Every loss term of a batch, unweighted."""
+        frame = self.features.canonical(batch.points)
+        x0, levels = self._truth(batch, frame), self._levels(batch)
+        x_t = add_noise(x0, batch.noise, self.net.per_feature(levels), self.schedule)
+        condition = self.features.condition(batch.points, batch.floor_height, batch.size, frame)
+        encoded = self.net.encode(
+            condition, self.net.object(batch.object_code), batch.has_object, batch.valid
+        )
+        x0_hat = self.net(x_t, levels, encoded, batch.valid).float()
+        # Millimetres are lost in half precision.
+        with torch.autocast(x0_hat.device.type, enabled=False):
+            return self._compared(x0_hat, x0, batch, frame)
+
+    def _compared(self, x0_hat: Tensor, x0: Tensor, batch: EchoWindow, frame: Rigid) -> dict[str, Tensor]:
+        square = (x0_hat - x0).square() * self._counts(batch)
+        weight = batch.valid.float()
+        terms = {
+            name: losses.masked_mean(part.mean(-1), weight)
+            for name, part in zip(("human", "object", "contact"), square.split(self.net.sizes, -1))
+        }
+        if not self.contacts:
+            terms.pop("contact")
+        said = self.net.motion_normalizer.inverse(x0_hat)
+        terms["object_vertices"] = self._vertices(said, batch, frame)
+        body = self.features.decode_body(said[..., : self.net.sizes[0]], frame)
+        predicted, true = self._joints(body, batch), self._joints(batch.body, batch)
+        terms["joints"] = losses.joint_position(predicted, true, weight)
+        terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.features.fps)
+        feet = predicted[:, :, self._feet].unflatten(2, (4, 1))
+        terms["skate"] = losses.foot_skate(feet, batch.contact[..., BODY_POINTS:], weight, self.features.fps)
+        return terms
+
+    def _joints(self, body: Body, batch: EchoWindow) -> Float[Tensor, "batch time joint 3"]:
+        """Joints (m) in the world."""
+        return forward_kinematics(self.skeleton, *body, batch.t_parent_joint[:, None]).t
+
+    def _vertices(
+        self, said: Float[Tensor, "batch time feature"], batch: EchoWindow, frame: Rigid
+    ) -> Float[Tensor, ""]:
+        """Root of the mean squared way (m) between the surface as said and as it is: ‖Δt‖² + 2 Δt·ΔR μ + tr ΔR S ΔRᵀ."""
+        first = self.net.sizes[0]
+        T = self.features.decode_object(said[..., first : first + OBJECT_SIZE], frame)
+        turn, shift = T.R - batch.R_world_object, T.t - batch.t_world_object
+        mean = (turn @ batch.object_mean[..., None])[..., 0]
+        turned = (turn @ batch.object_spread * turn).sum((-1, -2))
+        square = shift.square().sum(-1) + 2 * (shift * mean).sum(-1) + turned
+        distance = (square.clamp_min(0) + losses.EPSILON_M2).sqrt()
+        return losses.masked_mean(distance, (batch.valid & batch.has_object).float())

@@ -1,0 +1,152 @@
+"""Training of our small image encoder: where a wearer's own limbs are in a head camera's frame."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from wearcap.metrics.detection import average_precision
+from wearcap.models.image_encoder import EgoViewEncoder, letterboxed
+from wearcap.models.layers import Normalizer
+from wearcap.systems.hmd2.egoview_augmentation import half_mirrored, relit, turned
+from wearcap.systems.hmd2.egoview_frames import HANDS, POINTS, EgoFrame, EgoFrames
+from wearcap.training.base import SeededSteps
+
+LEAST_SPREAD_M = 0.02
+
+
+class EgoView(SeededSteps):
+    """Linear heads on the embedding tell which of `POINTS` are in the picture, and where they are.
+
+    The loss is their binary cross-entropy plus the Huber loss of the places, in standard deviations, of those that are.
+    Linear, so that it is the embedding that carries what is known. `turn_deg`: see `ego_augment.turned`.
+    """
+
+    def __init__(
+        self,
+        net: EgoViewEncoder,
+        optimizer: Callable[..., torch.optim.Optimizer],
+        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        dropout: float = 0.0,
+        augment: bool = True,
+        turn_deg: float = 5.0,
+        seed: int = 0,
+    ):
+        super().__init__()
+        self.net, self.heads = net, nn.Linear(net.size, 4 * len(POINTS))
+        self.normalizer = Normalizer(3 * len(POINTS))
+        self.dropout, self.augment, self.turn_deg, self.seed = nn.Dropout(dropout), augment, turn_deg, seed
+        self._optimizer, self._scheduler = optimizer, scheduler
+        self._validated: list[tuple[Tensor, Tensor, EgoFrame]] = []
+
+    def set_statistics(self, dataset: EgoFrames) -> None:
+        """Mean and deviation of every point's place, over the frames where it is in the picture."""
+        weight = dataset.visible.double()[..., None]
+        count = weight.sum(0).clamp_min(1)
+        mean = (weight * dataset.point_cam).sum(0) / count
+        spread = ((weight * (dataset.point_cam - mean) ** 2).sum(0) / count).sqrt().clamp_min(LEAST_SPREAD_M)
+        self.normalizer.set(mean.flatten().float(), spread.flatten().float())
+
+    def forward(
+        self, pictures: Float[Tensor, "batch 3 height width"]
+    ) -> tuple[Float[Tensor, "batch point"], Float[Tensor, "batch point 3"]]:
+        """Logits of being in the picture, and places (m)."""
+        logits, places = self.heads(self.dropout(self.net(pictures))).split(
+            [len(POINTS), 3 * len(POINTS)], -1
+        )
+        return logits, self.normalizer.inverse(places).unflatten(-1, (len(POINTS), 3))
+
+    def pictures(self, batch: EgoFrame) -> Float[Tensor, "batch 3 height width"]:
+        """The batch's pictures as the network takes them in."""
+        return letterboxed(batch.picture, self.net.width, self.net.height, self.net.mean, self.net.std)
+
+    def _intrinsics(self, batch: EgoFrame) -> Float[Tensor, "batch 4"]:
+        """Of the letterboxed pictures."""
+        height, width = batch.picture.shape[1:3]
+        scale = min(self.net.width / width, self.net.height / height)
+        margin = (torch.tensor([self.net.width, self.net.height]) - scale * torch.tensor([width, height])) / 2
+        centre = scale * (batch.intrinsics[:, 2:] + 0.5) - 0.5 + margin.to(batch.intrinsics)
+        return torch.cat([scale * batch.intrinsics[:, :2], centre], -1)
+
+    def loss(
+        self,
+        pictures: Float[Tensor, "batch 3 height width"],
+        point_cam: Float[Tensor, "batch point 3"],
+        visible: Bool[Tensor, "batch point"],
+    ) -> Tensor:
+        logits, places = self(pictures)
+        spread = self.normalizer.scale.unflatten(-1, (len(POINTS), 3))
+        miss = F.smooth_l1_loss(places / spread, point_cam / spread, reduction="none").mean(-1)
+        seen = F.binary_cross_entropy_with_logits(logits, visible.to(logits.dtype))
+        return seen + (miss * visible).sum() / visible.sum().clamp_min(1)
+
+    def training_step(self, batch: EgoFrame, batch_idx: int) -> Tensor:
+        varied = self.pictures(batch), batch.point_cam, batch.visible
+        if self.augment:
+            pictures, *points = turned(varied[0], self._intrinsics(batch), *varied[1:], self.turn_deg)
+            varied = half_mirrored(relit(pictures), *points)
+        loss = self.loss(*varied)
+        self.log("train/loss", loss, batch_size=len(batch.picture), prog_bar=True)
+        return loss
+
+    def validation_step(self, batch: EgoFrame, batch_idx: int) -> None:
+        pictures = self.pictures(batch)
+        self.log(
+            "val/loss",
+            self.loss(pictures, batch.point_cam, batch.visible),
+            batch_size=len(pictures),
+            sync_dist=True,
+        )
+        self._validated.append((*self(pictures), batch))
+
+    def on_validation_epoch_end(self) -> None:
+        logits, places = (torch.cat([part[k] for part in self._validated]) for k in range(2))
+        truth = EgoFrame(*(torch.cat(field) for field in zip(*(part[2] for part in self._validated))))
+        mean = self.normalizer.mean.unflatten(-1, (len(POINTS), 3)).expand_as(places)
+        for name, value in view_scores(
+            logits.sigmoid(), places, mean, truth.point_cam, truth.visible
+        ).items():
+            self.log(f"val/{name}", value)
+        self._validated.clear()
+
+    def configure_optimizers(self):
+        optimizer = self._optimizer(self.parameters())
+        if self._scheduler is None:
+            return optimizer
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
+        }
+
+
+def view_scores(
+    prob: Float[Tensor, "frame point"],
+    places: Float[Tensor, "frame point 3"],
+    mean_places: Float[Tensor, "frame point 3"],
+    point_cam: Float[Tensor, "frame point 3"],
+    visible: Bool[Tensor, "frame point"],
+) -> dict[str, float]:
+    """Average precision of telling which hands are in the picture, and the mean error (cm) of those that are, by side's
+    mean; beside each what it is for someone who knows the training split's share and mean place alone. The same error
+    for all points."""
+    left, right = (POINTS.index(name) for name in HANDS)
+    errors = {"": places, "_of_mean": mean_places}
+    scores = {
+        "hand_average_precision": _mean(
+            [average_precision(prob[:, k], visible[:, k]) for k in (left, right)]
+        ),
+        "hand_share": float(visible[:, [left, right]].double().mean()),
+    }
+    for suffix, guess in errors.items():
+        error = 100 * (guess - point_cam).norm(dim=-1)
+        by_point = [float(error[visible[:, k], k].mean()) for k in range(len(POINTS))]
+        scores[f"hand_error_cm{suffix}"] = _mean([by_point[left], by_point[right]])
+        scores[f"point_error_cm{suffix}"] = _mean(by_point)
+    return scores
+
+
+def _mean(values: list[float]) -> float:
+    """Of those that are defined."""
+    return float(torch.tensor(values).nanmean())

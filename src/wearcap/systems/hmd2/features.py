@@ -1,0 +1,140 @@
+"""What HMD²'s network sees of a head's path and says of a body: head paths to conditions, poses to vectors and back."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.data.features import FEET, LIMBS, first_repeated
+from wearcap.data.statistics import MIN_SCALE, collate
+from wearcap.data.windows import WindowDataset
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+
+
+@dataclass(frozen=True)
+class HeadFeatures:
+    """Encodes a head path (thesis §6.1: p = {t, R, v, ω}) and body poses in a gravity-keeping frame.
+
+    frame "window": yaw and horizontal position of the window's first frame are removed (the document, as we read
+    it). frame "heading": every frame's own head yaw is removed and no absolute position enters (ours; the root's
+    rotation is told relative to where the head points, so nothing has to be re-expressed when windows move).
+    height "relative": height of the head over its first frame's; "floor": over the floor (m); "stature": over the
+    floor, as a share of the head's height in the rest pose.
+    """
+
+    frame: str = "heading"
+    height: str = "stature"
+    joints: int = 23
+    contacts: bool = False
+    """Whether the motion carries the contact of both feet, too (EDGE; ours), as ±1."""
+    body: bool = False
+    """Whether the condition tells the wearer's size (ours): stature, length of leg, of arm and of trunk."""
+
+    def __post_init__(self):
+        for name, allowed in (("frame", ("heading", "window")), ("height", ("stature", "floor", "relative"))):
+            if getattr(self, name) not in allowed:
+                raise WearcapError(f"head features have no {name} {getattr(self, name)!r}",
+                                   expected=f"one of {', '.join(allowed)}")  # fmt: skip
+
+    @property
+    def condition_size(self) -> int:
+        return (13 if self.frame == "heading" else 15) + (len(LIMBS) if self.body else 0)
+
+    @property
+    def motion_size(self) -> int:
+        return 6 * self.joints + (FEET if self.contacts else 0)
+
+    def frame_of(self, R_world_head: Float[Tensor, "batch time 3 3"]) -> Float[Tensor, "batch #time 3 3"]:
+        """R_world_canonical of every frame (one for all frames when the frame is the window's)."""
+        if self.frame == "window":
+            R_world_head = R_world_head[:, :1]
+        return rotation.about_axis("z", rotation.yaw_of(R_world_head))
+
+    def condition(
+        self,
+        R_world_head: Float[Tensor, "batch time 3 3"],
+        t_world_head: Float[Tensor, "batch time 3"],
+        floor_height: Float[Tensor, "batch time"],
+        size: Float[Tensor, "batch limb"],
+        fps: float,
+    ) -> Float[Tensor, "batch time condition"]:
+        """Features of a head path; `size` holds the wearer's `body_size` (m)."""
+        R_canonical_world = self.frame_of(R_world_head).transpose(-1, -2)
+        velocity = first_repeated(t_world_head.diff(dim=1)) * fps
+        step = rotation.log(R_world_head[:, :-1].transpose(-1, -2) @ R_world_head[:, 1:]) * fps
+        angular_head = first_repeated(step)
+        R_canonical_head = R_canonical_world @ R_world_head
+        velocity = (R_canonical_world @ velocity[..., None])[..., 0]
+        angular = (R_canonical_head @ angular_head[..., None])[..., 0]
+        offset = R_canonical_world @ (t_world_head - t_world_head[:, :1])[..., None]
+        height = offset[..., 2:, 0]
+        if self.height != "relative":
+            height = (t_world_head[..., 2] - floor_height)[..., None]
+        if self.height == "stature":
+            height = height / size[:, None, :1]
+        horizontal = [offset[..., :2, 0]] if self.frame == "window" else []
+        told = [size[:, None].expand(-1, height.shape[1], -1)] if self.body else []
+        return torch.cat(
+            [*horizontal, height, rotation.rot6d_from_matrix(R_canonical_head), velocity, angular, *told], -1
+        )
+
+    def encode(
+        self,
+        R_parent_joint: Float[Tensor, "batch time joint 3 3"],
+        R_world_head: Float[Tensor, "batch time 3 3"],
+        foot_contact: Float[Tensor, "batch time foot"],
+    ) -> Float[Tensor, "batch time motion"]:
+        """Local rotations as 6D, the root's in the canonical frame (thesis: F = 23 × 6), and contact where asked for."""
+        R_root = self.frame_of(R_world_head).transpose(-1, -2) @ R_parent_joint[:, :, 0]
+        R = torch.cat([R_root[:, :, None], R_parent_joint[:, :, 1:]], 2)
+        motion = rotation.rot6d_from_matrix(R).flatten(-2)
+        return torch.cat([motion, 2 * foot_contact - 1], -1) if self.contacts else motion
+
+    def decode(
+        self, motion: Float[Tensor, "batch time motion"], R_world_head: Float[Tensor, "batch time 3 3"]
+    ) -> tuple[Float[Tensor, "batch time joint 3 3"], Float[Tensor, "batch time foot"]]:
+        """The inverse of `encode`: R_parent_joint, the root's entry in the world; and contact (0 where it is not told)."""
+        R = rotation.matrix_from_rot6d(motion[..., : 6 * self.joints].unflatten(-1, (-1, 6)))
+        R_root = self.frame_of(R_world_head) @ R[:, :, 0]
+        contact = (
+            (motion[..., 6 * self.joints :] + 1) / 2
+            if self.contacts
+            else motion.new_zeros(*motion.shape[:2], FEET)
+        )
+        return torch.cat([R_root[:, :, None], R[:, :, 1:]], 2), contact.clamp(0, 1)
+
+
+def feature_statistics(
+    dataset: WindowDataset, features: HeadFeatures, limit: int = 2000
+) -> dict[str, tuple[Tensor, Tensor]]:
+    """(mean, scale) of "motion", "head", "points" and "image" over at most `limit` windows, drawn by the dataset's weights."""
+    random = torch.Generator().manual_seed(0)
+    count = min(limit, 4 * len(dataset))
+    windows = torch.multinomial(dataset.weights, count, replacement=True, generator=random).tolist()
+    sums: dict[str, list[Tensor]] = {}
+    for start in range(0, count, 64):
+        batch = collate(
+            [dataset[item] for item in zip(windows[start : start + 64], range(start, start + 64))]
+        )
+        motion = features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
+        head = features.condition(
+            batch.R_world_head, batch.t_world_head, batch.floor_height, batch.size, dataset.fps
+        )
+        for name, value, valid in (
+            ("motion", motion, batch.valid),
+            ("head", head, batch.valid),
+            ("points", batch.points, batch.valid & batch.points_valid),
+            ("image", batch.image, batch.valid & batch.image_valid),
+        ):
+            rows = value[valid].double()
+            moments = torch.stack([torch.ones_like(rows).sum(0), rows.sum(0), rows.square().sum(0)])
+            sums.setdefault(name, []).append(moments)
+    result = {}
+    for name, parts in sums.items():
+        number, total, squares = torch.stack(parts).sum(0)
+        mean = total / number.clamp_min(1)
+        scale = (squares / number.clamp_min(1) - mean**2).clamp_min(0).sqrt().clamp_min(MIN_SCALE)
+        result[name] = (mean.float(), scale.float())
+    return result

@@ -1,0 +1,189 @@
+"""The conditional motion denoiser of HMD² (thesis §6.2): a DiT/EDGE-like transformer that predicts x0."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from wearcap.models.layers import (
+    AdaptiveBlock,
+    LevelEmbedding,
+    MotionEncoder,
+    Normalizer,
+    TemporalBlend,
+    Widening,
+    attention_mask,
+)
+
+
+class Conditions(NamedTuple):
+    """What a window is told, raw. Frames without points or picture hold any finite numbers where "valid" is False."""
+
+    head: Float[Tensor, "batch time head_feature"]
+    points: Float[Tensor, "batch time point_feature"]
+    """Code of the points around the body (`VoxelAutoencoder`); no columns for a network without points."""
+    points_valid: Bool[Tensor, "batch time"]
+    image: Float[Tensor, "batch time image_feature"]
+    """Embedding of the head camera's picture; no columns for a network without images."""
+    image_valid: Bool[Tensor, "batch time"]
+
+
+class OptionalInput(nn.Module):
+    """A modality that may be missing: standardised, or a learned null vector on the frames that lack it."""
+
+    def __init__(self, size: int, width: int, frames_per_token: int):
+        super().__init__()
+        self.normalizer = Normalizer(size)
+        self.null = nn.Parameter(torch.zeros(size))
+        self.widen = Widening(size + 1, width, frames_per_token, bias=False)
+
+    def forward(
+        self, x: Float[Tensor, "batch time feature"], valid: Bool[Tensor, "batch time"]
+    ) -> Float[Tensor, "batch token width"]:
+        there = valid[..., None]
+        # The flag beside the vector lets the network tell null from a scene that looks like it.
+        frames = torch.where(there, self.normalizer(x), self.null)
+        return self.widen(torch.cat([frames, there.to(x.dtype)], -1))
+
+
+class ConditionEncoder(nn.Module):
+    """Concatenates a frame's conditions and narrows them to one vector per token by an MLP (thesis §6.2).
+
+    The MLP's first layer is written as one product per modality, their sum: that is what a layer on the concatenation
+    is. Of the head it sees `context` frames before the token's own and as many behind them (ours): a stride shows in
+    half a second of a head's sway, not in one frame.
+    """
+
+    def __init__(
+        self, head_size: int, points_size: int, image_size: int, width: int, frames_per_token: int, context: int
+    ):  # fmt: skip
+        super().__init__()
+        # One more channel says which frames exist: padding would else look like the mean condition.
+        self.normalizer = Normalizer(head_size)
+        self.widen = Widening(head_size + 1, 2 * width, frames_per_token, context)
+        self.points = OptionalInput(points_size, 2 * width, frames_per_token) if points_size else None
+        self.image = OptionalInput(image_size, 2 * width, frames_per_token) if image_size else None
+        self.narrow = nn.Linear(2 * width, width)
+
+    def forward(
+        self, conditions: Conditions, valid: Bool[Tensor, "batch time"]
+    ) -> Float[Tensor, "batch token width"]:
+        mask = valid[..., None].to(conditions.head.dtype)
+        frames = torch.cat([self.normalizer(conditions.head) * mask, mask], -1)
+        wide = self.widen(frames)
+        if self.points is not None:
+            wide = wide + self.points(conditions.points, conditions.points_valid & valid)
+        if self.image is not None:
+            wide = wide + self.image(conditions.image, conditions.image_valid & valid)
+        return self.narrow(F.gelu(wide))
+
+
+class LevelPlan(NamedTuple):
+    """What of a step depends on its noise level alone; with a level per step, the same for all windows."""
+
+    worth: Float[Tensor, "batch #token width"]
+    blocks: tuple[Float[Tensor, "batch #token modulation"], ...]
+
+
+class MotionDenoiser(nn.Module):
+    """x̂0 = D(x_t, c, level): one token per frame (or per few frames) through adaptive transformer blocks.
+
+    A token is the sum of what the condition and x_t say about its frames; where x_t joins the conditions the document
+    leaves open. The condition's part, `encode`, is the same in every step of sampling and computed once.
+    `frames_per_token` > 1 is ours: neighbouring frames share a token, which cuts the cost of a window about as many
+    times; `blend` > 0 (ours too) mixes that many neighbouring frames of x̂0, which removes the seams between tokens and
+    most of an unfinished network's jitter. `self_conditioning` (Chen et al. 2023) shows the network its last x̂0.
+    """
+
+    def __init__(
+        self,
+        motion_size: int,
+        condition_size: int,
+        window: int = 240,
+        width: int = 512,
+        layers: int = 8,
+        heads: int = 8,
+        feedforward: int = 1024,
+        dropout: float = 0.1,
+        frames_per_token: int = 1,
+        blend: int = 0,
+        context: int = 14,
+        points_size: int = 0,
+        image_size: int = 0,
+        self_conditioning: bool = False,
+    ):
+        """`points_size` and `image_size` 0 leave a modality out; else one network runs with and without it."""
+        super().__init__()
+        if window % frames_per_token:
+            raise ValueError(f"a window of {window} frames does not split into tokens of {frames_per_token}")
+        self.window, self.frames_per_token = window, frames_per_token
+        self.motion_size, self.condition_size = motion_size, condition_size
+        self.points_size, self.image_size = points_size, image_size
+        self.self_conditioning = self_conditioning
+        self.motion_normalizer = Normalizer(motion_size)
+        self.condition_encoder = ConditionEncoder(
+            condition_size, points_size, image_size, width, frames_per_token, context
+        )
+        self.motion_encoder = MotionEncoder(
+            motion_size * (2 if self_conditioning else 1), width, frames_per_token
+        )
+        self.level = LevelEmbedding(width)
+        self.blocks = nn.ModuleList(
+            AdaptiveBlock(width, heads, feedforward, window // frames_per_token, dropout)
+            for _ in range(layers)
+        )
+        self.norm = nn.LayerNorm(width)
+        self.head = nn.Linear(width, frames_per_token * motion_size)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+        self.blend = TemporalBlend(blend) if blend else None
+
+    def encode(
+        self, conditions: Conditions, valid: Bool[Tensor, "batch time"]
+    ) -> Float[Tensor, "batch token width"]:
+        """The conditions' part of every token; `valid` is False on padding."""
+        return self.condition_encoder(conditions, valid)
+
+    def forward(
+        self,
+        x_t: Float[Tensor, "batch time motion"],
+        level: Float[Tensor, "batch #time"],
+        encoded: Float[Tensor, "batch token width"],
+        valid: Bool[Tensor, "batch time"],
+        last: Float[Tensor, "batch time motion"] | None = None,
+    ) -> Float[Tensor, "batch time motion"]:
+        """x̂0 in normalised motion space from x_t and what `encode` said.
+
+        last: with self-conditioning, the x̂0 of the step before (None: there is none yet).
+        """
+        return self.step(x_t, self.plan(level), encoded, valid, last)
+
+    def plan(self, level: Float[Tensor, "batch #time"]) -> LevelPlan:
+        """The levels' part of a step; sampling computes it once for all windows."""
+        k = self.frames_per_token
+        token_level = level if level.shape[1] == 1 else level.unflatten(1, (-1, k)).mean(-1)
+        embedded = self.level(token_level)
+        return LevelPlan(
+            self.motion_encoder.plan(embedded), tuple(block.plan(embedded) for block in self.blocks)
+        )
+
+    def step(
+        self,
+        x_t: Float[Tensor, "batch time motion"],
+        plan: LevelPlan,
+        encoded: Float[Tensor, "batch token width"],
+        valid: Bool[Tensor, "batch time"],
+        last: Float[Tensor, "batch time motion"] | None = None,
+    ) -> Float[Tensor, "batch time motion"]:
+        """`forward` with what `plan` said of the level, of which one may serve the whole batch."""
+        batch, time, _ = x_t.shape
+        mask = attention_mask(valid.unflatten(1, (-1, self.frames_per_token)).any(-1))
+        if self.self_conditioning:
+            x_t = torch.cat([x_t, torch.zeros_like(x_t) if last is None else last], -1)
+        token = encoded + self.motion_encoder(x_t, plan.worth, valid)
+        for block, modulation in zip(self.blocks, plan.blocks):
+            token = block(token, modulation, mask)
+        x0_hat = self.head(self.norm(token)).reshape(batch, time, -1)
+        return x0_hat if self.blend is None else self.blend(x0_hat, valid)

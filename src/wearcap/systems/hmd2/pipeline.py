@@ -1,0 +1,287 @@
+"""HMD² (thesis ch. 6): environment-aware full-body motion from a head-mounted device by conditional motion diffusion."""
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.data.features import body_size
+from wearcap.data.surroundings import latest_before
+from wearcap.diffusion.sampler import Denoise, step_levels
+from wearcap.diffusion.schedule import Schedule
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.recording import Motion, Recording
+from wearcap.scene.voxels import voxelize
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
+from wearcap.systems.hmd2.step_runner import StepRunner
+from wearcap.systems.hmd2.windows import Frames, Poses, WindowSampler, advance, unsaid
+from wearcap.tracking.anchor import hang_from_head
+from wearcap.tracking.floor import floor_from_points, tracked_floor
+from wearcap.tracking.head_path import HeadPath, head_path
+
+MODALITIES = ("points", "images")
+
+
+@dataclass
+class HMD2:
+    """Captures whole recordings in overlapping windows (thesis eq. 6.5)."""
+
+    net: MotionDenoiser
+    features: HeadFeatures
+    schedule: Schedule
+    skeleton: Skeleton
+    """For recordings that do not say whose body it is."""
+    fps: float
+    place_encoder: VoxelAutoencoder | None = None
+    image_encoder: str | None = None
+    """Name of the encoder whose embeddings the network was trained on."""
+    use: Sequence[str] = MODALITIES
+    """Modalities that are listened to, of those that the network knows and a recording has."""
+    steps: int = 5
+    stride: int | None = None
+    """Frames by which windows advance; None: half a window, or with `hold` three quarters (the document's 180 of 240)."""
+    eta: float = 1.0
+    guidance: float = 1.0
+    """Classifier-free guidance by points and images (Ho & Salimans 2022; ours): 1 leaves it out."""
+    live: bool = False
+    """Whether even the floor is told only from what has been sensed by then, as it must be in a stream."""
+    spacing: float = 1.0
+    """How the steps' levels are spaced (`diffusion.sampler.step_levels`)."""
+    hold: bool = False
+    """Whether windows hold on to what was said before in every step (thesis eq. 6.5) or say it anew (ours)."""
+    fade: int = 20
+    """Frames over which what windows differ by fades out where one goes on from the other (without `hold`)."""
+    lookahead: int | None = None
+    """Frames that must follow a pose before it is final (ours): what comes next says what the feet are about to do.
+    None: half of what windows share, so that poses come from their middle; with `hold` none."""
+    runtime: str = "eager"
+    """What the steps run on (`systems.hmd2.step_runner.RUNTIMES`); all but eager take some seconds to begin."""
+    precision: str = "auto"
+    """Of the steps' products (`systems.hmd2.step_runner.PRECISIONS`)."""
+    device: str = "cpu"
+    _steps: StepRunner | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        if unknown := set(self.use) - set(MODALITIES):
+            raise WearcapError(f"no modality {min(unknown)!r}", expected=f"some of {', '.join(MODALITIES)}")
+
+    @property
+    def advance(self) -> int:
+        """Frames by which windows advance. Raises WearcapError when the windows would not touch."""
+        window = self.net.window
+        advance = (3 * window // 4 if self.hold else window // 2) if self.stride is None else self.stride
+        if not 0 < advance <= window:
+            raise WearcapError(f"windows of {window} frames cannot advance by {advance}",
+                               expected=f"a stride from 1 to {window}")  # fmt: skip
+        return advance
+
+    @property
+    def waiting(self) -> int:
+        """Frames at a window's end that are said again. Raises WearcapError where windows do not share as many."""
+        shared = self.net.window - self.advance
+        waiting = (0 if self.hold else shared // 2) if self.lookahead is None else self.lookahead
+        if not 0 <= waiting <= shared:
+            raise WearcapError(f"windows that share {shared} frames cannot look {waiting} ahead",
+                               expected=f"a lookahead from 0 to {shared}")  # fmt: skip
+        return waiting
+
+    def __call__(self, recording: Recording, seed: int = 0) -> Motion:
+        return self.capture([recording], [seed])[0]
+
+    def prepare(self) -> None:
+        """Bring the network to its device and its steps into the form they run in, as every capture does first.
+
+        What is compiled or exported is made once, from the weights as they are then.
+        """
+        self.net.to(self.device).eval()
+        if self._steps is None or self.runtime == "eager":
+            levels = step_levels(self.steps, self.spacing)[:-1]
+            self._steps = StepRunner(self.net, levels, self.runtime, self.precision)
+
+    def undisturbed(self) -> AbstractContextManager[None]:
+        """For windows of few lanes, after `prepare`: nothing else takes the cores from the steps."""
+        assert self._steps is not None
+        return self._steps.undisturbed()
+
+    @torch.inference_mode()
+    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
+        """One motion per (recording, seed); recordings share batches, which changes nothing but the time."""
+        self.prepare()
+        # 1. head path and floor; 2. points around the body as codes; 3. pictures as embeddings; once for all seeds
+        once = {id(recording): recording for recording in recordings}
+        path_of = {key: head_path(recording, self.skeleton, self.fps) for key, recording in once.items()}
+        sensed = {key: self.sense(recording, path_of[key]) for key, recording in once.items()}
+        paths, frames = zip(*((path_of[id(recording)], sensed[id(recording)]) for recording in recordings))
+        # 4. windows of the diffusion model, each stretch of a path by itself
+        poses = self._windows(paths, frames, seeds)
+        # 5. the body hangs from the measured head
+        return [
+            self.motion(path.timestamps, path.skeleton, path.T_world_head, said)
+            for path, said in zip(paths, poses)
+        ]
+
+    def sense(self, recording: Recording, path: HeadPath) -> Frames:
+        """Everything that the network is told of a recording, as one lane.
+
+        Raises WearcapError for embeddings that the network does not know.
+        """
+        count = len(path.timestamps)
+        points, points_valid = self._points(recording, path)
+        image, image_valid = torch.zeros(count, self.net.image_size), torch.zeros(count, dtype=torch.bool)
+        camera = recording.camera
+        if (
+            self.net.image_size
+            and "images" in self.use
+            and camera is not None
+            and camera.embedding is not None
+        ):
+            size = camera.embedding.shape[1]
+            if (camera.embedding_name, size) != (self.image_encoder, self.net.image_size):
+                raise WearcapError(
+                    f"embeddings of {camera.embedding_name!r} with {size} features", where=recording.name,
+                    expected=f"{self.net.image_size} of {self.image_encoder!r}, which the network was trained on",
+                    fix="Prepare its embeddings with that encoder, or leave images out: pipeline.use=[points].",
+                )  # fmt: skip
+            number, image_valid = latest_before(camera.timestamps, path.timestamps)
+            image = camera.embedding[number].float()
+            image_valid &= image.isfinite().all(-1)
+            image = image.nan_to_num(0.0, 0.0, 0.0)
+        lane = Frames(
+            path.T_world_head.R, path.T_world_head.t, self._floor(recording, path), points, points_valid,
+            image, image_valid, torch.ones(count, dtype=torch.bool),
+        )  # fmt: skip
+        return Frames(*(part[None] for part in lane))
+
+    def _listens_to_points(self, recording: Recording) -> bool:
+        return bool(self.net.points_size) and "points" in self.use and recording.points is not None
+
+    def _points(
+        self, recording: Recording, path: HeadPath
+    ) -> tuple[Float[Tensor, "time feature"], Bool[Tensor, "time"]]:
+        """Codes of the points around the body at every frame, of those that had been seen by then."""
+        count, cloud = len(path.timestamps), recording.points
+        if not self._listens_to_points(recording) or self.place_encoder is None or cloud is None:
+            return torch.zeros(count, self.net.points_size), torch.zeros(count, dtype=torch.bool)
+        grid = voxelize(
+            cloud.points_world,
+            path.T_world_device,
+            self.place_encoder.grid,
+            cloud.first_seen,
+            path.timestamps,
+        )
+        code = torch.cat([self.place_encoder.encode(part) for part in grid.split(2048)])
+        return code, torch.ones(count, dtype=torch.bool)
+
+    def _floor(self, recording: Recording, path: HeadPath) -> Float[Tensor, "time"]:
+        """Floor beneath the head: from points that are listened to, else from the head's path."""
+        cloud = recording.points if self._listens_to_points(recording) else None
+        if self.live:
+            return tracked_floor(cloud, path.timestamps, path.T_world_head.t, path.stature, self.fps)
+        floor = floor_from_points(cloud, path.T_world_head.t, path.stature)
+        return path.floor_height if floor is None else floor
+
+    def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "lane time"]) -> Denoise:
+        """x̂0 of a window as a function of x_t and its level, asked for at the levels of the steps, one after the other.
+
+        What the conditions say, and what the levels do, is computed once.
+        """
+        encoded = self.net.encode(conditions, valid)
+        blind = None
+        if self.guidance != 1.0:
+            nothing = torch.zeros_like(valid)
+            blind = self.net.encode(conditions._replace(points_valid=nothing, image_valid=nothing), valid)
+        steps, number, last = self._steps, 0, None
+        assert steps is not None
+
+        def denoise(x_t: Tensor, level: Tensor) -> Tensor:
+            nonlocal last, number
+            x0_hat = steps(number, x_t, encoded, valid, last)
+            if blind is not None:
+                plain = steps(number, x_t, blind, valid, last)
+                x0_hat = plain + self.guidance * (x0_hat - plain)
+            last, number = x0_hat if self.net.self_conditioning else None, number + 1
+            return x0_hat
+
+        return denoise
+
+    def _windows(
+        self, paths: Sequence[HeadPath], frames: Sequence[Frames], seeds: Sequence[int]
+    ) -> list[Poses]:
+        """Poses of every path: its stretches side by side, window after window."""
+        stride, waiting, passed = self.advance, self.waiting, 0
+        done = [unsaid(self, len(path.timestamps)) for path in paths]
+        lanes = [
+            (i, start, stop, self.sampler(path.skeleton, seeds[i], start))
+            for i, path in enumerate(paths)
+            for start, stop in path.stretches
+        ]
+        while lanes:
+            advance(
+                [sampler for *_, sampler in lanes],
+                [_cut(frames[i], start + passed, stop, stride) for i, start, stop, _ in lanes],
+            )
+            passed += stride
+            for i, start, stop, sampler in lanes:
+                ended = start + passed >= stop
+                left = 0 if ended else waiting
+                given, behind = sampler.give(left), min(start + passed, stop) - left
+                for whole, part in zip(done[i], given.poses):
+                    whole[0, behind - part.shape[1] : behind] = part[0]
+            lanes = [lane for lane in lanes if lane[1] + passed < lane[2]]
+        return [
+            _bridged(Poses(*(part[0] for part in poses)), path.stretches) for poses, path in zip(done, paths)
+        ]
+
+    def sampler(self, skeleton: Skeleton, seed: int, start: int) -> WindowSampler:
+        """Windows of a stretch that begins at frame `start`; stretches of one recording have noise of their own."""
+        return WindowSampler(self, body_size(skeleton), seed + 1_000_003 * start)
+
+    def motion(
+        self, timestamps: Float64[Tensor, "time"], skeleton: Skeleton, T_world_head: Rigid, poses: Poses
+    ) -> Motion:
+        """Step 5: poses without the lane axis as a motion that hangs from the measured head."""
+        settings = {
+            "pipeline": "hmd2",
+            "steps": str(self.steps),
+            "stride": str(self.advance),
+            "eta": str(self.eta),
+            "lookahead": str(self.waiting),
+        }
+        contact = poses.foot_contact.repeat_interleave(2, -1) if self.features.contacts else None
+        motion = Motion(
+            timestamps,
+            skeleton,
+            poses.R_parent_joint,
+            torch.zeros(len(timestamps), 3),
+            contact,
+            provenance=settings,
+        )
+        return hang_from_head(motion, T_world_head)
+
+
+def _cut(frames: Frames, start: int, stop: int, length: int) -> Frames:
+    """`length` frames from `start`; behind `stop` the last one is repeated as not valid."""
+    take = torch.arange(start, start + length)
+    there = take < stop
+    cut = Frames(*(part[:, take.clamp_max(stop - 1)] for part in frames))
+    return cut._replace(valid=cut.valid & there)
+
+
+def _bridged(poses: Poses, stretches: tuple[tuple[int, int], ...]) -> Poses:
+    """Frames between stretches turn from the pose before to the pose behind."""
+    for (_, before), (after, _) in pairwise(stretches):
+        if after > before:
+            R = poses.R_parent_joint
+            share = torch.linspace(0, 1, after - before + 2)[1:-1]
+            turn = rotation.log(R[before - 1].transpose(-1, -2) @ R[after])
+            R[before:after] = R[before - 1] @ rotation.exp(share[:, None, None] * turn)
+    return poses

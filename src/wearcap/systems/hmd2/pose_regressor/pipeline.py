@@ -1,0 +1,98 @@
+"""AvatarPoser-style capture (Jiang et al. 2022): every frame's pose from its own past, hung from the measured head."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.models.pose_regressor import PoseRegressor
+from wearcap.recording import Motion, Recording
+from wearcap.recording.timing import at_times
+from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, pasts
+from wearcap.tracking.anchor import hang_from_head, with_hand_moved
+from wearcap.tracking.head_path import HeadPath, head_path
+
+
+@dataclass
+class PoseRegressorCapture:
+    """Captures whole recordings frame by frame: no frame waits for a later one, and nothing is drawn."""
+
+    net: PoseRegressor
+    points: TrackedPoints
+    skeleton: Skeleton
+    """For recordings that do not say whose body it is."""
+    fps: float
+    reach: bool = True
+    """Whether arms are bent until tracked wrists are where they were measured, AvatarPoser's last step."""
+    frames_per_pass: int = 4096
+    device: str = "cpu"
+
+    def __call__(self, recording: Recording, seed: int = 0) -> Motion:
+        return self.capture([recording], [seed])[0]
+
+    @torch.inference_mode()
+    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
+        """One motion per recording; seeds change nothing.
+
+        Raises WearcapError for a recording without head poses, or without a true motion where hands are tracked.
+        """
+        self.net.to(self.device).eval()
+        return [self._captured(recording) for recording in recordings]
+
+    def _captured(self, recording: Recording) -> Motion:
+        path = head_path(recording, self.skeleton, self.fps)
+        tracked = self._tracked(recording, path)
+        stature = torch.tensor([path.stature])
+        # Behind a gap or a jump of the tracking a new past begins.
+        count = len(path.timestamps)
+        begins = [0, *(start for start, _ in path.stretches[1:]), count]
+        features = (
+            self.points.encode(tracked.R[None, a:b], tracked.t[None, a:b], path.floor_height[None, a:b], stature, self.fps)
+            for a, b in pairwise(begins)
+        )  # fmt: skip
+        motion = torch.cat([self._regressed(part) for part in features])
+        R_parent_joint = decode_pose(motion, path.T_world_head.R)
+        origin = torch.zeros(count, 3)
+        captured = Motion(path.timestamps, path.skeleton, R_parent_joint, origin, provenance=self._settings())
+        hung = hang_from_head(captured, path.T_world_head)
+        return self._reaching(hung, tracked) if self.reach else hung
+
+    def _tracked(self, recording: Recording, path: HeadPath) -> Rigid:
+        """Poses "time point" of the tracked points; those of the hands are the truth's."""
+        truth = recording.motion
+        if len(self.points.points) == 1:
+            return self.points.poses(path.skeleton, path.T_world_head)
+        if truth is None:
+            raise WearcapError("hands are tracked by nothing in this recording", where=recording.name,
+                               expected="a recording with `motion`, or a checkpoint of the head alone")  # fmt: skip
+        if len(truth) != len(path.timestamps) or (truth.timestamps - path.timestamps).abs().max() > 1e-6:
+            truth = at_times(truth, path.timestamps)
+        return self.points.poses(path.skeleton, path.T_world_head, truth.R_parent_joint)
+
+    def _regressed(self, features: Float[Tensor, "1 time feature"]) -> Float[Tensor, "time motion"]:
+        passes = torch.arange(features.shape[1]).split(self.frames_per_pass)
+        windows = (pasts(features, ends[None], self.net.window) for ends in passes)
+        said = [self.net(past[0].to(self.device), exists[0].to(self.device)) for past, exists in windows]
+        return torch.cat(said).float().cpu()
+
+    def _reaching(self, motion: Motion, tracked: Rigid) -> Motion:
+        """The motion with its tracked wrists where they were measured, as far as the arms reach."""
+        for index, name in enumerate(self.points.points):
+            side, _, joint = name.partition("_")
+            if joint == "wrist":
+                offset = tracked.t[:, index] - motion.joint(name).t
+                motion = with_hand_moved(motion, side, offset)
+        return motion
+
+    def _settings(self) -> dict[str, str]:
+        return {
+            "pipeline": "pose_regressor",
+            "points": ",".join(self.points.points),
+            "reach": str(self.reach),
+        }

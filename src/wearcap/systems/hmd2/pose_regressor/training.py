@@ -1,0 +1,107 @@
+"""Training of the pose regressor: AvatarPoser's losses (Jiang et al. 2022) on the windows that HMD² learns from."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.skeleton import Skeleton
+from wearcap.data.statistics import MIN_SCALE, collate
+from wearcap.data.windows import Window, WindowDataset
+from wearcap.geometry.rigid import Rigid
+from wearcap.models.pose_regressor import PoseRegressor
+from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, encode_pose, pasts
+from wearcap.training.base import SeededSteps, WeighedTerms
+from wearcap.training.losses import joint_velocity, masked_mean
+
+
+class PoseRegression(SeededSteps, WeighedTerms):
+    """Regression of single frames from their pasts: `pairs` of neighbouring frames of every window are asked for.
+
+    Loss terms, weighed by `loss_weights`, are mean absolute errors: "root" and "rotation" of 6D rotations, "joints" of
+    positions with both bodies hung from the same head (m). "velocity" is HMD²'s: without it (as AvatarPoser is) single
+    frames answer to every tremor of the head, with a jitter of ten times people's.
+    """
+
+    def __init__(
+        self,
+        net: Callable[..., PoseRegressor],
+        points: TrackedPoints,
+        skeleton: Skeleton,
+        fps: float,
+        loss_weights: dict[str, float],
+        optimizer: Callable[..., torch.optim.Optimizer],
+        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        pairs: int = 4,
+        seed: int = 0,
+    ):
+        super().__init__()
+        self.net = net(feature_size=points.size, motion_size=6 * len(skeleton))
+        self.points, self.skeleton, self.fps = points, skeleton, fps
+        self.loss_weights, self.pairs, self.seed = dict(loss_weights), pairs, seed
+        self._optimizer, self._scheduler = optimizer, scheduler
+
+    def pipeline_parts(self) -> dict[str, Any]:
+        """What a `PoseRegressorCapture` takes from here."""
+        return {"net": self.net, "points": self.points, "skeleton": self.skeleton, "fps": self.fps}
+
+    def set_statistics(self, dataset: WindowDataset, limit: int = 500) -> None:
+        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        random = torch.Generator().manual_seed(0)
+        drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
+        windows = [dataset[item] for item in zip(drawn, range(limit))]
+        features, motion = [], []
+        for start in range(0, limit, 64):
+            batch = collate(windows[start : start + 64])
+            features.append(self._features(batch)[batch.valid])
+            motion.append(encode_pose(batch.R_parent_joint, batch.R_world_head)[batch.valid])
+        for normalizer, rows in (
+            (self.net.feature_normalizer, torch.cat(features)),
+            (self.net.motion_normalizer, torch.cat(motion)),
+        ):
+            normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
+
+    def _features(self, batch: Window) -> Float[Tensor, "batch time feature"]:
+        T_world_head = Rigid(batch.R_world_head, batch.t_world_head)
+        poses = self.points.poses(
+            self.skeleton, T_world_head, batch.R_parent_joint, batch.t_parent_joint[:, None]
+        )
+        return self.points.encode(poses.R, poses.t, batch.floor_from_head, batch.stature, self.fps)
+
+    def _asked(self, batch: Window) -> Int64[Tensor, "batch end"]:
+        """Pairs of neighbouring frames, spread evenly over each window and in training shifted by chance."""
+        count, time = batch.valid.shape
+        places = torch.arange(self.pairs, device=batch.valid.device)
+        shift = torch.rand(count, self.pairs) if self.training else torch.full((count, 1), 0.5)
+        last = ((places + shift.to(places.device)) * time / self.pairs).long().clamp(1, time - 1)
+        return torch.stack([last - 1, last], -1).flatten(1).expand(count, -1)
+
+    def terms(self, batch: Window) -> dict[str, Tensor]:
+        """Every loss term of a batch, unweighted."""
+        ends = self._asked(batch)
+        rows = torch.arange(len(ends), device=ends.device)[:, None]
+        features, exists = pasts(self._features(batch), ends, self.net.window)
+        motion = self.net(features.flatten(0, 1), exists.flatten(0, 1)).unflatten(0, ends.shape).float()
+        R_true, R_head = batch.R_parent_joint[rows, ends], batch.R_world_head[rows, ends]
+        valid = batch.valid[rows, ends].float()
+        error = (motion - encode_pose(R_true, R_head)).abs()
+        said, true = self._from_head(decode_pose(motion, R_head), batch), self._from_head(R_true, batch)
+        return {
+            "root": masked_mean(error[..., :6].mean(-1), valid),
+            "rotation": masked_mean(error[..., 6:].mean(-1), valid),
+            "joints": masked_mean((said - true).abs().mean((-1, -2)), valid),
+            "velocity": joint_velocity(
+                *(x.reshape(-1, 2, *x.shape[2:]) for x in (said, true, valid)), self.fps
+            ),
+        }
+
+    def _from_head(
+        self, R_parent_joint: Float[Tensor, "batch end joint 3 3"], batch: Window
+    ) -> Float[Tensor, "batch end joint 3"]:
+        """Joint positions seen from the head joint."""
+        origin = torch.zeros_like(R_parent_joint[:, :, 0, 0])
+        joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
+        return joints - joints[:, :, self.skeleton.index("head"), None]

@@ -1,0 +1,163 @@
+"""Training of the conditional motion diffusion model (thesis §6.2, eq. 6.1–6.4)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.skeleton import Skeleton
+from wearcap.data.features import FEET
+from wearcap.data.windows import Window, WindowDataset
+from wearcap.diffusion.process import add_noise
+from wearcap.diffusion.schedule import Schedule
+from wearcap.errors import WearcapError
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.systems.hmd2.features import HeadFeatures, feature_statistics
+from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
+from wearcap.training import losses
+from wearcap.training.base import SeededSteps, WeighedTerms
+
+_TAIL_FRAMES = 20
+"""Within which the weight of a window's last frames falls off."""
+
+
+class MotionDiffusion(SeededSteps, WeighedTerms):
+    """x0-prediction under one noise level per window; loss terms are weighed by `loss_weights`.
+
+    "motion" is the document's plain MSE; "joints", "velocity" and "skate" are ours (0 leaves them out). Levels are drawn
+    with a density that grows with the level to the power of `level_tilt`: 0 draws them uniformly, as the document does;
+    more (ours) trains what sampling in few steps depends on, the way from noise to a first guess. Points and images are
+    each replaced by their null token in a share `drop` of the windows, so that one checkpoint runs with any of them.
+    A window's last frames weigh up to 1 + `tail` in the loss (ours): in small strides they are what is said.
+    """
+
+    def __init__(
+        self,
+        net: Callable[..., MotionDenoiser],
+        features: HeadFeatures,
+        schedule: Schedule,
+        skeleton: Skeleton,
+        fps: float,
+        loss_weights: dict[str, float],
+        optimizer: Callable[..., torch.optim.Optimizer],
+        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        level_tilt: float = 0.0,
+        drop: float = 0.0,
+        tail: float = 0.0,
+        place_encoder: VoxelAutoencoder | None = None,
+        image_encoder: str | None = None,
+        image_size: int = 0,
+        seed: int = 0,
+        compile: bool = False,
+    ):
+        """`place_encoder` (frozen, thesis §6.2) makes the points' codes, the encoder of the name `image_encoder` the
+        embeddings of `image_size`; None leaves that modality out."""
+        super().__init__()
+        self.net = net(
+            motion_size=features.motion_size, condition_size=features.condition_size,
+            points_size=place_encoder.size if place_encoder else 0, image_size=image_size if image_encoder else 0,
+        )  # fmt: skip
+        self.place_encoder = None if place_encoder is None else place_encoder.requires_grad_(False).eval()
+        self.image_encoder, self.drop, self.tail = image_encoder, drop, tail
+        self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
+        self.loss_weights, self.level_tilt, self.seed = dict(loss_weights), level_tilt, seed
+        self._optimizer, self._scheduler = optimizer, scheduler
+        self._feet = [
+            skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")
+        ]
+        # Methods, not modules, which would put every weight into checkpoints a second time.
+        self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
+        self._encode = torch.compile(self.net.encode) if compile else self.net.encode
+
+    def set_statistics(self, dataset: WindowDataset) -> None:
+        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        _require_same_inputs(self, dataset)
+        statistics = feature_statistics(dataset, self.features)
+        self.net.motion_normalizer.set(*statistics["motion"])
+        encoder = self.net.condition_encoder
+        encoder.normalizer.set(*statistics["head"])
+        for name, optional in (("points", encoder.points), ("image", encoder.image)):
+            if optional is not None:
+                optional.normalizer.set(*statistics[name])
+        if self.place_encoder is not None and dataset.surroundings.places is not None:
+            self.place_encoder.load_state_dict(dataset.surroundings.places.encoder.state_dict())
+
+    def pipeline_parts(self) -> dict[str, Any]:
+        """What `HMD2` is built around."""
+        return {
+            "net": self.net, "features": self.features, "schedule": self.schedule, "skeleton": self.skeleton,
+            "fps": self.fps, "place_encoder": self.place_encoder, "image_encoder": self.image_encoder,
+        }  # fmt: skip
+
+    def train(self, mode: bool = True) -> "MotionDiffusion":
+        """The encoder of places stays as it is."""
+        super().train(mode)
+        if self.place_encoder is not None:
+            self.place_encoder.eval()
+        return self
+
+    def conditions(self, batch: Window) -> Conditions:
+        """What the network is told of a batch, modalities dropped by the windows' chances."""
+        kept = batch.chance[:, None] >= self.drop
+        points_valid, image_valid = batch.points_valid & kept[..., 0], batch.image_valid & kept[..., 1]
+        # Points tell where the floor is, too.
+        floor = torch.where(points_valid, batch.floor_height, batch.floor_from_head)
+        head = self.features.condition(batch.R_world_head, batch.t_world_head, floor, batch.size, self.fps)
+        return Conditions(head, batch.points, points_valid, batch.image, image_valid)
+
+    def _predicted(self, batch: Window, x0: Tensor) -> Tensor:
+        """x̂0 of a batch in normalised motion space; with self-conditioning, after a first guess in half the windows."""
+        encoded = self._encode(self.conditions(batch), batch.valid)
+        level = batch.level ** (1 / (1 + self.level_tilt))
+        x_t = add_noise(x0, batch.noise[..., : x0.shape[-1]], level, self.schedule)
+        if not self.net.self_conditioning:
+            return self._denoise(x_t, level, encoded, batch.valid)
+        with torch.no_grad():
+            guess = self._denoise(x_t, level, encoded, batch.valid)
+        told = guess * (batch.chance[:, 2] < 0.5)[:, None, None]
+        return self._denoise(x_t, level, encoded, batch.valid, told)
+
+    def _weight(self, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch time"]:
+        """Of each frame in the loss; none for padding."""
+        left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
+        return valid * (1 + self.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
+
+    def terms(self, batch: Window) -> dict[str, Tensor]:
+        """Every loss term of a batch, unweighted."""
+        weight = self._weight(batch.valid)
+        motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
+        x0 = self.net.motion_normalizer(motion)
+        x0_hat = self._predicted(batch, x0)
+        terms = {"motion": losses.motion_mse(x0_hat, x0, weight)}
+        if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate")):
+            motion_hat = self.net.motion_normalizer.inverse(x0_hat.float())
+            R_hat, _ = self.features.decode(motion_hat, batch.R_world_head)
+            predicted, true = self._from_head(R_hat, batch), self._from_head(batch.R_parent_joint, batch)
+            terms["joints"] = losses.joint_position(predicted, true, weight)
+            terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.fps)
+            feet = predicted[:, :, self._feet].unflatten(2, (FEET, -1)) + batch.t_world_head[:, :, None, None]
+            terms["skate"] = losses.foot_skate(feet, batch.foot_contact, weight, self.fps)
+        return terms
+
+    def _from_head(self, R_parent_joint: Tensor, batch: Window) -> Tensor:
+        """Joint positions seen from the head joint: where hanging the body from the true head puts them."""
+        origin = torch.zeros_like(batch.t_world_head)
+        joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
+        return joints - joints[:, :, self.skeleton.index("head"), None]
+
+
+def _require_same_inputs(system: MotionDiffusion, dataset: WindowDataset) -> None:
+    """Raise WearcapError unless the windows carry what the model takes in."""
+    net, places = system.net, dataset.surroundings.places
+    points_size = 0 if places is None else places.size
+    if (net.points_size, net.image_size) != (points_size, dataset.image_size):
+        raise WearcapError(
+            f"windows with points of {points_size} and images of {dataset.image_size} features",
+            expected=f"{net.points_size} and {net.image_size}, as the model has",
+            fix="Set data.surroundings and model.{place_encoder,image_encoder,image_size} alike.",
+        )  # fmt: skip
+    if system.image_encoder != dataset.surroundings.images and net.image_size:
+        raise WearcapError(f"embeddings of {dataset.surroundings.images!r}", expected=system.image_encoder)

@@ -1,0 +1,233 @@
+"""HPS' first two steps: the head camera's clock against the suit's (thesis §4.3.4), and its poses in the scene (§4.2.3)."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from wearcap.errors import WearcapError
+from wearcap.io.formats.video import read_frames, read_image
+from wearcap.localization.features import Extractor, GlobalDescriptor, Matcher, RootSift
+from wearcap.localization.localizer import Localizer, LocalizerSettings, localize_video
+from wearcap.localization.visual_map import VisualMap
+from wearcap.recording import CameraStream, Recording
+from wearcap.recording.recording import Localization
+from wearcap.runtime.stages import Source, Stage
+from wearcap.sensors.claps import camera_claps, detect_claps
+from wearcap.sensors.clock import Clock, fit_clock, retime
+from wearcap.sensors.imu import synthesize_imu
+
+CLOCKS = ("shared", "claps", "auto")
+WRISTS = ("left_wrist", "right_wrist")
+MAP_NAME = "map.safetensors"
+LEARNED = ("models/superpoint.py", "models/lightglue.py", "models/netvlad.py")
+USUAL_HZ = 6.0
+"""Frames localised per second where nothing else is said: the suit tells what lies between."""
+
+
+@runtime_checkable
+class Localize(Protocol):
+    """Finds the head camera's poses, on the camera's clock; recordings come with their data set's folder."""
+
+    def __call__(self, recording: Recording, folder: Path) -> Localization: ...
+
+    def reads(self, recording: Recording, folder: Path) -> list[Any]:
+        """All that decides the result, for its digest. Raises WearcapError when that is not enough for one."""
+        ...
+
+
+@dataclass(frozen=True)
+class Synchronization:
+    """How camera and suit come onto one clock."""
+
+    clock: str = "shared"
+    """"shared": they are on one already. "claps": by claps that both noticed. "auto": by claps where a wrist wears a
+    sensor, else shared."""
+    camera_claps_s: list[float] | None = None
+    """Times of the claps, s from the video's first picture; None: heard in its sound."""
+    max_offset_s: float | int = 600.0
+
+    def __post_init__(self):
+        if self.clock not in CLOCKS:
+            raise WearcapError(f"clock={self.clock!r}", expected=f"one of {', '.join(CLOCKS)}")
+
+    def by_claps(self, recording: Recording) -> bool:
+        """Whether this recording's clocks are brought together by claps."""
+        return self.clock == "claps" or (
+            self.clock == "auto" and any(name in recording.imu for name in WRISTS)
+        )
+
+    def reads(self, recording: Recording, folder: Path) -> list[Any]:
+        """All that decides the result, for its digest."""
+        camera = recording.camera
+        if not self.by_claps(recording) or camera is None:
+            return []
+        heard = self.camera_claps_s is None and camera.video is not None
+        worn = [recording.imu[name] for name in WRISTS if name in recording.imu] or recording.suit
+        return [self, worn, camera.timestamps[:1], folder / (camera.video or "") if heard else None]
+
+    def __call__(self, recording: Recording, folder: Path) -> Clock | None:
+        """The map between the clocks; None: they are one.
+
+        Without sensors on the wrists the claps are sought in the suit's own motion. Raises WearcapError when either
+        side has no clap, and when they fit together in several ways.
+        """
+        if not self.by_claps(recording):
+            return None
+        camera, suit = recording.camera, recording.suit
+        if camera is None:
+            raise WearcapError("no camera in this recording", where=recording.name,
+                               expected="a head camera that hears the suit's claps")  # fmt: skip
+        wrists = [recording.imu[name] for name in WRISTS if name in recording.imu]
+        if not wrists and suit is not None:
+            wrists = [synthesize_imu(suit, name, n=1) for name in WRISTS]
+        try:
+            heard = camera_claps(camera, folder, self.camera_claps_s)
+            return fit_clock(heard, detect_claps(*wrists), self.max_offset_s)
+        except WearcapError as error:
+            fix = (
+                "Give pipeline.synchronization.max_offset_s=SECONDS if both started within so much, or "
+                "….camera_claps_s=[…], or ….clock=shared where camera and suit are on one clock already."
+            )
+            raise WearcapError(error.what, where=error.where or recording.name, expected=error.expected, fix=fix) from error  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class MapLocalization:
+    """Localises a recording's pictures in a visual map."""
+
+    extractor: Extractor = field(default_factory=RootSift)
+    matcher: Matcher | None = None
+    descriptor: GlobalDescriptor | None = None
+    settings: LocalizerSettings = field(default_factory=LocalizerSettings)
+    map: str | None = None
+    """A map's file, or the folder of a scene that has one (map.safetensors); None: the recording's own poses are
+    taken, or where it has none the map in the folder of its scan."""
+    every: int | None = None
+    """Each n-th frame is localised; None: as many as make up `USUAL_HZ`."""
+    use_prior: bool = True
+
+    def __post_init__(self):
+        if self.every is not None and self.every < 1:
+            raise WearcapError(f"every={self.every}", expected="1 (each frame) or more")
+
+    def map_file(self, recording: Recording, folder: Path) -> Path | None:
+        """The map that is asked for; None: the recording's own localisation is taken. Raises WearcapError without either."""
+        if self.map is not None:
+            given = Path(self.map)
+            given = given / MAP_NAME if given.is_dir() else given
+            if not given.is_file():
+                raise WearcapError("no such map", where=given, fix="Build it: wearcap scene.")
+            return given
+        if recording.localization is not None:
+            return None
+        own = (folder / recording.scene).parent / MAP_NAME if recording.scene else None
+        if own is None or not own.is_file():
+            raise WearcapError("no localisation in this recording, and no map", where=recording.name,
+                               expected="camera poses, or a visual map of the scene",
+                               fix="Build one (wearcap scene) and give pipeline.localization.map=FILE.")  # fmt: skip
+        return own
+
+    def reads(self, recording: Recording, folder: Path) -> list[Any]:
+        """All that decides the result, for its digest. Raises WearcapError without localisation and map, or pictures."""
+        file, stream = self.map_file(recording, folder), recording.camera
+        if file is None or stream is None:
+            return [recording.localization]
+        features = [self.extractor, self.matcher, self.descriptor, self.settings, self.use_prior]
+        return [
+            *features, self.every or _usual_step(stream), stream.timestamps, stream.camera, file,
+            *_pictures(recording, folder),
+        ]  # fmt: skip
+
+    def __call__(self, recording: Recording, folder: Path) -> Localization:
+        """Poses at each `every`-th frame, on the camera's clock.
+
+        Raises WearcapError without localisation and map, without pictures, and what the map's and video's readers refuse.
+        """
+        file = self.map_file(recording, folder)
+        if file is None:
+            assert recording.localization is not None
+            return recording.localization
+        _pictures(recording, folder)
+        stream = recording.camera
+        assert stream is not None
+        localizer = Localizer(
+            VisualMap.load(file), self.extractor, self.matcher, self.settings, descriptor=self.descriptor
+        )
+        every = self.every or _usual_step(stream)
+        return localize_video(
+            _frames(stream, folder, every), stream.timestamps[::every], stream.camera, localizer,
+            use_prior=self.use_prior, progress=sys.stderr.isatty(),
+        )  # fmt: skip
+
+
+def camera_stages(source: Source, synchronization: Synchronization, localize: Localize) -> list[Stage]:
+    """The first two stages. Raises WearcapError when there can be no localisation."""
+    recording, folder = source.recording, source.folder
+    localize.reads(recording, folder)
+    return [
+        Stage(
+            "synchronize", lambda results: synchronization(recording, folder),
+            lambda: synchronization.reads(recording, folder),
+            code=("sensors/claps.py", "sensors/clock.py", "sensors/imu.py", "systems/hps/camera.py"),
+        ),
+        Stage(
+            "localize", lambda results: localize(recording, folder),
+            lambda: localize.reads(recording, folder),
+            code=("localization", *LEARNED, "geometry", "io/formats/video.py", "systems/hps/camera.py"),
+        ),
+    ]  # fmt: skip
+
+
+def on_one_clock(recording: Recording, results: dict[str, Any]) -> Recording:
+    """The recording with what both stages found: camera and localisation on the suit's clock."""
+    sensed = replace(recording, localization=results["localize"])
+    return sensed if results["synchronize"] is None else retime(sensed, results["synchronize"])
+
+
+def camera_report(results: dict[str, Any]) -> dict[str, Any]:
+    """The clock (None: shared), and how often the camera was found, as far as the stages went."""
+    clock: Clock | None = results["synchronize"]
+    about: dict[str, Any] = {"clock": None}
+    if clock is not None:
+        about["clock"] = {
+            "offset_s": clock.offset_s, "drift_ms_per_hour": 1000 * clock.drift_s_per_hour,
+            "residual_ms": 1000 * clock.residual_s, "claps": clock.claps,
+        }  # fmt: skip
+    if "localize" in results:
+        confidence = results["localize"].confidence
+        about["localized"] = {
+            "frames": len(confidence), "share": (confidence > 0).double().mean().item() if len(confidence) else 0.0,
+        }  # fmt: skip
+    return about
+
+
+def _usual_step(stream: CameraStream) -> int:
+    if len(stream.timestamps) < 2:
+        return 1
+    return max(1, round(1 / (USUAL_HZ * stream.timestamps.diff().median().item())))
+
+
+def _pictures(recording: Recording, folder: Path) -> list[Path]:
+    stream = recording.camera
+    if stream is None or (stream.video is None and stream.image_files is None):
+        raise WearcapError("no pictures of the head camera", where=recording.name,
+                           expected="a video or picture files, to be localised in the map")  # fmt: skip
+    return [
+        folder / name for name in ([stream.video] if stream.video is not None else stream.image_files or ())
+    ]
+
+
+def _frames(stream: CameraStream, folder: Path, every: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """Each `every`-th picture that has a timestamp."""
+    if stream.video is None:
+        assert stream.image_files is not None
+        for name in stream.image_files[::every]:
+            yield read_image(folder / name)
+        return
+    for _, picture in read_frames(folder / stream.video, stop=len(stream.timestamps), step=every):
+        yield picture

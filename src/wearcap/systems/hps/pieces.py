@@ -1,0 +1,83 @@
+"""Pieces of a recording that is being made: what is wrong with one, and putting them together."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from wearcap.recording import Motion
+from wearcap.recording.recording import Localization
+from wearcap.sensors.packets import (
+    MAX_POSITION_M,
+    MAX_TIME_S,
+    OFF_THE_CLOCK,
+    WRONG_TYPE,
+    rotations_fault,
+    values_fault,
+)
+
+MAX_PAUSE_S = 10.0
+"""Behind a longer pause a piece is alone until the next one agrees; then a new stretch begins."""
+
+
+def suit_fault(suit: object, like: Motion | None) -> str | None:
+    """What is wrong with a piece of a suit's motion beside an earlier good one."""
+    if not isinstance(suit, Motion) or not isinstance(suit.timestamps, Tensor) or suit.timestamps.ndim != 1:
+        return WRONG_TYPE
+    times, count, joints = suit.timestamps, len(suit.timestamps), len(suit.skeleton)
+    contact, known = suit.contact_prob, None if like is None else like.contact_prob
+    fault = (
+        _times_fault(times, MAX_PAUSE_S)
+        or rotations_fault(suit.R_parent_joint, (count, joints, 3, 3))
+        or values_fault(suit.t_world_root, (count, 3), MAX_POSITION_M)
+        or (None if contact is None else _contact_fault(contact, count))
+    )
+    if fault is None and like is not None:
+        same = like.skeleton.joint_names == suit.skeleton.joint_names and (contact is None) == (known is None)
+        return None if same and (known is None or contact is None or known.shape[1:] == contact.shape[1:]) else WRONG_TYPE  # fmt: skip
+    return fault
+
+
+def _contact_fault(contact: object, count: int) -> str | None:
+    patches = contact.shape[-1:] if isinstance(contact, Tensor) else ()
+    return values_fault(contact, (count, *patches), 1.0)
+
+
+def localization_fault(seen: object, suit: Motion) -> str | None:
+    """What is wrong with the camera poses of a piece; rows that are not localised (confidence 0) may hold anything."""
+    if not isinstance(seen, Localization) or not isinstance(seen.timestamps, Tensor):
+        return WRONG_TYPE
+    count = seen.timestamps.numel()
+    if fault := _times_fault(seen.timestamps, math.inf) or values_fault(seen.confidence, (count,), 1.0):
+        return fault
+    shapes = [getattr(part, "shape", None) for part in (seen.R_world_cam, seen.t_world_cam)]
+    if shapes != [(count, 3, 3), (count, 3)]:
+        return WRONG_TYPE
+    found = seen.confidence > 0
+    R, t = seen.R_world_cam[found], seen.t_world_cam[found]
+    if seen.timestamps[-1] > suit.timestamps[-1] + MAX_PAUSE_S:
+        return OFF_THE_CLOCK
+    return rotations_fault(R, (len(R), 3, 3)) or values_fault(t, (len(R), 3), MAX_POSITION_M)
+
+
+def _times_fault(times: Tensor, max_pause_s: float) -> str | None:
+    if fault := values_fault(times, (times.numel(),), MAX_TIME_S):
+        return fault
+    steps = times.diff()
+    return None if ((steps > 0) & (steps <= max_pause_s)).all() else OFF_THE_CLOCK
+
+
+def follows(first: Motion, then: Motion) -> bool:
+    """Whether a piece continues another, without overlap or a long pause."""
+    return 0 < (then.timestamps[0] - first.timestamps[-1]).item() <= MAX_PAUSE_S
+
+
+def more(first: Localization, then: Localization) -> Localization:
+    names = ("timestamps", "R_world_cam", "t_world_cam", "confidence")
+    return Localization(*(torch.cat([getattr(first, name), getattr(then, name)]) for name in names))
+
+
+def cut(seen: Localization, first: int) -> Localization:
+    return Localization(
+        seen.timestamps[first:], seen.R_world_cam[first:], seen.t_world_cam[first:], seen.confidence[first:]
+    )

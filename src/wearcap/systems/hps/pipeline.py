@@ -1,0 +1,253 @@
+"""HPS (thesis ch. 4): a suit's pose registered in a scanned scene by a head camera, without drift.
+
+A recording goes through the document's steps in order; each is a method that can be called alone, and a stage whose
+result can be kept: synchronize → localize → align → initialize → optimize.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from wearcap.body.anny_body import anny_body
+from wearcap.body.kinematics import site_positions
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, finite_difference, resample
+from wearcap.optimize.feet import FootPatches
+from wearcap.optimize.hps import HpsData, HpsEnergy, HpsState
+from wearcap.optimize.solution import Solution
+from wearcap.recording import Motion, Recording
+from wearcap.recording.recording import Localization
+from wearcap.recording.timing import resampled
+from wearcap.runtime.stages import Source, Stage, run_stages
+from wearcap.scene.scan import Scan
+from wearcap.sensors.alignment import align_suit, estimate_head_camera, inliers, yaw_between
+from wearcap.sensors.clock import Clock
+from wearcap.sensors.initialization import Initialization, InitializationSettings, initialize
+from wearcap.systems.hps.camera import (
+    Localize,
+    MapLocalization,
+    Synchronization,
+    camera_report,
+    camera_stages,
+    on_one_clock,
+)
+
+Solver = Callable[[HpsEnergy, HpsData], Solution]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """How the optimisation reads contacts and localisation."""
+
+    max_contact_speed: float | None = 0.6
+    """Flags of a foot patch that moves faster by the suit itself (m/s) are not believed; None: all are (document)."""
+    confident: bool = True
+    """Weigh frames by the localisation's confidence, not at all where it was lost; False: all alike (document)."""
+
+
+@dataclass(eq=False)
+class HPS:
+    """Registers the suit's motion of a recording with the scene."""
+
+    energy: HpsEnergy
+    solver: Solver
+    initialization: InitializationSettings = field(default_factory=InitializationSettings)
+    evidence: Evidence = field(default_factory=Evidence)
+    fps: float = 30.0
+    name: str = "hps"
+    synchronization: Synchronization = field(default_factory=Synchronization)
+    localization: Localize = field(default_factory=MapLocalization)
+
+    def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
+        """The wearer's motion in the scene at `fps`; `folder` is the data set's. Raises WearcapError as `stages`."""
+        source = Source(recording, folder, scan)
+        results, _ = run_stages(self.stages(source))
+        return self.motion(results["initialize"], results["optimize"])
+
+    def stages(self, source: Source) -> list[Stage]:
+        """The steps from a recording to the solution.
+
+        Raises WearcapError without suit, head camera, localisation or map, or a scan where the energy asks for one.
+        """
+        recording = source.recording
+        require(recording, "suit", "camera")
+        first = camera_stages(source, self.synchronization, self.localization)
+        self.require_scan(source.scan, recording.name)
+        body = (recording.suit, *mount(recording))
+        return [
+            *first,
+            Stage(
+                "align", lambda done: self.align(on_one_clock(recording, done)), lambda: (self.fps, *body),
+                ("synchronize", "localize"), ("sensors/alignment.py", "prepare/clean.py", "geometry", "body"),
+            ),
+            Stage(
+                "initialize", lambda done: self.initialize(on_one_clock(recording, done), done["align"]),
+                lambda: (self.initialization, *mount(recording)), ("synchronize", "localize", "align"),
+                ("sensors/initialization.py", "sensors/alignment.py", "geometry", "body"),
+            ),
+            Stage(
+                "optimize", lambda done: self.optimize(self._stated(source, done)),
+                lambda: (self.energy, self.solver, self.evidence, source.scan, source.metres_per_unit, recording.shape),
+                ("synchronize", "localize", "align", "initialize"),
+                ("optimize", "systems/hps/pipeline.py", "sensors/alignment.py", "io/formats/scan.py", "geometry", "body"),
+            ),
+        ]  # fmt: skip
+
+    def require_scan(self, scan: Path | Scan | None, where: str) -> None:
+        """Raise WearcapError when the energy asks for a scan and there is none."""
+        terms = [name for name in ("contact", "contact_plane") if self.energy.weight(name)]
+        if scan is None and terms:
+            raise WearcapError(f"no scan of the scene, which the energy's term {' and '.join(terms)} needs",
+                               where=where, expected="a recording that names its scan, or scene=FOLDER",
+                               fix="Without one: pipeline=hps_without_scene.")  # fmt: skip
+
+    def motion_of(self, results: dict[str, Any]) -> Motion | None:
+        """The motion after the last stage that was run: aligned, initial, or optimised."""
+        if "optimize" in results:
+            return self.motion(results["initialize"], results["optimize"])
+        return results["initialize"].motion if "initialize" in results else results.get("align")
+
+    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
+        """Clock, share localised, angle of the alignment, energies by term and iteration, and why the solver stopped."""
+        about = camera_report(results)
+        if "align" in results:
+            assert source.recording.suit is not None
+            angle, _ = yaw_between(
+                source.recording.suit.R_parent_joint[0, 0], results["align"].R_parent_joint[0, 0]
+            )
+            about["alignment_deg"] = angle.rad2deg().item()
+        if "optimize" in results:
+            about |= {"stopped": results["optimize"].reason, "energy": results["optimize"].history}
+        return about
+
+    def synchronize(self, recording: Recording, folder: Path) -> Clock | None:
+        """The camera's clock against the suit's by claps (thesis §4.3.4); None where they are one."""
+        return self.synchronization(recording, folder)
+
+    def localize(self, recording: Recording, folder: Path) -> Localization:
+        """The head camera's poses in the scene, on its own clock (thesis §4.2.3)."""
+        return self.localization(recording, folder)
+
+    def align(self, recording: Recording) -> Motion:
+        """The suit's motion at `fps`, turned about gravity and moved into the scene (thesis eq. 4.14, 4.15)."""
+        suit, localization, T_head_cam = required(recording)
+        return align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
+
+    def initialize(self, recording: Recording, aligned: Motion) -> Initialization:
+        """The start of the optimisation: the suit carried along the camera's path (thesis §4.2.5, eq. 4.13)."""
+        _, localization, T_head_cam = required(recording)
+        return initialize(aligned, localization, T_head_cam.R, T_head_cam.t, self.initialization)
+
+    def problem(
+        self, recording: Recording, aligned: Motion, start: Initialization, scan: Scan | None,
+        R_head_cam: Float[Tensor, "3 3"] | None = None,
+    ) -> HpsData:  # fmt: skip
+        """What the energy is told: the start, localised cameras, contacts, and the suit's own steps.
+
+        `R_head_cam` is estimated from the frames that are localised (HPS paper eq. 4) where it is not given.
+        """
+        motion, (_, localization, _) = start.motion, required(recording)
+        R_cam, sure = at_frames(localization, motion)
+        root, head = motion.R_parent_joint[:, 0].double(), motion.joint("head").R.double()
+        if R_head_cam is None:
+            R_head_cam = estimate_head_camera(head, R_cam, sure)
+        if not self.evidence.confident:
+            sure = (sure > 0).double()
+        body = anny_body(motion.skeleton, recording.shape or None)
+        yaw = start.yaw_correction.double()
+        heading = rotation.about_axis("z", yaw[:-1] + rotation.wrap_angle(yaw.diff()) / 2)
+        return HpsData(
+            FootPatches.of(body),
+            HpsState(rotation.log(motion.R_parent_joint[:, 1:].double()), root, motion.t_world_root.double()),
+            R_head_cam, R_cam, sure, sure * start.valid if self.evidence.confident else torch.ones_like(sure),
+            believed_contact(aligned, self.evidence.max_contact_speed).double(),
+            (heading @ aligned.t_world_root.double().diff(dim=0)[..., None])[..., 0], turns(root), turns(head),
+            scan.surface if scan else None,
+        )  # fmt: skip
+
+    def _stated(self, source: Source, results: dict[str, Any]) -> HpsData:
+        recording = on_one_clock(source.recording, results)
+        return self.problem(recording, results["align"], results["initialize"], source.read_scan())
+
+    def optimize(self, data: HpsData) -> Solution:
+        """Minimise the energy (thesis eq. 4.1)."""
+        return self.solver(self.energy, data)
+
+    def motion(self, start: Initialization, solution: Solution) -> Motion:
+        """What was captured; contacts stay the suit's."""
+        state = solution.state
+        return replace(
+            start.motion, R_parent_joint=state.R_parent_joint.float(), t_world_root=state.t_world_root.float(),
+            provenance={"pipeline": self.name, "solver": solution.reason},
+        )  # fmt: skip
+
+
+def required(recording: Recording) -> tuple[Motion, Localization, Rigid]:
+    """Suit, localisation and nominal mount T_head_cam of a recording. Raises WearcapError naming what it lacks."""
+    require(recording, "suit", "localization", "camera")
+    assert recording.suit is not None
+    assert recording.localization is not None
+    return recording.suit, recording.localization, Rigid(*mount(recording))
+
+
+def require(recording: Recording, *names: str) -> None:
+    """Raise WearcapError unless the recording has these parts."""
+    missing = [name for name in names if getattr(recording, name) is None]
+    if missing:
+        raise WearcapError(f"no {' and no '.join(missing)} in this recording", where=recording.name,
+                           expected="a suit's motion, a head camera, and where it was localised")  # fmt: skip
+
+
+def mount(recording: Recording) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+    """Nominal orientation and position (m) of the camera in the head's frame."""
+    assert recording.camera is not None
+    return recording.camera.R_head_cam, recording.camera.t_head_cam
+
+
+def at_frames(
+    localization: Localization, motion: Motion
+) -> tuple[Float64[Tensor, "time 3 3"], Float64[Tensor, "time"]]:
+    """Orientation and confidence of the nearest localised frame, 0 beyond half a frame or where it is an outlier.
+
+    The orientation is carried from its own time to the motion's frame by the turn of the motion's head, which matters
+    where cameras are localised more seldom than frames are asked for.
+    """
+    times, timestamps = localization.timestamps.contiguous(), motion.timestamps.contiguous()
+    after = torch.searchsorted(times, timestamps).clamp(1, len(times) - 1)
+    nearest = torch.where(times[after] - timestamps < timestamps - times[after - 1], after, after - 1)
+    step = max(times.diff().median().item(), timestamps.diff().median().item())
+    near = (times[nearest] - timestamps).abs() <= 0.51 * step
+    sure = (localization.confidence * inliers(localization))[nearest].double() * near
+    head = motion.joint("head")
+    then = resample(Trajectory(timestamps, head.R, head.t), times.clamp(timestamps[0], timestamps[-1]))
+    carried = head.R.double() @ then.R_world_body[nearest].double().mT
+    return carried @ localization.R_world_cam[nearest].double(), sure
+
+
+def turns(R_world_body: Float[Tensor, "time 3 3"]) -> Float[Tensor, "pair 3 3"]:
+    """Turn in the world's axes from each frame to the next."""
+    return R_world_body[1:] @ R_world_body[:-1].mT
+
+
+def believed_contact(suit: Motion, max_speed: float | None) -> Bool[Tensor, "time patch"]:
+    """The suit's contact flags, without those of patches that move faster than `max_speed` (m/s) by the suit itself.
+
+    Raises WearcapError when there are none, or fewer than frames.
+    """
+    if suit.contact_prob is None or len(suit.contact_prob) != len(suit):
+        count = "no" if suit.contact_prob is None else f"{len(suit.contact_prob)} frames of"
+        raise WearcapError(f"{count} foot contacts for {len(suit)} frames of the suit's pose",
+                           expected="one per frame and patch", fix="wearcap.sensors.contacts derives them.")  # fmt: skip
+    contact = suit.contact_prob >= 0.5
+    if max_speed is None:
+        return contact
+    patches = site_positions(suit.skeleton, suit.T_world_joint, FOOT_PATCHES)
+    return contact & (finite_difference(patches, suit.timestamps).norm(dim=-1) <= max_speed)

@@ -1,0 +1,106 @@
+"""What the documents compare HPS with (thesis §4.5.1): the suit alone, and the suit carried by the camera."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import Trajectory, filled, interpolate
+from wearcap.recording import Motion, Recording
+from wearcap.recording.timing import resampled
+from wearcap.runtime.stages import Source, Stage, run_stages
+from wearcap.scene.scan import Scan
+from wearcap.sensors.alignment import align_suit, body_camera, inliers
+from wearcap.systems.hps.camera import (
+    Localize,
+    MapLocalization,
+    Synchronization,
+    camera_report,
+    camera_stages,
+    on_one_clock,
+)
+from wearcap.systems.hps.pipeline import mount, require, required
+
+KINDS = ("imu", "imu_cam", "imu_cam_filtered")
+
+
+class PlacedSuit(ABC):
+    """A pipeline that puts the suit's motion into the scene in one step behind HPS' first two."""
+
+    fps: float
+    synchronization: Synchronization
+    localization: Localize
+
+    @property
+    @abstractmethod
+    def placing(self) -> Any:
+        """What decides the step, beside the recording and the rate."""
+
+    @abstractmethod
+    def place(self, recording: Recording) -> Motion:
+        """The suit's motion in the scene."""
+
+    def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
+        """The placed motion. Raises WearcapError as `stages`."""
+        return run_stages(self.stages(Source(recording, folder, scan)))[0]["place"]
+
+    def stages(self, source: Source) -> list[Stage]:
+        """HPS' first two, then the suit is placed. Raises WearcapError as HPS does."""
+        recording = source.recording
+        require(recording, "suit", "camera")
+        return [
+            *camera_stages(source, self.synchronization, self.localization),
+            Stage(
+                "place", lambda done: self.place(on_one_clock(recording, done)),
+                lambda: (self.placing, self.fps, recording.suit, *mount(recording)), ("synchronize", "localize"),
+                ("systems/hps/published.py", "systems/ireplica/bent_suit.py", "optimize", "sensors/alignment.py",
+                 "prepare/clean.py", "geometry", "body"),
+            ),
+        ]  # fmt: skip
+
+    def motion_of(self, results: dict[str, Any]) -> Motion | None:
+        """The motion, once it is placed."""
+        return results.get("place")
+
+    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
+        """Clock and share localised."""
+        return camera_report(results)
+
+
+@dataclass(frozen=True)
+class HpsBaseline(PlacedSuit):
+    """A row of the documents' tables: "imu", "imu_cam" or "imu_cam_filtered"; all are aligned at the start."""
+
+    kind: str
+    fps: float = 30.0
+    synchronization: Synchronization = field(default_factory=Synchronization)
+    localization: Localize = field(default_factory=MapLocalization)
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise WearcapError(f"no baseline {self.kind!r}", expected=f"one of {', '.join(KINDS)}")
+
+    @property
+    def name(self) -> str:
+        return self.kind
+
+    @property
+    def placing(self) -> str:
+        return self.kind
+
+    def place(self, recording: Recording) -> Motion:
+        """The suit's motion in the scene."""
+        suit, localization, T_head_cam = required(recording)
+        motion = align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
+        motion = replace(motion, provenance={"pipeline": self.kind})
+        if self.kind == "imu":
+            return motion
+        found = localization.confidence > 0
+        use = inliers(localization) if self.kind == "imu_cam_filtered" else found
+        path = filled(
+            Trajectory(localization.timestamps, localization.R_world_cam, localization.t_world_cam), use
+        )
+        at = motion.timestamps.clamp(path.timestamps[0], path.timestamps[-1])
+        camera = interpolate(path.timestamps, path.t_world_body, at)
+        return replace(motion, t_world_root=motion.t_world_root + camera - body_camera(motion, T_head_cam.t))

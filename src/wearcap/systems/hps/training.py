@@ -1,0 +1,79 @@
+"""HPS with the current weights during validation: what a localiser in training is worth to the captured motion."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import lightning
+import torch
+from lightning.pytorch import Callback
+
+from wearcap.body.anny_body import anny_body
+from wearcap.metrics.scores import score
+from wearcap.metrics.surface import foot_surface, foot_vertices
+from wearcap.recording import Motion, Recording
+from wearcap.recording.locate import dataset_folder, load_recording
+from wearcap.runtime.stages import Source, run_stages
+from wearcap.scene.scan import Scan
+from wearcap.systems.hps.camera import Localize
+from wearcap.systems.hps.pipeline import HPS
+
+
+class HpsValidation(Callback):
+    """Every n-th validation epoch captures recordings by HPS and logs root error, feet on the scan, share localised.
+
+    HPS has no network of its own: `localizer` makes its localisation from the module in training, such as
+    `MapLocalization` with its extractor and a map that was built with the same weights.
+    """
+
+    def __init__(
+        self, pipeline: HPS, localizer: Callable[[lightning.LightningModule], Localize], recordings: Sequence[str],
+        every_n_epochs: int = 1,
+    ):  # fmt: skip
+        """`recordings`: DATASET/NAME each, with a suit and a head camera."""
+        self.pipeline, self.localizer = pipeline, localizer
+        self.recordings, self.every_n_epochs = tuple(recordings), every_n_epochs
+        self._epochs = 0
+
+    def on_validation_epoch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        if trainer.sanity_checking or not trainer.is_global_zero:
+            return
+        self._epochs += 1
+        if self._epochs % self.every_n_epochs:
+            return
+        training = pl_module.training
+        pl_module.eval()
+        with torch.no_grad():
+            pipeline = replace(self.pipeline, localization=self.localizer(pl_module))
+            rows = [validated(pipeline, where) for where in self.recordings]
+        pl_module.train(training)
+        for name in rows[0]:
+            known = [row[name] for row in rows if row[name] == row[name]]
+            pl_module.log(
+                f"hps/{name}", sum(known) / len(known) if known else float("nan"), rank_zero_only=True
+            )
+
+
+def validated(pipeline: HPS, where: str) -> dict[str, float]:
+    """Scores of one recording by name with unit; those that need what it lacks (truth, scan) are NaN."""
+    recording, folder = load_recording(where), dataset_folder(where)
+    source = Source(recording, folder, folder / recording.scene if recording.scene else None)
+    results, _ = run_stages(pipeline.stages(source))
+    motion, nan = pipeline.motion(results["initialize"], results["optimize"]), float("nan")
+    feet = surface_scores(motion, recording, source.read_scan())
+    known = score(motion, recording, where, 0).scores if recording.motion is not None else {}
+    return {
+        "world_root_cm": known.get("world_root_cm", nan), "world_mpjpe_cm": known.get("world_mpjpe_cm", nan), **feet,
+        "localized_share": (results["localize"].confidence > 0).double().mean().item(),
+    }  # fmt: skip
+
+
+def surface_scores(motion: Motion, recording: Recording, scan: Scan | None) -> dict[str, float]:
+    """How feet that the suit reports in contact meet the scan (thesis Table 4.3)."""
+    if scan is None or motion.contact_prob is None:
+        return {"surface_cm": float("nan"), "sliding_cm": float("nan")}
+    body = anny_body(motion.skeleton, recording.shape or None)
+    points, touching = foot_vertices(body, motion.T_world_joint, motion.contact_prob >= 0.5)
+    found = foot_surface(points, touching, scan.surface)
+    return {"surface_cm": found.distance_cm, "sliding_cm": found.sliding_cm}

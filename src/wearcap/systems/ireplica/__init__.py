@@ -1,0 +1,1 @@
+"""iReplica: hand contacts predicted from pose, and objects moved by them."""

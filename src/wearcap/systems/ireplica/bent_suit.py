@@ -1,0 +1,50 @@
+"""iReplica's own registration as documented (thesis §5.3.1): the suit's path is bent to the camera's positions."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from wearcap.geometry import rotation
+from wearcap.geometry.trajectory import interpolate
+from wearcap.optimize.trajectory import BentPath
+from wearcap.recording import Motion, Recording
+from wearcap.recording.timing import resampled
+from wearcap.sensors.alignment import align_suit, body_camera, inliers
+from wearcap.systems.hps.camera import Localize, MapLocalization, Synchronization
+from wearcap.systems.hps.pipeline import required
+from wearcap.systems.hps.published import PlacedSuit
+
+
+@dataclass(frozen=True)
+class BentSuit(PlacedSuit):
+    """The suit's motion along its own path, bent in the ground plane; pose and height stay the suit's."""
+
+    bend: Callable[..., BentPath]
+    """`optimize.trajectory.bend` with its settings and solver."""
+    fps: float = 30.0
+    name: str = "bent_suit"
+    synchronization: Synchronization = field(default_factory=Synchronization)
+    localization: Localize = field(default_factory=MapLocalization)
+
+    @property
+    def placing(self) -> Callable[..., BentPath]:
+        return self.bend
+
+    def place(self, recording: Recording) -> Motion:
+        """F_tr(l, p) of eq. 5.2, p the root beneath each localised camera, outliers left out."""
+        suit, localization, T_head_cam = required(recording)
+        motion = align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
+        first, last = motion.timestamps[0], motion.timestamps[-1]
+        use = inliers(localization) & (localization.timestamps >= first) & (localization.timestamps <= last)
+        times = localization.timestamps[use].contiguous()
+        carried = body_camera(motion, T_head_cam.t) - motion.t_world_root
+        points = localization.t_world_cam[use] - interpolate(motion.timestamps, carried, times)
+        path = motion.t_world_root[:, :2].double()
+        bent = self.bend(
+            path, motion.timestamps, times, points[:, :2].double(), localization.confidence[use].double()
+        )
+        R = motion.R_parent_joint.clone()
+        R[:, 0] = rotation.about_axis("z", bent.frame_turn.to(R)) @ R[:, 0]
+        root = torch.cat([bent.path.to(motion.t_world_root), motion.t_world_root[:, 2:]], 1)
+        return replace(motion, R_parent_joint=R, t_world_root=root, provenance={"pipeline": self.name})

@@ -1,0 +1,18 @@
+"""Calibration of a contact network during validation."""
+
+import lightning
+from lightning.pytorch import Callback
+
+from wearcap.systems.ireplica.contact_network import fit_temperature
+from wearcap.systems.ireplica.training import ContactDetection
+
+
+class FitTemperature(Callback):
+    """After every validation epoch the network's temperatures are fitted to it, and go into the checkpoint with its weights.
+
+    Stands before the weight averaging in the list of callbacks: the temperatures belong to the averaged weights.
+    """
+
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: ContactDetection) -> None:
+        logits, truth = pl_module.validated()
+        pl_module.net.temperature.copy_(fit_temperature(logits.flatten(0, 1), truth.flatten(0, 1)))

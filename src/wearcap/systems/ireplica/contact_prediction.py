@@ -1,0 +1,156 @@
+"""Which hands hold something, told from poses alone (thesis §5.3.2): whole recordings, and frame by frame."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import interpolate
+from wearcap.models.build import build
+from wearcap.models.checkpoint import read_checkpoint
+from wearcap.recording import Motion
+from wearcap.systems.ireplica.contact_network import FRAMES, REACH, ContactNetwork
+from wearcap.systems.ireplica.contact_sequence import ContactSequence
+from wearcap.systems.ireplica.contact_transformer import ContactTransformer
+from wearcap.systems.ireplica.features import FEATURES, PoseFeatures, in_skeleton, pose_frames, worn
+
+NETWORKS = {cls.__name__: cls for cls in (ContactTransformer, ContactSequence)}
+
+
+@dataclass(frozen=True)
+class ContactDetector:
+    """A network with what it sees of poses, at its frame rate, and the classes of interaction that it tells."""
+
+    net: ContactNetwork
+    features: PoseFeatures
+    classes: tuple[str, ...]
+    fps: float = 60.0
+
+    def probability(self, feature: Float[Tensor, "time feature"]) -> Float[Tensor, "out hand class"]:
+        """Probabilities of all frames but the first and last `REACH`, in passes of the network's own size."""
+        step, out = self.net.frames_per_pass, len(feature) - 2 * REACH
+        device = self.net.temperature.device
+        passes = [
+            self.net.probability(feature[None, start : min(start + step, out) + 2 * REACH].to(device))[
+                0
+            ].cpu()
+            for start in range(0, out, step)
+        ]
+        return torch.cat(passes)
+
+
+class ContactPredictor:
+    """Probabilities of contact per class of interaction, hand and frame of a motion, by one or more detectors.
+
+    Frames before the beginning and behind the end are taken to be like the first and the last.
+    """
+
+    def __init__(self, *detectors: ContactDetector):
+        names = [name for detector in detectors for name in detector.classes]
+        if not names or len(set(names)) < len(names):
+            raise WearcapError(f"contact networks for {', '.join(names) or 'nothing'}",
+                               expected="one network for each class of interaction")  # fmt: skip
+        self.detectors, self.classes = detectors, tuple(names)
+        for detector in detectors:
+            detector.net.eval()
+
+    @classmethod
+    def load(cls, *checkpoints: str | Path) -> "ContactPredictor":
+        """From checkpoints of `wearcap train`, each with its classes. Raises WearcapError for any other file."""
+        return cls(*(load_detector(path) for path in checkpoints))
+
+    @torch.inference_mode()
+    def __call__(self, motion: Motion) -> dict[str, Float[Tensor, "time hand"]]:
+        """One probability per frame of `motion`, whatever its rate and skeleton.
+
+        Raises WearcapError for poses that are not numbers.
+        """
+        if not len(motion):
+            return {name: torch.zeros(0, 2) for name in self.classes}
+        result: dict[str, Tensor] = {}
+        for detector in self.detectors:
+            times, R = pose_frames(motion, detector.features.skeleton, detector.fps)
+            feature = detector.features.encode(R)
+            ends = feature[:1].expand(REACH, -1), feature[-1:].expand(REACH, -1)
+            prob = detector.probability(torch.cat([ends[0], feature, ends[1]]))
+            if times is not motion.timestamps:
+                prob = interpolate(times, prob, motion.timestamps)
+            result |= dict(zip(detector.classes, prob.unbind(-1)))
+        return result
+
+    def stream(self, skeleton: Skeleton) -> "ContactStream":
+        """The same for frames of a skeleton that come one by one, at the networks' rate."""
+        return ContactStream(self.detectors, skeleton)
+
+
+class ContactStream:
+    """Takes poses one by one and answers `REACH` frames later; its state is the last 61 frames' features."""
+
+    def __init__(self, detectors: tuple[ContactDetector, ...], skeleton: Skeleton):
+        self._detectors, self._skeleton = detectors, skeleton
+        self._worn = [worn(skeleton, detector.features.skeleton) for detector in detectors]
+        self._state: list[Tensor] = []
+        self._frames = 0
+
+    @torch.inference_mode()
+    def push(self, R_parent_joint: Float[Tensor, "joint 3 3"]) -> dict[str, Float[Tensor, "hand"]] | None:
+        """The answer for the frame `REACH` before this one; None as long as there is no such frame.
+
+        Raises WearcapError for a pose that is not a number: the state stays as it was.
+        """
+        if not R_parent_joint.isfinite().all():
+            raise WearcapError(f"the pose of frame {self._frames} is not a number",
+                               expected="a pose in every frame")  # fmt: skip
+        features = [
+            detector.features.encode(in_skeleton(self._skeleton, target, R_parent_joint[None]))
+            for detector, target in zip(self._detectors, self._worn)
+        ]
+        return self._advance(features)
+
+    @torch.inference_mode()
+    def finish(self) -> list[dict[str, Float[Tensor, "hand"]]]:
+        """The answers that are still missing, as if the last frame went on."""
+        last = [state[-1:] for state in self._state]
+        answers = [self._advance(last) for _ in range(REACH)]
+        return [answer for answer in answers if answer is not None]
+
+    def _advance(self, features: list[Tensor]) -> dict[str, Float[Tensor, "hand"]] | None:
+        if not self._state:
+            self._state = [feature.expand(FRAMES, -1) for feature in features]
+        self._state = [torch.cat([s[1:], f]) for s, f in zip(self._state, features)]
+        self._frames += 1
+        if self._frames <= REACH:
+            return None
+        answer = {}
+        for detector, state in zip(self._detectors, self._state):
+            answer |= dict(zip(detector.classes, detector.probability(state)[0].unbind(-1)))
+        return answer
+
+
+def load_detector(path: str | Path) -> ContactDetector:
+    """The detector of a checkpoint of `wearcap train`. Raises WearcapError when it holds another model."""
+    config, state = read_checkpoint(path)
+    model = config["model"]
+    net, features, classes, fps = (model.get(key) for key in ("net", "features", "classes", "fps"))
+    kinds = [_class_name(part) for part in (net, features)]
+    if (
+        kinds[0] not in NETWORKS
+        or kinds[1] not in FEATURES
+        or not (isinstance(classes, list) and isinstance(fps, int | float))
+    ):
+        raise WearcapError(f"a checkpoint of {kinds[0] or 'another model'}", where=path,
+                           expected=f"a contact network: {' or '.join(NETWORKS)}")  # fmt: skip
+    encoder = FEATURES[kinds[1]](**{key: value for key, value in features.items() if key != "_target_"})
+    net = {key: value for key, value in net.items() if key != "_partial_"}
+    network = build(net | {"inputs": encoder.size, "classes": len(classes)}, state, path, prefix="net.")
+    return ContactDetector(network, encoder, tuple(classes), fps)
+
+
+def _class_name(part: Any) -> str:
+    """Name of the class that a part of a config is made of, "" where it is no part."""
+    return str(part.get("_target_", "")).rpartition(".")[2] if isinstance(part, dict) else ""

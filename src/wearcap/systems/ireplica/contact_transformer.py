@@ -1,0 +1,135 @@
+"""The contact network of iReplica as it was published (thesis §5.3.2): a small transformer over 61 poses.
+
+One window gives one answer, that of its middle frame. 21,944 parameters for 69 inputs, 24,824 for 159.
+"""
+
+import math
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from wearcap.errors import WearcapError
+from wearcap.models.weights import load_weights, read_weights
+from wearcap.systems.ireplica.contact_network import FRAMES, ContactNetwork
+
+_WIDTH, _HEADS, _LAYERS, _HANDS = 32, 8, 3, 2
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention, its parameters named and shaped as in nn.MultiheadAttention."""
+
+    def __init__(self, dropout: float):
+        super().__init__()
+        self.dropout = dropout
+        self.in_proj_weight = nn.Parameter(nn.init.xavier_uniform_(torch.empty(3 * _WIDTH, _WIDTH)))
+        self.in_proj_bias = nn.Parameter(torch.zeros(3 * _WIDTH))
+        self.out_proj = nn.Linear(_WIDTH, _WIDTH)
+        nn.init.zeros_(self.out_proj.bias)
+
+    def forward(self, x: Float[Tensor, "sequence token width"]) -> Float[Tensor, "sequence token width"]:
+        projected = F.linear(x, self.in_proj_weight, self.in_proj_bias)
+        q, k, v = projected.unflatten(-1, (3, _HEADS, -1)).permute(2, 0, 3, 1, 4)
+        attended = F.scaled_dot_product_attention(q, k, v, dropout_p=self.dropout if self.training else 0.0)
+        return self.out_proj(attended.transpose(1, 2).flatten(2))
+
+
+class EncoderLayer(nn.Module):
+    """nn.TransformerEncoderLayer's post-norm layer, without its fused kernel, which cannot be exported."""
+
+    def __init__(self, dropout: float):
+        super().__init__()
+        self.self_attn = Attention(dropout)
+        self.linear1, self.linear2 = nn.Linear(_WIDTH, _WIDTH), nn.Linear(_WIDTH, _WIDTH)
+        self.norm1, self.norm2 = nn.LayerNorm(_WIDTH), nn.LayerNorm(_WIDTH)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Float[Tensor, "sequence token width"]) -> Float[Tensor, "sequence token width"]:
+        x = self.norm1(x + self.dropout(self.self_attn(x)))
+        return self.norm2(x + self.dropout(self.linear2(self.dropout(self.linear1(x).relu()))))
+
+
+class ContactTransformer(ContactNetwork):
+    """Linear 69→32, sinusoidal positions, 3 post-norm layers of 8 heads, 32→2 and ReLU per frame, 61·2→2 in the end.
+
+    `batch_axis`: attend over the windows of a batch instead of over their frames, and tell positions along that
+    axis, as the released code does by mistake. Predictions then depend on which windows share a batch; the switch
+    is there to reproduce the released checkpoints' numbers.
+    """
+
+    frames_per_pass = 100
+
+    def __init__(self, inputs: int = 69, classes: int = 1, dropout: float = 0.5, batch_axis: bool = False):
+        super().__init__(classes)
+        if classes != 1:
+            raise WearcapError(
+                f"the published contact network for {classes} classes of interaction", expected="one class",
+                fix="Train one network per class, as the document does, or model=contact_sequence.",
+            )  # fmt: skip
+        self.inputs, self.batch_axis = inputs, batch_axis
+        self.encoder = nn.Linear(inputs, _WIDTH)
+        self.layers = nn.ModuleList(EncoderLayer(dropout) for _ in range(_LAYERS))
+        self.decoder = nn.Linear(_WIDTH, _HANDS)
+        self.aggregator = nn.Linear(FRAMES * _HANDS, _HANDS)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch out hand class"]:
+        windows = pose.unfold(1, FRAMES, 1).transpose(-1, -2).flatten(0, 1)
+        x = self.encoder(windows) * math.sqrt(_WIDTH)
+        if self.batch_axis:
+            x = x.transpose(0, 1)
+        x = self.dropout(x + sinusoids(x.shape[1]).to(x))
+        for layer in self.layers:
+            x = layer(x)
+        if self.batch_axis:
+            x = x.transpose(0, 1)
+        return self.aggregator(self.decoder(x).relu().flatten(1)).view(len(pose), -1, _HANDS, 1)
+
+
+def sinusoids(length: int) -> Float[Tensor, "place width"]:
+    """Sines (even entries) and cosines (odd) of places, with wavelengths from 2π to 20,000π (Vaswani et al. 2017)."""
+    frequency = 10000.0 ** (-torch.arange(0, _WIDTH, 2) / _WIDTH)
+    angle = torch.arange(length)[:, None] * frequency
+    return torch.stack([angle.sin(), angle.cos()], -1).flatten(1)
+
+
+def load_released(path: str | Path, batch_axis: bool = True) -> ContactTransformer:
+    """The published network with the weights of a checkpoint of the released code, in evaluation mode.
+
+    Raises WearcapError that says which tensors are missing, unexpected or of another size.
+    """
+    tensors = {}
+    for name, value in _renamed(read_weights(path)).items():
+        if name.rpartition(".")[2] != "pe":
+            tensors[name] = value
+        elif not torch.allclose(value.flatten(0, -2), sinusoids(value.numel() // _WIDTH), atol=1e-5):
+            raise WearcapError(f"the positions {name!r} are not the sinusoids of this network", where=path)
+    inputs = tensors["encoder.weight"].shape[1] if "encoder.weight" in tensors else 69
+    network = ContactTransformer(inputs, batch_axis=batch_axis)
+    tensors["temperature"] = network.temperature
+    load_weights(network, tensors, name="iReplica's contact network", where=path)
+    return network.eval()
+
+
+def _renamed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Released tensors under this module's names; those that are none of the network's keep theirs.
+
+    Encoder layers are known by `layers.0…`, whatever stands before it; the linear layers around them by their shapes.
+    """
+    by_shape = {(_HANDS, _WIDTH): "decoder", (_HANDS, FRAMES * _HANDS): "aggregator"}
+    module = {}
+    for name, value in tensors.items():
+        if name.endswith(".weight") and value.ndim == 2 and "layers." not in name:
+            known = "encoder" if value.shape[0] == _WIDTH else by_shape.get(tuple(value.shape))
+            if known is not None:
+                module[name.removesuffix(".weight")] = known
+    result = {}
+    for name, value in tensors.items():
+        owner, _, kind = name.rpartition(".")
+        if "layers." in name:
+            result[name[name.index("layers.") :]] = value
+        else:
+            result[f"{module[owner]}.{kind}" if owner in module else name] = value
+    return result

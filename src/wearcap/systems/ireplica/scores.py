@@ -1,0 +1,182 @@
+"""Scores of captured interactions against the truth: thesis Tables 5.1, 5.2, 5.5, and hands and objects on their way.
+
+Nothing is aligned before it is measured.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from wearcap.body.anny_body import anny_body
+from wearcap.body.kinematics import site_positions
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.io.formats.environment import read_environment
+from wearcap.metrics.interaction import Handling, contact_mean, handlings, object_error, summary
+from wearcap.metrics.position import mpjpe_cm
+from wearcap.metrics.scores import Measure, score
+from wearcap.metrics.table import Row
+from wearcap.recording import Motion, Recording
+from wearcap.recording.timing import at_times
+from wearcap.runtime.stages import Source
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import SceneObject
+from wearcap.systems.ireplica.object_tracker import PALMS
+from wearcap.systems.ireplica.pipeline import IReplica
+
+SETTLED_S = 0.6
+"""An object's end is looked at so long after it was released, or when it is taken again: releases are seen late."""
+CHAMFER_EVERY_S, CHAMFER_POINTS = 1.0, 1500
+
+
+@dataclass(frozen=True)
+class InteractionScores:
+    """One capture's scores."""
+
+    handlings: tuple[Handling, ...]
+    mpjpe_cm: float
+    """Of the joints in the world, over the whole recording."""
+    body_chamfer_cm: float
+    """Between the captured and the true body during interactions (Table 5.5)."""
+    object_chamfer_cm: float
+    false_moves_cm: float
+    """How far objects that nobody touched were moved, mean over those objects."""
+
+
+def score_interactions(motion: Motion, recording: Recording, environment: Environment) -> InteractionScores:
+    """All scores of one capture; its object motion may lack objects that never moved.
+
+    Raises WearcapError when the recording lacks a true motion, interactions or object motion, or the capture objects.
+    """
+    truth, held = recording.motion, recording.interactions
+    if truth is None or held is None or not recording.object_motion:
+        raise WearcapError("nothing to measure interactions against", where=recording.name,
+                           expected="a true motion, interactions and object motion")  # fmt: skip
+    if motion.object_motion is None:
+        raise WearcapError("this capture has no objects", where=recording.name, expected="object_motion")
+    true = at_times(truth, motion.timestamps)
+    palms = [site_positions(m.skeleton, m.T_world_joint, PALMS) for m in (motion, true)]
+    found = {thing.name: poses_at(motion.object_motion.get(thing.name), thing, motion.timestamps) for thing in environment.objects}  # fmt: skip
+    real = {name: poses_at(recording.object_motion.get(name), environment.by_name(name), motion.timestamps) for name in found}  # fmt: skip
+    rows = handlings(held.start_s, held.stop_s, held.objects)
+    scored = [_handling(row, rows, environment, held, motion.timestamps, palms, found, real) for row in rows]
+    body, things = _chamfer(motion, true, recording, rows, environment, found, real)
+    joints = mpjpe_cm(motion.T_world_joint.t, true.T_world_joint.t).item()
+    return InteractionScores(
+        tuple(scored), joints, body, things, _false_moves(environment, held.objects, found)
+    )
+
+
+def with_interactions(pipeline: IReplica, folder: Path) -> Measure:
+    """The common scores of a motion, and the means over its handlings where the recording's interactions are known."""
+
+    def measure(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
+        row = score(motion, recording, name, seed)
+        if recording.interactions is None:
+            return row
+        environment = read_environment(pipeline.environment_file(Source(recording, folder)))
+        scores = score_interactions(motion, recording, environment)
+        return replace(row, scores=row.scores | summary(scores.handlings))
+
+    return measure
+
+
+def poses_at(track: Trajectory | None, thing: SceneObject, timestamps: Float64[Tensor, "time"]) -> Rigid:
+    """An object's poses at some times; before and after its track it rests, without one it never moved."""
+    if track is None:
+        count = len(timestamps)
+        return Rigid(thing.R_world_object.expand(count, 3, 3), thing.t_world_object.expand(count, 3))
+    inside = timestamps.clamp(track.timestamps[0], track.timestamps[-1])
+    return resample(track, inside).T_world_body
+
+
+def middle_of(thing: SceneObject) -> Float[Tensor, "3"]:
+    """Middle of an object's box in its own axes (m)."""
+    vertices = thing.mesh.vertices
+    return torch.from_numpy((vertices.min(0) + vertices.max(0)) / 2)
+
+
+def _handling(row, rows, environment, held, timestamps, palms, found, real) -> Handling:
+    name, start, stop = row
+    thing = environment.by_name(name)
+    again = min((a for n, a, _ in rows if n == name and a > start), default=float("inf"))
+    end = max(int(torch.searchsorted(timestamps, min(stop + SETTLED_S, again))) - 1, 0)
+    begin = int(torch.searchsorted(timestamps, start).clamp(max=len(timestamps) - 1))
+    middle = middle_of(thing)
+    left = object_error(found[name][end], real[name][end], middle)
+    own = replace(held, **_only(held, [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())]))  # fmt: skip
+    frames = slice(begin, max(int(torch.searchsorted(timestamps, stop)), begin + 1))
+    contact = own.hand_contact(timestamps[frames])
+    apart = torch.stack(
+        [environment.distance(name, palms[0][frames, hand], found[name][frames])[0] for hand in range(2)], 1
+    )
+    way = object_error(found[name][frames], real[name][frames], middle)
+    moved = object_error(real[name][[end]], real[name][[begin]], middle)
+    return Handling(
+        name, thing.category, start, stop, float(left.distance_cm), float(left.angle_deg), float(moved.distance_cm[0]),
+        100 * float(contact_mean(apart, contact)),
+        100 * float(contact_mean((palms[0] - palms[1])[frames].norm(dim=-1), contact)),
+        float(way.distance_cm.mean()), float(way.angle_deg.mean()),
+    )  # fmt: skip
+
+
+def _only(held, chosen: Sequence[bool]) -> dict:
+    keep = torch.tensor(chosen, dtype=torch.bool)
+    pick = lambda names: tuple(name for name, on in zip(names, chosen) if on)  # noqa: E731
+    return {"start_s": held.start_s[keep], "stop_s": held.stop_s[keep], "hands": held.hands[keep],
+            "objects": pick(held.objects), "classes": pick(held.classes)}  # fmt: skip
+
+
+def _false_moves(environment: Environment, touched: tuple[str, ...], found: dict[str, Rigid]) -> float:
+    """Mean over untouched objects of how far their centre ends from where it began (cm)."""
+    rest = [thing for thing in environment.objects if thing.name not in touched]
+    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], middle_of(t)).distance_cm[0] for t in rest]
+    return float(torch.stack(ends).mean()) if ends else 0.0
+
+
+def _chamfer(
+    motion: Motion, true: Motion, recording: Recording, rows, environment: Environment, found, real
+) -> tuple[float, float]:
+    """Symmetric mean distances (cm) between captured and true surfaces of body and handled object, once a second."""
+    body = anny_body(motion.skeleton, recording.shape or None)
+    errors: tuple[list[float], list[float]] = ([], [])
+    for name, start, stop in rows:
+        times = torch.arange(start, stop, CHAMFER_EVERY_S, dtype=torch.float64)
+        frames = torch.searchsorted(motion.timestamps, times).clamp(max=len(motion) - 1).tolist()
+        surface = surface_points(environment.by_name(name))
+        for frame in frames:
+            bodies = [_thinned(body.vertices(m.T_world_joint[frame]).numpy()) for m in (motion, true)]
+            errors[0].append(_both_ways(*bodies))
+            errors[1].append(
+                _both_ways(*((T[name][frame].to(torch.float32) @ surface).numpy() for T in (found, real)))
+            )
+    return tuple(float(np.mean(part)) if part else float("nan") for part in errors)  # pyright: ignore[reportReturnType]
+
+
+def surface_points(thing: SceneObject, count: int = CHAMFER_POINTS) -> Float[Tensor, "point 3"]:
+    """Points spread over an object's surface by area (of a cloud: its own points), always the same."""
+    vertices, faces = thing.mesh.vertices, thing.mesh.faces
+    rng = np.random.default_rng(0)
+    if not len(faces):
+        return torch.from_numpy(vertices[rng.permutation(len(vertices))[:count]])
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    chosen = rng.choice(len(faces), count, p=area / area.sum())
+    u, v = rng.uniform(size=(2, count, 1)).astype(np.float32)
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return torch.from_numpy(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    return points[:: max(1, len(points) // CHAMFER_POINTS)]
+
+
+def _both_ways(a: np.ndarray, b: np.ndarray) -> float:
+    return 50.0 * float(KDTree(a).query(b)[0].mean() + KDTree(b).query(a)[0].mean())

@@ -1,0 +1,80 @@
+"""Training of the contact networks: binary cross-entropy of hand contact from poses (thesis §5.3.2)."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from wearcap.data.statistics import collate
+from wearcap.geometry import rotation
+from wearcap.metrics.detection import mean_detection_scores
+from wearcap.systems.ireplica.contact_network import REACH, ContactNetwork
+from wearcap.systems.ireplica.features import PoseFeatures
+from wearcap.systems.ireplica.training_windows import ContactDataset, ContactWindow
+from wearcap.training.base import GivenOptimizer, SeededSteps
+
+
+class ContactDetection(SeededSteps, GivenOptimizer):
+    """A contact network for some classes of interaction; what it is trained on and scored by are single frames."""
+
+    def __init__(
+        self,
+        net: Callable[..., ContactNetwork],
+        features: PoseFeatures,
+        classes: list[str],
+        fps: float,
+        optimizer: Callable[..., torch.optim.Optimizer],
+        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        seed: int = 0,
+    ):
+        super().__init__()
+        self.net = net(inputs=features.size, classes=len(classes))
+        self.features, self.classes, self.fps, self.seed = features, tuple(classes), fps, seed
+        self._optimizer, self._scheduler = optimizer, scheduler
+        self._validated: list[tuple[Tensor, Tensor]] = []
+
+    def set_statistics(self, dataset: ContactDataset, limit: int = 400) -> None:
+        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        random = torch.Generator().manual_seed(0)
+        windows = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
+        self.net.normalize_on(self._pose(collate([dataset[item] for item in zip(windows, range(limit))])))
+
+    def _pose(self, batch: ContactWindow) -> Float[Tensor, "batch time feature"]:
+        return self.features.encode(batch.R_parent_joint @ rotation.exp(batch.error))
+
+    def _answers(
+        self, batch: ContactWindow
+    ) -> tuple[Float[Tensor, "batch out hand class"], Bool[Tensor, "batch out hand class"]]:
+        """Logits, and the truth of the frames that they are about."""
+        return self.net(self._pose(batch)), batch.contact[:, REACH:-REACH]
+
+    def training_step(self, batch: ContactWindow, batch_idx: int) -> Tensor:
+        logits, truth = self._answers(batch)
+        loss = F.binary_cross_entropy_with_logits(logits, truth.to(logits.dtype))
+        self.log("train/loss", loss, batch_size=len(truth), prog_bar=True)
+        return loss
+
+    def validation_step(self, batch: ContactWindow, batch_idx: int) -> None:
+        logits, truth = self._answers(batch)
+        loss = F.binary_cross_entropy_with_logits(logits, truth.to(logits.dtype))
+        self.log("val/loss", loss, batch_size=len(truth), sync_dist=True)
+        self._validated.append((logits.flatten(0, 1), truth.flatten(0, 1)))
+
+    def validated(
+        self,
+    ) -> tuple[Float[Tensor, "sample hand class"], Bool[Tensor, "sample hand class"]]:
+        """Logits and truth of the validation epoch so far, of all processes."""
+        parts = [torch.cat(part) for part in zip(*self._validated)]
+        every = [torch.as_tensor(self.all_gather(part)).reshape(-1, *part.shape[1:]) for part in parts]
+        return every[0], every[1]
+
+    def on_validation_epoch_end(self) -> None:
+        """Scores per class, hands' mean (thesis Table 5.3): of uncalibrated logits, whose order and sign are the same."""
+        logits, truth = self.validated()
+        for index, name in enumerate(self.classes):
+            scores = mean_detection_scores(logits[..., index].sigmoid(), truth[..., index])
+            for metric in ("average_precision", "precision", "recall", "accuracy"):
+                self.log(f"val/{name}_{metric}", getattr(scores, metric))
+        self._validated.clear()

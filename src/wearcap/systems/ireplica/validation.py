@@ -1,0 +1,80 @@
+"""iReplica with the current weights during validation: what a contact network in training is worth to the objects."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch import Callback
+
+from wearcap.io.formats.environment import read_environment
+from wearcap.metrics.interaction import summary
+from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.runtime.stages import Source
+from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactPredictor
+from wearcap.systems.ireplica.pipeline import IReplica
+from wearcap.systems.ireplica.scores import score_interactions
+from wearcap.systems.ireplica.training import ContactDetection
+from wearcap.training.callbacks import is_due
+
+
+class IReplicaValidation(Callback):
+    """Every n-th validation epoch tracks objects through recordings of the validation split; logs Tables 5.1 and 5.2.
+
+    HPS has no part in the training: its motions are made once. Stands before the weight averaging in the list of
+    callbacks, so that it sees the averaged weights. Recordings that HPS cannot register, or whose objects and
+    interactions are not known, are left out; without any other nothing is logged.
+    """
+
+    def __init__(self, pipeline: Callable[..., IReplica], recordings: int = 2, every_n_epochs: int = 10):
+        """`pipeline`: made for a `predictor`."""
+        self.pipeline, self.recordings, self.every_n_epochs = pipeline, recordings, every_n_epochs
+        self._registered: list[tuple[Recording, Source, Motion]] | None = None
+
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: ContactDetection) -> None:
+        if not is_due(trainer, self.every_n_epochs):
+            return
+        training = pl_module.training
+        detector = ContactDetector(pl_module.net, pl_module.features, pl_module.classes, pl_module.fps)
+        pipeline = self.pipeline(predictor=ContactPredictor(detector))
+        with torch.no_grad():
+            root = trainer.datamodule.val_sources[0].root  # pyright: ignore[reportAttributeAccessIssue]
+            rows = [
+                handling
+                for recording, source, motion in self._motions(pipeline, RecordingStore.open(root))
+                for handling in self._tracked(pipeline, recording, source, motion)
+            ]
+        pl_module.train(training)
+        for name, value in summary(rows).items() if rows else ():
+            pl_module.log(f"ireplica/{name}", value, rank_zero_only=True)
+
+    def _motions(self, pipeline: IReplica, store: RecordingStore) -> list[tuple[Recording, Source, Motion]]:
+        """The first recordings of the validation split, registered by HPS."""
+        if self._registered is None:
+            self._registered = []
+            for name in store.names("val"):
+                if len(self._registered) == self.recordings:
+                    break
+                recording = store.load(name)
+                if not fit(recording, store.root):
+                    continue
+                scan = store.root / recording.scene if recording.scene else None
+                source = Source(recording, store.root, scan)
+                self._registered.append((recording, source, pipeline.registered(source)))
+        return self._registered
+
+    @staticmethod
+    def _tracked(pipeline: IReplica, recording: Recording, source: Source, motion: Motion):
+        environment = read_environment(pipeline.environment_file(source))
+        assert recording.suit is not None
+        captured = pipeline.interact(motion, pipeline.contacts(recording.suit), environment)
+        return score_interactions(captured, recording, environment).handlings
+
+
+def fit(recording: Recording, folder: Path) -> bool:
+    """Whether a recording has what the tracker takes, and the truth that it is measured against."""
+    files = recording.environment, recording.scene
+    sensed = recording.suit, recording.camera, recording.localization
+    true = recording.motion, recording.interactions
+    known = None not in sensed and None not in true and bool(recording.object_motion)
+    return known and all(name is not None and (folder / name).is_file() for name in files)

@@ -1,0 +1,1 @@
+"""MocapEvery: full-body motion from two watches and a head camera."""

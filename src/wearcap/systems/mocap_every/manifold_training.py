@@ -1,0 +1,71 @@
+"""Training of MocapEvery's motion manifold: what it rebuilds is compared as in the document's eq. 9."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.skeleton import Skeleton
+from wearcap.data.statistics import MIN_SCALE, collate
+from wearcap.metrics.position import mpjpe_cm
+from wearcap.systems.mocap_every.manifold import MotionManifold
+from wearcap.systems.mocap_every.manifold_features import FEET, Posed, decode_window, encode_window, origin_of
+from wearcap.systems.mocap_every.training_windows import WatchDataset, WatchWindow
+from wearcap.training.base import WeighedTerms
+
+
+class ManifoldTraining(WeighedTerms):
+    """Windows of true motion are compressed and rebuilt.
+
+    Loss terms (eq. 9), weighed by `loss_weights`, are L1: "contact", "root" (translation and rotation), "rotation" of
+    the joints, "position" (m); "velocity" (m/s) is ours.
+    """
+
+    def __init__(
+        self,
+        net: Callable[..., MotionManifold],
+        skeleton: Skeleton,
+        fps: float,
+        loss_weights: dict[str, float],
+        optimizer: Callable[..., torch.optim.Optimizer],
+        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+    ):
+        super().__init__()
+        self.net = net(size=FEET + 3 + 6 * len(skeleton))
+        self.skeleton, self.fps, self.loss_weights = skeleton, fps, dict(loss_weights)
+        self._optimizer, self._scheduler = optimizer, scheduler
+
+    def set_statistics(self, dataset: WatchDataset, limit: int = 1000) -> None:
+        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        random = torch.Generator().manual_seed(0)
+        drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
+        window = _posed(collate([dataset[item] for item in zip(drawn, range(limit))]))
+        rows = encode_window(window, origin_of(window)).flatten(0, 1)
+        self.net.normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
+
+    def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
+        """Every loss term of a batch, unweighted, and the error of joints (cm)."""
+        window = _posed(batch)
+        origin = origin_of(window)
+        X = encode_window(window, origin)
+        rebuilt = self.net(X)
+        error = (rebuilt - X).abs()
+        joints, joints_true = (self._joints(decode_window(x, origin), batch) for x in (rebuilt, X))
+        wrong = joints - joints_true
+        return {
+            "contact": error[..., :FEET].mean(),
+            "root": error[..., FEET : FEET + 9].mean(),
+            "rotation": error[..., FEET + 9 :].mean(),
+            "position": wrong.abs().mean(),
+            "velocity": (wrong.diff(dim=1) * self.fps).abs().mean(),
+            "joints_cm": mpjpe_cm(joints.detach(), joints_true),
+        }
+
+    def _joints(self, window: Posed, batch: WatchWindow) -> Tensor:
+        offsets = batch.t_parent_joint[:, None]
+        return forward_kinematics(self.skeleton, window.R_parent_joint, window.t_world_root, offsets).t
+
+
+def _posed(batch: WatchWindow) -> Posed:
+    return Posed(batch.R_parent_joint, batch.t_world_root, batch.foot_contact)

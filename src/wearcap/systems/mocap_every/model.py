@@ -1,0 +1,147 @@
+"""MocapEvery's two-stage estimator (§3.3): end-effectors first, then contacts, then the body."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from wearcap.models.layers import Normalizer, TemporalBlend
+from wearcap.models.pose_regressor import PoseRegressor
+
+ENDS_SIZE = 12
+"""Positions of two hands and two feet."""
+FEET = 2
+
+
+class Estimate(NamedTuple):
+    """What is said of the last frames of a window (all of them, or the last one alone)."""
+
+    motion: Float[Tensor, "batch said motion"]
+    """Root translation and 6D rotations in the window's frame."""
+    contact_logit: Float[Tensor, "batch said foot"]
+    ends: Float[Tensor, "batch said 12"] | None
+    """Positions of hands and feet from the first stage (m); None where there is no such stage."""
+
+
+class WatchEstimator(nn.Module):
+    """What says bodies from windows of so many frames."""
+
+    window: int
+
+    def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
+        """What is said of raw features."""
+        raise NotImplementedError
+
+
+class TwoStageEstimator(WatchEstimator):
+    """Two transformer encoders in a row (document: width 1280, 4 layers, 10 heads, MLP heads of 256).
+
+    With one stage (`multi_stage` False, the document's ablation) the second encoder alone speaks. Positions of
+    tokens are learned. `frames_per_token` > 1 (ours, for CPUs) lets neighbouring frames share a token.
+    """
+
+    def __init__(
+        self,
+        feature_size: int,
+        motion_size: int,
+        window: int = 40,
+        width: int = 1280,
+        layers: int = 4,
+        heads: int = 10,
+        feedforward: int = 2048,
+        hidden: int = 256,
+        dropout: float = 0.1,
+        multi_stage: bool = True,
+        frames_per_token: int = 1,
+        blend: int = 0,
+    ):
+        """`blend` (odd; 0: none) frames of what is said are blended by learned weights (ours, against tremor)."""
+        super().__init__()
+        if window % frames_per_token:
+            raise ValueError(f"a window of {window} frames does not split into tokens of {frames_per_token}")
+        self.window, self.per_token = window, frames_per_token
+        self.feature_normalizer, self.motion_normalizer = Normalizer(feature_size), Normalizer(motion_size)
+        self.ends_normalizer = Normalizer(ENDS_SIZE)
+        tokens = window // frames_per_token
+        per = frames_per_token
+
+        def encoder() -> nn.TransformerEncoder:
+            layer = nn.TransformerEncoderLayer(
+                width, heads, feedforward, dropout, batch_first=True, norm_first=True
+            )
+            return nn.TransformerEncoder(layer, layers, nn.LayerNorm(width), enable_nested_tensor=False)
+
+        def head(inputs: int, outputs: int) -> nn.Sequential:
+            return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, per * outputs))
+
+        self.first: nn.ModuleDict | None = None
+        if multi_stage:
+            self.first = nn.ModuleDict({"embed": nn.Linear(per * feature_size, width), "encoder": encoder(),
+                                        "ends": head(width, ENDS_SIZE)})  # fmt: skip
+            self.first_position = nn.Parameter(0.02 * torch.randn(tokens, width))
+            self.embed_ends = nn.Linear(per * ENDS_SIZE, width // 2)
+        self.embed = nn.Linear(per * feature_size, width // 2 if multi_stage else width)
+        self.position = nn.Parameter(0.02 * torch.randn(tokens, width))
+        self.encoder = encoder()
+        self.contact = head(width, FEET)
+        self.body = head(width + per * FEET, motion_size)
+        self.blend = TemporalBlend(blend) if blend else None
+
+    def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
+        """What is said of every frame of raw features."""
+        x = self._tokens(self.feature_normalizer(features))
+        ends, embedded = None, self.embed(x)
+        if self.first is not None:
+            said = self.first["encoder"](self.first["embed"](x) + self.first_position)
+            ends = self._frames(self.first["ends"](said))
+            embedded = torch.cat([embedded, self.embed_ends(self._tokens(ends))], -1)
+            ends = self.ends_normalizer.inverse(ends)
+        encoded = self.encoder(embedded + self.position)
+        logit = self.contact(encoded)
+        motion = self._frames(self.body(torch.cat([encoded, logit.sigmoid()], -1)))
+        if self.blend is not None:
+            motion = self.blend(motion, torch.ones(motion.shape[:2], dtype=torch.bool, device=motion.device))
+        return Estimate(self.motion_normalizer.inverse(motion), self._frames(logit), ends)
+
+    def _tokens(self, frames: Float[Tensor, "batch window feature"]) -> Float[Tensor, "batch token wide"]:
+        return frames.unflatten(1, (-1, self.per_token)).flatten(2)
+
+    def _frames(self, tokens: Float[Tensor, "batch token wide"]) -> Float[Tensor, "batch window feature"]:
+        return tokens.unflatten(2, (self.per_token, -1)).flatten(1, 2)
+
+
+class LastPoseEstimator(WatchEstimator):
+    """AvatarPoser's way (Jiang et al. 2022), for comparison: the pose of a window's last frame, from one encoder."""
+
+    def __init__(
+        self, feature_size: int, motion_size: int, window: int = 40, width: int = 256, layers: int = 3, heads: int = 8,
+        feedforward: int = 2048, dropout: float = 0.1, frames_per_token: int = 1,
+    ):  # fmt: skip
+        super().__init__()
+        self.window = window
+        self.regressor = PoseRegressor(
+            feature_size,
+            motion_size + FEET,
+            window,
+            width,
+            layers,
+            heads,
+            feedforward,
+            dropout,
+            frames_per_token,
+        )
+        self.motion_normalizer, self.ends_normalizer = Normalizer(motion_size), Normalizer(ENDS_SIZE)
+
+    @property
+    def feature_normalizer(self) -> Normalizer:
+        return self.regressor.feature_normalizer
+
+    def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
+        """What is said of the last frame of raw features."""
+        exist = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
+        said = self.regressor(features, exist)[:, None]
+        return Estimate(self.motion_normalizer.inverse(said[..., :-FEET]), said[..., -FEET:], None)
+
+
+TrainedEstimator = TwoStageEstimator | LastPoseEstimator

@@ -1,0 +1,297 @@
+"""MocapEvery while things happen: head poses and watch samples go in as they come, poses come out frame by frame.
+
+Windows, floor and hanging are those of `MocapEvery.run`: with the same stride, lookahead and first floor the motion
+is the same. What a stream waits for beside its lookahead are the three frames that the mean filter sees ahead.
+"""
+
+import math
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.recording import ImuStream, Motion
+from wearcap.recording.timing import joined
+from wearcap.sensors.packets import (
+    MAX_ACC_M_S2,
+    MAX_WAITING,
+    OFF_THE_CLOCK,
+    WRONG_TYPE,
+    Admitted,
+    Clock,
+    HeadDoor,
+    connected,
+    owned,
+    rotation_fault,
+    time_fault,
+    vector_fault,
+)
+from wearcap.sensors.watches import FILTER, MAX_GAP_S, WRISTS, filtered
+from wearcap.systems.mocap_every.features import Sensed
+from wearcap.systems.mocap_every.pipeline import MocapEvery
+from wearcap.systems.mocap_every.windows import EstimatorWindows, Said
+from wearcap.tracking.anchor import hang_from_head
+from wearcap.tracking.head_track import Chunk, HeadTrack
+
+MAX_POINTS = 1_000_000
+"""Points that wait for the head's pose; the oldest make room."""
+
+
+class WatchSample(NamedTuple):
+    """What a watch said at one moment."""
+
+    timestamp: float
+    """Seconds, on the camera's clock."""
+    R_world_imu: Float[Tensor, "3 3"]
+    acc_world: Float[Tensor, "3"]
+    """Free acceleration (m/s²)."""
+
+
+@dataclass(frozen=True)
+class Wearing:
+    """Who wears the kit, and how it sits."""
+
+    skeleton: Skeleton
+    R_head_device: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
+    t_head_device: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
+    R_wrist_imu: Mapping[str, Float[Tensor, "3 3"]] = field(default_factory=dict)
+    """Mounting of each watch on its wrist joint, where it is not the joint's own."""
+    floor_m: float | None = None
+    """Height of the floor at the beginning (the document's h_0); None: the first head's, less that of one who stands."""
+
+
+class MocapEverySession:
+    """A streaming capture of one wearer.
+
+    Frames wait until both watches have said what they are told from; a watch that is silent for longer than
+    `watches.MAX_GAP_S` is taken to rest as it was, without acceleration, and counted in `silent`.
+    What cannot be true (`sensors.packets`) is `refused`. Where the camera's clock goes back for good, the capture begins
+    anew as a new session would; the watches are on that clock.
+    """
+
+    def __init__(self, pipeline: MocapEvery, wearing: Wearing):
+        pipeline.prepare()
+        self.pipeline, self.wearing = pipeline, wearing
+        self.silent = 0
+        """Frames for which a watch had nothing to say."""
+        self._door = HeadDoor()
+        self._track = HeadTrack(pipeline.fps, pipeline.stride)
+        self._samples: dict[str, list[WatchSample]] = {joint: [] for joint in WRISTS}
+        self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
+        self._finished: list[Motion] = []
+        """Of before the clock went back, not given yet."""
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin anew: what the watches said stays, and the counts."""
+        dropped = self._track.dropped
+        self._track = HeadTrack(self.pipeline.fps, self.pipeline.stride)
+        self._track.dropped = dropped
+        self._chunks: list[Chunk] = []
+        self._windows: EstimatorWindows | None = None
+        self._begin_s = 0.0
+        self._points: list[Tensor] = []
+        self._times = torch.zeros(0, dtype=torch.float64)
+        self._heads = Rigid(torch.zeros(0, 3, 3), torch.zeros(0, 3))
+        """Of the frames that are taken and not given yet."""
+
+    @property
+    def dropped(self) -> int:
+        """Head poses that came too late, twice, or were refused."""
+        return self._track.dropped + self._door.dropped
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """How many packets, or parts of them, were refused, by reason: "left_wrist: out of range"."""
+        return dict(self._door.refused)
+
+    def head(
+        self,
+        timestamp: float,
+        T_world_device: Rigid | None,
+        points_world: Float[Tensor, "point 3"] | None = None,
+    ) -> None:
+        """Take in a moment of the camera: its pose, if tracking has one, and points that are new."""
+        if self._door.timely(timestamp):
+            packet = self._door.pose(T_world_device), self._door.points(points_world)
+            self._take(self._door.admit(float(timestamp), packet))
+
+    def _take(self, admitted: Admitted) -> None:
+        if admitted.begins:
+            if admitted.again and (motion := self._final(ended=True)) is not None:
+                self._finished.append(motion)
+            self._begin()
+            for joint in self._samples:
+                self._rejoin(joint, None if admitted.again else admitted.packets[0][0])
+        for time, (pose, points) in admitted.packets:
+            self._track.take(time, pose)
+            if points is not None and len(points):
+                self._points.append(points)
+        if len(self._points) > 1000:
+            self._points = [torch.cat(self._points)[-MAX_POINTS:]]
+
+    def _rejoin(self, joint: str, time: float | None) -> None:
+        """Keep of a watch what belongs to the clock that begins at a time; None: nothing does."""
+        samples = self._samples[joint]
+        kept = [] if time is None else samples[connected([sample.timestamp for sample in samples], time)]
+        refused = self._clocks[joint].set(kept[-1].timestamp if kept else None)
+        self._refuse(joint, refused if time is None else refused + len(samples) - len(kept))
+        self._samples[joint] = kept
+
+    def _refuse(self, joint: str, count: int) -> None:
+        if count:
+            self._door.refuse(joint, OFF_THE_CLOCK, count)
+
+    def watch(self, joint: str, samples: Sequence[WatchSample]) -> None:
+        """Take in what a watch said; samples that come twice are left out.
+
+        Raises WearcapError for another joint than the wrists.
+        """
+        if joint not in self._samples:
+            raise WearcapError(f"no watch on {joint!r}", expected=" or ".join(WRISTS))
+        clock = self._clocks[joint]
+        for sample in samples:
+            if fault := _fault(sample):
+                self._door.refuse(joint, fault)
+                continue
+            sample = WatchSample(float(sample.timestamp), owned(sample.R_world_imu), owned(sample.acc_world))
+            admitted = clock.admit(sample.timestamp, sample, self._door.clock.newest)
+            self._refuse(joint, admitted.refused)
+            if admitted.begins:
+                first = bisect_left(self._samples[joint], admitted.packets[0][0], key=_time)
+                self._samples[joint] = self._samples[joint][: first if admitted.again else 0]
+            for _, believed in admitted.packets:
+                _insert(self._samples[joint], believed)
+
+    def poses(self, ended: bool = False) -> Motion | None:
+        """The frames that are final since the last time; `ended`: nothing more will come.
+
+        Where the camera's clock has gone back these are the frames before; call again for those with the new times.
+        """
+        if ended:
+            for time, (pose, _) in self._door.end():
+                self._track.take(time, pose)
+        return self._finished.pop(0) if self._finished else self._final(ended)
+
+    def _final(self, ended: bool) -> Motion | None:
+        while (chunk := self._track.next(ended)) is not None:
+            self._chunks.append(chunk)
+        given: list[Motion] = []
+        end_s = self._chunks[-1].timestamps[-1].item() if ended and self._chunks else math.inf
+        while self._chunks and (ended or self._told(self._chunks[0])):
+            given += self._advance(self._chunks.pop(0), end_s)
+        if ended and self._windows is not None:
+            given += self._give(self._windows.finish())
+            self._windows = None
+        return joined(given)
+
+    def _told(self, chunk: Chunk) -> bool:
+        """Whether both watches have said all that a chunk is told from, or are silent."""
+        last = chunk.timestamps[-1].item()
+        needed = last + (FILTER // 2 + 0.5) / self.pipeline.fps
+        newest = [samples[-1].timestamp if samples else -math.inf for samples in self._samples.values()]
+        head = self._track.newest
+        return all(time >= needed or head > max(time, last) + MAX_GAP_S for time in newest)
+
+    @torch.inference_mode()
+    def _advance(self, chunk: Chunk, end_s: float) -> list[Motion]:
+        given: list[Motion] = []
+        mount = Rigid(self.wearing.R_head_device, self.wearing.t_head_device).inverse()
+        T_world_head = chunk.T_world_device @ mount
+        if chunk.begins or self._windows is None:
+            if self._windows is not None:
+                given += self._give(self._windows.finish())
+            self._begin_s = chunk.timestamps[0].item()
+            floor_m = self.wearing.floor_m if self._windows is None else self._windows.floor_m
+            if floor_m is None:
+                floor_m = T_world_head.t[0, 2].item() - self.wearing.skeleton.height_of("head")
+            follower = self.pipeline.follower(self.wearing.skeleton, floor_m)
+            self._windows = EstimatorWindows(self.pipeline, self.wearing.skeleton, follower)
+        elif len(chunk.amended.t):
+            self._windows.amend(chunk.amended @ mount)
+        for points in self._points:
+            self._windows.floor.see(points)
+        self._points.clear()
+        R, acc = self._watches(chunk, end_s)
+        sensed = Sensed(T_world_head.R, T_world_head.t, R, acc, torch.zeros_like(acc))
+        self._times = torch.cat([self._times, chunk.timestamps])
+        self._heads = Rigid(
+            *(
+                torch.cat(part)
+                for part in zip((self._heads.R, self._heads.t), (T_world_head.R, T_world_head.t))
+            )
+        )
+        return given + self._give(self._windows.advance(sensed))
+
+    def _watches(
+        self, chunk: Chunk, end_s: float
+    ) -> tuple[Float[Tensor, "time wrist 3 3"], Float[Tensor, "time wrist 3"]]:
+        """What the watches say of a chunk's frames; the filter sees nothing before the stretch and behind `end_s`."""
+        step = 1 / self.pipeline.fps
+        frames = torch.arange(-(FILTER // 2), len(chunk.timestamps) + FILTER // 2, dtype=torch.float64)
+        around = chunk.timestamps[0] + step * frames
+        around = around.clamp(self._begin_s, end_s)
+        streams = []
+        for joint, samples in self._samples.items():
+            if not samples or samples[-1].timestamp < chunk.timestamps[-1].item() - MAX_GAP_S:
+                self.silent += len(chunk.timestamps)
+                samples = self._resting(samples, chunk)
+            elif len(samples) == 1:
+                samples = [samples[0]._replace(timestamp=samples[0].timestamp - step), *samples]
+            streams.append(ImuStream(
+                torch.tensor([s.timestamp for s in samples], dtype=torch.float64), joint,
+                torch.stack([s.R_world_imu for s in samples]), torch.stack([s.acc_world for s in samples]),
+                R_joint_imu=self.wearing.R_wrist_imu.get(joint),
+            ))  # fmt: skip
+            forget = around[-FILTER].item() - 2 * step
+            kept = self._samples[joint]
+            self._samples[joint] = [s for s in kept if s.timestamp >= forget] or kept[-1:]
+        return filtered(streams, chunk.timestamps, around, step)
+
+    def _resting(self, samples: list[WatchSample], chunk: Chunk) -> list[WatchSample]:
+        """A watch as it was last, at rest."""
+        R = samples[-1].R_world_imu if samples else torch.eye(3)
+        return [
+            WatchSample(time, R, torch.zeros(3))
+            for time in (chunk.timestamps[0].item() - 1.0, chunk.timestamps[-1].item() + 1.0)
+        ]
+
+    def _give(self, said: Said) -> list[Motion]:
+        count = len(said.t_world_root)
+        if not count:
+            return []
+        times, heads = self._times[:count], self._heads[:count]
+        self._times, self._heads = self._times[count:], self._heads[count:]
+        motion = Motion(times, self.wearing.skeleton, said.R_parent_joint, said.t_world_root,
+                        said.contact_prob.repeat_interleave(2, -1), provenance=self.pipeline.settings())  # fmt: skip
+        return [hang_from_head(motion, heads) if self.pipeline.hang else motion]
+
+
+def _time(sample: WatchSample) -> float:
+    return sample.timestamp
+
+
+def _fault(sample: object) -> str | None:
+    """What is wrong with a watch's sample."""
+    if not isinstance(sample, WatchSample):
+        return WRONG_TYPE
+    return (
+        time_fault(sample.timestamp)
+        or rotation_fault(sample.R_world_imu)
+        or vector_fault(sample.acc_world, MAX_ACC_M_S2)
+    )
+
+
+def _insert(known: list[WatchSample], sample: WatchSample) -> None:
+    """Put a sample where it belongs in time, unless there is one already."""
+    place = bisect_left(known, sample.timestamp, key=_time)
+    if place == len(known) or known[place].timestamp != sample.timestamp:
+        known.insert(place, sample)
+        del known[:-MAX_WAITING]

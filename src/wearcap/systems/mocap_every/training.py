@@ -1,0 +1,136 @@
+"""Training of MocapEvery's estimator: the losses of §3.3 (eq. 2–4), forward kinematics inside."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.skeleton import Skeleton
+from wearcap.data.statistics import MIN_SCALE, collate
+from wearcap.systems.mocap_every.features import ENDS, Canonical, WatchFeatures, to_world
+from wearcap.systems.mocap_every.model import TrainedEstimator
+from wearcap.systems.mocap_every.training_windows import WatchDataset, WatchWindow
+from wearcap.training.base import SeededSteps, WeighedTerms
+from wearcap.training.losses import EPSILON_M2
+
+
+class WatchRegression(SeededSteps, WeighedTerms):
+    """Regression of bodies from a head and two wrists.
+
+    Loss terms, weighed by `loss_weights`, are means over frames and joints: "root" and "rotation" (eq. 2), "position"
+    with `joint_weights` for hands and feet (eq. 3), "mid" and "consistency" of the first stage (eq. 4), "contact"
+    (cross entropy), "foot_velocity"; "velocity" of all joints is ours.
+    """
+
+    _joint_weights: Tensor
+
+    def __init__(
+        self,
+        net: Callable[..., TrainedEstimator],
+        features: WatchFeatures,
+        skeleton: Skeleton,
+        fps: float,
+        loss_weights: dict[str, float],
+        optimizer: Callable[..., torch.optim.Optimizer],
+        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        end_weight: float = 1.0,
+        seed: int = 0,
+    ):
+        """`end_weight`: of hands and feet among the joints of "position"."""
+        super().__init__()
+        self.net = net(feature_size=features.size, motion_size=features.motion_size)
+        self.features, self.skeleton, self.fps = features, skeleton, fps
+        self.loss_weights, self.seed = dict(loss_weights), seed
+        self._ends = skeleton.indices(*ENDS)
+        weights = torch.ones(len(skeleton))
+        weights[self._ends] = end_weight
+        self.register_buffer("_joint_weights", weights / weights.mean(), persistent=False)
+        self._optimizer, self._scheduler = optimizer, scheduler
+
+    def pipeline_parts(self) -> dict[str, Any]:
+        """What a `MocapEvery` pipeline takes from here."""
+        return {"net": self.net, "features": self.features, "skeleton": self.skeleton, "fps": self.fps}
+
+    def set_statistics(self, dataset: WatchDataset, limit: int = 1500) -> None:
+        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        random = torch.Generator().manual_seed(0)
+        drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
+        batch = collate([dataset[item] for item in zip(drawn, range(limit))])
+        features, motion, canonical = self._inputs(batch)
+        ends = self._seen(self._joints(motion, batch, canonical)[:, :, self._ends], batch, canonical).flatten(
+            -2
+        )
+        for normalizer, rows in (
+            (self.net.feature_normalizer, features), (self.net.motion_normalizer, motion), (self.net.ends_normalizer, ends),
+        ):  # fmt: skip
+            rows = rows.flatten(0, 1)
+            normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
+
+    def _inputs(
+        self, batch: WatchWindow
+    ) -> tuple[Float[Tensor, "batch time feature"], Float[Tensor, "batch time motion"], Canonical]:
+        """Features, true motion, and the windows' frames."""
+        canonical = self.features.canonical(batch.sensed, batch.floor_height)
+        features = self.features.encode(batch.sensed, batch.floor_height, batch.size, canonical)
+        true = self.features.encode_motion(batch.R_parent_joint, batch.t_world_root, batch.sensed, canonical)
+        return features, true, canonical
+
+    def _joints(
+        self, motion: Float[Tensor, "batch said motion"], batch: WatchWindow, canonical: Canonical
+    ) -> Float[Tensor, "batch said joint 3"]:
+        """Joints (m) in the world."""
+        R, t = to_world(*self.features.decode_motion(motion, batch.sensed, canonical), canonical)
+        return forward_kinematics(self.skeleton, R, t, batch.t_parent_joint[:, None]).t
+
+    def _placed(
+        self, ends: Float[Tensor, "batch time end 3"], batch: WatchWindow, canonical: Canonical
+    ) -> Float[Tensor, "batch time end 3"]:
+        """End-effectors in the world, from where they are said."""
+        origin = self.features.origin(batch.sensed, canonical)
+        return (
+            canonical.t[:, :, None]
+            + (canonical.R[:, :, None] @ (ends + origin[:, :, None])[..., None])[..., 0]
+        )
+
+    def _seen(
+        self, ends: Float[Tensor, "batch time end 3"], batch: WatchWindow, canonical: Canonical
+    ) -> Float[Tensor, "batch time end 3"]:
+        """The inverse of `_placed`."""
+        origin = self.features.origin(batch.sensed, canonical)
+        return (canonical.R.mT[:, :, None] @ (ends - canonical.t[:, :, None])[..., None])[..., 0] - origin[
+            :, :, None
+        ]
+
+    def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
+        """Every loss term of a batch, unweighted."""
+        features, true, canonical = self._inputs(batch)
+        said = self.net(features)
+        last = said.motion.shape[1]
+        motion, true = said.motion.float(), true[:, -last:]
+        joints, joints_true = (self._joints(each, batch, canonical) for each in (motion, true))
+        error = motion - true
+        turns, distance = _norm(error[..., 3:].unflatten(-1, (-1, 6))), _norm(joints - joints_true)
+        terms = {
+            "root": (_norm(error[..., :3]) + turns[..., 0]).mean(),
+            "rotation": turns[..., 1:].mean(),
+            "position": (distance * self._joint_weights).mean(),
+            "contact": F.binary_cross_entropy_with_logits(
+                said.contact_logit.float(), batch.foot_contact[:, -last:]
+            ),
+        }
+        if last > 1:
+            velocity = _norm((joints - joints_true).diff(dim=1) * self.fps)
+            terms |= {"foot_velocity": velocity[:, :, self._ends[2:]].mean(), "velocity": velocity.mean()}
+        if said.ends is not None:
+            ends = self._placed(said.ends.float().unflatten(-1, (-1, 3)), batch, canonical)
+            terms["mid"] = _norm(ends - joints_true[:, :, self._ends]).mean()
+            terms["consistency"] = _norm(joints[:, :, self._ends] - ends).mean()
+        return terms
+
+
+def _norm(value: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch"]:
+    return (value.square().sum(-1) + EPSILON_M2).sqrt()

@@ -1,0 +1,222 @@
+"""MocapEvery's second half (§3.4): a captured motion is edited within the manifold until it agrees with what was seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float, Float64, Int64
+from torch import Tensor
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import nearest_frames
+from wearcap.recording import Motion, Recording
+from wearcap.recording.recording import Cue
+from wearcap.systems.mocap_every.energy import (
+    Body,
+    LatentSolution,
+    LatentSolver,
+    LatentWeights,
+    PixelCue,
+    PlaceCue,
+    PoseCue,
+    Seen,
+    energy_terms,
+    hung_body,
+    solve_latent,
+)  # fmt: skip
+from wearcap.systems.mocap_every.manifold import MotionManifold
+from wearcap.systems.mocap_every.manifold_features import FEET, Posed, decode_window, encode_window, origin_of
+from wearcap.tracking.anchor import hang_from_head
+
+FOOT_JOINTS = ("left_toe", "right_toe")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A wearer's pose as another wearer's camera saw it: frames with a confidence per joint; 0 says nothing."""
+
+    motion: Motion
+    confidence: Float[Tensor, "time joint"]
+
+
+@dataclass
+class VisualCues:
+    """Edits windows in which anything was seen; what was not seen stays as it was captured."""
+
+    manifold: MotionManifold
+    weights: LatentWeights = field(default_factory=LatentWeights)
+    solver: LatentSolver = field(default_factory=LatentSolver)
+    window: int = 80
+    """Frames, edited at once; windows advance by half of it and are blended."""
+    residual: bool = True
+    """Whether what the manifold changes is added to the capture (ours), or the manifold's own motion taken (the
+    document), with what its autoencoder loses."""
+    smooth: float = 2.0
+    """Frames (deviation of a Gaussian) over which a change is spread, so that a detector's errors do not shake the arm;
+    with `residual` alone (ours)."""
+    batch: int = 16
+    """Windows that are edited at once."""
+
+    def edit(
+        self, motion: Motion, recording: Recording, T_world_head: Rigid, views: Sequence[View] = ()
+    ) -> tuple[Motion, list[LatentSolution]]:
+        """The motion, edited by the recording's cues and by other wearers' views, and how each batch went.
+
+        `T_world_head` holds the head's measured poses at the motion's frames.
+        """
+        cues = [
+            at_frames(cue, motion.timestamps)
+            for cue in recording.cues.values()
+            if cue.joint in motion.skeleton
+        ]
+        seen = [view_at_frames(view, motion.timestamps) for view in views]
+        said = [cue.confidence for cue in cues] + [view.confidence.amax(-1) for view in seen]
+        if not said or not torch.stack(said).any():
+            return motion, []
+        starts = self._starts(torch.stack(said).amax(0) > 0)
+        edited, solutions = _Blend(motion, self.window), []
+        for some in starts.split(self.batch):
+            frames = some[:, None] + torch.arange(self.window)
+            R, root, solution = self._edit_windows(motion, recording, T_world_head, frames, cues, seen)
+            edited.add(frames, R, root)
+            solutions.append(solution)
+        return hang_from_head(edited.motion(), T_world_head), solutions
+
+    def _starts(self, shown: Tensor) -> Int64[Tensor, "window"]:
+        """First frames of the windows, on a grid of half windows, that show anything; the outer ones reach beyond."""
+        half = self.window // 2
+        grid = torch.arange(-half, len(shown), half)
+        counted = torch.cat([torch.zeros(1, dtype=torch.int64), shown.long().cumsum(0)])
+        within = (grid + self.window).clamp_max(len(shown))
+        return grid[counted[within] > counted[grid.clamp_min(0)]]
+
+    def _edit_windows(
+        self, motion: Motion, recording: Recording, T_world_head: Rigid, frames: Int64[Tensor, "window time"],
+        cues: list[Cue], views: list[View],
+    ) -> tuple[Tensor, Tensor, LatentSolution]:  # fmt: skip
+        skeleton = motion.skeleton
+        there = (frames >= 0) & (frames < len(motion))
+        frames = frames.clamp(0, len(motion) - 1)
+        window = Posed(
+            motion.R_parent_joint[frames], motion.t_world_root[frames], _foot_contact(motion)[frames]
+        )
+        head = Rigid(T_world_head.R[frames], T_world_head.t[frames])
+        seen = _seen(recording, skeleton, head, frames, there, cues, views)
+        origin = origin_of(window)
+        X0 = encode_window(window, origin)
+        feet = skeleton.indices(*FOOT_JOINTS)
+        with torch.no_grad():
+            start = self.manifold.encode(X0)
+            rebuilt = self.manifold.decode(start)
+
+        spread = _spread(self.window, self.smooth)
+
+        def edited(latent: Tensor) -> Tensor:
+            said = self.manifold.decode(latent)
+            return X0 + spread @ (said - rebuilt) if self.residual else said
+
+        def body(latent: Tensor) -> Body:
+            posed = decode_window(edited(latent), origin)
+            return hung_body(skeleton, posed.R_parent_joint, window.foot_contact, head)
+
+        solution = solve_latent(
+            start,
+            lambda z: energy_terms(body(z), seen, z - start, feet, motion.fps, self.weights),
+            self.solver,
+        )
+        with torch.no_grad():
+            posed = decode_window(edited(solution.latent), origin)
+        return posed.R_parent_joint, posed.t_world_root, solution
+
+
+def _spread(window: int, frames: float) -> Float[Tensor, "time time"]:
+    """Averages over time with the weights of a Gaussian; 0 frames: nothing is averaged."""
+    time = torch.arange(window, dtype=torch.float32)
+    weight = torch.exp(-0.5 * ((time[:, None] - time) / max(frames, 1e-3)) ** 2)
+    return weight / weight.sum(1, keepdim=True)
+
+
+class _Blend:
+    """Frames of overlapping windows, each weighed by how far it is from its window's ends; elsewhere as captured."""
+
+    def __init__(self, motion: Motion, window: int):
+        self._motion = motion
+        self._weight = torch.hann_window(window, periodic=True)
+        self._rotations = torch.zeros(len(motion), 6 * len(motion.skeleton))
+        self._roots, self._shares = torch.zeros(len(motion), 3), torch.zeros(len(motion))
+
+    def add(self, frames: Tensor, R: Tensor, root: Tensor) -> None:
+        there = (frames >= 0) & (frames < len(self._shares))
+        weight = (self._weight * there).flatten()
+        at = frames.flatten().clamp(0, len(self._shares) - 1)
+        self._rotations.index_add_(
+            0, at, weight[:, None] * rotation.rot6d_from_matrix(R).flatten(-2).flatten(0, 1)
+        )
+        self._roots.index_add_(0, at, weight[:, None] * root.flatten(0, 1))
+        self._shares.index_add_(0, at, weight)
+
+    def motion(self) -> Motion:
+        motion = self._motion
+        left = (1 - self._shares).clamp_min(0)[:, None]
+        whole = self._shares[:, None] + left
+        turned = self._rotations + left * rotation.rot6d_from_matrix(motion.R_parent_joint).flatten(-2)
+        R = rotation.matrix_from_rot6d((turned / whole).unflatten(-1, (-1, 6)))
+        return replace(
+            motion, R_parent_joint=R, t_world_root=(self._roots + left * motion.t_world_root) / whole
+        )
+
+
+def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
+    """A cue at a motion's frames: the nearest observation within half a frame; no confidence where there is none."""
+    if not len(cue.timestamps):
+        empty = torch.zeros(len(timestamps), cue.points.shape[-1])
+        return replace(cue, timestamps=timestamps, points=empty, confidence=torch.zeros(len(timestamps)))
+    nearest = nearest_frames(cue.timestamps, timestamps)
+    step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
+    points = cue.points[nearest]
+    near = ((cue.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6) & points.isfinite().all(-1)
+    return replace(
+        cue, timestamps=timestamps, points=points.nan_to_num(), confidence=cue.confidence[nearest] * near
+    )
+
+
+def view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> View:
+    """A view at a motion's frames, likewise."""
+    nearest = nearest_frames(view.motion.timestamps, timestamps)
+    step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
+    near = (view.motion.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6
+    motion = replace(
+        view.motion, timestamps=timestamps, R_parent_joint=view.motion.R_parent_joint[nearest],
+        t_world_root=view.motion.t_world_root[nearest], contact_prob=None, hand_contact_prob=None, body_contact_prob=None, object_motion=None,
+    )  # fmt: skip
+    return View(motion, view.confidence[nearest] * near[:, None])
+
+
+def _seen(
+    recording: Recording, skeleton: Skeleton, head: Rigid, frames: Tensor, there: Tensor, cues: list[Cue], views: list[View],
+) -> Seen:  # fmt: skip
+    """What of it falls into windows; frames beyond the capture show nothing."""
+    camera = recording.camera
+    flat, deep = ([cue for cue in cues if cue.points.shape[-1] == axes] for axes in (2, 3))
+    pixels = (
+        tuple(PixelCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * there) for c in flat)
+        if camera
+        else ()
+    )
+    places = tuple(
+        PlaceCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * there) for c in deep
+    )
+    poses = tuple(
+        PoseCue(v.motion.R_parent_joint[frames], v.confidence[frames] * there[..., None]) for v in views
+    )
+    mount = None if camera is None else Rigid(camera.R_head_cam, camera.t_head_cam)
+    return Seen(head, None if camera is None else camera.camera, mount, pixels, places, poses)
+
+
+def _foot_contact(motion: Motion) -> Float[Tensor, "time foot"]:
+    """Probability that each foot touches the floor, from those of its patches."""
+    if motion.contact_prob is None:
+        return torch.zeros(len(motion), FEET)
+    return motion.contact_prob.unflatten(-1, (FEET, -1)).amax(-1)

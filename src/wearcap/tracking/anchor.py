@@ -1,0 +1,69 @@
+"""Hang a pose from a joint whose pose is measured: the body follows, the joint is where it must be."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics, local_rotations
+from wearcap.body.limb_ik import reach
+from wearcap.body.skeleton import Skeleton
+from wearcap.geometry.rigid import Rigid
+from wearcap.recording import Motion
+
+
+def hang(
+    skeleton: Skeleton,
+    R_parent_joint: Float[Tensor, "*batch joint 3 3"],
+    T_world_measured: Rigid,
+    t_parent_joint: Float[Tensor, "*#batch joint 3"] | None = None,
+    joint: str = "head",
+) -> tuple[Float[Tensor, "*batch joint 3 3"], Rigid]:
+    """Match position and orientation of `joint` to `T_world_measured` (thesis §6.2).
+
+    The root keeps its orientation; the joint itself turns against its parent until its world orientation is the
+    measured one, and the whole body is shifted. Returns (R_parent_joint, poses of all joints in the world).
+    """
+    at, parent = skeleton.index(joint), skeleton.parents[skeleton.index(joint)]
+    origin = torch.zeros_like(R_parent_joint[..., 0, :, 0])
+    T_root_joint = forward_kinematics(skeleton, R_parent_joint, origin, t_parent_joint)
+    R_parent_measured = T_root_joint.R[..., parent, :, :].transpose(-1, -2) @ T_world_measured.R
+    shift = T_world_measured.t - T_root_joint.t[..., at, :]
+    R_hung = torch.cat(
+        [
+            R_parent_joint[..., :at, :, :],
+            R_parent_measured[..., None, :, :],
+            R_parent_joint[..., at + 1 :, :, :],
+        ],
+        dim=-3,
+    )
+    R_world = torch.cat(
+        [
+            T_root_joint.R[..., :at, :, :],
+            T_world_measured.R[..., None, :, :],
+            T_root_joint.R[..., at + 1 :, :, :],
+        ],
+        dim=-3,
+    )
+    return R_hung, Rigid(R_world, T_root_joint.t + shift[..., None, :])
+
+
+def hang_from_head(motion: Motion, T_world_head: Rigid) -> Motion:
+    """Last step: shift the body and turn its head so that the head is where it was measured."""
+    R_parent_joint, T_world_joint = hang(motion.skeleton, motion.R_parent_joint, T_world_head)
+    return replace(motion, R_parent_joint=R_parent_joint, t_world_root=T_world_joint.t[:, 0])
+
+
+def with_hand_moved(motion: Motion, side: str, offset: Float[Tensor, "time 3"]) -> Motion:
+    """The motion with one wrist moved by an offset in the world (m), shoulder and elbow following."""
+    skeleton, T = motion.skeleton, motion.T_world_joint
+    shoulder, elbow, wrist = skeleton.indices(
+        *(f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist"))
+    )
+    # in double precision: a nearly straight arm's bend is the root of a difference of squares
+    start, middle, end = (T.t[:, joint].double() for joint in (shoulder, elbow, wrist))
+    upper, lower = (turn.to(T.R) for turn in reach(start, middle, end, end + offset.double()))
+    R = T.R.clone()
+    R[:, shoulder], R[:, elbow] = upper @ R[:, shoulder], lower @ R[:, elbow]
+    return replace(motion, R_parent_joint=local_rotations(skeleton, R))
