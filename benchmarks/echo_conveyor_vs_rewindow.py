@@ -20,17 +20,17 @@ from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.recording import Recording, RecordingStore
 from wearcap.systems.echo.dataset import EchoOnDataset
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.echo.queue import EchoQueue, Told
+from wearcap.systems.echo.queue import Conditioning, EchoQueue
 from wearcap.systems.echo.rewindow import Rewindow
 
 STRIDE = 10
 DATASET = Path(__file__).resolve().parents[1] / "datasets" / "simulated_objects"
 
 
-def measure(lanes: int = 4, rounds: int = 6, recordings: int = 4, seconds: float = 20.0) -> list[dict]:
+def measure(items: int = 4, rounds: int = 6, recordings: int = 4, seconds: float = 20.0) -> list[dict]:
     conveyor = pipeline_of("echo", guidance=None)
     windows = replace(conveyor, rewindow=STRIDE)
-    rows = [_time(conveyor, windows, lanes, rounds)]
+    rows = [_time(conveyor, windows, items, rounds)]
     if NAME in shared_checkpoints() and (DATASET / "manifest.json").is_file():
         rows += _errors(conveyor, windows, recordings, seconds)
     else:
@@ -39,33 +39,33 @@ def measure(lanes: int = 4, rounds: int = 6, recordings: int = 4, seconds: float
 
 
 @torch.no_grad()
-def _time(conveyor: Echo, windows: Echo, lanes: int, rounds: int) -> dict:
+def _time(conveyor: Echo, windows: Echo, items: int, rounds: int) -> dict:
     """In turn: as many frames through the queue as one window gives."""
     window = conveyor.net.window
-    told = lanes_of(conveyor, lanes, (window + STRIDE * (rounds + 1)) / conveyor.fps)
-    queue, again = _queue(conveyor, lanes), _queue(windows, lanes)
+    conditioning = lanes_of(conveyor, items, (window + STRIDE * (rounds + 1)) / conveyor.fps)
+    queue, again = _queue(conveyor, items), _queue(windows, items)
     assert isinstance(again, Rewindow)
     for number in range(window):
-        queue.push(told.frames(slice(number, number + 1)))
-    first = told.frames(slice(0, window))
-    before = again.window(first, torch.zeros(lanes, 0, sum(conveyor.net.sizes)))[:, : conveyor.context]
+        queue.push(conditioning.frames(slice(number, number + 1)))
+    first = conditioning.frames(slice(0, window))
+    before = again.window(first, torch.zeros(items, 0, sum(conveyor.net.sizes)))[:, : conveyor.context]
     ours, theirs = [], []
     for number in range(rounds):
-        ours.append(_seconds(lambda start=window + STRIDE * number: _pushed(queue, told, start)))
-        there = told.frames(slice(STRIDE * number, STRIDE * number + window))
+        ours.append(_seconds(lambda start=window + STRIDE * number: _pushed(queue, conditioning, start)))
+        there = conditioning.frames(slice(STRIDE * number, STRIDE * number + window))
         theirs.append(_seconds(lambda there=there: again.window(there, before)))
-    value, baseline = (1000 * statistics.median(times) / STRIDE / lanes for times in (ours, theirs))
+    value, baseline = (1000 * statistics.median(times) / STRIDE / items for times in (ours, theirs))
     return figure("echo_conveyor_vs_rewindow", value, "ms/frame", baseline, baseline / value, 5.0)
 
 
-def _queue(pipeline: Echo, lanes: int) -> EchoQueue:
+def _queue(pipeline: Echo, items: int) -> EchoQueue:
     pipeline.prepare()
-    return pipeline.queue([pipeline.skeleton] * lanes, list(range(lanes)), [{}] * lanes, [[]] * lanes)
+    return pipeline.queue([pipeline.skeleton] * items, list(range(items)), [{}] * items, [[]] * items)
 
 
-def _pushed(queue: EchoQueue, told: Told, start: int) -> None:
+def _pushed(queue: EchoQueue, conditioning: Conditioning, start: int) -> None:
     for number in range(start, start + STRIDE):
-        queue.push(told.frames(slice(number, number + 1)))
+        queue.push(conditioning.frames(slice(number, number + 1)))
 
 
 def _seconds(run) -> float:

@@ -18,13 +18,13 @@ DOCUMENT_MS = 13.73
 GOAL_MS = 1.4
 
 
-def measure(frames: int = 200, lanes: tuple[int, ...] = (1, 8), device: str = "cuda") -> list[dict]:
+def measure(frames: int = 200, items: tuple[int, ...] = (1, 8), device: str = "cuda") -> list[dict]:
     if device == "cuda" and without_cuda("echo_ms_per_frame"):
         return []
     runtime = "compile" if device == "cuda" else "eager"
     pipeline = pipeline_of("echo", device, "echo_full", runtime=runtime, guidance=None)
     rows = []
-    for count in lanes:
+    for count in items:
         value = _milliseconds(pipeline, frames, count)
         name = "echo_ms_per_frame" + (f"_{count}_wearers" if count > 1 else "")
         rows.append(figure(name, value, "ms", DOCUMENT_MS, DOCUMENT_MS / value, DOCUMENT_MS / GOAL_MS))
@@ -32,13 +32,13 @@ def measure(frames: int = 200, lanes: tuple[int, ...] = (1, 8), device: str = "c
 
 
 @torch.no_grad()
-def _milliseconds(pipeline: Echo, frames: int, lanes: int) -> float:
+def _milliseconds(pipeline: Echo, frames: int, items: int) -> float:
     pipeline.prepare()
-    told, filling = lanes_of(pipeline, lanes, (frames + 90) / pipeline.fps), 90
-    queue = pipeline.queue([pipeline.skeleton] * lanes, list(range(lanes)), [{}] * lanes, [[]] * lanes)
+    conditioning, filling = lanes_of(pipeline, items, (frames + 90) / pipeline.fps), 90
+    queue = pipeline.queue([pipeline.skeleton] * items, list(range(items)), [{}] * items, [[]] * items)
     for number in range(filling):
-        queue.push(told.frames(slice(number, number + 1)))
+        queue.push(conditioning.frames(slice(number, number + 1)))
     begin = time.perf_counter()
     for number in range(filling, filling + frames):
-        queue.push(told.frames(slice(number, number + 1)))
-    return 1000 * (time.perf_counter() - begin) / frames / lanes
+        queue.push(conditioning.frames(slice(number, number + 1)))
+    return 1000 * (time.perf_counter() - begin) / frames / items

@@ -85,6 +85,6 @@ def sheet(truth: Motion | None, motion: Motion, environment: Environment, act: A
 
 
 if __name__ == "__main__":
-    rest = sys.argv[5:]
-    chosen = tuple(word for word in rest if "=" not in word) or KINDS
-    draw(Path(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4]), chosen, [word for word in rest if "=" in word])  # fmt: skip
+    static_threshold = sys.argv[5:]
+    chosen = tuple(word for word in static_threshold if "=" not in word) or KINDS
+    draw(Path(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4]), chosen, [word for word in static_threshold if "=" in word])  # fmt: skip

@@ -9,7 +9,7 @@ from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
 from wearcap.recording import Motion, RecordingStore
 from wearcap.systems.echo.dataset import EchoOnDataset
-from wearcap.systems.echo.observations import Lane, Scenario, lane_of
+from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.scores import Truth, observed_share
 from wearcap.tracking.head_path import head_path
@@ -40,27 +40,29 @@ class Captured:
     seed: int
     motion: Motion
     truth: Truth
-    lane: Lane
+    item: BatchItem
 
 
 def captured(
-    method: Method, store: RecordingStore, names: Sequence[str], seeds: Sequence[int], lanes: int
+    method: Method, store: RecordingStore, names: Sequence[str], seeds: Sequence[int], items: int
 ) -> Iterator[Captured]:
-    """Every recording with every seed, `lanes` of them at a time: those of like length side by side, so that none waits
+    """Every recording with every seed, `items` of them at a time: those of like length side by side, so that none waits
     long for another."""
     on = EchoOnDataset(pipeline_of(method), store.root)
     reader = on.echo.reader()
     ordered = sorted(names, key=lambda name: store.entries[name].frames)
     jobs = [(name, seed) for name in ordered for seed in seeds]
-    for start in range(0, len(jobs), lanes):
-        batch = jobs[start : start + lanes]
-        known = {name: on.scenario(store.load(name)) for name, _ in batch}
-        scenarios = [_observing(method, on, known[name], seed) for name, seed in batch]
+    for start in range(0, len(jobs), items):
+        batch = jobs[start : start + items]
+        observed_parts = {name: on.scenario(store.load(name)) for name, _ in batch}
+        scenarios = [_observing(method, on, observed_parts[name], seed) for name, seed in batch]
         motions = on.echo.capture_scenarios(scenarios, [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):
-            scenario = known[name]
-            lane = lane_of(scenario, head_path(scenario.recording, on.echo.skeleton, on.echo.fps), reader)
-            yield Captured(name, seed, motion, on.truth(motion, scenario.recording), lane)
+            scenario = observed_parts[name]
+            item = batch_item_of(
+                scenario, head_path(scenario.recording, on.echo.skeleton, on.echo.fps), reader
+            )
+            yield Captured(name, seed, motion, on.truth(motion, scenario.recording), item)
 
 
 def _observing(method: Method, on: EchoOnDataset, scenario: Scenario, seed: int) -> Scenario:

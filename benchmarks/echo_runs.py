@@ -14,9 +14,9 @@ from wearcap.cli.load import load_pipeline
 from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.scene.environment import Environment
 from wearcap.simulation.things import make_thing
-from wearcap.systems.echo.observations import Scenario, lane_of
+from wearcap.systems.echo.observations import Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.echo.queue import Told
+from wearcap.systems.echo.queue import Conditioning
 from wearcap.systems.echo.stream import EchoSession, EchoWearer
 from wearcap.tracking.head_path import head_path
 
@@ -55,7 +55,7 @@ class Streamed:
     def __init__(self, pipeline: Echo):
         box = make_thing("box", "box", np.random.default_rng(0)).object
         self.session = EchoSession(pipeline, EchoWearer(xsens23(), floor_m=0.0), Environment((box,)))
-        self.number, self.said = 0, 0
+        self.number, self.outputs = 0, 0
         motion = swinging("walk", LAP_S / 2, 0, fps=FPS).motion
         assert motion is not None
         self._lap = [
@@ -67,14 +67,14 @@ class Streamed:
         """One moment: what is tracked goes in, what is final comes out."""
         moment, place = self.number / FPS, self.number % len(self._lap[0])
         if self.number % round(HELD_S * FPS) == 0:
-            held = self.number % round(2 * HELD_S * FPS) == 0
-            self.session.activate("box" if held else None, moment)
+            observation = self.number % round(2 * HELD_S * FPS) == 0
+            self.session.activate("box" if observation else None, moment)
         head, left, right = (poses[place] for poses in self._lap)
         self.session.wrist("left_wrist", moment, left)
         self.session.wrist("right_wrist", moment, right)
         self.session.head(moment, head)
         motion = self.session.poses()
-        self.said += 0 if motion is None else len(motion)
+        self.outputs += 0 if motion is None else len(motion)
         self.number += 1
 
     def fill(self) -> "Streamed":
@@ -95,14 +95,14 @@ def frames_per_second(pipeline: Echo, frames: int, repeats: int) -> float:
     return sorted(rates)[repeats // 2]
 
 
-def lanes_of(pipeline: Echo, lanes: int, duration_s: float) -> Told:
+def lanes_of(pipeline: Echo, items: int, duration_s: float) -> Conditioning:
     """What is told of several walks of a human alone, side by side."""
     reader, parts = pipeline.reader(), []
-    for seed in range(lanes):
+    for seed in range(items):
         recording = swinging(f"walk_{seed}", duration_s, seed, fps=FPS)
         path = head_path(recording, pipeline.skeleton, pipeline.fps)
-        parts.append(lane_of(Scenario(recording), path, reader).told)
-    return Told(*(torch.cat(fields) for fields in zip(*parts)))
+        parts.append(batch_item_of(Scenario(recording), path, reader).conditioning)
+    return Conditioning(*(torch.cat(fields) for fields in zip(*parts)))
 
 
 def figure(name: str, value: float, unit: str, baseline: float, ratio: float, goal: float) -> dict:

@@ -17,7 +17,7 @@ TINY = ("model.net.width=32", "model.net.layers=1", "model.net.heads=2", "model.
 
 def measure(minutes: float = 30.0) -> list[dict]:
     stream = Streamed(pipeline_of("echo_online", overrides=TINY, runtime="eager")).fill()
-    filled, frames = stream.said, round(60 * FPS * minutes)
+    filled, frames = stream.outputs, round(60 * FPS * minutes)
     memory, seconds = [], []
     begin = time.process_time()
     for number in range(1, frames + 1):
@@ -25,7 +25,7 @@ def measure(minutes: float = 30.0) -> list[dict]:
         if number in (frames // 10, frames):
             memory.append(_peak_mib())
             seconds.append((time.process_time() - begin) / number)
-    assert stream.said == filled + frames
+    assert stream.outputs == filled + frames
     (early, late), (short, long) = memory, seconds
     return [
         figure("echo_stream_memory", late, "MiB", early, late / early, 1.05),

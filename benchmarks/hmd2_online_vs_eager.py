@@ -46,5 +46,5 @@ class _Plain(HMD2):
 
 
 def _plain(pipeline: HMD2) -> HMD2:
-    told = {entry.name: getattr(pipeline, entry.name) for entry in fields(pipeline) if entry.init}
-    return _Plain(**told | {"steps": STEPS, "spacing": 1.0, "runtime": "eager", "precision": "float32"})
+    conditions = {entry.name: getattr(pipeline, entry.name) for entry in fields(pipeline) if entry.init}
+    return _Plain(**conditions | {"steps": STEPS, "spacing": 1.0, "runtime": "eager", "precision": "float32"})

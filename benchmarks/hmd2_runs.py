@@ -65,7 +65,7 @@ def run_method(method: Method, case: Case) -> Result:
             seeds = seeds[:1]
     realism = None if case.realism is None else load_realism(case.realism, STRIDE_S)
     measure = scored if realism is None else realism.beside(scored, method.name)
-    rows = list(evaluate(pipeline, store, case.names, seeds, lanes=8, measure=measure))
+    rows = list(evaluate(pipeline, store, case.names, seeds, items=8, measure=measure))
     scores = aggregate(rows)
     if realism is not None:
         scores |= realism.scores(method.name)
@@ -87,9 +87,9 @@ def seam_ratio(motion: Motion) -> float | None:
     """
     if "stride" not in motion.provenance:
         return None
-    stride, waiting = (int(motion.provenance[key]) for key in ("stride", "lookahead"))
+    stride, lookahead_frames = (int(motion.provenance[key]) for key in ("stride", "lookahead"))
     jerk = motion.T_world_joint.t.diff(dim=0, n=3).norm(dim=-1).mean(-1)
-    phase = (torch.arange(len(jerk)) + waiting) % stride
+    phase = (torch.arange(len(jerk)) + lookahead_frames) % stride
     grown = torch.arange(len(jerk)) >= 240
     seam = phase >= stride - 3
     if stride < 6 or not (grown & seam).any():

@@ -28,13 +28,13 @@ def measure(minutes: int = 60, settle: int = 10, max_points: int = 100_000) -> l
     pipeline = HMD2(net, features, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any",
                     steps=1, stride=60, lookahead=0)  # fmt: skip
     session = Session(pipeline, [Wearer(xsens23())], [0], Memory(max_points=max_points))
-    walk, early, said = Walk(pipeline, new_points=10, forever=True), 0.0, 0
+    walk, early, predicted = Walk(pipeline, new_points=10, forever=True), 0.0, 0
     for second in range(60 * minutes):
         motion = session.push([[walk.moment(60 * second + i) for i in range(60)]])[0]
-        said += 0 if motion is None else len(motion)
+        predicted += 0 if motion is None else len(motion)
         if second + 1 == 60 * settle:
             early = _peak_mib()
-    assert said == 3600 * minutes
+    assert predicted == 3600 * minutes
     late = _peak_mib()
     return [{"name": "hmd2_stream_memory", "value": late, "unit": "MiB", "baseline": early, "ratio": late / early, "goal": 1.05}]  # fmt: skip
 

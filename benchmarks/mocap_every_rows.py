@@ -12,7 +12,7 @@ from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline, load_visual_cues
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import interpolate_held
+from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.metrics.floor import floor_error_m, stood_on
 from wearcap.metrics.position import joint_error_cm
 from wearcap.metrics.scores import score_in_world, truth_at
@@ -83,7 +83,7 @@ def floor_row(recording: Recording, captured: Captured) -> Row:
     row = body_row(recording, captured)
     assert recording.floor is not None
     found = captured.floor
-    true = interpolate_held(recording.floor.timestamps, recording.floor.height, found.timestamps)
+    true = interpolate_clamped(recording.floor.timestamps, recording.floor.height, found.timestamps)
     stood = floor_error_m(found.height, *_ground(recording, captured.motion))
     smooth = floor_error_m(_smoothed(found.height, captured.motion.fps), *_ground(recording, captured.motion))
     scores = row.scores | {

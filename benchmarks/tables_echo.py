@@ -31,7 +31,7 @@ HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_
 UNGUIDED = ("pipeline=echo", "pipeline.guidance=null")
 ABLATIONS: dict[str, tuple[str, ...]] = {
     "ours without guidance, as long as the others": ("echo_short", *UNGUIDED),
-    "the same, objects move untouched": ("echo_short", *UNGUIDED, "pipeline.rest=null"),
+    "the same, objects move untouched": ("echo_short", *UNGUIDED, "pipeline.static_threshold=null"),
     "the same, guided by contacts": ("echo_short", "pipeline=echo"),
     "document's frame": ("echo_window", *UNGUIDED),
     "no canonical frame": ("echo_world", *UNGUIDED),
@@ -44,10 +44,10 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
 }
 SETTINGS = {
     "ours": ("pipeline=echo",),
-    "objects move untouched": ("pipeline=echo", "pipeline.rest=null"),
+    "objects move untouched": ("pipeline=echo", "pipeline.static_threshold=null"),
     "told where objects stand at first": ("pipeline=echo", "pipeline.placed=true"),
     "not guided by contacts": UNGUIDED,
-    "not hung from the head": ("pipeline=echo", "pipeline.hang=false"),
+    "not anchored to the head": ("pipeline=echo", "pipeline.anchor=false"),
     "steps evenly spaced": ("pipeline=echo", "pipeline.spacing=1.0"),
     "the stochastic posterior": ("pipeline=echo", "pipeline.eta=1.0"),
     "noise redrawn (eq. 11 as printed)": ("pipeline=echo", "pipeline.step=redraw", "pipeline.spacing=1.0"),
@@ -106,7 +106,7 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, tupl
     mine, stuck = [], []
     for one in _captured(ours, options, progress, store, names):
         mine.append(score_echo(one.motion, one.truth, one.name, one.seed))
-        stuck.append(score_echo(wrist.attached(one.motion, one.lane), one.truth, one.name, one.seed))
+        stuck.append(score_echo(wrist.attached(one.motion, one.item), one.truth, one.name, one.seed))
     scores |= {"ours, object stuck to the nearer wrist": aggregate(stuck), "ours": aggregate(mine)}
     return f"Table 1: objects, {options.split}", OBJECTS, scores | DOCUMENT
 
@@ -191,7 +191,7 @@ def _captured(
     seeds = list(range(2 if options.quick else options.seeds))
     bar = progress.add_task(method.name, total=len(seeds) * len(names))
     changed = replace(method, pipeline=(*method.pipeline, *options.pipeline))
-    for one in captured(changed, store, names, seeds, options.lanes):
+    for one in captured(changed, store, names, seeds, options.items):
         progress.advance(bar)
         yield one
 

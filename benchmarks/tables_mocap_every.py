@@ -36,7 +36,7 @@ FLOOR = (
 )
 CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
 TRAINED = {
-    "AvatarPoser-style, watches": ("mocap_every_avatarposer", ("pipeline=mocap_every", "pipeline.stride=1", "pipeline.lookahead=0", "pipeline.mirror=false")),
+    "AvatarPoser-style, watches": ("mocap_every_avatarposer", ("pipeline=mocap_every", "pipeline.stride=1", "pipeline.lookahead=0", "pipeline.mirror_average=false")),
     "as in the document": ("mocap_every_document", ("pipeline=mocap_every_document",)),
     "neither": ("mocap_every_neither", ("pipeline=mocap_every",)),
     "+ representation": ("mocap_every_one_stage", ("pipeline=mocap_every",)),
@@ -91,11 +91,11 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
     ours = [
         Method("ours", options.checkpoint, ("pipeline=mocap_every", level)),
         Method("ours, floor followed", options.checkpoint),
-        Method("ours, not in a mirror", options.checkpoint, ("pipeline=mocap_every", level, "pipeline.mirror=false")),
-        Method("ours, not hung from the head", options.checkpoint, ("pipeline=mocap_every", level, "pipeline.hang=false")),
+        Method("ours, without mirror averaging", options.checkpoint, ("pipeline=mocap_every", level, "pipeline.mirror_average=false")),
+        Method("ours, not anchored to the head", options.checkpoint, ("pipeline=mocap_every", level, "pipeline.anchor=false")),
         Method("ours, three frames at a time", options.checkpoint, ("pipeline=mocap_every_online", level)),
         Method("ours, heads as by SLAM", options.checkpoint, slam=True),
-        Method("ours, heads as by SLAM, not hung", options.checkpoint, ("pipeline=mocap_every", "pipeline.hang=false"), slam=True),
+        Method("ours, heads as by SLAM, not anchored", options.checkpoint, ("pipeline=mocap_every", "pipeline.anchor=false"), slam=True),
     ]  # fmt: skip
     trained = {}
     for name, (run, pipeline) in TRAINED.items():

@@ -39,7 +39,7 @@ def box_mesh(half=HALF, middle=MIDDLE) -> Mesh:
     return mesh_between(np.subtract(middle, half), np.add(middle, half))
 
 
-def thing(name: str, category: str = "box", mesh: Mesh | None = None) -> SceneObject:
+def scene_object(name: str, category: str = "box", mesh: Mesh | None = None) -> SceneObject:
     return SceneObject(name, category, mesh or box_mesh(), torch.eye(3), torch.zeros(3), Freedom("free"))
 
 
@@ -48,7 +48,8 @@ def boxes(carried=CARRIED) -> Environment:
     names = dict.fromkeys(name for name, *_ in carried)
     return Environment(
         tuple(
-            thing(name, CLASSES[k % 2], box_mesh(HALF / (1 + k), MIDDLE * k)) for k, name in enumerate(names)
+            scene_object(name, CLASSES[k % 2], box_mesh(HALF / (1 + k), MIDDLE * k))
+            for k, name in enumerate(names)
         )
     )
 
@@ -64,11 +65,13 @@ def carrying(seconds: float = 2.0, name: str = "carry", carried=CARRIED, fps: fl
         tracks[box] = Trajectory(time, T.R, T.t)
     start, stop = (torch.tensor([row[k] for row in carried], dtype=torch.float64) for k in (2, 3))
     hands = torch.tensor([[row[1] == "left", row[1] == "right"] for row in carried]).bool().reshape(-1, 2)
-    held = Interactions(start, stop, hands, tuple(row[0] for row in carried), ("sliding",) * len(carried))
+    observation = Interactions(
+        start, stop, hands, tuple(row[0] for row in carried), ("sliding",) * len(carried)
+    )
     return Recording(
         name, head=HeadStream(time, T_world_device.R, T_world_device.t, SEAT.R, SEAT.t), motion=motion,
         contacts=ContactTrack(time, FOOT_PATCHES, contact), floor=FloorTrack(time, torch.zeros(len(time))),
-        skeleton=motion.skeleton, object_motion=tracks, interactions=held if carried else None,
+        skeleton=motion.skeleton, object_motion=tracks, interactions=observation if carried else None,
         subject=f"subject_{name}", location="nowhere", license="MIT",
     )  # fmt: skip
 
@@ -113,7 +116,7 @@ def small_net(features: EchoFeatures, **changes) -> EchoDenoiser:
 def drawn_echo(frame: str = "own", net=None, **settings) -> Echo:
     """A small pipeline; a pose is final when seven frames have followed it, and objects are as drawn."""
     features = small_features(frame)
-    given = {"context": 8, "per_frame": 1, "rest": None, **settings}
+    given = {"context": 8, "per_frame": 1, "static_threshold": None, **settings}
     return Echo(net or small_net(features), features, CosineSchedule(), xsens23(), **given)
 
 

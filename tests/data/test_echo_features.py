@@ -16,7 +16,7 @@ BOX = "box_1"
 
 
 @pytest.fixture(scope="module")
-def told() -> tuple[ThreePoints, Body, Rigid, torch.Tensor]:
+def conditioning() -> tuple[ThreePoints, Body, Rigid, torch.Tensor]:
     """Of a walk: tracked points, body, box, floor; each with a batch axis of one."""
     recording = carrying(1.0)
     motion, track = recording.motion, recording.object_motion[BOX]
@@ -31,32 +31,32 @@ def moved(points: ThreePoints) -> ThreePoints:
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_body_and_object_come_back_as_they_went_in(told, frame):
-    points, body, box, _ = told
+def test_body_and_object_come_back_as_they_went_in(conditioning, frame):
+    points, body, box, _ = conditioning
     features = small_features(frame)
     at = features.canonical(points)
-    human, thing = features.encode_body(body, at), features.encode_object(box, at)
+    human, scene_object = features.encode_body(body, at), features.encode_object(box, at)
     assert human.shape[-1] == features.human_size == 3 + 6 * 23
-    assert thing.shape[-1] == OBJECT_SIZE
+    assert scene_object.shape[-1] == OBJECT_SIZE
     for back, given in zip(features.decode_body(human, at), body):
         torch.testing.assert_close(back, given, atol=1e-5, rtol=0)
-    back = features.decode_object(thing, at)
+    back = features.decode_object(scene_object, at)
     torch.testing.assert_close(back.matrix(), box.matrix(), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("body", [True, False])
 @pytest.mark.parametrize(("frame", "size"), [("window", 54), ("world", 54), ("own", 56)])
-def test_sizes_are_the_documents(told, frame, size, body):
+def test_sizes_are_the_documents(conditioning, frame, size, body):
     features = small_features(frame, body=body)
     assert features.condition_size == size + 5 * body
-    points, *_, floor = told
+    points, *_, floor = conditioning
     assert features.condition(points, floor, SIZE).shape == (1, 30, features.condition_size)
     assert features.moves == (frame == "window")
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_north_and_place_matter_in_the_world_alone(told, frame):
-    points, body, box, floor = told
+def test_north_and_place_matter_in_the_world_alone(conditioning, frame):
+    points, body, box, floor = conditioning
     features, turned = small_features(frame), moved(points)
     here, there = features.canonical(points), features.canonical(turned)
     root = TURN @ Rigid(body.R_parent_joint[:, :, 0], body.t_world_root)
@@ -71,8 +71,8 @@ def test_north_and_place_matter_in_the_world_alone(told, frame):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_canonical_frames_are_the_heads_and_upright(told, frame):
-    points, *_ = told
+def test_canonical_frames_are_the_heads_and_upright(conditioning, frame):
+    points, *_ = conditioning
     at = small_features(frame).canonical(points)
     up = at.R[..., 2]
     torch.testing.assert_close(up, torch.tensor([0.0, 0.0, 1.0]).expand_as(up))
@@ -82,9 +82,9 @@ def test_canonical_frames_are_the_heads_and_upright(told, frame):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_what_is_told_is_eq_4(told, frame):
+def test_what_is_told_is_eq_4(conditioning, frame):
     """Rotations, their turns since the frame before, places and velocities, written out point by point."""
-    points, *_, floor = told
+    points, *_, floor = conditioning
     features = small_features(frame, body=False)
     told_so = features.condition(points, floor, SIZE)[0]
     at, (R, t) = features.canonical(points), points
@@ -103,8 +103,8 @@ def test_what_is_told_is_eq_4(told, frame):
                 torch.testing.assert_close(told_so[k, 36 + 3 * p : 39 + 3 * p], place, atol=1e-5, rtol=0)
 
 
-def test_in_its_own_frame_the_head_is_told_from_the_windows_first_one(told):
-    points, *_, floor = told
+def test_in_its_own_frame_the_head_is_told_from_the_windows_first_one(conditioning):
+    points, *_, floor = conditioning
     own, window = (small_features(frame, body=False).condition(points, floor, SIZE) for frame in ("own", "window"))  # fmt: skip
     torch.testing.assert_close(own[..., 36:39], window[..., 36:39], atol=1e-5, rtol=0)
     heading = own[0, :, 54:]
@@ -114,8 +114,8 @@ def test_in_its_own_frame_the_head_is_told_from_the_windows_first_one(told):
 
 def test_a_single_frame_can_be_told():
     points = ThreePoints(torch.eye(3).expand(1, 1, 3, 3, 3), torch.rand(1, 1, 3, 3))
-    told = small_features().condition(points, torch.zeros(1, 1), SIZE)
-    assert told.isfinite().all()
+    conditioning = small_features().condition(points, torch.zeros(1, 1), SIZE)
+    assert conditioning.isfinite().all()
 
 
 def test_classes_are_told_by_one_number_each():

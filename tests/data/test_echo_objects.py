@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from carried_box import HALF, MIDDLE, box_mesh, carrying, small_features, thing
+from carried_box import HALF, MIDDLE, box_mesh, carrying, scene_object, small_features
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -16,7 +16,7 @@ POSE = Rigid(rotation.exp(torch.tensor([[0.3, -0.9, 0.4], [1.0, 0.2, 0.0]])), to
 
 @pytest.fixture(scope="module")
 def shape():
-    return ObjectReader(small_features(), None)(thing("box_1"))
+    return ObjectReader(small_features(), None)(scene_object("box_1"))
 
 
 def distance_to_box(points: torch.Tensor) -> torch.Tensor:
@@ -38,18 +38,18 @@ def test_its_feature_is_the_encoders_and_its_mirror_images(shape):
     torch.manual_seed(0)
     encoder = PointNeXt(4, (6,), (0,), (8,), 0.3).eval()
     reader = ObjectReader(small_features(shape_size=encoder.size), encoder)
-    told = reader(thing("box_1"))
-    assert len(told.code) == reader.features.object_condition_size
-    torch.testing.assert_close(told.code[8:], encoder(told.cloud[None])[0], atol=1e-5, rtol=0)
-    flipped = told.cloud * torch.tensor([1.0, -1.0, 1.0])
-    torch.testing.assert_close(told.code_mirrored[8:], encoder(flipped[None])[0], atol=1e-5, rtol=0)
-    assert torch.equal(told.code[:2], told.code_mirrored[:2])
-    assert not told.code.requires_grad
+    conditioning = reader(scene_object("box_1"))
+    assert len(conditioning.code) == reader.features.object_condition_size
+    torch.testing.assert_close(conditioning.code[8:], encoder(conditioning.cloud[None])[0], atol=1e-5, rtol=0)
+    flipped = conditioning.cloud * torch.tensor([1.0, -1.0, 1.0])
+    torch.testing.assert_close(conditioning.code_mirrored[8:], encoder(flipped[None])[0], atol=1e-5, rtol=0)
+    assert torch.equal(conditioning.code[:2], conditioning.code_mirrored[:2])
+    assert not conditioning.code.requires_grad
 
 
 def test_a_mesh_is_read_once_for_all_objects_that_have_it():
     reader, mesh = ObjectReader(small_features(), None), box_mesh()
-    one, two, chair = reader(thing("a", mesh=mesh)), reader(thing("b", mesh=mesh)), reader(thing("c", "chair", mesh))  # fmt: skip
+    one, two, chair = reader(scene_object("a", mesh=mesh)), reader(scene_object("b", mesh=mesh)), reader(scene_object("c", "chair", mesh))  # fmt: skip
     assert one.surface is two.surface
     assert (one.name, two.name) == ("a", "b")
     assert not torch.equal(one.code, chair.code)
@@ -72,7 +72,7 @@ def test_a_touch_is_a_distance_to_the_surface(shape, within_m):
     """Against the distance to a box as a formula, from outside and from within."""
     random = torch.Generator().manual_seed(0)
     local = 0.5 * torch.rand(2, 300, 3, generator=random).double() - 0.25
-    exact = ObjectReader(small_features(), None)(thing("box_1"))
+    exact = ObjectReader(small_features(), None)(scene_object("box_1"))
     T_world_mesh = Rigid(POSE.R.double(), POSE.t.double())
     world = T_world_mesh[:, None] @ (local + torch.tensor(MIDDLE))
     touches = body_contact(world.float(), exact, exact.centred(POSE), within_m)
@@ -89,7 +89,7 @@ def test_what_is_deep_inside_does_not_touch(shape):
 
 
 def test_poses_are_the_recordings_or_the_environments(shape):
-    recording, item = carrying(0.5), thing("box_1")
+    recording, item = carrying(0.5), scene_object("box_1")
     take = torch.tensor([3, 7])
     T = object_poses(recording, Environment((item,)), "box_1", shape, take)
     track = recording.object_motion["box_1"]
@@ -100,4 +100,4 @@ def test_poses_are_the_recordings_or_the_environments(shape):
 
 def test_a_class_that_is_not_known_is_named():
     with pytest.raises(WearcapError, match="no object class 'piano'. Expected one of box, chair"):
-        ObjectReader(small_features(), None)(thing("p", "piano"))
+        ObjectReader(small_features(), None)(scene_object("p", "piano"))

@@ -11,8 +11,8 @@ from carried_box import (
     boxes,
     carried_dataset,
     carrying,
+    scene_object,
     small_features,
-    thing,
 )
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, contact_points
@@ -87,7 +87,7 @@ def mirrored_shape(shape: ObjectShape) -> ObjectShape:
     """The object whose mesh is the mirror image."""
     vertices = (shape.mesh.vertices * [1, -1, 1]).astype("float32")
     mesh = replace(shape.mesh, vertices=vertices, faces=shape.mesh.faces[:, ::-1].copy())
-    return ObjectReader(small_features(), None)(thing(shape.name, shape.category, mesh))
+    return ObjectReader(small_features(), None)(scene_object(shape.name, shape.category, mesh))
 
 
 def test_contacts_in_a_mirror_are_those_of_the_mirrored_geometry(root):

@@ -5,31 +5,31 @@ from dataclasses import replace
 import pytest
 import torch
 
-from wearcap.diffusion.conveyor import Belt, Conveyor, Held
+from wearcap.diffusion.conveyor import Conveyor, Observation, RollingSchedule
 from wearcap.diffusion.process import add_noise, posterior_step
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 
 SIZES = (2, 3)
 SCHEDULE = CosineSchedule()
-BELT = Belt(window=6, context=2, per_frame=3)
+BELT = RollingSchedule(window=6, context=2, per_frame=3)
 
 
-def free(lanes: int, frames: int, sizes=SIZES) -> Held:
+def free(items: int, frames: int, sizes=SIZES) -> Observation:
     """Nothing is known, everything is there."""
-    none = torch.zeros(lanes, frames, len(sizes), dtype=torch.bool)
-    return Held(torch.zeros(lanes, frames, sum(sizes)), none, none)
+    none = torch.zeros(items, frames, len(sizes), dtype=torch.bool)
+    return Observation(torch.zeros(items, frames, sum(sizes)), none, none)
 
 
-def run(conveyor: Conveyor, count: int, denoise, held=None, random=None):
+def run(conveyor: Conveyor, count: int, denoise, observation=None, random=None):
     """Pushes frames; yields the number of the oldest one and what is on the conveyor after each."""
-    lanes, per_frame = len(conveyor.x), conveyor.belt.per_frame
+    items, per_frame = len(conveyor.x), conveyor.rolling.per_frame
     random = random or torch.Generator().manual_seed(1)
     for frame in range(count):
-        conveyor.push(torch.randn(lanes, sum(conveyor.sizes), generator=random))
+        conveyor.push(torch.randn(items, sum(conveyor.sizes), generator=random))
         first, frames = frame + 1 - len(conveyor.age), len(conveyor.age)
         noise = torch.randn(per_frame, *conveyor.x.shape, generator=random)
-        part = held(first, frames) if held else free(lanes, frames, conveyor.sizes)
+        part = observation(first, frames) if observation else free(items, frames, conveyor.sizes)
         conveyor.run(lambda x, level, first=first: denoise(x, level, first), part, noise)
         yield first, conveyor
 
@@ -70,7 +70,7 @@ def test_a_level_per_frame_and_feature_is_one_per_frame_for_each_modality(levels
 def test_every_frame_leaves_as_a_perfect_denoiser_says(how):
     truth = torch.randn(2, 20, 5)
     conveyor = Conveyor(replace(BELT, **how), SCHEDULE, SIZES, 2)
-    ramp, given = conveyor.belt.ramp, 0
+    ramp, given = conveyor.rolling.ramp, 0
     for first, now in run(conveyor, 20, lambda x, level, first: truth[:, first : first + x.shape[1]]):
         assert now.clean == max(0, first + len(now.age) - ramp + 1 - first)
         torch.testing.assert_close(now.x[:, : now.clean], truth[:, first : first + now.clean])
@@ -83,7 +83,7 @@ def test_frames_on_their_way_have_their_levels_marginals(step):
     """With the true x0 a frame at level l is N(√ᾱ x0, 1 - ᾱ), in both ways to step."""
     conveyor = Conveyor(replace(BELT, step=step), SCHEDULE, (1,), 20_000)
     *_, (_, now) = run(conveyor, 9, lambda x, level, first: torch.full_like(x, 1.5))
-    alpha_bar = SCHEDULE(now.belt.levels(now.age))
+    alpha_bar = SCHEDULE(now.rolling.levels(now.age))
     torch.testing.assert_close(now.x.mean(0)[:, 0], 1.5 * alpha_bar.sqrt(), atol=0.03, rtol=0)
     torch.testing.assert_close(now.x.var(0)[:, 0], 1 - alpha_bar, atol=0.03, rtol=0)
 
@@ -105,14 +105,14 @@ def gaussian(rho: float, std: float, mean: float):
 def test_a_gaussian_process_comes_out_as_it_is_with_neighbours_at_other_levels():
     """Mean, deviation, and what neighbours have in common: the conditional of each frame on clean and noisy ones."""
     rho, std, mean = 0.8, 0.5, 2.0
-    conveyor = Conveyor(Belt(6, 2, per_frame=40), SCHEDULE, (1,), 4000)
+    conveyor = Conveyor(RollingSchedule(6, 2, per_frame=40), SCHEDULE, (1,), 4000)
     *_, (_, now) = run(conveyor, 12, gaussian(rho, std, mean))
     pair = now.x[:, now.clean - 2 : now.clean, 0].mT.double()
     assert pair.mean().item() == pytest.approx(mean, abs=0.03)
     assert pair.std(1).mean().item() == pytest.approx(std, rel=0.05)
     assert pair.corrcoef()[0, 1].item() == pytest.approx(rho, abs=0.04)
     noisy = now.x[:, -2, 0]
-    a = SCHEDULE(now.belt.levels(now.age))[-2].item()
+    a = SCHEDULE(now.rolling.levels(now.age))[-2].item()
     assert noisy.mean().item() == pytest.approx(mean * a**0.5, abs=0.04)
     assert noisy.var().item() == pytest.approx(a * std**2 + 1 - a, rel=0.08)
 
@@ -142,19 +142,19 @@ def test_what_is_known_stays_at_level_0_and_what_is_absent_stays_noise(step):
     conveyor = Conveyor(replace(BELT, step=step), SCHEDULE, SIZES, 1)
     seen = []
 
-    def held(first, frames):
-        known = torch.zeros(1, frames, 2, dtype=torch.bool)
-        known[..., 0] = (torch.arange(first, first + frames) % 2 == 0)[None]
-        absent = torch.zeros_like(known)
+    def observation(first, frames):
+        observed = torch.zeros(1, frames, 2, dtype=torch.bool)
+        observed[..., 0] = (torch.arange(first, first + frames) % 2 == 0)[None]
+        absent = torch.zeros_like(observed)
         absent[..., 1] = True
-        return Held(torch.full((1, frames, 5), 7.0), known, absent)
+        return Observation(torch.full((1, frames, 5), 7.0), observed, absent)
 
     def denoise(x, level, first):
         seen.append((x, level, first))
         return torch.zeros_like(x)
 
     noise = {}
-    for first, now in run(conveyor, 9, denoise, held):
+    for first, now in run(conveyor, 9, denoise, observation):
         for k in range(len(now.age)):
             noise.setdefault(first + k, now.x[0, k, 2:])
             assert torch.equal(now.x[0, k, 2:], noise[first + k]), "absent: as it entered"

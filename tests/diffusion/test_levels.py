@@ -72,16 +72,16 @@ def test_observed_frames_are_of_one_modality_at_a_time():
 def test_what_is_observed_says_nothing_about_the_other_modalities_levels():
     levels, _ = drawn(independent=1.0, conveyor=0.0, observed=1.0)
     for modality in range(3):
-        known = levels[..., modality] == 0
-        other = levels[..., (modality - 1) % 3][known]
+        observed_parts = levels[..., modality] == 0
+        other = levels[..., (modality - 1) % 3][observed_parts]
         assert other.mean() == pytest.approx(0.5, abs=0.02)
 
 
 @pytest.mark.parametrize("whole", [0.0, 0.4])
 def test_as_many_windows_as_asked_for_are_known_whole(whole):
     levels, _ = drawn(independent=1.0, conveyor=0.0, observed=1.0, whole=whole)
-    known = (levels == 0).all(1).any(-1).float().mean()
-    assert known == pytest.approx(whole, abs=0.04)
+    observed_parts = (levels == 0).all(1).any(-1).float().mean()
+    assert observed_parts == pytest.approx(whole, abs=0.04)
     some = (levels == 0).any(1).any(-1).float().mean()
     assert some > whole + 0.3, "others are known in part"
 

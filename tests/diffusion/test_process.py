@@ -83,17 +83,17 @@ def test_sampler_reproduces_a_gaussian():
 
 
 def test_known_frames_come_out_as_given():
-    known = torch.randn(2, 6, 3)
-    is_known = torch.tensor([True, True, False, False, False, False]).expand(2, -1)
+    observed = torch.randn(2, 6, 3)
+    is_observed = torch.tensor([True, True, False, False, False, False]).expand(2, -1)
     drawn = sample(
         lambda x, level: torch.tanh(x),
         torch.randn(8, 2, 6, 3),
         CosineSchedule(),
-        known=known,
-        is_known=is_known,
+        observed=observed,
+        is_observed=is_observed,
     )
-    assert torch.allclose(drawn[:, :2], known[:, :2], atol=1e-6)
-    assert not torch.allclose(drawn[:, 2:], known[:, 2:], atol=0.1)
+    assert torch.allclose(drawn[:, :2], observed[:, :2], atol=1e-6)
+    assert not torch.allclose(drawn[:, 2:], observed[:, 2:], atol=0.1)
 
 
 @pytest.mark.parametrize("schedule", SCHEDULES)

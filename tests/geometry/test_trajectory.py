@@ -14,7 +14,7 @@ from wearcap.geometry.trajectory import (
     find_gaps,
     finite_difference,
     interpolate,
-    interpolate_held,
+    interpolate_clamped,
     linear_velocity,
     outlier_mask,
     resample,
@@ -178,5 +178,5 @@ def test_hostile_timestamps_are_named(times, word, function):
 def test_values_beyond_the_ends_are_held():
     known, value = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64), torch.tensor([10.0, 20.0, 0.0])
     at = torch.tensor([-5.0, 1.0, 1.25, 3.0, 4.0, 9.0], dtype=torch.float64)
-    assert interpolate_held(known, value, at).tolist() == [10.0, 10.0, 12.5, 10.0, 0.0, 0.0]
-    assert interpolate_held(known[:1], value[:1], at).tolist() == [10.0] * 6
+    assert interpolate_clamped(known, value, at).tolist() == [10.0, 10.0, 12.5, 10.0, 0.0, 0.0]
+    assert interpolate_clamped(known[:1], value[:1], at).tolist() == [10.0] * 6

@@ -21,7 +21,7 @@ def inputs(net: EchoDenoiser, time: int = WINDOW):
     return x_t, level, condition, code, there, there.clone()
 
 
-def said(net: EchoDenoiser, x_t, level, condition, code, has_object, valid):
+def outputs(net: EchoDenoiser, x_t, level, condition, code, has_object, valid):
     return net(x_t, level, net.encode(condition, net.object(code), has_object, valid), valid)
 
 
@@ -36,14 +36,17 @@ def net(request):
 @nets
 @pytest.mark.parametrize("modality", range(3))
 def test_each_modalitys_level_and_noise_reach_all_that_is_said(net, modality):
-    x_t, level, *told = inputs(net)
-    before = said(net, x_t, level, *told)
+    x_t, level, *conditioning = inputs(net)
+    before = outputs(net, x_t, level, *conditioning)
     assert before.shape == x_t.shape
     other = level.clone()
     other[:, 3, modality] = 1 - other[:, 3, modality]
     noised = [part.clone() for part in x_t.split(net.sizes, -1)]
     noised[modality][:, 3] += 1.0
-    for after in (said(net, x_t, other, *told), said(net, torch.cat(noised, -1), level, *told)):
+    for after in (
+        outputs(net, x_t, other, *conditioning),
+        outputs(net, torch.cat(noised, -1), level, *conditioning),
+    ):
         for part in (after - before).split(net.sizes, -1):
             assert part.abs().max() > 1e-6
 
@@ -52,10 +55,10 @@ def test_each_modalitys_level_and_noise_reach_all_that_is_said(net, modality):
 def test_padding_changes_nothing_on_the_frames_that_exist(net):
     x_t, level, condition, code, has, valid = inputs(net)
     valid[:, 9:] = False
-    before = said(net, x_t, level, condition, code, has, valid)
+    before = outputs(net, x_t, level, condition, code, has, valid)
     has = has.clone()
     x_t[:, 9:], level[:, 9:], condition[:, 9:], code[:, 9:], has[:, 9:] = 99.0, 0.5, -99.0, 99.0, False
-    after = said(net, x_t, level, condition, code, has, valid)
+    after = outputs(net, x_t, level, condition, code, has, valid)
     torch.testing.assert_close(after[:, :9], before[:, :9], atol=1e-4, rtol=0)
 
 
@@ -63,19 +66,19 @@ def test_padding_changes_nothing_on_the_frames_that_exist(net):
 def test_a_short_window_is_a_padded_one(net):
     x_t, level, condition, code, has, valid = inputs(net)
     valid[:, 9:] = False
-    padded = said(net, x_t, level, condition, code, has, valid)[:, :9]
-    short = said(net, *(part[:, :9] for part in (x_t, level, condition, code, has, valid)))
+    padded = outputs(net, x_t, level, condition, code, has, valid)[:, :9]
+    short = outputs(net, *(part[:, :9] for part in (x_t, level, condition, code, has, valid)))
     torch.testing.assert_close(short, padded, atol=1e-4, rtol=0)
 
 
 def test_without_an_object_its_code_means_nothing(net):
     x_t, level, condition, code, has, valid = inputs(net)
     none = torch.zeros_like(has)
-    one, two = (said(net, x_t, level, condition, part, none, valid) for part in (code, 7 - code))
+    one, two = (outputs(net, x_t, level, condition, part, none, valid) for part in (code, 7 - code))
     assert torch.equal(one, two)
-    with_it = said(net, x_t, level, condition, code, has, valid)
+    with_it = outputs(net, x_t, level, condition, code, has, valid)
     assert (with_it - one).abs().max() > 1e-3
-    other = said(net, x_t, level, condition, code + 1, has, valid)
+    other = outputs(net, x_t, level, condition, code + 1, has, valid)
     assert (with_it - other).abs().max() > 1e-3
 
 
@@ -92,7 +95,7 @@ def test_a_level_per_window_is_the_broadcast_case(net):
 def test_gradients_reach_every_parameter(net):
     x_t, level, condition, code, has, valid = inputs(net)
     has[0, :8] = False
-    said(net, x_t, level, condition, code, has, valid).square().sum().backward()
+    outputs(net, x_t, level, condition, code, has, valid).square().sum().backward()
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.abs().sum() > 0, name

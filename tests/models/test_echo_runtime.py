@@ -15,30 +15,30 @@ from wearcap.systems.echo import step_runner as echo_runtime
 from wearcap.systems.echo.step_runner import EchoPlans, EchoRunner
 
 
-def levels_of(lanes: int, frames: int, start: int) -> torch.Tensor:
+def levels_of(items: int, frames: int, start: int) -> torch.Tensor:
     """As on a queue, with an object that comes in at another frame in every lane."""
-    level = torch.linspace(0, 1, frames)[None, :, None].repeat(lanes, 1, 3)
-    for lane in range(lanes):
-        level[lane, : max(start - lane, 0), 1] = 1.0
+    level = torch.linspace(0, 1, frames)[None, :, None].repeat(items, 1, 3)
+    for batch_item in range(items):
+        level[batch_item, : max(start - batch_item, 0), 1] = 1.0
     return level
 
 
-def told(lanes: int, frames: int) -> list[torch.Tensor]:
+def conditioning(items: int, frames: int) -> list[torch.Tensor]:
     """Condition, object, whether there is one, and which frames are valid."""
     features, random = small_features(), torch.Generator().manual_seed(0)
     sizes = features.condition_size, len(small_net(features).no_object)
-    condition, code = (torch.randn(lanes, frames, size, generator=random) for size in sizes)
-    valid = torch.arange(frames).expand(lanes, -1) < frames - torch.arange(lanes)[:, None]
-    return [condition, code, torch.rand(lanes, frames, generator=random) < 0.5, valid]
+    condition, code = (torch.randn(items, frames, size, generator=random) for size in sizes)
+    valid = torch.arange(frames).expand(items, -1) < frames - torch.arange(items)[:, None]
+    return [condition, code, torch.rand(items, frames, generator=random) < 0.5, valid]
 
 
 @pytest.mark.parametrize("streams", [1, 3])
-@pytest.mark.parametrize("lanes", [1, 2])
-def test_plans_are_those_of_the_network(streams, lanes):
+@pytest.mark.parametrize("items", [1, 2])
+def test_plans_are_those_of_the_network(streams, items):
     net = small_net(small_features(), streams=streams)
     plans = EchoPlans(net)
     for start in (0, 3, 4, 9):
-        level = levels_of(lanes, WINDOW, start)
+        level = levels_of(items, WINDOW, start)
         found, expected = plans.plan(plans(level)), net.plan(level)
         for one, other in zip((*found.worth, *found.blocks), (*expected.worth, *expected.blocks)):
             torch.testing.assert_close(one.expand_as(other), other)
@@ -60,13 +60,13 @@ def test_lanes_of_the_same_levels_share_a_plan():
     assert plans(levels_of(1, WINDOW, 2).repeat(4, 1, 1)).shape == (1, WINDOW, plans.size)
 
 
-def said(runner: EchoRunner) -> list[torch.Tensor]:
+def outputs(runner: EchoRunner) -> list[torch.Tensor]:
     """Of a whole window, and of some that are not full yet."""
     answers, random = [], torch.Generator().manual_seed(1)
-    for lanes, frames in ((1, WINDOW), (2, 5)):
-        level = levels_of(lanes, frames, 3)
-        x_t = torch.randn(lanes, frames, sum(runner.net.sizes), generator=random)
-        answers.append(runner.begin(*told(lanes, frames))(x_t, level))
+    for items, frames in ((1, WINDOW), (2, 5)):
+        level = levels_of(items, frames, 3)
+        x_t = torch.randn(items, frames, sum(runner.net.sizes), generator=random)
+        answers.append(runner.begin(*conditioning(items, frames))(x_t, level))
     return answers
 
 
@@ -74,8 +74,8 @@ def said(runner: EchoRunner) -> list[torch.Tensor]:
 def worst_of(runtime: str, device: str = "cpu") -> float:
     """Largest difference from eager steps."""
     net = small_net(small_features(), streams=3, blend=3)
-    expected = said(EchoRunner(net))
-    found = said(EchoRunner(net.to(device), runtime))
+    expected = outputs(EchoRunner(net))
+    found = outputs(EchoRunner(net.to(device), runtime))
     return max((one - two).abs().max().item() for one, two in zip(found, expected))
 
 

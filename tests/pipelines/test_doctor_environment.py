@@ -46,12 +46,12 @@ def found(*objects, severity=("error", "warning", "note")) -> list[Finding]:
 
 def test_a_sound_environment_is_listed():
     assert not found(*SOUND)
-    said = {finding.check: finding for finding in found(*SOUND, severity=("ok",))}
-    assert said["environment"].what == "5 objects"
-    assert said["environment"].evidence == "1 axis, 1 free, 1 hinge, 2 plane"
-    assert said["object door_1"].what == "door: turns about a hinge, 0° to 92°"
-    assert said["object drawer_1"].what == "drawer: slides along an axis, 0.00 to 0.40 m"
-    assert "0.90 x 0.05 x 2.00 m, 12 triangles" in said["object door_1"].evidence
+    reported = {finding.check: finding for finding in found(*SOUND, severity=("ok",))}
+    assert reported["environment"].what == "5 objects"
+    assert reported["environment"].evidence == "1 axis, 1 free, 1 hinge, 2 plane"
+    assert reported["object door_1"].what == "door: turns about a hinge, 0° to 92°"
+    assert reported["object drawer_1"].what == "drawer: slides along an axis, 0.00 to 0.40 m"
+    assert "0.90 x 0.05 x 2.00 m, 12 triangles" in reported["object door_1"].evidence
 
 
 @pytest.mark.parametrize(
@@ -70,10 +70,10 @@ def test_a_sound_environment_is_listed():
     ],
 )  # fmt: skip
 def test_what_looks_wrong_is_named(item, what, severity):
-    said = found(*SOUND, item)
-    assert [(finding.what, finding.severity) for finding in said] == [(what, severity)]
-    assert "_9" in said[0].check
-    assert said[0].fix
+    reported = found(*SOUND, item)
+    assert [(finding.what, finding.severity) for finding in reported] == [(what, severity)]
+    assert "_9" in reported[0].check
+    assert reported[0].fix
 
 
 def test_an_empty_environment():

@@ -14,9 +14,9 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
 from wearcap.systems.echo.features import CONTACTS, Body
-from wearcap.systems.echo.observations import Observed, lane_of
+from wearcap.systems.echo.observations import Observed, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.echo.queue import EchoQueue, Told
+from wearcap.systems.echo.queue import Conditioning, EchoQueue
 from wearcap.systems.echo.rewindow import Rewindow
 from wearcap.tracking.head_path import head_path
 
@@ -24,8 +24,8 @@ TWO = (("box_1", "left", 0.1, 0.35), ("box_2", "right", 0.6, 0.8))
 FRAMES = ("own", "window", "world")
 
 
-def lane(echo: Echo, scenario):
-    return lane_of(scenario, head_path(scenario.recording, echo.skeleton, echo.fps), echo.reader())
+def batch_item(echo: Echo, scenario):
+    return batch_item_of(scenario, head_path(scenario.recording, echo.skeleton, echo.fps), echo.reader())
 
 
 def everything(recording) -> Observed:
@@ -51,12 +51,12 @@ def assert_true(motion: Motion, recording, scenario, atol: float = 2e-4) -> None
 def test_what_is_observed_comes_out_as_it_is(frame, rewindow):
     recording = carrying(1.0, carried=TWO)
     scenario = scenario_of(recording, TWO, observed=everything(recording))
-    echo = drawn_echo(frame, hang=False, rewindow=rewindow)
+    echo = drawn_echo(frame, anchor=False, rewindow=rewindow)
     motion = echo.capture_scenarios([scenario], [0])[0]
     assert_true(motion, recording, scenario)
     contact = scenario.observed.contact
     torch.testing.assert_close(motion.contact_prob, contact[:, BODY_POINTS:], atol=1e-5, rtol=0)
-    active = lane(echo, scenario).told.has_object[0, :, None]
+    active = batch_item(echo, scenario).conditioning.has_object[0, :, None]
     torch.testing.assert_close(motion.body_contact_prob, contact[:, :BODY_POINTS] * active, atol=1e-5, rtol=0)
 
 
@@ -70,24 +70,24 @@ def test_known_frames_of_one_modality_enter_at_level_0(modality):
         Observed(object_motion={name: track[take] for name, track in recording.object_motion.items()}),
         Observed(contact_times=times, contact=all_of_it.contact[take]),
     )[modality]
-    echo, given = drawn_echo(hang=False), []
+    echo, given = drawn_echo(anchor=False), []
     denoiser = echo.denoiser
 
-    def watched(queue, told, frame):
-        denoise, amend = denoiser(queue, told, frame)
+    def watched(queue, conditioning, frame):
+        denoise, correct = denoiser(queue, conditioning, frame)
 
         def look(x, level):
-            given.append((level, told.is_known))
+            given.append((level, conditioning.is_observed))
             return denoise(x, level)
 
-        return look, amend
+        return look, correct
 
     echo.denoiser = watched
     found = echo.capture_scenarios([scenario_of(recording, margin_s=3.0, observed=seen)], [0])[0]
-    plain = drawn_echo(hang=False).capture_scenarios([scenario_of(recording, margin_s=3.0)], [0])[0]
-    for level, known in given:
-        assert (level[known] == 0).all()
-        assert not known[..., [k for k in range(3) if k != modality]].any()
+    plain = drawn_echo(anchor=False).capture_scenarios([scenario_of(recording, margin_s=3.0)], [0])[0]
+    for level, observed_parts in given:
+        assert (level[observed_parts] == 0).all()
+        assert not observed_parts[..., [k for k in range(3) if k != modality]].any()
     pairs = [
         (found.t_world_root, plain.t_world_root, recording.motion.t_world_root),
         (*(m.object_motion["box_1"].t_world_body for m in (found, plain)), recording.object_motion["box_1"].t_world_body),
@@ -101,22 +101,24 @@ def test_known_frames_of_one_modality_enter_at_level_0(modality):
     assert not torch.allclose(value[others], without[others], atol=1e-5), "its neighbours hear of it"
 
 
-def truth_of(echo: Echo, told: Told, frame: Rigid) -> torch.Tensor:
+def truth_of(echo: Echo, conditioning: Conditioning, frame: Rigid) -> torch.Tensor:
     """x0 as the frame sees what stands beside what is told."""
-    body = echo.features.encode_body(Body(told.R_parent_joint, told.t_world_root), frame)
-    thing = echo.features.encode_object(Rigid(told.R_world_object, told.t_world_object), frame)
-    return echo.net.motion_normalizer(torch.cat([body, thing, 2 * told.contact - 1], -1))
+    body = echo.features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
+    scene_object = echo.features.encode_object(
+        Rigid(conditioning.R_world_object, conditioning.t_world_object), frame
+    )
+    return echo.net.motion_normalizer(torch.cat([body, scene_object, 2 * conditioning.contact - 1], -1))
 
 
 class Knowing(Echo):
     """Whose denoiser is perfect."""
 
-    def denoiser(self, queue, told, frame):
-        truth = truth_of(self, told, frame)
-        known = queue.seen if hasattr(queue, "seen") else []
+    def denoiser(self, queue, conditioning, frame):
+        truth = truth_of(self, conditioning, frame)
+        observed_parts = queue.seen if hasattr(queue, "seen") else []
 
         def denoise(x, level):
-            known.append(torch.where(queue.conveyor.wide(level) == 0, (x - truth).abs(), 0.0))
+            observed_parts.append(torch.where(queue.conveyor.wide(level) == 0, (x - truth).abs(), 0.0))
             return truth
 
         return denoise, None
@@ -124,7 +126,7 @@ class Knowing(Echo):
 
 def knowing(frame: str, **settings) -> Echo:
     plain = drawn_echo(frame)
-    given = {"context": 8, "per_frame": 2, "hang": False} | settings
+    given = {"context": 8, "per_frame": 2, "anchor": False} | settings
     return Knowing(plain.net, plain.features, plain.schedule, plain.skeleton, **given)
 
 
@@ -141,16 +143,20 @@ def test_a_perfect_denoiser_says_the_truth_in_any_frame(frame, make, step):
     """And what is clean stays the truth while the windows' frame of reference moves."""
     recording = carrying(1.0, carried=TWO)
     echo = knowing(frame, step=step)
-    told = lane(echo, scenario_of(recording, TWO, observed=everything(recording))).told
-    told = told._replace(is_known=torch.zeros_like(told.is_known))
+    conditioning = batch_item(echo, scenario_of(recording, TWO, observed=everything(recording))).conditioning
+    conditioning = conditioning._replace(is_observed=torch.zeros_like(conditioning.is_observed))
     queue = make(echo, [echo.skeleton], [0])
     queue.seen = []
-    said = queue.run(told)
-    torch.testing.assert_close(said.t_world_root, told.t_world_root, atol=2e-4, rtol=0)
-    torch.testing.assert_close(said.R_parent_joint, told.R_parent_joint, atol=2e-4, rtol=0)
-    there = told.has_object
-    torch.testing.assert_close(said.t_world_object[there], told.t_world_object[there], atol=2e-4, rtol=0)
-    torch.testing.assert_close(said.R_world_object[there], told.R_world_object[there], atol=2e-4, rtol=0)
+    outputs = queue.run(conditioning)
+    torch.testing.assert_close(outputs.t_world_root, conditioning.t_world_root, atol=2e-4, rtol=0)
+    torch.testing.assert_close(outputs.R_parent_joint, conditioning.R_parent_joint, atol=2e-4, rtol=0)
+    there = conditioning.has_object
+    torch.testing.assert_close(
+        outputs.t_world_object[there], conditioning.t_world_object[there], atol=2e-4, rtol=0
+    )
+    torch.testing.assert_close(
+        outputs.R_world_object[there], conditioning.R_world_object[there], atol=2e-4, rtol=0
+    )
     assert max(part.max() for part in queue.seen) < 5e-3, "clean frames are what they were said to be"
 
 
@@ -158,19 +164,24 @@ def test_what_moves_with_the_window_is_noised_in_the_new_frame():
     """z' = A z + √ᾱ b against encoding there, with the same noise turned."""
     echo = drawn_echo("window")
     queue, recording = EchoQueue(echo, [echo.skeleton], [0]), carrying(1.6)
-    told = lane(echo, scenario_of(recording, margin_s=5.0, observed=everything(recording))).told
-    before, queue.told = told.frames(slice(0, WINDOW)), told.frames(slice(5, 5 + WINDOW))
-    old, new = (echo.features.canonical(part.points) for part in (before, queue.told))
+    conditioning = batch_item(
+        echo, scenario_of(recording, margin_s=5.0, observed=everything(recording))
+    ).conditioning
+    before, queue.conditioning = (
+        conditioning.frames(slice(0, WINDOW)),
+        conditioning.frames(slice(5, 5 + WINDOW)),
+    )
+    old, new = (echo.features.canonical(part.points) for part in (before, queue.conditioning))
     queue.conveyor.age = torch.arange(WINDOW).flip(0)
     queue.conveyor.level = torch.rand(1, WINDOW, 3)
     level = echo.net.per_feature(queue.conveyor.level)
     noise = torch.randn(1, WINDOW, sum(echo.net.sizes))
-    queue.conveyor.x = add_noise(truth_of(echo, queue.told, old), noise, level, echo.schedule)
+    queue.conveyor.x = add_noise(truth_of(echo, queue.conditioning, old), noise, level, echo.schedule)
     turned, change = noise.clone(), new.R.mT @ old.R
     first = echo.net.sizes[0]
     for at in (0, 3, 6, first, first + 3, first + 6):
         turned[..., at : at + 3] = (change @ noise[..., at : at + 3, None])[..., 0]
-    expected = add_noise(truth_of(echo, queue.told, new), turned, level, echo.schedule)
+    expected = add_noise(truth_of(echo, queue.conditioning, new), turned, level, echo.schedule)
     queue._frame = old
     queue._move(new)
     torch.testing.assert_close(queue.conveyor.x, expected, atol=1e-4, rtol=0)
@@ -222,7 +233,7 @@ def test_the_body_hangs_from_the_measured_head():
     head, true = motion.joint("head"), recording.motion.joint("head")
     torch.testing.assert_close(head.t, true.t, atol=1e-4, rtol=0)
     torch.testing.assert_close(head.R, true.R, atol=1e-4, rtol=0)
-    standing = drawn_echo(hang=False).capture([recording], [0])[0]
+    standing = drawn_echo(anchor=False).capture([recording], [0])[0]
     assert not torch.allclose(standing.joint("head").t, true.t, atol=1e-2)
 
 
@@ -276,24 +287,30 @@ def test_behind_a_gap_of_the_head_it_begins_anew():
 def test_a_frame_waits_for_the_ramp():
     echo, recording = drawn_echo(), carrying(1.0)
     assert echo.latency_s == pytest.approx(7 / FPS)
-    queue, told = EchoQueue(echo, [echo.skeleton], [0]), lane(echo, scenario_of(recording)).told
-    given = [queue.push(told.frames(slice(k, k + 1))) is not None for k in range(30)]
+    queue, conditioning = (
+        EchoQueue(echo, [echo.skeleton], [0]),
+        batch_item(echo, scenario_of(recording)).conditioning,
+    )
+    given = [queue.push(conditioning.frames(slice(k, k + 1))) is not None for k in range(30)]
     assert given == [False] * 7 + [True] * 23
 
 
 def test_a_queue_needs_no_more_the_longer_it_runs():
     echo = drawn_echo()
-    queue, told = EchoQueue(echo, [echo.skeleton], [0]), lane(echo, scenario_of(carrying(2.0))).told
+    queue, conditioning = (
+        EchoQueue(echo, [echo.skeleton], [0]),
+        batch_item(echo, scenario_of(carrying(2.0))).conditioning,
+    )
     for k in range(60):
-        queue.push(told.frames(slice(k, k + 1)))
-        assert queue.told.valid.shape[1] == queue.conveyor.x.shape[1] <= WINDOW
+        queue.push(conditioning.frames(slice(k, k + 1)))
+        assert queue.conditioning.valid.shape[1] == queue.conveyor.x.shape[1] <= WINDOW
 
 
 def test_acts_may_be_given():
     recording, environment = carrying(1.5), boxes()
     acts = [{"object": "box_1", "start_s": 0.9, "stop_s": 1.2}, {"object": "box_1", "start_s": 0.2, "stop_s": 0.4}]  # fmt: skip
-    told = drawn_echo(acts=acts).scenario(recording, environment).acts
-    assert [act.start_s for act in told] == [0.2, 0.9]
+    conditioning = drawn_echo(acts=acts).scenario(recording, environment).acts
+    assert [act.start_s for act in conditioning] == [0.2, 0.9]
     assert drawn_echo(acts="none").scenario(recording, environment).acts == ()
     assert [act.object for act in drawn_echo().scenario(recording, environment).acts] == ["box_1"]
     assert drawn_echo().scenario(carrying(1.0, carried=()), None).acts == ()
@@ -326,7 +343,7 @@ def tracked(recording, **changes):
 def test_wrists_of_controllers_are_as_good_as_true_ones():
     recording = carrying(1.0)
     echo = drawn_echo()
-    one, two = (lane(echo, scenario_of(each)).told for each in (recording, replace(tracked(recording), motion=None)))  # fmt: skip
+    one, two = (batch_item(echo, scenario_of(each)).conditioning for each in (recording, replace(tracked(recording), motion=None)))  # fmt: skip
     torch.testing.assert_close(one.t_world_point, two.t_world_point, atol=1e-4, rtol=0)
     torch.testing.assert_close(one.R_world_point, two.R_world_point, atol=1e-4, rtol=0)
 
@@ -336,9 +353,9 @@ def test_observations_may_be_in_double_precision():
     seen = everything(recording)
     motion = replace(recording.motion, R_parent_joint=recording.motion.R_parent_joint.double(), t_world_root=recording.motion.t_world_root.double())  # fmt: skip
     tracks = {name: Trajectory(track.timestamps, track.R_world_body.double(), track.t_world_body.double()) for name, track in recording.object_motion.items()}  # fmt: skip
-    echo = drawn_echo(hang=False)
+    echo = drawn_echo(anchor=False)
     one, two = (
-        lane(echo, scenario_of(recording, TWO, observed=each)).told
+        batch_item(echo, scenario_of(recording, TWO, observed=each)).conditioning
         for each in (seen, replace(seen, motion=motion, object_motion=tracks))
     )
     torch.testing.assert_close(one.t_world_object, two.t_world_object)

@@ -24,7 +24,7 @@ from wearcap.metrics.objects import vertex_error_cm
 from wearcap.recording import RecordingStore
 from wearcap.systems.echo.dataset import EchoOnDataset
 from wearcap.systems.echo.features import CONTACTS
-from wearcap.systems.echo.observations import lane_of
+from wearcap.systems.echo.observations import batch_item_of
 from wearcap.systems.echo.published import NearestEcho, RigidWrist
 from wearcap.systems.echo.scores import MEASURES, MODALITIES, observed_share, score_echo, truth_of
 from wearcap.systems.echo.training_windows import EchoDataset
@@ -123,14 +123,16 @@ def test_without_a_truth_there_is_nothing_to_compare_with(scenario, missing):
 def test_a_share_of_the_truth_is_observed(truth, scenario, modality, share):
     seen = observed_share(truth, modality, share, seed=1)
     echo = drawn_echo()
-    lane = lane_of(replace(scenario, observed=seen), head_path(RECORDING, echo.skeleton, echo.fps), echo.reader())  # fmt: skip
-    known, place = lane.told.is_known[0], MODALITIES.index(modality)
-    assert not known[:, [k for k in range(3) if k != place]].any()
+    item = batch_item_of(replace(scenario, observed=seen), head_path(RECORDING, echo.skeleton, echo.fps), echo.reader())  # fmt: skip
+    observed_parts, place = item.conditioning.is_observed[0], MODALITIES.index(modality)
+    assert not observed_parts[:, [k for k in range(3) if k != place]].any()
     if share == 1.0:
-        active = lane.told.has_object[0]
-        assert torch.equal(known[:, place], active if modality == "object" else torch.ones_like(active))
+        active = item.conditioning.has_object[0]
+        assert torch.equal(
+            observed_parts[:, place], active if modality == "object" else torch.ones_like(active)
+        )
     elif modality != "object":
-        assert known[:, place].sum() == round(share * len(TIMES))
+        assert observed_parts[:, place].sum() == round(share * len(TIMES))
     other = observed_share(truth, modality, share, seed=1)
     assert str(other) == str(seen)
     if modality == "contact":
@@ -169,8 +171,8 @@ def test_an_object_is_stuck_to_the_wrist_that_carried_it(dataset):
     stuck = RigidWrist.fit(dataset)
     echo, recording = drawn_echo(), carrying(1.5)
     scenario = scenario_of(recording, margin_s=2.0)
-    lane = lane_of(scenario, head_path(recording, echo.skeleton, echo.fps), echo.reader())
-    motion = stuck.attached(recording.motion, lane)
+    item = batch_item_of(scenario, head_path(recording, echo.skeleton, echo.fps), echo.reader())
+    motion = stuck.attached(recording.motion, item)
     found, true = motion.object_motion["box_1"], recording.object_motion["box_1"]
     wrist = recording.motion.joint("left_wrist").t
     assert (found.t_world_body - wrist).norm(dim=-1).max() < 0.4
@@ -181,7 +183,7 @@ def test_an_object_is_stuck_to_the_wrist_that_carried_it(dataset):
 
 def test_baselines_are_functions_of_the_training_split_alone(dataset):
     one, two = (NearestEcho.fit(dataset, window=12) for _ in range(2))
-    assert torch.equal(one.said, two.said)
+    assert torch.equal(one.outputs, two.outputs)
     assert set(one.descriptor) == {"box"}
     np.testing.assert_array_equal(one.frames["box"].numpy(), two.frames["box"].numpy())
     assert RecordingStore.open(dataset.recordings[0][0].root).names("train") == ["c0"]

@@ -38,7 +38,7 @@ def feed(session, recording, frame: int, shift: float = 0.0, tracked: bool = Tru
     return given(session)
 
 
-def rest(session) -> list[Motion]:
+def static_threshold(session) -> list[Motion]:
     return given(session, ended=True) + given(session, ended=True)
 
 
@@ -49,7 +49,7 @@ def whole(session, recording, happen=None) -> Motion:
         if happen is not None and frame == FAULT:
             happen(session)
         parts += feed(session, recording, frame)
-    return joined(parts + rest(session))
+    return joined(parts + static_threshold(session))
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,10 @@ def test_where_the_clock_moves_it_goes_on(echo, recording, shift):
     for frame in range(FRAMES):
         late += feed(session, recording, frame, 1.2 + shift)
         expected += feed(fresh, recording, frame, 1.2 + shift, frame >= AGREEING - 1)
-    late, expected = joined(before + late + rest(session)), joined(expected + rest(fresh))
+    late, expected = (
+        joined(before + late + static_threshold(session)),
+        joined(expected + static_threshold(fresh)),
+    )
     assert len(late) == 40 + FRAMES
     new = slice(40, None)
     assert torch.allclose(late.timestamps[new], expected.timestamps, atol=1e-6)
@@ -116,7 +119,7 @@ def test_the_active_object_stays_active_where_the_clock_goes_back(echo, recordin
     session.activate("box_1", 50.1)
     parts = [motion for frame in range(FRAMES) for motion in feed(session, recording, frame, 50.0)]
     parts += [motion for frame in range(FRAMES) for motion in feed(session, recording, frame)]
-    parts += rest(session)
+    parts += static_threshold(session)
     assert all((motion.timestamps.diff() > 0).all() for motion in parts)
     seen = torch.cat([motion.object_motion["box_1"].timestamps for motion in parts if motion.object_motion])
     assert int((seen < 10).sum()) == FRAMES
@@ -150,7 +153,11 @@ def test_whatever_comes_it_goes_on(echo, recording, seed):
         motions.append(session.poses())
     for k in range(30):  # the devices are well again
         motions += feed(session, recording, k, 4.0)
-    motions = [motion for motion in (*motions, *rest(session), *rest(session)) if motion is not None]
+    motions = [
+        motion
+        for motion in (*motions, *static_threshold(session), *static_threshold(session))
+        if motion is not None
+    ]
     assert max(motion.timestamps[-1].item() for motion in motions) >= 4.9
     for motion in motions:
         assert motion.R_parent_joint.isfinite().all()

@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from carried_box import box_mesh, boxes, carrying, drawn_echo, scenario_of, thing
+from carried_box import box_mesh, boxes, carrying, drawn_echo, scenario_of, scene_object
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.environment import Environment
 from wearcap.systems.echo.features import OBJECT_SIZE, Body
 from wearcap.systems.echo.guidance import Guidance, GuidedScene
-from wearcap.systems.echo.observations import Observed, lane_of
+from wearcap.systems.echo.observations import Observed, batch_item_of
 from wearcap.systems.echo.pipeline import pulled_by
 from wearcap.tracking.head_path import head_path
 
@@ -23,42 +23,42 @@ def scene_of(frame: str = "own", shift=(0.0, 0.0, 0.0), lift: float = 0.0, conta
     """A walk as x̂0, the box shifted and the body lifted (m); touching where `contact` says, else the left hand and all feet."""
     recording, echo = carrying(0.6), drawn_echo(frame)
     motion = recording.motion
-    lane = lane_of(scenario_of(recording, margin_s=9.0, observed=Observed(motion, recording.object_motion)), head_path(recording, echo.skeleton, echo.fps), echo.reader())  # fmt: skip
-    told = lane.told.frames(slice(0, FRAMES))
-    at = echo.features.canonical(told.points)
-    body = Body(told.R_parent_joint, told.t_world_root + torch.tensor([0.0, 0.0, lift]))
-    box = Rigid(told.R_world_object, told.t_world_object + torch.tensor(shift))
+    batch_item = batch_item_of(scenario_of(recording, margin_s=9.0, observed=Observed(motion, recording.object_motion)), head_path(recording, echo.skeleton, echo.fps), echo.reader())  # fmt: skip
+    conditioning = batch_item.conditioning.frames(slice(0, FRAMES))
+    at = echo.features.canonical(conditioning.points)
+    body = Body(conditioning.R_parent_joint, conditioning.t_world_root + torch.tensor([0.0, 0.0, lift]))
+    box = Rigid(conditioning.R_world_object, conditioning.t_world_object + torch.tensor(shift))
     if contact is None:
         contact = torch.full((1, FRAMES, BODY_POINTS + 4), -0.9)
         contact[..., LEFT_HAND] = contact[..., BODY_POINTS:] = 0.9
     raw = torch.cat([echo.features.encode_body(body, at), echo.features.encode_object(box, at), contact], -1)
-    scene = GuidedScene(echo.net, echo.features, told, at, *pulled_by([motion.skeleton], [{}], [lane.objects]))  # fmt: skip
+    scene = GuidedScene(echo.net, echo.features, conditioning, at, *pulled_by([motion.skeleton], [{}], [batch_item.objects]))  # fmt: skip
     return scene, echo.net.motion_normalizer(raw)
 
 
 @pytest.mark.parametrize("frame", ["own", "window", "world"])
 def test_an_object_comes_to_the_hand_that_touches_it(frame):
     scene, x = scene_of(frame, shift=(0.1, 0.05, -0.1))
-    amended = Guidance(object=1.0, human=0.0, feet=0.0).amended(x, scene)
-    assert scene.costs(amended, 0.5)[0] < 0.9 * scene.costs(x, 0.5)[0]
+    corrected = Guidance(object=1.0, human=0.0, feet=0.0).corrected(x, scene)
+    assert scene.costs(corrected, 0.5)[0] < 0.9 * scene.costs(x, 0.5)[0]
     first = scene.net.sizes[0]
-    changed = (amended != x).any(0).any(0)
+    changed = (corrected != x).any(0).any(0)
     assert not changed[:first].any()
     assert not changed[first + OBJECT_SIZE :].any(), "contacts are what they were predicted to be"
 
 
 def test_a_body_comes_to_its_object():
     scene, x = scene_of(shift=(0.1, 0.05, -0.1))
-    amended = Guidance(object=0.0, human=0.3, feet=0.0).amended(x, scene)
-    assert scene.costs(amended, 0.5)[0] < scene.costs(x, 0.5)[0]
-    assert torch.equal(amended[..., scene.net.sizes[0] :], x[..., scene.net.sizes[0] :])
+    corrected = Guidance(object=0.0, human=0.3, feet=0.0).corrected(x, scene)
+    assert scene.costs(corrected, 0.5)[0] < scene.costs(x, 0.5)[0]
+    assert torch.equal(corrected[..., scene.net.sizes[0] :], x[..., scene.net.sizes[0] :])
 
 
 @pytest.mark.parametrize("lift", [0.1, -0.1])
 def test_feet_come_to_the_floor_from_above_and_from_below(lift):
     scene, x = scene_of(lift=lift)
-    amended = Guidance(object=0.0, human=0.0, feet=0.5).amended(x, scene)
-    assert scene.costs(amended, 0.5)[1] < 0.9 * scene.costs(x, 0.5)[1]
+    corrected = Guidance(object=0.0, human=0.0, feet=0.5).corrected(x, scene)
+    assert scene.costs(corrected, 0.5)[1] < 0.9 * scene.costs(x, 0.5)[1]
 
 
 def test_step_after_step_it_converges():
@@ -68,7 +68,7 @@ def test_step_after_step_it_converges():
     scene, x = scene_of(shift=(0.3, 0.1, -0.2), lift=0.1, contact=contact)
     first = last = sum(scene.costs(x, 0.5))
     for _ in range(30):
-        x = Guidance().amended(x, scene)
+        x = Guidance().corrected(x, scene)
         now = sum(scene.costs(x, 0.5))
         assert now < 1.02 * last
         last = now
@@ -78,22 +78,22 @@ def test_step_after_step_it_converges():
 def test_what_does_not_touch_is_left_alone():
     contact = torch.full((1, FRAMES, BODY_POINTS + 4), -0.9)
     scene, x = scene_of(shift=(0.1, 0.0, 0.0), lift=0.1, contact=contact)
-    assert torch.equal(Guidance().amended(x, scene), x)
+    assert torch.equal(Guidance().corrected(x, scene), x)
 
 
 @pytest.mark.parametrize(("threshold", "moves"), [(0.9, True), (0.97, False)])
 def test_the_threshold_is_a_probability(threshold, moves):
     scene, x = scene_of(shift=(0.1, 0.0, 0.0))
-    assert torch.equal(Guidance(threshold=threshold).amended(x, scene), x) != moves
+    assert torch.equal(Guidance(threshold=threshold).corrected(x, scene), x) != moves
 
 
 @pytest.mark.parametrize("part", ["valid", "has_object"])
 def test_what_is_not_there_is_not_pulled(part):
     scene, x = scene_of(shift=(0.1, 0.0, 0.0))
-    there = getattr(scene.told, part).clone()
+    there = getattr(scene.conditioning, part).clone()
     there[:, 4:] = False
-    scene = replace(scene, told=scene.told._replace(**{part: there}))
-    moved = (Guidance(feet=0.0).amended(x, scene) != x).any(-1)[0]
+    scene = replace(scene, conditioning=scene.conditioning._replace(**{part: there}))
+    moved = (Guidance(feet=0.0).corrected(x, scene) != x).any(-1)[0]
     assert moved.tolist() == [True] * 4 + [False] * 4
 
 
@@ -103,7 +103,7 @@ def test_gradients_are_those_of_finite_differences(frame):
     scene, x = scene_of(frame, shift=(0.2, 0.05, -0.2), lift=0.05)
     double = lambda part: part.double() if part.is_floating_point() else part  # noqa: E731
     scene = replace(
-        scene, told=type(scene.told)(*(double(part) for part in scene.told)),
+        scene, conditioning=type(scene.conditioning)(*(double(part) for part in scene.conditioning)),
         frame=Rigid(scene.frame.R.double(), scene.frame.t.double()),
     )  # fmt: skip
     x, step = x.double(), 1e-6
@@ -122,12 +122,12 @@ def test_lanes_have_their_own_bodies_and_objects():
     one, x = scene_of(shift=(0.1, 0.05, -0.1))
     two, y = scene_of(shift=(-0.1, 0.0, 0.2))
     both = GuidedScene(
-        one.net, one.features, type(one.told)(*(torch.cat(parts) for parts in zip(one.told, two.told))),
+        one.net, one.features, type(one.conditioning)(*(torch.cat(parts) for parts in zip(one.conditioning, two.conditioning))),
         Rigid(torch.cat([one.frame.R, two.frame.R]), torch.cat([one.frame.t, two.frame.t])),
         [*one.surfaces, *two.surfaces], [*one.objects, *two.objects],
     )  # fmt: skip
-    together = Guidance().amended(torch.cat([x, y]), both)
-    for part, alone in zip(together.split(1), (Guidance().amended(x, one), Guidance().amended(y, two))):
+    together = Guidance().corrected(torch.cat([x, y]), both)
+    for part, alone in zip(together.split(1), (Guidance().corrected(x, one), Guidance().corrected(y, two))):
         torch.testing.assert_close(part, alone, atol=1e-6, rtol=0)
 
 
@@ -158,7 +158,7 @@ def test_a_network_without_contacts_is_not_guided():
 
 def test_each_lane_is_pulled_at_its_own_objects():
     recording = carrying(0.8)
-    small = Environment((thing("box_1", mesh=box_mesh([0.05, 0.05, 0.05])),))
+    small = Environment((scene_object("box_1", mesh=box_mesh([0.05, 0.05, 0.05])),))
     echo = drawn_echo(guidance=Guidance(threshold=0.0))
     scenarios = [scenario_of(recording), replace(scenario_of(recording), environment=small)]
     together = echo.capture_scenarios(scenarios, [0, 0])

@@ -9,8 +9,8 @@ from carried_box import carrying, drawn_echo, scenario_of
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.geometry import rotation
 from wearcap.systems.echo.features import CONTACTS
-from wearcap.systems.echo.queue import Said, Told
-from wearcap.systems.echo.static_objects import FADE, INSIDE, Resting, inside, rested
+from wearcap.systems.echo.queue import Conditioning, Outputs
+from wearcap.systems.echo.static_objects import FADE, INSIDE, StaticObjects, inside, with_static_objects
 
 TOUCH = 0.7
 ACTS = [-1, 0, 0, 0, 0, 0, 0, 1, 1, 1, -1, 1, 1, 1, 0, 0]
@@ -22,7 +22,7 @@ MOVED = [0, 3, 3, 3, 4, 4, 4, 11, 11, 11, 10, 11, 11, 11, 4, 15]
 back where it was left."""
 
 
-def frames(active=ACTS, touched=TOUCHED, observed=()) -> tuple[Told, Said]:
+def frames(active=ACTS, touched=TOUCHED, observed=()) -> tuple[Conditioning, Outputs]:
     """Objects that move a metre and turn a little in every frame; one point of the body touches."""
     count = len(active)
     number = torch.tensor([active], dtype=torch.float32)
@@ -30,31 +30,31 @@ def frames(active=ACTS, touched=TOUCHED, observed=()) -> tuple[Told, Said]:
     contact = torch.full((1, count, CONTACTS), 0.6)
     contact[..., BODY_POINTS:] = 1.0
     contact[0, touched, 12] = TOUCH
-    known = torch.zeros(1, count, 3, dtype=torch.bool)
-    known[0, list(observed), 1] = True
-    told = Told(
+    observed_parts = torch.zeros(1, count, 3, dtype=torch.bool)
+    observed_parts[0, list(observed), 1] = True
+    conditioning = Conditioning(
         eye[:, :, None].repeat(1, 1, 3, 1, 1), zeros[:, :, None].repeat(1, 1, 3, 1), zeros[..., 0], number >= 0, zeros[..., :1],
-        number, number > -2, eye[:, :, None], zeros, eye, zeros, contact, known,
+        number, number > -2, eye[:, :, None], zeros, eye, zeros, contact, observed_parts,
     )  # fmt: skip
     way = torch.arange(count, dtype=torch.float32)
     turn = rotation.exp(torch.stack([0 * way, 0 * way, 0.1 * way], -1))
-    return told, Said(
+    return conditioning, Outputs(
         eye[:, :, None], zeros, turn[None], torch.stack([way, 0 * way, 0 * way], -1)[None], contact
     )
 
 
-def places(said: Said) -> list[int]:
+def places(outputs: Outputs) -> list[int]:
     assert torch.equal(
-        said.R_world_object, frames()[1].R_world_object[:, said.t_world_object[0, :, 0].long()]
+        outputs.R_world_object, frames()[1].R_world_object[:, outputs.t_world_object[0, :, 0].long()]
     )
-    return said.t_world_object[0, :, 0].long().tolist()
+    return outputs.t_world_object[0, :, 0].long().tolist()
 
 
 def test_objects_move_while_they_are_touched_alone():
-    told, said = frames()
-    found = rested(told, said, TOUCH)
+    conditioning, outputs = frames()
+    found = with_static_objects(conditioning, outputs, TOUCH)
     assert places(found) == MOVED
-    assert found.contact_prob is said.contact_prob
+    assert found.contact_prob is outputs.contact_prob
 
 
 def test_poses_from_within_a_contact_count():
@@ -74,13 +74,13 @@ def test_poses_from_within_a_contact_count():
 
 def test_an_object_waits_where_it_is_drawn_within_the_contact():
     stop = 10 + 3 * INSIDE
-    told, said = frames([0] * 60, list(range(10, stop)))
-    way = rested(told, said, TOUCH).t_world_object[0, :, 0].long().tolist()
+    conditioning, outputs = frames([0] * 60, list(range(10, stop)))
+    way = with_static_objects(conditioning, outputs, TOUCH).t_world_object[0, :, 0].long().tolist()
     first, last = 10 + INSIDE, stop - 1 - INSIDE
     assert way == [min(max(k, first), last) for k in range(60)]
 
 
-def again(observed=()) -> tuple[Told, Said, int]:
+def again(observed=()) -> tuple[Conditioning, Outputs, int]:
     """Frames with two contacts and a rest between, and the first frame of the second."""
     back = 70
     return *frames([0] * 140, [*range(10, 50), *range(back, 140)], observed), back
@@ -88,8 +88,8 @@ def again(observed=()) -> tuple[Told, Said, int]:
 
 def test_an_object_that_is_touched_again_comes_from_where_it_was_left():
     """Without a jump, though it is drawn elsewhere."""
-    told, said, back = again()
-    found = rested(told, said, TOUCH)
+    conditioning, outputs, back = again()
+    found = with_static_objects(conditioning, outputs, TOUCH)
     way = found.t_world_object[0, :, 0]
     left, begin = 49 - INSIDE, back + INSIDE
     assert way[left : begin + 1].tolist() == [left] * (begin + 1 - left)
@@ -102,12 +102,14 @@ def test_an_object_that_is_touched_again_comes_from_where_it_was_left():
 
 
 def test_frame_by_frame_it_comes_from_there_too():
-    told, said, back = again()
-    step, way = Resting(TOUCH), []
+    conditioning, outputs, back = again()
+    step, way = StaticObjects(TOUCH), []
     for k in range(140):
         one = slice(k, k + 1)
         way.append(
-            step(told.frames(one), Said(*(field[:, one] for field in said))).t_world_object[0, 0, 0].item()
+            step(conditioning.frames(one), Outputs(*(field[:, one] for field in outputs)))
+            .t_world_object[0, 0, 0]
+            .item()
         )
     assert way[49 : back + 1] == [49.0] * (back + 1 - 49)
     assert way[back + FADE :] == list(range(back + FADE, 140))
@@ -117,56 +119,81 @@ def test_frame_by_frame_it_comes_from_there_too():
 def test_from_an_observed_pose_on_nothing_fades():
     """What is seen, and what is drawn after it, stays as it is."""
     seen = 85
-    told, said, _ = again(observed=[seen])
-    way = rested(told, said, TOUCH).t_world_object[0, :, 0]
+    conditioning, outputs, _ = again(observed=[seen])
+    way = with_static_objects(conditioning, outputs, TOUCH).t_world_object[0, :, 0]
     assert way[seen:].tolist() == list(range(seen, 140))
     assert way[seen - 1] < seen - 1
-    step, streamed = Resting(TOUCH), []
+    step, streamed = StaticObjects(TOUCH), []
     for k in range(140):
         one = slice(k, k + 1)
         streamed.append(
-            step(told.frames(one), Said(*(field[:, one] for field in said))).t_world_object[0, 0, 0].item()
+            step(conditioning.frames(one), Outputs(*(field[:, one] for field in outputs)))
+            .t_world_object[0, 0, 0]
+            .item()
         )
     assert streamed[seen:] == list(range(seen, 140))
 
 
 def test_an_observed_pose_is_believed_without_a_contact():
-    told, said = frames(observed=[6, 9])
-    assert places(rested(told, said, TOUCH)) == [0, 3, 3, 3, 4, 4, 6, 9, 9, 9, 10, 11, 11, 11, 6, 15]
+    conditioning, outputs = frames(observed=[6, 9])
+    assert places(with_static_objects(conditioning, outputs, TOUCH)) == [
+        0,
+        3,
+        3,
+        3,
+        4,
+        4,
+        6,
+        9,
+        9,
+        9,
+        10,
+        11,
+        11,
+        11,
+        6,
+        15,
+    ]
 
 
 def test_feet_on_the_floor_touch_no_object():
-    told, said = frames(touched=[])
-    assert places(rested(told, said, 0.65)) == list(range(len(ACTS)))
+    conditioning, outputs = frames(touched=[])
+    assert places(with_static_objects(conditioning, outputs, 0.65)) == list(range(len(ACTS)))
 
 
 def test_lanes_rest_on_their_own():
     one, other = frames(), frames(touched=[5, 9])
     both = [type(a)(*(torch.cat(fields) for fields in zip(a, b))) for a, b in zip(one, other)]
-    found = rested(*both, TOUCH)
-    for k, (told, said) in enumerate((one, other)):
-        assert torch.equal(found.t_world_object[k : k + 1], rested(told, said, TOUCH).t_world_object)
+    found = with_static_objects(*both, TOUCH)
+    for k, (conditioning, outputs) in enumerate((one, other)):
+        assert torch.equal(
+            found.t_world_object[k : k + 1], with_static_objects(conditioning, outputs, TOUCH).t_world_object
+        )
 
 
 def test_frame_by_frame_it_is_the_same_from_the_first_contact_on():
-    told, said = frames()
-    step = Resting(TOUCH)
+    conditioning, outputs = frames()
+    step = StaticObjects(TOUCH)
     way = []
     for k in range(len(ACTS)):
         one = slice(k, k + 1)
-        way.append(step(told.frames(one), Said(*(field[:, one] for field in said))).t_world_object[0, 0, 0])
+        way.append(
+            step(conditioning.frames(one), Outputs(*(field[:, one] for field in outputs))).t_world_object[
+                0, 0, 0
+            ]
+        )
     assert [int(x) for x in way] == [0, 1, 2, *MOVED[3:7], 7, 8, 9, *MOVED[10:15], 4], (
         "the last is touched, and still left"
     )
 
 
-@pytest.mark.parametrize("settings", [{"rest": None}, {"contacts": False}])
+@pytest.mark.parametrize("settings", [{"static_threshold": None}, {"contacts": False}])
 def test_without_contacts_objects_are_as_they_are_drawn(settings):
     recording = carrying(1.0)
     scenario = scenario_of(recording)
-    echo = drawn_echo(**{"rest": 0.0, **settings})
+    echo = drawn_echo(**{"static_threshold": 0.0, **settings})
     motion = echo.capture_scenarios([scenario], [0])[0]
     track = motion.object_motion["box_1"]
     active = (motion.timestamps >= 0.4) & (motion.timestamps < 1.2)
-    assert echo.rests_below is None
+    assert echo.static_below is None
     assert (track.t_world_body[active].diff(dim=0).norm(dim=-1) > 0).all()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from carried_box import CARRIED, boxes, carrying, drawn_echo, scenario_of, thing
+from carried_box import CARRIED, boxes, carrying, drawn_echo, scenario_of, scene_object
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
@@ -67,7 +67,7 @@ def assert_same(motion: Motion, whole: Motion, scenario) -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"frame": "window"}, {"hang": False}, {"per_frame": 2, "context": 0}, {"placed": True}]
+    "settings", [{}, {"frame": "window"}, {"anchor": False}, {"per_frame": 2, "context": 0}, {"placed": True}]
 )
 def test_a_stream_says_what_a_whole_capture_says(settings):
     """Two objects, one after the other, with nothing between."""
@@ -89,7 +89,7 @@ def test_objects_rest_in_a_stream_from_their_first_contact_on():
     drawn = drawn_echo().capture_scenarios([scenario], [3])[0]
     likely = drawn.body_contact_prob.amax(1)
     threshold = likely[likely > 0].median().item()
-    session = EchoSession(drawn_echo(rest=threshold), wearer(recording), boxes(TWO), seed=3)
+    session = EchoSession(drawn_echo(static_threshold=threshold), wearer(recording), boxes(TWO), seed=3)
     told_acts(session, scenario)
     motion, _ = streamed(session, recording)
     for act in scenario.acts:
@@ -136,7 +136,7 @@ def test_what_is_final_stays_as_it_was():
 
 
 def test_an_object_that_is_seen_is_where_it_was_seen():
-    recording, echo = carrying(1.4), drawn_echo(hang=False)
+    recording, echo = carrying(1.4), drawn_echo(anchor=False)
     session = EchoSession(echo, wearer(recording), boxes(), seed=3)
     session.activate("box_1", 0.0)
     track = recording.object_motion["box_1"]
@@ -154,7 +154,7 @@ def test_an_object_that_is_seen_is_where_it_was_seen():
 
 
 def test_of_several_sights_of_an_object_the_nearest_in_time_counts():
-    recording, echo = carrying(1.0), drawn_echo(hang=False)
+    recording, echo = carrying(1.0), drawn_echo(anchor=False)
     session = EchoSession(echo, wearer(recording), boxes(), seed=3)
     session.activate("box_1", 0.0)
     track = recording.object_motion["box_1"]
@@ -172,7 +172,7 @@ def test_of_several_sights_of_an_object_the_nearest_in_time_counts():
 
 
 def test_what_was_seen_of_one_object_is_not_believed_of_another():
-    recording, echo = carrying(1.4, carried=TWO), drawn_echo(hang=False)
+    recording, echo = carrying(1.4, carried=TWO), drawn_echo(anchor=False)
     session = EchoSession(echo, wearer(recording), boxes(TWO), seed=3)
     session.activate("box_1", 0.0)
     far = Rigid(torch.eye(3), torch.tensor([50.0, 0.0, 0.0]))
@@ -263,7 +263,7 @@ def test_behind_a_gap_it_begins_anew_as_the_whole_capture_does():
     recording, echo = carrying(3.0), drawn_echo()
     keep = [*range(30), *range(60, 90)]
     head = recording.head
-    known = replace(recording, head=replace(head, timestamps=head.timestamps[keep], R_world_device=head.R_world_device[keep], t_world_device=head.t_world_device[keep]))  # fmt: skip
+    observed = replace(recording, head=replace(head, timestamps=head.timestamps[keep], R_world_device=head.R_world_device[keep], t_world_device=head.t_world_device[keep]))  # fmt: skip
     session = EchoSession(echo, wearer(recording), seed=5)
     parts = []
     for frame in range(90):
@@ -275,7 +275,7 @@ def test_behind_a_gap_it_begins_anew_as_the_whole_capture_does():
         parts.append(session.poses())
     parts.append(session.poses(ended=True))
     motion = joined([part for part in parts if part is not None])
-    whole = echo.capture([known], [5])[0]
+    whole = echo.capture([observed], [5])[0]
     torch.testing.assert_close(motion.timestamps, whole.timestamps[keep], atol=1e-6, rtol=0)
     torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t[keep], atol=1e-3, rtol=0)
 
@@ -289,8 +289,8 @@ def test_a_head_that_is_lost_holds_nothing_back():
         session.head(frame / 30, head)
         for joint in WRISTS:
             session.wrist(joint, frame / 30, recording.motion.joint(joint)[frame])
-        said = session.poses()
-        count += 0 if said is None else len(said)
+        outputs = session.poses()
+        count += 0 if outputs is None else len(outputs)
     assert count >= 30
     assert session._waiting == []
     assert session.poses(ended=True) is None
@@ -318,7 +318,7 @@ def test_the_floor_is_where_one_who_stands_has_it():
     recording = carrying(0.6)
     session = EchoSession(drawn_echo(), wearer(recording, floor_m=None), seed=0)
     streamed(session, recording)
-    floor = session._queue.told.floor_height if session._queue else session._frame(1.0, recording.motion.joint("head")[:1]).floor_height  # fmt: skip
+    floor = session._queue.conditioning.floor_height if session._queue else session._frame(1.0, recording.motion.joint("head")[:1]).floor_height  # fmt: skip
     assert floor[0, -1].item() == pytest.approx(0.0, abs=0.1)
 
 
@@ -347,7 +347,7 @@ def test_unknown_names_are_refused():
 def test_objects_that_cannot_be_used_are_refused_when_they_are_named():
     mesh = boxes(CARRIED).by_name("box_1").mesh
     huge = Mesh(mesh.vertices * 1000, mesh.faces, mesh.color)
-    things = Environment((thing("a", mesh=huge), thing("b", "piano")))
+    things = Environment((scene_object("a", mesh=huge), scene_object("b", "piano")))
     session = EchoSession(drawn_echo(), EchoWearer(carrying(0.6).skeleton), things)
     with pytest.raises(WearcapError, match="object 'a': .*looks like millimetres"):
         session.activate("a", 0.0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from carried_box import MIDDLE, box_mesh, boxes, carrying, drawn_echo, scenario_of, thing
+from carried_box import MIDDLE, box_mesh, boxes, carrying, drawn_echo, scenario_of, scene_object
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
@@ -15,22 +15,24 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.acts import Act
 from wearcap.scene.environment import Environment
 from wearcap.systems.echo.features import CONTACTS
-from wearcap.systems.echo.observations import WRISTS, Observed, lane_of, wrist_poses
+from wearcap.systems.echo.observations import WRISTS, Observed, batch_item_of, wrist_poses
 from wearcap.tracking.head_path import head_path
 
 RECORDING = carrying(1.0)
 TIMES = RECORDING.motion.timestamps
 
 
-def told(scenario):
+def conditioning(scenario):
     echo = drawn_echo()
-    return lane_of(scenario, head_path(scenario.recording, echo.skeleton, echo.fps), echo.reader()).told
+    return batch_item_of(
+        scenario, head_path(scenario.recording, echo.skeleton, echo.fps), echo.reader()
+    ).conditioning
 
 
 def with_mesh(vertices=None, faces=None, category: str = "box"):
     mesh = box_mesh()
     given = Mesh(mesh.vertices if vertices is None else vertices.astype(np.float32), mesh.faces if faces is None else faces, mesh.color)  # fmt: skip
-    return replace(scenario_of(RECORDING), environment=Environment((thing("box_1", category, given),)))
+    return replace(scenario_of(RECORDING), environment=Environment((scene_object("box_1", category, given),)))
 
 
 def spoiled() -> np.ndarray:
@@ -111,7 +113,7 @@ FAULTS = {
 def test_a_fault_is_named(fault):
     make, message = FAULTS[fault]
     with pytest.raises(WearcapError, match=message) as caught:
-        told(make())
+        conditioning(make())
     assert caught.value.expected
     assert str(copy.copy(caught.value)) == str(caught.value)
 
@@ -133,48 +135,48 @@ def test_arms_of_a_true_motion_may_be_crossed():
         joint = motion.skeleton.joint_names.index(f"{side}_shoulder")
         R[:, joint] = R[:, joint] @ turn
     crossed = replace(RECORDING, motion=replace(motion, R_parent_joint=R))
-    assert told(scenario_of(crossed)).valid.all()
+    assert conditioning(scenario_of(crossed)).valid.all()
     tracks = {joint: Trajectory(TIMES, T.R, T.t) for joint in WRISTS for T in [crossed.motion.joint(joint)]}
     with pytest.raises(WearcapError, match="the left wrist is 56 cm to the right"):
-        told(scenario_of(replace(crossed, tracked=tracks)))
+        conditioning(scenario_of(replace(crossed, tracked=tracks)))
 
 
 def test_what_is_sound_passes():
-    assert told(tracked()).valid.all()
-    assert told(scenario_of(RECORDING)).has_object.any()
+    assert conditioning(tracked()).valid.all()
+    assert conditioning(scenario_of(RECORDING)).has_object.any()
 
 
 def test_what_is_seen_of_an_object_while_it_is_not_active_is_not_believed():
     scenario = observing(object_motion={"box_1": BOX})
-    seen = told(scenario)
-    assert torch.equal(seen.is_known[0, :, 1], seen.has_object[0])
+    seen = conditioning(scenario)
+    assert torch.equal(seen.is_observed[0, :, 1], seen.has_object[0])
 
 
 def test_the_floor_is_the_recordings_else_the_paths():
     floor = replace(RECORDING.floor, height=torch.full((30,), 0.2))
-    assert (told(scenario_of(replace(RECORDING, floor=floor))).floor_height == 0.2).all()
-    without = told(scenario_of(replace(RECORDING, floor=None))).floor_height
+    assert (conditioning(scenario_of(replace(RECORDING, floor=floor))).floor_height == 0.2).all()
+    without = conditioning(scenario_of(replace(RECORDING, floor=None))).floor_height
     assert without.abs().max() < 0.2
 
 
 def test_an_object_begins_where_its_environment_has_it():
     acts = (Act("box_1", 0.1, 0.3), Act("box_1", 0.6, 0.8))
-    item = thing("box_1")
+    item = scene_object("box_1")
     turn = rotation.exp(torch.tensor([0.3, -0.2, 0.9]))
     there = Environment((replace(item, R_world_object=turn, t_world_object=torch.tensor([1.0, 2.0, 0.5])),))
     scenario = replace(scenario_of(RECORDING), acts=acts, environment=there, placed=True)
-    seen = told(scenario)
-    assert seen.is_known[0, :, 1].nonzero()[:, 0].tolist() == [3]
+    seen = conditioning(scenario)
+    assert seen.is_observed[0, :, 1].nonzero()[:, 0].tolist() == [3]
     torch.testing.assert_close(seen.R_world_object[0, 3], turn)
     middle = torch.tensor([1.0, 2.0, 0.5]) + turn @ torch.tensor(MIDDLE, dtype=torch.float32)
     torch.testing.assert_close(seen.t_world_object[0, 3], middle)
     elsewhere = replace(scenario, observed=Observed(object_motion={"box_1": BOX}))
-    torch.testing.assert_close(told(elsewhere).t_world_object[0, 3], told(replace(elsewhere, placed=False)).t_world_object[0, 3])  # fmt: skip
+    torch.testing.assert_close(conditioning(elsewhere).t_world_object[0, 3], conditioning(replace(elsewhere, placed=False)).t_world_object[0, 3])  # fmt: skip
 
 
 def test_objects_are_read_once_however_often_they_are_active():
     acts = (Act("box_1", 0.0, 0.3), Act("box_1", 0.6, 0.8))
     echo, scenario = drawn_echo(), replace(scenario_of(RECORDING), acts=acts, environment=boxes())
-    lane = lane_of(scenario, head_path(RECORDING, echo.skeleton, echo.fps), echo.reader())
-    assert len(lane.objects) == 1
-    assert lane.told.has_object[0].sum() == 9 + 6
+    batch_item = batch_item_of(scenario, head_path(RECORDING, echo.skeleton, echo.fps), echo.reader())
+    assert len(batch_item.objects) == 1
+    assert batch_item.conditioning.has_object[0].sum() == 9 + 6

@@ -15,7 +15,7 @@ from wearcap.recording import CameraStream, PointCloud, Recording
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
-from wearcap.tracking.anchor import hang_from_head
+from wearcap.tracking.anchor import anchored_to_head
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 IMAGE_SIZE = 6
@@ -94,13 +94,13 @@ def test_a_recording_without_head_poses_is_named():
 
 def test_hanging_the_truth_from_its_own_head_changes_nothing():
     truth = swaying_motion(50)
-    hung = hang_from_head(truth, truth.joint("head"))
-    assert torch.allclose(hung.T_world_joint.t, truth.T_world_joint.t, atol=1e-5)
+    anchored = anchored_to_head(truth, truth.joint("head"))
+    assert torch.allclose(anchored.T_world_joint.t, truth.T_world_joint.t, atol=1e-5)
 
 
 def test_evaluation_scores_every_recording_once_per_seed(tmp_path):
     store = small_dataset(tmp_path)
-    rows = list(evaluate(pipeline(), store, store.names("test"), [0, 1], lanes=3))
+    rows = list(evaluate(pipeline(), store, store.names("test"), [0, 1], items=3))
     assert sorted((row.recording, row.seed) for row in rows) == [(n, s) for n in ("r4", "r5") for s in (0, 1)]
     assert all(row.scores["mpjpe_cm"] > 1 for row in rows)
     assert {row.frames for row in rows} == {260, 300}
@@ -121,10 +121,10 @@ def test_what_is_seen_later_changes_nothing_before():
     recording = seeing_recording()
     cloud, camera = recording.points, recording.camera
     half = recording.head.timestamps[75]
-    known = cloud.first_seen < half
+    observed = cloud.first_seen < half
     later = torch.where(camera.timestamps >= half, torch.nan, 1.0)[:, None].half()
     first = replace(
-        recording, points=PointCloud(cloud.points_world[known], None, cloud.first_seen[known]),
+        recording, points=PointCloud(cloud.points_world[observed], None, cloud.first_seen[observed]),
         camera=replace(camera, embedding=camera.embedding * later),
     )  # fmt: skip
     whole, part = (pipeline(stride=25, live=True, lookahead=0)(r).R_parent_joint for r in (recording, first))

@@ -56,13 +56,13 @@ def opened(hmd2, recording) -> Session:
     return Session(hmd2, [wearer(recording), wearer(recording)], [3, 4])
 
 
-def push(session: Session, *told: list) -> list[Motion | None]:
-    return unchecked(session.push)(list(told))
+def push(session: Session, *conditions: list) -> list[Motion | None]:
+    return unchecked(session.push)(list(conditions))
 
 
-def run(session: Session, told: list[Sensed], shift: float = 0.0) -> list[Motion]:
+def run(session: Session, conditions: list[Sensed], shift: float = 0.0) -> list[Motion]:
     """What the first of two wearers is given, in pieces; the second one says nothing."""
-    shifted = [moment._replace(timestamp=moment.timestamp + shift) for moment in told]
+    shifted = [moment._replace(timestamp=moment.timestamp + shift) for moment in conditions]
     return [motion for moment in shifted if (motion := push(session, [moment], [])[0]) is not None]
 
 
@@ -72,19 +72,19 @@ def assert_equal(motion: Motion, expected: Motion) -> None:
 
 
 def test_bad_packets_of_one_wearer_change_nothing_for_anybody(hmd2, recording, undisturbed):
-    told, session = moments(recording), opened(hmd2, recording)
-    good, before = recording.head.T_world_device[FAULT], told[FAULT - 1].timestamp
+    conditions, session = moments(recording), opened(hmd2, recording)
+    good, before = recording.head.T_world_device[FAULT], conditions[FAULT - 1].timestamp
     bad = [Sensed(time, good) for time in TIMES.values()]
     bad += [Sensed(before + 1e-4 * k, pose) for k, pose in enumerate(bad_poses(good).values())]
     bad += [Sensed(before, None, points_world=points) for points in VECTORS.values() if points is not None]
     bad += [Sensed(before, None, floor_height=height) for name, height in TIMES.items() if height is not None and name != "ahead" and name != "far"]  # fmt: skip
     bad += [Sensed(before, None, floor_height=1e9), None, "packet", (before, good)]
-    said = [[], []]
-    for frame, moment in enumerate(told):
+    predicted = [[], []]
+    for frame, moment in enumerate(conditions):
         first = [*bad, moment] if frame == FAULT else [moment]
-        for parts, motion in zip(said, push(session, first, [moment])):
+        for parts, motion in zip(predicted, push(session, first, [moment])):
             parts += [] if motion is None else [motion]
-    for motions, expected in zip(said, undisturbed):
+    for motions, expected in zip(predicted, undisturbed):
         assert_equal(motions[0].sliced(0, 10), expected.sliced(0, 10))
         assert sum(map(len, motions)) == FRAMES
         for k, motion in enumerate(motions):
@@ -96,23 +96,23 @@ def test_bad_packets_of_one_wearer_change_nothing_for_anybody(hmd2, recording, u
 
 
 def test_a_bad_picture_is_none_and_the_next_one_is_believed(hmd2, recording, undisturbed):
-    told, session = moments(recording), opened(hmd2, recording)
+    conditions, session = moments(recording), opened(hmd2, recording)
     time = (FAULT - 0.5) / 60
     bad = [Sensed(time, embedding=value) for value in EMBEDDINGS.values() if value is not None]
-    said = stream(session, told[:FAULT], told[:FAULT], ended=False)
+    predicted = stream(session, conditions[:FAULT], conditions[:FAULT], ended=False)
     push(session, bad, [])
-    said = stream(session, told[FAULT:], told[FAULT:])
-    assert_equal(said[0], undisturbed[0].sliced(40, FRAMES))
+    predicted = stream(session, conditions[FAULT:], conditions[FAULT:])
+    assert_equal(predicted[0], undisturbed[0].sliced(40, FRAMES))
     assert sum(session.refused[0].values()) == len(bad)
 
 
 def test_an_embedding_of_wrong_length_is_raised_at_first_and_disturbs_nothing(hmd2, recording, undisturbed):
-    told, session = moments(recording), opened(hmd2, recording)
-    wrong = told[0]._replace(embedding=torch.zeros(IMAGE + 1))
+    conditions, session = moments(recording), opened(hmd2, recording)
+    wrong = conditions[0]._replace(embedding=torch.zeros(IMAGE + 1))
     for _ in range(2):
         with pytest.raises(WearcapError, match=f"an embedding of {IMAGE + 1} features at 0.000 s"):
-            session.push([[told[0]._replace(embedding=None)], [wrong]])
-    for motion, expected in zip(stream(session, told, told), undisturbed):
+            session.push([[conditions[0]._replace(embedding=None)], [wrong]])
+    for motion, expected in zip(stream(session, conditions, conditions), undisturbed):
         assert_equal(motion, expected)
     session.push([[wrong], []])
     assert session.refused[0]["embedding: wrong type or shape"] == 1
@@ -121,12 +121,12 @@ def test_an_embedding_of_wrong_length_is_raised_at_first_and_disturbs_nothing(hm
 @pytest.mark.parametrize("shift", [-1000.0, -1.1, 1000.0])
 def test_where_the_clock_moves_it_goes_on(hmd2, recording, shift):
     """Back: exactly as a session that is new."""
-    session, fresh, told = opened(hmd2, recording), opened(hmd2, recording), moments(recording)
-    before = run(session, told[:75])
-    left = run(session, told, 75 / 60 + shift) + [
+    session, fresh, conditions = opened(hmd2, recording), opened(hmd2, recording), moments(recording)
+    before = run(session, conditions[:75])
+    left = run(session, conditions, 75 / 60 + shift) + [
         motion for motion in session.flush()[:1] if motion is not None
     ]
-    expected = run(fresh, told, 75 / 60 + shift) + [
+    expected = run(fresh, conditions, 75 / 60 + shift) + [
         motion for motion in fresh.flush()[:1] if motion is not None
     ]
     assert all((motion.timestamps.diff() > 0).all() for motion in before + left)
@@ -147,18 +147,18 @@ def _joined(parts: list[Motion], count: int) -> dict[str, torch.Tensor]:
     return {name: torch.cat([getattr(part, name) for part in parts])[-count:] for name in names}
 
 
-@pytest.mark.parametrize("waiting", [1, AGREEING - 1])
-def test_a_session_is_saved_while_its_clock_moves(hmd2, recording, tmp_path, waiting):
-    whole, told = opened(hmd2, recording), moments(recording)
-    pushed = [told[0]._replace(timestamp=math.nan), *told[:75]]
-    late = [moment._replace(timestamp=moment.timestamp + 900, floor_height=0.1) for moment in told]
+@pytest.mark.parametrize("lookahead_frames", [1, AGREEING - 1])
+def test_a_session_is_saved_while_its_clock_moves(hmd2, recording, tmp_path, lookahead_frames):
+    whole, conditions = opened(hmd2, recording), moments(recording)
+    pushed = [conditions[0]._replace(timestamp=math.nan), *conditions[:75]]
+    late = [moment._replace(timestamp=moment.timestamp + 900, floor_height=0.1) for moment in conditions]
     run(whole, pushed)
-    run(whole, late[:waiting])
+    run(whole, late[:lookahead_frames])
     whole.save(tmp_path / "session.safetensors")
     again = Session.load(tmp_path / "session.safetensors", hmd2)
     assert again.refused == whole.refused == [{"head: not finite": 1}, {}]
     assert again.dropped == whole.dropped == [1, 0]
-    expected, resumed = run(whole, late[waiting:]), run(again, late[waiting:])
+    expected, resumed = run(whole, late[lookahead_frames:]), run(again, late[lookahead_frames:])
     assert len(expected) == len(resumed) > 5
     for motion, other in zip(expected, resumed):
         assert_equal(motion, other)
@@ -169,32 +169,32 @@ def test_what_waits_for_a_lost_head_is_bounded(hmd2, recording, monkeypatch):
     session = Session(hmd2, [wearer(recording)], [0], Memory(max_points=1000))
     for k in range(200):
         session.push([[Sensed(k / 60, None, torch.rand(100, 3), torch.zeros(IMAGE), 0.0)]])
-    state = session._lanes[0]
+    state = session._items[0]
     assert len(state.pictures) == len(state.floors) == 30
     assert len(state.places._map) == sum(len(points) for points, _ in state.places._new) <= 4000
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_whatever_comes_it_goes_on(hmd2, recording, seed):
-    session, draw, told = opened(hmd2, recording), Mutator(seed), moments(recording)
+    session, draw, conditions = opened(hmd2, recording), Mutator(seed), moments(recording)
     fine = Session(hmd2, [wearer(recording)], [4])
     for k in range(240):
-        good = told[k % FRAMES]
+        good = conditions[k % FRAMES]
         bad = Sensed(
             draw.time(k / 60), draw.pose(good.T_world_device),
             draw.one(VECTORS) if draw.bad() else good.points_world, draw.one(EMBEDDINGS) if draw.bad() and k else good.embedding,
             draw.one(TIMES) if draw.bad() else None,
         )  # fmt: skip
-        neighbour = [told[k]] if k < FRAMES else []
-        for motion in (said := push(session, [bad], neighbour)):
+        neighbour = [conditions[k]] if k < FRAMES else []
+        for motion in (predicted := push(session, [bad], neighbour)):
             assert motion is None or motion.R_parent_joint.isfinite().all()
             assert motion is None or motion.t_world_root.isfinite().all()
         alone = fine.push([neighbour])[0]
-        assert (alone is None) == (said[1] is None)
-        assert alone is None or torch.allclose(alone.t_world_root, said[1].t_world_root, atol=1e-4)
-    well = run(session, told, 4.0)
+        assert (alone is None) == (predicted[1] is None)
+        assert alone is None or torch.allclose(alone.t_world_root, predicted[1].t_world_root, atol=1e-4)
+    well = run(session, conditions, 4.0)
     assert max(motion.timestamps[-1].item() for motion in well) > 5.1
-    state = session._lanes[0]
+    state = session._items[0]
     assert len(state.pictures) + len(state.floors) + len(state.track._poses) < 300
 
 
@@ -219,9 +219,9 @@ def damaged(tensors: dict, head: dict):
 
 def test_damaged_files_are_no_sessions(hmd2, recording, tmp_path):
     session, path = Session(hmd2, [wearer(recording)], [0]), tmp_path / "session.safetensors"
-    told = moments(recording)
-    stream(session, told[:35], ended=False)
-    session.push([[told[40]._replace(timestamp=900.0)]])
+    conditions = moments(recording)
+    stream(session, conditions[:35], ended=False)
+    session.push([[conditions[40]._replace(timestamp=900.0)]])
     session.save(path)
     with safe_open(path, "pt") as file:
         head = json.loads(file.metadata()["wearcap_stream"])

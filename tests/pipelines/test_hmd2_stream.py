@@ -44,10 +44,10 @@ def pipeline(places):
         )  # fmt: skip
         for parameter in net.parameters():
             torch.nn.init.normal_(parameter, std=0.05)
-        told = {
+        conditions = {
             "steps": STEPS, "place_encoder": places, "image_encoder": "eyes", "live": True, "fade": 6, "lookahead": 0,
         } | changes  # fmt: skip
-        return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, stride=stride, **told)
+        return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, stride=stride, **conditions)
 
     return make
 
@@ -73,27 +73,29 @@ def surrounded(frames: int, seed: int = 0) -> Recording:
 def moments(recording: Recording) -> list[Sensed]:
     """A recording as it was sensed, moment by moment."""
     head, points, camera = recording.head, recording.points, recording.camera
-    told = []
+    conditions = []
     for i, time in enumerate(head.timestamps.tolist()):
         new = points.points_world[points.first_seen == time] if points is not None else None
         shown = camera is not None and i % 2 == 0
-        told.append(Sensed(time, head.T_world_device[i], new, camera.embedding[i // 2] if shown else None))
-    return told
+        conditions.append(
+            Sensed(time, head.T_world_device[i], new, camera.embedding[i // 2] if shown else None)
+        )
+    return conditions
 
 
 def wearer(recording: Recording) -> Wearer:
     return Wearer(recording.skeleton, recording.head.R_head_device, recording.head.t_head_device)
 
 
-def stream(session: Session, *told: list[Sensed], ended: bool = True) -> list[Motion]:
+def stream(session: Session, *conditions: list[Sensed], ended: bool = True) -> list[Motion]:
     """One motion per wearer, from one moment of each per push."""
-    said = [[] for _ in told]
-    for i in range(max(len(part) for part in told)):
-        for parts, motion in zip(said, session.push([part[i : i + 1] for part in told])):
+    predicted = [[] for _ in conditions]
+    for i in range(max(len(part) for part in conditions)):
+        for parts, motion in zip(predicted, session.push([part[i : i + 1] for part in conditions])):
             parts += [] if motion is None else [motion]
-    for parts, motion in zip(said, session.flush() if ended else [None] * len(told)):
+    for parts, motion in zip(predicted, session.flush() if ended else [None] * len(conditions)):
         parts += [] if motion is None else [motion]
-    return [together(parts) for parts in said]
+    return [together(parts) for parts in predicted]
 
 
 def together(parts: list[Motion]) -> Motion:
@@ -124,7 +126,7 @@ def assert_same(motion: Motion, other: Motion, atol: float | None = None) -> Non
 
 
 @pytest.mark.parametrize(("stride", "frames"), [(10, 133), (45, 150), (60, 121)])
-@pytest.mark.parametrize("windows", [{"hold": True}, {}, {"lookahead": None}])
+@pytest.mark.parametrize("windows", [{"inpaint": True}, {}, {"lookahead": None}])
 def test_streaming_equals_the_capture_of_the_whole(pipeline, stride, frames, windows):
     recording, hmd2 = surrounded(frames), pipeline(stride, **windows)
     streamed = stream(Session(hmd2, [wearer(recording)], [3]), moments(recording))[0]
@@ -134,9 +136,9 @@ def test_streaming_equals_the_capture_of_the_whole(pipeline, stride, frames, win
 
 def test_poses_wait_for_the_stride(pipeline):
     session = Session(pipeline(), [Wearer(xsens23())], [0])
-    said = [session.push([[moment]])[0] for moment in moments(surrounded(25))]
-    assert [i for i, motion in enumerate(said) if motion is not None] == [9, 19]
-    assert [len(motion) for motion in said if motion is not None] == [10, 10]
+    predicted = [session.push([[moment]])[0] for moment in moments(surrounded(25))]
+    assert [i for i, motion in enumerate(predicted) if motion is not None] == [9, 19]
+    assert [len(motion) for motion in predicted if motion is not None] == [10, 10]
     rest = session.flush()[0]
     assert len(rest) == 5
     assert session.flush() == [None]
@@ -144,13 +146,13 @@ def test_poses_wait_for_the_stride(pipeline):
 
 def test_poses_wait_for_what_they_look_ahead_to(pipeline):
     session = Session(pipeline(lookahead=13), [Wearer(xsens23())], [0])
-    said = [session.push([[moment]])[0] for moment in moments(surrounded(45))]
-    assert [(i, len(motion)) for i, motion in enumerate(said) if motion is not None] == [
+    predicted = [session.push([[moment]])[0] for moment in moments(surrounded(45))]
+    assert [(i, len(motion)) for i, motion in enumerate(predicted) if motion is not None] == [
         (19, 7), (29, 10), (39, 10),
     ]  # fmt: skip
     rest = session.flush()[0]
     assert len(rest) == 18
-    times = torch.cat([motion.timestamps for motion in [*said, rest] if motion is not None])
+    times = torch.cat([motion.timestamps for motion in [*predicted, rest] if motion is not None])
     assert torch.allclose(times * 60, torch.arange(45, dtype=torch.float64))
 
 
@@ -167,12 +169,12 @@ def test_several_wearers_are_as_alone(pipeline):
     late = [moment._replace(timestamp=moment.timestamp + 500.0) for moment in moments(recordings[1])]
     session = Session(hmd2, [wearer(recording) for recording in recordings], [5, 6])
     early = moments(recordings[0])
-    said = [[], []]
+    predicted = [[], []]
     for i in range(90):
         now = session.push([[early[i]], late[i - 10 : i - 9] if i >= 10 else []])
-        for parts, motion in zip(said, now):
+        for parts, motion in zip(predicted, now):
             parts += [] if motion is None else [motion]
-    first, second = (together(parts) for parts in said)
+    first, second = (together(parts) for parts in predicted)
     assert_same(first, hmd2(recordings[0], seed=5), 1e-4)
     assert_same(replace(second, timestamps=second.timestamps - 500.0), hmd2(recordings[1], seed=6), 1e-4)
 
@@ -180,13 +182,13 @@ def test_several_wearers_are_as_alone(pipeline):
 @pytest.mark.parametrize(("lookahead", "given"), [(0, 50), (13, 37)])
 def test_saved_and_restored_it_goes_on_bit_for_bit(pipeline, tmp_path, lookahead, given):
     recording, hmd2 = surrounded(120), pipeline(lookahead=lookahead)
-    told = moments(recording)
+    conditions = moments(recording)
     whole, first = (Session(hmd2, [wearer(recording)], [4]) for _ in range(2))
-    stream(first, told[:57], ended=False)
+    stream(first, conditions[:57], ended=False)
     first.save(tmp_path / "session.safetensors")
     again = Session.load(tmp_path / "session.safetensors", hmd2)
-    expected = stream(whole, told)[0]
-    resumed = stream(again, told[57:])[0]
+    expected = stream(whole, conditions)[0]
+    resumed = stream(again, conditions[57:])[0]
     for name in ("timestamps", "R_parent_joint", "t_world_root", "contact_prob"):
         assert torch.equal(getattr(resumed, name), getattr(expected, name)[given:])
 
@@ -204,38 +206,38 @@ def test_a_session_is_loaded_with_its_own_pipeline_alone(pipeline, tmp_path):
 @pytest.mark.parametrize("missing", [range(33, 37), range(20, 29), range(0)])
 def test_missing_poses_within_a_chunk_are_interpolated(pipeline, missing):
     recording, hmd2 = surrounded(75), pipeline(points=False)
-    told = [
+    conditions = [
         moment._replace(T_world_device=None) if i in missing else moment
         for i, moment in enumerate(moments(recording))
     ]
     keep = [i for i in range(75) if i not in missing]
-    known = replace(recording, head=head_of(recording, keep))
-    assert_same(stream(Session(hmd2, [wearer(recording)], [2]), told)[0], hmd2(known, seed=2), 5e-5)
+    observed = replace(recording, head=head_of(recording, keep))
+    assert_same(stream(Session(hmd2, [wearer(recording)], [2]), conditions)[0], hmd2(observed, seed=2), 5e-5)
 
 
 def test_poses_that_are_missing_at_a_chunks_end_are_held_and_put_right(pipeline):
     recording = surrounded(70)
-    told = moments(recording)
-    told[38], told[39] = (moment._replace(T_world_device=None) for moment in told[38:40])
+    conditions = moments(recording)
+    conditions[38], conditions[39] = (moment._replace(T_world_device=None) for moment in conditions[38:40])
     session = Session(pipeline(), [wearer(recording)], [2])
-    motion = stream(session, told)[0]
+    motion = stream(session, conditions)[0]
     head = motion.joint("head").t
     assert len(motion) == 70
     assert torch.allclose(head[38:40], head[37].expand(2, 3), atol=1e-4)
     assert torch.allclose(head[40:], recording.head.T_world_head.t[40:], atol=1e-4)
-    window = session._lanes[0].sampler.frames.t_world_head[0]
+    window = session._items[0].sampler.frames.t_world_head[0]
     true = recording.head.T_world_head.t[70 - 60 : 70]
     assert torch.allclose(window[:60], true, atol=2e-4)
 
 
 def test_moments_out_of_order_are_sorted_in_and_late_ones_dropped(pipeline):
     recording, hmd2 = surrounded(60), pipeline()
-    told = moments(recording)
-    mixed = [*told[:12], told[14], told[13], told[12], *told[15:]]
+    conditions = moments(recording)
+    mixed = [*conditions[:12], conditions[14], conditions[13], conditions[12], *conditions[15:]]
     session = Session(hmd2, [wearer(recording)], [1])
     assert_same(stream(session, mixed)[0], hmd2(recording, seed=1))
     assert session.dropped == [0]
-    late = [*told[:15], *told[16:], told[15], told[59]]
+    late = [*conditions[:15], *conditions[16:], conditions[15], conditions[59]]
     session = Session(hmd2, [wearer(recording)], [1])
     assert len(stream(session, late)[0]) == 60
     assert session.dropped == [2]
@@ -265,25 +267,25 @@ def test_after_gaps_and_jumps_it_begins_anew_as_offline(pipeline, broken, lookah
     recording = replace(recording, head=head, points=None, camera=None)
     whole = hmd2(recording, seed=7)
     motion = stream(Session(hmd2, [wearer(recording)], [7]), moments(recording))[0]
-    said = torch.tensor([i for i in range(150) if broken == "jump" or not 44 <= i < 90])
+    predicted = torch.tensor([i for i in range(150) if broken == "jump" or not 44 <= i < 90])
     kept = replace(
-        whole, timestamps=whole.timestamps[said], R_parent_joint=whole.R_parent_joint[said],
-        t_world_root=whole.t_world_root[said], contact_prob=whole.contact_prob[said],
+        whole, timestamps=whole.timestamps[predicted], R_parent_joint=whole.R_parent_joint[predicted],
+        t_world_root=whole.t_world_root[predicted], contact_prob=whole.contact_prob[predicted],
     )  # fmt: skip
     assert_same(motion, kept)
 
 
 def test_what_is_not_finite_counts_as_missing(pipeline):
     recording, hmd2 = surrounded(60), pipeline()
-    told = moments(recording)
+    conditions = moments(recording)
     nan = Rigid(torch.full((3, 3), torch.nan), torch.zeros(3))
-    told[22] = told[22]._replace(
+    conditions[22] = conditions[22]._replace(
         T_world_device=nan, embedding=torch.full((IMAGE,), torch.inf), floor_height=torch.nan
     )
-    told[31] = told[31]._replace(points_world=torch.full((5, 3), torch.nan))
-    told.insert(40, Sensed(float("nan"), Rigid.identity()))
+    conditions[31] = conditions[31]._replace(points_world=torch.full((5, 3), torch.nan))
+    conditions.insert(40, Sensed(float("nan"), Rigid.identity()))
     session = Session(hmd2, [wearer(recording)], [1])
-    motion = stream(session, told)[0]
+    motion = stream(session, conditions)[0]
     assert len(motion) == 60
     assert motion.R_parent_joint.isfinite().all()
     assert session.dropped == [2]
@@ -301,7 +303,7 @@ def test_a_floor_that_is_told_is_believed(pipeline):
     session = Session(pipeline(), [wearer(recording)], [0])
     stream(session, [moment._replace(floor_height=0.01 * i) for i, moment in enumerate(moments(recording))])
     assert torch.allclose(
-        session._lanes[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5
+        session._items[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5
     )
 
 
@@ -312,7 +314,7 @@ def test_points_beyond_the_memory_are_forgotten(pipeline):
         at = torch.tensor([0.1 * i, 0.0, 1.6])
         points = at + 8 * torch.rand(100, 3, generator=random) - 4
         session.push([[Sensed(i / 60, Rigid(torch.eye(3), at), points)]])
-    places = session._lanes[0].places
+    places = session._items[0].places
     kept = torch.cat([points for points, _ in places._known + places._new])
     assert len(kept) == len(places._map) <= 2000 + 1000
     assert (kept - at)[:, :2].norm(dim=-1).min() < 1.0
@@ -321,9 +323,9 @@ def test_points_beyond_the_memory_are_forgotten(pipeline):
 def test_a_long_stream_needs_no_more_than_a_short_one(pipeline, tmp_path):
     """A minute in which the map is full after a few seconds: what would be saved does not grow."""
     session = Session(pipeline(60, steps=1), [Wearer(xsens23())], [0], Memory(5.0, 1000))
-    told, sizes = moments(surrounded(120))[::6], []
+    conditions, sizes = moments(surrounded(120))[::6], []
     for lap in range(30):
-        session.push([[moment._replace(timestamp=moment.timestamp + 2 * lap) for moment in told]])
+        session.push([[moment._replace(timestamp=moment.timestamp + 2 * lap) for moment in conditions]])
         if lap % 5 == 4:
             session.save(tmp_path / "session.safetensors")
             sizes.append((tmp_path / "session.safetensors").stat().st_size)

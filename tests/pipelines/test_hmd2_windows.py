@@ -11,12 +11,12 @@ from wearcap.tracking.head_path import head_path
 
 def test_what_is_new_goes_on_from_what_is_known_and_fades_into_what_is_said():
     torch.manual_seed(0)
-    x0_hat, known = torch.randn(3, 30, 4), torch.randn(3, 30, 4)
-    x0_hat[1], known[1] = 0.0, torch.arange(30.0)[:, None]
+    x0_hat, observed = torch.randn(3, 30, 4), torch.randn(3, 30, 4)
+    x0_hat[1], observed[1] = 0.0, torch.arange(30.0)[:, None]
     number = torch.arange(30)
-    is_known = torch.stack([number < 0, number < 10, number < 1])
-    whole = joined(x0_hat, known, is_known, 8)
-    assert torch.equal(whole[is_known], known[is_known])
+    is_observed = torch.stack([number < 0, number < 10, number < 1])
+    whole = joined(x0_hat, observed, is_observed, 8)
+    assert torch.equal(whole[is_observed], observed[is_observed])
     assert torch.equal(whole[0], x0_hat[0]), "nothing is known"
     assert torch.allclose(whole[:, 17:], x0_hat[:, 17:], atol=1e-6)
     assert torch.allclose(whole[2, 8:], x0_hat[2, 8:], atol=1e-6), "one frame has no slope"
@@ -24,8 +24,8 @@ def test_what_is_new_goes_on_from_what_is_known_and_fades_into_what_is_said():
     assert steps[0] == pytest.approx(1.0)
     assert 0.3 < steps[1] < 1.0, "it goes on as it went, and turns back"
     assert steps.diff().abs().max() < 1.1, "without a kink, on a way of nine in eight frames"
-    step = joined(x0_hat, known, is_known, 0)
-    assert torch.equal(step, torch.where(is_known[..., None], known, x0_hat))
+    step = joined(x0_hat, observed, is_observed, 0)
+    assert torch.equal(step, torch.where(is_observed[..., None], observed, x0_hat))
 
 
 def windows(hmd2, frames: int, stride: int):
@@ -33,9 +33,9 @@ def windows(hmd2, frames: int, stride: int):
     recording = seeing_recording(frames)
     path = head_path(recording, hmd2.skeleton, hmd2.fps)
     hmd2.prepare()
-    told, sampler = hmd2.sense(recording, path), hmd2.sampler(path.skeleton, 0, 0)
+    conditions, sampler = hmd2.sense(recording, path), hmd2.sampler(path.skeleton, 0, 0)
     for start in range(0, frames, stride):
-        advance([sampler], [Frames(*(part[:, start : start + stride] for part in told))])
+        advance([sampler], [Frames(*(part[:, start : start + stride] for part in conditions))])
         yield sampler
 
 
@@ -57,11 +57,11 @@ def test_what_is_final_stays_and_what_waits_is_said_again():
         poses = sampler.give(20).poses.R_parent_joint[0]
         if len(poses):
             final = sampler.given
-            assert torch.equal(sampler.said.R_parent_joint[0, final - len(poses) : final], poses)
+            assert torch.equal(sampler.predicted.R_parent_joint[0, final - len(poses) : final], poses)
             held = torch.cat([*given, poses])[-final:]
-            assert torch.equal(sampler.said.R_parent_joint[0, final - len(held) : final], held)
+            assert torch.equal(sampler.predicted.R_parent_joint[0, final - len(held) : final], held)
         given.append(poses)
-        waited.append(sampler.said.R_parent_joint[0, sampler.given :])
+        waited.append(sampler.predicted.R_parent_joint[0, sampler.given :])
     assert len(torch.cat(given)) == 80
     assert not torch.allclose(waited[-2][10:], waited[-1][:10], atol=1e-5)
 
@@ -72,7 +72,7 @@ def test_windows_do_not_look_further_ahead_than_they_share():
 
 
 def test_strides_and_lookahead_follow_from_the_window():
-    hmd2 = pipeline(hold=True, stride=None)
-    assert (hmd2.advance, hmd2.waiting) == (45, 0)
+    hmd2 = pipeline(inpaint=True, stride=None)
+    assert (hmd2.advance, hmd2.lookahead_frames) == (45, 0)
     anew = pipeline(stride=None)
-    assert (anew.advance, anew.waiting) == (30, 15)
+    assert (anew.advance, anew.lookahead_frames) == (30, 15)

@@ -32,8 +32,8 @@ def test_the_body_hangs_from_the_measured_head(recording, floor):
 
 
 def test_without_hanging_the_root_is_where_the_estimator_puts_it(recording):
-    hung, free = (drawn_pipeline(floor="fixed", hang=hang)(recording) for hang in (True, False))
-    assert (hung.t_world_root - free.t_world_root).norm(dim=-1).mean() > 0.01
+    anchored, free = (drawn_pipeline(floor="fixed", anchor=anchor)(recording) for anchor in (True, False))
+    assert (anchored.t_world_root - free.t_world_root).norm(dim=-1).mean() > 0.01
 
 
 def test_where_a_walk_begins_and_where_it_leads_changes_nothing(recording):
@@ -68,7 +68,7 @@ def test_asked_in_a_mirror_left_and_right_are_treated_alike(recording):
             R_joint_imu=None,
         )  # fmt: skip
     seen = replace(recording, head=seen_head, imu=imu)
-    pipeline = drawn_pipeline(floor="fixed", mirror=True)
+    pipeline = drawn_pipeline(floor="fixed", mirror_average=True)
     here, there = pipeline(recording), pipeline(seen)
     twins = [here.skeleton.index(mirrored_name(name)) for name in here.skeleton.joint_names]
     torch.testing.assert_close(

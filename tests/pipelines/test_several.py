@@ -15,7 +15,7 @@ from wearcap.systems.mocap_every.energy import LatentSolver, LatentWeights
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.sessions import capture_session, read_view, simulated_views, write_view
 from wearcap.systems.mocap_every.visual_cues import VisualCues
-from wearcap.tracking.anchor import hang_from_head
+from wearcap.tracking.anchor import anchored_to_head
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def wrong(recording: Recording) -> Motion:
     turn = rotation.about_axis("x", torch.tensor(30.0).deg2rad())
     for joint in ("left_shoulder", "right_shoulder"):
         R[:, motion.skeleton.index(joint)] = R[:, motion.skeleton.index(joint)] @ turn
-    return hang_from_head(replace(motion, R_parent_joint=R), motion.joint("head"))
+    return anchored_to_head(replace(motion, R_parent_joint=R), motion.joint("head"))
 
 
 def arms_off_deg(motion: Motion, truth: Motion) -> float:

@@ -14,7 +14,7 @@ from wearcap.geometry.rotation import about_axis
 from wearcap.scene.editing import ObjectEditing, points_world
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.scene.placing import floor_beneath, footprint, hinge_places, snapped, usual_freedom
+from wearcap.scene.placing import floor_below, footprint, hinge_places, snapped, usual_freedom
 from wearcap.scene.scan import Scan
 from wearcap.scene.selection import Box, SlicedCloud, first_hit
 
@@ -219,9 +219,9 @@ def test_places_snap_within_reach_only():
 def test_the_floor_is_not_a_stray_point_below_it(scan):
     stray = np.concatenate([scan.points, [[2.0, 1.0, -1.0]]]).astype(np.float32)
     leaf = scan.points[DOOR.contains(scan.points)]
-    assert floor_beneath(leaf, stray) == pytest.approx(FLOOR_M, abs=1e-3)
-    assert floor_beneath(leaf, leaf[:0]) == pytest.approx(FLOOR_M + 0.04, abs=1e-3)
-    assert floor_beneath(leaf, stray[stray[:, 0] > 4]) == pytest.approx(FLOOR_M + 0.04, abs=1e-3)
+    assert floor_below(leaf, stray) == pytest.approx(FLOOR_M, abs=1e-3)
+    assert floor_below(leaf, leaf[:0]) == pytest.approx(FLOOR_M + 0.04, abs=1e-3)
+    assert floor_below(leaf, stray[stray[:, 0] > 4]) == pytest.approx(FLOOR_M + 0.04, abs=1e-3)
 
 
 def test_usual_freedoms(scan):

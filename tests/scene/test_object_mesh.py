@@ -40,10 +40,10 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named(fault):
     spoilt, message = FAULTS[fault]
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as inputs:
         check_object_mesh(spoilt, "some/box.ply")
-    assert str(told.value).startswith("some/box.ply: ")
-    assert str(copy.copy(told.value)) == str(told.value)
+    assert str(inputs.value).startswith("some/box.ply: ")
+    assert str(copy.copy(inputs.value)) == str(inputs.value)
 
 
 def test_what_is_sound_passes():

@@ -65,7 +65,7 @@ class Oracle(EchoDenoiser):
     """Says what it was told to."""
 
     def forward(self, x_t, level, encoded, valid):
-        return self.said
+        return self.outputs
 
 
 def oracle(frame: str = "own") -> EchoDiffusion:
@@ -84,13 +84,13 @@ def test_the_truth_costs_nothing(data, people, frame):
     system = oracle(frame)
     windows = batch(system.features, data, people)
     at = system.features.canonical(windows.points)
-    system.net.said = system._truth(windows, at)
+    system.net.outputs = system._truth(windows, at)
     for name, term in system.terms(windows).items():
         if name != "skate":
             assert term < 0.005, name
-    wrong = system.net.said.clone()
+    wrong = system.net.outputs.clone()
     wrong[..., 2] += 0.1
-    system.net.said = wrong
+    system.net.outputs = wrong
     terms = system.terms(windows)
     assert terms["joints"] == pytest.approx(0.1, abs=0.01)
     assert terms["object_vertices"] < 0.005
@@ -103,12 +103,12 @@ def test_the_vertex_term_is_the_mean_over_the_points(data, frame):
     windows, source = batch(system.features, data), dataset(system.features, data)
     cloud = source.track(0).objects[0].cloud
     at = system.features.canonical(windows.points)
-    said = system._truth(windows, at)
+    outputs = system._truth(windows, at)
     turn = rotation.exp(0.7 * torch.randn(*windows.valid.shape, 3))
     R, t = turn @ windows.R_world_object, windows.t_world_object + 0.2 * torch.randn_like(windows.t_world_object)  # fmt: skip
     first = system.net.sizes[0]
-    said[..., first : first + OBJECT_SIZE] = system.features.encode_object(type(at)(R, t), at)
-    value = system._vertices(said, windows, at)
+    outputs[..., first : first + OBJECT_SIZE] = system.features.encode_object(type(at)(R, t), at)
+    value = system._vertices(outputs, windows, at)
     torch.testing.assert_close(value, explicit_vertices(windows, cloud, R, t).mean(), atol=1e-4, rtol=1e-4)
 
 

@@ -55,9 +55,9 @@ def batch(data: Path):
 
 
 def system(net=None, **features) -> WatchRegression:
-    told = WatchFeatures(**features)
+    estimated = WatchFeatures(**features)
     make = net or (lambda **sizes: TwoStageEstimator(**sizes, window=40, width=32, layers=1, heads=2, feedforward=32, hidden=32, dropout=0.0, frames_per_token=2))  # fmt: skip
-    return WatchRegression(make, told, xsens23(), 30.0, WEIGHTS, torch.optim.AdamW, end_weight=2.0)
+    return WatchRegression(make, estimated, xsens23(), 30.0, WEIGHTS, torch.optim.AdamW, end_weight=2.0)
 
 
 class Oracle(nn.Module):
@@ -67,10 +67,10 @@ class Oracle(nn.Module):
 
     def __init__(self, **sizes):
         super().__init__()
-        self.said: Estimate | None = None
+        self.output: Estimate | None = None
 
     def forward(self, features):
-        return self.said
+        return self.output
 
 
 @pytest.mark.parametrize(
@@ -82,12 +82,12 @@ def test_the_truth_costs_nothing(data, features):
     joints = oracle._joints(true, windows, canonical)[:, :, xsens23().indices(*ENDS)]
     ends = oracle._seen(joints, windows, canonical)
     sure = 40 * (2 * windows.foot_contact - 1)
-    oracle.net.said = Estimate(true, sure, ends.flatten(-2))
+    oracle.net.output = Estimate(true, sure, ends.flatten(-2))
     for name, term in oracle.terms(windows).items():
         assert term < 0.005, name  # the smoothing of norms at zero
     wrong = true.clone()
     wrong[..., 0] += 0.1
-    oracle.net.said = Estimate(wrong, sure, ends.flatten(-2))
+    oracle.net.output = Estimate(wrong, sure, ends.flatten(-2))
     terms = oracle.terms(windows)
     assert terms["root"] == pytest.approx(0.1, abs=0.01)
     assert terms["position"] == pytest.approx(0.1, abs=0.01)
@@ -128,9 +128,9 @@ def test_one_stage_says_no_ends():
 
 
 def test_the_last_pose_alone():
-    said = LastPoseEstimator(27, 141, 40, 32, 1, 4, 32, 0.0)(torch.randn(3, 40, 27))
-    assert said.motion.shape == (3, 1, 141)
-    assert said.contact_logit.shape == (3, 1, 2)
+    output = LastPoseEstimator(27, 141, 40, 32, 1, 4, 32, 0.0)(torch.randn(3, 40, 27))
+    assert output.motion.shape == (3, 1, 141)
+    assert output.contact_logit.shape == (3, 1, 2)
 
 
 def test_the_documents_size():

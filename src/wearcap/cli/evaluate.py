@@ -109,7 +109,7 @@ def _rows(
 ) -> Iterable[Row]:
     names = store.names(config.split)
     return progress.track(
-        evaluate(pipeline, store, names, seeds, config.lanes, measure),
+        evaluate(pipeline, store, names, seeds, config.batch_size, measure),
         total=len(names) * len(seeds),
         description=title,
     )

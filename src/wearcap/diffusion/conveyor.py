@@ -16,14 +16,14 @@ from wearcap.errors import WearcapError
 
 STEPS = ("posterior", "redraw")
 Denoise = Callable[
-    [Float[Tensor, "lane frame feature"], Float[Tensor, "lane frame modality"]],
-    Float[Tensor, "lane frame feature"],
+    [Float[Tensor, "batch frame feature"], Float[Tensor, "batch frame modality"]],
+    Float[Tensor, "batch frame feature"],
 ]
 """x̂0 from x_t and its levels, of all the frames on the conveyor."""
 
 
 @dataclass(frozen=True)
-class Belt:
+class RollingSchedule:
     """How a conveyor runs: `context` clean frames are kept before the ramp, on which a frame is denoised `per_frame`
     times for every frame that enters. Raises WearcapError for a context that leaves no ramp, and for unknown steps."""
 
@@ -64,76 +64,79 @@ class Belt:
 
 
 @dataclass(frozen=True)
-class Held:
+class Observation:
     """What of the frames on a conveyor is not to be denoised."""
 
-    known: Float[Tensor, "lane frame feature"]
-    is_known: Bool[Tensor, "lane frame modality"]
-    """Observed: at level 0, as `known` says."""
-    is_absent: Bool[Tensor, "lane frame modality"]
+    observed: Float[Tensor, "batch frame feature"]
+    is_observed: Bool[Tensor, "batch frame modality"]
+    """Observed: at level 0, as `observed` says."""
+    is_absent: Bool[Tensor, "batch frame modality"]
     """Not there at all: stays noise."""
 
 
 class Conveyor:
     """The frames of several lanes, the oldest first; never more than the window."""
 
-    def __init__(self, belt: Belt, schedule: Schedule, sizes: tuple[int, ...], lanes: int):
+    def __init__(self, rolling: RollingSchedule, schedule: Schedule, sizes: tuple[int, ...], items: int):
         """`sizes`: features of each modality."""
-        self.belt, self.schedule, self.sizes = belt, schedule, sizes
-        self.x = torch.zeros(lanes, 0, sum(sizes))
+        self.rolling, self.schedule, self.sizes = rolling, schedule, sizes
+        self.x = torch.zeros(items, 0, sum(sizes))
         self.age = torch.zeros(0, dtype=torch.long)
-        self.level = torch.zeros(lanes, 0, len(sizes))
+        self.level = torch.zeros(items, 0, len(sizes))
         """Where each frame's modalities have come to."""
-        self._known = torch.zeros(lanes, 0, len(sizes), dtype=torch.bool)
+        self._observed = torch.zeros(items, 0, len(sizes), dtype=torch.bool)
         self._modality = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
 
-    def push(self, noise: Float[Tensor, "lane feature"]) -> bool:
+    def push(self, noise: Float[Tensor, "batch feature"]) -> bool:
         """Take a new frame on; True where the oldest one had to make room."""
-        full = len(self.age) == self.belt.window
+        full = len(self.age) == self.rolling.window
         self.x = torch.cat([self.x[:, int(full) :], noise[:, None].to(self.x)], 1)
         self.age = torch.cat([self.age[int(full) :], self.age.new_zeros(1)])
         new = self.level.new_ones(len(self.level), 1, len(self.sizes))
         self.level = torch.cat([self.level[:, int(full) :], new], 1)
-        self._known = torch.cat([self._known[:, int(full) :], new < 1], 1)
+        self._observed = torch.cat([self._observed[:, int(full) :], new < 1], 1)
         return full
 
     def run(
         self,
         denoise: Denoise,
-        held: Held,
-        noise: Float[Tensor, "step lane frame feature"],
-        amend: Callable[[Float[Tensor, "lane frame feature"]], Float[Tensor, "lane frame feature"]]
+        observation: Observation,
+        noise: Float[Tensor, "step batch frame feature"],
+        correct: Callable[[Float[Tensor, "batch frame feature"]], Float[Tensor, "batch frame feature"]]
         | None = None,
     ) -> None:
-        """As many steps as there are between two frames; `noise` is what each adds. `amend` changes every x̂0 (guidance).
+        """As many steps as there are between two frames; `noise` is what each adds. `correct` changes every x̂0 (guidance).
 
         What was absent and is there now comes from noise to its frame's level in one step; what is there or known no more
         becomes noise, but in frames that are final.
         """
-        lost = self._known & ~held.is_known & (self.age < self.belt.steps)[:, None]
-        known, gone = self.wide(held.is_known), (held.is_absent & (self.level < 1)) | lost
-        self._known = held.is_known
+        lost = self._observed & ~observation.is_observed & (self.age < self.rolling.steps)[:, None]
+        observed, gone = self.wide(observation.is_observed), (observation.is_absent & (self.level < 1)) | lost
+        self._observed = observation.is_observed
         self.x = torch.where(self.wide(gone), noise[0], self.x)
-        self.level = torch.where(held.is_known, 0.0, torch.where(gone, 1.0, self.level))
+        self.level = torch.where(observation.is_observed, 0.0, torch.where(gone, 1.0, self.level))
         for fresh in noise:
-            due = self.belt.levels(self.age + 1)[:, None].expand_as(self.level)
-            level, then = self.level, torch.where(held.is_absent, self.level, torch.minimum(due, self.level))
-            self.x = torch.where(known, held.known, self.x)
+            due = self.rolling.levels(self.age + 1)[:, None].expand_as(self.level)
+            level, then = (
+                self.level,
+                torch.where(observation.is_absent, self.level, torch.minimum(due, self.level)),
+            )
+            self.x = torch.where(observed, observation.observed, self.x)
             x0_hat = denoise(self.x, level)
-            if amend is not None:
-                x0_hat = amend(x0_hat)
+            if correct is not None:
+                x0_hat = correct(x0_hat)
             now, after = self.wide(level), self.wide(then)
-            if self.belt.step == "redraw":
+            if self.rolling.step == "redraw":
                 moved = add_noise(x0_hat, fresh, after, self.schedule)
-                self.x = torch.where(known, held.known, torch.where(after < now, moved, self.x))
+                self.x = torch.where(observed, observation.observed, torch.where(after < now, moved, self.x))
             else:
-                self.x = posterior_step(self.x, x0_hat, now, after, fresh, self.schedule, self.belt.eta)
-            self.level, self.age = then, (self.age + 1).clamp_max(self.belt.steps)
+                self.x = posterior_step(self.x, x0_hat, now, after, fresh, self.schedule, self.rolling.eta)
+            self.level, self.age = then, (self.age + 1).clamp_max(self.rolling.steps)
 
     @property
     def clean(self) -> int:
         """Frames that are final."""
-        return int((self.age >= self.belt.steps).sum())
+        return int((self.age >= self.rolling.steps).sum())
 
     def wide(self, value: Tensor) -> Tensor:
         """Per feature instead of per modality."""

@@ -48,7 +48,7 @@ class LevelMix:
         """Levels from uniform random numbers: one per frame and modality, one more per frame, and `DRAWS` per window."""
         frames, chance = frames[..., :-1], frames[..., -1:]
         time, count = frames.shape[1:]
-        kind, ramp_at, tail_at, known, which, share, *_ = draws[..., None, None].unbind(1)
+        kind, ramp_at, tail_at, observed_parts, which, share, *_ = draws[..., None, None].unbind(1)
         low, high = self.ramp
         ramp = (low + (high - low) * ramp_at).round()
         # The queue's newest frame, at level 1, may lie behind the window: then the recording has ended.
@@ -65,4 +65,4 @@ class LevelMix:
         modality = torch.arange(count, device=frames.device) == (which * count).long()
         # Few frames are known as often as many: the share of known frames grows with the cube, up to all of them.
         seen = chance < (share / (1 - self.whole)) ** 3
-        return torch.where((known < self.observed) & modality & seen, 0.0, levels)
+        return torch.where((observed_parts < self.observed) & modality & seen, 0.0, levels)

@@ -30,12 +30,12 @@ def sample(
     *,
     eta: float = 1.0,
     spacing: float = 1.0,
-    known: Float[Tensor, "batch time feature"] | None = None,
-    is_known: Bool[Tensor, "batch time"] | None = None,
+    observed: Float[Tensor, "batch time feature"] | None = None,
+    is_observed: Bool[Tensor, "batch time"] | None = None,
 ) -> Float[Tensor, "batch time feature"]:
     """Draw x0 in `draw` steps between the levels of `step_levels`; noise[0] is the start, the rest the steps' noise.
 
-    Where `is_known`, every x̂0 is overwritten by `known` (autoregressive inpainting, thesis eq. 6.5).
+    Where `is_observed`, every x̂0 is overwritten by `observed` (autoregressive inpainting, thesis eq. 6.5).
     The same noise gives the same sample, so windows of several wearers can share a batch.
     """
     steps = len(noise)
@@ -44,8 +44,8 @@ def sample(
     for step in range(steps):
         level, level_next = (levels[step + i].expand(x.shape[0], 1) for i in (0, 1))
         x0_hat = denoise(x, level)
-        if known is not None and is_known is not None:
-            x0_hat = torch.where(is_known[..., None], known, x0_hat)
+        if observed is not None and is_observed is not None:
+            x0_hat = torch.where(is_observed[..., None], observed, x0_hat)
         fresh = noise[step + 1] if step + 1 < steps else torch.zeros_like(x)
         x = posterior_step(x, x0_hat, level, level_next, fresh, schedule, eta)
     return x

@@ -121,10 +121,10 @@ def check_points(points: PointCloud, head: HeadStream | None) -> list[Finding]:
             Finding("error", "points", "not a surrounding in metres", evidence, "Check the cloud's unit.")
         ]
     findings = [Finding("ok", "points", "a surrounding in metres", evidence)]
-    return findings if head is None else [*findings, _floor_beneath(points, head)]
+    return findings if head is None else [*findings, _floor_below(points, head)]
 
 
-def _floor_beneath(points: PointCloud, head: HeadStream) -> Finding:
+def _floor_below(points: PointCloud, head: HeadStream) -> Finding:
     check = "points: floor"
     try:
         floor = estimate_floor(points.points_world, head.t_world_device)
@@ -158,7 +158,7 @@ def _floor_beneath(points: PointCloud, head: HeadStream) -> Finding:
     return Finding("ok", check, "a floor beneath the head", evidence)
 
 
-def floor_beneath(points: PointCloud, head: HeadStream) -> FloorTrack | None:
+def floor_below(points: PointCloud, head: HeadStream) -> FloorTrack | None:
     """The floor that the points show along the head's path; None where they show none."""
     try:
         floor = estimate_floor(points.points_world, head.t_world_device)

@@ -11,7 +11,7 @@ from wearcap.doctor.agreement import (
     check_head_against_body,
     check_head_cue,
     check_points,
-    floor_beneath,
+    floor_below,
 )
 from wearcap.doctor.body import check_motion
 from wearcap.doctor.inertial import check_imu
@@ -90,7 +90,7 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
         head = head if _sound(found) else None
     floor = recording.floor
     if floor is None and recording.points is not None and head is not None:
-        floor = floor_beneath(recording.points, head)
+        floor = floor_below(recording.points, head)
     bodies = {}
     for name, motion in (("motion", recording.motion), ("suit", recording.suit)):
         if motion is not None and name in usable:

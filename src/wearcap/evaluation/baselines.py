@@ -21,7 +21,7 @@ from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.systems.hmd2.features import HeadFeatures
-from wearcap.tracking.anchor import hang_from_head
+from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import HeadPath, head_path
 
 QUERY_BATCH = 256
@@ -61,7 +61,7 @@ class MeanPose(_Baseline):
         """The mean pose hung from the recording's head."""
         path = _query_path(recording, self.joint_names, self.fps)
         R = self.R_parent_joint.repeat(len(path.timestamps), 1, 1, 1)
-        return _hung(path, R, "mean_pose")
+        return _anchored(path, R, "mean_pose")
 
     def save(self, path: str | Path) -> None:
         """Write as .safetensors."""
@@ -137,7 +137,7 @@ class NearestWindow(_Baseline):
         )
         found = self._nearest(_describe(path, starts, self.window, self.sample))
         pose = self._pasted(starts, found, count)
-        return _hung(path, rotation.matrix_from_rot6d(pose.unflatten(-1, (-1, 6))), "nearest_window")
+        return _anchored(path, rotation.matrix_from_rot6d(pose.unflatten(-1, (-1, 6))), "nearest_window")
 
     def _nearest(self, raw: Float[Tensor, "query sample channel"]) -> Int64[Tensor, "query"]:
         query = ((raw - self.mean) / self.scale).flatten(1)
@@ -245,13 +245,13 @@ def _describe(
     return channels[:, ::sample]
 
 
-def _hung(path: HeadPath, R_heading: Float[Tensor, "time joint 3 3"], name: str) -> Motion:
+def _anchored(path: HeadPath, R_heading: Float[Tensor, "time joint 3 3"], name: str) -> Motion:
     """Turn the root from the head's heading into the world and hang the body from the head."""
     R_world_heading = rotation.about_axis("z", rotation.yaw_of(path.T_world_head.R))
     R = torch.cat([(R_world_heading @ R_heading[:, 0])[:, None], R_heading[:, 1:]], 1)
     origin = torch.zeros(len(path.timestamps), 3)
     motion = Motion(path.timestamps, path.skeleton, R, origin, provenance={"pipeline": name})
-    return hang_from_head(motion, path.T_world_head)
+    return anchored_to_head(motion, path.T_world_head)
 
 
 def _save(

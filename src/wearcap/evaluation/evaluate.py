@@ -16,17 +16,17 @@ class Pipeline(Protocol):
 
 
 def evaluate(
-    pipeline: Pipeline, store: RecordingStore, names: Iterable[str], seeds: Sequence[int], lanes: int = 16,
+    pipeline: Pipeline, store: RecordingStore, names: Iterable[str], seeds: Sequence[int], batch_size: int = 16,
     measure: Measure | None = None,
 ) -> Iterator[Row]:  # fmt: skip
     """Capture every recording with every seed, hang the body from the true head, and score it.
 
-    `lanes` recordings share a batch; `measure` takes the place of `score`. Raises WearcapError when a recording has no true motion.
+    `batch_size` recordings share a batch; `measure` takes the place of `score`. Raises WearcapError when a recording has no true motion.
     """
     names = sorted(names, key=lambda name: store.entries[name].frames)
     jobs = [(name, seed) for name in names for seed in seeds]
-    for start in range(0, len(jobs), lanes):
-        batch = jobs[start : start + lanes]
+    for start in range(0, len(jobs), batch_size):
+        batch = jobs[start : start + batch_size]
         recordings = {name: store.load(name) for name, _ in batch}
         motions = pipeline.capture([recordings[name] for name, _ in batch], [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):

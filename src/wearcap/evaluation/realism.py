@@ -44,13 +44,13 @@ class Realism:
 
     def add(self, motion: Motion, recording: Recording, name: str, seed: int, method: str) -> None:
         """Take one capture in. Raises WearcapError as `score` does, and for motions of another rate than the network's."""
-        hung, truth, _ = comparable(motion, recording, name)
+        anchored, truth, _ = comparable(motion, recording, name)
         key = (name, len(truth))
         if key not in self._true:
             whole = self.features.movement(truth)
             self._true[key] = whole.floor_height, self._encode(whole)
         floor_height, latent_true = self._true[key]
-        latent = self._encode(self.features.movement(hung, floor_height))
+        latent = self._encode(self.features.movement(anchored, floor_height))
         self._seen[method][seed][name] = latent, latent_true
 
     @torch.inference_mode()

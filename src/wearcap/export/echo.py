@@ -46,7 +46,7 @@ from wearcap.systems.echo.model import MODALITIES, EchoDenoiser, EchoPlan
 from wearcap.systems.echo.pipeline import Echo
 
 MAX_ERROR = 1e-4
-_CONVEYOR = ("context", "per_frame", "spacing", "eta", "step", "rewindow", "hang", "rest")
+_CONVEYOR = ("context", "per_frame", "spacing", "eta", "step", "rewindow", "anchor", "static_threshold")
 
 
 class _DenoiserGraph(nn.Module):
@@ -173,17 +173,17 @@ class ExportedEchoDenoiser(EchoDenoiser):
         self.motion_normalizer = Normalizer(sum(self.sizes))
         self.motion_normalizer.set(torch.tensor(about["motion_mean"]), torch.tensor(about["motion_scale"]))
         self.object = nn.Identity()
-        self._told = len(about["condition_channels"]), len(about["object_channels"]), 1
+        self._conditioning = len(about["condition_channels"]), len(about["object_channels"]), 1
 
     def encode(
         self,
         condition: Float[Tensor, "batch time condition"],
-        thing: Float[Tensor, "batch time embedded"],
+        scene_object: Float[Tensor, "batch time embedded"],
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time width"]:
         """What is told, side by side: the file's network embeds and encodes it itself."""
-        return torch.cat([condition, thing, has_object[..., None].to(condition.dtype)], -1)
+        return torch.cat([condition, scene_object, has_object[..., None].to(condition.dtype)], -1)
 
     def plan(self, level: Float[Tensor, "batch time modality"]) -> EchoPlan:
         """The level itself."""
@@ -197,14 +197,17 @@ class ExportedEchoDenoiser(EchoDenoiser):
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time feature"]:
         batch, count, _ = x_t.shape
-        condition, object_code, has_object = encoded.split(self._told, -1)
+        condition, object_code, has_object = encoded.split(self._conditioning, -1)
         level = plan.worth[0].expand(batch, -1, -1)
-        told = {
+        conditioning = {
             "condition": condition, "object_code": object_code, "has_object": has_object[..., 0] > 0, "valid": valid,
             "x_t": x_t, "level": level,
         }  # fmt: skip
         missing = self.window - count
-        whole = {name: F.pad(value, (0, 0) * (value.ndim - 2) + (0, missing)) for name, value in told.items()}
+        whole = {
+            name: F.pad(value, (0, 0) * (value.ndim - 2) + (0, missing))
+            for name, value in conditioning.items()
+        }
         return self._run[0](**whole)[:, :count]
 
 

@@ -58,11 +58,11 @@ class ConditionGraph(nn.Module):
         image_valid: Bool[Tensor, "batch time"] | None = None,
     ) -> Float[Tensor, "batch token width"]:
         none = head[..., :0]
-        told = Conditions(
+        conditions = Conditions(
             head, none if points is None else points, valid if points_valid is None else points_valid,
             none if image is None else image, valid if image_valid is None else image_valid,
         )  # fmt: skip
-        return self.net.encode(told, valid)
+        return self.net.encode(conditions, valid)
 
 
 class PlaceGraph(nn.Module):
@@ -88,11 +88,11 @@ def export_hmd2(pipeline: HMD2, path: str | Path, format: str) -> dict[str, Expo
     valid = torch.arange(net.window).expand(2, -1) < net.window - 3
     normalizer = net.condition_encoder.normalizer
     noise = torch.randn(*shape, len(normalizer.scale), generator=random)
-    conditions = {"head": normalizer.mean.cpu() + normalizer.scale.cpu() * noise, "valid": valid}
+    inputs = {"head": normalizer.mean.cpu() + normalizer.scale.cpu() * noise, "valid": valid}
     for name, size in (("points", net.points_size), ("image", net.image_size)):
         if size:
             there = valid & (torch.rand(shape, generator=random) < 0.7)
-            conditions |= {name: torch.randn(*shape, size, generator=random), f"{name}_valid": there}
+            inputs |= {name: torch.randn(*shape, size, generator=random), f"{name}_valid": there}
     tokens, width = net.window // net.frames_per_token, net.motion_encoder.linear.out_features
     x_t, last = torch.randn(2, *shape, net.motion_size, generator=random)
     step = {
@@ -101,7 +101,7 @@ def export_hmd2(pipeline: HMD2, path: str | Path, format: str) -> dict[str, Expo
     }  # fmt: skip
     graphs = {
         "step": (net, step | ({"last": last} if net.self_conditioning else {})),
-        "conditions": (ConditionGraph(net), conditions),
+        "conditions": (ConditionGraph(net), inputs),
     }
     if pipeline.place_encoder is not None and net.points_size:
         grid = pipeline.place_encoder.grid
@@ -134,7 +134,7 @@ def describe(pipeline: HMD2, reports: dict[str, ExportReport]) -> dict:
             "eta": pipeline.eta,
             "spacing": pipeline.spacing,
             "guidance": pipeline.guidance,
-            "hold": pipeline.hold,
+            "inpaint": pipeline.inpaint,
             "fade": pipeline.fade,
             "lookahead": pipeline.lookahead,
             "live": pipeline.live,
@@ -189,12 +189,12 @@ class ExportedDenoiser(MotionDenoiser):
     def encode(
         self, conditions: Conditions, valid: Bool[Tensor, "batch time"]
     ) -> Float[Tensor, "batch token width"]:
-        told = {"head": conditions.head, "valid": valid}
+        inputs = {"head": conditions.head, "valid": valid}
         if self.points_size:
-            told |= {"points": conditions.points, "points_valid": conditions.points_valid}
+            inputs |= {"points": conditions.points, "points_valid": conditions.points_valid}
         if self.image_size:
-            told |= {"image": conditions.image, "image_valid": conditions.image_valid}
-        return self._run[1](**told)
+            inputs |= {"image": conditions.image, "image_valid": conditions.image_valid}
+        return self._run[1](**inputs)
 
     def plan(self, level: Float[Tensor, "batch #time"]) -> LevelPlan:
         """The exported step takes the level itself."""
@@ -208,15 +208,15 @@ class ExportedDenoiser(MotionDenoiser):
         valid: Bool[Tensor, "batch time"],
         last: Float[Tensor, "batch time motion"] | None = None,
     ) -> Float[Tensor, "batch time motion"]:
-        told = {
+        inputs = {
             "x_t": x_t,
             "level": plan.worth[..., 0].expand(len(x_t), 1),
             "encoded": encoded,
             "valid": valid,
         }
         if self.self_conditioning:
-            told["last"] = torch.zeros_like(x_t) if last is None else last
-        return self._run[0](**told)
+            inputs["last"] = torch.zeros_like(x_t) if last is None else last
+        return self._run[0](**inputs)
 
 
 class ExportedPlaces(VoxelAutoencoder):

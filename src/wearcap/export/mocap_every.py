@@ -33,9 +33,11 @@ class _Joined(nn.Module):
         super().__init__()
         self.net = net
 
-    def forward(self, features: Float[Tensor, "batch window feature"]) -> Float[Tensor, "batch said value"]:
-        said = self.net(features)
-        return torch.cat([said.motion, said.contact_logit], -1)
+    def forward(
+        self, features: Float[Tensor, "batch window feature"]
+    ) -> Float[Tensor, "batch predicted value"]:
+        output = self.net(features)
+        return torch.cat([output.motion, output.contact_logit], -1)
 
 
 def export_mocap_every(pipeline: MocapEvery, path: str | Path, format: str) -> ExportReport:
@@ -54,7 +56,7 @@ def export_mocap_every(pipeline: MocapEvery, path: str | Path, format: str) -> E
     about = {
         "features": asdict(features), "feature_size": features.size, "motion_size": features.motion_size,
         "window": net.window, "fps": pipeline.fps, "skeleton": skeleton_to_json(pipeline.skeleton),
-        "stride": pipeline.stride, "lookahead": pipeline.lookahead, "floor": pipeline.floor, "hang": pipeline.hang,
+        "stride": pipeline.stride, "lookahead": pipeline.lookahead, "floor": pipeline.floor, "anchor": pipeline.anchor,
     }  # fmt: skip
     write_sidecar(path, header("mocap_every", report) | about)
     return report
@@ -68,8 +70,8 @@ class ExportedEstimator(WatchEstimator):
         self._run, self.window = (run,), window
 
     def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
-        said = self._run[0](features=features)
-        return Estimate(said[..., :-FEET], said[..., -FEET:], None)
+        output = self._run[0](features=features)
+        return Estimate(output[..., :-FEET], output[..., -FEET:], None)
 
 
 def load_exported_mocap_every(path: str | Path) -> MocapEvery:
@@ -80,7 +82,7 @@ def load_exported_mocap_every(path: str | Path) -> MocapEvery:
     run, about = open_exported(path), read_sidecar(path, "mocap_every")
     return MocapEvery(
         ExportedEstimator(run, about["window"]), WatchFeatures(**about["features"]), skeleton_from_json(about["skeleton"]),
-        about["fps"], about["stride"], about["lookahead"], about["floor"], about["hang"],
+        about["fps"], about["stride"], about["lookahead"], about["floor"], about["anchor"],
     )  # fmt: skip
 
 

@@ -214,8 +214,8 @@ def _shadow_maps(scene: _Scene, light: Light) -> tuple:
     shadow = np.maximum(shadow, np.float32(-1e6))
     high = ndimage.maximum_filter(shadow, size=4, origin=-1)
     low = ndimage.minimum_filter(shadow, size=4, origin=-1)
-    beneath, down_axes = orthographic_map(casters, (0.0, 0.0, -1.0), *where)
-    contact = np.exp(np.clip(beneath / _CONTACT_FADE, -80, 80))
+    below, down_axes = orthographic_map(casters, (0.0, 0.0, -1.0), *where)
+    contact = np.exp(np.clip(below / _CONTACT_FADE, -80, 80))
     contact = ndimage.gaussian_filter(contact, sigma=2.5)
     scale = _MAP_SIZE / (2 * light.shadow_radius)
     return np.concatenate([key_axes, down_axes]), scale, shadow, high, low, contact

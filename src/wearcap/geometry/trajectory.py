@@ -71,7 +71,7 @@ def interpolate(
     return torch.lerp(value[before], value[after], blend)
 
 
-def interpolate_held(
+def interpolate_clamped(
     timestamps: Float64[Tensor, "time"], value: Float[Tensor, "time"], at: Float64[Tensor, "new_time"]
 ) -> Float[Tensor, "new_time"]:
     """Values at any times, linearly between frames; beyond the ends they are those of the ends."""

@@ -13,7 +13,7 @@ from wearcap.metrics.position import mpjpe_cm, root_error_cm
 from wearcap.metrics.table import Row, evaluate_motion
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import at_times
-from wearcap.tracking.anchor import hang_from_head
+from wearcap.tracking.anchor import anchored_to_head
 
 Measure = Callable[[Motion, Recording, str, int], Row]
 """Scores of a motion that was captured from a recording, by the recording's name and a seed."""
@@ -25,8 +25,8 @@ def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
     Both are hung from the true head, but for `world_root_cm` and `world_mpjpe_cm`: these are measured where the capture
     put the body in the world.
     """
-    hung, truth, contact = comparable(motion, recording, name)
-    scores = evaluate_motion(hung, truth, contact)
+    anchored, truth, contact = comparable(motion, recording, name)
+    scores = evaluate_motion(anchored, truth, contact)
     joints, joints_true = motion.T_world_joint.t, truth.T_world_joint.t
     scores["world_root_cm"] = root_error_cm(joints[:, 0], joints_true[:, 0]).item()
     scores["world_mpjpe_cm"] = mpjpe_cm(joints, joints_true).item()
@@ -55,7 +55,7 @@ def comparable(
     Raises WearcapError when the recording has no true motion.
     """
     truth, contact = truth_at(motion, recording, name)
-    return hang_from_head(motion, truth.joint("head")), truth, contact
+    return anchored_to_head(motion, truth.joint("head")), truth, contact
 
 
 def truth_at(

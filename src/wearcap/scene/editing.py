@@ -12,7 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.scene.environment import Environment, surface_index
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.scene.placing import floor_beneath, footprint, usual_freedom
+from wearcap.scene.placing import floor_below, footprint, usual_freedom
 from wearcap.scene.scan import Scan
 from wearcap.scene.selection import Box, SlicedCloud
 
@@ -123,7 +123,7 @@ class ObjectEditing:
         points = self.scan.points[self.selected]
         rest = self.left()
         rest[self.selected] = False
-        floor = floor_beneath(points, self.scan.points[rest])
+        floor = floor_below(points, self.scan.points[rest])
         origin = np.array([*footprint(points).center, floor])
         colors = np.full(3, 0.6, np.float32)
         if self.scan.colors is not None:

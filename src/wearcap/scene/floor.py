@@ -144,8 +144,8 @@ def _evidence(votes: np.ndarray) -> np.ndarray:
     layer = gaussian_filter1d(votes, 1.5, axis=1)
     strength = (layer + _FAINT) / (layer.max(1, keepdims=True) + _FAINT)
     margin = int(0.08 / _BIN_M)
-    beneath = np.pad(votes.cumsum(1), ((0, 0), (margin, 0)))[:, : votes.shape[1]]
-    share = beneath / np.maximum(votes.sum(1, keepdims=True), 1)  # a lone point beneath is no evidence
+    below = np.pad(votes.cumsum(1), ((0, 0), (margin, 0)))[:, : votes.shape[1]]
+    share = below / np.maximum(votes.sum(1, keepdims=True), 1)  # a lone point beneath is no evidence
     return -np.log(strength) + 6.0 * share.clip(max=0.4)
 
 

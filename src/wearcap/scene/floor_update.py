@@ -176,10 +176,10 @@ class FloorFollow:
     ) -> None:
         settings, wrong = self._settings, 0.0
         weight = (contact_prob.detach().cpu().numpy() - settings.contact).clip(0) / (1 - settings.contact)
-        said, seen = self._beneath(t_world_foot.detach().cpu().double().numpy())
+        reported, seen = self._below(t_world_foot.detach().cpu().double().numpy())
         weight = weight * np.where(seen, settings.gain_points, settings.gain)
         total = weight.sum(1)
-        target = (weight * said).sum(1) / np.where(total > 0, total, 1)
+        target = (weight * reported).sum(1) / np.where(total > 0, total, 1)
         share = weight.max(1)
         for frame in np.flatnonzero(total):
             wrong += share[frame] * (target[frame] - self._floors[frame] - wrong)
@@ -200,7 +200,7 @@ class FloorFollow:
         walking = float(np.clip((np.hypot(*self._velocity) - low) / (high - low), 0, 1))
         return walking * (self._level - before)
 
-    def _beneath(self, feet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _below(self, feet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Height (m) of the floor beneath feet "time foot 3", of the points there, else of the soles; and which it is."""
         settings, soles = self._settings, feet[..., 2] - self._sole
         if self._cloud.empty:

@@ -52,7 +52,7 @@ def footprint(points: Float[np.ndarray, "point 3"]) -> Footprint:
     return Footprint(center, long, max(length, width) / 2, min(length, width) / 2)
 
 
-def floor_beneath(points: Float[np.ndarray, "point 3"], scene: Float[np.ndarray, "other 3"]) -> float:
+def floor_below(points: Float[np.ndarray, "point 3"], scene: Float[np.ndarray, "other 3"]) -> float:
     """Height (m) of the floor that something stands on: the lowest strong layer of the scene's points around it.
 
     Its own lowest point where the scene has none beneath.

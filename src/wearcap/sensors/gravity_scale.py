@@ -170,7 +170,7 @@ def by_floor(
     random = np.random.default_rng(seed)
     eyes = slam.t_world_body[during(slam.timestamps, standing, "standing", 1.0)].double().mean(0).numpy()
     rough = -slam.R_world_body[:, :, 1].double().mean(0).numpy()
-    points = _beneath(
+    points = _below(
         points_slam.double().numpy(), slam.t_world_body.double().numpy(), rough / np.linalg.norm(rough)
     )
     floor = _floor_points(points, eyes, rough / np.linalg.norm(rough), random)
@@ -187,7 +187,7 @@ def by_floor(
     return GravityScale(_upright(up), height_m / height, float(np.std(scales)), deviation)
 
 
-def _beneath(points: np.ndarray, path: np.ndarray, up: np.ndarray) -> np.ndarray:
+def _below(points: np.ndarray, path: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Points within 50° of straight below some place of the path, down to twice the usual drop."""
     across = np.eye(3) - np.outer(up, up)
     distance, nearest = KDTree(path @ across).query(points @ across)

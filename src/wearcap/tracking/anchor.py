@@ -13,7 +13,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 
 
-def hang(
+def anchor(
     skeleton: Skeleton,
     R_parent_joint: Float[Tensor, "*batch joint 3 3"],
     T_world_measured: Rigid,
@@ -30,7 +30,7 @@ def hang(
     T_root_joint = forward_kinematics(skeleton, R_parent_joint, origin, t_parent_joint)
     R_parent_measured = T_root_joint.R[..., parent, :, :].transpose(-1, -2) @ T_world_measured.R
     shift = T_world_measured.t - T_root_joint.t[..., at, :]
-    R_hung = torch.cat(
+    R_anchored = torch.cat(
         [
             R_parent_joint[..., :at, :, :],
             R_parent_measured[..., None, :, :],
@@ -46,12 +46,12 @@ def hang(
         ],
         dim=-3,
     )
-    return R_hung, Rigid(R_world, T_root_joint.t + shift[..., None, :])
+    return R_anchored, Rigid(R_world, T_root_joint.t + shift[..., None, :])
 
 
-def hang_from_head(motion: Motion, T_world_head: Rigid) -> Motion:
+def anchored_to_head(motion: Motion, T_world_head: Rigid) -> Motion:
     """Last step: shift the body and turn its head so that the head is where it was measured."""
-    R_parent_joint, T_world_joint = hang(motion.skeleton, motion.R_parent_joint, T_world_head)
+    R_parent_joint, T_world_joint = anchor(motion.skeleton, motion.R_parent_joint, T_world_head)
     return replace(motion, R_parent_joint=R_parent_joint, t_world_root=T_world_joint.t[:, 0])
 
 

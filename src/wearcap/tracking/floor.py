@@ -10,7 +10,7 @@ from scipy.ndimage import percentile_filter
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.geometry.trajectory import interpolate_held
+from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording import PointCloud
 from wearcap.scene.floor import estimate_floor
 
@@ -35,9 +35,9 @@ def floor_from_path(
     `stature`, the head joint's height in the rest pose (m). Stairs are followed late, long sits mistaken for steps.
     """
     every = torch.arange(timestamps[0].item(), timestamps[-1].item() + _LOOK_EVERY_S, _LOOK_EVERY_S).double()
-    seen = interpolate_held(timestamps, t_world_head[:, 2], every).numpy()
+    seen = interpolate_clamped(timestamps, t_world_head[:, 2], every).numpy()
     upright = percentile_filter(seen, 90, size=int(UPRIGHT_WITHIN_S / _LOOK_EVERY_S), mode="nearest")
-    return interpolate_held(every, torch.from_numpy(np.asarray(upright) - stature).float(), timestamps)
+    return interpolate_clamped(every, torch.from_numpy(np.asarray(upright) - stature).float(), timestamps)
 
 
 def floor_from_points(

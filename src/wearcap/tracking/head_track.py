@@ -25,7 +25,7 @@ class Chunk(NamedTuple):
 
     timestamps: Float64[Tensor, "time"]
     T_world_device: Rigid
-    amended: Rigid
+    corrected: Rigid
     """Poses of the last frames of the chunk before, which had been held for want of newer ones."""
     first: int
     """Number of the first frame on the wearer's clock."""

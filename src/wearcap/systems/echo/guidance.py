@@ -16,7 +16,7 @@ from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.echo.features import OBJECT_SIZE, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser
-from wearcap.systems.echo.queue import Told
+from wearcap.systems.echo.queue import Conditioning
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Guidance:
     threshold: float = 0.5
     """From which probability on something touches."""
 
-    def amended(
-        self, x0_hat: Float[Tensor, "lane frame feature"], scene: "GuidedScene"
-    ) -> Float[Tensor, "lane frame feature"]:
+    def corrected(
+        self, x0_hat: Float[Tensor, "batch frame feature"], scene: "GuidedScene"
+    ) -> Float[Tensor, "batch frame feature"]:
         """x̂0 after one step down the gradient (classifier guidance, Dhariwal and Nichol 2021)."""
         with torch.enable_grad():
             x = x0_hat.detach().clone().requires_grad_(True)
@@ -57,7 +57,7 @@ class GuidedScene:
 
     net: EchoDenoiser
     features: EchoFeatures
-    told: Told
+    conditioning: Conditioning
     frame: Rigid
     surfaces: Sequence[BodyModel]
     """Each lane's contact points."""
@@ -65,42 +65,42 @@ class GuidedScene:
     """Points of each lane's objects, about their middles."""
 
     def costs(
-        self, x0_hat: Float[Tensor, "lane frame feature"], threshold: float
+        self, x0_hat: Float[Tensor, "batch frame feature"], threshold: float
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Squared distances (m²) of touching points to the object, and of standing feet to the floor: means over each
         frame's points, summed over frames."""
         mean, scale = self.net.motion_normalizer.mean.to(x0_hat), self.net.motion_normalizer.scale.to(x0_hat)
-        human, thing, contact = (x0_hat * scale + mean).split(self.net.sizes, -1)
+        human, scene_object, contact = (x0_hat * scale + mean).split(self.net.sizes, -1)
         body, T_object = (
             self.features.decode_body(human, self.frame),
-            self.features.decode_object(thing, self.frame),
+            self.features.decode_object(scene_object, self.frame),
         )
-        said = (contact.detach() + 1) / 2 > threshold
-        there = self.told.valid & self.told.has_object
+        outputs = (contact.detach() + 1) / 2 > threshold
+        there = self.conditioning.valid & self.conditioning.has_object
         touch, stand = x0_hat.new_zeros(()), x0_hat.new_zeros(())
-        for lane, surface in enumerate(self.surfaces):
-            pose = forward_kinematics(surface.skeleton, body.R_parent_joint[lane], body.t_world_root[lane])
-            touches = said[lane, :, :BODY_POINTS] & there[lane, :, None]
+        for item, surface in enumerate(self.surfaces):
+            pose = forward_kinematics(surface.skeleton, body.R_parent_joint[item], body.t_world_root[item])
+            touches = outputs[item, :, :BODY_POINTS] & there[item, :, None]
             if touches.any():
-                touch = touch + self._to_object(lane, surface, pose, T_object[lane], touches)
-            stands = said[lane, :, BODY_POINTS:] & self.told.valid[lane, :, None]
+                touch = touch + self._to_object(item, surface, pose, T_object[item], touches)
+            stands = outputs[item, :, BODY_POINTS:] & self.conditioning.valid[item, :, None]
             soles = site_positions(surface.skeleton, pose, FOOT_PATCHES)
-            height = soles[..., 2] - self.told.floor_height[lane, :, None]
+            height = soles[..., 2] - self.conditioning.floor_height[item, :, None]
             stand = stand + (height.square() * stands / stands.sum(1, keepdim=True).clamp_min(1)).sum()
         return touch, stand
 
     def _to_object(
-        self, lane: int, surface: BodyModel, pose: Rigid, T_object: Rigid, touches: Tensor
+        self, item: int, surface: BodyModel, pose: Rigid, T_object: Rigid, touches: Tensor
     ) -> Float[Tensor, ""]:
         """Of one lane, to the nearest point of the surface, through which the gradient goes."""
         frame, point = touches.nonzero(as_tuple=True)
         arm = surface.vertices(pose)[frame, point] - T_object.t[frame]
         local = (T_object.R[frame].mT @ arm[..., None])[..., 0]
-        number = self.told.object_number[lane, frame].long()
+        number = self.conditioning.object_number[item, frame].long()
         share = 1 / touches.sum(1)[frame]
         total = local.new_zeros(())
         for index in number.unique().tolist():
-            tree = self.objects[lane][int(index)]
+            tree = self.objects[item][int(index)]
             mine = local[number == index]
             _, nearest = tree.query(mine.detach().double().numpy())
             target = torch.from_numpy(np.asarray(tree.data, np.float32)[nearest])

@@ -85,15 +85,15 @@ class EchoDenoiser(nn.Module):
     def encode(
         self,
         condition: Float[Tensor, "batch time condition"],
-        thing: Float[Tensor, "batch time embedded"],
+        scene_object: Float[Tensor, "batch time embedded"],
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time width"]:
-        """What a window's frames are told, the same in every step. `thing`: their objects' codes, through `object`."""
+        """What a window's frames are told, the same in every step. `scene_object`: their objects' codes, through `object`."""
         mask = valid[..., None].to(condition.dtype)
         wide = self.widen(torch.cat([self.condition_normalizer(condition) * mask, mask], -1))
-        thing = torch.where(has_object[..., None], thing, self.no_object)
-        return self.narrow(F.gelu(wide + thing))
+        scene_object = torch.where(has_object[..., None], scene_object, self.no_object)
+        return self.narrow(F.gelu(wide + scene_object))
 
     def plan(self, level: Float[Tensor, "batch time modality"]) -> EchoPlan:
         """The levels' part of a step; a queue that runs repeats it."""
@@ -124,8 +124,8 @@ class EchoDenoiser(nn.Module):
             token = torch.cat([encoded + part + own for part, own in zip(tokens, self.stream)], 1)
         for block, modulation in zip(self.blocks, plan.blocks):
             token = block(token, modulation, mask)
-        said = self.norm(token).chunk(self.streams, 1)
-        x0_hat = torch.cat([head(said[k % self.streams]) for k, head in enumerate(self.heads)], -1)
+        outputs = self.norm(token).chunk(self.streams, 1)
+        x0_hat = torch.cat([head(outputs[k % self.streams]) for k, head in enumerate(self.heads)], -1)
         return x0_hat if self.blend is None else self.blend(x0_hat, valid)
 
     def forward(

@@ -65,18 +65,20 @@ class ObjectReader:
         """`encoder` None tells class and extents alone, where the features have no shape. `embed`: the network's layer on
         codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
         self.features, self.encoder, self._embed = features, encoder, embed
-        self.nothing: Float[Tensor, "code"] = self._told(torch.zeros(1, features.object_condition_size))[0]
+        self.nothing: Float[Tensor, "code"] = self._conditioning(
+            torch.zeros(1, features.object_condition_size)
+        )[0]
         """Stands where no object is active."""
-        self._known: dict[tuple[int, str], ObjectShape] = {}
+        self._observed: dict[tuple[int, str], ObjectShape] = {}
 
     @torch.inference_mode()
     def __call__(self, item: SceneObject) -> ObjectShape:
         """Raises WearcapError for a class that the model does not know."""
         key = (id(item.mesh), item.category)
-        if key not in self._known:
-            self._known[key] = self._read(item)
-        known = self._known[key]
-        return ObjectShape(item.name, *(getattr(known, name) for name in ObjectShape.__dataclass_fields__ if name != "name"))  # fmt: skip
+        if key not in self._observed:
+            self._observed[key] = self._read(item)
+        observed = self._observed[key]
+        return ObjectShape(item.name, *(getattr(observed, name) for name in ObjectShape.__dataclass_fields__ if name != "name"))  # fmt: skip
 
     def _read(self, item: SceneObject) -> ObjectShape:
         one_hot = self.features.class_code(item.category)
@@ -86,13 +88,13 @@ class ObjectReader:
         parts = [one_hot.expand(2, -1), cloud_extents(both)]
         if self.encoder is not None and self.features.shape_size:
             parts.append(self.encoder(both))
-        code, code_mirrored = self._told(torch.cat(parts, -1)).unbind(0)
+        code, code_mirrored = self._conditioning(torch.cat(parts, -1)).unbind(0)
         return ObjectShape(
             item.name, item.category, item.mesh, middle, both[0].clone(), code, code_mirrored, surface_index(item.mesh)
         )  # fmt: skip
 
     @torch.no_grad()
-    def _told(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:
+    def _conditioning(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:
         return (codes if self._embed is None else self._embed(codes)).clone()
 
 

@@ -12,7 +12,7 @@ from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, interpolate_held, resample
+from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, resample
 from wearcap.recording.acts import NO_OBJECT, Act, active_at
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
@@ -22,7 +22,7 @@ from wearcap.scene.object_mesh import check_object
 from wearcap.systems.echo.features import CONTACTS, POINTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.objects import ObjectReader, ObjectShape
-from wearcap.systems.echo.queue import Told
+from wearcap.systems.echo.queue import Conditioning
 from wearcap.tracking.head_path import HeadPath
 
 WRISTS = POINTS[1:]
@@ -60,16 +60,16 @@ class Scenario:
 
 
 @dataclass(frozen=True, eq=False)
-class Lane:
+class BatchItem:
     """One scenario, ready for the queue."""
 
     path: HeadPath
-    told: Told
+    conditioning: Conditioning
     """With a lane axis of one."""
     objects: list[ObjectShape]
 
 
-def lane_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> Lane:
+def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> BatchItem:
     """What is told, frame by frame of the head's path.
 
     Raises WearcapError for wrists that are not tracked or are swapped, for acts of unknown objects, for objects whose
@@ -83,10 +83,10 @@ def lane_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> Lane:
     codes = torch.stack([*(shape.code for shape in objects), reader.nothing])
     floor = path.floor_height
     if recording.floor is not None:
-        floor = interpolate_held(recording.floor.timestamps, recording.floor.height, path.timestamps)
-    known = _observed(scenario, path, names, objects, active)
-    told = (R, t, floor.float(), active != NO_OBJECT, codes[active], active.float(), torch.ones(count, dtype=torch.bool))  # fmt: skip
-    return Lane(path, Told(*(part[None] for part in (*told, *known))), objects)
+        floor = interpolate_clamped(recording.floor.timestamps, recording.floor.height, path.timestamps)
+    observed_parts = _observed(scenario, path, names, objects, active)
+    conditioning = (R, t, floor.float(), active != NO_OBJECT, codes[active], active.float(), torch.ones(count, dtype=torch.bool))  # fmt: skip
+    return BatchItem(path, Conditioning(*(part[None] for part in (*conditioning, *observed_parts))), objects)
 
 
 def _tracked_points(
@@ -132,9 +132,10 @@ def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
         inside - times[last] <= SAME_S
     )
     found = resample(track, inside).T_world_body if len(times) > 1 else track.T_world_body[last]
-    held = track.T_world_body[last]
+    observation = track.T_world_body[last]
     return Rigid(
-        torch.where(gone[:, None, None], held.R, found.R), torch.where(gone[:, None], held.t, found.t)
+        torch.where(gone[:, None, None], observation.R, found.R),
+        torch.where(gone[:, None], observation.t, found.t),
     )
 
 
@@ -172,7 +173,7 @@ def _observed(
     joints = len(path.skeleton)
     R, root = torch.eye(3).repeat(count, joints, 1, 1), torch.zeros(count, 3)
     R_object, t_object = torch.eye(3).repeat(count, 1, 1), torch.zeros(count, 3)
-    contact, is_known = (
+    contact, is_observed = (
         torch.zeros(count, CONTACTS),
         torch.zeros(count, len(MODALITIES), dtype=torch.bool),
     )
@@ -181,7 +182,7 @@ def _observed(
         if len(seen.motion.skeleton) != joints:
             raise WearcapError(f"an observed body of {len(seen.motion.skeleton)} joints", where=where, expected=f"{joints}, as the wearer has")  # fmt: skip
         R[at], root[at] = seen.motion.R_parent_joint.float(), seen.motion.t_world_root.float()
-        is_known[at, 0] = True
+        is_observed[at, 0] = True
     for name, track in seen.object_motion.items():
         if name not in names:
             raise WearcapError(f"an observed object {name!r}", where=where, expected=f"one of {', '.join(names) or 'no objects'}")  # fmt: skip
@@ -189,25 +190,25 @@ def _observed(
         mine = active[at] == number
         T = objects[number].centred(track.T_world_body)
         R_object[at[mine]], t_object[at[mine]] = T.R[mine].float(), T.t[mine].float()
-        is_known[at[mine], 1] = True
+        is_observed[at[mine], 1] = True
     if scenario.placed and scenario.environment is not None:
         for number, name in enumerate(names):
             first = (active == number).nonzero()[:1, 0]
-            if len(first) and not is_known[first, 1]:
+            if len(first) and not is_observed[first, 1]:
                 T = objects[number].centred(scenario.environment.by_name(name).T_world_object)
                 R_object[first], t_object[first] = T.R.float(), T.t.float()
-                is_known[first, 1] = True
+                is_observed[first, 1] = True
     if seen.contact is not None and seen.contact_times is not None:
         at = _frames(seen.contact_times, path, where)
         if seen.contact.shape[1] != CONTACTS:
             raise WearcapError(f"observed contacts of {seen.contact.shape[1]} points", where=where,
                                expected=f"{BODY_POINTS} of the body and {len(FOOT_PATCHES)} of the feet")  # fmt: skip
         contact[at] = seen.contact.float()
-        is_known[at, 2] = True
+        is_observed[at, 2] = True
     for value in (R, root, R_object, t_object, contact):
         if not value.isfinite().all():
             raise WearcapError("observations that are NaN or infinite", where=where, expected="finite values")
-    return R, root, R_object, t_object, contact, is_known
+    return R, root, R_object, t_object, contact, is_observed
 
 
 def _frames(times: Float64[Tensor, "frame"], path: HeadPath, where: str) -> Tensor:

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, contact_points
 from wearcap.body.skeleton import Skeleton
-from wearcap.diffusion.conveyor import Belt, Denoise
+from wearcap.diffusion.conveyor import Denoise, RollingSchedule
 from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -23,12 +23,12 @@ from wearcap.systems.echo.features import EchoFeatures
 from wearcap.systems.echo.guidance import Guidance, GuidedScene
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.objects import ObjectReader, ObjectShape
-from wearcap.systems.echo.observations import Lane, Scenario, lane_of
-from wearcap.systems.echo.queue import Amend, EchoQueue, Said, Told
+from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
+from wearcap.systems.echo.queue import Conditioning, Correction, EchoQueue, Outputs
 from wearcap.systems.echo.rewindow import Rewindow
-from wearcap.systems.echo.static_objects import rested
+from wearcap.systems.echo.static_objects import with_static_objects
 from wearcap.systems.echo.step_runner import EchoRunner, require_runtime
-from wearcap.tracking.anchor import hang_from_head
+from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import HeadPath, head_path
 
 
@@ -51,12 +51,12 @@ class Echo:
     spacing: float = 2.0
     eta: float = 0.0
     step: str = "posterior"
-    """See `diffusion.conveyor.Belt`."""
+    """See `diffusion.conveyor.RollingSchedule`."""
     rewindow: int | None = None
     """Frames by which windows advance that are denoised from scratch, as is usual; None: a conveyor."""
-    hang: bool = True
+    anchor: bool = True
     """Whether the body hangs from the measured head (ours) or stands where it was drawn (the document)."""
-    rest: float | None = 0.7
+    static_threshold: float | None = 0.7
     """Objects stay where they are in frames in which nothing touches them with this probability (ours); None: they are as
     drawn (the document), and so they are where the network knows no contacts."""
     guidance: Guidance | None = None
@@ -76,7 +76,7 @@ class Echo:
     def __post_init__(self):
         if isinstance(self.acts, str) and self.acts not in ("truth", "none"):
             raise WearcapError(f"no acts {self.acts!r}", expected="truth, none, or a list of {object, start_s, stop_s}")  # fmt: skip
-        ramp, _ = self.belt.ramp, self._given_acts()
+        ramp, _ = self.rolling.ramp, self._given_acts()
         if self.rewindow is not None and not 0 < self.rewindow <= ramp:
             raise WearcapError(f"windows that advance by {self.rewindow} frames", expected=f"1 to {ramp}, the window less the context")  # fmt: skip
         if self.rewindow is not None and self.step == "redraw":
@@ -84,9 +84,11 @@ class Echo:
         require_runtime(self.runtime, self.device)
 
     @property
-    def belt(self) -> Belt:
+    def rolling(self) -> RollingSchedule:
         """How the conveyor runs."""
-        return Belt(self.net.window, self.context, self.per_frame, self.spacing, self.eta, self.step)
+        return RollingSchedule(
+            self.net.window, self.context, self.per_frame, self.spacing, self.eta, self.step
+        )
 
     @property
     def fps(self) -> float:
@@ -95,12 +97,12 @@ class Echo:
     @property
     def latency_s(self) -> float:
         """Between a frame and its final pose."""
-        return (self.belt.ramp - 1) / self.fps
+        return (self.rolling.ramp - 1) / self.fps
 
     @property
-    def rests_below(self) -> float | None:
-        """`rest`, where the network knows contacts."""
-        return self.rest if self.contacts else None
+    def static_below(self) -> float | None:
+        """`static_threshold`, where the network knows contacts."""
+        return self.static_threshold if self.contacts else None
 
     @property
     def guided_by(self) -> Guidance | None:
@@ -139,8 +141,8 @@ class Echo:
         were given.
         """
         if self.acts == "truth":
-            told = bool(recording.object_motion) or recording.interactions is not None
-            there = environment is not None and told
+            tracked = bool(recording.object_motion) or recording.interactions is not None
+            there = environment is not None and tracked
             acts = tuple(true_acts(recording)) if there else ()
             return Scenario(recording, environment, acts, placed=self.placed)
         if callable(self.acts) and environment is not None:
@@ -152,42 +154,44 @@ class Echo:
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
         """One motion per (scenario, seed), with `object_motion` and `body_contact_prob` where objects are active.
 
-        Raises WearcapError as `head_path` and `lane_of` do.
+        Raises WearcapError as `head_path` and `batch_item_of` do.
         """
         self.prepare()
         # 1. the three tracked points on the model's clock, and the active objects' codes; once for all seeds
         reader, once = self.reader(), {id(scenario): scenario for scenario in scenarios}
-        lane_by = {key: self._lane(scenario, reader) for key, scenario in once.items()}
-        lanes = [lane_by[id(scenario)] for scenario in scenarios]
+        item_by = {key: self._item(scenario, reader) for key, scenario in once.items()}
+        items = [item_by[id(scenario)] for scenario in scenarios]
         # 2. frame after frame enters as noise and leaves clean
-        said = self._conveyed(lanes, [scenario.recording for scenario in scenarios], seeds)
+        outputs = self._conveyed(items, [scenario.recording for scenario in scenarios], seeds)
         # 3. the body hangs from the measured head; objects rest while nothing touches them
-        if (threshold := self.rests_below) is not None:
-            said = [rested(lane.told, part, threshold) for lane, part in zip(lanes, said)]
-        return [motion_of(lane, part, self.hang, self.settings()) for lane, part in zip(lanes, said)]
+        if (threshold := self.static_below) is not None:
+            outputs = [
+                with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)
+            ]
+        return [motion_of(item, part, self.anchor, self.settings()) for item, part in zip(items, outputs)]
 
-    def _lane(self, scenario: Scenario, reader: ObjectReader) -> Lane:
-        return lane_of(scenario, head_path(scenario.recording, self.skeleton, self.fps), reader)
+    def _item(self, scenario: Scenario, reader: ObjectReader) -> BatchItem:
+        return batch_item_of(scenario, head_path(scenario.recording, self.skeleton, self.fps), reader)
 
     def _conveyed(
-        self, lanes: Sequence[Lane], recordings: Sequence[Recording], seeds: Sequence[int]
-    ) -> list[Said]:
+        self, items: Sequence[BatchItem], recordings: Sequence[Recording], seeds: Sequence[int]
+    ) -> list[Outputs]:
         """All frames of every lane: its stretches side by side, what lies between them as it was before."""
-        parts = [(k, *stretch) for k, lane in enumerate(lanes) for stretch in lane.path.stretches]
+        parts = [(k, *stretch) for k, item in enumerate(items) for stretch in item.path.stretches]
         longest = max(stop - start for _, start, stop in parts)
         queue = self.queue(
-            [lanes[k].path.skeleton for k, *_ in parts],
+            [items[k].path.skeleton for k, *_ in parts],
             [stretch_seed(seeds[k], start) for k, start, _ in parts],
             [recordings[k].shape for k, *_ in parts],
-            [lanes[k].objects for k, *_ in parts],
+            [items[k].objects for k, *_ in parts],
         )
-        told = [_padded(lanes[k].told, start, stop, longest) for k, start, stop in parts]
-        whole = Told(*(torch.cat(fields) for fields in zip(*told)))
+        conditioning = [_padded(items[k].conditioning, start, stop, longest) for k, start, stop in parts]
+        whole = Conditioning(*(torch.cat(fields) for fields in zip(*conditioning)))
         together = queue.run(whole)
-        found: list[list[Said]] = [[] for _ in lanes]
+        found: list[list[Outputs]] = [[] for _ in items]
         for row, (k, start, stop) in enumerate(parts):
-            found[k].append(Said(*(field[row : row + 1, : stop - start] for field in together)))
-        return [_bridged(said, lane.path) for said, lane in zip(found, lanes)]
+            found[k].append(Outputs(*(field[row : row + 1, : stop - start] for field in together)))
+        return [_bridged(outputs, item.path) for outputs, item in zip(found, items)]
 
     def queue(
         self,
@@ -204,45 +208,50 @@ class Echo:
             queue.guided = pulled_by(skeletons, shapes, objects)
         return queue
 
-    def denoiser(self, queue: EchoQueue, told: Told, frame: Rigid) -> tuple[Denoise, Amend | None]:
+    def denoiser(
+        self, queue: EchoQueue, conditioning: Conditioning, frame: Rigid
+    ) -> tuple[Denoise, Correction | None]:
         """x̂0 of the frames on a conveyor as a function of x_t and levels, and what guidance makes of it.
 
         What the frames are told is encoded once, what their levels do is kept for when the same ones come again.
         """
-        condition = self.features.condition(told.points, told.floor_height, queue.size, frame)
+        condition = self.features.condition(conditioning.points, conditioning.floor_height, queue.size, frame)
         if self._runner is None:
             self.prepare()
         assert self._runner is not None
-        denoise = self._runner.begin(condition, told.object_code, told.has_object, told.valid)
+        denoise = self._runner.begin(
+            condition, conditioning.object_code, conditioning.has_object, conditioning.valid
+        )
         guidance = self.guided_by
         if guidance is None or queue.guided is None:
             return denoise, None
         surfaces, objects = queue.guided
-        scene = GuidedScene(self.net, self.features, told, frame, surfaces, objects)
-        return denoise, lambda x0_hat: guidance.amended(x0_hat, scene)
+        scene = GuidedScene(self.net, self.features, conditioning, frame, surfaces, objects)
+        return denoise, lambda x0_hat: guidance.corrected(x0_hat, scene)
 
     def settings(self) -> dict[str, str]:
         """What the motion depends on, beside the network."""
         return {
             "pipeline": "echo", "context": str(self.context), "per_frame": str(self.per_frame), "spacing": str(self.spacing),
-            "eta": str(self.eta), "step": self.step, "rewindow": str(self.rewindow), "hang": str(self.hang),
-            "rest": str(self.rests_below), "placed": str(self.placed), "guidance": str(self.guided_by), "acts": "search" if callable(self.acts) else str(self.acts),
+            "eta": str(self.eta), "step": self.step, "rewindow": str(self.rewindow), "anchor": str(self.anchor),
+            "static_threshold": str(self.static_below), "placed": str(self.placed), "guidance": str(self.guided_by), "acts": "search" if callable(self.acts) else str(self.acts),
         }  # fmt: skip
 
 
-def motion_of(lane: Lane, said: Said, hung: bool, provenance: dict[str, str]) -> Motion:
+def motion_of(item: BatchItem, outputs: Outputs, anchored: bool, provenance: dict[str, str]) -> Motion:
     """What was said of a lane as a motion, hung from the measured head or not; a body that is observed stays as it is."""
-    path, contact = lane.path, said.contact_prob[0]
+    path, contact = item.path, outputs.contact_prob[0]
     motion = Motion(
-        path.timestamps, path.skeleton, said.R_parent_joint[0], said.t_world_root[0], contact[:, BODY_POINTS:],
-        body_contact_prob=contact[:, :BODY_POINTS] * lane.told.has_object[0, :, None],
-        object_motion=object_tracks(lane, said) or None, provenance=provenance,
+        path.timestamps, path.skeleton, outputs.R_parent_joint[0], outputs.t_world_root[0], contact[:, BODY_POINTS:],
+        body_contact_prob=contact[:, :BODY_POINTS] * item.conditioning.has_object[0, :, None],
+        object_motion=object_tracks(item, outputs) or None, provenance=provenance,
     )  # fmt: skip
-    if not hung:
+    if not anchored:
         return motion
-    hanging, seen = hang_from_head(motion, path.T_world_head), lane.told.is_known[0, :, 0]
-    R = torch.where(seen[:, None, None, None], motion.R_parent_joint, hanging.R_parent_joint)
-    t = torch.where(seen[:, None], motion.t_world_root, hanging.t_world_root)
+    anchored_motion = anchored_to_head(motion, path.T_world_head)
+    seen = item.conditioning.is_observed[0, :, 0]
+    R = torch.where(seen[:, None, None, None], motion.R_parent_joint, anchored_motion.R_parent_joint)
+    t = torch.where(seen[:, None], motion.t_world_root, anchored_motion.t_world_root)
     return replace(motion, R_parent_joint=R, t_world_root=t)
 
 
@@ -258,18 +267,18 @@ def pulled_by(
     return surfaces, [[KDTree(shape.cloud.numpy()) for shape in mine] for mine in objects]
 
 
-def object_tracks(lane: Lane, said: Said) -> dict[str, Trajectory]:
+def object_tracks(item: BatchItem, outputs: Outputs) -> dict[str, Trajectory]:
     """Each object's poses: as said while it is active, as it was last (before the first time: as it will be first) else."""
-    active = torch.where(lane.told.has_object[0], lane.told.object_number[0], -1.0)
-    T = Rigid(said.R_world_object[0], said.t_world_object[0])
+    active = torch.where(item.conditioning.has_object[0], item.conditioning.object_number[0], -1.0)
+    T = Rigid(outputs.R_world_object[0], outputs.t_world_object[0])
     tracks = {}
-    for number, shape in enumerate(lane.objects):
+    for number, shape in enumerate(item.objects):
         rows = (active == number).nonzero()[:, 0]
         if not len(rows):
             continue
         last = torch.searchsorted(rows, torch.arange(len(active)), right=True).sub(1).clamp_min(0)
         pose = shape.of_mesh(T[rows[last]])
-        tracks[shape.name] = Trajectory(lane.path.timestamps, pose.R, pose.t)
+        tracks[shape.name] = Trajectory(item.path.timestamps, pose.R, pose.t)
     return tracks
 
 
@@ -278,15 +287,15 @@ def stretch_seed(seed: int, start: int) -> int:
     return seed + 1_000_003 * start
 
 
-def _padded(told: Told, start: int, stop: int, length: int) -> Told:
+def _padded(conditioning: Conditioning, start: int, stop: int, length: int) -> Conditioning:
     """Frames start…stop-1, up to a length: the last one again, not valid."""
     take = (start + torch.arange(length)).clamp_max(stop - 1)
     there = torch.arange(length) < stop - start
-    padded = told.frames(take)
-    return padded._replace(valid=padded.valid & there, is_known=padded.is_known & there[:, None])
+    padded = conditioning.frames(take)
+    return padded._replace(valid=padded.valid & there, is_observed=padded.is_observed & there[:, None])
 
 
-def _bridged(said: list[Said], path: HeadPath) -> Said:
+def _bridged(outputs: list[Outputs], path: HeadPath) -> Outputs:
     """Stretches as one; frames in the gaps between them are as the one before."""
-    whole, held = Said(*(torch.cat(fields, 1) for fields in zip(*said))), path.held_frames
-    return Said(*(field[:, held] for field in whole))
+    whole, frames = Outputs(*(torch.cat(fields, 1) for fields in zip(*outputs))), path.held_frames
+    return Outputs(*(field[:, frames] for field in whole))

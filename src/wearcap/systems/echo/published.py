@@ -17,9 +17,9 @@ from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording import Motion
 from wearcap.systems.echo.features import EchoFeatures, ThreePoints
 from wearcap.systems.echo.objects import ObjectReader
-from wearcap.systems.echo.observations import Lane, Scenario, lane_of
+from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import motion_of, object_tracks
-from wearcap.systems.echo.queue import Said
+from wearcap.systems.echo.queue import Outputs
 from wearcap.systems.echo.training_windows import EchoDataset, EchoTrack
 from wearcap.tracking.head_path import head_path
 
@@ -34,8 +34,8 @@ def _own(features: EchoFeatures) -> EchoFeatures:
 def _channels(features: EchoFeatures, points: ThreePoints, floor_height: Tensor, size: Tensor) -> Float[Tensor, "time channel"]:  # fmt: skip
     """What each frame's three points are like, seen from its own head: the condition without the head's way and heading
     since the window began, and without the body's size."""
-    told = features.condition(ThreePoints(*(part[None] for part in points)), floor_height[None], size[None])[0]  # fmt: skip
-    return torch.cat([told[:, :36], told[:, 39:54], told[:, 56:57]], 1)
+    conditioning = features.condition(ThreePoints(*(part[None] for part in points)), floor_height[None], size[None])[0]  # fmt: skip
+    return torch.cat([conditioning[:, :36], conditioning[:, 39:54], conditioning[:, 56:57]], 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,18 +53,18 @@ class NearestEcho:
     """By class; `NO_CLASS` without an object."""
     frames: dict[str, Int64[Tensor, "window"]]
     """First frame of each window."""
-    said: Float[Tensor, "frame value"]
+    outputs: Float[Tensor, "frame value"]
 
     @classmethod
     def fit(cls, dataset: EchoDataset, window: int = 30, stride: int = 3, sample: int = 3) -> "NearestEcho":
         """Describe a training split's windows."""
         features = _own(dataset.features)
-        channels, said, starts, labels, first = [], [], [], [], 0
+        channels, outputs, starts, labels, first = [], [], [], [], 0
         for number in range(len(dataset.recordings)):
             track = dataset.track(number)
             count = len(track.floor_height)
             channels.append(_channels(features, track.points, track.floor_height, track.size))
-            said.append(_said_of(features, track))
+            outputs.append(_outputs_of(features, track))
             for start in range(0, count - window + 1, stride):
                 active = int(track.active[start + window // 2])
                 starts.append(first + start)
@@ -79,7 +79,7 @@ class NearestEcho:
             mine = torch.tensor([start for start, label in zip(starts, labels) if label == name])
             descriptor[name], frames[name] = whole[mine[:, None] + offsets].flatten(1), mine
         return cls(
-            features, dataset.encoder, window, sample, mean, scale, descriptor, frames, torch.cat(said)
+            features, dataset.encoder, window, sample, mean, scale, descriptor, frames, torch.cat(outputs)
         )
 
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
@@ -88,28 +88,30 @@ class NearestEcho:
         return [self._capture(scenario, reader) for scenario in scenarios]
 
     def _capture(self, scenario: Scenario, reader: ObjectReader) -> Motion:
-        lane = lane_of(scenario, head_path(scenario.recording, scenario.recording.skeleton, self.features.fps), reader)  # fmt: skip
-        told, count = lane.told, len(lane.path.timestamps)
-        points = ThreePoints(*(part[0] for part in told.points))
-        size = body_size(lane.path.skeleton)
-        channels = (_channels(self.features, points, told.floor_height[0], size) - self.mean) / self.scale
-        total, weight = torch.zeros(count, self.said.shape[1]), torch.zeros(count, 1)
+        item = batch_item_of(scenario, head_path(scenario.recording, scenario.recording.skeleton, self.features.fps), reader)  # fmt: skip
+        conditioning, count = item.conditioning, len(item.path.timestamps)
+        points = ThreePoints(*(part[0] for part in conditioning.points))
+        size = body_size(item.path.skeleton)
+        channels = (
+            _channels(self.features, points, conditioning.floor_height[0], size) - self.mean
+        ) / self.scale
+        total, weight = torch.zeros(count, self.outputs.shape[1]), torch.zeros(count, 1)
         offsets = torch.arange(self.window)
         triangle = torch.minimum(offsets + 1, self.window - offsets).float()[:, None] / self.window
         for start in [*range(0, max(count - self.window, 0), self.window // 2), max(count - self.window, 0)]:
             take = (start + offsets).clamp_max(count - 1)
-            active = int(told.object_number[0, take[self.window // 2]])
-            name = lane.objects[active].category if active >= 0 else NO_CLASS
+            active = int(conditioning.object_number[0, take[self.window // 2]])
+            name = item.objects[active].category if active >= 0 else NO_CLASS
             name = name if name in self.descriptor else NO_CLASS
             query = channels[take[:: self.sample]].flatten()
             best = (self.descriptor[name] - query).square().sum(1).argmin()
-            pasted = self.said[self.frames[name][best] + offsets]
+            pasted = self.outputs[self.frames[name][best] + offsets]
             total.index_add_(0, take, pasted * triangle)
             weight.index_add_(0, take, triangle)
-        return motion_of(lane, _decoded(self.features, total / weight, lane), True, {"pipeline": "nearest_echo"})  # fmt: skip
+        return motion_of(item, _decoded(self.features, total / weight, item), True, {"pipeline": "nearest_echo"})  # fmt: skip
 
 
-def _said_of(features: EchoFeatures, track: EchoTrack) -> Float[Tensor, "time feature"]:
+def _outputs_of(features: EchoFeatures, track: EchoTrack) -> Float[Tensor, "time feature"]:
     """A track's truth, seen from each frame's head."""
     batch = lambda parts: type(parts)(*(part[None] for part in parts))  # noqa: E731
     frame = features.canonical(batch(track.points))
@@ -119,11 +121,11 @@ def _said_of(features: EchoFeatures, track: EchoTrack) -> Float[Tensor, "time fe
     )[0]  # fmt: skip
 
 
-def _decoded(features: EchoFeatures, said: Float[Tensor, "time feature"], lane: Lane) -> Said:
-    frame = features.canonical(lane.told.points)
-    human, thing, contact = said[None].split((features.human_size, 9, said.shape[1] - features.human_size - 9), -1)  # fmt: skip
-    body, T = features.decode_body(human, frame), features.decode_object(thing, frame)
-    return Said(*body, T.R, T.t, contact)
+def _decoded(features: EchoFeatures, outputs: Float[Tensor, "time feature"], item: BatchItem) -> Outputs:
+    frame = features.canonical(item.conditioning.points)
+    human, scene_object, contact = outputs[None].split((features.human_size, 9, outputs.shape[1] - features.human_size - 9), -1)  # fmt: skip
+    body, T = features.decode_body(human, frame), features.decode_object(scene_object, frame)
+    return Outputs(*body, T.R, T.t, contact)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,10 +153,10 @@ class RigidWrist:
             frame = features.canonical(ThreePoints(*(part[None] for part in track.points)))
             heading = frame.R[0]
             for index, shape in enumerate(track.objects):
-                held = (track.active == index) & (track.contact[:, :BODY_POINTS].amax(1) > 0)
-                T, wrists = track.T_world_object[held], track.points.t_world_point[held, 1:]
-                back = heading[held].mT
-                place = (back @ (T.t - frame.t[0][held])[..., None])[..., 0]
+                observation = (track.active == index) & (track.contact[:, :BODY_POINTS].amax(1) > 0)
+                T, wrists = track.T_world_object[observation], track.points.t_world_point[observation, 1:]
+                back = heading[observation].mT
+                place = (back @ (T.t - frame.t[0][observation])[..., None])[..., 0]
                 offset = (back[:, None] @ (T.t[:, None] - wrists)[..., None])[..., 0]
                 rows.setdefault(shape.category, []).append((place, offset, back @ T.R))
         place, offset, turn = {}, {}, {}
@@ -167,20 +169,20 @@ class RigidWrist:
             raise WearcapError("nothing is touched in these training windows", expected="recordings with objects in hands")  # fmt: skip
         return cls(features, dataset.encoder, place, offset, turn)
 
-    def attached(self, motion: Motion, lane: Lane) -> Motion:
+    def attached(self, motion: Motion, item: BatchItem) -> Motion:
         """The motion with its objects stuck to wrists."""
-        points = lane.told.points
+        points = item.conditioning.points
         frame = self.features.canonical(points)
         heading, head = frame.R[0], frame.t[0]
         count = len(head)
         R, t = heading.clone(), head.clone()
-        for number, shape in enumerate(lane.objects):
-            rows = (lane.told.object_number[0] == number) & lane.told.has_object[0]
+        for number, shape in enumerate(item.objects):
+            rows = (item.conditioning.object_number[0] == number) & item.conditioning.has_object[0]
             name = shape.category if shape.category in self.place else next(iter(self.place))
             wrists = points.t_world_point[0, rows, 1:]
             expected = head[rows] + (heading[rows] @ self.place[name])
             wrist = int((wrists - expected[:, None]).norm(dim=-1).mean(0).argmin()) if rows.any() else 0
             t[rows] = wrists[:, wrist] + heading[rows] @ self.offset[name][wrist]
             R[rows] = heading[rows] @ self.turn[name]
-        said = Said(torch.zeros(1, count, 1, 3, 3), torch.zeros(1, count, 3), R[None], t[None], torch.zeros(1, count, 1))  # fmt: skip
-        return replace(motion, object_motion=object_tracks(lane, said), provenance={"pipeline": "rigid_wrist"})  # fmt: skip
+        outputs = Outputs(torch.zeros(1, count, 1, 3, 3), torch.zeros(1, count, 3), R[None], t[None], torch.zeros(1, count, 1))  # fmt: skip
+        return replace(motion, object_motion=object_tracks(item, outputs), provenance={"pipeline": "rigid_wrist"})  # fmt: skip

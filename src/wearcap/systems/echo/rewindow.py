@@ -10,7 +10,7 @@ from torch import Tensor
 from wearcap.diffusion.process import posterior_step
 from wearcap.diffusion.sampler import step_levels
 from wearcap.systems.echo.model import MODALITIES
-from wearcap.systems.echo.queue import EchoQueue, Model, Said, Told
+from wearcap.systems.echo.queue import Conditioning, EchoQueue, Model, Outputs
 
 
 class Rewindow(EchoQueue):
@@ -25,51 +25,52 @@ class Rewindow(EchoQueue):
         self.stride = stride
 
     @torch.no_grad()
-    def window(self, told: Told, before: Float[Tensor, "lane known feature"]) -> Float[Tensor, "lane frame feature"]:  # fmt: skip
+    def window(self, conditioning: Conditioning, before: Float[Tensor, "batch known feature"]) -> Float[Tensor, "batch frame feature"]:  # fmt: skip
         """x̂0 of a window, of whose frames the first ones are known, in normalised space."""
-        frame = self.pipeline.features.canonical(told.points)
-        count = told.valid.shape[1]
-        known_frames = before.shape[1]
-        held = self._held(told, frame)
-        denoise, amend = self.pipeline.denoiser(self, told, frame)
-        levels = step_levels(self.belt.steps, self.belt.spacing)
+        frame = self.pipeline.features.canonical(conditioning.points)
+        count = conditioning.valid.shape[1]
+        observed_frames = before.shape[1]
+        observation = self._observation(conditioning, frame)
+        denoise, correct = self.pipeline.denoiser(self, conditioning, frame)
+        levels = step_levels(self.rolling.steps, self.rolling.spacing)
         # As much for a window that is not full: what is drawn for a lane does not depend on how long others are.
-        x = self._noise(self.belt.window)[:, :count]
-        known = held.known.clone()
-        known[:, :known_frames] = before
-        is_known = held.is_known.clone()
-        is_known[:, :known_frames] = ~held.is_absent[:, :known_frames]
+        x = self._noise(self.rolling.window)[:, :count]
+        observed = observation.observed.clone()
+        observed[:, :observed_frames] = before
+        is_observed = observation.is_observed.clone()
+        is_observed[:, :observed_frames] = ~observation.is_absent[:, :observed_frames]
         wide = self.conveyor.wide
         for now, after in pairwise(levels):
             level, then = (
-                torch.where(is_known, 0.0, torch.where(held.is_absent, 1.0, value)) for value in (now, after)
+                torch.where(is_observed, 0.0, torch.where(observation.is_absent, 1.0, value))
+                for value in (now, after)
             )
-            x = torch.where(wide(is_known), known, x)
+            x = torch.where(wide(is_observed), observed, x)
             x0_hat = denoise(x, level)
-            x0_hat = x0_hat if amend is None else amend(x0_hat)
-            noise = self._noise(self.belt.window)[:, :count]
+            x0_hat = x0_hat if correct is None else correct(x0_hat)
+            noise = self._noise(self.rolling.window)[:, :count]
             x = posterior_step(
-                x, x0_hat, wide(level), wide(then), noise, self.pipeline.schedule, self.belt.eta
+                x, x0_hat, wide(level), wide(then), noise, self.pipeline.schedule, self.rolling.eta
             )
         return x
 
     @torch.no_grad()
-    def run(self, whole: Told) -> Said:
+    def run(self, whole: Conditioning) -> Outputs:
         """All frames of some lanes."""
-        context, count = self.belt.context, whole.valid.shape[1]
-        given: list[Said] = []
+        context, count = self.rolling.context, whole.valid.shape[1]
+        given: list[Outputs] = []
         before, start = torch.zeros(len(whole.valid), 0, sum(self.pipeline.net.sizes)), 0
         while start < count:
             first = max(0, start - context)
-            told = whole.frames(slice(first, min(first + self.belt.window, count)))
-            before, frame = before[:, before.shape[1] - (start - first) :], self.pipeline.features.canonical(told.points)  # fmt: skip
+            conditioning = whole.frames(slice(first, min(first + self.rolling.window, count)))
+            before, frame = before[:, before.shape[1] - (start - first) :], self.pipeline.features.canonical(conditioning.points)  # fmt: skip
             if self._frame is not None and self.pipeline.features.moves:
-                change, known = frame.inverse() @ self._frame, told.frames(slice(0, start - first))
-                before = self._reexpressed(before, change, torch.zeros(1, 1, len(MODALITIES)), known)
+                change, observed = frame.inverse() @ self._frame, conditioning.frames(slice(0, start - first))
+                before = self._reexpressed(before, change, torch.zeros(1, 1, len(MODALITIES)), observed)
             self._frame = frame
-            x = self.window(told, before)
+            x = self.window(conditioning, before)
             stop = min(start + self.stride, count)
             given.append(self._decoded(x, slice(start - first, stop - first), frame))
             kept = x[:, : stop - first]
             before, start = kept[:, -context:] if context else kept[:, :0], stop
-        return Said(*(torch.cat(parts, 1) for parts in zip(*given)))
+        return Outputs(*(torch.cat(parts, 1) for parts in zip(*given)))

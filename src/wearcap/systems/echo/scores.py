@@ -12,7 +12,7 @@ from wearcap.body.contact_points import BODY_POINTS, TOUCH_M, contact_points
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, interpolate_held, nearest_frames, resample
+from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, nearest_frames, resample
 from wearcap.metrics.detection import detection_scores
 from wearcap.metrics.objects import (
     center_error_cm,
@@ -81,7 +81,7 @@ def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: Ob
         poses.append(T)
     floor = torch.zeros(len(times))
     if recording.floor is not None:
-        floor = interpolate_held(recording.floor.timestamps, recording.floor.height, times).float()
+        floor = interpolate_clamped(recording.floor.timestamps, recording.floor.height, times).float()
     nearest = nearest_frames(whole.timestamps, times)
     return Truth(motion, floor, shapes, active, poses, touch, foot_patches(recording)[nearest].float())
 

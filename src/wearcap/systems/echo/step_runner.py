@@ -42,7 +42,7 @@ class EchoPlans:
         return sum(self._sizes)
 
     @torch.no_grad()
-    def __call__(self, level: Float[Tensor, "lane frame modality"]) -> Float[Tensor, "#lane frame column"]:
+    def __call__(self, level: Float[Tensor, "batch frame modality"]) -> Float[Tensor, "#batch frame column"]:
         """Of all lanes, or of one where all have the same levels (on the CPU)."""
         if len(level) > 1 and (level == level[:1]).all():
             level = level[:1]
@@ -53,7 +53,7 @@ class EchoPlans:
             self._windows[key] = self._of(level)
         return self._windows[key]
 
-    def _of(self, level: Float[Tensor, "lane frame modality"]) -> Float[Tensor, "lane frame column"]:
+    def _of(self, level: Float[Tensor, "batch frame modality"]) -> Float[Tensor, "batch frame column"]:
         triples = [tuple(row) for row in level.flatten(0, 1).tolist()]
         if len(self._number) > MOST_ROWS:
             self._number.clear()
@@ -67,7 +67,7 @@ class EchoPlans:
         take = torch.tensor([self._number[triple] for triple in triples], device=self._device)
         return self._rows[take].unflatten(0, level.shape[:2])
 
-    def plan(self, columns: Float[Tensor, "lane frame column"]) -> EchoPlan:
+    def plan(self, columns: Float[Tensor, "batch frame column"]) -> EchoPlan:
         """As the network takes it."""
         parts = columns.split(self._sizes, -1)
         worth, blocks = parts[: self._worth], parts[self._worth :]
@@ -93,7 +93,7 @@ class _StepGraph(nn.Module):
         return self.net.step(x_t, self._plans[0].plan(plan), encoded, valid)
 
 
-class _ToldGraph(nn.Module):
+class _ConditioningGraph(nn.Module):
     """What a window's frames are told."""
 
     def __init__(self, net: EchoDenoiser):
@@ -103,11 +103,11 @@ class _ToldGraph(nn.Module):
     def forward(
         self,
         condition: Float[Tensor, "batch time condition"],
-        thing: Float[Tensor, "batch time embedded"],
+        scene_object: Float[Tensor, "batch time embedded"],
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time width"]:
-        return self.net.encode(condition, thing, has_object, valid)
+        return self.net.encode(condition, scene_object, has_object, valid)
 
 
 class EchoRunner:
@@ -118,19 +118,22 @@ class EchoRunner:
         self._device = net.motion_normalizer.mean.device
         require_runtime(runtime, self._device)
         self.net, self.plans = net, EchoPlans(net)
-        step, told = _StepGraph(self.plans).eval(), _ToldGraph(net).eval()
+        step, conditioning = _StepGraph(self.plans).eval(), _ConditioningGraph(net).eval()
         self._step: Callable[..., Tensor] = step
-        self._told: Callable[..., Tensor] = told
+        self._conditioning: Callable[..., Tensor] = conditioning
         if runtime == "onnx":
-            self._step, self._told = _onnx(net, self.plans.size, step, told)
+            self._step, self._conditioning = _onnx(net, self.plans.size, step, conditioning)
         elif runtime == "compile":
-            self._step, self._told = _compiled(step, self._device), _compiled(told, self._device)
+            self._step, self._conditioning = (
+                _compiled(step, self._device),
+                _compiled(conditioning, self._device),
+            )
         self._window = None if runtime == "eager" else net.window
 
     def begin(
         self,
         condition: Float[Tensor, "batch time condition"],
-        thing: Float[Tensor, "batch time embedded"],
+        scene_object: Float[Tensor, "batch time embedded"],
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Callable[[Tensor, Tensor], Tensor]:
@@ -139,8 +142,8 @@ class EchoRunner:
         Everything goes in and comes out on the CPU.
         """
         count = valid.shape[1]
-        told = [self._whole(part) for part in (condition, thing, has_object, valid)]
-        encoded, there = self._told(*told), told[-1]
+        conditioning = [self._whole(part) for part in (condition, scene_object, has_object, valid)]
+        encoded, there = self._conditioning(*conditioning), conditioning[-1]
 
         def denoise(x_t: Tensor, level: Tensor) -> Tensor:
             plan = self.plans(self._filled(level))
@@ -170,7 +173,7 @@ def require_runtime(runtime: str, device: str | torch.device) -> None:
 
 
 def _onnx(
-    net: EchoDenoiser, columns: int, step: nn.Module, told: nn.Module
+    net: EchoDenoiser, columns: int, step: nn.Module, conditioning: nn.Module
 ) -> tuple[Callable[..., Tensor], Callable[..., Tensor]]:
     frames = 2, net.window
     there = torch.ones(frames, dtype=torch.bool)
@@ -182,12 +185,12 @@ def _onnx(
         "x_t": torch.zeros(*frames, sum(net.sizes)), "plan": torch.zeros(*frames, columns),
         "encoded": torch.zeros(*frames, net.narrow.out_features), "valid": there,
     }  # fmt: skip
-    run_step, run_told = onnx_runner(step, inputs), onnx_runner(told, codes)
+    run_step, run_conditioning = onnx_runner(step, inputs), onnx_runner(conditioning, codes)
 
     def stepped(x_t: Tensor, plan: Tensor, encoded: Tensor, valid: Tensor) -> Tensor:
         return run_step(x_t, plan.expand(len(x_t), -1, -1), encoded, valid)[0]
 
-    return stepped, lambda *given: run_told(*given)[0]
+    return stepped, lambda *given: run_conditioning(*given)[0]
 
 
 def _compiled(graph: nn.Module, device: torch.device) -> Callable[..., Tensor]:

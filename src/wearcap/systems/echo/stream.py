@@ -39,10 +39,10 @@ from wearcap.sensors.packets import (
 from wearcap.systems.echo.features import CONTACTS, POINTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.objects import ObjectShape
-from wearcap.systems.echo.observations import MAX_GAP_S, Lane, wrist_poses
+from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, wrist_poses
 from wearcap.systems.echo.pipeline import Echo, motion_of, pulled_by, stretch_seed
-from wearcap.systems.echo.queue import EchoQueue, Said, Told
-from wearcap.systems.echo.static_objects import Resting
+from wearcap.systems.echo.queue import Conditioning, EchoQueue, Outputs
+from wearcap.systems.echo.static_objects import StaticObjects
 from wearcap.tracking.floor import FloorTracker
 from wearcap.tracking.head_path import HeadPath
 from wearcap.tracking.head_track import Chunk, HeadTrack
@@ -103,11 +103,11 @@ class EchoSession:
         self._track.dropped = dropped
         self._chunks: list[Chunk] = []
         self._queue: EchoQueue | None = None
-        self._waiting: list[tuple[float, Told, Rigid]] = []
+        self._waiting: list[tuple[float, Conditioning, Rigid]] = []
         """Times, what was told, and the head, of frames that are taken and not given yet."""
         self._floor = FloorTracker(self.wearer.skeleton.height_of("head"), pipeline.fps)
-        threshold = pipeline.rests_below
-        self._resting = None if threshold is None else Resting(threshold)
+        threshold = pipeline.static_below
+        self._static = None if threshold is None else StaticObjects(threshold)
 
     @property
     def dropped(self) -> int:
@@ -142,10 +142,10 @@ class EchoSession:
 
     def _rejoin(self, joint: str, time: float | None) -> None:
         """Keep of a wrist what belongs to the clock that begins at a time; None: nothing does."""
-        known = self._wrists[joint]
-        kept = [] if time is None else known[connected([pose[0] for pose in known], time)]
+        observed = self._wrists[joint]
+        kept = [] if time is None else observed[connected([pose[0] for pose in observed], time)]
         refused = self._clocks[joint].set(kept[-1][0] if kept else None)
-        self._refuse(joint, refused if time is None else refused + len(known) - len(kept))
+        self._refuse(joint, refused if time is None else refused + len(observed) - len(kept))
         self._wrists[joint] = kept
 
     def _refuse(self, stream: str, count: int) -> None:
@@ -169,11 +169,11 @@ class EchoSession:
             first = bisect_left(self._wrists[joint], admitted.packets[0][0], key=_time)
             self._wrists[joint] = self._wrists[joint][: first if admitted.again else 0]
         for time, T in admitted.packets:
-            known = self._wrists[joint]
-            place = bisect_left(known, time, key=_time)
-            if place == len(known) or known[place][0] != time:
-                known.insert(place, (time, T.R, T.t))
-                del known[:-MAX_WAITING]
+            observed = self._wrists[joint]
+            place = bisect_left(observed, time, key=_time)
+            if place == len(observed) or observed[place][0] != time:
+                observed.insert(place, (time, T.R, T.t))
+                del observed[:-MAX_WAITING]
 
     def activate(self, name: str | None, timestamp: float) -> None:
         """From a time (s) on this object is the active one; None: none is. Frames whose poses are not final yet, too.
@@ -184,9 +184,9 @@ class EchoSession:
             self._door.refuse("activate", fault)
             return
         if name is not None:
-            known = name in self._shapes
+            observed = name in self._shapes
             self._shape(name)
-            if self.pipeline.placed and not known and self._environment is not None:
+            if self.pipeline.placed and not observed and self._environment is not None:
                 # In the middle between then and one frame later: the first frame from then on is the one nearby.
                 soon = timestamp + 0.499 / self.pipeline.fps
                 self._see(name, soon, self._environment.by_name(name).T_world_object)
@@ -239,13 +239,13 @@ class EchoSession:
             self._chunks.append(chunk)
         given: list[Motion] = []
         with undisturbed(self.pipeline.runtime == "onnx"):
-            while self._chunks and (ended or self._told(self._chunks[0])):
+            while self._chunks and (ended or self._conditioning(self._chunks[0])):
                 given += self._advance(self._chunks.pop(0))
             if ended or not (self._chunks or self._track.inside):
                 given += self._finish()
         return joined(given)
 
-    def _told(self, chunk: Chunk) -> bool:
+    def _conditioning(self, chunk: Chunk) -> bool:
         """Whether both wrists have said where they are at a frame, or are silent."""
         time, head = chunk.timestamps[-1].item(), self._track.newest
         newest = [poses[-1][0] if poses else -math.inf for poses in self._wrists.values()]
@@ -262,22 +262,22 @@ class EchoSession:
             )  # fmt: skip
         mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
         T_world_head = chunk.T_world_device @ mount
-        self._amend(chunk.amended @ mount)
+        self._correct(chunk.corrected @ mount)
         time = chunk.timestamps[0].item()
-        told = self._frame(time, T_world_head)
-        said = self._queue.push(told)
-        self._waiting.append((time, told, T_world_head))
-        return given + self._give(said)
+        conditioning = self._frame(time, T_world_head)
+        outputs = self._queue.push(conditioning)
+        self._waiting.append((time, conditioning, T_world_head))
+        return given + self._give(outputs)
 
-    def _amend(self, T_world_head: Rigid) -> None:
+    def _correct(self, T_world_head: Rigid) -> None:
         """Put the head of the last frames where it turned out to have been."""
         count = min(len(T_world_head.t), len(self._waiting))
         for k in range(count):
-            time, told, _ = self._waiting[-count + k]
+            time, conditioning, _ = self._waiting[-count + k]
             at = T_world_head[len(T_world_head.t) - count + k : len(T_world_head.t) - count + k + 1]
-            R, t = told.R_world_point.clone(), told.t_world_point.clone()
+            R, t = conditioning.R_world_point.clone(), conditioning.t_world_point.clone()
             R[0, 0, 0], t[0, 0, 0] = at.R[0], at.t[0]
-            self._waiting[-count + k] = (time, told._replace(R_world_point=R, t_world_point=t), at)
+            self._waiting[-count + k] = (time, conditioning._replace(R_world_point=R, t_world_point=t), at)
         if count:
             self._retell()
 
@@ -289,7 +289,7 @@ class EchoSession:
         self._queue = None
         return given
 
-    def _frame(self, time: float, T_world_head: Rigid) -> Told:
+    def _frame(self, time: float, T_world_head: Rigid) -> Conditioning:
         poses = [T_world_head, *(self._wrist_at(joint, time, T_world_head) for joint in WRISTS)]
         R, t = torch.stack([T.R for T in poses], 1), torch.stack([T.t for T in poses], 1)
         joints = len(self.wearer.skeleton)
@@ -299,7 +299,7 @@ class EchoSession:
         if self.wearer.floor_m is None:
             floor = self._floor.follow(T_world_head.t)
         fields = (R, t, floor, *self._active(time), one, *unseen, torch.zeros(1, len(MODALITIES), dtype=torch.bool))  # fmt: skip
-        return self._observed(Told(*(value[None] for value in fields)), time)
+        return self._observed(Conditioning(*(value[None] for value in fields)), time)
 
     def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor]:
         """Whether an object is active at a time, its code and its number."""
@@ -309,39 +309,41 @@ class EchoSession:
         number = torch.full((1,), float(list(self._shapes).index(name)))
         return torch.ones(1, dtype=torch.bool), self._shapes[name].code[None], number
 
-    def _observed(self, told: Told, time: float) -> Told:
+    def _observed(self, conditioning: Conditioning, time: float) -> Conditioning:
         """With the active object's pose, where it was seen within half a frame: the one that is nearest in time."""
-        if not told.has_object.item():
-            return told
-        active, near = list(self._shapes)[int(told.object_number)], 0.5 / self.pipeline.fps + 1e-6
+        if not conditioning.has_object.item():
+            return conditioning
+        active, near = list(self._shapes)[int(conditioning.object_number)], 0.5 / self.pipeline.fps + 1e-6
         seen = [
             (abs(at - time), T) for at, name, T in self._seen if name == active and abs(at - time) <= near
         ]
         if not seen:
-            return told
+            return conditioning
         _, T = min(seen, key=lambda pair: pair[0])
-        known = told.is_known.clone()
-        known[..., 1] = True
-        return told._replace(R_world_object=T.R[None, None], t_world_object=T.t[None, None], is_known=known)
+        observed = conditioning.is_observed.clone()
+        observed[..., 1] = True
+        return conditioning._replace(
+            R_world_object=T.R[None, None], t_world_object=T.t[None, None], is_observed=observed
+        )
 
     def _retell(self) -> None:
         """What has become known of the frames that are on the conveyor."""
-        if self._queue is None or self._queue.told is None or not self._waiting:
+        if self._queue is None or self._queue.conditioning is None or not self._waiting:
             return
-        whole, first = self._queue.told, self._queue.told.valid.shape[1] - len(self._waiting)
+        whole, first = self._queue.conditioning, self._queue.conditioning.valid.shape[1] - len(self._waiting)
         frames = [whole.frames(slice(k, k + 1)) for k in range(max(first, 0))]
-        for k, (time, told, head) in enumerate(self._waiting):
+        for k, (time, conditioning, head) in enumerate(self._waiting):
             has, code, number = (value[None] for value in self._active(time))
-            changed = told._replace(
+            changed = conditioning._replace(
                 has_object=has,
                 object_code=code,
                 object_number=number,
-                is_known=torch.zeros_like(told.is_known),
+                is_observed=torch.zeros_like(conditioning.is_observed),
             )
             changed = self._observed(changed, time)
             self._waiting[k] = (time, changed, head)
             frames.append(changed)
-        self._queue.told = Told(*(torch.cat(fields, 1) for fields in zip(*frames)))
+        self._queue.conditioning = Conditioning(*(torch.cat(fields, 1) for fields in zip(*frames)))
 
     def _hanging(self, joint: str, T_world_head: Rigid) -> Rigid:
         """Of a wrist that has not been seen yet: beside the body, arms down."""
@@ -351,32 +353,32 @@ class EchoSession:
         return Rigid(heading, T_world_head.t + (heading @ below[:, None])[..., 0])
 
     def _wrist_at(self, joint: str, time: float, T_world_head: Rigid) -> Rigid:
-        known = self._wrists[joint]
-        if not known or known[-1][0] < time - MAX_GAP_S:
+        observed = self._wrists[joint]
+        if not observed or observed[-1][0] < time - MAX_GAP_S:
             self.silent += 1
-        if not known:
+        if not observed:
             return self._hanging(joint, T_world_head)
-        times, R, t = zip(*known)
+        times, R, t = zip(*observed)
         track = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
         pose = wrist_poses(track, torch.tensor([time], dtype=torch.float64))
         # What came before the last second is asked for no more, but for where the wrist was when it began.
-        old = bisect_left(known, time - 1.0, key=lambda sample: sample[0]) - 1
-        self._wrists[joint] = known[max(old, 0) :]
+        old = bisect_left(observed, time - 1.0, key=lambda sample: sample[0]) - 1
+        self._wrists[joint] = observed[max(old, 0) :]
         return Rigid(pose.R.float(), pose.t.float())
 
-    def _give(self, said: Said | None) -> list[Motion]:
-        if said is None or not self._waiting:
+    def _give(self, outputs: Outputs | None) -> list[Motion]:
+        if outputs is None or not self._waiting:
             return []
-        time, told, T_world_head = self._waiting.pop(0)
+        time, conditioning, T_world_head = self._waiting.pop(0)
         path = HeadPath(
-            torch.tensor([time], dtype=torch.float64), T_world_head, T_world_head, told.floor_height[0],
+            torch.tensor([time], dtype=torch.float64), T_world_head, T_world_head, conditioning.floor_height[0],
             self.wearer.skeleton, ((0, 1),),
         )  # fmt: skip
         self._forget(time)
-        lane = Lane(path, told, list(self._shapes.values()))
-        if self._resting is not None:
-            said = self._resting(told, said)
-        return [motion_of(lane, said, self.pipeline.hang, self.pipeline.settings())]
+        batch_item = BatchItem(path, conditioning, list(self._shapes.values()))
+        if self._static is not None:
+            outputs = self._static(conditioning, outputs)
+        return [motion_of(batch_item, outputs, self.pipeline.anchor, self.pipeline.settings())]
 
     def _forget(self, time: float) -> None:
         """What no later frame asks for."""

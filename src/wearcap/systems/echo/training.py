@@ -80,8 +80,8 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
             rows["condition"].append(
                 self.features.condition(batch.points, batch.floor_height, batch.size)[batch.valid]
             )
-        human, thing, condition = (torch.cat(part) for part in rows.values())
-        ranges = [self._range(human), self._range(thing)]
+        human, scene_object, condition = (torch.cat(part) for part in rows.values())
+        ranges = [self._range(human), self._range(scene_object)]
         mean, scale = (torch.cat(part) for part in zip(*ranges))
         contact = torch.zeros(CONTACTS), torch.ones(CONTACTS)
         self.net.motion_normalizer.set(torch.cat([mean, contact[0]]), torch.cat([scale, contact[1]]))
@@ -117,22 +117,22 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
     def _levels(self, batch: EchoWindow) -> Float[Tensor, "batch time modality"]:
         """Of a batch; an object that is not there is noise alone."""
         levels = self.mix.levels(batch.level_draws, batch.draws)
-        human, thing, contact = levels.unbind(-1)
-        thing = torch.where(batch.has_object, thing, 1.0)
+        human, scene_object, contact = levels.unbind(-1)
+        scene_object = torch.where(batch.has_object, scene_object, 1.0)
         contact = contact if self.contacts else torch.ones_like(contact)
-        return torch.stack([human, thing, contact], -1)
+        return torch.stack([human, scene_object, contact], -1)
 
     def _truth(self, batch: EchoWindow, frame: Rigid) -> Float[Tensor, "batch time feature"]:
         """x0, normalised."""
         human = self.features.encode_body(batch.body, frame)
-        thing = self.features.encode_object(batch.T_world_object, frame)
-        x0 = self.net.motion_normalizer(torch.cat([human, thing, 2 * batch.contact - 1], -1))
+        scene_object = self.features.encode_object(batch.T_world_object, frame)
+        x0 = self.net.motion_normalizer(torch.cat([human, scene_object, 2 * batch.contact - 1], -1))
         return torch.where(self._counts(batch), x0, self._blank(x0))
 
     def _blank(self, x0: Tensor) -> Tensor:
         """What stands for the object and the body's contacts where there is no object: nothing, and no contact."""
-        human, thing, contact = x0.split(self.net.sizes, -1)
-        return torch.cat([human, torch.zeros_like(thing), -torch.ones_like(contact)], -1)
+        human, scene_object, contact = x0.split(self.net.sizes, -1)
+        return torch.cat([human, torch.zeros_like(scene_object), -torch.ones_like(contact)], -1)
 
     def _counts(self, batch: EchoWindow) -> Tensor:
         """Which features mean something: all with an object, human and feet without."""
@@ -164,9 +164,9 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         }
         if not self.contacts:
             terms.pop("contact")
-        said = self.net.motion_normalizer.inverse(x0_hat)
-        terms["object_vertices"] = self._vertices(said, batch, frame)
-        body = self.features.decode_body(said[..., : self.net.sizes[0]], frame)
+        outputs = self.net.motion_normalizer.inverse(x0_hat)
+        terms["object_vertices"] = self._vertices(outputs, batch, frame)
+        body = self.features.decode_body(outputs[..., : self.net.sizes[0]], frame)
         predicted, true = self._joints(body, batch), self._joints(batch.body, batch)
         terms["joints"] = losses.joint_position(predicted, true, weight)
         terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.features.fps)
@@ -179,11 +179,11 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         return forward_kinematics(self.skeleton, *body, batch.t_parent_joint[:, None]).t
 
     def _vertices(
-        self, said: Float[Tensor, "batch time feature"], batch: EchoWindow, frame: Rigid
+        self, outputs: Float[Tensor, "batch time feature"], batch: EchoWindow, frame: Rigid
     ) -> Float[Tensor, ""]:
         """Root of the mean squared way (m) between the surface as said and as it is: ‖Δt‖² + 2 Δt·ΔR μ + tr ΔR S ΔRᵀ."""
         first = self.net.sizes[0]
-        T = self.features.decode_object(said[..., first : first + OBJECT_SIZE], frame)
+        T = self.features.decode_object(outputs[..., first : first + OBJECT_SIZE], frame)
         turn, shift = T.R - batch.R_world_object, T.t - batch.t_world_object
         mean = (turn @ batch.object_mean[..., None])[..., 0]
         turned = (turn @ batch.object_spread * turn).sum((-1, -2))

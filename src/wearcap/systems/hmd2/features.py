@@ -75,9 +75,17 @@ class HeadFeatures:
         if self.height == "stature":
             height = height / size[:, None, :1]
         horizontal = [offset[..., :2, 0]] if self.frame == "window" else []
-        told = [size[:, None].expand(-1, height.shape[1], -1)] if self.body else []
+        conditions = [size[:, None].expand(-1, height.shape[1], -1)] if self.body else []
         return torch.cat(
-            [*horizontal, height, rotation.rot6d_from_matrix(R_canonical_head), velocity, angular, *told], -1
+            [
+                *horizontal,
+                height,
+                rotation.rot6d_from_matrix(R_canonical_head),
+                velocity,
+                angular,
+                *conditions,
+            ],
+            -1,
         )
 
     def encode(

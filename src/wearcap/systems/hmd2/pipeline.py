@@ -23,8 +23,8 @@ from wearcap.scene.voxels import voxelize
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
 from wearcap.systems.hmd2.step_runner import StepRunner
-from wearcap.systems.hmd2.windows import Frames, Poses, WindowSampler, advance, unsaid
-from wearcap.tracking.anchor import hang_from_head
+from wearcap.systems.hmd2.windows import Frames, Poses, WindowSampler, advance, no_poses
+from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.floor import floor_from_points, tracked_floor
 from wearcap.tracking.head_path import HeadPath, head_path
 
@@ -48,7 +48,7 @@ class HMD2:
     """Modalities that are listened to, of those that the network knows and a recording has."""
     steps: int = 5
     stride: int | None = None
-    """Frames by which windows advance; None: half a window, or with `hold` three quarters (the document's 180 of 240)."""
+    """Frames by which windows advance; None: half a window, or with `inpaint` three quarters (the document's 180 of 240)."""
     eta: float = 1.0
     guidance: float = 1.0
     """Classifier-free guidance by points and images (Ho & Salimans 2022; ours): 1 leaves it out."""
@@ -56,13 +56,13 @@ class HMD2:
     """Whether even the floor is told only from what has been sensed by then, as it must be in a stream."""
     spacing: float = 1.0
     """How the steps' levels are spaced (`diffusion.sampler.step_levels`)."""
-    hold: bool = False
+    inpaint: bool = False
     """Whether windows hold on to what was said before in every step (thesis eq. 6.5) or say it anew (ours)."""
     fade: int = 20
-    """Frames over which what windows differ by fades out where one goes on from the other (without `hold`)."""
+    """Frames over which what windows differ by fades out where one goes on from the other (without `inpaint`)."""
     lookahead: int | None = None
     """Frames that must follow a pose before it is final (ours): what comes next says what the feet are about to do.
-    None: half of what windows share, so that poses come from their middle; with `hold` none."""
+    None: half of what windows share, so that poses come from their middle; with `inpaint` none."""
     runtime: str = "eager"
     """What the steps run on (`systems.hmd2.step_runner.RUNTIMES`); all but eager take some seconds to begin."""
     precision: str = "auto"
@@ -78,21 +78,21 @@ class HMD2:
     def advance(self) -> int:
         """Frames by which windows advance. Raises WearcapError when the windows would not touch."""
         window = self.net.window
-        advance = (3 * window // 4 if self.hold else window // 2) if self.stride is None else self.stride
+        advance = (3 * window // 4 if self.inpaint else window // 2) if self.stride is None else self.stride
         if not 0 < advance <= window:
             raise WearcapError(f"windows of {window} frames cannot advance by {advance}",
                                expected=f"a stride from 1 to {window}")  # fmt: skip
         return advance
 
     @property
-    def waiting(self) -> int:
+    def lookahead_frames(self) -> int:
         """Frames at a window's end that are said again. Raises WearcapError where windows do not share as many."""
         shared = self.net.window - self.advance
-        waiting = (0 if self.hold else shared // 2) if self.lookahead is None else self.lookahead
-        if not 0 <= waiting <= shared:
-            raise WearcapError(f"windows that share {shared} frames cannot look {waiting} ahead",
+        lookahead_frames = (0 if self.inpaint else shared // 2) if self.lookahead is None else self.lookahead
+        if not 0 <= lookahead_frames <= shared:
+            raise WearcapError(f"windows that share {shared} frames cannot look {lookahead_frames} ahead",
                                expected=f"a lookahead from 0 to {shared}")  # fmt: skip
-        return waiting
+        return lookahead_frames
 
     def __call__(self, recording: Recording, seed: int = 0) -> Motion:
         return self.capture([recording], [seed])[0]
@@ -125,8 +125,8 @@ class HMD2:
         poses = self._windows(paths, frames, seeds)
         # 5. the body hangs from the measured head
         return [
-            self.motion(path.timestamps, path.skeleton, path.T_world_head, said)
-            for path, said in zip(paths, poses)
+            self.motion(path.timestamps, path.skeleton, path.T_world_head, predicted)
+            for path, predicted in zip(paths, poses)
         ]
 
     def sense(self, recording: Recording, path: HeadPath) -> Frames:
@@ -155,11 +155,11 @@ class HMD2:
             image = camera.embedding[number].float()
             image_valid &= image.isfinite().all(-1)
             image = image.nan_to_num(0.0, 0.0, 0.0)
-        lane = Frames(
+        item = Frames(
             path.T_world_head.R, path.T_world_head.t, self._floor(recording, path), points, points_valid,
             image, image_valid, torch.ones(count, dtype=torch.bool),
         )  # fmt: skip
-        return Frames(*(part[None] for part in lane))
+        return Frames(*(part[None] for part in item))
 
     def _listens_to_points(self, recording: Recording) -> bool:
         return bool(self.net.points_size) and "points" in self.use and recording.points is not None
@@ -189,7 +189,7 @@ class HMD2:
         floor = floor_from_points(cloud, path.T_world_head.t, path.stature)
         return path.floor_height if floor is None else floor
 
-    def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "lane time"]) -> Denoise:
+    def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Denoise:
         """x̂0 of a window as a function of x_t and its level, asked for at the levels of the steps, one after the other.
 
         What the conditions say, and what the levels do, is computed once.
@@ -217,26 +217,26 @@ class HMD2:
         self, paths: Sequence[HeadPath], frames: Sequence[Frames], seeds: Sequence[int]
     ) -> list[Poses]:
         """Poses of every path: its stretches side by side, window after window."""
-        stride, waiting, passed = self.advance, self.waiting, 0
-        done = [unsaid(self, len(path.timestamps)) for path in paths]
-        lanes = [
+        stride, lookahead_frames, passed = self.advance, self.lookahead_frames, 0
+        done = [no_poses(self, len(path.timestamps)) for path in paths]
+        items = [
             (i, start, stop, self.sampler(path.skeleton, seeds[i], start))
             for i, path in enumerate(paths)
             for start, stop in path.stretches
         ]
-        while lanes:
+        while items:
             advance(
-                [sampler for *_, sampler in lanes],
-                [_cut(frames[i], start + passed, stop, stride) for i, start, stop, _ in lanes],
+                [sampler for *_, sampler in items],
+                [_cut(frames[i], start + passed, stop, stride) for i, start, stop, _ in items],
             )
             passed += stride
-            for i, start, stop, sampler in lanes:
+            for i, start, stop, sampler in items:
                 ended = start + passed >= stop
-                left = 0 if ended else waiting
+                left = 0 if ended else lookahead_frames
                 given, behind = sampler.give(left), min(start + passed, stop) - left
                 for whole, part in zip(done[i], given.poses):
                     whole[0, behind - part.shape[1] : behind] = part[0]
-            lanes = [lane for lane in lanes if lane[1] + passed < lane[2]]
+            items = [item for item in items if item[1] + passed < item[2]]
         return [
             _bridged(Poses(*(part[0] for part in poses)), path.stretches) for poses, path in zip(done, paths)
         ]
@@ -254,7 +254,7 @@ class HMD2:
             "steps": str(self.steps),
             "stride": str(self.advance),
             "eta": str(self.eta),
-            "lookahead": str(self.waiting),
+            "lookahead": str(self.lookahead_frames),
         }
         contact = poses.foot_contact.repeat_interleave(2, -1) if self.features.contacts else None
         motion = Motion(
@@ -265,7 +265,7 @@ class HMD2:
             contact,
             provenance=settings,
         )
-        return hang_from_head(motion, T_world_head)
+        return anchored_to_head(motion, T_world_head)
 
 
 def _cut(frames: Frames, start: int, stop: int, length: int) -> Frames:

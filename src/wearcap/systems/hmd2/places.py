@@ -49,21 +49,21 @@ class Places:
 
     def state(self) -> dict[str, Tensor]:
         points, seen = _joined(self._known + self._new)
-        known = torch.tensor([len(_joined(self._known)[0]), self.mapped])
+        observed = torch.tensor([len(_joined(self._known)[0]), self.mapped])
         center = torch.zeros(0) if self._center is None else self._center
-        here = {"points": points, "seen": seen, "known": known, "center": center}
+        here = {"points": points, "seen": seen, "known": observed, "center": center}
         return here | {f"floor.{name}": part for name, part in self._floor.state().items()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        known, mapped = state["known"].tolist()
+        observed, mapped = state["known"].tolist()
         self.mapped, points, seen = bool(mapped), state["points"], state["seen"]
         self._center = state["center"] if len(state["center"]) else None
-        self._new = [(points[known:], seen[known:])]
+        self._new = [(points[observed:], seen[observed:])]
         self._map.add(*self._new[0])
         floor = {
             name.removeprefix("floor."): part for name, part in state.items() if name.startswith("floor.")
         }
-        self._begin([(points[:known], seen[:known])], floor)
+        self._begin([(points[:observed], seen[:observed])], floor)
 
     def add(self, points_world: Float[Tensor, "point 3"], first_seen: float) -> None:
         """Take in points (m) that were seen first at a time (s); those that are not finite are left out."""
@@ -82,11 +82,11 @@ class Places:
         while self._new and (not kept or count + len(self._new[-1][0]) <= self.memory.max_points):
             kept.append(self._new.pop())
             count += len(kept[-1][0])
-        known = [_joined(self._known)]
+        observed = [_joined(self._known)]
         self._map, self._new = VoxelMap(self.grid), kept[::-1]
         for part in self._new:
             self._map.add(*part)
-        self._begin(known, self._floor.state())
+        self._begin(observed, self._floor.state())
 
     def grids(
         self, T_world_device: Rigid, timestamps: Float64[Tensor, "time"]
@@ -135,11 +135,11 @@ class Places:
             self._map.add(*part)
         self._begin([(points, seen)], self._floor.state())
 
-    def _begin(self, known: list[tuple[Tensor, Tensor]], floor: dict[str, Tensor]) -> None:
+    def _begin(self, observed: list[tuple[Tensor, Tensor]], floor: dict[str, Tensor]) -> None:
         """Go on with these known points alone."""
-        self._known, self._floor = known, FloorTracker(*self._about)
+        self._known, self._floor = observed, FloorTracker(*self._about)
         self._floor.restore(floor)
-        for points, seen in known:
+        for points, seen in observed:
             self._map.add(points, seen)
             self._floor.see(points)
 

@@ -161,7 +161,7 @@ def _settings(pipeline: HMD2) -> dict[str, float | str]:
     net = pipeline.net
     return {
         "window": net.window, "stride": pipeline.advance, "steps": pipeline.steps, "fps": pipeline.fps,
-        "hold": pipeline.hold, "fade": pipeline.fade, "lookahead": pipeline.waiting,
+        "inpaint": pipeline.inpaint, "fade": pipeline.fade, "lookahead": pipeline.lookahead_frames,
         "eta": pipeline.eta, "spacing": pipeline.spacing, "motion_size": net.motion_size, "points_size": net.points_size, "image_size": net.image_size,
         "features": str(pipeline.features),
     }  # fmt: skip

@@ -78,10 +78,10 @@ class StepRunner:
 
 
 def _chosen(runtime: str, precision: str, device: torch.device) -> tuple[str, str]:
-    for what, value, known in (("runtime", runtime, RUNTIMES), ("precision", precision, PRECISIONS)):
-        if value not in known:
+    for what, value, observed in (("runtime", runtime, RUNTIMES), ("precision", precision, PRECISIONS)):
+        if value not in observed:
             raise WearcapError(
-                f"no {what} {value!r}", expected=f"one of {', '.join(known)}", fix=nearest(value, known)
+                f"no {what} {value!r}", expected=f"one of {', '.join(observed)}", fix=nearest(value, observed)
             )
     missing = missing_libraries()
     if runtime == "auto":
@@ -118,10 +118,10 @@ def _step_of(net: MotionDenoiser, runtime: str, precision: str) -> Step:
     if precision == "float32":
         return step
 
-    def narrow(x_t: Tensor, *told) -> Tensor:
+    def narrow(x_t: Tensor, *conditions) -> Tensor:
         # Norms stay in float32 under autocast, and so does the sampler, which sees what comes out.
         with torch.autocast(x_t.device.type, torch.bfloat16):
-            return step(x_t, *told).float()
+            return step(x_t, *conditions).float()
 
     return narrow
 

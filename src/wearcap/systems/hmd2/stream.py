@@ -28,7 +28,7 @@ __all__ = ["Sensed", "Session", "Wearer", "joined"]
 class Session:
     """A streaming capture of one or several wearers with one pipeline; each has a clock of their own.
 
-    Poses wait until `stride` frames, and the `waiting` ones behind them, have come; what waits at a gap is given with what
+    Poses wait until `stride` frames, and the `lookahead_frames` ones behind them, have come; what waits at a gap is given with what
     comes behind it. Moments may come late or out of order within those frames; later ones
     count as `dropped` (their points and pictures still serve). A pose that is missing or refused is interpolated;
     at a chunk's end, where no newer one is known yet, the last is held, and put right for the windows that follow.
@@ -46,8 +46,12 @@ class Session:
                 f"{len(seeds)} seeds for {len(wearers)} wearers", expected="one for each wearer"
             )
         pipeline.prepare()
-        self.pipeline, self.memory, self._waiting = pipeline, memory or Memory(), pipeline.waiting
-        self._lanes = [
+        self.pipeline, self.memory, self._lookahead_frames = (
+            pipeline,
+            memory or Memory(),
+            pipeline.lookahead_frames,
+        )
+        self._items = [
             WearerState(pipeline, wearer, seed, self.memory) for wearer, seed in zip(wearers, seeds)
         ]
         self._embedded = False
@@ -56,12 +60,12 @@ class Session:
     @property
     def dropped(self) -> list[int]:
         """Poses of each wearer that came too late, twice, or were refused."""
-        return [lane.dropped for lane in self._lanes]
+        return [item.dropped for item in self._items]
 
     @property
     def refused(self) -> list[dict[str, int]]:
         """How many packets, or parts of them, of each wearer were refused, by reason: "head: not a rotation"."""
-        return [dict(lane.door.refused) for lane in self._lanes]
+        return [dict(item.door.refused) for item in self._items]
 
     def push(self, sensed: Sequence[Sequence[Sensed]]) -> list[Motion | None]:
         """Take in each wearer's new moments (any number, also none); poses of each whose next frames are complete.
@@ -70,42 +74,42 @@ class Session:
         Raises WearcapError, and takes nothing in, for embeddings of another length than the network knows where none
         of the right length has come yet; later ones are refused.
         """
-        if len(sensed) != len(self._lanes):
-            raise WearcapError(f"moments of {len(sensed)} wearers", expected=f"of {len(self._lanes)}, as the session has")  # fmt: skip
+        if len(sensed) != len(self._items):
+            raise WearcapError(f"moments of {len(sensed)} wearers", expected=f"of {len(self._items)}, as the session has")  # fmt: skip
         if not self._embedded:
             self._require_embeddings(sensed)
         before: dict[int, list[Motion]] = {}
         for i, moments in enumerate(sensed):
             for moment in moments:
-                before.setdefault(i, []).extend(self._take(i, self._lanes[i].admit(moment)))
+                before.setdefault(i, []).extend(self._take(i, self._items[i].admit(moment)))
         begun = {i for i, parts in before.items() if parts}
-        said = self._run([i for i in range(len(self._lanes)) if i not in begun], ended=False)
-        return [joined(before[i]) if i in begun else motion for i, motion in enumerate(said)]
+        predicted = self._run([i for i in range(len(self._items)) if i not in begun], ended=False)
+        return [joined(before[i]) if i in begun else motion for i, motion in enumerate(predicted)]
 
     def flush(self) -> list[Motion | None]:
         """Poses of the frames that still wait, when nothing more will come."""
-        for lane in self._lanes:
-            for _, moment in lane.door.end():
-                lane.take(moment)
-        return self._run(range(len(self._lanes)), ended=True)
+        for item in self._items:
+            for _, moment in item.door.end():
+                item.take(moment)
+        return self._run(range(len(self._items)), ended=True)
 
     def _take(self, number: int, admitted: Admitted) -> list[Motion]:
         """Take in one wearer's moments; the poses left from before, where the clock begins anew with them."""
-        lane, left = self._lanes[number], []
+        item, left = self._items[number], []
         if admitted.begins:
             last = self._run([number], ended=True)[number] if admitted.again else None
             left = [] if last is None else [last]
-            lane.begin()
+            item.begin()
         for _, moment in admitted.packets:
-            lane.take(moment)
+            item.take(moment)
         return left
 
     def _require_embeddings(self, sensed: Sequence[Sequence[Sensed]]) -> None:
         size = self.pipeline.net.image_size
-        for lane, moments in zip(self._lanes, sensed):
+        for item, moments in zip(self._items, sensed):
             for moment in moments:
                 embedding = getattr(moment, "embedding", None)
-                if not lane.shows_pictures or not isinstance(embedding, Tensor) or embedding.ndim != 1:
+                if not item.shows_pictures or not isinstance(embedding, Tensor) or embedding.ndim != 1:
                     continue
                 if embedding.shape == (size,):
                     self._embedded = True
@@ -115,38 +119,38 @@ class Session:
 
     def _run(self, wearers: Sequence[int], ended: bool) -> list[Motion | None]:
         """The next poses of some wearers; None for the others."""
-        said: list[list[Motion]] = [[] for _ in self._lanes]
-        while chunks := {i: chunk for i in wearers if (chunk := self._lanes[i].track.next(ended))}:
+        predicted: list[list[Motion]] = [[] for _ in self._items]
+        while chunks := {i: chunk for i in wearers if (chunk := self._items[i].track.next(ended))}:
             for i, chunk in chunks.items():
                 if chunk.begins:
-                    said[i] += self._lanes[i].give(0)
+                    predicted[i] += self._items[i].give(0)
             with self.pipeline.undisturbed():
                 self._advance(chunks)
             for i in chunks:
-                said[i] += self._lanes[i].give(self._waiting)
+                predicted[i] += self._items[i].give(self._lookahead_frames)
         for i in wearers if ended else ():
-            said[i] += self._lanes[i].give(0)
-        return [joined(parts) for parts in said]
+            predicted[i] += self._items[i].give(0)
+        return [joined(parts) for parts in predicted]
 
     @torch.inference_mode()
     def _advance(self, chunks: dict[int, Chunk]) -> None:
         """Say one chunk of some wearers, in one batch."""
         samplers, fresh = [], []
         for i, chunk in chunks.items():
-            lane = self._lanes[i]
-            T_device_head = Rigid(lane.wearer.R_head_device, lane.wearer.t_head_device).inverse()
-            fresh.append(lane.frames(chunk, chunk.T_world_device @ T_device_head))
-            lane.times = torch.cat([lane.times, chunk.timestamps])
-            if chunk.begins or lane.sampler is None:
-                lane.sampler = self.pipeline.sampler(lane.wearer.skeleton, lane.seed, chunk.first)
-            elif len(chunk.amended.t):
-                lane.sampler.amend(chunk.amended @ T_device_head)
-            samplers.append(lane.sampler)
+            item = self._items[i]
+            T_device_head = Rigid(item.wearer.R_head_device, item.wearer.t_head_device).inverse()
+            fresh.append(item.frames(chunk, chunk.T_world_device @ T_device_head))
+            item.times = torch.cat([item.times, chunk.timestamps])
+            if chunk.begins or item.sampler is None:
+                item.sampler = self.pipeline.sampler(item.wearer.skeleton, item.seed, chunk.first)
+            elif len(chunk.corrected.t):
+                item.sampler.correct(chunk.corrected @ T_device_head)
+            samplers.append(item.sampler)
         advance(samplers, fresh)
 
     def save(self, path: str | Path) -> None:
         """Write everything that the poses to come depend on, but the pipeline (.safetensors)."""
-        write(path, self.pipeline, self._lanes, self._embedded)
+        write(path, self.pipeline, self._items, self._embedded)
 
     @classmethod
     def load(cls, path: str | Path, pipeline: HMD2) -> "Session":
@@ -157,7 +161,7 @@ class Session:
         saved = read(path, pipeline)
         wearers, seeds = zip(*((state.wearer, state.seed) for state in saved.wearers))
         session = cls(pipeline, wearers, seeds, saved.memory)
-        session._lanes, session._embedded = saved.wearers, saved.embedded
+        session._items, session._embedded = saved.wearers, saved.embedded
         return session
 
 

@@ -117,8 +117,8 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
             return self._denoise(x_t, level, encoded, batch.valid)
         with torch.no_grad():
             guess = self._denoise(x_t, level, encoded, batch.valid)
-        told = guess * (batch.chance[:, 2] < 0.5)[:, None, None]
-        return self._denoise(x_t, level, encoded, batch.valid, told)
+        last = guess * (batch.chance[:, 2] < 0.5)[:, None, None]
+        return self._denoise(x_t, level, encoded, batch.valid, last)
 
     def _weight(self, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch time"]:
         """Of each frame in the loss; none for padding."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.surroundings import latest_before
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import interpolate_held
+from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording import Motion
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.sensors.packets import (
@@ -155,9 +155,9 @@ class WearerState:
             image = image.nan_to_num(0.0, 0.0, 0.0)
             self.pictures = self.pictures[_newest(shown, times[-1].item()) :]
         valid = torch.ones(count, dtype=torch.bool)
-        told = (T_world_head.R, T_world_head.t, floor, points, points_valid, image, image_valid, valid)
+        conditions = (T_world_head.R, T_world_head.t, floor, points, points_valid, image, image_valid, valid)
         number = torch.arange(self.pipeline.advance)
-        frames = Frames(*(part[number.clamp_max(count - 1)][None] for part in told))
+        frames = Frames(*(part[number.clamp_max(count - 1)][None] for part in conditions))
         return frames._replace(valid=frames.valid & (number < count))
 
     def _floor(
@@ -166,15 +166,15 @@ class WearerState:
         tracked = self.places.floor(times, t_world_head)
         if not self.floors:
             return tracked
-        known, height = (torch.tensor(part, dtype=torch.float64) for part in zip(*self.floors))
-        self.floors = self.floors[_newest(known, times[-1].item()) :]
-        return interpolate_held(known, height.float(), times)
+        observed, height = (torch.tensor(part, dtype=torch.float64) for part in zip(*self.floors))
+        self.floors = self.floors[_newest(observed, times[-1].item()) :]
+        return interpolate_clamped(observed, height.float(), times)
 
-    def give(self, waiting: int) -> list[Motion]:
-        """The poses that wait, but for the last `waiting` frames; none or one motion."""
-        if self.sampler is None or len(self.times) <= waiting:
+    def give(self, lookahead_frames: int) -> list[Motion]:
+        """The poses that wait, but for the last `lookahead_frames` frames; none or one motion."""
+        if self.sampler is None or len(self.times) <= lookahead_frames:
             return []
-        poses, T_world_head = self.sampler.give(waiting)
+        poses, T_world_head = self.sampler.give(lookahead_frames)
         times, self.times = self.times.tensor_split([len(T_world_head.t)])
         poses = Poses(*(part[0] for part in poses))
         return [self.pipeline.motion(times, self.wearer.skeleton, T_world_head, poses)]
@@ -242,6 +242,6 @@ class WearerState:
         self.floors = [(time, height) for time, height in parts["floors"]["known"].tolist()]
 
 
-def _newest(known: Float64[Tensor, "known"], time: float) -> int:
+def _newest(observed: Float64[Tensor, "known"], time: float) -> int:
     """Number of the newest that is known at a time, or 0."""
-    return max(0, int(torch.searchsorted(known, time + 1e-4, right=True)) - 1)
+    return max(0, int(torch.searchsorted(observed, time + 1e-4, right=True)) - 1)

@@ -15,7 +15,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.tracking.anchor import hang
+from wearcap.tracking.anchor import anchor
 
 ROUND = 1e-5
 """Squared radians, or m², below which a cue is met: within the noise of detectors a distance counts as if it were
@@ -109,9 +109,9 @@ class LatentSolution:
     """Of the energy and its gradient."""
 
 
-def hung_body(skeleton: Skeleton, R_parent_joint: Tensor, contact: Tensor, T_world_head: Rigid) -> Body:
+def anchored_body(skeleton: Skeleton, R_parent_joint: Tensor, contact: Tensor, T_world_head: Rigid) -> Body:
     """A motion whose head is where it was measured."""
-    R, T_world_joint = hang(skeleton, R_parent_joint, T_world_head)
+    R, T_world_joint = anchor(skeleton, R_parent_joint, T_world_head)
     return Body(R, T_world_joint, contact)
 
 

@@ -183,8 +183,8 @@ class WatchFeatures:
         return torch.cat([root, rotation.rot6d_from_matrix(turned).flatten(-2)], -1)
 
     def decode_motion(
-        self, motion: Float[Tensor, "batch said motion"], sensed: Sensed, canonical: Canonical
-    ) -> tuple[Float[Tensor, "batch said joint 3 3"], Float[Tensor, "batch said 3"]]:
+        self, motion: Float[Tensor, "batch predicted motion"], sensed: Sensed, canonical: Canonical
+    ) -> tuple[Float[Tensor, "batch predicted joint 3 3"], Float[Tensor, "batch predicted 3"]]:
         """R_parent_joint and root (m) of the window's last frames, still in the window's frame."""
         R = rotation.matrix_from_rot6d(motion[..., 3:].unflatten(-1, (-1, 6)))
         return R, motion[..., :3] + self.origin(sensed, canonical)[:, -motion.shape[1] :]
@@ -197,10 +197,10 @@ class WatchFeatures:
 
 
 def to_world(
-    R_parent_joint: Float[Tensor, "batch said joint 3 3"],
-    t_root: Float[Tensor, "batch said 3"],
+    R_parent_joint: Float[Tensor, "batch predicted joint 3 3"],
+    t_root: Float[Tensor, "batch predicted 3"],
     canonical: Canonical,
-) -> tuple[Float[Tensor, "batch said joint 3 3"], Float[Tensor, "batch said 3"]]:
+) -> tuple[Float[Tensor, "batch predicted joint 3 3"], Float[Tensor, "batch predicted 3"]]:
     """A motion of the last frames out of its windows' frames."""
     R, t = canonical.last(t_root.shape[1])
     turned = torch.cat([(R @ R_parent_joint[:, :, 0])[:, :, None], R_parent_joint[:, :, 1:]], 2)

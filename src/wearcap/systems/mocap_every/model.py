@@ -17,10 +17,10 @@ FEET = 2
 class Estimate(NamedTuple):
     """What is said of the last frames of a window (all of them, or the last one alone)."""
 
-    motion: Float[Tensor, "batch said motion"]
+    motion: Float[Tensor, "batch predicted motion"]
     """Root translation and 6D rotations in the window's frame."""
-    contact_logit: Float[Tensor, "batch said foot"]
-    ends: Float[Tensor, "batch said 12"] | None
+    contact_logit: Float[Tensor, "batch predicted foot"]
+    ends: Float[Tensor, "batch predicted 12"] | None
     """Positions of hands and feet from the first stage (m); None where there is no such stage."""
 
 
@@ -93,8 +93,8 @@ class TwoStageEstimator(WatchEstimator):
         x = self._tokens(self.feature_normalizer(features))
         ends, embedded = None, self.embed(x)
         if self.first is not None:
-            said = self.first["encoder"](self.first["embed"](x) + self.first_position)
-            ends = self._frames(self.first["ends"](said))
+            output = self.first["encoder"](self.first["embed"](x) + self.first_position)
+            ends = self._frames(self.first["ends"](output))
             embedded = torch.cat([embedded, self.embed_ends(self._tokens(ends))], -1)
             ends = self.ends_normalizer.inverse(ends)
         encoded = self.encoder(embedded + self.position)
@@ -140,8 +140,8 @@ class LastPoseEstimator(WatchEstimator):
     def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
         """What is said of the last frame of raw features."""
         exist = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
-        said = self.regressor(features, exist)[:, None]
-        return Estimate(self.motion_normalizer.inverse(said[..., :-FEET]), said[..., -FEET:], None)
+        output = self.regressor(features, exist)[:, None]
+        return Estimate(self.motion_normalizer.inverse(output[..., :-FEET]), output[..., -FEET:], None)
 
 
 TrainedEstimator = TwoStageEstimator | LastPoseEstimator

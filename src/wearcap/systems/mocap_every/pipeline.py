@@ -9,7 +9,7 @@ from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
-from wearcap.geometry.trajectory import interpolate_held
+from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import FloorTrack
 from wearcap.recording.timing import at_times
@@ -20,8 +20,8 @@ from wearcap.systems.mocap_every.energy import LatentSolution
 from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
 from wearcap.systems.mocap_every.visual_cues import VisualCues
-from wearcap.systems.mocap_every.windows import EstimatorWindows, Said
-from wearcap.tracking.anchor import hang_from_head
+from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
+from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.floor import floor_from_points
 from wearcap.tracking.head_path import HeadPath, head_path
 
@@ -54,9 +54,9 @@ class MocapEvery:
     """Frames that must follow a pose before it is final."""
     floor: str = "follow"
     """follow: ours. update: the document's D.2. points: beneath the head, from points alone. fixed: where it was."""
-    hang: bool = True
+    anchor: bool = True
     """Whether the body hangs from the measured head (ours) or stands where the estimator puts it (the document)."""
-    mirror: bool = False
+    mirror_average: bool = False
     """Whether each window is asked in a mirror, too (ours)."""
     cues: VisualCues | None = None
     """Edits the motion by the recording's keypoints (§3.4); None: it stays as estimated."""
@@ -104,13 +104,13 @@ class MocapEvery:
         path = head_path(recording, self.skeleton, self.fps)
         sensed = self._sensed(recording, path)
         # 2. end-effectors, contacts and poses, window after window; 3. the floor by where the feet touch it
-        said = [self._stretch(recording, path, sensed, start, stop) for start, stop in path.stretches]
-        whole = _bridged(said, path)
+        output = [self._stretch(recording, path, sensed, start, stop) for start, stop in path.stretches]
+        whole = _bridged(output, path)
         motion = Motion(path.timestamps, path.skeleton, whole.R_parent_joint, whole.t_world_root,
                         whole.contact_prob.repeat_interleave(2, -1), provenance=self.settings())  # fmt: skip
         # 4. the head is where it was measured
-        if self.hang:
-            motion = hang_from_head(motion, path.T_world_head)
+        if self.anchor:
+            motion = anchored_to_head(motion, path.T_world_head)
         # 5. the motion agrees with what was seen, as far as the manifold of motions allows
         edits: list[LatentSolution] = []
         if self.cues is not None:
@@ -122,8 +122,8 @@ class MocapEvery:
         if self._runner is not None:
             motion, contact, *ends = self._runner(features)
             return Estimate(motion, contact, ends[0] if ends else None)
-        said = self.net(features.to(self.device))
-        return Estimate(*(part if part is None else part.cpu() for part in said))
+        output = self.net(features.to(self.device))
+        return Estimate(*(part if part is None else part.cpu() for part in output))
 
     def _sensed(self, recording: Recording, path: HeadPath) -> Sensed:
         """What is worn, at the path's times; a recording of a true motion without watches has synthetic ones (eq. 8)."""
@@ -141,28 +141,30 @@ class MocapEvery:
             R, t, *watches_at(recording.imu, path.timestamps, recording.name), torch.zeros(len(t), 2, 3)
         )
 
-    def _stretch(self, recording: Recording, path: HeadPath, sensed: Sensed, start: int, stop: int) -> Said:
+    def _stretch(
+        self, recording: Recording, path: HeadPath, sensed: Sensed, start: int, stop: int
+    ) -> FinalPoses:
         times = path.timestamps[start:stop]
         floor = self._follower(recording, path, times[0].item())
         windows, parts = EstimatorWindows(self, path.skeleton, floor), []
-        beneath = self._beneath(recording, path) if self.floor == "points" else None
+        below = self._below(recording, path) if self.floor == "points" else None
         seen = -torch.inf
         for first in range(start, stop, self.stride):
             last = min(first + self.stride, stop)
             seen = self._show(recording, floor, seen, path.timestamps[last - 1].item())
-            if beneath is not None:
+            if below is not None:
                 assert isinstance(floor, FloorFixed)
-                floor.height = beneath[first].item()
+                floor.height = below[first].item()
             parts.append(windows.advance(Sensed(*(part[first:last] for part in sensed))))
         parts.append(windows.finish())
-        return Said(*(torch.cat(part) for part in zip(*parts)))
+        return FinalPoses(*(torch.cat(part) for part in zip(*parts)))
 
     def _follower(self, recording: Recording, path: HeadPath, time_s: float) -> FloorFollower:
         """Begins with the measured height of the floor (the document's h_0) where there is one, else with what the
         head's path says."""
         track = recording.floor
         if track is not None:
-            initial = interpolate_held(
+            initial = interpolate_clamped(
                 track.timestamps, track.height, torch.tensor([time_s], dtype=torch.float64)
             )[0].item()
         else:
@@ -177,7 +179,7 @@ class MocapEvery:
             return FloorFollow(initial_m, skeleton.height_of("left_toe"), self.fps)
         return FloorFixed(initial_m)
 
-    def _beneath(self, recording: Recording, path: HeadPath) -> Float[Tensor, "time"]:
+    def _below(self, recording: Recording, path: HeadPath) -> Float[Tensor, "time"]:
         found = floor_from_points(recording.points, path.T_world_head.t, path.stature)
         return path.floor_height if found is None else found
 
@@ -198,11 +200,11 @@ class MocapEvery:
         """What the motion depends on, beside the network."""
         return {
             "pipeline": "mocap_every", "stride": str(self.stride), "lookahead": str(self.lookahead), "floor": self.floor,
-            "hang": str(self.hang), "mirror": str(self.mirror),
+            "anchor": str(self.anchor), "mirror_average": str(self.mirror_average),
         }  # fmt: skip
 
 
-def _bridged(said: list[Said], path: HeadPath) -> Said:
+def _bridged(output: list[FinalPoses], path: HeadPath) -> FinalPoses:
     """Stretches as one; frames in the gaps between them hold the pose before, at the interpolated head."""
-    whole, held = Said(*(torch.cat(part) for part in zip(*said))), path.held_frames
-    return Said(*(part[held] for part in whole))
+    whole, held = FinalPoses(*(torch.cat(part) for part in zip(*output))), path.held_frames
+    return FinalPoses(*(part[held] for part in whole))

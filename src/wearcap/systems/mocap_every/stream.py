@@ -36,8 +36,8 @@ from wearcap.sensors.packets import (
 from wearcap.sensors.watches import FILTER, MAX_GAP_S, WRISTS, filtered
 from wearcap.systems.mocap_every.features import Sensed
 from wearcap.systems.mocap_every.pipeline import MocapEvery
-from wearcap.systems.mocap_every.windows import EstimatorWindows, Said
-from wearcap.tracking.anchor import hang_from_head
+from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
+from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_track import Chunk, HeadTrack
 
 MAX_POINTS = 1_000_000
@@ -185,14 +185,14 @@ class MocapEverySession:
             self._chunks.append(chunk)
         given: list[Motion] = []
         end_s = self._chunks[-1].timestamps[-1].item() if ended and self._chunks else math.inf
-        while self._chunks and (ended or self._told(self._chunks[0])):
+        while self._chunks and (ended or self._complete(self._chunks[0])):
             given += self._advance(self._chunks.pop(0), end_s)
         if ended and self._windows is not None:
             given += self._give(self._windows.finish())
             self._windows = None
         return joined(given)
 
-    def _told(self, chunk: Chunk) -> bool:
+    def _complete(self, chunk: Chunk) -> bool:
         """Whether both watches have said all that a chunk is told from, or are silent."""
         last = chunk.timestamps[-1].item()
         needed = last + (FILTER // 2 + 0.5) / self.pipeline.fps
@@ -214,8 +214,8 @@ class MocapEverySession:
                 floor_m = T_world_head.t[0, 2].item() - self.wearing.skeleton.height_of("head")
             follower = self.pipeline.follower(self.wearing.skeleton, floor_m)
             self._windows = EstimatorWindows(self.pipeline, self.wearing.skeleton, follower)
-        elif len(chunk.amended.t):
-            self._windows.amend(chunk.amended @ mount)
+        elif len(chunk.corrected.t):
+            self._windows.correct(chunk.corrected @ mount)
         for points in self._points:
             self._windows.floor.see(points)
         self._points.clear()
@@ -242,7 +242,7 @@ class MocapEverySession:
         for joint, samples in self._samples.items():
             if not samples or samples[-1].timestamp < chunk.timestamps[-1].item() - MAX_GAP_S:
                 self.silent += len(chunk.timestamps)
-                samples = self._resting(samples, chunk)
+                samples = self._at_rest(samples, chunk)
             elif len(samples) == 1:
                 samples = [samples[0]._replace(timestamp=samples[0].timestamp - step), *samples]
             streams.append(ImuStream(
@@ -255,7 +255,7 @@ class MocapEverySession:
             self._samples[joint] = [s for s in kept if s.timestamp >= forget] or kept[-1:]
         return filtered(streams, chunk.timestamps, around, step)
 
-    def _resting(self, samples: list[WatchSample], chunk: Chunk) -> list[WatchSample]:
+    def _at_rest(self, samples: list[WatchSample], chunk: Chunk) -> list[WatchSample]:
         """A watch as it was last, at rest."""
         R = samples[-1].R_world_imu if samples else torch.eye(3)
         return [
@@ -263,15 +263,15 @@ class MocapEverySession:
             for time in (chunk.timestamps[0].item() - 1.0, chunk.timestamps[-1].item() + 1.0)
         ]
 
-    def _give(self, said: Said) -> list[Motion]:
-        count = len(said.t_world_root)
+    def _give(self, output: FinalPoses) -> list[Motion]:
+        count = len(output.t_world_root)
         if not count:
             return []
         times, heads = self._times[:count], self._heads[:count]
         self._times, self._heads = self._times[count:], self._heads[count:]
-        motion = Motion(times, self.wearing.skeleton, said.R_parent_joint, said.t_world_root,
-                        said.contact_prob.repeat_interleave(2, -1), provenance=self.pipeline.settings())  # fmt: skip
-        return [hang_from_head(motion, heads) if self.pipeline.hang else motion]
+        motion = Motion(times, self.wearing.skeleton, output.R_parent_joint, output.t_world_root,
+                        output.contact_prob.repeat_interleave(2, -1), provenance=self.pipeline.settings())  # fmt: skip
+        return [anchored_to_head(motion, heads) if self.pipeline.anchor else motion]
 
 
 def _time(sample: WatchSample) -> float:

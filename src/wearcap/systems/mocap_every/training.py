@@ -80,8 +80,8 @@ class WatchRegression(SeededSteps, WeighedTerms):
         return features, true, canonical
 
     def _joints(
-        self, motion: Float[Tensor, "batch said motion"], batch: WatchWindow, canonical: Canonical
-    ) -> Float[Tensor, "batch said joint 3"]:
+        self, motion: Float[Tensor, "batch predicted motion"], batch: WatchWindow, canonical: Canonical
+    ) -> Float[Tensor, "batch predicted joint 3"]:
         """Joints (m) in the world."""
         R, t = to_world(*self.features.decode_motion(motion, batch.sensed, canonical), canonical)
         return forward_kinematics(self.skeleton, R, t, batch.t_parent_joint[:, None]).t
@@ -108,9 +108,9 @@ class WatchRegression(SeededSteps, WeighedTerms):
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
         features, true, canonical = self._inputs(batch)
-        said = self.net(features)
-        last = said.motion.shape[1]
-        motion, true = said.motion.float(), true[:, -last:]
+        output = self.net(features)
+        last = output.motion.shape[1]
+        motion, true = output.motion.float(), true[:, -last:]
         joints, joints_true = (self._joints(each, batch, canonical) for each in (motion, true))
         error = motion - true
         turns, distance = _norm(error[..., 3:].unflatten(-1, (-1, 6))), _norm(joints - joints_true)
@@ -119,14 +119,14 @@ class WatchRegression(SeededSteps, WeighedTerms):
             "rotation": turns[..., 1:].mean(),
             "position": (distance * self._joint_weights).mean(),
             "contact": F.binary_cross_entropy_with_logits(
-                said.contact_logit.float(), batch.foot_contact[:, -last:]
+                output.contact_logit.float(), batch.foot_contact[:, -last:]
             ),
         }
         if last > 1:
             velocity = _norm((joints - joints_true).diff(dim=1) * self.fps)
             terms |= {"foot_velocity": velocity[:, :, self._ends[2:]].mean(), "velocity": velocity.mean()}
-        if said.ends is not None:
-            ends = self._placed(said.ends.float().unflatten(-1, (-1, 3)), batch, canonical)
+        if output.ends is not None:
+            ends = self._placed(output.ends.float().unflatten(-1, (-1, 3)), batch, canonical)
             terms["mid"] = _norm(ends - joints_true[:, :, self._ends]).mean()
             terms["consistency"] = _norm(joints[:, :, self._ends] - ends).mean()
         return terms

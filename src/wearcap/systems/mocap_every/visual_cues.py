@@ -22,13 +22,13 @@ from wearcap.systems.mocap_every.energy import (
     PlaceCue,
     PoseCue,
     Seen,
+    anchored_body,
     energy_terms,
-    hung_body,
     solve_latent,
 )  # fmt: skip
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.manifold_features import FEET, Posed, decode_window, encode_window, origin_of
-from wearcap.tracking.anchor import hang_from_head
+from wearcap.tracking.anchor import anchored_to_head
 
 FOOT_JOINTS = ("left_toe", "right_toe")
 
@@ -72,17 +72,17 @@ class VisualCues:
             if cue.joint in motion.skeleton
         ]
         seen = [view_at_frames(view, motion.timestamps) for view in views]
-        said = [cue.confidence for cue in cues] + [view.confidence.amax(-1) for view in seen]
-        if not said or not torch.stack(said).any():
+        output = [cue.confidence for cue in cues] + [view.confidence.amax(-1) for view in seen]
+        if not output or not torch.stack(output).any():
             return motion, []
-        starts = self._starts(torch.stack(said).amax(0) > 0)
+        starts = self._starts(torch.stack(output).amax(0) > 0)
         edited, solutions = _Blend(motion, self.window), []
         for some in starts.split(self.batch):
             frames = some[:, None] + torch.arange(self.window)
             R, root, solution = self._edit_windows(motion, recording, T_world_head, frames, cues, seen)
             edited.add(frames, R, root)
             solutions.append(solution)
-        return hang_from_head(edited.motion(), T_world_head), solutions
+        return anchored_to_head(edited.motion(), T_world_head), solutions
 
     def _starts(self, shown: Tensor) -> Int64[Tensor, "window"]:
         """First frames of the windows, on a grid of half windows, that show anything; the outer ones reach beyond."""
@@ -114,12 +114,12 @@ class VisualCues:
         spread = _spread(self.window, self.smooth)
 
         def edited(latent: Tensor) -> Tensor:
-            said = self.manifold.decode(latent)
-            return X0 + spread @ (said - rebuilt) if self.residual else said
+            output = self.manifold.decode(latent)
+            return X0 + spread @ (output - rebuilt) if self.residual else output
 
         def body(latent: Tensor) -> Body:
             posed = decode_window(edited(latent), origin)
-            return hung_body(skeleton, posed.R_parent_joint, window.foot_contact, head)
+            return anchored_body(skeleton, posed.R_parent_joint, window.foot_contact, head)
 
         solution = solve_latent(
             start,

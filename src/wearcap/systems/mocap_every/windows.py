@@ -26,7 +26,7 @@ FEET = ("left_toe", "right_toe")
 """Joints whose contact is said, and that the floor is followed by."""
 
 
-class Said(NamedTuple):
+class FinalPoses(NamedTuple):
     """Frames that are final."""
 
     R_parent_joint: Float[Tensor, "time joint 3 3"]
@@ -57,7 +57,7 @@ class EstimatorWindows:
         """Weighted sums of what was said of the window's frames: root, rotations, contact, and of the weights."""
         self._given, self._taken = 0, 0
 
-    def advance(self, new: Sensed) -> Said:
+    def advance(self, new: Sensed) -> FinalPoses:
         """Take in up to `stride` new frames; the frames that are final now."""
         window, count = self._pipeline.net.window, len(new.t_world_head)
         if self._sensed is None:
@@ -69,14 +69,14 @@ class EstimatorWindows:
         self._floors = torch.cat([self._floors[count:], self.floor.ahead(new.t_world_head)])
         self._sum = torch.cat([self._sum[count:], self._sum.new_zeros(count, self._sum.shape[1])])
         self._taken += count
-        said = self._estimate()
-        last = len(said)
-        self._sum[-last:] += self._weight[-last:] * torch.cat([said, torch.ones(last, 1)], -1)
-        R, t, contact = _parts(said[-count:])
+        output = self._estimate()
+        last = len(output)
+        self._sum[-last:] += self._weight[-last:] * torch.cat([output, torch.ones(last, 1)], -1)
+        R, t, contact = _parts(output[-count:])
         self.floor.follow(contact, forward_kinematics(self._skeleton, R, t).t[:, self._feet])
         return self._give(self._pipeline.lookahead)
 
-    def amend(self, T_world_head: Rigid) -> None:
+    def correct(self, T_world_head: Rigid) -> None:
         """Put the latest head poses right, which had been held."""
         assert self._sensed is not None
         count = len(T_world_head.t)
@@ -90,35 +90,37 @@ class EstimatorWindows:
         """Height of the floor (m) at the latest frame."""
         return self._floors[-1].item()
 
-    def finish(self) -> Said:
+    def finish(self) -> FinalPoses:
         """The frames that are left."""
         return self._give(0)
 
-    def _give(self, waiting: int) -> Said:
+    def _give(self, waiting: int) -> FinalPoses:
         """Frames that have not been given yet, but for the last ones."""
         window, count = len(self._sum), self._taken - waiting - self._given
         stop = window - waiting
         rows = self._sum[stop - max(count, 0) : stop]
         self._given += max(count, 0)
-        return Said(*_parts(rows[:, :-1] / rows[:, -1:]), self._floors[stop - len(rows) : stop])
+        return FinalPoses(*_parts(rows[:, :-1] / rows[:, -1:]), self._floors[stop - len(rows) : stop])
 
-    def _estimate(self) -> Float[Tensor, "said value"]:
+    def _estimate(self) -> Float[Tensor, "predicted value"]:
         """Root, 6D rotations and contact in the world of the window's last frames.
 
-        With `mirror` the window seen in a mirror is asked, too, and the mean of both taken: none of what a network
+        With `mirror_average` the window seen in a mirror is asked, too, and the mean of both taken: none of what a network
         believes of left hands and right ones stays.
         """
         pipeline, skeleton = self._pipeline, self._skeleton
         assert self._sensed is not None
         sensed, floor, size = Sensed(*(part[None] for part in self._sensed)), self._floors[None], self._size
-        if pipeline.mirror:
+        if pipeline.mirror_average:
             sensed = Sensed(*(torch.cat(both) for both in zip(sensed, mirrored(sensed))))
             floor, size = floor.expand(2, -1), size.expand(2, -1)
         canonical = pipeline.features.canonical(sensed, floor)
-        told = pipeline.estimate(pipeline.features.encode(sensed, floor, size, canonical))
-        R, t = to_world(*pipeline.features.decode_motion(told.motion.float(), sensed, canonical), canonical)
-        contact = told.contact_logit.float().sigmoid()
-        if pipeline.mirror:
+        estimated = pipeline.estimate(pipeline.features.encode(sensed, floor, size, canonical))
+        R, t = to_world(
+            *pipeline.features.decode_motion(estimated.motion.float(), sensed, canonical), canonical
+        )
+        contact = estimated.contact_logit.float().sigmoid()
+        if pipeline.mirror_average:
             R = torch.stack([R[0], mirrored_rotations(R[1], skeleton)])
             t = torch.stack([t[0], t[1] * t.new_tensor(MIRROR)])
             contact = torch.stack([contact[0], contact[1].flip(-1)])
@@ -126,7 +128,7 @@ class EstimatorWindows:
 
 
 def _parts(
-    said: Float[Tensor, "time value"],
+    output: Float[Tensor, "time value"],
 ) -> tuple[Float[Tensor, "time joint 3 3"], Float[Tensor, "time 3"], Float[Tensor, "time foot"]]:
     """Rotations, root and contact."""
-    return rotation.matrix_from_rot6d(said[:, 3:-2].unflatten(-1, (-1, 6))), said[:, :3], said[:, -2:]
+    return rotation.matrix_from_rot6d(output[:, 3:-2].unflatten(-1, (-1, 6))), output[:, :3], output[:, -2:]

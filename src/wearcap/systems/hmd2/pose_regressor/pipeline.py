@@ -15,7 +15,7 @@ from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import at_times
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, pasts
-from wearcap.tracking.anchor import hang_from_head, with_hand_moved
+from wearcap.tracking.anchor import anchored_to_head, with_hand_moved
 from wearcap.tracking.head_path import HeadPath, head_path
 
 
@@ -60,8 +60,8 @@ class PoseRegressorCapture:
         R_parent_joint = decode_pose(motion, path.T_world_head.R)
         origin = torch.zeros(count, 3)
         captured = Motion(path.timestamps, path.skeleton, R_parent_joint, origin, provenance=self._settings())
-        hung = hang_from_head(captured, path.T_world_head)
-        return self._reaching(hung, tracked) if self.reach else hung
+        anchored = anchored_to_head(captured, path.T_world_head)
+        return self._reaching(anchored, tracked) if self.reach else anchored
 
     def _tracked(self, recording: Recording, path: HeadPath) -> Rigid:
         """Poses "time point" of the tracked points; those of the hands are the truth's."""
@@ -78,8 +78,8 @@ class PoseRegressorCapture:
     def _regressed(self, features: Float[Tensor, "1 time feature"]) -> Float[Tensor, "time motion"]:
         passes = torch.arange(features.shape[1]).split(self.frames_per_pass)
         windows = (pasts(features, ends[None], self.net.window) for ends in passes)
-        said = [self.net(past[0].to(self.device), exists[0].to(self.device)) for past, exists in windows]
-        return torch.cat(said).float().cpu()
+        predicted = [self.net(past[0].to(self.device), exists[0].to(self.device)) for past, exists in windows]
+        return torch.cat(predicted).float().cpu()
 
     def _reaching(self, motion: Motion, tracked: Rigid) -> Motion:
         """The motion with its tracked wrists where they were measured, as far as the arms reach."""

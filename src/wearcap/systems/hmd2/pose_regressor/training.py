@@ -88,13 +88,13 @@ class PoseRegression(SeededSteps, WeighedTerms):
         R_true, R_head = batch.R_parent_joint[rows, ends], batch.R_world_head[rows, ends]
         valid = batch.valid[rows, ends].float()
         error = (motion - encode_pose(R_true, R_head)).abs()
-        said, true = self._from_head(decode_pose(motion, R_head), batch), self._from_head(R_true, batch)
+        predicted, true = self._from_head(decode_pose(motion, R_head), batch), self._from_head(R_true, batch)
         return {
             "root": masked_mean(error[..., :6].mean(-1), valid),
             "rotation": masked_mean(error[..., 6:].mean(-1), valid),
-            "joints": masked_mean((said - true).abs().mean((-1, -2)), valid),
+            "joints": masked_mean((predicted - true).abs().mean((-1, -2)), valid),
             "velocity": joint_velocity(
-                *(x.reshape(-1, 2, *x.shape[2:]) for x in (said, true, valid)), self.fps
+                *(x.reshape(-1, 2, *x.shape[2:]) for x in (predicted, true, valid)), self.fps
             ),
         }
 
