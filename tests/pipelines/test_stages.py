@@ -13,9 +13,11 @@ from rich.console import Console
 from torch import nn
 
 from wearcap.errors import WearcapError
-from wearcap.runtime.digest import code_digest, digest
+from wearcap.runtime import digest as digests
+from wearcap.runtime.digest import code_digest, digest, modules_of
 from wearcap.runtime.stages import Stage, StageCache, run_stages
 from wearcap.sensors.clock import Clock
+from wearcap.systems.ireplica.hand_snapping import HandSnapping
 
 CLOCK = Clock(torch.tensor([1.5, 9.0]).double(), torch.tensor([0.5, 8.0]).double(), 0.1, 0.0, 2)
 
@@ -164,7 +166,38 @@ def test_digests_follow_content(tmp_path):
         digest(tmp_path / "none")
 
 
-def test_sources_have_a_digest():
-    assert code_digest("sensors/clock.py") != code_digest("sensors")
-    with pytest.raises(WearcapError, match="no such file"):
-        code_digest("sensors/none.py")
+def test_the_code_of_a_stage_is_all_that_its_module_imports(tmp_path, monkeypatch):
+    """A change of any module that is imported, however far below, changes the digest; another one does not."""
+    package = tmp_path / "wearcap"
+    sources = {
+        "top": "from wearcap.middle import run", "middle": "import wearcap.deep.bottom", "deep/__init__": "",
+        "deep/bottom": "VALUE = 1", "aside": "",
+    }  # fmt: skip
+    for name, text in sources.items():
+        (package / name).parent.mkdir(parents=True, exist_ok=True)
+        (package / f"{name}.py").write_text(text)
+    monkeypatch.setattr(digests, "PACKAGE", package)
+
+    def found() -> str:
+        digests._code_digest.cache_clear()
+        digests._imports.cache_clear()
+        return code_digest("wearcap.top")
+
+    before = found()
+    (package / "aside.py").write_text("VALUE = 2")
+    assert found() == before
+    (package / "deep" / "bottom.py").write_text("VALUE = 22")
+    assert found() != before
+    with pytest.raises(WearcapError, match="no module 'wearcap.none'"):
+        code_digest("wearcap.none")
+    digests._code_digest.cache_clear()
+    digests._imports.cache_clear()
+
+
+def test_the_modules_of_what_a_stage_reads():
+    energy = functools.partial(code_digest, HandSnapping())
+    assert modules_of([energy, {"a": torch.ones(2)}, 3]) == {
+        "wearcap.runtime.digest",
+        "wearcap.systems.ireplica.hand_snapping",
+        "wearcap.optimize.contact_correction",
+    }

@@ -1,5 +1,6 @@
 """What a value is made of, as one short text: equal content gives an equal digest, on every machine."""
 
+import ast
 import dataclasses
 import functools
 import hashlib
@@ -29,19 +30,65 @@ def digest(*values: Any) -> str:
     return sha.hexdigest()
 
 
-def code_digest(*places: str) -> str:
-    """Digest of this package's sources by folder or module ("sensors", "optimize/hps.py")."""
-    return _code_digest(places)
+def code_digest(*modules: str) -> str:
+    """Digest of the sources of some modules of this package ("wearcap.systems.hps.camera") and of all that they import.
+
+    Modules outside the package do not count. Raises WearcapError for a module of the package that is not there.
+    """
+    return _code_digest(frozenset(modules))
+
+
+def modules_of(value: Any) -> set[str]:
+    """This package's modules that define the classes and functions among some values: their code decides a result, too."""
+    modules: set[str] = set()
+    rest = [value]
+    while rest:
+        part = rest.pop()
+        if isinstance(part, functools.partial):
+            rest += [part.func, part.args, part.keywords]
+        elif isinstance(part, dict):
+            rest += part.values()
+        elif isinstance(part, list | tuple):
+            rest += part
+        elif isinstance(part, Callable) and hasattr(part, "__qualname__"):
+            modules.add(part.__module__)
+        elif not isinstance(part, Tensor | np.ndarray | Path) and type(part).__module__.startswith(
+            "wearcap."
+        ):
+            modules.add(type(part).__module__)
+            rest += list(getattr(part, "__dict__", {}).values())
+    return {name for name in modules if name.startswith("wearcap.")}
 
 
 @functools.cache
-def _code_digest(places: tuple[str, ...]) -> str:
-    files = []
-    for place in places:
-        path = PACKAGE / place
-        found = sorted(path.rglob("*.py")) if path.is_dir() else [path]
-        files += [(file.relative_to(PACKAGE).as_posix(), file) for file in found]
-    return digest(files)
+def _code_digest(modules: frozenset[str]) -> str:
+    rest, reached = sorted(modules), set(modules)
+    while rest:
+        new = _imports(rest.pop()) - reached
+        reached |= new
+        rest += sorted(new)
+    return digest([(name, _source(name)) for name in sorted(reached) if _source(name) is not None])
+
+
+def _source(module: str) -> Path | None:
+    """File of a module of this package; None for a name within a module."""
+    path = PACKAGE.joinpath(*module.split(".")[1:])
+    return next((file for file in (path / "__init__.py", path.with_suffix(".py")) if file.is_file()), None)
+
+
+@functools.cache
+def _imports(module: str) -> frozenset[str]:
+    """Names of this package that a module imports, of modules and of what they define."""
+    file = _source(module)
+    if file is None:
+        raise WearcapError(f"no module {module!r}", where=PACKAGE, expected="one of this package")
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return frozenset(name for name in found if name.startswith("wearcap.") and _source(name) is not None)
 
 
 def _parts(value: Any) -> Iterator[bytes | memoryview]:

@@ -1,7 +1,8 @@
 """A pipeline's steps as stages: each one's result is kept by what it was made from, and made again only when that changes.
 
-A stage's key is a digest of its name, its sources, what it reads (settings, streams, files), and the results of the
-stages that it follows. A change therefore reaches the stages behind it, and only as far as results differ.
+A stage's key is a digest of its name, of what it reads (settings, streams, files), of the results of the stages that it
+follows, and of its code: the module that makes it, the modules of what it reads, and all that these import. A change
+therefore reaches the stages behind it, and only as far as results differ.
 """
 
 import json
@@ -23,7 +24,7 @@ from wearcap.optimize.hps import HpsState
 from wearcap.optimize.solution import Solution
 from wearcap.recording import Motion, Recording
 from wearcap.recording.serialize import KNOWN, dumps, flatten, unflatten
-from wearcap.runtime.digest import code_digest, digest
+from wearcap.runtime.digest import code_digest, digest, modules_of
 from wearcap.scene.scan import Scan
 from wearcap.sensors.clock import Clock
 from wearcap.sensors.initialization import Initialization
@@ -44,8 +45,6 @@ class Stage:
     there is a cache."""
     after: tuple[str, ...] = ()
     """Earlier stages whose results it takes."""
-    code: tuple[str, ...] = ()
-    """Folders and modules of the package whose sources decide the result, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +179,8 @@ def run_stages(
 
 def _key(stage: Stage, digests: dict[str, str]) -> str:
     followed = [digests[name] for name in stage.after]
-    return digest(stage.name, code_digest(*stage.code), list(stage.reads()), followed)
+    reads = list(stage.reads())
+    return digest(stage.name, code_digest(*modules_of([stage.make, reads])), reads, followed)
 
 
 def _kept(

@@ -24,7 +24,6 @@ from wearcap.sensors.imu import synthesize_imu
 CLOCKS = ("shared", "claps", "auto")
 WRISTS = ("left_wrist", "right_wrist")
 MAP_NAME = "map.safetensors"
-LEARNED = ("models/superpoint.py", "models/lightglue.py", "models/netvlad.py")
 USUAL_HZ = 6.0
 """Frames localised per second where nothing else is said: the suit tells what lies between."""
 
@@ -173,12 +172,10 @@ def camera_stages(source: Source, synchronization: Synchronization, localize: Lo
         Stage(
             "synchronize", lambda results: synchronization(recording, folder),
             lambda: synchronization.reads(recording, folder),
-            code=("sensors/claps.py", "sensors/clock.py", "sensors/imu.py", "systems/hps/camera.py"),
         ),
         Stage(
             "localize", lambda results: localize(recording, folder),
             lambda: localize.reads(recording, folder),
-            code=("localization", *LEARNED, "geometry", "io/formats/video.py", "systems/hps/camera.py"),
         ),
     ]  # fmt: skip
 

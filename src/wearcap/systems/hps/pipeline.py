@@ -86,18 +86,16 @@ class HPS:
             *first,
             Stage(
                 "align", lambda done: self.align(on_one_clock(recording, done)), lambda: (self.fps, *body),
-                ("synchronize", "localize"), ("sensors/alignment.py", "prepare/clean.py", "geometry", "body"),
+                ("synchronize", "localize"),
             ),
             Stage(
                 "initialize", lambda done: self.initialize(on_one_clock(recording, done), done["align"]),
                 lambda: (self.initialization, *mount(recording)), ("synchronize", "localize", "align"),
-                ("sensors/initialization.py", "sensors/alignment.py", "geometry", "body"),
             ),
             Stage(
                 "optimize", lambda done: self.optimize(self._stated(source, done)),
                 lambda: (self.energy, self.solver, self.evidence, source.scan, source.metres_per_unit, recording.shape),
                 ("synchronize", "localize", "align", "initialize"),
-                ("optimize", "systems/hps/pipeline.py", "sensors/alignment.py", "io/formats/scan.py", "geometry", "body"),
             ),
         ]  # fmt: skip
 

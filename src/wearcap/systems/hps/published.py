@@ -54,8 +54,6 @@ class PlacedSuit(ABC):
             Stage(
                 "place", lambda done: self.place(on_one_clock(recording, done)),
                 lambda: (self.placing, self.fps, recording.suit, *mount(recording)), ("synchronize", "localize"),
-                ("systems/hps/published.py", "systems/ireplica/bent_suit.py", "optimize", "sensors/alignment.py",
-                 "prepare/clean.py", "geometry", "body"),
             ),
         ]  # fmt: skip
 

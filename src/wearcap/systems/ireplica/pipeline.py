@@ -51,16 +51,12 @@ class IReplica:
         return [
             *before,
             Stage(
-                "contacts", lambda done: self.contacts(suit), lambda: (self.predictor, suit, self.fps), (),
-                ("systems/ireplica/contact_prediction.py", "models", "data", "body", "geometry"),
+                "contacts", lambda done: self.contacts(suit), lambda: (self.predictor, suit, self.fps),
             ),
             Stage(
                 "interact", lambda done: self.interact(self.registration.motion_of(done), done["contacts"], environment),
                 lambda: (environment, self.tracker, self.fps),
                 (*(stage.name for stage in before), "contacts"),
-                ("systems/ireplica/object_tracker.py", "systems/ireplica/contact_intervals.py", "systems/ireplica/settling.py",
-                 "systems/ireplica/attachment.py", "systems/ireplica/snapping.py", "systems/ireplica/hand_snapping.py", "optimize", "scene",
-                 "body", "geometry"),
             ),
         ]  # fmt: skip
 
