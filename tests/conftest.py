@@ -5,6 +5,7 @@ WEARCAP_EXAMPLES=1000 makes the property tests and the fuzzing of the readers se
 
 import os
 import tempfile
+from functools import partial, partialmethod
 from pathlib import Path
 
 import pytest
@@ -27,3 +28,26 @@ def real_data() -> Path:
     if not root.is_dir():
         pytest.fail(f"{root} is not there: tests marked `real` need it (set WEARCAP_REAL_DATA)")
     return root
+
+
+@pytest.fixture(scope="module")
+def few_statistics():
+    """Training takes its normalisation from 100 windows in place of up to 2000, which would take most of a short run."""
+    from wearcap.training import motion_diffusion
+    from wearcap.training.contact_detection import ContactDetection
+    from wearcap.training.echo_diffusion import EchoDiffusion
+    from wearcap.training.motion_autoencoder import MotionEncoding
+    from wearcap.training.motion_manifold import ManifoldTraining
+    from wearcap.training.pose_regression import PoseRegression
+    from wearcap.training.voxel_reconstruction import VoxelReconstruction
+    from wearcap.training.watch_regression import WatchRegression
+
+    systems = (
+        ContactDetection, EchoDiffusion, ManifoldTraining, MotionEncoding, PoseRegression, VoxelReconstruction, WatchRegression,
+    )  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        for system in systems:
+            patch.setattr(system, "set_statistics", partialmethod(system.set_statistics, limit=100))
+        few = partial(motion_diffusion.feature_statistics, limit=100)
+        patch.setattr(motion_diffusion, "feature_statistics", few)
+        yield

@@ -19,6 +19,8 @@ from wearcap.models.checkpoint import read_checkpoint
 from wearcap.pipelines.contact_prediction import ContactPredictor
 from wearcap.recording import RecordingStore
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
+
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("contact_*.yaml"))
 
 

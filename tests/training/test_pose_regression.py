@@ -21,6 +21,8 @@ from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.training.pose_regression import PoseRegression
 from wearcap_testing import small_dataset
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
+
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 HANDS = ("head", "left_wrist", "right_wrist")
 
@@ -96,7 +98,9 @@ def test_it_learns_and_hands_help(data):
     for points in (("head",), HANDS):
         torch.manual_seed(0)
         module, windows = system(points), batch(data, mirror=True)
-        module.set_statistics(WindowDataset([Source(str(data))], "train", window=60, stride=30, fps=60.0), 16)
+        module.set_statistics(
+            WindowDataset([Source(str(data))], "train", window=60, stride=30, fps=60.0), limit=16
+        )
         optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
         before = module.eval().terms(windows)["joints"].item()
         for _ in range(40):
