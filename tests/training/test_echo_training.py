@@ -260,7 +260,7 @@ def test_with_the_encoder_it_trains_is_evaluated_and_captures(data, people, tmp_
     scores = json.loads((tmp_path / "table.json").read_text())["methods"]["wearcap"]
     assert {"mpjpe_mm", "v2v_cm", "center_cm", "rotation_deg", "touch_f1"} <= set(scores)
     capture.main([
-        *common, f"recording={data}/c2", "video=false", "body=false", f"output={tmp_path}/c", f"hydra.run.dir={tmp_path}/c",
+        *common, "pipeline.runtime=eager", f"recording={data}/c2", "video=false", "body=false", f"output={tmp_path}/c", f"hydra.run.dir={tmp_path}/c",
     ])  # fmt: skip
     motion = read_motion(tmp_path / "c" / "motion.npz")
     assert len(motion) == len(carrying(2.0).motion)
