@@ -30,10 +30,10 @@ demo: $(STAMP)
 	$(BIN)/wearcap demo
 
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not real and not gpu" -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not real and not gpu" -n 2 --dist loadfile
 
 test-real: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "real and not gpu" -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "real and not gpu" -n 2 --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
