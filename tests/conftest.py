@@ -3,6 +3,7 @@
 WEARCAP_EXAMPLES=1000 makes the property tests and the fuzzing of the readers search longer.
 """
 
+import gc
 import os
 import tempfile
 from functools import partial, partialmethod
@@ -12,6 +13,7 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
+gc.disable()  # until all is imported, which leaves little to collect
 install_import_hook("wearcap", "shapes.checker")
 
 # What tests remember of files (checksums) is not the user's; it goes with the system's temporary files.
@@ -21,6 +23,12 @@ os.environ.setdefault("WEARCAP_CACHE", os.path.join(os.environ["XDG_CACHE_HOME"]
 
 settings.register_profile("suite", max_examples=int(os.environ.get("WEARCAP_EXAMPLES", "25")), deadline=None)
 settings.load_profile("suite")
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays: collections need not look at it again."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
