@@ -6,7 +6,7 @@ WEARCAP_EXAMPLES=1000 makes the property tests and the fuzzing of the readers se
 import gc
 import os
 import tempfile
-from functools import partial, partialmethod
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
@@ -42,8 +42,7 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="module")
 def few_statistics():
-    """Training takes its normalisation from 100 windows in place of up to 2000, which would take most of a short run."""
-    from wearcap.training import motion_diffusion
+    """Training takes its normalisation from 100 windows in place of up to 1500, which would take most of a short run."""
     from wearcap.training.contact_detection import ContactDetection
     from wearcap.training.echo_diffusion import EchoDiffusion
     from wearcap.training.motion_autoencoder import MotionEncoding
@@ -58,6 +57,4 @@ def few_statistics():
     with pytest.MonkeyPatch.context() as patch:
         for system in systems:
             patch.setattr(system, "set_statistics", partialmethod(system.set_statistics, limit=100))
-        few = partial(motion_diffusion.feature_statistics, limit=100)
-        patch.setattr(motion_diffusion, "feature_statistics", few)
         yield

@@ -19,8 +19,6 @@ from wearcap.io.motion_npz import write_motion
 from wearcap.recording import RecordingStore
 from wearcap_testing import recording_of, small_dataset, suited, swaying_motion
 
-pytestmark = pytest.mark.usefixtures("few_statistics")
-
 SMALL = ["debug=fast", "data.window=60", "trainer.accelerator=cpu", "model.net.width=32", "model.net.layers=1",
          "model.net.heads=4", "model.net.feedforward=32", "trainer.enable_progress_bar=false",
          "trainer.enable_model_summary=false", "callbacks.progress=null"]  # fmt: skip

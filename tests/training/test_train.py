@@ -18,8 +18,6 @@ from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap_testing import small_dataset
 
-pytestmark = pytest.mark.usefixtures("few_statistics")
-
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("motion_diffusion*.yaml"))
 KINDS = (
     "motion_", "contact_", "pose_regressor_", "egoego_", "egoview", "voxel_autoencoder", "hmd2", "mocap_every", "object_encoder",
