@@ -29,11 +29,12 @@ $(STAMP): pyproject.toml requirements.lock
 demo: $(STAMP)
 	$(BIN)/wearcap demo
 
+# Bytecode of the tests and of the checked modules is kept, also where the environment says otherwise: half of a start.
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not real and not gpu" -n 2
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not real and not gpu" -n 2 --dist loadfile
 
 test-real: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "real and not gpu" -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "real and not gpu" -n 2 --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

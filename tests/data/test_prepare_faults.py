@@ -229,12 +229,15 @@ def holds(process, root: Path) -> bool:
 
 @posix
 def test_kills_at_random_moments_leave_the_same_bytes(alone, tmp_path, monkeypatch):
-    """Each run is started as soon as the one before it was killed; every eighth is left to come to its end."""
+    """Each run is started as soon as the one before it was killed; every eighth is left to come to its end.
+
+    `benchmarks/faults.py` kills hundreds.
+    """
     moments, kills = random.Random(0), 0
     context = multiprocessing.get_context("forkserver")  # what it has imported, a run need not import again
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([*sys.path, str(Path(__file__).parent)]))
     context.set_forkserver_preload([prepare_tasks.__name__])
-    for number in range(48):
+    for number in range(16):
         root = tmp_path / str(number // 8)
         process = context.Process(target=prepare_tasks.run, args=(str(root), 12, 0.01))
         process.start()
@@ -247,14 +250,14 @@ def test_kills_at_random_moments_leave_the_same_bytes(alone, tmp_path, monkeypat
         if number % 8 == 7:
             assert process.exitcode == 0
             assert digests(root) == digests(alone)
-    assert kills >= 20
+    assert kills >= 7
 
 
 @linux
 @pytest.mark.slow
 def test_kills_of_a_run_with_workers_leave_the_same_bytes(alone, tmp_path):
     moments = random.Random(1)
-    for _ in range(5):
+    for _ in range(3):
         with preparing(tmp_path, 12, 0.3, 2) as (process, _):
             time.sleep(moments.uniform(0, 0.5))
             process.kill()

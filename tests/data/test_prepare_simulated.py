@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from command_line import exit_code
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.errors import WearcapError
 from wearcap.files import sha256_of
@@ -14,20 +15,21 @@ from wearcap.prepare.simulated import simulated_tasks
 from wearcap.recording import RecordingStore
 
 
+def given(output: Path, *more: str) -> list[str]:
+    settings = ["recordings={train:2,val:1,test:1}", "duration_s=3", "points=false", *more]
+    return ["prepare", "simulated", f"output={output}", *settings]
+
+
 def prepare(output: Path, *more: str) -> RecordingStore:
     """As a user would, in a process of its own."""
-    settings = ["recordings={train:2,val:1,test:1}", "duration_s=3", "points=false", *more]
-    command = [
-        sys.executable,
-        "-m",
-        "wearcap.cli.main",
-        "prepare",
-        "simulated",
-        f"output={output}",
-        *settings,
-    ]
+    command = [sys.executable, "-m", "wearcap.cli.main", *given(output, *more)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+    return RecordingStore.open(output)
+
+
+def prepare_here(output: Path, *more: str) -> RecordingStore:
+    assert exit_code(given(output, *more)) == 0
     return RecordingStore.open(output)
 
 
@@ -46,12 +48,12 @@ def test_a_small_set(tmp_path):
     assert recording.contacts is not None
     assert recording.floor is not None
     assert (len(recording.motion), recording.imu.keys()) == (180, {"left_wrist", "right_wrist"})
-    with_two = prepare(tmp_path / "b", "jobs=2", "backend=threading")
+    with_two = prepare_here(tmp_path / "b", "jobs=2", "backend=threading")
     assert {n: e.sha256 for n, e in with_two.entries.items()} == {
         n: e.sha256 for n, e in store.entries.items()
     }
     manifest = sha256_of(store.manifest_path)
-    prepare(tmp_path / "a", "jobs=1")
+    prepare_here(tmp_path / "a", "jobs=1")
     assert sha256_of(store.manifest_path) == manifest
 
 

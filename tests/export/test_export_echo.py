@@ -1,8 +1,10 @@
 """ECHO's network leaves the house: the same motion from the file, and files that do not belong are refused."""
 
 import json
+import shutil
 import sys
 from dataclasses import replace
+from pathlib import Path
 from subprocess import run
 
 import pytest
@@ -95,25 +97,25 @@ def test_what_was_exported_cannot_be_exported_again(exports, tmp_path):
         export_echo(load_exported_echo(exports["pt2"].path), tmp_path / "again.pt2", "pt2")
 
 
-def test_files_that_do_not_belong_are_refused(tmp_path):
-    report = export_echo(drawn(), tmp_path / "net.pt2", "pt2")
-    sidecar, encoder = tmp_path / "net.json", encoder_path(report.path)
+def test_files_that_do_not_belong_are_refused(exports, tmp_path):
+    path = shutil.copytree(Path(exports["pt2"].path).parent, tmp_path, dirs_exist_ok=True) / "net.pt2"
+    sidecar, encoder = tmp_path / "net.json", encoder_path(path)
     about = json.loads(sidecar.read_text())
     sidecar.write_text(json.dumps(about | {"network": "contact"}))
     with pytest.raises(WearcapError, match="a contact network"):
-        load_exported_echo(report.path)
+        load_exported_echo(path)
     sidecar.write_text(json.dumps(about))
     kept = encoder.read_bytes()
     encoder.write_bytes(kept[:-4] + b"\0\1\2\3")
     with pytest.raises(WearcapError, match="belongs to another"):
-        load_exported_echo(report.path)
+        load_exported_echo(path)
     encoder.unlink()
     with pytest.raises(WearcapError, match=r"net\.objects\.safetensors: a part of the exported model is missing"):  # fmt: skip
-        load_exported_echo(report.path)
+        load_exported_echo(path)
     encoder.write_bytes(kept)
     sidecar.unlink()
     with pytest.raises(WearcapError, match="no such sidecar"):
-        load_exported_echo(report.path)
+        load_exported_echo(path)
 
 
 def test_other_schedules_are_refused(tmp_path):

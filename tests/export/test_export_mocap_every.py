@@ -1,7 +1,9 @@
 """MocapEvery's network leaves the house: the same motion from the file, and files that do not belong are refused."""
 
 import json
+import shutil
 import sys
+from pathlib import Path
 from subprocess import run
 
 import pytest
@@ -13,22 +15,30 @@ from wearcap.export.mocap_every import export_mocap_every, load_exported_mocap_e
 from wearcap.recording.store import RecordingFile, save_recording
 
 
+@pytest.fixture(scope="module")
+def exports(tmp_path_factory):
+    """What is told of a pipeline's file in either format."""
+    folder, formats = tmp_path_factory.mktemp("mocap_every"), ("onnx", "pt2")
+    return {
+        format: export_mocap_every(drawn_pipeline(), folder / format / f"net.{format}", format)
+        for format in formats
+    }
+
+
 @pytest.mark.parametrize("format", ["onnx", "pt2"])
-def test_the_file_says_what_the_network_says(tmp_path, format):
-    pipeline, recording = drawn_pipeline(), watched_walk()
-    report = export_mocap_every(pipeline, tmp_path / f"net.{format}", format)
+def test_the_file_says_what_the_network_says(exports, format):
+    pipeline, recording, report = drawn_pipeline(), watched_walk(), exports[format]
     assert report.max_abs_error < 1e-4
     motion = load_exported_mocap_every(report.path)(recording)
     torch.testing.assert_close(motion.T_world_joint.t, pipeline(recording).T_world_joint.t, atol=1e-4, rtol=0)
-    about = json.loads((tmp_path / "net.json").read_text())
+    about = json.loads(Path(report.path).with_suffix(".json").read_text())
     assert about["features"]["frame"] == "heading"
     assert about["window"] == 16
 
 
-def test_it_runs_without_lightning_and_hydra(tmp_path):
+def test_it_runs_without_lightning_and_hydra(exports, tmp_path):
     pytest.importorskip("onnxruntime")
     recording = watched_walk()
-    export_mocap_every(drawn_pipeline(), tmp_path / "net.onnx", "onnx")
     save_recording(recording, tmp_path / "walk.safetensors")
     program = (
         "import sys; from wearcap.export.mocap_every import main; main(sys.argv[1:]); "
@@ -39,7 +49,7 @@ def test_it_runs_without_lightning_and_hydra(tmp_path):
             sys.executable,
             "-c",
             program,
-            tmp_path / "net.onnx",
+            exports["onnx"].path,
             tmp_path / "walk.safetensors",
             tmp_path / "out.safetensors",
         ],
@@ -50,9 +60,9 @@ def test_it_runs_without_lightning_and_hydra(tmp_path):
     assert len(motion) == len(recording.head.timestamps)
 
 
-def test_a_sidecar_of_another_network_is_refused(tmp_path):
-    report = export_mocap_every(drawn_pipeline(), tmp_path / "net.pt2", "pt2")
+def test_a_sidecar_of_another_network_is_refused(exports, tmp_path):
+    own = shutil.copytree(Path(exports["pt2"].path).parent, tmp_path, dirs_exist_ok=True)
     about = json.loads((tmp_path / "net.json").read_text())
     (tmp_path / "net.json").write_text(json.dumps(about | {"network": "contact"}))
     with pytest.raises(WearcapError):
-        load_exported_mocap_every(report.path)
+        load_exported_mocap_every(own / "net.pt2")

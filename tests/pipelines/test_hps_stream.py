@@ -52,10 +52,26 @@ def root_error_cm(motions: list, recording: Recording) -> torch.Tensor:
     )
 
 
-def test_every_frame_comes_once_and_in_order_nearly_as_good_as_offline():
-    recording, scan = hps_recording(seconds=20.0), Scan(floor_points())
-    online = list(follow(hps(), pieces(recording), scan, settings=SETTINGS))
-    offline = hps()(recording, scan)
+@pytest.fixture(scope="module")
+def streamed():
+    """A recording, what comes of it piece by piece, and how much of suit and camera was kept after each piece."""
+    recording, kept = hps_recording(seconds=20.0), []
+    push = HpsStream.push
+
+    def watched(self, *args):
+        done = push(self, *args)
+        kept.append((len(self.suit), len(self.seen.timestamps)))
+        return done
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(HpsStream, "push", watched)
+        online = list(follow(hps(), pieces(recording), Scan(floor_points()), settings=SETTINGS))
+    return recording, online, kept
+
+
+def test_every_frame_comes_once_and_in_order_nearly_as_good_as_offline(streamed):
+    recording, online, _ = streamed
+    offline = hps()(recording, Scan(floor_points()))
     assert sum(map(len, online)) == len(offline)
     assert len(online) > 10
     late = slice(120, None)
@@ -86,19 +102,8 @@ def test_a_camera_that_falls_silent_for_longer_than_a_window_is_bridged_too():
     assert error.max() < 60.0  # the suit alone: 30 cm off by then, and turned by 3°
 
 
-def test_no_more_than_a_window_is_kept(monkeypatch):
-    from wearcap.systems.hps import stream as hps_stream
-
-    kept = []
-    push = hps_stream.HpsStream.push
-
-    def watched(self, *args):
-        done = push(self, *args)
-        kept.append((len(self.suit), len(self.seen.timestamps)))
-        return done
-
-    monkeypatch.setattr(hps_stream.HpsStream, "push", watched)
-    list(follow(hps(), pieces(hps_recording(seconds=20.0)), Scan(floor_points()), settings=SETTINGS))
+def test_no_more_than_a_window_is_kept(streamed):
+    _, _, kept = streamed
     most = SETTINGS.window_s + SETTINGS.lag_s + 1.1
     assert max(suit for suit, _ in kept) <= most * 60
     assert max(seen for _, seen in kept) <= most * 30

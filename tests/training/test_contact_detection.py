@@ -19,6 +19,8 @@ from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import RecordingStore
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
+
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("contact_*.yaml"))
 
 
@@ -106,21 +108,34 @@ def test_resumed_equals_straight_through(data, tmp_path):
     assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
 
 
+FORMATS = ("onnx", "pt2")
+RUN = """
+import sys
+from wearcap.export.contact_runner import main
+
+recording, *exported = sys.argv[1:]
+for model in exported:
+    main([model, recording, model + ".csv"])
+assert not {"lightning", "hydra", "omegaconf"} & set(sys.modules)
+"""
+
+
+@pytest.fixture(scope="module")
+def tables(learned, data, tmp_path_factory) -> dict[str, Path]:
+    """What the exported file of each format tells of a recording, in a process without Lightning and Hydra."""
+    folder, source = tmp_path_factory.mktemp("exported"), RecordingStore.open(data).path_of("b3")
+    models = {format: folder / format / f"contact.{format}" for format in FORMATS}
+    for format, model in models.items():
+        export.main([f"checkpoint={learned}", f"format={format}", f"output={model}", f"hydra.run.dir={folder}/x"])  # fmt: skip
+        assert json.loads(model.with_suffix(".json").read_text())["model"]["max_abs_error"] < 1e-5
+    subprocess.run([sys.executable, "-c", RUN, source, *models.values()], check=True)
+    return {format: Path(f"{model}.csv") for format, model in models.items()}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("format", ["onnx", "pt2"])
-def test_the_export_runs_on_a_recording_without_lightning(learned, data, tmp_path, format):
-    model, table = tmp_path / f"contact.{format}", tmp_path / "contact.csv"
-    export.main(
-        [f"checkpoint={learned}", f"format={format}", f"output={model}", f"hydra.run.dir={tmp_path}/x"]
-    )
-    assert json.loads(model.with_suffix(".json").read_text())["model"]["max_abs_error"] < 1e-5
-    program = (
-        "import sys; from wearcap.export.contact_runner import main; main(sys.argv[1:]); "
-        "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
-    )
-    source = RecordingStore.open(data).path_of("b3")
-    subprocess.run([sys.executable, "-c", program, model, source, table], check=True)
-    with open(table) as file:
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_export_runs_on_a_recording_without_lightning(learned, data, tables, format):
+    with open(tables[format]) as file:
         rows = list(csv.DictReader(file))
     suit = RecordingStore.open(data).load("b3").suit
     assert suit is not None

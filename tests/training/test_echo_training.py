@@ -26,6 +26,8 @@ from wearcap.systems.echo.training import EchoDiffusion
 from wearcap.systems.echo.training_windows import EchoDataset, EchoWindow
 from wearcap_testing import small_dataset
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
+
 EXPERIMENTS = sorted(
     path.stem
     for kind in ("echo", "bodiffusion")
@@ -163,7 +165,7 @@ def test_padding_counts_for_nothing(data):
 def test_every_term_is_finite_and_every_weight_is_learned(data, people, frame):
     torch.manual_seed(0)
     system = learner(frame=frame)
-    system.set_statistics(dataset(system.features, data, people), 100)
+    system.set_statistics(dataset(system.features, data, people), limit=100)
     terms = system.terms(batch(system.features, data, people))
     assert set(terms) == set(WEIGHTS)
     assert all(term.isfinite() for term in terms.values())
@@ -175,7 +177,7 @@ def test_every_term_is_finite_and_every_weight_is_learned(data, people, frame):
 
 def test_where_windows_move_vectors_share_one_scale(data):
     system = learner(frame="window")
-    system.set_statistics(dataset(system.features, data), 100)
+    system.set_statistics(dataset(system.features, data), limit=100)
     mean, scale = system.net.motion_normalizer.mean, system.net.motion_normalizer.scale
     first = system.net.sizes[0]
     for part in (slice(0, 3), slice(3, 9), slice(first, first + 3), slice(first + 3, first + 9)):
@@ -186,13 +188,13 @@ def test_where_windows_move_vectors_share_one_scale(data):
 
 def test_windows_and_model_must_be_of_the_same_features(data):
     with pytest.raises(WearcapError, match="windows of other features"):
-        learner(frame="world").set_statistics(dataset(small_features("own"), data), 100)
+        learner(frame="world").set_statistics(dataset(small_features("own"), data), limit=100)
 
 
 def test_one_batch_is_learned(data, people):
     torch.manual_seed(0)
     system = learner()
-    system.set_statistics(dataset(system.features, data, people), 100)
+    system.set_statistics(dataset(system.features, data, people), limit=100)
     windows = batch(system.features, data, people, count=4)
     optimizer, losses = torch.optim.AdamW(system.parameters(), 5e-3), []
     for _ in range(50):
@@ -258,7 +260,7 @@ def test_with_the_encoder_it_trains_is_evaluated_and_captures(data, people, tmp_
     scores = json.loads((tmp_path / "table.json").read_text())["methods"]["wearcap"]
     assert {"mpjpe_mm", "v2v_cm", "center_cm", "rotation_deg", "touch_f1"} <= set(scores)
     capture.main([
-        *common, f"recording={data}/c2", "video=false", "body=false", f"output={tmp_path}/c", f"hydra.run.dir={tmp_path}/c",
+        *common, "pipeline.runtime=eager", f"recording={data}/c2", "video=false", "body=false", f"output={tmp_path}/c", f"hydra.run.dir={tmp_path}/c",
     ])  # fmt: skip
     motion = read_motion(tmp_path / "c" / "motion.npz")
     assert len(motion) == len(carrying(2.0).motion)

@@ -17,6 +17,8 @@ from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
 from wearcap_testing import recording_of, swaying_motion
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
+
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("hmd2*.yaml"))
 SIZE = 64
 

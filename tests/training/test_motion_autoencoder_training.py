@@ -14,6 +14,8 @@ from wearcap.errors import WearcapError
 from wearcap.training.motion_autoencoder import MotionEncoding
 from wearcap_testing import small_dataset
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
+
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:

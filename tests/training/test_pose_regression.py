@@ -8,6 +8,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from torch import nn
+from wearcap.models.pose_regressor import PoseRegressor
 
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import evaluate, train
@@ -16,10 +17,11 @@ from wearcap.cli.load import load_system
 from wearcap.data.statistics import collate
 from wearcap.data.windows import Source, WindowDataset
 from wearcap.errors import WearcapError
-from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, encode_pose
 from wearcap.systems.hmd2.pose_regressor.training import PoseRegression
 from wearcap_testing import small_dataset
+
+pytestmark = pytest.mark.usefixtures("few_statistics")
 
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 HANDS = ("head", "left_wrist", "right_wrist")
@@ -96,7 +98,9 @@ def test_it_learns_and_hands_help(data):
     for points in (("head",), HANDS):
         torch.manual_seed(0)
         module, windows = system(points), batch(data, mirror=True)
-        module.set_statistics(WindowDataset([Source(str(data))], "train", window=60, stride=30, fps=60.0), 16)
+        module.set_statistics(
+            WindowDataset([Source(str(data))], "train", window=60, stride=30, fps=60.0), limit=16
+        )
         optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
         before = module.eval().terms(windows)["joints"].item()
         for _ in range(40):

@@ -150,7 +150,7 @@ def test_a_sweep_of_two_jobs_runs(data, tmp_path):
     script = Path(__file__).parents[2] / "train.py"
     subprocess.run(
         [sys.executable, script, "-m", *command, f"hydra.sweep.dir={tmp_path}/sweep", "seed=0,1",
-         "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], check=True, cwd=tmp_path,
+         "callbacks.capture=null", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], check=True, cwd=tmp_path,
     )  # fmt: skip
     trained = [losses(tmp_path / "sweep" / job) for job in ("0", "1")]
     assert len(trained[0]) == len(trained[1]) == 4

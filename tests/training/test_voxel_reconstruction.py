@@ -13,6 +13,8 @@ from wearcap.data.place_codes import PlaceCodes
 from wearcap.recording import PointCloud, RecordingStore
 from wearcap_testing import recording_of, swaying_motion
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
+
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("voxel_autoencoder*.yaml"))
 
 

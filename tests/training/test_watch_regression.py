@@ -25,6 +25,8 @@ from wearcap.systems.mocap_every.training import WatchRegression
 from wearcap.systems.mocap_every.training_windows import WatchDataset
 from wearcap_testing import small_dataset
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
+
 EXPERIMENTS = (
     "mocap_every", "mocap_every_document", "mocap_every_one_stage", "mocap_every_neither", "mocap_every_hands",
     "mocap_every_avatarposer",
@@ -99,7 +101,7 @@ def test_both_stages_and_contacts_are_learned(data):
     torch.manual_seed(0)
     windows, learner = batch(data), system()
     learner.set_statistics(
-        WatchDataset([Source(str(data))], "train", window=40, stride=10, fps=60.0, every=2), 20
+        WatchDataset([Source(str(data))], "train", window=40, stride=10, fps=60.0, every=2), limit=20
     )
     terms = learner.terms(windows)
     sum(WEIGHTS[name] * term for name, term in terms.items()).backward()
@@ -199,7 +201,7 @@ def test_the_manifold_keeps_time_and_learns(data):
     torch.manual_seed(0)
     windows, learner = batch(data), manifold_system()
     learner.set_statistics(
-        WatchDataset([Source(str(data))], "train", window=40, stride=10, fps=60.0, every=2), 20
+        WatchDataset([Source(str(data))], "train", window=40, stride=10, fps=60.0, every=2), limit=20
     )
     assert learner.net.size == 5 + 6 * 23
     optimizer, losses = torch.optim.AdamW(learner.parameters(), 3e-3), []
