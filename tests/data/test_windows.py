@@ -11,7 +11,7 @@ from wearcap.data.windows import FixedSampler, SeededSampler, Source, WindowData
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.hmd2.features import HeadFeatures, feature_statistics
-from wearcap.tracking.anchor import hang
+from wearcap.tracking.anchor import anchor
 from wearcap_testing import small_dataset
 
 
@@ -60,7 +60,7 @@ def test_balance_shares_the_draws_among_recordings(store):
 def test_hanging_the_truth_from_the_head_gives_the_truth(store):
     window = dataset(store)[(0, 0)]
     true = forward_kinematics(xsens23(), window.R_parent_joint, torch.zeros(120, 3)).t
-    hung = hang(xsens23(), window.R_parent_joint, Rigid(window.R_world_head, window.t_world_head))[1].t
+    hung = anchor(xsens23(), window.R_parent_joint, Rigid(window.R_world_head, window.t_world_head))[1].t
     assert torch.allclose(hung - hung[:, :1], true - true[:, :1], atol=1e-5)
 
 
@@ -70,7 +70,7 @@ def test_the_mirror_swaps_sides_and_is_its_own_inverse(store):
     again = mirror_window(mirrored, skeleton)
     assert torch.allclose(again.R_parent_joint, window.R_parent_joint)
     flip = torch.tensor([1.0, -1.0, 1.0])
-    pose = lambda w: hang(skeleton, w.R_parent_joint, Rigid(w.R_world_head, w.t_world_head))[1].t  # noqa: E731
+    pose = lambda w: anchor(skeleton, w.R_parent_joint, Rigid(w.R_world_head, w.t_world_head))[1].t  # noqa: E731
     left, right = skeleton.index("left_wrist"), skeleton.index("right_wrist")
     assert torch.allclose(pose(mirrored)[:, left], pose(window)[:, right] * flip, atol=1e-5)
 

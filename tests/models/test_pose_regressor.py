@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from wearcap.models.pose_regressor import PoseRegressor
 
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
+from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, encode_pose, pasts
 from wearcap_testing import swaying_motion
 

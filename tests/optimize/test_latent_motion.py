@@ -18,8 +18,8 @@ from wearcap.systems.mocap_every.energy import (
     PlaceCue,
     PoseCue,
     Seen,
+    anchored_body,
     contact_slip,
-    hung_body,
     pixel_error,
     place_error,
     pose_error,
@@ -54,7 +54,7 @@ def thirty(frames: int = 160, seed: int = 0) -> Motion:
 def body_of(motion: Motion):
     head = motion.joint("head")
     one = Rigid(head.R[None], head.t[None])
-    return hung_body(SKELETON, motion.R_parent_joint[None], torch.ones(1, len(motion), 2), one), one
+    return anchored_body(SKELETON, motion.R_parent_joint[None], torch.ones(1, len(motion), 2), one), one
 
 
 def test_terms_are_what_they_are_named_after():

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from wearcap.models.pose_regressor import PoseRegressor
 
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import Pipeline
+from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, encode_pose
 from wearcap.systems.hmd2.pose_regressor.pipeline import PoseRegressorCapture
 from wearcap_testing import recording_of, swaying_motion

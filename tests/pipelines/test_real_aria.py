@@ -27,7 +27,7 @@ from wearcap.scene.voxels import VoxelGrid, VoxelMap, voxelize
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
-from wearcap.tracking.anchor import hang
+from wearcap.tracking.anchor import anchor
 from wearcap.viewer.head_path import draw_head_path
 from wearcap.viewer.picture import contact_sheet
 
@@ -131,7 +131,7 @@ def test_a_body_hung_from_the_real_head_beside_the_true_one(real_data):
     yaw = rotation.about_axis("z", rotation.yaw_of(T_world_head.R))
     R = torch.eye(3).repeat(len(yaw), len(skeleton), 1, 1)
     R[:, 0] = yaw
-    R, T_world_joint = hang(skeleton, R, T_world_head)
+    R, T_world_joint = anchor(skeleton, R, T_world_head)
     motion = Motion(head.timestamps, skeleton, R, T_world_joint.t[:, 0])
     errors = cue_errors_cm(motion, recording.cues)
     assert set(errors) == set(recording.cues), "every tracked joint has its like"

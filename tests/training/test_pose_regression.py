@@ -8,7 +8,6 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from torch import nn
-from wearcap.models.pose_regressor import PoseRegressor
 
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import evaluate, train
@@ -17,6 +16,7 @@ from wearcap.cli.load import load_system
 from wearcap.data.statistics import collate
 from wearcap.data.windows import Source, WindowDataset
 from wearcap.errors import WearcapError
+from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, encode_pose
 from wearcap.systems.hmd2.pose_regressor.training import PoseRegression
 from wearcap_testing import small_dataset

@@ -110,7 +110,7 @@ class WatchDataset(Dataset):
             return window
         window = scaled(window, self.variation.scale ** (2 * larger - 1))
         window = self._disturbed(turned(window, 2 * torch.pi * turn), random)
-        return mirror_average(window, whole.skeleton) if mirrored < 0.5 else window
+        return mirror_window(window, whole.skeleton) if mirrored < 0.5 else window
 
     def _disturbed(self, window: WatchWindow, random: torch.Generator) -> WatchWindow:
         wrong = self.variation
@@ -195,7 +195,7 @@ def scaled(window: WatchWindow, factor: float) -> WatchWindow:
     )  # fmt: skip
 
 
-def mirror_average(window: WatchWindow, skeleton: Skeleton) -> WatchWindow:
+def mirror_window(window: WatchWindow, skeleton: Skeleton) -> WatchWindow:
     """The same happening seen in a mirror that swaps left and right."""
     flip = torch.tensor(MIRROR)
     twins = joint_twins(skeleton)
