@@ -82,7 +82,7 @@ def stand(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 def look_around(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Stand and look far about, the trunk turning with the head."""
     start, stop = plan.time, plan.time + rng.uniform(4.0, 9.0)
-    look_about(plan, start, stop, rng, spread=0.75, rest=1.2)
+    look_about(plan, start, stop, rng, spread=0.75, pause_s=1.2)
     time = start + 0.4
     while time < stop - 2.0:
         plan.lean.move(time, time + 0.9, (0.0, 0.0, np.clip(rng.normal(0.0, 0.22), -0.5, 0.5)))
@@ -109,17 +109,17 @@ def walk(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 @activity("run", weight=1.0, outdoors=3.0)
 def run(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Run a way of at least 5 m without a step; False where none is found."""
-    path = _way_to_run(plan, world, rng)
+    path = _path_to_run(plan, world, rng)
     if path is None:
         return False
     start = plan.time
     walk_along(plan, path, rng, float(rng.uniform(2.2, 3.2)), ())
-    look_about(plan, start + 1.0, plan.time, rng, spread=0.12, rest=2.2)
+    look_about(plan, start + 1.0, plan.time, rng, spread=0.12, pause_s=2.2)
     plan.time += rng.uniform(0.25, 0.6)
     return True
 
 
-def _way_to_run(plan: Plan, world: World, rng: np.random.Generator, tries: int = 4) -> np.ndarray | None:
+def _path_to_run(plan: Plan, world: World, rng: np.random.Generator, tries: int = 4) -> np.ndarray | None:
     for _ in range(tries):
         goal = _free_point(world, rng)
         if np.linalg.norm(goal[:2] - plan.position[:2]) < 3.0:
@@ -150,7 +150,7 @@ def follow(
     if path_length(path) > 0.25:
         speed = plan.style.speed * float(np.exp(rng.normal(0.0, 0.13)))
         walk_along(plan, path, rng, speed, world.flights)
-        look_about(plan, start + 1.0, plan.time, rng, spread=0.22, rest=3.0)
+        look_about(plan, start + 1.0, plan.time, rng, spread=0.22, pause_s=3.0)
     if heading is not None and abs(wrap(heading - plan.heading)) > 0.2:
         turn_to(plan, heading, rng)
     plan.time += rng.uniform(0.25, 0.6)

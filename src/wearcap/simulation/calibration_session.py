@@ -110,7 +110,7 @@ def simulate_calibration(
     T_world_cam = _camera_path(R_head_cam, distances, height, end, _FINER * camera_fps, noise, rng)
     slam = _seen(T_world_cam[::_FINER], scale, R_world_slam, t_world_slam, camera_fps, noise, rng)
     upright = (T_world_cam.timestamps >= STANDING[0]) & (T_world_cam.timestamps <= STANDING[1])
-    points = (_floor_and_things(rng) - t_world_slam) @ R_world_slam / scale
+    points = (_floor_and_objects(rng) - t_world_slam) @ R_world_slam / scale
     return CalibrationSession(
         {joint: made[0] for joint, made in watches.items()}, slam, _head_imu(T_world_cam, watch_fps, noise, rng),
         points.float(), torch.from_numpy(np.round(tops * camera_fps) / camera_fps), distances, height,
@@ -307,7 +307,7 @@ def _head_imu(T: Trajectory, fps: float, noise: SessionNoise, rng: np.random.Gen
     return ImuStream(torch.from_numpy(at), "head", acc_imu=torch.from_numpy(felt).float())
 
 
-def _floor_and_things(rng: np.random.Generator) -> Float64[Tensor, "point 3"]:
+def _floor_and_objects(rng: np.random.Generator) -> Float64[Tensor, "point 3"]:
     """Points of a semi-dense cloud (m, world): floor, a table, walls, and some that are wrong."""
     low, high = np.array([-8.0, -8.0]), np.array([8.0, 12.0])
     floor = np.concatenate([rng.uniform(low, high, (3000, 2)), np.zeros((3000, 1))], 1)

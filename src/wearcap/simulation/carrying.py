@@ -13,7 +13,7 @@ from wearcap.simulation.grips import Grip, GripPlace
 from wearcap.simulation.handling import Handling, handling_of
 from wearcap.simulation.plan import SIDES, Plan, wrap
 from wearcap.simulation.shuffling import step_to
-from wearcap.simulation.things import Thing
+from wearcap.simulation.things import Movable
 from wearcap.simulation.track import ease
 
 BEFORE_CHEST_M = (0.17, 0.22)
@@ -30,7 +30,7 @@ DEEP = 0.30
 class Errand:
     """How somebody will take a thing from one place to another, decided but not yet on the plan."""
 
-    thing: Thing
+    movable: Movable
     start: Float[np.ndarray, "4"]
     """Where it stands: x, y (m), heading (rad), height of its underside (m)."""
     stop: Float[np.ndarray, "4"]
@@ -88,7 +88,7 @@ class Lifted:
 
 def carry_options(
     plan: Plan,
-    thing: Thing,
+    movable: Movable,
     start: Float[np.ndarray, "4"],
     stop: Float[np.ndarray, "4"],
     rng: np.random.Generator,
@@ -99,10 +99,10 @@ def carry_options(
     the second and calls `put_down`. The box may end turned by quarters against `stop`, as `Carry.stop` says.
     """
     start, stop = np.asarray(start, np.float64), np.asarray(stop, np.float64)
-    for index in rng.permutation(len(thing.sides)):
-        left, right, facing = thing.sides[index]
+    for index in rng.permutation(len(movable.sides)):
+        left, right, facing = movable.sides[index]
         ahead = np.array([np.cos(facing), np.sin(facing), 0.0])
-        deep = float(np.abs(ahead[:2]) @ np.array(thing.half_size))
+        deep = float(np.abs(ahead[:2]) @ np.array(movable.half_size))
         nearer = rng.uniform(0.25, 0.7) * deep * ahead
         places = {
             side: GripPlace(_shifted(place.point, -nearer), place.normal, place.fingers)
@@ -111,9 +111,9 @@ def carry_options(
         below = float(rng.uniform(*BELOW_CHEST)) * plan.hip_height
         chest = np.array([deep + rng.uniform(*BEFORE_CHEST_M), below + left.point[2]])
         away = (
-            plan.sole[1] + 0.08 + 0.2 * max(thing.height - 0.25, 0.0) + deep + float(rng.uniform(0.0, 0.06))
+            plan.sole[1] + 0.08 + 0.2 * max(movable.height - 0.25, 0.0) + deep + float(rng.uniform(0.0, 0.06))
         )
-        yield Carry(thing, start, stop, places, facing, away, chest)
+        yield Carry(movable, start, stop, places, facing, away, chest)
 
 
 def _shifted(point: tuple[float, float, float], by: np.ndarray) -> tuple[float, float, float]:
@@ -133,7 +133,7 @@ def lift(plan: Plan, choice: Carry, rng: np.random.Generator) -> Lifted:
     bow(plan, start, touch, bend, lean)
     spread(plan, (start, start + 0.45 * down), (touch, begin + rise))
     plan.gaze_point.move(
-        start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.thing.height)
+        start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.movable.height)
     )
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(begin + 0.3 * rise, begin + rise, 0.0)
@@ -157,7 +157,7 @@ def put_down(plan: Plan, lifted: Lifted, rng: np.random.Generator) -> Handling:
     plan.gaze_point.move(start, start, np.append(choice.stop[:2], choice.stop[3]))
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(release, release + 0.6, 0.0)
-    moves = _Way(choice, (lifted.lift_s, lifted.lifted_s), (start, start + down))
+    moves = _CarriedPath(choice, (lifted.lift_s, lifted.lifted_s), (start, start + down))
     grips = []
     for side in SIDES:
         late = float(rng.uniform(0.0, 0.12)) if rng.random() < 0.5 else 0.0
@@ -169,7 +169,7 @@ def put_down(plan: Plan, lifted: Lifted, rng: np.random.Generator) -> Handling:
         plan.grip(side, grip)
         grips.append((side, grip))
     plan.time = release + rise + float(rng.uniform(0.0, 0.3))
-    return handling_of(choice.thing.name, "sliding", moves, grips)
+    return handling_of(choice.movable.name, "sliding", moves, grips)
 
 
 def arrive(plan: Plan, place: Float[np.ndarray, "3"], rng: np.random.Generator) -> None:
@@ -207,7 +207,7 @@ def spread(plan: Plan, out: tuple[float, float], back: tuple[float, float]) -> N
 
 
 @dataclass(frozen=True)
-class _Way:
+class _CarriedPath:
     """A carried box's pose over time: where it stands, before the chest, and where it will stand."""
 
     choice: Carry

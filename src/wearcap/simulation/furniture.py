@@ -171,10 +171,10 @@ def counter(rng: np.random.Generator) -> Piece:
         Part((-0.14, 0, 1.75), (0.34, width, 0.65), color, 5.0),
     ]
     parts += [Part((0.27, y, 0.78), (0.02, 0.14, 0.02), (0.7, 0.7, 0.7), PATTERNED) for y in np.arange(-width / 2 + 0.3, width / 2, 0.6)]  # fmt: skip
-    things = [_prop(rng, (rng.uniform(-0.15, 0.2), y, 0.91)) for y in _spread(rng, width - 0.3, 5)]
-    reaches = [(p.center[0], p.center[1], 0.91 + p.size[2] * 0.7) for p in things]
+    props = [_prop(rng, (rng.uniform(-0.15, 0.2), y, 0.91)) for y in _spread(rng, width - 0.3, 5)]
+    reaches = [(p.center[0], p.center[1], 0.91 + p.size[2] * 0.7) for p in props]
     reaches += [(0.05, y, 1.5) for y in _spread(rng, width - 0.6, 2)]
-    return Piece("counter", (0.62, width), (0.0, 2.08), (*parts, *things), reaches=tuple(reaches))
+    return Piece("counter", (0.62, width), (0.0, 2.08), (*parts, *props), reaches=tuple(reaches))
 
 
 def plant(rng: np.random.Generator) -> Piece:

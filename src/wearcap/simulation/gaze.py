@@ -18,20 +18,20 @@ def look_about(
     stop_s: float,
     rng: np.random.Generator,
     spread: float = 0.5,
-    rest: float = 1.6,
+    pause_s: float = 1.6,
 ) -> None:
     """Head turns of 10 to 60 degrees every 1 to 4 s between two times, back to the front at the end.
 
     `spread` is the deviation of the yaw (rad), `rest` the mean pause between turns (s).
     """
-    time = start_s + rng.uniform(0.2, 1.0) * rest
+    time = start_s + rng.uniform(0.2, 1.0) * pause_s
     pitch = plan.style.head_pitch
     while time < stop_s - 1.2:
         yaw, down = rng.normal(0.0, spread), pitch + rng.normal(0.0, 0.35 * spread)
         if rng.random() < 0.3:
             yaw, down = 0.15 * yaw, pitch
         time = turn_head(plan, time, (np.clip(yaw, -1.2, 1.2), np.clip(down, -0.5, 0.8)))
-        time += rest * (0.35 + rng.exponential(0.75))
+        time += pause_s * (0.35 + rng.exponential(0.75))
     turn_head(plan, max(stop_s - 0.6, start_s), (0.0, pitch))
 
 

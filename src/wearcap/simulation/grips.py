@@ -116,10 +116,10 @@ def drawn_grip(
     return Grip(place, moves, touch_s, release_s, there, back, float(rng.uniform(0.04, 0.09)))
 
 
-def still(T_world_thing: Rigid) -> Moves:
+def still(T_world_object: Rigid) -> Moves:
     """Of a thing that stays where it is."""
     return lambda times, chest: Rigid(
-        T_world_thing.R.double().expand(len(times), 3, 3), T_world_thing.t.double().expand(len(times), 3)
+        T_world_object.R.double().expand(len(times), 3, 3), T_world_object.t.double().expand(len(times), 3)
     )
 
 

@@ -113,7 +113,7 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
     side = "left" if aside > 0 else "right"
     hand, arm = plan.hands[side], plan.arm_length
     shoulder = 1.52 * plan.hip_height
-    thing, point = point, _wrist_before(plan, point, shoulder, LEFT_SIGN[side] * 0.17 * across)
+    touched, point = point, _wrist_before(plan, point, shoulder, LEFT_SIGN[side] * 0.17 * across)
     offset = point[:2] - plan.position[:2]
     low = shoulder - (point[2] - plan.position[2])
     far = float(offset @ ahead)
@@ -128,7 +128,7 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
     plan.crouch.move(start, start + out, crouch)
     hand.goal.move(start, start, point)
     hand.goal_weight.move(start, start + out, 1.0)
-    plan.gaze_point.move(start, start, thing)
+    plan.gaze_point.move(start, start, touched)
     plan.gaze_weight.move(start, start + 0.45, 1.0)
     leave = start + out + hold_s
     plan.lean.move(leave, leave + back, 0.0)
@@ -141,5 +141,5 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
 def _wrist_before(plan: Plan, point: np.ndarray, shoulder: float, aside: np.ndarray) -> np.ndarray:
     """Where the wrist is when the fingers of a straight hand touch a point (m)."""
     fingers = float(np.linalg.norm(plan.skeleton.sites["left_fingertip"].t_joint_site))
-    way = point - plan.position - np.append(aside, shoulder)
-    return point - FINGERS_USED * fingers * way / np.linalg.norm(way)
+    arm_vector = point - plan.position - np.append(aside, shoulder)
+    return point - FINGERS_USED * fingers * arm_vector / np.linalg.norm(arm_vector)

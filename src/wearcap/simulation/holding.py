@@ -18,7 +18,7 @@ from wearcap.simulation.handling import Handling, handling_of
 from wearcap.simulation.hands import ON_THIGHS, hold
 from wearcap.simulation.outline import turn
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan
-from wearcap.simulation.things import Thing
+from wearcap.simulation.things import Movable
 from wearcap.simulation.track import Track, ease
 
 BESIDE = ("suitcase", "backpack")
@@ -73,16 +73,16 @@ class Take(Errand):
     @property
     def long(self) -> bool:
         """Whether it is a stick whose other end is held ahead."""
-        return self.thing.category == "tool" and max(self.thing.half_size) > LONG_M
+        return self.movable.category == "tool" and max(self.movable.half_size) > LONG_M
 
     @property
     def beside(self) -> bool:
-        return self.side is not None and self.thing.category in BESIDE
+        return self.side is not None and self.movable.category in BESIDE
 
     @cached_property
     def extent(self) -> Float[np.ndarray, "2"]:
         """Half its outline ahead and across, as the holder sees it (m)."""
-        return np.abs(turn(self.facing).T) @ np.array(self.thing.half_size)
+        return np.abs(turn(self.facing).T) @ np.array(self.movable.half_size)
 
     def neutral(self) -> Float[np.ndarray, "3 3"]:
         """Rotation against the holder's heading while the keys' angles are zero: upright, or, of what is taken from
@@ -130,14 +130,14 @@ class Held:
         """Bring it to a place, as shares of the arm's reach, and angles (rad) between two times."""
         self.keys.move(start_s, stop_s, np.array([*(self.reach * np.array(place)), pitch, yaw, roll]))
 
-    def rest(self, start_s: float, stop_s: float) -> None:
+    def return_to_carry(self, start_s: float, stop_s: float) -> None:
         """Back to how it is carried."""
         self.keys.move(start_s, stop_s, self.carry)
 
 
 def take_options(
     plan: Plan,
-    thing: Thing,
+    movable: Movable,
     start: Float[np.ndarray, "4"],
     stop: Float[np.ndarray, "4"],
     rng: np.random.Generator,
@@ -148,13 +148,13 @@ def take_options(
     to the second and calls `put_down`.
     """
     start, stop = np.asarray(start, np.float64), np.asarray(stop, np.float64)
-    ways = [({grasp.side: grasp.place}, grasp.facing) for grasp in thing.grasps]
-    ways += [(dict(zip(SIDES, (left, right))), facing) for left, right, facing in thing.sides]
-    both = [len(places) == 2 for places, _ in ways]
-    rank = rng.exponential(size=len(ways)) * np.where(both, sum(both), len(ways) - sum(both))
+    variants = [({grasp.side: grasp.place}, grasp.facing) for grasp in movable.grasps]
+    variants += [(dict(zip(SIDES, (left, right))), facing) for left, right, facing in movable.sides]
+    both = [len(places) == 2 for places, _ in variants]
+    rank = rng.exponential(size=len(variants)) * np.where(both, sum(both), len(variants) - sum(both))
     for index in np.argsort(rank):  # one hand and both come first equally often
-        places, facing = ways[index]
-        choice = Take(thing, start, stop, places, float(facing), np.zeros(2))
+        places, facing = variants[index]
+        choice = Take(movable, start, stop, places, float(facing), np.zeros(2))
         palm = turn(-facing) @ choice.middle[:2]
         ahead = plan.sole[1] + 0.07 + choice.extent[0] + float(rng.uniform(0.0, 0.08))
         if choice.beside:
@@ -164,7 +164,7 @@ def take_options(
             local = np.array([ahead + 0.02, 0.0])
         else:
             local = np.array([ahead, choice.sign * float(rng.uniform(0.08, 0.2)) - palm[1]])
-        yield Take(thing, start, stop, places, float(facing), local)
+        yield Take(movable, start, stop, places, float(facing), local)
 
 
 def take_up(plan: Plan, choice: Take, rng: np.random.Generator) -> Held:
@@ -180,7 +180,7 @@ def take_up(plan: Plan, choice: Take, rng: np.random.Generator) -> Held:
     bow(plan, begin, begin + rise, 0.0, float(rng.normal(-0.03, 0.03)), _counter(choice))
     _other_hand(plan, choice, bend, (start, start + 0.5 * down), (touch, begin + rise), rng)
     plan.gaze_point.move(
-        start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.thing.height)
+        start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.movable.height)
     )
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(begin + 0.3 * rise, begin + rise, 0.0)
@@ -210,7 +210,7 @@ def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
     plan.gaze_point.move(start, start, np.append(choice.stop[:2], choice.stop[3]))
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(release, release + 0.6, 0.0)
-    moves = _Way(held, strides(plan, held, start), (held.lift_s, held.lifted_s), (start, start + down))
+    moves = _HeldPath(held, strides(plan, held, start), (held.lift_s, held.lifted_s), (start, start + down))
     grips = []
     for side, place in choice.places.items():
         grip = Grip(
@@ -220,7 +220,7 @@ def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
         plan.grip(side, grip)
         grips.append((side, grip))
     plan.time = release + rise + float(rng.uniform(0.0, 0.3))
-    return handling_of(choice.thing.name, "sliding", moves, grips)
+    return handling_of(choice.movable.name, "sliding", moves, grips)
 
 
 def shoulder_of(plan: Plan) -> Float[np.ndarray, "3"]:
@@ -308,7 +308,7 @@ def strides(plan: Plan, held: Held, until_s: float) -> Track:
 
 
 @dataclass(frozen=True)
-class _Way:
+class _HeldPath:
     """A held thing's pose over time: where it stands, in the hands, and where it will stand."""
 
     held: Held
@@ -371,7 +371,7 @@ class _Way:
 
     @cached_property
     def _corners(self) -> Float[Tensor, "corner 3"]:
-        vertices = self.held.choice.thing.object.mesh.vertices.astype(np.float64)
+        vertices = self.held.choice.movable.object.mesh.vertices.astype(np.float64)
         return torch.from_numpy(vertices[scipy.spatial.ConvexHull(vertices).vertices])
 
 

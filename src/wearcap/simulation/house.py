@@ -16,7 +16,7 @@ from wearcap.simulation.handling import Handling, interactions_of, object_motion
 from wearcap.simulation.interactive_flat import InteractiveFlat, obstacle
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.plan import Plan
-from wearcap.simulation.things import Thing
+from wearcap.simulation.things import Movable
 from wearcap.simulation.world import World, WorldObject
 
 Seem = Callable[[Plan, dict[str, GripPlace], Rigid, float, np.random.Generator], None]
@@ -37,15 +37,15 @@ class House:
 
     def __post_init__(self):
         self.values = {item.name: 0.0 for item in self.flat.openables}
-        self.poses = {item.name: item.object.T_world_object.to(torch.float64) for item in self.flat.things}
+        self.poses = {item.name: item.object.T_world_object.to(torch.float64) for item in self.flat.movables}
 
-    def pose(self, item: Thing | Openable) -> Rigid:
+    def pose(self, item: Movable | Openable) -> Rigid:
         """Where something is at the end of the plan."""
         return item.pose(self.values[item.name]) if isinstance(item, Openable) else self.poses[item.name]
 
     def obstacles(self, without: tuple[str, ...] = ()) -> tuple[WorldObject, ...]:
         """Everything that can be moved, where it is now."""
-        items = (*self.flat.things, *self.flat.openables)
+        items = (*self.flat.movables, *self.flat.openables)
         return tuple(obstacle(item, self.pose(item)) for item in items if item.name not in without)
 
     def world(self, around: Float[np.ndarray, "3"], without: tuple[str, ...] = ()) -> World:
@@ -77,7 +77,7 @@ class House:
             item.name: object_motion(
                 item.object.T_world_object, [h for h in self.handlings if h.name == item.name], motion
             )
-            for item in (*self.flat.things, *self.flat.openables)
+            for item in (*self.flat.movables, *self.flat.openables)
         }
 
 

@@ -17,7 +17,7 @@ from wearcap.simulation.opening import operate
 from wearcap.simulation.outline import distance_to_convex
 from wearcap.simulation.plan import Plan
 from wearcap.simulation.rearranging import fetch, floor_place, rearrange, relocate
-from wearcap.simulation.things import Thing
+from wearcap.simulation.things import Movable
 from wearcap.simulation.wearer import TAIL_S, Wearer
 
 WEIGHTS = {
@@ -76,21 +76,21 @@ VARIED = Habits(
 
 
 def seem_to_handle(
-    plan: Plan, places: dict[str, GripPlace], T_world_thing: Rigid, height_m: float, rng: np.random.Generator
+    plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, height_m: float, rng: np.random.Generator
 ) -> None:
     """One of the things that look like handling, before something of a height."""
-    low = float(T_world_thing.t[2]) + height_m < 0.95
+    low = float(T_world_object.t[2]) + height_m < 0.95
     chance = rng.random()
     if low and chance < 0.18:
-        bend_over(plan, T_world_thing, height_m, rng)
+        bend_over(plan, T_world_object, height_m, rng)
     elif low and chance < 0.32:
-        squat_by(plan, T_world_thing, height_m, rng)
+        squat_by(plan, T_world_object, height_m, rng)
     elif chance < 0.45:
-        gesture_at(plan, T_world_thing, height_m, rng)
+        gesture_at(plan, T_world_object, height_m, rng)
     elif chance < 0.55:
         linger(plan, rng)
     else:
-        hover(plan, places, T_world_thing, rng)
+        hover(plan, places, T_world_object, rng)
 
 
 class Household:
@@ -105,7 +105,7 @@ class Household:
         self.plan = Plan(person.skeleton, person.style, position, heading, static.floor_height)
         self.plan.time = 0.3
         self.openables = {item.name: item for item in house.flat.openables}
-        self.things = {item.name: item for item in house.flat.things}
+        self.movables = {item.name: item for item in house.flat.movables}
         self.last: str | None = None
 
     def live(self, duration_s: float) -> None:
@@ -139,7 +139,7 @@ class Household:
         if chance > 1.0 - ROOM:
             return self.rearrange_room()
         for _ in range(TRIES):
-            if (done := self.use(self._drawn(self.openables | self.things))) != "stand":
+            if (done := self.use(self._drawn(self.openables | self.movables))) != "stand":
                 return done
         return "stand"
 
@@ -151,22 +151,22 @@ class Household:
         if not done:
             return "walk" if self.plan.time > start else "stand"
         self.last = name
-        verb = "move" if name in self.things else "turn"
-        return f"{verb} {(self.openables | self.things)[name].category}"
+        verb = "move" if name in self.movables else "turn"
+        return f"{verb} {(self.openables | self.movables)[name].category}"
 
     def _act(self, name: str) -> bool:
         seem = seem_to_handle if self.rng.random() < self.habits.seem_share else None
         if name in self.openables:
             return self.turn(self.openables[name], seem)
-        thing = self.things[name]
-        act = {"box": relocate, **dict.fromkeys(HANDHELD, fetch)}.get(thing.category, rearrange)
-        return act(self.plan, self.house, self.rng, thing, seem)
+        movable = self.movables[name]
+        act = {"box": relocate, **dict.fromkeys(HANDHELD, fetch)}.get(movable.category, rearrange)
+        return act(self.plan, self.house, self.rng, movable, seem)
 
     def rearrange_room(self) -> str:
         """Move several things near each other, one after another."""
-        start, first = self.plan.time, self._drawn(self.things)
+        start, first = self.plan.time, self._drawn(self.movables)
         middle = self.place_of(first)
-        away = {name: float(np.linalg.norm(self.place_of(name) - middle)) for name in self.things}
+        away = {name: float(np.linalg.norm(self.place_of(name) - middle)) for name in self.movables}
         names = sorted((name for name in away if away[name] < SAME_ROOM_M), key=lambda name: away[name])
         for name in names[: int(self.rng.integers(2, IN_ROOM + 1))]:
             self.use(name)
@@ -235,8 +235,8 @@ class Household:
     def place_of(self, name: str) -> Float[np.ndarray, "3"]:
         """Floor point at a thing, or before an openable's handle (m)."""
         floor = float(self.plan.position[2])
-        if name in self.things:
-            return np.append(floor_place(self.house, self.things[name])[:2], floor)
+        if name in self.movables:
+            return np.append(floor_place(self.house, self.movables[name])[:2], floor)
         item = self.openables[name]
         if item.category == "door":
             return self._beyond(item, self._side(item), 0.6)
@@ -244,7 +244,7 @@ class Household:
         out = -(item.pose(item.closed).R.numpy() @ np.array(item.handles[0].fingers))[:2]
         return np.append(place[:2] + 0.7 * out / np.linalg.norm(out), floor)
 
-    def _drawn(self, items: Mapping[str, Thing | Openable]) -> str:
+    def _drawn(self, items: Mapping[str, Movable | Openable]) -> str:
         """The name of something to use next, rather of what is near."""
         kinds = Counter(item.category for item in items.values())
         away = [np.linalg.norm(self.place_of(name)[:2] - self.plan.position[:2]) for name in items]
@@ -253,12 +253,12 @@ class Household:
         return str(self.rng.choice(list(items), p=weights / weights.sum()))
 
     def _kind(self, name: str | None) -> str:
-        return (self.openables | self.things)[name].category if name is not None else ""
+        return (self.openables | self.movables)[name].category if name is not None else ""
 
     def _weight(self, category: str) -> float:
         if not self.habits.even:
             return self.habits.weights[category]
-        items = self.openables | self.things
+        items = self.openables | self.movables
         spans = [h.stop_s - h.start_s for h in self.house.handlings if items[h.name].category == category]
         return self.habits.weights[category] / (EVEN_S + sum(spans))
 
@@ -272,14 +272,14 @@ class Household:
         """How far a point is before a door's plane, positive where the leaf opens to (m)."""
         pose = door.pose(door.closed)
         local = pose.R.numpy().T @ (np.array([*point[:2], 0.0]) - np.array([*pose.t[:2].tolist(), 0.0]))
-        return float(local[1]) * door.way
+        return float(local[1]) * door.opening_sign
 
     def _beyond(self, door: Openable, side: int, far_m: float = BEYOND_M) -> Float[np.ndarray, "3"]:
         """Floor point before a door's middle on a side (m)."""
         pose = door.pose(door.closed)
         width = float(door.outline[:, 0].max())
-        way = door.way if side == 0 else -door.way
-        point = pose.R.numpy() @ np.array([width / 2, way * far_m, 0.0]) + pose.t.numpy()
+        sign = door.opening_sign if side == 0 else -door.opening_sign
+        point = pose.R.numpy() @ np.array([width / 2, sign * far_m, 0.0]) + pose.t.numpy()
         return np.array([point[0], point[1], self.plan.position[2]])
 
     def _same_side(self, point: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"]) -> bool:
@@ -303,13 +303,13 @@ class Household:
         if not shut:
             return None
         world = self.house.world(self.plan.position, without=tuple(door.name for door in shut))
-        way = world.navigation.shortest(self.plan.position, goal, 1.0)
-        if way is None:
+        path = world.navigation.shortest(self.plan.position, goal, 1.0)
+        if path is None:
             return None
         first = {}
         for door in shut:
             gap = door.footprint(door.closed)
-            near = np.flatnonzero(distance_to_convex(way[:, :2], gap) < 0.12)
+            near = np.flatnonzero(distance_to_convex(path[:, :2], gap) < 0.12)
             if len(near):
                 first[door.name] = int(near[0])
         return self.openables[min(first, key=lambda name: first[name])] if first else None

@@ -74,9 +74,9 @@ def simulate_session(
     ACTIVITIES["stand"].act(plan, world, rng)
     plan.time = max(plan.time, duration + TAIL_S)
     simulated = perform(plan, world, rng, duration, fps)
-    way = simulated.motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1).cumsum(0).numpy()
+    path_so_far = simulated.motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1).cumsum(0).numpy()
     starts, stops, names = zip(*session.stretches)
-    travelled = np.interp(starts, simulated.motion.timestamps.numpy()[1:], way)
+    travelled = np.interp(starts, simulated.motion.timestamps.numpy()[1:], path_so_far)
     intervals = Intervals(
         torch.tensor(starts, dtype=torch.float64), torch.tensor(stops, dtype=torch.float64),
         torch.from_numpy(travelled).float(), names,
@@ -98,7 +98,7 @@ class _Session:
         self.travelled = 0.0
         self.stretches: list[tuple[float, float, str]] = []
         self.clap_times: list[float] = []
-        self._way_home = world.navigation.lengths_from(self.home)
+        self._length_home = world.navigation.lengths_from(self.home)
 
     def walk(self, goal: np.ndarray, heading: float | None = None) -> bool:
         path = self.world.plan_path(self.plan.position, goal, self.rng)
@@ -117,11 +117,11 @@ class _Session:
         while True:
             there = self.world.navigation.lengths_from(self.plan.position)
             left = until_m - self.travelled
-            fits = np.flatnonzero(free & (there > 2.5) & (there + self._way_home < left + 1.5))
+            fits = np.flatnonzero(free & (there > 2.5) & (there + self._length_home < left + 1.5))
             if not len(fits):
                 return
             # the last walk before home uses up what is left; others go anywhere
-            total = there[fits] + self._way_home[fits]
+            total = there[fits] + self._length_home[fits]
             last = fits[total > left - 3.0] if left < 1.6 * total.max() else fits
             goal = points[self.rng.choice(last if len(last) else fits)]
             if not self.walk(goal) or self.rng.random() < IDLE_SHARE:
@@ -197,16 +197,16 @@ class _Session:
         """Put both hands on the table, lean over it, and rise again."""
         plan, start = self.plan, self.plan.time
         across = np.array([-ahead[1], ahead[0]])
-        out, rest, back = 0.9, float(self.rng.uniform(1.2, 2.2)), 0.9
+        out, pause, back = 0.9, float(self.rng.uniform(1.2, 2.2)), 0.9
         for hand_side in SIDES:
             hand = plan.hands[hand_side]
             place = self.home[:2] + (self.spot.table_m + 0.06) * ahead + LEFT_SIGN[hand_side] * 0.22 * across
             height = self.home[2] + self.spot.table_z + 0.07
             hand.goal.move(start, start, np.append(place, height))
             hand.goal_weight.move(start, start + out, 1.0)
-            hand.goal_weight.move(start + out + rest, start + out + rest + back, 0.0)
+            hand.goal_weight.move(start + out + pause, start + out + pause + back, 0.0)
         plan.lean.move(start, start + out, (0.5, 0.0, 0.0))
-        plan.lean.move(start + out + rest, start + out + rest + back, 0.0)
-        plan.time = start + out + rest + back + 0.2
+        plan.lean.move(start + out + pause, start + out + pause + back, 0.0)
+        plan.time = start + out + pause + back + 0.2
         turn_to(plan, plan.heading + 1.2 * float(self.rng.choice([-1.0, 1.0])), self.rng)
         plan.label(start, "lean")

@@ -163,10 +163,10 @@ class NavigationGrid:
         weights = graph.data * (price[source] + price[target]) / 2
         priced = scipy.sparse.csr_array((weights, graph.indices, graph.indptr), shape=graph.shape)
         _, came_from = scipy.sparse.csgraph.dijkstra(priced, indices=last, return_predecessors=True)
-        way = [first]
-        while way[-1] != last:
-            way.append(int(came_from[way[-1]]))
-        return self.node_points[way]
+        path = [first]
+        while path[-1] != last:
+            path.append(int(came_from[path[-1]]))
+        return self.node_points[path]
 
 
 def _window(outline: np.ndarray, origin: np.ndarray, cell: float, shape: tuple, margin: float) -> tuple:

@@ -54,7 +54,7 @@ class Openable:
         return self.object.freedom.kind == "hinge"
 
     @property
-    def way(self) -> float:
+    def opening_sign(self) -> float:
         """Sign of the values' change in opening."""
         return float(np.sign(self.opened - self.closed))
 
@@ -99,7 +99,7 @@ def hook(point: tuple[float, float, float], inwards: tuple[float, float]) -> Gri
 
 
 def hinged(
-    category: str, foot: Float[np.ndarray, "3"], heading: float, way: float, width: float,
+    category: str, foot: Float[np.ndarray, "3"], heading: float, opening_sign: float, width: float,
     z_range: tuple[float, float], most: float, rng: np.random.Generator,
 ) -> Openable:  # fmt: skip
     """A leaf, still without a name, that hangs at `foot` (m), closed along `heading` (rad) and opening by `most` (rad) in the sense of `way`.
@@ -112,10 +112,10 @@ def hinged(
     level = {"door": float(rng.uniform(1.0, 1.05)), "window": float(np.clip((low + high) / 2, 1.2, 1.5))}.get(
         category, float(np.clip(high - 0.15, low + 0.1, rng.uniform(1.0, 1.1)))
     )
-    parts = _leaf(category, width, thick, low, high, way, rng)
+    parts = _leaf(category, width, thick, low, high, opening_sign, rng)
     handles = []
-    for side in (way, -way) if category == "door" else (way,):
-        face = 0.0 if side == way else thick
+    for side in (opening_sign, -opening_sign) if category == "door" else (opening_sign,):
+        face = 0.0 if side == opening_sign else thick
         out = side * (face + 0.05)
         long = 0.11 if category != "cabinet_door" else 0.02
         middle = width - edge - long / 2
@@ -125,19 +125,29 @@ def hinged(
         parts.append(Part((width - edge, side * (face + 0.02), level), (0.02, 0.06, 0.02), METAL, PATTERNED))
         handles.append(hook((place, out, level), (0.0, -side)))
     spin = rotation.about_axis("z", torch.tensor(heading, dtype=torch.float64)).float()
-    freedom = Freedom("hinge", pivot=vector(foot), limits=(min(way * most, 0.0), max(way * most, 0.0)))
+    freedom = Freedom(
+        "hinge", pivot=vector(foot), limits=(min(opening_sign * most, 0.0), max(opening_sign * most, 0.0))
+    )
     scene_object = SceneObject(
         category, category, _mesh(category, parts), spin, torch.from_numpy(np.asarray(foot)).float(), freedom
     )
-    outline = _box_outline((0.0, width), sorted((0.0, -way * thick)))
-    return Openable(scene_object, outline, (foot[2] + low, foot[2] + high), tuple(handles), 0.0, way * most)
+    outline = _box_outline((0.0, width), sorted((0.0, -opening_sign * thick)))
+    return Openable(
+        scene_object, outline, (foot[2] + low, foot[2] + high), tuple(handles), 0.0, opening_sign * most
+    )
 
 
 def _leaf(
-    category: str, width: float, thick: float, low: float, high: float, way: float, rng: np.random.Generator
+    category: str,
+    width: float,
+    thick: float,
+    low: float,
+    high: float,
+    opening_sign: float,
+    rng: np.random.Generator,
 ) -> list[Part]:
     """Parts of a leaf: a slab, or a frame about a pane."""
-    off, color = -way * thick / 2, wood(rng) if rng.random() < 0.5 else hue(rng, (0.0, 0.25))
+    off, color = -opening_sign * thick / 2, wood(rng) if rng.random() < 0.5 else hue(rng, (0.0, 0.25))
     middle, tall = (low + high) / 2, high - low
     if category != "window":
         parts = [Part((width / 2, off, middle), (width, thick, tall), color, PLAIN)]

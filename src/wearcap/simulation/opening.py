@@ -16,7 +16,7 @@ from wearcap.simulation.openables import Openable
 from wearcap.simulation.outline import distance_to_convex
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan, wrap
 from wearcap.simulation.shuffling import shuffle
-from wearcap.simulation.stances import Stances, Task, find_stances, smooth_way
+from wearcap.simulation.stances import Stances, Task, find_stances, smooth_path
 from wearcap.simulation.track import ease
 from wearcap.simulation.world import World, WorldObject
 
@@ -92,9 +92,9 @@ def plan_turn(
     seconds = float(np.clip((0.9 + 1.3 * amount) * rng.normal(1.0, 0.12) / plan.style.briskness, 1.0, 3.2))
     keys = max(round(seconds / KEY_S), 6)
     values = start + ease(np.linspace(0.0, 1.0, keys)) * (value - start)
-    way, footprint = item.handle(handle, values), item.footprint(values)
+    handle_path, footprint = item.handle(handle, values), item.footprint(values)
     near = [other for other in world.objects
-            if other.name != item.name and distance_to_convex(way[:, :2], other.footprint).min() < NEAR_M]  # fmt: skip
+            if other.name != item.name and distance_to_convex(handle_path[:, :2], other.footprint).min() < NEAR_M]  # fmt: skip
     if _hits(item, values, near):
         return None
     floor = float(plan.position[2])
@@ -102,15 +102,15 @@ def plan_turn(
     high = [
         other
         for other in solid
-        if other.z_range[1] > way[0, 2] - 0.05 and other.z_range[0] < floor + shoulder
+        if other.z_range[1] > handle_path[0, 2] - 0.05 and other.z_range[0] < floor + shoulder
     ]
     task = Task(
-        way, footprint, tuple(other.footprint for other in solid), tuple(other.footprint for other in high), 1.0,
-        floor + shoulder, plan.arm_length + PALM_M, low=bool(item.z_range[1] < way[0, 2] + 0.2),
+        handle_path, footprint, tuple(other.footprint for other in solid), tuple(other.footprint for other in high), 1.0,
+        floor + shoulder, plan.arm_length + PALM_M, low=bool(item.z_range[1] < handle_path[0, 2] + 0.2),
         beyond=_beyond(item, handle),
     )  # fmt: skip
     walkable = world.navigation.node_points[:, :2]
-    walkable = walkable[np.linalg.norm(walkable - way[0, :2], axis=1) < 2.0]
+    walkable = walkable[np.linalg.norm(walkable - handle_path[0, :2], axis=1) < 2.0]
     found = [(side, find_stances(replace(task, sign=LEFT_SIGN[side]), walkable, rng)) for side in SIDES]
     able = [(stances.cost, side, stances) for side, stances in found if stances is not None]
     if not able:
@@ -152,13 +152,13 @@ def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> 
     places = turn.stances.places.copy()
     here = np.array([*plan.position[:2], places[0, 2] + wrap(plan.heading - places[0, 2])])
     fade = np.linspace(1.0, 0.0, len(places))[:, None] ** 2
-    way = smooth_way(places + fade * (here - places[0]), count)
+    path = smooth_path(places + fade * (here - places[0]), count)
     times = np.linspace(begin, stop, count)
 
     def poses(at: Float[np.ndarray, "time"]) -> Rigid:
         return item.pose(turn.values((at - begin) / turn.seconds))
 
-    yaw = _hand_yaw(plan, turn, way)
+    yaw = _hand_yaw(plan, turn, path)
 
     def moves(at: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
         pose = poses(at)
@@ -173,7 +173,7 @@ def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> 
     plan.gaze_point.move(start, start, item.handle(turn.handle, np.array(turn.start)))
     plan.gaze_weight.move(start, start + 0.45, 0.8)
     plan.gaze_weight.move(begin + 0.5 * turn.seconds, begin + 0.5 * turn.seconds + 0.6, 0.0)
-    body = lambda at: np.stack([np.interp(at, times, column) for column in way.T], 1)  # noqa: E731
+    body = lambda at: np.stack([np.interp(at, times, column) for column in path.T], 1)  # noqa: E731
     shuffle(plan, rng, body, begin - 0.1, stop)
     contact_class = item.object.freedom.contact_class
     house.handlings.append(
@@ -183,12 +183,12 @@ def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> 
     plan.time = max(plan.time, release)
 
 
-def _hand_yaw(plan: Plan, turn: Turn, way: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time"]:
+def _hand_yaw(plan: Plan, turn: Turn, path: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time"]:
     """How far the hand turns on the handle (rad), so that the fingers point where the arm does."""
-    values = turn.values(np.linspace(0.0, 1.0, len(way)))
+    values = turn.values(np.linspace(0.0, 1.0, len(path)))
     handle, pose = turn.item.handle(turn.handle, values), turn.item.pose(values)
     fingers = (pose.R.numpy() @ np.array(turn.item.handles[turn.handle].fingers))[:, :2]
-    across = np.stack([-np.sin(way[:, 2]), np.cos(way[:, 2])], 1)
-    arm = handle[:, :2] - way[:, :2] - 0.18 * LEFT_SIGN[turn.side] * across
+    across = np.stack([-np.sin(path[:, 2]), np.cos(path[:, 2])], 1)
+    arm = handle[:, :2] - path[:, :2] - 0.18 * LEFT_SIGN[turn.side] * across
     angle = np.arctan2(fingers[:, 0] * arm[:, 1] - fingers[:, 1] * arm[:, 0], (fingers * arm).sum(1))
     return YAW_MOST * np.tanh(np.unwrap(angle) / YAW_MOST)

@@ -13,11 +13,11 @@ from wearcap.simulation.world import Room, World
 
 KERB_STONE_M = 0.15
 LONGEST_RAMP_M = 9.5
-SQUARE_THINGS = (
+SQUARE_KINDS = (
     "tree", "bench", "board", "bin", "tree", "low_wall", "bench", "planter", "street_lamp", "bush", "bollard",
 )  # fmt: skip
-PAVEMENT_THINGS = ("street_lamp", "letter_box", "bench", "bollard", "tree", "bin")
-TERRACE_THINGS = ("bench", "planter", "bin")
+PAVEMENT_KINDS = ("street_lamp", "letter_box", "bench", "bollard", "tree", "bin")
+TERRACE_KINDS = ("bench", "planter", "bin")
 """What stands in each part, the most wanted first."""
 
 
@@ -234,9 +234,9 @@ def _furnish(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) ->
         (terrace[2] - 1.2, *inner[1:]) if layout.ramp_up < 0 else (*inner[:2], terrace[0] + 1.2, inner[3])
     )
     for room, z, kinds in (
-        (square, kerb, SQUARE_THINGS),
-        (pavement, kerb, PAVEMENT_THINGS),
-        (terrace, layout.top, TERRACE_THINGS),
+        (square, kerb, SQUARE_KINDS),
+        (pavement, kerb, PAVEMENT_KINDS),
+        (terrace, layout.top, TERRACE_KINDS),
     ):
         plan = Plan(builder, room, z, [*free, stairs_head, ramp_head])
         for kind in kinds:

@@ -19,10 +19,10 @@ def plan_path(
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "waypoint 3"] | None:
     """A smooth way from start to goal, waypoints about 0.1 m apart; heights only to a cell. None without a way."""
-    way = grid.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
-    if way is None:
+    cells = grid.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
+    if cells is None:
         return None
-    points = _evenly(np.concatenate([start[None], way, goal[None]]))
+    points = _evenly(np.concatenate([start[None], cells, goal[None]]))
     if len(points) < 4:
         return points
     layer = grid.layer_of(points)

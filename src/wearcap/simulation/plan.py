@@ -44,12 +44,12 @@ def step_rise(old: Footprint, new: Footprint) -> float:
     rise = float(new.ground[2] - old.ground[2])
     if old.tilt == new.tilt == 0.0:
         return rise
-    way = (new.ground - old.ground)[:2]
+    offset = (new.ground - old.ground)[:2]
     slopes = (
-        -np.tan(p.tilt) * (way @ np.array([np.cos(p.heading), np.sin(p.heading)])) / 2 for p in (old, new)
+        -np.tan(p.tilt) * (offset @ np.array([np.cos(p.heading), np.sin(p.heading)])) / 2 for p in (old, new)
     )
-    rest = rise - sum(slopes)
-    return rest if abs(rest) > STEP_M else 0.0
+    remaining = rise - sum(slopes)
+    return remaining if abs(remaining) > STEP_M else 0.0
 
 
 @dataclass

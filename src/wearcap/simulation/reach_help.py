@@ -46,10 +46,10 @@ def reach_help(
         trunk = trunk_motion(plan, feet, stance, times, fps, MOST * np.tanh(wanted / MOST))
         spine = spine_motion(plan.skeleton, trunk)
         smooth = number >= ROUNDS
-        lacks, ways = zip(*(_lack(plan, side, spine, trunk, times, fps, smooth) for side in SIDES))
+        lacks, gains = zip(*(_lack(plan, side, spine, trunk, times, fps, smooth) for side in SIDES))
         if smooth and max(float(lack.max()) for lack in lacks) < 1e-4:
             break
-        step = _shared(np.stack(lacks, 1), np.stack(ways, 1), easy)
+        step = _shared(np.stack(lacks, 1), np.stack(gains, 1), easy)
         step[:, 3] = np.maximum(step[:, 3], -crouch - wanted[:, 3])
         wanted = wanted + EAGER * step
     return MOST * np.tanh(wanted / MOST)

@@ -37,11 +37,11 @@ def _down_and_up(
     plan: Plan, start: float, down: float, leave: float, up: float, rng: np.random.Generator
 ) -> None:
     """Lean forward 40–45°, hips back and down, lean back; and the other way round (Schenkman et al. 1990)."""
-    bow, rest = np.deg2rad(rng.uniform(36, 44)), rng.normal(-0.06, 0.06)
+    bow, seated_lean = np.deg2rad(rng.uniform(36, 44)), rng.normal(-0.06, 0.06)
     plan.lean.move(start, start + 0.55 * down, (bow, 0.0, 0.0))
     plan.seat_weight.move(start, start + 0.85 * down, (1.0, 0.0))
     plan.seat_weight.move(start + 0.15 * down, start + down, (1.0, 1.0))
-    plan.lean.move(start + 0.60 * down, start + 1.35 * down, (rest, 0.0, 0.0))
+    plan.lean.move(start + 0.60 * down, start + 1.35 * down, (seated_lean, 0.0, 0.0))
     plan.lean.move(leave - 0.35 * up, leave + 0.25 * up, (bow, 0.0, 0.0))
     plan.seat_weight.move(leave, leave + 0.85 * up, (1.0, 0.0))
     plan.seat_weight.move(leave + 0.1 * up, leave + 0.95 * up, (0.0, 0.0))

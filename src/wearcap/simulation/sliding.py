@@ -14,7 +14,7 @@ from wearcap.simulation.grips import Grip, GripPlace, Moves, drawn_grip
 from wearcap.simulation.handling import Handling, handling_of
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan, wrap
 from wearcap.simulation.shuffling import shuffle, step_to
-from wearcap.simulation.things import Rail, Thing, floor_pose
+from wearcap.simulation.things import Movable, Rail, floor_pose
 from wearcap.simulation.track import ease
 
 SPEEDS = {"sofa": (0.12, 0.26), "table": (0.13, 0.32), "chair": (0.18, 0.42)}
@@ -33,7 +33,7 @@ PUSH, PULL = np.deg2rad(62.0), np.deg2rad(118.0)
 class Slide:
     """How somebody will move a thing, decided but not yet on the plan."""
 
-    thing: Thing
+    movable: Movable
     start: Float[np.ndarray, "3"]
     """Where it stands: x, y (m), heading (rad)."""
     stop: Float[np.ndarray, "3"]
@@ -50,10 +50,10 @@ class Slide:
     seconds: float
     pause_s: float
     """Rest in the middle of the way, hands on; 0 for none."""
-    way_angle: float
+    travel_angle: float
     """Of the way against the body's heading, -π … π."""
 
-    def thing_at(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
+    def object_at(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
         """The thing's x, y and heading when a share of the way is done."""
         change = self.stop - self.start
         across = np.array([-change[1], change[0], 0.0])
@@ -64,7 +64,7 @@ class Slide:
 
     def body_at(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
         """The wearer's x, y and heading then."""
-        x, y, heading = self.thing_at(share).T
+        x, y, heading = self.object_at(share).T
         cos, sin = np.cos(heading), np.sin(heading)
         return np.stack(
             [x + cos * self.local[0] - sin * self.local[1], y + sin * self.local[0] + cos * self.local[1],
@@ -91,7 +91,7 @@ class Slide:
 
 def slide_options(
     plan: Plan,
-    thing: Thing,
+    movable: Movable,
     start: Float[np.ndarray, "3"],
     stop: Float[np.ndarray, "3"],
     rng: np.random.Generator,
@@ -106,34 +106,36 @@ def slide_options(
     turns = bool(abs(stop[2] - start[2]) > TURN_FREE)
     if not turns:
         stop[2] = start[2]
-    way = stop[:2] - start[:2]
+    displacement = stop[:2] - start[:2]
     found = []
-    for rail in thing.rails:
+    for rail in movable.rails:
         angle = (
-            wrap(float(np.arctan2(way[1], way[0])) - start[2] - rail.facing) if np.hypot(*way) > 0.05 else 0.0
+            wrap(float(np.arctan2(displacement[1], displacement[0])) - start[2] - rail.facing)
+            if np.hypot(*displacement) > 0.05
+            else 0.0
         )
         for both in (True, False):
             if (both and not rail.both_hands) or (turns and not both):
                 continue
             aside = PUSH < abs(angle) < PULL
-            if aside and thing.category == "sofa":
+            if aside and movable.category == "sofa":
                 continue
             weight = (0.25 if aside else 1.0) * (
-                1.0 if both else {"chair": 1.5, "table": 0.5}.get(thing.category, 0.25)
+                1.0 if both else {"chair": 1.5, "table": 0.5}.get(movable.category, 0.25)
             )
             found.append((rng.exponential(1.0) / weight, rail, both, angle))
     for _, rail, both, angle in sorted(found, key=lambda option: option[0]):
-        yield _drawn(plan, thing, start, stop, rail, both, angle, rng)
+        yield _drawn(plan, movable, start, stop, rail, both, angle, rng)
 
 
 def _drawn(
-    plan: Plan, thing: Thing, start: np.ndarray, stop: np.ndarray, rail: Rail, both: bool, angle: float,
+    plan: Plan, movable: Movable, start: np.ndarray, stop: np.ndarray, rail: Rail, both: bool, angle: float,
     rng: np.random.Generator,
 ) -> Slide:  # fmt: skip
     """Draw what is left open: hands and their places, tempo, pause, distance."""
     change = stop - start
     length, turned = float(np.linalg.norm(change[:2])), abs(change[2])
-    low, high = SPEEDS[thing.category]
+    low, high = SPEEDS[movable.category]
     speed = float(rng.uniform(low, high)) * plan.style.briskness**0.5
     if PUSH < abs(angle) < PULL:
         speed *= 0.75
@@ -156,8 +158,8 @@ def _drawn(
         along = float(np.clip(middle + offsets[side], 0.0, rail.length))
         places[side] = rail.at(along, tilt + float(rng.normal(0.0, 0.05)))
     return Slide(
-        thing, start, stop, float(np.clip(rng.normal(0.0, 0.05), -0.1, 0.1)) * length if turned == 0 else 0.0, rail,
-        places, hands, _body(plan, rail, places, speed, angle, EFFORT[thing.category], rng), seconds, pause, angle,
+        movable, start, stop, float(np.clip(rng.normal(0.0, 0.05), -0.1, 0.1)) * length if turned == 0 else 0.0, rail,
+        places, hands, _body(plan, rail, places, speed, angle, EFFORT[movable.category], rng), seconds, pause, angle,
     )  # fmt: skip
 
 
@@ -216,7 +218,7 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
     end = begin + choice.duration_s
 
     def moves(times: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
-        return floor_pose(choice.thing_at(choice.share(times - begin)), floor_z)
+        return floor_pose(choice.object_at(choice.share(times - begin)), floor_z)
 
     release = end + float(rng.uniform(0.1, 0.7))
     grips = _grips(plan, choice, moves, (touch, begin, end, release), rng)
@@ -233,7 +235,7 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
 
     shuffle(plan, rng, body, begin, end)
     plan.time = max(plan.time, release + 0.5 * max(grip.return_s for _, grip in grips))
-    return handling_of(choice.thing.name, "sliding", moves, grips)
+    return handling_of(choice.movable.name, "sliding", moves, grips)
 
 
 def _grips(
@@ -269,8 +271,8 @@ def _lean(
     rng: np.random.Generator,
 ) -> None:
     """Into a push, back in a pull; a little already when taking hold."""
-    effort = EFFORT[choice.thing.category]
-    pushes, pulls = abs(choice.way_angle) < PUSH, abs(choice.way_angle) > PULL
+    effort = EFFORT[choice.movable.category]
+    pushes, pulls = abs(choice.travel_angle) < PUSH, abs(choice.travel_angle) > PULL
     ready = float(np.clip(rng.normal(0.22, 0.06), 0.08, 0.4))
     lean, shift, crouch = ready, 0.0, 0.0
     if pushes:
@@ -307,7 +309,7 @@ def _look(
     plan.gaze_point.move(touch - 0.6, touch - 0.6, point)
     plan.gaze_weight.move(touch - 0.6, touch - 0.2, 0.85)
     plan.gaze_weight.move(begin + 0.1, begin + 0.8, 0.0)
-    time, back = begin + 0.6, abs(choice.way_angle) > PULL
+    time, back = begin + 0.6, abs(choice.travel_angle) > PULL
     while time < end - 0.8:
         side = (
             float(rng.choice([-1.0, 1.0])) * rng.uniform(0.7, 1.1)

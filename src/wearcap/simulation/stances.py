@@ -157,13 +157,13 @@ def _cheapest(
         total = through[best, np.arange(len(points))] + cost[key]
     if not np.isfinite(total).any():
         return None, np.inf
-    way = [int(total.argmin())]
+    path = [int(total.argmin())]
     for best in reversed(came):
-        way.append(int(best[way[-1]]))
-    return number[way[::-1]], float(total.min())
+        path.append(int(best[path[-1]]))
+    return number[path[::-1]], float(total.min())
 
 
-def smooth_way(places: Float[np.ndarray, "key 3"], count: int) -> Float[np.ndarray, "time 3"]:
+def smooth_path(places: Float[np.ndarray, "key 3"], count: int) -> Float[np.ndarray, "time 3"]:
     """The way at `count` even moments, smooth, its ends kept."""
     at = np.linspace(0.0, len(places) - 1.0, count)
     fine = np.stack([np.interp(at, np.arange(len(places)), column) for column in places.T], 1)

@@ -280,14 +280,14 @@ def _grown(body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator)
         if solid
         else np.array([0.0, rng.uniform(0.45, 0.6)])
     )
-    open_sides = [(axis, way) for axis in (1, 0) for way in (-1, 1)]
+    open_sides = [(axis, sign) for axis in (1, 0) for sign in (-1, 1)]
     while open_sides:
-        for axis, way in list(open_sides):
+        for axis, sign in list(open_sides):
             low, high = tread.low.copy(), tread.high.copy()
-            (low if way < 0 else high)[axis] += 0.03 * way
+            (low if sign < 0 else high)[axis] += 0.03 * sign
             wider = replace(tread, low=low, high=high)
             if wider.size[axis] > most[axis] or not _clear(body, wider, solid):
-                open_sides.remove((axis, way))
+                open_sides.remove((axis, sign))
             else:
                 tread = wider
     return tread

@@ -15,7 +15,7 @@ from wearcap.simulation.builder import Piece, WorldBuilder, hue
 from wearcap.simulation.flat import before_door
 from wearcap.simulation.furnish import ROOM_KINDS, Box, Plan, middle_and_size
 from wearcap.simulation.furniture import MAKERS, wood
-from wearcap.simulation.outdoor import PAVEMENT_THINGS, SQUARE_THINGS, put_somewhere
+from wearcap.simulation.outdoor import PAVEMENT_KINDS, SQUARE_KINDS, put_somewhere
 from wearcap.simulation.outline import rectangle
 from wearcap.simulation.street import barrier, build_facade, slab
 from wearcap.simulation.supports import box_size, build_seat, build_tread, find_sits, find_treads, meets
@@ -101,9 +101,9 @@ def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
     swept = SweptFloor.of(here, BEYOND_M)
     plan = FreePlan(builder, (0.0, 0.0, 0.0, 0.0), 0.0, body=body, swept=swept)
     _support(plan, motion, rng)
-    way = builder.from_world(path)
+    local_path = builder.from_world(path)
     reach = _extent(here)
-    (_street if outdoors else _room)(plan, reach, way, rng)
+    (_street if outdoors else _room)(plan, reach, local_path, rng)
     return builder.finish(cell=0.1)
 
 
@@ -147,7 +147,7 @@ def _around(points: Float[np.ndarray, "point 2"]) -> Box:
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
-def _room(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generator) -> None:
+def _room(plan: FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator) -> None:
     """Four walls with doors and windows, furniture beside the way, then along the walls."""
     builder = plan.builder
     gap = rng.uniform(*WALL_M, 4)
@@ -169,7 +169,7 @@ def _room(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generator)
         build_wall(builder, wall, color, rng)
     plan.room = (box[0] + 0.07, box[1] + 0.07, box[2] - 0.07, box[3] - 0.07)
     plan.kept_free += [before_door(builder, door) for door in builder.doors]
-    _beside(plan, NEAR_INDOORS, way, rng)
+    _beside(plan, NEAR_INDOORS, path, rng)
     plan.furnish(str(rng.choice(list(ROOM_KINDS))), rng)
 
 
@@ -189,14 +189,14 @@ def _passage(builder: WorldBuilder, wall: Wall, color: tuple, rng: np.random.Gen
         build_wall(builder, Wall(start, end), color, rng)
 
 
-def _beside(plan: FreePlan, kinds: tuple[str, ...], way: np.ndarray, rng: np.random.Generator) -> None:
+def _beside(plan: FreePlan, kinds: tuple[str, ...], path: np.ndarray, rng: np.random.Generator) -> None:
     """Things within `NEAR_M` of the body, about one for every metre and a half of its way."""
-    length = float(np.linalg.norm(np.diff(way[::30], axis=0), axis=1).sum())
+    length = float(np.linalg.norm(np.diff(path[::30], axis=0), axis=1).sum())
     for _ in range(int(np.clip(2 + length / 1.5, 2, 7))):
         piece = MAKERS[str(rng.choice(kinds))](rng)
         for _ in range(40):
             angle, reach = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 2.2)
-            x, y = way[rng.integers(len(way))] + reach * np.array([np.cos(angle), np.sin(angle)])
+            x, y = path[rng.integers(len(path))] + reach * np.array([np.cos(angle), np.sin(angle)])
             heading = float(
                 rng.integers(4) * np.pi / 2 + (rng.normal(0.0, 0.3) if piece.kind == "chair" else 0.0)
             )
@@ -205,7 +205,7 @@ def _beside(plan: FreePlan, kinds: tuple[str, ...], way: np.ndarray, rng: np.ran
                 break
 
 
-def _street(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generator) -> None:
+def _street(plan: FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator) -> None:
     """A pavement before a house front, with a row of barriers across, open at its ends."""
     builder = plan.builder
     ends, front, across = rng.uniform(2.5, 5.0, 2), rng.uniform(0.8, 3.0), rng.uniform(1.0, 4.0)
@@ -232,6 +232,6 @@ def _street(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generato
     for x in rng.uniform(box[0] - 4.0, box[2] + 4.0, 6):
         builder.place(MAKERS["tree"](rng), (float(x), float(box[1] - rng.uniform(3.0, 9.0)), -0.06), 0.0)
     plan.room = (box[0] + 0.2, box[1] + 0.7, box[2] - 0.2, box[3] - 0.1)
-    _beside(plan, NEAR_OUTDOORS, way, rng)
-    for kind in (*PAVEMENT_THINGS, *SQUARE_THINGS)[:: int(rng.integers(1, 4))]:
+    _beside(plan, NEAR_OUTDOORS, path, rng)
+    for kind in (*PAVEMENT_KINDS, *SQUARE_KINDS)[:: int(rng.integers(1, 4))]:
         put_somewhere(plan, kind, rng)

@@ -47,7 +47,7 @@ class Rail:
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
+class Movable:
     """An object to be moved by hand; its own axes have the front at +x, the origin on the floor beneath its middle."""
 
     object: SceneObject
@@ -82,12 +82,12 @@ def floor_pose(place: Float[np.ndarray, "*batch 3"], z: float | np.ndarray = 0.0
     return Rigid(rotation.about_axis("z", at[..., 2]), torch.cat([at[..., :2], height[..., None]], -1))
 
 
-def make_thing(category: str, name: str, rng: np.random.Generator) -> Thing:
+def make_movable(category: str, name: str, rng: np.random.Generator) -> Movable:
     """A thing of a category of `THINGS` with drawn size and colour, at the world's origin."""
-    return THINGS[category](name, rng)
+    return MOVABLES[category](name, rng)
 
 
-def _sofa(name: str, rng: np.random.Generator) -> Thing:
+def _sofa(name: str, rng: np.random.Generator) -> Movable:
     """Held at the upper edge of its back from behind, or of an arm from that side."""
     piece = furniture.armchair(rng) if rng.random() < 0.3 else furniture.sofa(rng)
     half_depth, half_width = piece.size[0] / 2, piece.size[1] / 2
@@ -103,7 +103,7 @@ def _sofa(name: str, rng: np.random.Generator) -> Thing:
     return _sliding(name, "sofa", piece, rails)
 
 
-def _table(name: str, rng: np.random.Generator) -> Thing:
+def _table(name: str, rng: np.random.Generator) -> Movable:
     """Held at its top's edges."""
     piece = furniture.table(rng)
     bare = replace(
@@ -117,7 +117,7 @@ def _table(name: str, rng: np.random.Generator) -> Thing:
         deep = abs(ahead @ np.array([half_depth, half_width]))
         wide = abs(left @ np.array([half_depth, half_width])) - 0.08
         edge = -(deep - 0.012) * ahead
-        ends = (np.append(edge + way * wide * left, top) for way in (1.0, -1.0))
+        ends = (np.append(edge + sign * wide * left, top) for sign in (1.0, -1.0))
         start, stop = (vector(end) for end in ends)
         rails.append(
             Rail(start, stop, (0.0, 0.0, 1.0), (float(ahead[0]), float(ahead[1]), 0.0), facing, 0.012)
@@ -125,7 +125,7 @@ def _table(name: str, rng: np.random.Generator) -> Thing:
     return _sliding(name, "table", bare, rails)
 
 
-def _chair(name: str, rng: np.random.Generator) -> Thing:
+def _chair(name: str, rng: np.random.Generator) -> Movable:
     """Held at the top of its backrest, from behind or, with one hand, from beside it."""
     piece = furniture.chair(rng)
     half_depth, half_width, top = piece.size[0] / 2, piece.size[1] / 2, piece.z_range[1]
@@ -138,7 +138,7 @@ def _chair(name: str, rng: np.random.Generator) -> Thing:
     return _sliding(name, "chair", piece, rails)
 
 
-def _box(name: str, rng: np.random.Generator) -> Thing:
+def _box(name: str, rng: np.random.Generator) -> Movable:
     """Lifted between the palms, which press on two opposite faces."""
     depth, width = rng.uniform(0.20, 0.45), rng.uniform(0.25, 0.55)
     height, color = (
@@ -162,36 +162,36 @@ def _box(name: str, rng: np.random.Generator) -> Thing:
         )
         fingers = vector((ahead - 0.35 * np.array(up)) / np.hypot(1.0, 0.35))
         hands = (
-            GripPlace(vector(way * (half + SKIN_M) * left + [0.0, 0.0, level]), vector(way * left), fingers)
-            for way in (1.0, -1.0)
+            GripPlace(vector(sign * (half + SKIN_M) * left + [0.0, 0.0, level]), vector(sign * left), fingers)
+            for sign in (1.0, -1.0)
         )
         sides.append((*hands, facing))
-    thing = _of_piece(name, "box", piece, Freedom("free"))
-    return replace(thing, sides=tuple(sides))
+    movable = _of_piece(name, "box", piece, Freedom("free"))
+    return replace(movable, sides=tuple(sides))
 
 
 def _held(
     category: str, make: Callable[[np.random.Generator], Handheld]
-) -> Callable[[str, np.random.Generator], Thing]:
-    def thing(name: str, rng: np.random.Generator) -> Thing:
+) -> Callable[[str, np.random.Generator], Movable]:
+    def movable(name: str, rng: np.random.Generator) -> Movable:
         shape = make(rng)
         scene_object = SceneObject(name, category, shape.mesh, torch.eye(3), torch.zeros(3), Freedom("free"))
         half_size = (shape.size[0] / 2, shape.size[1] / 2)
-        return Thing(scene_object, half_size, shape.height, sides=shape.sides, grasps=shape.grasps)
+        return Movable(scene_object, half_size, shape.height, sides=shape.sides, grasps=shape.grasps)
 
-    return thing
+    return movable
 
 
-def _sliding(name: str, category: str, piece: Piece, rails: list[Rail]) -> Thing:
+def _sliding(name: str, category: str, piece: Piece, rails: list[Rail]) -> Movable:
     return replace(_of_piece(name, category, piece, Freedom("plane")), rails=tuple(rails))
 
 
-def _of_piece(name: str, category: str, piece: Piece, freedom: Freedom) -> Thing:
+def _of_piece(name: str, category: str, piece: Piece, freedom: Freedom) -> Movable:
     scene_object = SceneObject(name, category, piece_mesh(piece), torch.eye(3), torch.zeros(3), freedom)
-    return Thing(scene_object, (piece.size[0] / 2, piece.size[1] / 2), piece.z_range[1])
+    return Movable(scene_object, (piece.size[0] / 2, piece.size[1] / 2), piece.z_range[1])
 
 
-THINGS: dict[str, Callable[[str, np.random.Generator], Thing]] = {
+MOVABLES: dict[str, Callable[[str, np.random.Generator], Movable]] = {
     "sofa": _sofa, "table": _table, "chair": _chair, "box": _box,
     **{category: _held(category, make) for category, make in handhelds.MAKERS.items()},
 }  # fmt: skip

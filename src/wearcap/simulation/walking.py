@@ -163,10 +163,10 @@ def plan_course(plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float,
     anchors = [anchor for flight in flights for anchor in _tread_anchors(points, flight, foot)]
     anchors = sorted(anchors, key=lambda anchor: anchor[0])
     stairs = np.zeros(len(points))
-    for at, way, tread, _rise in anchors:
+    for at, direction, tread, _rise in anchors:
         near = np.abs(length - at) < 0.55 * tread
-        stairs[near] = way
-        beat = (0.58 if way > 0 else 0.54) / plan.style.briskness**0.5
+        stairs[near] = direction
+        beat = (0.58 if direction > 0 else 0.54) / plan.style.briskness**0.5
         limit[near] = np.minimum(limit[near], tread / beat)
     limit = blur(_ramped(limit), 0.10, 1 / SPACING_M)
     stride = np.minimum(np.sqrt(60 * plan.style.walk_ratio * limit), limit * 60 / MIN_CADENCE)
