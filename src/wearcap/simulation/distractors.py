@@ -1,6 +1,6 @@
-"""What looks like handling a thing but is not: hands that stop short, gestures beside it, bending over and squatting.
+"""Motions that resemble handling an object but are not: reaching short of it, gestures, bending over and squatting.
 
-Each is done where the wearer stands, before a thing; nothing is touched and nothing is recorded as contact.
+Each is done where the wearer stands, in front of an object; nothing is touched or recorded as contact.
 """
 
 from dataclasses import replace
@@ -16,9 +16,9 @@ from wearcap.simulation.hands import ON_THIGHS, hold
 from wearcap.simulation.plan import SIDES, Plan
 
 SHORT_M = (0.05, 0.20)
-"""How far off the surface a palm stays."""
+"""Range of the palm's distance from the surface."""
 LOW_M, HOVER_LOW_M = 0.60, 0.18
-"""For places below the first one bends down, hands beside the thing."""
+"""Height of places below which one bends down, and the hands' distance then, beside the object."""
 
 
 def hover(
@@ -28,9 +28,9 @@ def hover(
     rng: np.random.Generator,
     gaze: bool = True,
 ) -> None:
-    """Reach for places on a thing as if to take hold, stop short of them, stay a while, and draw back.
+    """Reach for places on an object as if to take hold, stop short of them, stay a while, and draw back.
 
-    `places` is by hand, in the thing's axes; they must be within reach of the standing wearer.
+    `places` is by hand, in the object's axes; they must be within reach of the standing wearer.
     """
     start = plan.time + 0.1
     first = next(iter(places.values()))
@@ -74,7 +74,7 @@ def hover(
 
 
 def gesture_at(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
-    """Talk about a thing of a height (m) with the hands, looking at it now and then."""
+    """Gesture about an object of a height (m), looking at it now and then."""
     start, stop = plan.time, plan.time + float(rng.uniform(2.5, 6.0))
     for side in SIDES if rng.random() < 0.5 else (str(rng.choice(SIDES)),):
         hand, time, first = plan.hands[side], start + float(rng.uniform(0.1, 0.6)), True
@@ -101,7 +101,7 @@ def gesture_at(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.
 
 
 def bend_over(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
-    """Lean over a thing to look at it, hands hanging, on the back or on the thighs."""
+    """Lean over an object to look at it, hands hanging, on the back or on the thighs."""
     start = plan.time + 0.1
     down = float(rng.uniform(0.8, 1.3)) / plan.style.briskness
     leave = start + down + float(rng.uniform(0.6, 3.0))
@@ -117,7 +117,7 @@ def bend_over(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.G
 
 
 def squat_by(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
-    """Squat before a low thing as if to lift it, hands on the thighs or before the knees, and get up without it."""
+    """Squat in front of a low object as if to lift it, hands on the thighs or before the knees, and get up again."""
     start = plan.time + 0.1
     depth = float(rng.uniform(0.24, 0.42)) * plan.hip_height
     down = (0.7 + 1.1 * depth) * float(rng.uniform(0.9, 1.3)) / plan.style.briskness
@@ -140,7 +140,7 @@ def squat_by(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Ge
 
 
 def linger(plan: Plan, rng: np.random.Generator) -> None:
-    """Stand close before a thing, looking about."""
+    """Stand close to an object, looking about."""
     stop = plan.time + float(rng.uniform(1.0, 3.5))
     look_about(plan, plan.time, stop, rng, spread=0.4)
     plan.time = stop

@@ -12,9 +12,9 @@ from wearcap.simulation.walls import build_flight
 from wearcap.simulation.world import Room, World
 
 DEPTH_M = 6.2
-"""Of the whole hillside, across the slope."""
+"""Depth of the whole hillside, across the slope."""
 STAIRS_M, RAMP_M = 2.4, 3.6
-"""Across the slope, stairs and what follows them lie below the first, the ramp above the second."""
+"""Across the slope, stairs and the path after them are below the first, the ramp above the second."""
 PLATEAU_M = 6.0
 KINDS = ("bench", "planter", "tree", "bin", "street_lamp", "low_wall")
 GROUND = (0.60, 0.58, 0.54)
@@ -25,7 +25,7 @@ class Layout:
     """Lengths in m; x rises with the slope, the middle terrace lies at z = 0 from x = 0 to `PLATEAU_M`."""
 
     rise: float
-    """From each terrace to the next."""
+    """Height from each terrace to the next."""
     steps: int
     tread: float
     slope: float
@@ -61,7 +61,7 @@ def build_hillside(rng: np.random.Generator, name: str) -> World:
 
 
 def _terrace(builder: WorldBuilder, name: str, boxes: list, z: float, rng: np.random.Generator) -> None:
-    """Level ground; the last box is the place itself, with what stands there, and open to the ways that lead to it."""
+    """Level ground; the last box is the place itself, with its furniture, and open to the paths that lead to it."""
     for box in boxes:
         slab(builder, "floor", box, z, 0.3, GROUND, 6.0)
     x_low, _, x_high, _ = boxes[-1]
