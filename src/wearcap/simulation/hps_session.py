@@ -1,4 +1,4 @@
-"""A long walk by the protocol of the documents' evaluation (thesis §4.5): from a capture spot and back to it.
+"""A long walk by the protocol of the HPS thesis' evaluation (§4.5): from a capture spot and back to it.
 
 At the spot the wearer claps, stands in an A-pose, walks about and leans on the table; then goes through the site
 and comes back after given distances to do the same again.
@@ -19,27 +19,27 @@ from wearcap.simulation.world import CaptureSpot, World
 A_POSE = (0.02, 0.46, -0.84, 0.2, 0.0, 0.0)
 """Hand's pose channel (`HandScore.pose`): the arm hangs 30° off the body."""
 CLAP_HEIGHT, CLAP_AHEAD = 0.02, 0.62
-"""Of the wrists when they meet, from the shoulders, as shares of the arm's length: before the face."""
+"""Wrist positions when the palms meet, from the shoulders, as shares of the arm's length: in front of the face."""
 PALMS_M, APART_M = 0.045, 0.13
-"""Each wrist's distance from the middle when the palms meet, and by how much more it comes from."""
+"""Distance of each wrist from the middle when the palms meet, and the additional distance before."""
 IDLE = ("stand", "look_around", "gesture", "hold", "crouch", "turn")
-"""What is done between walks, now and then."""
+"""Activities between walks, now and then."""
 IDLE_SHARE = 0.3
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is recorded."""
+    """Course of a session."""
 
     returns_m: tuple[float, ...] = (70.0, 200.0, 380.0)
-    """Distances travelled after which the wearer is back at the spot, besides the start."""
+    """Travelled distances after which the wearer is back at the spot, besides the start."""
     end_m: float = 410.0
-    """The recording ends, at the spot, when about this much is travelled."""
+    """The recording ends, at the spot, when about this distance is travelled."""
     stand_s: float = 3.0
     move_s: float = 10.0
     claps: int = 3
     clap_every_s: float = 240.0
-    """Claps come at the start, at the end, and at the first stop after so much time."""
+    """Claps come at the start, at the end, and at the first stop after this time."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def simulate_session(
 
 
 class _Session:
-    """The plan in the making, with what was walked so far."""
+    """The plan in the making, and the distance walked so far."""
 
     def __init__(self, world: World, person: Wearer, rng: np.random.Generator, protocol: Protocol):
         self.world, self.rng, self.protocol = world, rng, protocol
@@ -111,7 +111,7 @@ class _Session:
         return True
 
     def wander(self, until_m: float) -> None:
-        """Walk from place to place as long as the way home leaves room for it."""
+        """Walk from place to place as long as the path home leaves room for it."""
         points = self.world.navigation.node_points
         free = (self.world.clearance(points) > FREE_M) & ~on_stairs(self.world, points)
         while True:
@@ -133,7 +133,7 @@ class _Session:
         self.walk(self.home, self.spot.heading)
 
     def visit(self) -> None:
-        """What is done at the spot: claps where due, the A-pose, moving about."""
+        """Activities at the spot: claps where due, the A-pose, moving about."""
         if not self.clap_times or self.plan.time - self.clap_times[-1] > self.protocol.clap_every_s:
             self.clap()
         self.stand()
@@ -165,7 +165,7 @@ class _Session:
         plan.label(start, "clap")
 
     def stand(self) -> None:
-        """An A-pose, held."""
+        """Hold an A-pose."""
         plan, start, rise = self.plan, self.plan.time, 0.9
         stop = start + rise + 0.2 + self.protocol.stand_s
         for side in SIDES:

@@ -1,4 +1,4 @@
-"""Seeded flats whose doors, windows, drawers and much furniture can be moved (thesis §5.2: an interactive environment)."""
+"""Seeded flats whose doors, windows, drawers and much furniture can be moved (iReplica thesis §5.2)."""
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -26,7 +26,7 @@ LOOSE: dict[str, tuple[str, ...]] = {
     "kitchen": ("table", "box"),
     "study": ("sofa", "table", "box", "chair"),
 }
-"""What can be moved about in each kind of room, the most wanted first; a table comes with chairs."""
+"""Movable furniture in each kind of room, in order of preference; a table comes with chairs."""
 FIXED: dict[str, tuple[str, ...]] = {
     "living room": ("cabinet", "shelf", "plant", "lamp"),
     "bedroom": ("bed", "wardrobe", "cabinet", "lamp"),
@@ -36,23 +36,23 @@ FIXED: dict[str, tuple[str, ...]] = {
 FEWEST = {"sofa": 1, "table": 1, "chair": 1, "box": 1, "door": 2, "window": 1, "drawer": 2}
 FEWEST_OBJECTS = 10
 WINDOW_SHARE, AJAR_SHARE = 0.6, 0.3
-"""Of the windows can be opened; of the doors (and half as many windows) stand open at first."""
+"""Share of the windows that can be opened; share of the doors (half that of the windows) that stand open at first."""
 LEAST_OPEN, MOST_OPEN = np.deg2rad(75.0), np.deg2rad(100.0)
-"""A leaf that cannot be opened so far is not hung; and none opens further."""
+"""Least angle to which a leaf must open, else it is left out; and largest angle to which any opens."""
 FRAME_M = 0.015
-"""How far a frame stands out of its wall."""
+"""Depth of a frame in front of its wall."""
 
 
 @dataclass(frozen=True)
 class _Loose(Piece):
-    """A thing's outline, to find a place for it."""
+    """Outline of a movable object, to find a place for it."""
 
     movable: Movable | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class InteractiveFlat:
-    """What stays where it is, and what can be moved."""
+    """A static world, and the objects in it that can be moved or opened."""
 
     static: World
     movables: tuple[Movable, ...]
@@ -64,7 +64,7 @@ class InteractiveFlat:
 
     @cached_property
     def world(self) -> World:
-        """Everything as it is at the beginning, as it is scanned and seen."""
+        """The world with all objects at their initial poses, as it is scanned and seen."""
         world, meshes = self.static, [self.static.mesh]
         face_object, face_texture = [world.face_object], [world.face_texture]
         objects = list(world.objects)
@@ -83,7 +83,7 @@ class InteractiveFlat:
 
 
 def obstacle(item: Movable | Openable, pose: Rigid | None) -> WorldObject:
-    """What a walker keeps off: an object at a pose (None: the initial one)."""
+    """Obstacle of an object at a pose (None: the initial one)."""
     pose = item.object.T_world_object if pose is None else pose
     R, t = pose.R.double().numpy(), pose.t.double().numpy()
     if isinstance(item, Openable):
@@ -98,13 +98,13 @@ def obstacle(item: Movable | Openable, pose: Rigid | None) -> WorldObject:
 
 @dataclass
 class _Builder(WorldBuilder):
-    """A builder that keeps what can be moved out of the world."""
+    """A builder that keeps movable objects out of the world."""
 
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
     movables: list[Movable] = field(default_factory=list)
     openables: list[Openable] = field(default_factory=list)
     shut: set[int] = field(default_factory=set)
-    """Windows that cannot be opened."""
+    """Indices of windows that cannot be opened."""
 
     def place(self, piece: Piece, position: tuple[float, float, float], heading: float) -> int:
         if isinstance(piece, _Loose):
@@ -144,7 +144,7 @@ def _draw(rng: np.random.Generator, name: str) -> InteractiveFlat:
 
 
 def _numbered(items: list) -> list:
-    """The same with names: door_1, door_2 …"""
+    """The same items with names: door_1, door_2 …"""
     count: Counter[str] = Counter()
     out = []
     for item in items:
@@ -155,7 +155,7 @@ def _numbered(items: list) -> list:
 
 
 def _furnish(plan: Plan, kind: str, rng: np.random.Generator) -> None:
-    """What can be moved first, then what stands still along the walls, with room before windows."""
+    """Movable furniture first, then static furniture along the walls, with room in front of windows."""
     builder = plan.builder
     assert isinstance(builder, _Builder)
     for number, window in enumerate(builder.windows):
@@ -213,7 +213,7 @@ def _before_window(builder: WorldBuilder, window: Door) -> Box:
 
 
 def _add_door_leaves(builder: _Builder, static: World, rng: np.random.Generator) -> list[Openable]:
-    """Leaves in door gaps, mostly opening into rooms, on whichever side they have the space to."""
+    """Door leaves in the gaps, mostly opening into rooms, on whichever side they have the space to."""
     leaves = []
     for door in builder.doors:
         variants = [(side, hand) for side in (-1.0, 1.0) for hand in (-1.0, 1.0)]
@@ -231,7 +231,7 @@ def _add_door_leaves(builder: _Builder, static: World, rng: np.random.Generator)
 
 
 def _add_sashes(builder: _Builder, static: World, rng: np.random.Generator) -> list[Openable]:
-    """Sashes that open into the room; a window wider than one has two."""
+    """Window sashes that open into the room; a window wider than one sash has two."""
     sashes = []
     for number, window in enumerate(builder.windows):
         sides = [side for side in (-1.0, 1.0) if _room_at(static, window, side)]
@@ -251,7 +251,7 @@ def _add_sashes(builder: _Builder, static: World, rng: np.random.Generator) -> l
 
 
 def _jamb(gap: Door, side: float, hand: float, width: float) -> tuple[np.ndarray, float, float]:
-    """Hinge's foot, heading of the closed leaf and sense of opening, for a leaf that opens towards `side` of a gap."""
+    """Hinge's foot, heading of the closed leaf and sign of opening, for a leaf that opens towards `side` of a gap."""
     ahead = side * direction(gap.heading)
     along = hand * np.array([-ahead[1], ahead[0]])
     foot = np.array(gap.position)
@@ -264,7 +264,7 @@ def _jamb(gap: Door, side: float, hand: float, width: float) -> tuple[np.ndarray
 
 
 def _room_at(static: World, gap: Door, side: float) -> str:
-    """Name of the room half a metre off a gap, "" outside."""
+    """Name of the room half a metre away from a gap, "" outside."""
     point = np.array(gap.position[:2]) + side * 0.5 * direction(gap.heading)
     names = [room.name for room in static.rooms if points_in_convex(point[None], room.polygon)[0]]
     return names[0] if names else ""
@@ -273,7 +273,7 @@ def _room_at(static: World, gap: Door, side: float) -> str:
 def _free_angle(
     leaf: Openable, static: World, movables: list[Movable], gap: tuple[float, float, float]
 ) -> float:
-    """How far a leaf opens before it touches something (rad), its own frame left aside."""
+    """Angle to which a leaf opens before it touches something (rad), its own frame left aside."""
     solid = [item for item in static.objects if np.linalg.norm(np.array(item.position[:2]) - gap[:2]) < 4.0]
     solid += [obstacle(movable, None) for movable in movables]
     solid = [
@@ -293,7 +293,7 @@ def _free_angle(
 
 
 def _limited(leaf: Openable, most: float) -> Openable:
-    """The leaf opening no further than `most` (rad)."""
+    """The leaf with an opening of at most `most` (rad)."""
     freedom = leaf.object.freedom
     low, high = (min(leaf.opening_sign * most, 0.0), max(leaf.opening_sign * most, 0.0))
     return replace(
@@ -304,7 +304,7 @@ def _limited(leaf: Openable, most: float) -> Openable:
 
 
 def _ajar(leaf: Openable, rng: np.random.Generator, share: float) -> Openable:
-    """Closed, or in `share` of the cases open by 65° or more at first."""
+    """The leaf closed or, in `share` of the cases, opened by 65° or more at first."""
     if rng.random() >= share:
         return leaf
     return at(leaf, leaf.opening_sign * float(rng.uniform(np.deg2rad(65.0), leaf.openness(leaf.opened))))

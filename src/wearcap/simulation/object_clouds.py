@@ -1,4 +1,4 @@
-"""Clouds of the objects that a simulated household has, by the thousand."""
+"""Point clouds of the object classes of a simulated household."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ _SEEDS = {"train": 0, "val": 1, "test": 2}
 
 
 _PER_FLAT = 3
-"""Instances of a category taken from one flat: more would be much alike."""
+"""Number of instances of a category taken from one flat: more would be much alike."""
 
 
 def check_classes(classes: Sequence[str]) -> None:
@@ -36,7 +36,7 @@ def check_classes(classes: Sequence[str]) -> None:
 def generate_clouds(
     split: str, classes: Sequence[str], per_class: int, points: int = POINTS
 ) -> tuple[Float[Tensor, "object point 3"], Int64[Tensor, "object"]]:
-    """Clouds (m, in their objects' own axes) and their classes' numbers; splits share no seed.
+    """Clouds (m, in their objects' own axes) and their class indices; splits share no seed.
 
     Raises WearcapError for an unknown class.
     """

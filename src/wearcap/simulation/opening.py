@@ -1,4 +1,4 @@
-"""Opening and closing doors, windows, cabinet doors and drawers: a hand on the handle, the body out of the way."""
+"""Opening and closing doors, windows, cabinet doors and drawers: a hand on the handle, the body clear of the leaf."""
 
 from dataclasses import dataclass, replace
 
@@ -22,17 +22,17 @@ from wearcap.simulation.world import World, WorldObject
 
 KEY_S = 0.2
 NEAR_M = 2.2
-"""Things further from the handle are no hindrance."""
+"""Distance from the handle's path up to which objects are checked for collisions."""
 OTHER_HAND = 0.25
-"""How often the hand that would do worse is taken all the same."""
+"""Probability of using the hand with the higher cost."""
 YAW_MOST = 1.1
-"""A hand turns on its handle up to this (rad)."""
+"""Largest rotation of a hand on its handle (rad)."""
 BEYOND_M = 0.4
-"""Past a leaf's edge one would rather stand."""
+"""Preferred distance beyond a leaf's edge."""
 OUT_RAD, OUT_M = 0.25, 0.08
-"""From here on nothing of a leaf or a drawer's front is within its frame."""
+"""Opening from which on no part of a leaf or a drawer's front is within its frame."""
 PALM_M = 0.085
-"""From wrist to palm."""
+"""Distance from wrist to palm."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ def operate(
     plan: Plan, house: House, rng: np.random.Generator, item: Openable, value: float, handle: int = 0,
     seem: Seem | None = None,
 ) -> bool:  # fmt: skip
-    """Go to an openable and bring it to a value by one of its handles; False, with nothing done, where one cannot.
+    """Go to an openable and bring it to a value by one of its handles; False, with nothing done, if impossible.
 
-    With `seem`, that is done there instead, and nothing is touched.
+    With `seem`, that act is done there instead, and nothing is touched.
     """
     world = house.world(plan.position)
     turn = plan_turn(plan, house, world, rng, item, value, handle)
@@ -86,7 +86,7 @@ def plan_turn(
     value: float,
     handle: int,
 ) -> Turn | None:
-    """Hand, tempo and way of the body; None where the thing would hit something or one cannot stand for it."""
+    """Hand, tempo and body path; None where the leaf or drawer would hit something or one cannot stand for it."""
     start, shoulder = house.values[item.name], 1.50 * plan.hip_height
     amount = abs(value - start) / (np.deg2rad(80.0) if item.hinged else 0.4)
     seconds = float(np.clip((0.9 + 1.3 * amount) * rng.normal(1.0, 0.12) / plan.style.briskness, 1.0, 3.2))
@@ -130,7 +130,7 @@ def _beyond(item: Openable, handle: int) -> tuple[Float[np.ndarray, "2"], float]
 
 
 def _hits(item: Openable, values: Float[np.ndarray, "key"], near: list[WorldObject]) -> bool:
-    """Whether a leaf or drawer, once it is out of its frame, meets what stands about."""
+    """Whether a leaf or drawer, once it is out of its frame, meets other objects."""
     others = [
         other.footprint for other in near
         if other.z_range[0] < item.z_range[1] - 0.02 and other.z_range[1] > item.z_range[0] + 0.02
@@ -142,7 +142,7 @@ def _hits(item: Openable, values: Float[np.ndarray, "key"], near: list[WorldObje
 
 
 def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> None:
-    """Write the grip, the steps, where the thing goes and who held it when."""
+    """Write the grip, the steps, the object's motion and the interactions."""
     item, start = turn.item, plan.time
     touch = start + 0.75 / plan.style.briskness
     begin = touch + float(rng.uniform(0.05, 0.25))
@@ -184,7 +184,7 @@ def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> 
 
 
 def _hand_yaw(plan: Plan, turn: Turn, path: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time"]:
-    """How far the hand turns on the handle (rad), so that the fingers point where the arm does."""
+    """Rotation of the hand on the handle (rad), so that the fingers point along the arm."""
     values = turn.values(np.linspace(0.0, 1.0, len(path)))
     handle, pose = turn.item.handle(turn.handle, values), turn.item.pose(values)
     fingers = (pose.R.numpy() @ np.array(turn.item.handles[turn.handle].fingers))[:, :2]

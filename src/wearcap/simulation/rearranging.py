@@ -1,4 +1,4 @@
-"""Finding new places for things in a flat, and ways on which neither they nor who moves them touch anything."""
+"""New places for objects in a flat, and paths on which neither they nor the person moving them touch anything."""
 
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -27,17 +27,17 @@ Options = Callable[[Plan, Movable, np.ndarray, np.ndarray, np.random.Generator],
 
 TRIES, OPTIONS, PLACES = 24, 4, 4
 APART_M, BODY_M = 0.04, 0.22
-"""Room kept from other things by what is moved, and by the middle of who moves it."""
+"""Distance kept from other objects by the moved object, and by the middle of the person who moves it."""
 REACHED_M = 0.35
-"""The place to stand is no further than this from where one can walk freely."""
+"""Largest distance of the place to stand from where one can walk freely."""
 FAR_M = {"sofa": (0.3, 1.6), "table": (0.3, 1.8), "chair": (0.25, 2.2)}
-"""How far things are moved."""
+"""Range of the distance by which objects are moved."""
 CARRIED_M = 5.0
 USED_BEFORE, USED_AGAIN = 0.7, 0.7
-"""How often what is held is used before it is carried, and then once more; what was not is always used there."""
+"""Probability of using a held object before it is carried, and once more after; if not before, it is used after."""
 TURN_SHARE = 0.4
 BEFORE_M = 0.45
-"""Kept free before what opens, beyond its sweep."""
+"""Depth kept free in front of openables, beyond their sweep."""
 REACHABLE_SHARE = 0.85
 KEYS = np.linspace(0.0, 1.0, 9)
 
@@ -45,9 +45,9 @@ KEYS = np.linspace(0.0, 1.0, 9)
 def rearrange(
     plan: Plan, house: House, rng: np.random.Generator, movable: Movable, seem: Seem | None = None
 ) -> bool:
-    """Slide a thing to another place nearby; False, with nothing done, where none is found or one cannot get to it.
+    """Slide an object to another place nearby; False, with nothing done, where none is found or reachable.
 
-    With `seem`, that is done there instead, and nothing is touched.
+    With `seem`, that act is done there instead, and nothing is touched.
     """
     world = house.world(plan.position)
     choice = choose_slide(plan, house, world, rng, movable)
@@ -76,7 +76,7 @@ def rearrange(
 def choose_slide(
     plan: Plan, house: House, world: World, rng: np.random.Generator, movable: Movable
 ) -> Slide | None:
-    """A new place for a thing and a way to bring it there; None where none was found."""
+    """A new place for an object and a plan to slide it there; None where none was found."""
     start, points = floor_place(house, movable), world.navigation.node_points[:, :2]
     if np.linalg.norm(points - start[:2], axis=1).min() > max(movable.half_size) + 1.0:
         return None
@@ -117,9 +117,9 @@ def choose_slide(
 def relocate(
     plan: Plan, house: House, rng: np.random.Generator, movable: Movable, seem: Seem | None = None
 ) -> bool:
-    """Carry a box to another place on the floor; False, with nothing done, where none is found or one cannot get there.
+    """Carry a box to another place on the floor; False, with nothing done, where none is found or reachable.
 
-    With `seem`, that is done before it instead, and nothing is touched.
+    With `seem`, that act is done in front of it instead, and nothing is touched.
     """
     world = house.world(plan.position)
     choice = choose_carry(plan, house, world, rng, movable, carry_options)
@@ -145,9 +145,9 @@ def relocate(
 def fetch(
     plan: Plan, house: House, rng: np.random.Generator, movable: Movable, seem: Seem | None = None
 ) -> bool:
-    """Take a hand-held thing, use it, and put it down elsewhere on the floor; False where that cannot be done.
+    """Take a hand-held object, use it, and put it down elsewhere on the floor; False where that cannot be done.
 
-    With `seem`, that is done before it instead, and nothing is touched.
+    With `seem`, that act is done in front of it instead, and nothing is touched.
     """
     world = house.world(plan.position)
     for _ in range(PLACES):
@@ -183,7 +183,7 @@ def fetch(
 def choose_carry(
     plan: Plan, house: House, world: World, rng: np.random.Generator, movable: Movable, options: Options[C]
 ) -> C | None:
-    """A free place on the floor for a thing and a way to hold it; None where none was found."""
+    """A free place on the floor for an object and an option to hold it; None where none was found."""
     place, level = floor_place(house, movable), float(house.poses[movable.name].t[2])
     points = world.navigation.node_points[:, :2]
     if np.linalg.norm(points - place[:2], axis=1).min() > 1.0:
@@ -209,7 +209,7 @@ def choose_carry(
 def _keeps_floor_reachable(
     house: House, world: World, movable: Movable, stop: Float[np.ndarray, "3"], body: Float[np.ndarray, "2"]
 ) -> bool:
-    """Whether one who has moved a thing, and stands at `body`, still gets to most of the floor that one got to before."""
+    """Whether most of the floor stays reachable after an object was moved and its mover stands at `body`."""
     end = np.append(body, float(house.poses[movable.name].t[2]))
     placed = obstacle(movable, floor_pose(stop, end[2]))
     grid = house.flat.static.navigation.barred((*house.obstacles((movable.name,)), placed), end)
@@ -219,7 +219,7 @@ def _keeps_floor_reachable(
 
 
 def floor_place(house: House, movable: Movable) -> Float[np.ndarray, "3"]:
-    """Where a thing stands: x, y (m) and heading (rad)."""
+    """Floor pose of an object: x, y (m) and heading (rad)."""
     pose = house.poses[movable.name]
     return np.array([*pose.t[:2].tolist(), float(np.arctan2(pose.R[1, 0], pose.R[0, 0]))])
 
@@ -254,7 +254,7 @@ def _local(pose, corners: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "4 2"]:
 
 
 def _meets(zone: Float[np.ndarray, "4 2"], start: Float[np.ndarray, "3"]) -> bool:
-    """Whether a zone matters for what stands at `start`: it is near, and not where the thing is already."""
+    """Whether a zone matters for an object at `start`: it is near, and the object is not in it already."""
     distance = float(distance_to_convex(start[:2], zone))
     return distance < 4.0
 
@@ -262,7 +262,7 @@ def _meets(zone: Float[np.ndarray, "4 2"], start: Float[np.ndarray, "3"]) -> boo
 def _drawn_stop(
     movable: Movable, start: Float[np.ndarray, "3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "3"]:
-    """Somewhere else, mostly along the thing's own axes, now and then turned."""
+    """A new place, mostly displaced along the object's own axes, now and then turned."""
     low, high = FAR_M[movable.category]
     along = rng.choice(4) * np.pi / 2 + start[2] if rng.random() < 0.7 else rng.uniform(-np.pi, np.pi)
     angle = float(along + rng.normal(0.0, 0.15))
@@ -284,7 +284,7 @@ def outlines(
 def apart(
     outlines: Float[np.ndarray, "key 4 2"], others: list[Float[np.ndarray, "corner 2"]], least_m: float
 ) -> bool:
-    """Whether outlines keep off others: neither's border comes near the other."""
+    """Whether outlines keep a distance from others: neither's border comes near the other."""
     share = np.linspace(0.0, 1.0, 7)[:-1, None]
     border = lambda corners: np.concatenate(  # noqa: E731
         [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0))]

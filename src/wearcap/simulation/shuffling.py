@@ -1,4 +1,4 @@
-"""Small steps that carry the body along any way: forwards, backwards, sideways, turning."""
+"""Small steps that carry the body along any path: forwards, backwards, sideways, turning."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,25 +16,25 @@ GRID_S = 0.02
 STILL = 0.035
 """Below this speed (m/s) no step is taken."""
 TURNED_M = 0.24
-"""A turn of one radian counts as so much way (m)."""
+"""Path length equivalent to a turn of one radian (m)."""
 CLOSE_M = 0.15
-"""Least distance of the feet across when one passes the other."""
+"""Least lateral distance of the feet when one passes the other."""
 APART_S = 0.05
-"""At least so long both feet stand between two steps."""
+"""Least time for which both feet stand between two steps."""
 
 
 @dataclass(frozen=True)
 class _BodyPath:
-    """A body's way on a grid of times."""
+    """Path of a body on a grid of times."""
 
     times: Float[np.ndarray, "time"]
     place: Float[np.ndarray, "time 3"]
     ahead: Float[np.ndarray, "time"]
-    """Speed forwards, against the body's heading (m/s)."""
+    """Speed forwards, along the body's heading (m/s)."""
     aside: Float[np.ndarray, "time"]
-    """To the left."""
+    """Speed to the left (m/s)."""
     turn: Float[np.ndarray, "time"]
-    """rad/s, to the left."""
+    """Turn rate to the left (rad/s)."""
 
     @classmethod
     def of(cls, body: Body, start_s: float, stop_s: float) -> "_Way":
@@ -63,10 +63,10 @@ def shuffle(
     stop_s: float,
     width: float | None = None,
 ) -> None:
-    """Follow a body's way from one time to another with alternate steps, feet together at its end.
+    """Follow a body's path from one time to another with alternate steps, feet together at its end.
 
-    Each foot lands where the body will be in the middle of its stance. `width` is the feet's distance across (m);
-    None is the wearer's own. `plan.time` becomes the last landing, at most about half a second after the way's end.
+    Each foot lands at the body's place in the middle of its stance. `width` is the lateral distance of the feet (m);
+    None is the wearer's own. `plan.time` becomes the last landing, at most about half a second after the path's end.
     """
     path = _BodyPath.of(body, start_s, stop_s)
     lands, beats = _landings(plan, path, rng)
@@ -106,7 +106,7 @@ def step_to(
 def _landings(
     plan: Plan, path: _BodyPath, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "step"], Float[np.ndarray, "step"]]:
-    """When feet land, and each step's time (s); the last step closes the feet."""
+    """Landing times of the feet, and each step's duration (s); the last step closes the feet."""
     effort = np.hypot(path.ahead, path.aside) + TURNED_M * np.abs(path.turn)
     beat = np.clip(0.42 + 0.06 / np.maximum(effort, STILL), 0.45, 1.0) / plan.style.briskness**0.5
     beat = np.clip(beat, 0.42, 1.1)
@@ -147,7 +147,7 @@ def _first(plan: Plan, path: _BodyPath, rng: np.random.Generator) -> str:
 def _print(
     plan: Plan, path: _BodyPath, side: str, middle: float, beat: float, width: float, rng: np.random.Generator
 ) -> Footprint:
-    """Where a foot stands whose stance has its middle at a time."""
+    """Footprint of a foot whose stance has its middle at a time."""
     x, y, heading = path.place_at(middle)
     across = abs(path.at("aside", middle)) * beat
     half = max(width, across + CLOSE_M) / 2 * (1.0 + plan.style.variability * rng.standard_normal())

@@ -37,7 +37,7 @@ YARD_KINDS = (
     "tree", "bush", "planter", "bollard", "tree", "low_wall", "street_lamp",
 )  # fmt: skip
 TERRACE_KINDS = ("bench", "planter", "bin", "board")
-"""What stands in each part, the most wanted first."""
+"""Furniture of each part, in order of preference."""
 
 
 @dataclass(frozen=True)
@@ -253,7 +253,7 @@ def _capture_spot(plan: Plan, rng: np.random.Generator) -> None:
 
 
 def _pillars(plan: Plan, rng: np.random.Generator) -> None:
-    """Columns down the middle of a hall, where nothing is in the way, with notices on them."""
+    """Columns down the middle of a hall, out of the walkers' path, with notices on them."""
     x_low, y_low, x_high, y_high = plan.room
     y, color = (y_low + y_high) / 2, hue(rng, (0.0, 0.1))
     for x in np.arange(x_low + 2.5, x_high - 1.5, 4.2):

@@ -1,4 +1,4 @@
-"""Hand-held things on the free floor of an interactive flat."""
+"""Hand-held objects on the free floor of an interactive flat."""
 
 import numpy as np
 
@@ -11,18 +11,18 @@ from wearcap.simulation.rearranging import APART_M, apart, kept_free, outlines
 from wearcap.simulation.things import Movable, make_movable
 
 TWICE = 0.4
-"""How often there are two of a kind."""
+"""Probability of two objects of a kind."""
 TRIES = 60
 OPEN_SHARE, WIDE = 0.75, np.deg2rad(66.0)
-"""Of the doors that are shut stand open; at least so far."""
+"""Share of the shut doors that are opened; least angle to which they are."""
 REACHABLE_SHARE = 0.96
-"""So much of the floor one must still get to when a thing has been put there."""
+"""Share of the floor that must stay reachable when an object has been put there."""
 
 
 def with_handhelds(flat: InteractiveFlat, rng: np.random.Generator) -> InteractiveFlat | None:
-    """The flat with most doors open and one or two of each hand-held kind where one gets to.
+    """The flat with most doors open and one or two of each hand-held kind at reachable places.
 
-    They lie out of the way of doors, drawers and walkers. None where a kind finds no place.
+    They are clear of doors, drawers and walkers. None where a kind finds no place.
     """
     openables = tuple(
         at(item, item.opening_sign * float(rng.uniform(WIDE, item.openness(item.opened))))
@@ -43,7 +43,7 @@ def with_handhelds(flat: InteractiveFlat, rng: np.random.Generator) -> Interacti
 
 
 def _placed(flat: InteractiveFlat, movable: Movable, rng: np.random.Generator) -> Movable | None:
-    """The thing at a free place of the floor; None where none was found."""
+    """The object at a free place of the floor; None where none was found."""
     house, navigation = House(flat), flat.static.navigation
     standing = house.obstacles()
     solid = [item.footprint for item in (*flat.static.objects, *standing) if item.z_range[0] < 1.0]

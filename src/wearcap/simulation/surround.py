@@ -1,7 +1,7 @@
-"""Surroundings for a motion that was captured in an empty hall: a room or a street that fits what the person does.
+"""Surroundings for a motion that was captured in an empty hall: a room or a street that fits the activity.
 
-Walls and furniture stand beside the way, some within arm's reach, and nothing ever meets the body; beneath sitters
-stands a seat, beneath climbers a step. The floor is at z = 0, where `prepare.mocap` puts it.
+Walls and furniture stand beside the path, some within arm's reach, and nothing ever meets the body; below sitters
+stands a seat, below climbers a step. The floor is at z = 0, where `prepare.mocap` puts it.
 """
 
 from dataclasses import dataclass
@@ -23,15 +23,15 @@ from wearcap.simulation.walls import HEIGHT, Wall, build_wall
 from wearcap.simulation.world import Room, World
 
 MARGIN_M = 0.12
-"""Nothing comes nearer to the body than this, but for what it rests on."""
+"""Least distance of anything from the body, except its supports."""
 NEAR_M = (0.3, 0.8)
-"""How far from the body stands what is put beside its way."""
+"""Distance of furniture from the body beside its path."""
 WALL_M = (0.6, 3.0)
-"""From the body to walls."""
+"""Distance from the body to walls."""
 BEYOND_M = 5.0
-"""Of floor around the body that are looked at."""
+"""Margin of the checked floor around the body."""
 FAST, TALL_M = 2.0, HEIGHT - 0.25
-"""Whoever travels faster (m/s), or reaches higher, is mostly, or always, outdoors."""
+"""Speed (m/s) and reach above which a motion is mostly, or always, outdoors."""
 NEAR_INDOORS = (
     "table",
     "chair",
@@ -60,15 +60,15 @@ NEAR_OUTDOORS = (
 
 @dataclass(kw_only=True)
 class FreePlan(Plan):
-    """A plan that also keeps off the space that a moving body takes."""
+    """A plan that also keeps off the space that a moving body occupies."""
 
     body: BodySpace
-    """In the world."""
+    """Space of the body in the world."""
     swept: SweptFloor
-    """In the builder's frame."""
+    """Floor swept by the body, in the builder's frame."""
 
     def distance(self, piece: Piece, x: float, y: float, heading: float) -> float:
-        """From the body to a piece's outline up to its height (m)."""
+        """Distance from the body to a piece's outline up to its height (m)."""
         return self.swept.distance((x, y), piece.size, heading, piece.z_range[1])
 
     def try_place(self, piece: Piece, x: float, y: float, heading: float, front: float = 0.0) -> bool:
@@ -87,7 +87,7 @@ def _overhangs(piece: Piece) -> bool:
 
 
 def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
-    """The same world for the same motion and generator; `motion` needs xsens23's joints and sites.
+    """A world around a motion, deterministic for its motion and generator; `motion` needs xsens23's joints and sites.
 
     Raises WearcapError for another skeleton.
     """
@@ -115,7 +115,7 @@ def _is_outdoors(motion: Motion, path: np.ndarray, body: BodySpace, rng: np.rand
 
 
 def _heading(path: Float[np.ndarray, "time 2"], rng: np.random.Generator) -> float:
-    """Rooms lie along the way, more or less; around who stays in one place anyhow."""
+    """Heading of a room: roughly along the path; random for a body that stays in one place."""
     offset = path - path.mean(0)
     if np.ptp(offset, axis=0).max() < 2.0:
         return float(rng.uniform(-np.pi, np.pi))
@@ -130,7 +130,7 @@ def _extent(body: BodySpace) -> Box:
 
 
 def _support(plan: FreePlan, motion: Motion, rng: np.random.Generator) -> None:
-    """Seats and steps where the motion rests on some."""
+    """Seats and steps where the motion needs support."""
     builder, sits = plan.builder, find_sits(motion)
     for sit in sits:
         if (built := build_seat(builder, plan.body, sit, rng)) is not None:
@@ -148,7 +148,7 @@ def _around(points: Float[np.ndarray, "point 2"]) -> Box:
 
 
 def _room(plan: FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator) -> None:
-    """Four walls with doors and windows, furniture beside the way, then along the walls."""
+    """Four walls with doors and windows, furniture beside the path, then along the walls."""
     builder = plan.builder
     gap = rng.uniform(*WALL_M, 4)
     box = (reach[0] - gap[0], reach[1] - gap[1], reach[2] + gap[2], reach[3] + gap[3])
@@ -174,13 +174,13 @@ def _room(plan: FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator
 
 
 def _walls(box: Box) -> list[Wall]:
-    """Around a rectangle, its inside to their left."""
+    """Walls around a rectangle, its inside to their left."""
     corners = [(box[0], box[1]), (box[2], box[1]), (box[2], box[3]), (box[0], box[3])]
     return [Wall(a, b) for a, b in zip(corners, (*corners[1:], corners[0]))]
 
 
 def _passage(builder: WorldBuilder, wall: Wall, color: tuple, rng: np.random.Generator) -> None:
-    """What is seen through a door: a bit of hallway."""
+    """The view through a door: a bit of hallway."""
     deep = rng.uniform(1.3, 1.8)
     a, b = wall.at(-0.06, -deep), wall.at(wall.length + 0.06, -deep)
     outline = np.array([wall.at(-0.06, -deep), wall.at(wall.length + 0.06, -deep), wall.at(wall.length + 0.06, -0.06), wall.at(-0.06, -0.06)])  # fmt: skip
@@ -190,7 +190,7 @@ def _passage(builder: WorldBuilder, wall: Wall, color: tuple, rng: np.random.Gen
 
 
 def _beside(plan: FreePlan, kinds: tuple[str, ...], path: np.ndarray, rng: np.random.Generator) -> None:
-    """Things within `NEAR_M` of the body, about one for every metre and a half of its way."""
+    """Furniture within `NEAR_M` of the body, about one piece per metre and a half of its path."""
     length = float(np.linalg.norm(np.diff(path[::30], axis=0), axis=1).sum())
     for _ in range(int(np.clip(2 + length / 1.5, 2, 7))):
         piece = MAKERS[str(rng.choice(kinds))](rng)

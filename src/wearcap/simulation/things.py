@@ -1,4 +1,4 @@
-"""Things that a wearer slides or carries: their shape, what they stand on, and where hands take hold of them."""
+"""Objects that a wearer slides or carries: their shape, their support, and the places where hands hold them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,17 +18,17 @@ from wearcap.simulation.handhelds import Grasp, Handheld
 
 @dataclass(frozen=True)
 class Rail:
-    """A straight stretch of a thing on which hands lie, for someone who stands on one side of it; thing's axes."""
+    """A straight segment of an object on which hands rest, for a holder on one side of it; in the object's axes."""
 
     start: Vector
-    """Its end on the holder's left (m)."""
+    """End on the holder's left (m)."""
     stop: Vector
     normal: Vector
     fingers: Vector
     facing: float
-    """The holder's heading against the thing's (rad)."""
+    """Heading of the holder relative to the object's (rad)."""
     stand_off: float
-    """From the middle of the rail back to the footprint's edge, against `facing` (m)."""
+    """Distance from the middle of the rail back to the footprint's edge, against `facing` (m)."""
     both_hands: bool = True
 
     @property
@@ -48,18 +48,18 @@ class Rail:
 
 @dataclass(frozen=True, eq=False)
 class Movable:
-    """An object to be moved by hand; its own axes have the front at +x, the origin on the floor beneath its middle."""
+    """An object to be moved by hand; its own axes have the front at +x, the origin on the floor below its middle."""
 
     object: SceneObject
     half_size: tuple[float, float]
-    """Of the footprint along the thing's x and y (m)."""
+    """Half size of the footprint along the object's x and y (m)."""
     height: float
     rails: tuple[Rail, ...] = ()
-    """Where it is pushed and pulled."""
+    """Rails where it is pushed and pulled."""
     sides: tuple[tuple[GripPlace, GripPlace, float], ...] = ()
-    """Ways to lift it between both hands: the left and right palm's places and the holder's heading against it."""
+    """Options for lifting it between both hands: the left and right palm's places and the holder's relative heading."""
     grasps: tuple[Grasp, ...] = ()
-    """Ways to lift it with one hand."""
+    """Options for lifting it with one hand."""
 
     @property
     def name(self) -> str:
@@ -70,25 +70,25 @@ class Movable:
         return self.object.category
 
     def placed(self, x: float, y: float, heading: float, z: float = 0.0) -> "Thing":
-        """The same thing, initially elsewhere (m, rad)."""
+        """The same object with another initial pose (m, rad)."""
         R, t = rotation.about_axis("z", torch.tensor(heading)), torch.tensor([x, y, z])
         return replace(self, object=replace(self.object, R_world_object=R, t_world_object=t))
 
 
 def floor_pose(place: Float[np.ndarray, "*batch 3"], z: float | np.ndarray = 0.0) -> Rigid:
-    """Pose of a thing that stands at x, y with a heading (m, m, rad), `z` above the world's zero (m)."""
+    """Pose of an object that stands at x, y with a heading (m, m, rad), `z` above the world's zero (m)."""
     at = torch.from_numpy(np.asarray(place, np.float64))
     height = torch.as_tensor(np.asarray(z, np.float64)).expand(at.shape[:-1])
     return Rigid(rotation.about_axis("z", at[..., 2]), torch.cat([at[..., :2], height[..., None]], -1))
 
 
 def make_movable(category: str, name: str, rng: np.random.Generator) -> Movable:
-    """A thing of a category of `THINGS` with drawn size and colour, at the world's origin."""
+    """A movable object of a category of `MOVABLES` with drawn size and colour, at the world's origin."""
     return MOVABLES[category](name, rng)
 
 
 def _sofa(name: str, rng: np.random.Generator) -> Movable:
-    """Held at the upper edge of its back from behind, or of an arm from that side."""
+    """A sofa, held at the upper edge of its back from behind, or of an arm from that side."""
     piece = furniture.armchair(rng) if rng.random() < 0.3 else furniture.sofa(rng)
     half_depth, half_width = piece.size[0] / 2, piece.size[1] / 2
     back = Rail((-half_depth + 0.012, half_width - 0.1, 0.85), (-half_depth + 0.012, 0.1 - half_width, 0.85),
@@ -104,11 +104,11 @@ def _sofa(name: str, rng: np.random.Generator) -> Movable:
 
 
 def _table(name: str, rng: np.random.Generator) -> Movable:
-    """Held at its top's edges."""
+    """A table, held at its top's edges."""
     piece = furniture.table(rng)
     bare = replace(
         piece, parts=piece.parts[:5]
-    )  # four legs and the top; nothing stands on a table that is moved
+    )  # The four legs and the top; nothing stands on a table that is moved.
     half_depth, half_width = piece.size[0] / 2, piece.size[1] / 2
     top = piece.z_range[1]
     rails = []
@@ -126,7 +126,7 @@ def _table(name: str, rng: np.random.Generator) -> Movable:
 
 
 def _chair(name: str, rng: np.random.Generator) -> Movable:
-    """Held at the top of its backrest, from behind or, with one hand, from beside it."""
+    """A chair, held at the top of its backrest, from behind or, with one hand, from beside it."""
     piece = furniture.chair(rng)
     half_depth, half_width, top = piece.size[0] / 2, piece.size[1] / 2, piece.z_range[1]
     x = -half_depth + 0.02
@@ -139,7 +139,7 @@ def _chair(name: str, rng: np.random.Generator) -> Movable:
 
 
 def _box(name: str, rng: np.random.Generator) -> Movable:
-    """Lifted between the palms, which press on two opposite faces."""
+    """A box, lifted between the palms, which press on two opposite faces."""
     depth, width = rng.uniform(0.20, 0.45), rng.uniform(0.25, 0.55)
     height, color = (
         rng.uniform(0.20, 0.50),

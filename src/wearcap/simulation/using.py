@@ -1,6 +1,6 @@
-"""What is done with a thing that is held: drinking, hammering, drilling, mopping, lifting, swinging, hugging, tossing about.
+"""Uses of held objects: drinking, hammering, drilling, mopping, lifting, swinging, hugging, tossing about.
 
-Each use is done where the wearer stands, and ends with the thing as it is carried.
+Each use is done where the wearer stands, and ends with the object in its carrying pose.
 """
 
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from wearcap.simulation.plan import Plan
 Use = Callable[[Plan, Held, np.random.Generator], None]
 
 MOUTH_M = (0.10, 0.0, 0.0)
-"""From the head's joint."""
+"""Position of the mouth from the head's joint."""
 TILT = (1.15, 1.45)
-"""Of a bottle that is drunk from (rad)."""
+"""Tilt range of a bottle while drinking (rad)."""
 
 
 def use(plan: Plan, held: Held, rng: np.random.Generator) -> None:
-    """Something that fits what is held and the number of hands; `plan.time` becomes its end."""
+    """Do a random use that fits the held object and the number of hands; `plan.time` becomes its end."""
     uses = _uses(held)
     uses[int(rng.integers(len(uses)))](plan, held, rng)
 
@@ -69,7 +69,7 @@ def drink(plan: Plan, held: Held, rng: np.random.Generator) -> None:
 
 
 def hammer(plan: Plan, held: Held, rng: np.random.Generator) -> None:
-    """Strokes before the body, each cocked slower than it falls."""
+    """Strike in front of the body, each stroke raised slower than it falls."""
     level, out = float(rng.uniform(-0.60, -0.25)), float(rng.uniform(-0.12, 0.06))
     low = (float(rng.uniform(0.62, 0.74)), out, level)
     high = (low[0] - 0.16, out + 0.06, level + float(rng.uniform(0.16, 0.30)))
@@ -138,7 +138,7 @@ def mop(plan: Plan, held: Held, rng: np.random.Generator) -> None:
 
 
 def hold_up(plan: Plan, held: Held, rng: np.random.Generator) -> None:
-    """Lift what hangs from the hand up before the body, as if onto something, and let it down again."""
+    """Lift the object that hangs from the hand up in front of the body, as if onto a shelf, and lower it again."""
     x, y, z = (held.carry[:3] / held.reach).tolist()
     start, up = plan.time + 0.1, float(rng.uniform(1.0, 1.5) / plan.style.briskness)
     height = float(rng.uniform(0.15, 0.32))
@@ -153,7 +153,7 @@ def hold_up(plan: Plan, held: Held, rng: np.random.Generator) -> None:
 
 
 def swing(plan: Plan, held: Held, rng: np.random.Generator) -> None:
-    """Let what hangs from the hand swing forwards and back."""
+    """Let the object that hangs from the hand swing forwards and back."""
     x, y, z = (held.carry[:3] / held.reach).tolist()
     time, size, sign = plan.time + 0.1, float(rng.uniform(0.12, 0.25)), 1.0
     for number in range(int(rng.integers(4, 9))):
@@ -167,7 +167,7 @@ def swing(plan: Plan, held: Held, rng: np.random.Generator) -> None:
 
 
 def look_at(plan: Plan, held: Held, rng: np.random.Generator) -> None:
-    """Hold a small thing up before the eyes and turn it about."""
+    """Hold a small object up in front of the eyes and turn it about."""
     start, time = plan.time + 0.1, plan.time + 1.0
     at = (float(rng.uniform(0.5, 0.6)), float(rng.uniform(-0.2, -0.05)), float(rng.uniform(-0.30, -0.12)))
     held.go(start, time, at, -0.1, -0.1)
@@ -181,7 +181,7 @@ def look_at(plan: Plan, held: Held, rng: np.random.Generator) -> None:
 
 
 def hug(plan: Plan, held: Held, rng: np.random.Generator) -> None:
-    """Draw what is between both hands to the chest, and hold it there."""
+    """Draw an object between both hands to the chest, and hold it there."""
     start, near = plan.time + 0.1, 0.13 + held.choice.extent[0]
     stop = start + 0.9 + float(rng.uniform(1.5, 4.0))
     at = (near / held.reach, 0.0, -float(rng.uniform(0.38, 0.50)))
@@ -198,7 +198,7 @@ def hug(plan: Plan, held: Held, rng: np.random.Generator) -> None:
 
 
 def sway(plan: Plan, held: Held, rng: np.random.Generator) -> None:
-    """Move what is between both hands from side to side, the trunk turning with it."""
+    """Move an object between both hands from side to side, the trunk turning with it."""
     start = time = plan.time + 0.1
     ahead, level, sign = (
         float(rng.uniform(0.58, 0.68)),
@@ -219,7 +219,7 @@ def sway(plan: Plan, held: Held, rng: np.random.Generator) -> None:
 
 
 def overhead(plan: Plan, held: Held, rng: np.random.Generator) -> None:
-    """Raise what is between both hands before and above the head, up to three times."""
+    """Raise an object between both hands in front of and above the head, up to three times."""
     start = time = plan.time + 0.1
     for _ in range(int(rng.integers(1, 4))):
         up = float(rng.uniform(0.8, 1.1) / plan.style.briskness)
@@ -240,7 +240,7 @@ def overhead(plan: Plan, held: Held, rng: np.random.Generator) -> None:
 
 
 def _watch(plan: Plan, held: Held, at: tuple[float, float, float], start_s: float, stop_s: float) -> None:
-    """Look where the hands are at work: a place given as `Held.go` takes it."""
+    """Look at the working hands: a place given as in `Held.go`."""
     shoulder = shoulder_of(plan)
     ahead, out, up = held.reach * np.array(at)
     aside = held.choice.sign * (out + (0.0 if held.choice.side is None else shoulder[1]))
