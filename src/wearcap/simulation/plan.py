@@ -141,7 +141,7 @@ class Plan:
         """Add a grip to a hand; the hand must have let go of its last object."""
         if self.grips[side] and self.grips[side][-1].release_s > grip.start_s + 1e-9:
             raise ValueError(
-                f"the {side} hand reaches at {grip.start_s} s for one thing while it holds another"
+                f"the {side} hand reaches at {grip.start_s} s for one object while it holds another"
             )
         self.grips[side].append(grip)
 

@@ -37,7 +37,7 @@ class _BodyPath:
     """Turn rate to the left (rad/s)."""
 
     @classmethod
-    def of(cls, body: Body, start_s: float, stop_s: float) -> "_Way":
+    def of(cls, body: Body, start_s: float, stop_s: float) -> "_BodyPath":
         times = np.linspace(start_s, stop_s, max(int((stop_s - start_s) / GRID_S), 2) + 1)
         place = body(times)
         step = times[1] - times[0]

@@ -69,7 +69,7 @@ class Movable:
     def category(self) -> str:
         return self.object.category
 
-    def placed(self, x: float, y: float, heading: float, z: float = 0.0) -> "Thing":
+    def placed(self, x: float, y: float, heading: float, z: float = 0.0) -> "Movable":
         """The same object with another initial pose (m, rad)."""
         R, t = rotation.about_axis("z", torch.tensor(heading)), torch.tensor([x, y, z])
         return replace(self, object=replace(self.object, R_world_object=R, t_world_object=t))
