@@ -1,4 +1,4 @@
-"""Hand-held things: their shapes, and how they are lifted, carried, used and put down."""
+"""Hand-held objects: their shapes, and how they are lifted, carried, used and put down."""
 
 from collections import Counter
 from dataclasses import replace
@@ -49,7 +49,7 @@ def test_a_ball_is_round_and_a_bottle_has_a_neck():
 
 
 def handled(floor, category, seed, hands=None):
-    """A thing lifted, used, carried some steps and put down, by a way with so many hands."""
+    """An object lifted, used, carried some steps and put down with one hand or both."""
     rng = np.random.default_rng(seed)
     person = draw_person("p", rng)
     movable = make_movable(category, f"{category}_1", rng)

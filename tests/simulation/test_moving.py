@@ -23,7 +23,7 @@ def floor():
 
 
 def slid(floor, category, target, seed, hands=None):
-    """A thing slid from the origin to a target by a wearer who stands where it begins."""
+    """An object slid from the origin to a target by a wearer who stands where it begins."""
     rng = np.random.default_rng(seed)
     person = draw_person("p", rng)
     movable = make_movable(category, f"{category}_1", rng)

@@ -1,4 +1,4 @@
-"""Sessions with hand-held things: what the truth says agrees with itself, and the other sessions' flats are as before."""
+"""Sessions with hand-held objects: the ground truth is consistent, and the other sessions' flats are as before."""
 
 import hashlib
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.comfort import ArmBones, Taken, elbow_pole, forearm_and_wrist, take
+from wearcap.simulation.comfort import ArmBones, ArmPosture, elbow_pole, forearm_and_wrist, take
 from wearcap.simulation.grips import Grip
 from wearcap.simulation.ik import two_bone
 from wearcap.simulation.plan import LEFT_SIGN, Plan
@@ -94,7 +94,7 @@ def _turned(
     R_forearm: Float[Tensor, "time 3 3"],
     turn: Float[Tensor, "time"],
     fold: Float[Tensor, "time"],
-    grips: list[tuple[slice, Tensor, Taken]],
+    grips: list[tuple[slice, Tensor, ArmPosture]],
 ) -> tuple[Float[Tensor, "time 3 3"], Float[Tensor, "time 3 3"]]:
     """The elbow's rotation in the world and the wrist's in the forearm: at ease, or as the grips have it."""
     axis, sign = bones.axis, bones.sign
@@ -145,7 +145,7 @@ def shoulder_girdle(
 
 
 @dataclass(frozen=True)
-class Wanted:
+class WristGoal:
     """Wrist goals that follow from the grips of one side."""
 
     wrist: Float[Tensor, "time 3"]
@@ -156,7 +156,7 @@ class Wanted:
     """The same weight, but rising `AROUND_S` earlier and falling as much later."""
 
 
-def held_wrist(plan: Plan, side: str, chest: Rigid, times: Float[np.ndarray, "time"]) -> Wanted:
+def held_wrist(plan: Plan, side: str, chest: Rigid, times: Float[np.ndarray, "time"]) -> WristGoal:
     """Wrist goals that follow from the grips of one side, with the hand turned as the grips prefer."""
     bones = arm_bones(plan.skeleton, side)
     wrist, free = torch.zeros_like(chest.t), torch.ones(2, len(times), dtype=torch.float64)
@@ -173,7 +173,7 @@ def held_wrist(plan: Plan, side: str, chest: Rigid, times: Float[np.ndarray, "ti
         free[:, part] *= 1.0 - weights
     none = (total < 1e-9)[:, None]
     weight, near = 1.0 - free
-    return Wanted(torch.where(none, chest.t, wrist / total[:, None]), weight, near)
+    return WristGoal(torch.where(none, chest.t, wrist / total[:, None]), weight, near)
 
 
 def _gripped(
@@ -184,7 +184,7 @@ def _gripped(
     at_shoulder: Float[Tensor, "time 3"],
     times: np.ndarray,
     fps: float,
-) -> list[tuple[slice, Tensor, Taken]]:
+) -> list[tuple[slice, Tensor, ArmPosture]]:
     """Grips of one side: the frames of each, its weight there, and how the arm takes it."""
     found = []
     for grip in plan.grips[side]:

@@ -49,7 +49,7 @@ class ArmBones:
 
 
 @dataclass(frozen=True)
-class Taken:
+class ArmPosture:
     """A hold with the arm posture chosen for it."""
 
     wrist: Float[Tensor, "time 3"]
@@ -83,7 +83,7 @@ def take(
     R_world_chest: Float[Tensor, "time 3 3"],
     shoulder: Float[Tensor, "time 3"],
     fps: float,
-) -> Taken:
+) -> ArmPosture:
     """Choose elbow swivel and hand yaw over time: the softly least strained of a grid of both, smooth in time."""
     count = len(shoulder)
     some = np.unique(np.linspace(0, count - 1, max(int(count / fps / SPACING_S), 2)).round().astype(int))
@@ -96,7 +96,7 @@ def take(
     full = np.stack([np.interp(np.arange(count), some, row) for row in chosen], 1)
     swivel, yaw = torch.from_numpy(blur(full, SMOOTH_S, fps)).unbind(-1)
     hand = hold.hand(bones.sign, yaw)
-    return Taken(hold.palm - hand @ bones.palm, hand, swivel)
+    return ArmPosture(hold.palm - hand @ bones.palm, hand, swivel)
 
 
 def _strain(

@@ -101,7 +101,7 @@ def foot_motion(
 
 
 class _Timeline:
-    """Which print each frame belongs to, and its numbers gathered per frame."""
+    """Index of each frame's print, and the values of that print gathered per frame."""
 
     def __init__(self, prints: list[Footprint], times: np.ndarray):
         columns = {

@@ -65,7 +65,7 @@ def suitcase(rng: np.random.Generator) -> Handheld:
         for y in (-thick / 2 + 0.03, thick / 2 - 0.03):
             parts.append(_lying(_disc(wheel, 0.02, DARK), "y", (x, y, wheel)))
     level = top + handle
-    grasps = _hung((0.0, 0.0, level), (0.0, np.pi))
+    grasps = _beside_body((0.0, 0.0, level), (0.0, np.pi))
     return Handheld(merged(parts), (length, thick + 0.004), level + 0.011, (), grasps)
 
 
@@ -88,7 +88,7 @@ def backpack(rng: np.random.Generator) -> Handheld:
     parts.append(_box((0.0, 0.0, loop), (0.022, 0.114, 0.014), DARK))
     level = float(rng.uniform(0.42, 0.55)) * body
     sides = _between({0.0: width / 2, np.pi: width / 2}, level)
-    grasps = _hung((0.0, 0.0, loop), (np.pi / 2, -np.pi / 2))
+    grasps = _beside_body((0.0, 0.0, loop), (np.pi / 2, -np.pi / 2))
     return Handheld(merged(parts), (depth + 0.06, width), loop + 0.007, sides, grasps)
 
 
@@ -198,7 +198,7 @@ MAKERS: dict[str, Callable[[np.random.Generator], Handheld]] = {
 }  # fmt: skip
 
 
-def _hung(bar: tuple[float, float, float], facings: Sequence[float]) -> tuple[Grasp, ...]:
+def _beside_body(bar: tuple[float, float, float], facings: Sequence[float]) -> tuple[Grasp, ...]:
     """Grasps of either hand on a bar along the holder's heading, beside the body, fingers down, palm inwards."""
     x, y, z = bar
     out = 0.011 + SKIN_M

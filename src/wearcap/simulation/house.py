@@ -19,7 +19,7 @@ from wearcap.simulation.plan import Plan
 from wearcap.simulation.things import Movable
 from wearcap.simulation.world import World, WorldObject
 
-Seem = Callable[[Plan, dict[str, GripPlace], Rigid, float, np.random.Generator], None]
+Distractor = Callable[[Plan, dict[str, GripPlace], Rigid, float, np.random.Generator], None]
 """An act that resembles handling an object: given places for the hands, the object's pose and its height (m)."""
 
 

@@ -11,7 +11,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.actions import ACTIVITIES, follow, start_place
 from wearcap.simulation.distractors import bend_over, gesture_at, hover, linger, squat_by
 from wearcap.simulation.grips import GripPlace
-from wearcap.simulation.house import House, Seem
+from wearcap.simulation.house import Distractor, House
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.opening import operate
 from wearcap.simulation.outline import distance_to_convex
@@ -31,7 +31,7 @@ EVEN_S = 4.0
 AGAIN, ROOM = 0.25, 0.10
 """Probability of using the last object again, and of moving several objects of one room."""
 TRIES = 5
-SEEM_SHARE = 0.14
+DISTRACTOR_SHARE = 0.14
 """Probability of an act in front of an object without touching it."""
 ORDINARY = ("stand", "look_around", "turn", "walk", "hold", "gesture", "carry", "reach", "sit", "crouch")
 CLOSE_BEHIND = 0.35
@@ -60,7 +60,7 @@ class Habits:
     """Probability of using the last object again, unless it was in the hands for long."""
     near_m: float = NEAR_M
     """Distance per factor 1/e in the probability of an object's choice."""
-    seem_share: float = SEEM_SHARE
+    distractor_share: float = DISTRACTOR_SHARE
     """Probability of an act in front of an object without touching it."""
 
 
@@ -70,12 +70,12 @@ VARIED = Habits(
         "door": 3.0, "window": 4.4, "drawer": 4.4, "cabinet_door": 4.6, "sofa": 4.5, "table": 2.6, "chair": 2.4,
         "box": 0.5, "suitcase": 1.2, "backpack": 1.2, "bottle": 1.0, "tool": 1.0, "ball": 0.9,
     },
-    0.75, even=True, again=0.7, near_m=1.5, seem_share=0.04,
+    0.75, even=True, again=0.7, near_m=1.5, distractor_share=0.04,
 )  # fmt: skip
 """Every kind is held for a fair share of the time, hand-held objects for about half of it."""
 
 
-def seem_to_handle(
+def pretend_to_handle(
     plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, height_m: float, rng: np.random.Generator
 ) -> None:
     """One of the acts that resemble handling, in front of an object of a height."""
@@ -155,12 +155,12 @@ class Household:
         return f"{verb} {(self.openables | self.movables)[name].category}"
 
     def _act(self, name: str) -> bool:
-        seem = seem_to_handle if self.rng.random() < self.habits.seem_share else None
+        distractor = pretend_to_handle if self.rng.random() < self.habits.distractor_share else None
         if name in self.openables:
-            return self.turn(self.openables[name], seem)
+            return self.turn(self.openables[name], distractor)
         movable = self.movables[name]
         act = {"box": relocate, **dict.fromkeys(HANDHELD, fetch)}.get(movable.category, rearrange)
-        return act(self.plan, self.house, self.rng, movable, seem)
+        return act(self.plan, self.house, self.rng, movable, distractor)
 
     def rearrange_room(self) -> str:
         """Move several objects near each other, one after another."""
@@ -172,7 +172,7 @@ class Household:
             self.use(name)
         return "rearrange" if self.plan.time > start else "stand"
 
-    def turn(self, item: Openable, seem: Seem | None = None) -> bool:
+    def turn(self, item: Openable, distractor: Distractor | None = None) -> bool:
         """Open a closed openable, close an open one; sometimes to a value in between."""
         at, full = self.house.values[item.name], item.openness(item.opened)
         if item.openness(at) > 0.3 * full:
@@ -182,7 +182,7 @@ class Household:
         value = item.closed + share * (item.opened - item.closed)
         if abs(value - at) < 0.12 * full:
             return False
-        return operate(self.plan, self.house, self.rng, item, value, self._side(item), seem)
+        return operate(self.plan, self.house, self.rng, item, value, self._side(item), distractor)
 
     def go(self, goal: Float[np.ndarray, "3"], stop_m: float = 0.0) -> bool:
         """Walk to a floor point (m), or within `stop_m` of it, opening closed doors on the path; False on failure."""

@@ -25,7 +25,7 @@ SITES = {"train": 8, "val": 3, "test": 5}
 
 @dataclass(frozen=True)
 class HpsConfig(HeadCameraConfig):
-    """What to simulate."""
+    """Settings of a simulated recording."""
 
     fps: float = 60.0
     """Frame rate of suit and wrist sensors."""

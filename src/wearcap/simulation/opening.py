@@ -11,7 +11,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.actions import approach
 from wearcap.simulation.grips import drawn_grip
 from wearcap.simulation.handling import handling_of
-from wearcap.simulation.house import House, Seem
+from wearcap.simulation.house import Distractor, House
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.outline import distance_to_convex
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan, wrap
@@ -53,11 +53,11 @@ class Turn:
 
 def operate(
     plan: Plan, house: House, rng: np.random.Generator, item: Openable, value: float, handle: int = 0,
-    seem: Seem | None = None,
+    distractor: Distractor | None = None,
 ) -> bool:  # fmt: skip
     """Go to an openable and bring it to a value by one of its handles; False, with nothing done, if impossible.
 
-    With `seem`, that act is done there instead, and nothing is touched.
+    With `distractor`, that act is done there instead, and nothing is touched.
     """
     world = house.world(plan.position)
     turn = plan_turn(plan, house, world, rng, item, value, handle)
@@ -68,8 +68,8 @@ def operate(
     far = np.linalg.norm(goal[:2] - plan.position[:2]) > 0.1 or abs(wrap(first[2] - plan.heading)) > 0.3
     if far and not approach(plan, world, rng, goal, float(first[2])):
         return False
-    if seem is not None:
-        seem(
+    if distractor is not None:
+        distractor(
             plan, {turn.side: item.handles[handle]}, item.pose(turn.start), item.handles[handle].point[2], rng
         )
     else:

@@ -11,7 +11,7 @@ from wearcap.simulation.actions import approach
 from wearcap.simulation.carrying import Carry, carry_options, lift, put_down
 from wearcap.simulation.holding import Take, take_options, take_up
 from wearcap.simulation.holding import put_down as put_held_down
-from wearcap.simulation.house import House, Seem
+from wearcap.simulation.house import Distractor, House
 from wearcap.simulation.interactive_flat import obstacle
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.outline import distance_to_convex, rectangle, turn
@@ -43,11 +43,11 @@ KEYS = np.linspace(0.0, 1.0, 9)
 
 
 def rearrange(
-    plan: Plan, house: House, rng: np.random.Generator, movable: Movable, seem: Seem | None = None
+    plan: Plan, house: House, rng: np.random.Generator, movable: Movable, distractor: Distractor | None = None
 ) -> bool:
     """Slide an object to another place nearby; False, with nothing done, where none is found or reachable.
 
-    With `seem`, that act is done there instead, and nothing is touched.
+    With `distractor`, that act is done there instead, and nothing is touched.
     """
     world = house.world(plan.position)
     choice = choose_slide(plan, house, world, rng, movable)
@@ -58,9 +58,9 @@ def rearrange(
     far = np.linalg.norm(goal[:2] - plan.position[:2]) > 0.25
     if far and not approach(plan, world, rng, goal, float(heading)):
         return False
-    if seem is not None:
+    if distractor is not None:
         step_to(plan, rng, choice.stand[:2], float(heading))
-        seem(
+        distractor(
             plan,
             {side: choice.places[side] for side in choice.hands[0]},
             house.poses[movable.name],
@@ -115,11 +115,11 @@ def choose_slide(
 
 
 def relocate(
-    plan: Plan, house: House, rng: np.random.Generator, movable: Movable, seem: Seem | None = None
+    plan: Plan, house: House, rng: np.random.Generator, movable: Movable, distractor: Distractor | None = None
 ) -> bool:
     """Carry a box to another place on the floor; False, with nothing done, where none is found or reachable.
 
-    With `seem`, that act is done in front of it instead, and nothing is touched.
+    With `distractor`, that act is done in front of it instead, and nothing is touched.
     """
     world = house.world(plan.position)
     choice = choose_carry(plan, house, world, rng, movable, carry_options)
@@ -129,9 +129,9 @@ def relocate(
     x, y, heading = choice.stand
     if not approach(plan, world, rng, np.array([x, y, floor]), float(heading)):
         return False
-    if seem is not None:
+    if distractor is not None:
         step_to(plan, rng, choice.stand[:2], float(heading))
-        seem(plan, choice.places, house.poses[movable.name], movable.height, rng)
+        distractor(plan, choice.places, house.poses[movable.name], movable.height, rng)
         return True
     lifted = lift(plan, choice, rng)
     there = house.world(plan.position, without=(movable.name,))
@@ -143,11 +143,11 @@ def relocate(
 
 
 def fetch(
-    plan: Plan, house: House, rng: np.random.Generator, movable: Movable, seem: Seem | None = None
+    plan: Plan, house: House, rng: np.random.Generator, movable: Movable, distractor: Distractor | None = None
 ) -> bool:
     """Take a hand-held object, use it, and put it down elsewhere on the floor; False where that cannot be done.
 
-    With `seem`, that act is done in front of it instead, and nothing is touched.
+    With `distractor`, that act is done in front of it instead, and nothing is touched.
     """
     world = house.world(plan.position)
     for _ in range(PLACES):
@@ -162,9 +162,9 @@ def fetch(
     x, y, heading = choice.stand
     if not approach(plan, world, rng, np.array([x, y, floor]), float(heading)):
         return False
-    if seem is not None:
+    if distractor is not None:
         step_to(plan, rng, choice.stand[:2], float(heading))
-        seem(plan, choice.places, house.poses[movable.name], movable.height, rng)
+        distractor(plan, choice.places, house.poses[movable.name], movable.height, rng)
         return True
     held = take_up(plan, choice, rng)
     early = rng.random() < USED_BEFORE

@@ -170,7 +170,7 @@ def _box(name: str, rng: np.random.Generator) -> Movable:
     return replace(movable, sides=tuple(sides))
 
 
-def _held(
+def _handheld(
     category: str, make: Callable[[np.random.Generator], Handheld]
 ) -> Callable[[str, np.random.Generator], Movable]:
     def movable(name: str, rng: np.random.Generator) -> Movable:
@@ -193,5 +193,5 @@ def _of_piece(name: str, category: str, piece: Piece, freedom: Freedom) -> Movab
 
 MOVABLES: dict[str, Callable[[str, np.random.Generator], Movable]] = {
     "sofa": _sofa, "table": _table, "chair": _chair, "box": _box,
-    **{category: _held(category, make) for category, make in handhelds.MAKERS.items()},
+    **{category: _handheld(category, make) for category, make in handhelds.MAKERS.items()},
 }  # fmt: skip
