@@ -92,9 +92,9 @@ def plan_turn(
     seconds = float(np.clip((0.9 + 1.3 * amount) * rng.normal(1.0, 0.12) / plan.style.briskness, 1.0, 3.2))
     keys = max(round(seconds / KEY_S), 6)
     values = start + ease(np.linspace(0.0, 1.0, keys)) * (value - start)
-    handle_path, footprint = item.handle(handle, values), item.footprint(values)
+    palms, footprint = item.handle(handle, values), item.footprint(values)
     near = [other for other in world.objects
-            if other.name != item.name and distance_to_convex(handle_path[:, :2], other.footprint).min() < NEAR_M]  # fmt: skip
+            if other.name != item.name and distance_to_convex(palms[:, :2], other.footprint).min() < NEAR_M]  # fmt: skip
     if _hits(item, values, near):
         return None
     floor = float(plan.position[2])
@@ -102,15 +102,15 @@ def plan_turn(
     high = [
         other
         for other in solid
-        if other.z_range[1] > handle_path[0, 2] - 0.05 and other.z_range[0] < floor + shoulder
+        if other.z_range[1] > palms[0, 2] - 0.05 and other.z_range[0] < floor + shoulder
     ]
     task = Task(
-        handle_path, footprint, tuple(other.footprint for other in solid), tuple(other.footprint for other in high), 1.0,
-        floor + shoulder, plan.arm_length + PALM_M, low=bool(item.z_range[1] < handle_path[0, 2] + 0.2),
+        palms, footprint, tuple(other.footprint for other in solid), tuple(other.footprint for other in high), 1.0,
+        floor + shoulder, plan.arm_length + PALM_M, low=bool(item.z_range[1] < palms[0, 2] + 0.2),
         beyond=_beyond(item, handle),
     )  # fmt: skip
     walkable = world.navigation.node_points[:, :2]
-    walkable = walkable[np.linalg.norm(walkable - handle_path[0, :2], axis=1) < 2.0]
+    walkable = walkable[np.linalg.norm(walkable - palms[0, :2], axis=1) < 2.0]
     found = [(side, find_stances(replace(task, sign=LEFT_SIGN[side]), walkable, rng)) for side in SIDES]
     able = [(stances.cost, side, stances) for side, stances in found if stances is not None]
     if not able:

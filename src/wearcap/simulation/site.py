@@ -1,4 +1,4 @@
-"""Seeded large sites of about 1000 m²: rooms, a corridor and halls, a terrace before them, stairs and a ramp to a yard."""
+"""Seeded sites of about 1000 m²: rooms, a corridor, halls, a terrace in front, stairs and a ramp to a yard."""
 
 from dataclasses import dataclass
 from itertools import pairwise
