@@ -13,7 +13,7 @@ from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
 from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.scene.environment import Environment
-from wearcap.simulation.things import make_thing
+from wearcap.simulation.things import make_movable
 from wearcap.systems.echo.observations import Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import Conditioning
@@ -53,7 +53,7 @@ class Streamed:
     """A session that is fed a walk at 30 Hz, of one who takes up a box and lays it down every few seconds."""
 
     def __init__(self, pipeline: Echo):
-        box = make_thing("box", "box", np.random.default_rng(0)).object
+        box = make_movable("box", "box", np.random.default_rng(0)).object
         self.session = EchoSession(pipeline, EchoWearer(xsens23(), floor_m=0.0), Environment((box,)))
         self.number, self.outputs = 0, 0
         motion = swinging("walk", LAP_S / 2, 0, fps=FPS).motion

@@ -1,4 +1,4 @@
-"""A level floor and checks shared by the tests of hands that hold things."""
+"""A level floor and checks shared by the tests of hands that hold objects."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""Hands that hold things keep to them, however they move."""
+"""Gripping hands follow their objects, however these move."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Hand-held things: their shapes, and how they are lifted, carried, used and put down."""
+"""Hand-held objects: their shapes, and how they are lifted, carried, used and put down."""
 
 from collections import Counter
 from dataclasses import replace
@@ -12,7 +12,7 @@ from wearcap.simulation.handhelds import MAKERS, ball, bottle, drill, hammer, mo
 from wearcap.simulation.handling import object_motion
 from wearcap.simulation.holding import put_down, take_options, take_up
 from wearcap.simulation.person import draw_person
-from wearcap.simulation.things import floor_pose, make_thing
+from wearcap.simulation.things import floor_pose, make_movable
 from wearcap.simulation.using import use
 from wearcap.simulation.walking import walk_along
 
@@ -49,11 +49,11 @@ def test_a_ball_is_round_and_a_bottle_has_a_neck():
 
 
 def handled(floor, category, seed, hands=None):
-    """A thing lifted, used, carried some steps and put down, by a way with so many hands."""
+    """An object lifted, used, carried some steps and put down with one hand or both."""
     rng = np.random.default_rng(seed)
     person = draw_person("p", rng)
-    thing = make_thing(category, f"{category}_1", rng)
-    options = take_options(plan_at(person, floor, 0.0, 0.0, 0.0), thing, START, STOP, rng)
+    movable = make_movable(category, f"{category}_1", rng)
+    options = take_options(plan_at(person, floor, 0.0, 0.0, 0.0), movable, START, STOP, rng)
     choice = next(option for option in options if hands in (None, len(option.places)))
     # one walks straight on
     turned = float(choice.stand[2])
@@ -79,7 +79,7 @@ def test_a_thing_is_lifted_used_carried_and_put_down(floor, category, seed, hand
     assert_natural(simulated)
     choice = held.choice
     assert np.abs(track.t_world_body[-1].numpy() - choice.stop[[0, 1, 3]]).max() < 1e-4
-    vertices = torch.from_numpy(choice.thing.object.mesh.vertices)
+    vertices = torch.from_numpy(choice.movable.object.mesh.vertices)
     lowest = (track.R_world_body[:, 2] @ vertices.T).amin(1) + track.t_world_body[:, 2]
     assert lowest.min() > -1e-4, "nothing goes through the floor"
     times = track.timestamps
@@ -95,16 +95,16 @@ def test_what_hangs_beside_a_leg_keeps_off_it_and_upright(floor):
     _, held, _, simulated, track = handled(floor, "suitcase", 1)
     during = (track.timestamps > held.lifted_s) & (track.timestamps < held.lifted_s + 6.0)
     assert track.R_world_body[during, 2, 2].min() > 0.9
-    thing, motion = held.choice.thing, simulated.motion
+    movable, motion = held.choice.movable, simulated.motion
     for joint in ("left_knee", "right_knee"):
         local = (track.T_world_body.inverse() @ motion.joint(joint).t)[during].numpy()
-        outside = np.maximum(np.abs(local[:, :2]) - np.array(thing.half_size), 0.0)
+        outside = np.maximum(np.abs(local[:, :2]) - np.array(movable.half_size), 0.0)
         assert np.linalg.norm(outside, axis=1).min() > 0.02
 
 
 def test_a_bottle_is_brought_to_the_mouth(floor):
     _, held, _, simulated, track = handled(floor, "bottle", 2)
-    top = torch.tensor([0.0, 0.0, held.choice.thing.height])
+    top = torch.tensor([0.0, 0.0, held.choice.movable.height])
     mouth = simulated.motion.joint("head") @ torch.tensor([0.10, 0.0, 0.0])
     away = (track.T_world_body @ top - mouth).norm(dim=-1)
     assert away.min() < 0.06

@@ -1,4 +1,4 @@
-"""Sessions of interactions: what the truth says of hands and things agrees with the bodies' motion."""
+"""Sessions of interactions: the ground truth of hands and objects agrees with the bodies' motion."""
 
 from itertools import pairwise
 
@@ -92,7 +92,7 @@ def test_things_keep_to_their_freedom(simulated, recording):
     for item in simulated.environment.objects:
         track, freedom = recording.object_motion[item.name], item.freedom
         up = track.R_world_body[:, 2, 2]
-        assert (up > 1 - 1e-5).all(), "things stay upright"
+        assert (up > 1 - 1e-5).all(), "objects stay upright"
         if freedom.kind != "free":
             assert (track.t_world_body[:, 2] - item.t_world_object[2]).abs().max() < 1e-4
         if freedom.kind == "hinge":

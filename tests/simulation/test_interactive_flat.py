@@ -20,7 +20,7 @@ def flats():
 
 def test_every_flat_has_enough_to_move(flats):
     for flat in flats:
-        kinds = Counter(item.category for item in (*flat.things, *flat.openables))
+        kinds = Counter(item.category for item in (*flat.movables, *flat.openables))
         assert kinds.total() == len(flat.environment) >= 10
         assert all(kinds[kind] >= least for kind, least in FEWEST.items()), kinds
         assert not {"sofa", "table", "chair", "armchair"} & {item.kind for item in flat.static.objects}
@@ -51,7 +51,7 @@ def test_a_closed_leaf_fills_its_gap_and_an_open_one_clears_it(flats):
             gap = min(flat.static.doors, key=lambda d: np.linalg.norm(door.footprint(door.closed).mean(0) - d.position[:2]))  # fmt: skip
             middle = np.array(gap.position[:2])
             assert distance_to_convex(middle, door.footprint(door.closed)) < 0.08
-            opened = door.closed + door.way * np.deg2rad(75)
+            opened = door.closed + door.opening_sign * np.deg2rad(75)
             assert distance_to_convex(middle, door.footprint(opened)) > 0.3
             pose = door.object.T_world_object
             start = door.pose(0.0)
@@ -62,12 +62,12 @@ def test_a_closed_leaf_fills_its_gap_and_an_open_one_clears_it(flats):
 def test_things_stand_apart_and_leave_the_doors_their_sweep(flats):
     for flat in flats:
         house = House(flat)
-        names = {thing.name for thing in flat.things}
-        things = [item for item in house.obstacles() if item.name in names]
+        names = {movable.name for movable in flat.movables}
+        movables = [item for item in house.obstacles() if item.name in names]
         for door in (item for item in flat.openables if item.category == "door"):
             for value in np.linspace(door.closed, door.opened, 7):
                 tip = door.footprint(value)[1:3]
-                assert min(distance_to_convex(tip, thing.footprint).min() for thing in things) > 0.0
+                assert min(distance_to_convex(tip, movable.footprint).min() for movable in movables) > 0.0
 
 
 def test_closed_doors_bar_the_way_and_open_ones_do_not(flats):

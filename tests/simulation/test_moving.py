@@ -13,7 +13,7 @@ from wearcap.simulation.outline import distance_to_convex, rectangle
 from wearcap.simulation.person import draw_person
 from wearcap.simulation.plan import SIDES
 from wearcap.simulation.sliding import slide, slide_options
-from wearcap.simulation.things import THINGS, floor_pose, make_thing
+from wearcap.simulation.things import MOVABLES, floor_pose, make_movable
 from wearcap.simulation.walking import turn_to, walk_along
 
 
@@ -23,18 +23,18 @@ def floor():
 
 
 def slid(floor, category, target, seed, hands=None):
-    """A thing slid from the origin to a target by a wearer who stands where it begins."""
+    """An object slid from the origin to a target by a wearer who stands where it begins."""
     rng = np.random.default_rng(seed)
     person = draw_person("p", rng)
-    thing = make_thing(category, f"{category}_1", rng)
+    movable = make_movable(category, f"{category}_1", rng)
     plan = plan_at(person, floor, 0.0, 0.0, 0.0)
-    options = slide_options(plan, thing, np.zeros(3), np.array(target), rng)
+    options = slide_options(plan, movable, np.zeros(3), np.array(target), rng)
     choice = next(option for option in options if hands is None or len(option.places) == hands)
     x, y, heading = choice.stand
     plan = plan_at(person, floor, x - 0.1, y, heading + 0.2)
     handling = slide(plan, choice, rng)
     simulated = performed(plan, floor, rng)
-    track = object_motion(thing.object.T_world_object, [handling], simulated.motion)
+    track = object_motion(movable.object.T_world_object, [handling], simulated.motion)
     return plan, choice, handling, simulated, track
 
 
@@ -51,7 +51,7 @@ def test_a_thing_goes_where_it_should_with_the_hands_on_it(floor, category, targ
     moving = track.t_world_body.diff(dim=0).norm(dim=-1) > 1e-5
     held = interactions_of([handling]).hand_contact(simulated.motion.timestamps)
     assert held[1:][moving].any(1).all(), "it moves only while it is held"
-    half_deep, half_wide = choice.thing.half_size
+    half_deep, half_wide = choice.movable.half_size
     for frame in range(0, len(track), 5):
         x, y, _ = track.t_world_body[frame].tolist()
         outline = rectangle(
@@ -66,11 +66,11 @@ def test_one_hand_only_translates(floor):
         rng = np.random.default_rng(seed)
         plan = plan_at(draw_person("p", rng), floor, 0.0, 0.0, 0.0)
         for category in ("table", "chair"):
-            thing = make_thing(category, category, rng)
-            for option in slide_options(plan, thing, np.zeros(3), np.array([0.5, 0.2, 0.8]), rng):
+            movable = make_movable(category, category, rng)
+            for option in slide_options(plan, movable, np.zeros(3), np.array([0.5, 0.2, 0.8]), rng):
                 assert option.hands == (SIDES,)
-            for option in slide_options(plan, thing, np.zeros(3), np.array([0.5, 0.2, 0.02]), rng):
-                assert np.ptp(option.thing_at(np.linspace(0, 1, 9))[:, 2]) == 0.0
+            for option in slide_options(plan, movable, np.zeros(3), np.array([0.5, 0.2, 0.02]), rng):
+                assert np.ptp(option.object_at(np.linspace(0, 1, 9))[:, 2]) == 0.0
 
 
 def test_rows_are_split_where_the_hands_change():
@@ -83,10 +83,10 @@ def test_rows_are_split_where_the_hands_change():
 def test_a_box_is_lifted_carried_and_put_down(floor):
     rng = np.random.default_rng(2)
     person = draw_person("p", rng)
-    thing = make_thing("box", "box_1", rng)
+    movable = make_movable("box", "box_1", rng)
     plan = plan_at(person, floor, 0.0, 0.0, 0.0)
     start, stop = np.array([0.0, 0.0, 0.3, 0.0]), np.array([2.0, 1.5, 1.0, 0.7])
-    choice = next(carry_options(plan, thing, start, stop, rng))
+    choice = next(carry_options(plan, movable, start, stop, rng))
     x, y, heading = choice.stand
     plan = plan_at(person, floor, x, y, heading)
     lifted = lift(plan, choice, rng)
@@ -108,37 +108,37 @@ def test_a_box_is_lifted_carried_and_put_down(floor):
 def test_distractors_stay_off_the_thing(floor, category):
     rng = np.random.default_rng(6)
     person = draw_person("p", rng)
-    thing = make_thing(category, category, rng)
+    movable = make_movable(category, category, rng)
     plan = plan_at(person, floor, 0.0, 0.0, 0.0)
     if category == "box":
-        choice = next(carry_options(plan, thing, np.zeros(4), np.zeros(4), rng))
+        choice = next(carry_options(plan, movable, np.zeros(4), np.zeros(4), rng))
     else:
-        choice = next(slide_options(plan, thing, np.zeros(3), np.array([1.0, 0.0, 0.0]), rng))
+        choice = next(slide_options(plan, movable, np.zeros(3), np.array([1.0, 0.0, 0.0]), rng))
     plan = plan_at(person, floor, *choice.stand)
-    pose = thing.object.T_world_object
+    pose = movable.object.T_world_object
     hover(plan, choice.places, pose, rng)
     for act in (gesture_at, bend_over, squat_by):
-        act(plan, pose, thing.height, rng)
+        act(plan, pose, movable.height, rng)
     simulated = performed(plan, floor, rng)
     assert_natural(simulated)
-    low, high = thing.object.mesh.vertices.min(0), thing.object.mesh.vertices.max(0)
+    low, high = movable.object.mesh.vertices.min(0), movable.object.mesh.vertices.max(0)
     for side in SIDES:
         wrist = simulated.motion.joint(f"{side}_wrist").t.numpy()
         outside = np.maximum(np.maximum(low - wrist, wrist - high), 0.0)
         assert np.linalg.norm(outside, axis=1).min() > 0.01
 
 
-@pytest.mark.parametrize("category", sorted(THINGS))
+@pytest.mark.parametrize("category", sorted(MOVABLES))
 def test_hands_lie_on_the_things_surface(category):
     for seed in range(3):
-        thing = make_thing(category, category, np.random.default_rng(seed))
-        low, high = thing.object.mesh.vertices.min(0), thing.object.mesh.vertices.max(0)
-        assert np.allclose(high[:2], thing.half_size, atol=0.02)
-        places = [rail.at(share * rail.length) for rail in thing.rails for share in (0.0, 0.4, 1.0)]
-        places += [place for left, right, _ in thing.sides for place in (left, right)]
-        places += [grasp.place for grasp in thing.grasps]
+        movable = make_movable(category, category, np.random.default_rng(seed))
+        low, high = movable.object.mesh.vertices.min(0), movable.object.mesh.vertices.max(0)
+        assert np.allclose(high[:2], movable.half_size, atol=0.02)
+        places = [rail.at(share * rail.length) for rail in movable.rails for share in (0.0, 0.4, 1.0)]
+        places += [place for left, right, _ in movable.sides for place in (left, right)]
+        places += [grasp.place for grasp in movable.grasps]
         assert places
         for place in places:
             point = np.array(place.point)
             assert ((point > low - 0.011) & (point < high + 0.011)).all()
-            assert np.abs(np.dot(place.normal, place.fingers)) < 1e-6 or category == "box" or thing.sides
+            assert np.abs(np.dot(place.normal, place.fingers)) < 1e-6 or category == "box" or movable.sides

@@ -1,4 +1,4 @@
-"""Sessions with hand-held things: what the truth says agrees with itself, and the other sessions' flats are as before."""
+"""Sessions with hand-held objects: the ground truth is consistent, and the other sessions' flats are as before."""
 
 import hashlib
 
@@ -78,7 +78,7 @@ def test_every_hand_held_kind_is_handled():
     house = House(flat)
     household = Household(house, person_of("val", 1), np.random.default_rng(0), VARIED)
     for kind in HANDHELD:
-        names = [thing.name for thing in flat.things if thing.category == kind]
+        names = [movable.name for movable in flat.movables if movable.category == kind]
         assert any(household.use(name) == f"move {kind}" for name in names for _ in range(4)), kind
     assert {handling.name.rpartition("_")[0] for handling in house.handlings} >= set(HANDHELD)
 

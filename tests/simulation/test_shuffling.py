@@ -1,4 +1,4 @@
-"""Small steps follow any way of the body."""
+"""Small steps follow any path of the body."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The simulated wearer: seeded people who live in seeded places, with what their sensors would say and what is true.
+"""The simulated wearer: seeded people in seeded places, with the readings of their sensors and the ground truth.
 
 Open `simulate.py` first: one recording from a seed. A `World` (`world.py`; made by `flat.py`, `outdoor.py`,
 `site.py`, `hillside.py`) and a `Person` go in; activities (`actions.py`, where one is added; `hands.py`, `settle.py`)

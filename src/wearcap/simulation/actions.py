@@ -1,4 +1,4 @@
-"""What a wearer can do. Each activity is a function that writes footsteps and channels onto the plan.
+"""Activities of a wearer. Each is a function that writes footsteps and channels onto the plan.
 
 A new one (a door, a sofa to push, a box to carry) is a function `(plan, world, rng) -> bool` under `@activity`;
 it returns False, without having written anything, where the world gives no occasion for it.
@@ -19,7 +19,7 @@ Act = Callable[[Plan, World, np.random.Generator], bool]
 
 @dataclass(frozen=True)
 class Activity:
-    """`weight` is how often it is drawn among all, `outdoors` by how much more often in the open."""
+    """An activity; `weight` is its share among all draws, `outdoors` the factor on that weight outdoors."""
 
     act: Act
     weight: float
@@ -27,10 +27,10 @@ class Activity:
 
 
 RUN_RISE_M = 0.02
-"""Between waypoints 0.1 m apart: one runs up a ramp, but over no step."""
+"""Largest rise (m) between waypoints 0.1 m apart when running: a ramp is allowed, a step is not."""
 FREE_M = 0.45
 ELSEWHERE = 0.4
-"""Share of walks outdoors that lead up or down if they can: the terrace is small beside the street."""
+"""Share of walks outdoors that go up or down if they can: the terrace is small beside the street."""
 
 ACTIVITIES: dict[str, Activity] = {}
 
@@ -51,7 +51,7 @@ def start_place(world: World, rng: np.random.Generator) -> tuple[np.ndarray, flo
 
 
 def _free_point(world: World, rng: np.random.Generator, beside_z: float | None = None) -> np.ndarray:
-    """A random place to stand freely; in the open, often one that is higher or lower than `beside_z` (m)."""
+    """A random free place to stand; outdoors, often one that is higher or lower than `beside_z` (m)."""
     points = world.sample_floor(rng, 24)
     free = (world.clearance(points) > FREE_M) & ~on_stairs(world, points)
     if world.outdoors and beside_z is not None and rng.random() < ELSEWHERE:
@@ -82,7 +82,7 @@ def stand(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 def look_around(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Stand and look far about, the trunk turning with the head."""
     start, stop = plan.time, plan.time + rng.uniform(4.0, 9.0)
-    look_about(plan, start, stop, rng, spread=0.75, rest=1.2)
+    look_about(plan, start, stop, rng, spread=0.75, pause_s=1.2)
     time = start + 0.4
     while time < stop - 2.0:
         plan.lean.move(time, time + 0.9, (0.0, 0.0, np.clip(rng.normal(0.0, 0.22), -0.5, 0.5)))
@@ -102,24 +102,24 @@ def turn(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 
 @activity("walk", weight=6.0)
 def walk(plan: Plan, world: World, rng: np.random.Generator) -> bool:
-    """Walk to another place, over stairs where the way leads there."""
+    """Walk to another place, over stairs where the path leads there."""
     return approach(plan, world, rng, None)
 
 
 @activity("run", weight=1.0, outdoors=3.0)
 def run(plan: Plan, world: World, rng: np.random.Generator) -> bool:
-    """Run a way of at least 5 m without a step; False where none is found."""
-    path = _way_to_run(plan, world, rng)
+    """Run along a path of at least 5 m without a step; False where none is found."""
+    path = _path_to_run(plan, world, rng)
     if path is None:
         return False
     start = plan.time
     walk_along(plan, path, rng, float(rng.uniform(2.2, 3.2)), ())
-    look_about(plan, start + 1.0, plan.time, rng, spread=0.12, rest=2.2)
+    look_about(plan, start + 1.0, plan.time, rng, spread=0.12, pause_s=2.2)
     plan.time += rng.uniform(0.25, 0.6)
     return True
 
 
-def _way_to_run(plan: Plan, world: World, rng: np.random.Generator, tries: int = 4) -> np.ndarray | None:
+def _path_to_run(plan: Plan, world: World, rng: np.random.Generator, tries: int = 4) -> np.ndarray | None:
     for _ in range(tries):
         goal = _free_point(world, rng)
         if np.linalg.norm(goal[:2] - plan.position[:2]) < 3.0:
@@ -133,7 +133,7 @@ def _way_to_run(plan: Plan, world: World, rng: np.random.Generator, tries: int =
 def approach(
     plan: Plan, world: World, rng: np.random.Generator, goal: np.ndarray | None, heading: float | None = None
 ) -> bool:
-    """Walk to a floor point (m; a free one when None) and turn to a heading (rad) there; False if no way leads there."""
+    """Walk to a floor point (m; a free one when None) and turn there to a heading (rad); False without a path."""
     goal = _free_point(world, rng, float(plan.position[2])) if goal is None else goal
     path = world.plan_path(plan.position, goal, rng)
     if path is None or (heading is None and path_length(path) < 1.2):
@@ -150,12 +150,12 @@ def follow(
     if path_length(path) > 0.25:
         speed = plan.style.speed * float(np.exp(rng.normal(0.0, 0.13)))
         walk_along(plan, path, rng, speed, world.flights)
-        look_about(plan, start + 1.0, plan.time, rng, spread=0.22, rest=3.0)
+        look_about(plan, start + 1.0, plan.time, rng, spread=0.22, pause_s=3.0)
     if heading is not None and abs(wrap(heading - plan.heading)) > 0.2:
         turn_to(plan, heading, rng)
     plan.time += rng.uniform(0.25, 0.6)
 
 
 def path_length(path: np.ndarray) -> float:
-    """Of a way over the floor, in the plane (m)."""
+    """Horizontal length of a path over the floor (m)."""
     return float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())

@@ -10,7 +10,7 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.comfort import ArmBones, Taken, elbow_pole, forearm_and_wrist, take
+from wearcap.simulation.comfort import ArmBones, ArmPosture, elbow_pole, forearm_and_wrist, take
 from wearcap.simulation.grips import Grip
 from wearcap.simulation.ik import two_bone
 from wearcap.simulation.plan import LEFT_SIGN, Plan
@@ -18,7 +18,7 @@ from wearcap.simulation.posture import Trunk
 from wearcap.simulation.track import blur, ease, wander
 
 AROUND_S, TRACE = 0.7, 0.01
-"""A grip's place counts a little for some time before and after the grip, so that nothing jumps there."""
+"""Time around a grip in which its place already has a little weight (s), against jumps, and that weight."""
 ELBOW_POLE = torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64)
 """Side of the upper arm, in its rest axes, to which the bent elbow points."""
 
@@ -43,7 +43,7 @@ def arm_motion(
     fps: float,
     rng: np.random.Generator,
 ) -> ArmMotion:
-    """One arm over time. The wrist's way is mixed in space between swing, posture and goal, then solved for.
+    """One arm over time. The wrist's path is mixed in space between swing, posture and goal, then solved for.
 
     `running` is 1 where the wearer runs, smooth between.
     """
@@ -94,7 +94,7 @@ def _turned(
     R_forearm: Float[Tensor, "time 3 3"],
     turn: Float[Tensor, "time"],
     fold: Float[Tensor, "time"],
-    grips: list[tuple[slice, Tensor, Taken]],
+    grips: list[tuple[slice, Tensor, ArmPosture]],
 ) -> tuple[Float[Tensor, "time 3 3"], Float[Tensor, "time 3 3"]]:
     """The elbow's rotation in the world and the wrist's in the forearm: at ease, or as the grips have it."""
     axis, sign = bones.axis, bones.sign
@@ -118,7 +118,7 @@ def arm_bones(skeleton: Skeleton, side: str) -> ArmBones:
 
 @dataclass(frozen=True)
 class Girdle:
-    """The collar bone's rotation and where it carries the shoulder."""
+    """Rotation of the collar bone, and the position to which it carries the shoulder."""
 
     R_collar: Float[Tensor, "time 3 3"]
     at_shoulder: Float[Tensor, "time 3"]
@@ -132,7 +132,7 @@ def shoulder_girdle(
     goal: Float[Tensor, "time 3"],
     weight: Float[Tensor, "time"],
 ) -> Girdle:
-    """The shoulder, which goes along with a hand that is led to a goal in the world."""
+    """The shoulder girdle; the shoulder follows a hand that is drawn to a goal in the world."""
     skeleton = plan.skeleton
     collar, shoulder = skeleton.t_parent_joint[
         skeleton.indices(f"{side}_collar", f"{side}_shoulder")
@@ -145,19 +145,19 @@ def shoulder_girdle(
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """Where a side's grips want the wrist."""
+class WristGoal:
+    """Wrist goals that follow from the grips of one side."""
 
     wrist: Float[Tensor, "time 3"]
-    """About there in the world (m); the chest's place where nothing is held."""
+    """Approximate wrist position in the world (m); the chest's position where nothing is held."""
     weight: Float[Tensor, "time"]
-    """How much (0…1)."""
+    """Weight of the grip, 0…1."""
     near: Float[Tensor, "time"]
-    """The same, but rising `AROUND_S` earlier and falling as much later."""
+    """The same weight, but rising `AROUND_S` earlier and falling as much later."""
 
 
-def held_wrist(plan: Plan, side: str, chest: Rigid, times: Float[np.ndarray, "time"]) -> Wanted:
-    """Where a side's grips want the wrist, the hand turned as they would best have it."""
+def held_wrist(plan: Plan, side: str, chest: Rigid, times: Float[np.ndarray, "time"]) -> WristGoal:
+    """Wrist goals that follow from the grips of one side, with the hand turned as the grips prefer."""
     bones = arm_bones(plan.skeleton, side)
     wrist, free = torch.zeros_like(chest.t), torch.ones(2, len(times), dtype=torch.float64)
     total = torch.full_like(free[0], 1e-12)
@@ -173,7 +173,7 @@ def held_wrist(plan: Plan, side: str, chest: Rigid, times: Float[np.ndarray, "ti
         free[:, part] *= 1.0 - weights
     none = (total < 1e-9)[:, None]
     weight, near = 1.0 - free
-    return Wanted(torch.where(none, chest.t, wrist / total[:, None]), weight, near)
+    return WristGoal(torch.where(none, chest.t, wrist / total[:, None]), weight, near)
 
 
 def _gripped(
@@ -184,8 +184,8 @@ def _gripped(
     at_shoulder: Float[Tensor, "time 3"],
     times: np.ndarray,
     fps: float,
-) -> list[tuple[slice, Tensor, Taken]]:
-    """A side's grips: the frames of each, its weight there and how the arm takes it."""
+) -> list[tuple[slice, Tensor, ArmPosture]]:
+    """Grips of one side: the frames of each, its weight there, and how the arm takes it."""
     found = []
     for grip in plan.grips[side]:
         part, share = _span(grip, times)
@@ -235,7 +235,7 @@ def _swing(
 
 
 def _forward_part(swing: np.ndarray) -> np.ndarray:
-    """The swing where it is forward, smoothly nothing where it is backward."""
+    """The swing where it is forward, decaying smoothly to zero where it is backward."""
     return 0.08 * np.logaddexp(0.0, swing / 0.08)
 
 
@@ -251,6 +251,6 @@ def _collar_turn(sign: float, trunk: Trunk, reach: Tensor, weight: Tensor) -> Te
 
 
 def _shy_of_shoulder(wrist: Tensor, length: float) -> Tensor:
-    """Wrist from the shoulder, kept so far off that the elbow bends no more than about 150 degrees."""
+    """Wrist relative to the shoulder, kept so far off that the elbow bends no more than about 150 degrees."""
     distance = wrist.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     return wrist * (distance.clamp(min=0.27 * length) / distance)

@@ -1,4 +1,4 @@
-"""The space that a moving body takes: its limbs as capsules, where its weight is, and the floor it sweeps by height."""
+"""The space that a moving body occupies: limbs as capsules, its centre of mass, and the floor it sweeps by height."""
 
 from dataclasses import dataclass
 
@@ -30,20 +30,20 @@ LIMBS: tuple[tuple[str, str, float, float, str], ...] = (
 
 PARTS = ("seat", "trunk", "shin", "foot", "arm", "hand")
 SOLE_M = 0.03
-"""A foot's capsule lies so far above the soles' sites, which touch the floor."""
+"""Height of a foot's capsule above the soles' sites, which touch the floor."""
 
 SPACING_M = 0.04
-"""Between the points that stand for a capsule."""
+"""Spacing of the points that represent a capsule."""
 VOXEL_M = 0.02
-"""Points in one such cube are one point."""
+"""Side of the cubes within which points are merged."""
 CELL_M = 0.06
 TOPS_M = (0.12, 0.25, 0.35, 0.5, 0.65, 0.8, 0.95, 1.1, 1.4, 1.7, 2.1, 2.6, np.inf)
-"""Up to which height the floor's cells are looked at."""
+"""Heights up to which the floor's cells are checked."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodySpace:
-    """Points that stand for the capsules of all frames, at most `VOXEL_M` off, and their capsules' radii (m)."""
+    """Points that represent the capsules of all frames, at most `VOXEL_M` off, and their capsules' radii (m)."""
 
     points: Float[np.ndarray, "point 3"]
     radius: Float[np.ndarray, "point"]
@@ -66,7 +66,7 @@ class BodySpace:
         return cls(np.concatenate(list(thinned.values())), radius, part)
 
     def around(self, center: Float[np.ndarray, "3"], reach: float) -> "BodySpace":
-        """What of the body comes within `reach` (m) of a point, along any of the world's axes."""
+        """The part of the body that comes within `reach` (m) of a point, along any of the world's axes."""
         near = (np.abs(self.points - center) < reach + self.radius[:, None]).all(1)
         return BodySpace(self.points[near], self.radius[near], self.part[near])
 
@@ -80,7 +80,7 @@ class BodySpace:
     ) -> bool:
         """Whether the body comes nearer than `margin` (m) to a box.
 
-        Parts in `may_touch` may reach so deep (m) into it.
+        Parts in `may_touch` may reach into it by these depths (m).
         """
         body = self.around(center, float(np.linalg.norm(size)) / 2 + margin)
         least = np.array([-(may_touch or {}).get(part, -margin) for part in PARTS])[body.part]
@@ -113,12 +113,12 @@ def mass_center(motion: Motion) -> Float[np.ndarray, "time 3"]:
 
 
 def foot_points(motion: Motion) -> Float[np.ndarray, "time patch 3"]:
-    """`FOOT_PATCHES` (m)."""
+    """Positions of `FOOT_PATCHES` (m)."""
     return site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES).double().numpy()
 
 
 def _thinned(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "kept 3"]:
-    """One point of each cube of `VOXEL_M` that holds any."""
+    """One point for each cube of side `VOXEL_M` that contains any."""
     cube = np.floor(points / VOXEL_M).astype(np.int64)
     cube -= cube.min(0)
     key = (cube[:, 0] * (cube[:, 1].max() + 1) + cube[:, 1]) * (cube[:, 2].max() + 1) + cube[:, 2]
@@ -127,7 +127,7 @@ def _thinned(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "kept 3"
 
 @dataclass(frozen=True, eq=False)
 class SweptFloor:
-    """How far every cell of the floor is from a body that passes over or beside it, by the height looked at."""
+    """Distance of every floor cell from a body that passes over or beside it, by height."""
 
     origin: Float[np.ndarray, "2"]
     clear: Float[np.ndarray, "top i j"]
@@ -161,7 +161,7 @@ class SweptFloor:
     def distance(
         self, center: tuple[float, float], size: tuple[float, float], heading: float, top: float
     ) -> float:
-        """From a rectangle up to a height (m) to the body that is nearest; never too large."""
+        """Distance from a rectangle up to a height (m) to the nearest part of the body; never too large."""
         rows, columns = (np.linspace(-0.5, 0.5, max(2, int(np.ceil(s / CELL_M)) + 1)) * s for s in size)
         points = np.stack(np.meshgrid(rows, columns), -1).reshape(-1, 2) @ turn(heading).T + np.array(center)
         i, j = ((points - self.origin) / CELL_M).astype(int).T
@@ -170,6 +170,6 @@ class SweptFloor:
 
 
 _SIZES = np.array([0.055, 0.08, 0.14])
-"""Radii (m) that are told apart: each limb's, or a little more."""
+"""Classes of radii (m): each limb is assigned the next larger one."""
 _CELL_ERROR_M = CELL_M
-"""Bound on how far points lie from the cells' middles they are rounded to, at both ends of a distance."""
+"""Bound on the distance between points and the middles of the cells to which they are rounded, at both ends."""

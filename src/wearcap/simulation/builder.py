@@ -1,4 +1,4 @@
-"""Collects surfaces, objects and their triangles into a World, in a frame of its own that is turned and shifted."""
+"""Collects surfaces, objects and their triangles into a World, in a local frame that is turned and shifted."""
 
 import colorsys
 from dataclasses import dataclass, field
@@ -26,12 +26,12 @@ class Part:
     texture: float = 6.0
     """Visual features per m²."""
     sides: int = 4
-    """4 is a box; more approximate a round column of diameter size[0]."""
+    """Number of sides: 4 is a box; more approximate a round column of diameter size[0]."""
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A thing to place: its outline (length along its front direction, width), parts, seats and reachable points."""
+    """A piece of furniture to place: its outline (length along its front, width), parts, seats and reachable points."""
 
     kind: str
     size: tuple[float, float]
@@ -46,13 +46,13 @@ class Piece:
 def hue(
     rng: np.random.Generator, saturation: tuple[float, float] = (0.15, 0.7)
 ) -> tuple[float, float, float]:
-    """A random RGB colour (0…1) of middling brightness."""
+    """A random RGB colour (0…1) of medium brightness."""
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(0.45, 0.9))
 
 
 @dataclass
 class WorldBuilder:
-    """Everything is given in the builder's frame; the finished world is turned by `heading` and moved by `shift`."""
+    """Collects a world in the builder's frame; the finished world is turned by `heading` and moved by `shift`."""
 
     name: str
     heading: float = 0.0
@@ -66,7 +66,7 @@ class WorldBuilder:
     rooms: list[w.Room] = field(default_factory=list)
     doors: list[w.Door] = field(default_factory=list)
     windows: list[w.Door] = field(default_factory=list)
-    """Gaps above a sill, given by the floor point beneath them."""
+    """Gaps above a sill, given by the floor point below them."""
     spots: list[w.CaptureSpot] = field(default_factory=list)
     _triangles: list[tuple] = field(default_factory=list)
 
@@ -114,7 +114,7 @@ class WorldBuilder:
         texture: float = 1.0,
         thickness=0.0,
     ) -> None:
-        """Something to stand on, as a Surface and as a slab of the given thickness (m)."""
+        """Add a walkable surface, as a Surface and as a slab of the given thickness (m)."""
         polygon = np.asarray(polygon, dtype=np.float64)
         a, b, c = plane
         top = np.concatenate([polygon, polygon @ np.array([[a], [b]]) + c], 1)
@@ -133,7 +133,7 @@ class WorldBuilder:
     def add_object(
         self, kind: str, outline, z_range: tuple[float, float], position, heading: float = 0.0
     ) -> int:
-        """An obstacle without triangles; returns its index for `add_box(item=…)`."""
+        """Add an obstacle without triangles; returns its index for `add_box(item=…)`."""
         place = self.to_world(np.asarray(position))
         number = len(self.objects)
         self.objects.append(
@@ -143,7 +143,7 @@ class WorldBuilder:
         return number
 
     def add_block(self, kind: str, center, size, color, texture: float = 6.0, heading: float = 0.0) -> int:
-        """A box that is an object of its own: a wall, a post, a hedge."""
+        """Add a box that is an object by itself: a wall, a post, a hedge."""
         z_range = (center[2] - size[2] / 2, center[2] + size[2] / 2)
         outline = rectangle(center[:2], size[:2], heading)
         item = self.add_object(kind, outline, z_range, (center[0], center[1], z_range[0]), heading)
@@ -179,7 +179,7 @@ class WorldBuilder:
         self.reach_targets.append(w.ReachTarget(position, stand, self.heading + heading))
 
     def finish(self, cell: float) -> w.World:
-        """The world, without the seats and reach targets that no walker can stand before."""
+        """The world, without the seats and reach targets that no walker can stand in front of."""
         draft = self._world((), (), cell)
         seats = tuple(s for s in self.seats if _reachable(draft, s.standing_point(), 0.45))
         reaches = tuple(r for r in self.reach_targets if _reachable(draft, np.array(r.stand), 0.15))

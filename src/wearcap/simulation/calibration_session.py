@@ -1,11 +1,12 @@
-"""A simulated calibration as MocapEvery's appendix C.2 has it, with planted answers.
+"""A simulated calibration after MocapEvery's appendix C.2, with planted answers.
 
 Watches on the board, T-pose, camera on four positions, standing, arm swings, then half a minute and more of walking.
 The world is the board's: z up, y where the wearer faces, the floor at 0. The camera's clock is the true one.
 
-Attitude: at rest Core Motion holds it to 0.2-0.3°, wandering within some seconds; moved, it errs by 1.5° more, slowly (the
-project's usual watch). What no procedure can see is left out: a T-pose held wrongly by a constant angle, and
-watches laid on the board askew. A pose's wobble and a stander's sway therefore average to zero over the step.
+Attitude: at rest Core Motion keeps it to 0.2-0.3°, wandering within some seconds; when moved, it errs by 1.5° more,
+slowly (the project's usual watch). Errors that no procedure can detect are left out: a T-pose that is wrong by a
+constant angle, and watches laid on the board askew. A pose's wobble and a stander's sway therefore average to zero
+over the step.
 """
 
 import math
@@ -31,19 +32,19 @@ from wearcap.sensors.stillness import Stretch
 BOARD, T_POSE, STANDING = (3.0, 6.5), (14.0, 17.5), (52.0, 62.0)
 MARKS = ((24.0, 27.0), (30.0, 33.0), (36.0, 39.0), (42.0, 45.0))
 SWINGS_S = 66.0
-"""When the arms begin to swing."""
+"""Time at which the arms begin to swing (s)."""
 _MARGIN_S = 0.6
-"""Things are held still for so much longer at both ends of a step."""
+"""Additional time for which everything is kept still at both ends of a step."""
 _MOVE_S = 1.5
-"""Time that a move from one step to the next takes."""
+"""Duration of the transition from one step to the next."""
 _FINER = 6
-"""The camera's path is drawn so many times finer than its frames: a second difference at 60 Hz misses 0.4 % of a gait."""
+"""Oversampling of the camera's path relative to its frames: a second difference at 60 Hz misses 0.4 % of a gait."""
 _FACING = rotation.about_axis("z", torch.tensor(math.pi / 2, dtype=torch.float64))
 
 
 @dataclass(frozen=True)
 class SessionNoise:
-    """Errors of the sensors and the unsteadiness of the wearer."""
+    """Errors of the sensors and unsteadiness of the wearer."""
 
     still_deg: float = 0.25
     moving_deg: float = 1.5
@@ -62,17 +63,17 @@ class SessionNoise:
 
 @dataclass(frozen=True)
 class CalibrationSession:
-    """What was recorded, when which step was done, and what a calibration should find."""
+    """The recorded session, the times of its steps, and the answers that a calibration should find."""
 
     watches: dict[str, ImuStream]
-    """Each in its own reference frame, on its own clock."""
+    """Logs of the watches, each in its own reference frame and on its own clock."""
     slam: Trajectory
     """Camera poses (OpenCV) in the SLAM's world and unit, on the camera's clock."""
     head_imu: ImuStream
-    """Fixed to the camera, in its axes, on its clock."""
+    """IMU fixed to the camera, in its axes, on its clock."""
     points_slam: Float[Tensor, "point 3"]
     swings_s: Float64[Tensor, "swing"]
-    """Camera's frames in which the hands are nearest."""
+    """Times on the camera's clock at which the hands are nearest."""
     distances_m: tuple[float, float]
     mark_height_m: float
     standing_m: float
@@ -84,7 +85,7 @@ class CalibrationSession:
     scale: float
     R_head_cam: Float64[Tensor, "3 3"]
     offset_s: dict[str, float]
-    """Camera's clock less the watch's when the arms begin to swing."""
+    """Camera clock minus watch clock when the arms begin to swing."""
     board: dict[str, Stretch]
     t_pose: dict[str, Stretch]
 
@@ -97,7 +98,7 @@ def simulate_calibration(
     walk_s: float = 60.0,
     swings: int = 10,
 ) -> CalibrationSession:
-    """One session; everything is drawn from `seed`."""
+    """Simulate one session; everything is drawn from `seed`."""
     rng = np.random.default_rng(seed)
     tops = SWINGS_S + 0.8 + np.cumsum(rng.normal(1.35, 0.12, swings).clip(1.0, 1.7))
     end = tops[-1] + 3 + walk_s
@@ -110,7 +111,7 @@ def simulate_calibration(
     T_world_cam = _camera_path(R_head_cam, distances, height, end, _FINER * camera_fps, noise, rng)
     slam = _seen(T_world_cam[::_FINER], scale, R_world_slam, t_world_slam, camera_fps, noise, rng)
     upright = (T_world_cam.timestamps >= STANDING[0]) & (T_world_cam.timestamps <= STANDING[1])
-    points = (_floor_and_things(rng) - t_world_slam) @ R_world_slam / scale
+    points = (_floor_and_objects(rng) - t_world_slam) @ R_world_slam / scale
     return CalibrationSession(
         {joint: made[0] for joint, made in watches.items()}, slam, _head_imu(T_world_cam, watch_fps, noise, rng),
         points.float(), torch.from_numpy(np.round(tops * camera_fps) / camera_fps), distances, height,
@@ -130,7 +131,7 @@ def _turn(rng: np.random.Generator, angle: float) -> Float64[Tensor, "3 3"]:
 
 
 def _held(time: np.ndarray, holds: list[tuple[float, float]]) -> np.ndarray:
-    """Place among the holds (start s, stop s): whole numbers while held, a minimum-jerk step in between."""
+    """Index among the holds (start s, stop s): whole numbers during a hold, a minimum-jerk step in between."""
     place = np.zeros(len(time))
     for (_, left), (arrived, _) in pairwise(holds):
         begin = max(left, arrived - _MOVE_S)
@@ -140,14 +141,14 @@ def _held(time: np.ndarray, holds: list[tuple[float, float]]) -> np.ndarray:
 
 
 def _between(keys: Float64[Tensor, "key 3 3"], place: np.ndarray) -> Float64[Tensor, "time 3 3"]:
-    """Rotations at fractional places among keys."""
+    """Rotations at fractional indices among keys."""
     first = torch.from_numpy(np.floor(place).clip(0, len(keys) - 2).astype(np.int64))
     blend = torch.from_numpy(place) - first
     return keys[first] @ rotation.exp(rotation.log(keys[first].mT @ keys[first + 1]) * blend[:, None])
 
 
 def _centred(wobble: Tensor, time: np.ndarray, stretch: Stretch) -> Tensor:
-    """The part of a disturbance that averages out over a step, which begins and ends gently."""
+    """The part of a disturbance that averages out over a step, with a smooth beginning and end."""
     inside = (time >= stretch[0]) & (time <= stretch[1])
     edge = np.minimum(time - stretch[0] + _MARGIN_S, stretch[1] + _MARGIN_S - time) / _MARGIN_S
     return (wobble - wobble[torch.from_numpy(inside)].mean(0)) * torch.from_numpy(edge.clip(0, 1))[:, None]
@@ -216,7 +217,7 @@ def _watch(
 def _logged(
     time: np.ndarray, joint: str, R_world_imu: Tensor, position: Tensor, R_world_ref: Tensor, noise: SessionNoise, rng: np.random.Generator
 ) -> ImuStream:  # fmt: skip
-    """What Core Motion says in its reference frame: attitude that errs more when moved, and what it felt."""
+    """Core Motion's log in its reference frame: attitude that errs more when moved, and the measured acceleration."""
     fps = 1 / (time[1] - time[0])
     R, times = R_world_imu, torch.from_numpy(time)
     acc = finite_difference(finite_difference(position, times), times).roll(-1, 0)
@@ -226,7 +227,7 @@ def _logged(
     )
     rate = angular_rate(R, fps)
     turning = np.convolve(rate.norm(dim=-1).numpy(), np.ones(int(fps)) / fps, "same")
-    # Slower than 0.2 rad/s on average is rest to the filter.
+    # Slower than 0.2 rad/s on average counts as rest for the filter.
     moved = torch.from_numpy((turning - 0.2).clip(0, 1))
     error = noise.still_deg * smooth_noise(rng, len(time), 3, noise.still_period_s, fps).double()
     error += (
@@ -296,7 +297,7 @@ def _seen(
 
 
 def _head_imu(T: Trajectory, fps: float, noise: SessionNoise, rng: np.random.Generator) -> ImuStream:
-    """A sensor within the camera: specific force and turn rate at its own rate, from the camera's donning on."""
+    """A sensor within the camera: specific force and turn rate at its own rate, from when the camera is put on."""
     worn = T[T.timestamps > MARKS[-1][1] + 5]
     times = worn.timestamps
     acc = finite_difference(finite_difference(worn.t_world_body, times), times).roll(-1, 0)
@@ -307,7 +308,7 @@ def _head_imu(T: Trajectory, fps: float, noise: SessionNoise, rng: np.random.Gen
     return ImuStream(torch.from_numpy(at), "head", acc_imu=torch.from_numpy(felt).float())
 
 
-def _floor_and_things(rng: np.random.Generator) -> Float64[Tensor, "point 3"]:
+def _floor_and_objects(rng: np.random.Generator) -> Float64[Tensor, "point 3"]:
     """Points of a semi-dense cloud (m, world): floor, a table, walls, and some that are wrong."""
     low, high = np.array([-8.0, -8.0]), np.array([8.0, 12.0])
     floor = np.concatenate([rng.uniform(low, high, (3000, 2)), np.zeros((3000, 1))], 1)

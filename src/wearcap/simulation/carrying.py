@@ -13,55 +13,55 @@ from wearcap.simulation.grips import Grip, GripPlace
 from wearcap.simulation.handling import Handling, handling_of
 from wearcap.simulation.plan import SIDES, Plan, wrap
 from wearcap.simulation.shuffling import step_to
-from wearcap.simulation.things import Thing
+from wearcap.simulation.things import Movable
 from wearcap.simulation.track import ease
 
 BEFORE_CHEST_M = (0.17, 0.22)
-"""Between the chest's joint and the near face of what is carried."""
+"""Distance range between the chest's joint and the near face of the carried box."""
 BELOW_CHEST = (0.16, 0.30)
-"""Of the palms, as a share of the hips' height."""
+"""Range of the palms' height below the chest, as a share of the hip height."""
 BESIDE = (-0.02, 0.42, -0.74, 0.5, 0.0, 0.0)
-"""Hand's pose channel (`HandScore.pose`): out to the side and back."""
+"""The hand's pose channel (`HandScore.pose`): out to the side and back."""
 DEEP = 0.30
-"""Crouches deeper than this share of the hips' height lift the heels."""
+"""Crouches deeper than this share of the hip height lift the heels."""
 
 
 @dataclass(frozen=True)
 class Errand:
-    """How somebody will take a thing from one place to another, decided but not yet on the plan."""
+    """A plan to take an object from one place to another, not yet written to the motion's plan."""
 
-    thing: Thing
+    movable: Movable
     start: Float[np.ndarray, "4"]
-    """Where it stands: x, y (m), heading (rad), height of its underside (m)."""
+    """Pose of the object before: x, y (m), heading (rad), height of its underside (m)."""
     stop: Float[np.ndarray, "4"]
     places: dict[str, GripPlace]
-    """By hand: one, or both."""
+    """Palm places by hand: one, or both."""
     facing: float
-    """The holder's heading against the thing's (rad)."""
+    """Heading of the holder relative to the object's (rad)."""
 
     @property
     def stand(self) -> Float[np.ndarray, "3"]:
-        """Where the wearer lifts it: x, y, heading."""
+        """Pose at which the wearer lifts the object: x, y, heading."""
         return self._before(self.start)
 
     @property
     def goal(self) -> Float[np.ndarray, "3"]:
-        """Where the wearer puts it down."""
+        """Pose at which the wearer puts the object down: x, y, heading."""
         return self._before(self.stop)
 
     def _before(self, pose: np.ndarray) -> np.ndarray:
-        """Where one stands before a thing at a pose."""
+        """Pose at which one stands in front of the object at a pose."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Carry(Errand):
-    """A box between both palms."""
+    """A plan to carry a box between both palms."""
 
     away: float
-    """From the middle of the feet to the box's middle when it is lifted and put down (m)."""
+    """Distance from the middle of the feet to the box's middle when it is lifted and put down (m)."""
     chest: Float[np.ndarray, "2"]
-    """Its origin ahead of and below the chest while it is carried (m)."""
+    """Origin of the box ahead of and below the chest while it is carried (m)."""
 
     def _before(self, pose: np.ndarray) -> np.ndarray:
         heading = pose[2] + self.facing
@@ -70,7 +70,7 @@ class Carry(Errand):
         )
 
     def palm_height(self, pose: Float[np.ndarray, "4"]) -> float:
-        """Of the palms on a box that stands at a pose (m)."""
+        """Height of the palms on a box at a pose (m)."""
         return float(pose[3] + self.places["left"].point[2])
 
 
@@ -80,7 +80,7 @@ class Lifted:
 
     choice: Carry
     start_s: float
-    """When the plan began to go down for it."""
+    """Time at which the plan begins to bend down for the box."""
     touch_s: float
     lift_s: float
     lifted_s: float
@@ -88,21 +88,21 @@ class Lifted:
 
 def carry_options(
     plan: Plan,
-    thing: Thing,
+    movable: Movable,
     start: Float[np.ndarray, "4"],
     stop: Float[np.ndarray, "4"],
     rng: np.random.Generator,
 ) -> Iterator[Carry]:
-    """Ways to carry a box between two poses (x, y in m, heading in rad, height of its underside in m), in random order.
+    """Options for carrying a box between two poses (x, y, heading, underside height; m, rad), in random order.
 
-    Who takes one makes sure that one can stand at its `stand` and `goal`, goes to the first, calls `lift`, goes to
-    the second and calls `put_down`. The box may end turned by quarters against `stop`, as `Carry.stop` says.
+    The caller of an option checks that one can stand at its `stand` and `goal`, goes to the first, calls `lift`, goes
+    to the second and calls `put_down`. The box may end turned by quarters relative to `stop`, as `Carry.stop` states.
     """
     start, stop = np.asarray(start, np.float64), np.asarray(stop, np.float64)
-    for index in rng.permutation(len(thing.sides)):
-        left, right, facing = thing.sides[index]
+    for index in rng.permutation(len(movable.sides)):
+        left, right, facing = movable.sides[index]
         ahead = np.array([np.cos(facing), np.sin(facing), 0.0])
-        deep = float(np.abs(ahead[:2]) @ np.array(thing.half_size))
+        deep = float(np.abs(ahead[:2]) @ np.array(movable.half_size))
         nearer = rng.uniform(0.25, 0.7) * deep * ahead
         places = {
             side: GripPlace(_shifted(place.point, -nearer), place.normal, place.fingers)
@@ -111,9 +111,9 @@ def carry_options(
         below = float(rng.uniform(*BELOW_CHEST)) * plan.hip_height
         chest = np.array([deep + rng.uniform(*BEFORE_CHEST_M), below + left.point[2]])
         away = (
-            plan.sole[1] + 0.08 + 0.2 * max(thing.height - 0.25, 0.0) + deep + float(rng.uniform(0.0, 0.06))
+            plan.sole[1] + 0.08 + 0.2 * max(movable.height - 0.25, 0.0) + deep + float(rng.uniform(0.0, 0.06))
         )
-        yield Carry(thing, start, stop, places, facing, away, chest)
+        yield Carry(movable, start, stop, places, facing, away, chest)
 
 
 def _shifted(point: tuple[float, float, float], by: np.ndarray) -> tuple[float, float, float]:
@@ -133,7 +133,7 @@ def lift(plan: Plan, choice: Carry, rng: np.random.Generator) -> Lifted:
     bow(plan, start, touch, bend, lean)
     spread(plan, (start, start + 0.45 * down), (touch, begin + rise))
     plan.gaze_point.move(
-        start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.thing.height)
+        start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.movable.height)
     )
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(begin + 0.3 * rise, begin + rise, 0.0)
@@ -157,7 +157,7 @@ def put_down(plan: Plan, lifted: Lifted, rng: np.random.Generator) -> Handling:
     plan.gaze_point.move(start, start, np.append(choice.stop[:2], choice.stop[3]))
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(release, release + 0.6, 0.0)
-    moves = _Way(choice, (lifted.lift_s, lifted.lifted_s), (start, start + down))
+    moves = _CarriedPath(choice, (lifted.lift_s, lifted.lifted_s), (start, start + down))
     grips = []
     for side in SIDES:
         late = float(rng.uniform(0.0, 0.12)) if rng.random() < 0.5 else 0.0
@@ -169,7 +169,7 @@ def put_down(plan: Plan, lifted: Lifted, rng: np.random.Generator) -> Handling:
         plan.grip(side, grip)
         grips.append((side, grip))
     plan.time = release + rise + float(rng.uniform(0.0, 0.3))
-    return handling_of(choice.thing.name, "sliding", moves, grips)
+    return handling_of(choice.movable.name, "sliding", moves, grips)
 
 
 def arrive(plan: Plan, place: Float[np.ndarray, "3"], rng: np.random.Generator) -> None:
@@ -179,7 +179,7 @@ def arrive(plan: Plan, place: Float[np.ndarray, "3"], rng: np.random.Generator) 
 
 
 def bend_for(plan: Plan, low: float, rng: np.random.Generator) -> tuple[float, float]:
-    """How far knees (m) and trunk (rad) bend for palms at a height above the floor (m)."""
+    """Bend of the knees (m) and the trunk (rad) for palms at a height above the floor (m)."""
     drop = max(1.52 * plan.hip_height - low - 0.62 * plan.arm_length, 0.0)
     knees = float(np.clip(rng.normal(0.50, 0.08), 0.32, 0.66))
     return float(np.clip(knees * drop, 0.0, 0.46 * plan.hip_height)), float(
@@ -198,7 +198,7 @@ def bow(plan: Plan, start: float, stop: float, crouch: float, lean: float, aside
 
 
 def spread(plan: Plan, out: tuple[float, float], back: tuple[float, float]) -> None:
-    """Who bends over a box keeps the hands that do not hold it beside it."""
+    """Keep hands that do not hold the box beside it while bending over it."""
     for side in SIDES:
         hand = plan.hands[side]
         hand.pose.move(out[0], out[0], BESIDE)
@@ -207,8 +207,8 @@ def spread(plan: Plan, out: tuple[float, float], back: tuple[float, float]) -> N
 
 
 @dataclass(frozen=True)
-class _Way:
-    """A carried box's pose over time: where it stands, before the chest, and where it will stand."""
+class _CarriedPath:
+    """Pose of a carried box over time: where it stands, in front of the chest, and where it will stand."""
 
     choice: Carry
     up: tuple[float, float]
@@ -224,7 +224,7 @@ class _Way:
         yaw = rotation.yaw_of(T_world_chest.R).double()
         ahead = torch.stack([yaw.cos(), yaw.sin(), torch.zeros_like(yaw)], -1)
         held = T_world_chest.t.double() + choice.chest[0] * ahead - torch.tensor([0.0, 0.0, choice.chest[1]])
-        # around the knees: it comes near the body late, and leaves it early
+        # Around the knees: the box comes near the body late, and leaves it early.
         share = torch.stack([near, near, lift], -1), torch.stack([off, off, lower], -1)
         t = held + (1 - share[0]) * (first[[0, 1, 3]] - held) + share[1] * (last[[0, 1, 3]] - held)
         heading = yaw - choice.facing

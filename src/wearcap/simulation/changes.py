@@ -1,4 +1,4 @@
-"""The same place some days later: things stand elsewhere, or are gone."""
+"""The same place some days later: some objects stand elsewhere, others are gone."""
 
 from dataclasses import replace
 
@@ -16,9 +16,9 @@ MOVABLE = (
 def changed_world(
     world: World, rng: np.random.Generator, moved: float = 0.4, removed: float = 0.15, most_m: float = 0.5
 ) -> World:
-    """The world with these shares of its movable things shifted (and turned), or taken away.
+    """The world with these shares of its movable objects shifted (and turned), or removed.
 
-    Walkers keep to the world as it was: things are moved by at most `most_m`. The capture spots' tables stay.
+    Walkers keep to the world as it was: objects are moved by at most `most_m`. The capture spots' tables stay.
     """
     vertices, kept = world.mesh.vertices.copy(), np.ones(len(world.mesh.faces), bool)
     objects = list(world.objects)

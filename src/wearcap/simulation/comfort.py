@@ -1,4 +1,4 @@
-"""How an arm best takes a hold: elbow and hand turned where wrist and forearm are at ease."""
+"""Arm posture for a hold: elbow and hand turned so that wrist and forearm are at ease."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,15 @@ from wearcap.simulation.ik import two_bone
 from wearcap.simulation.track import blur
 
 SWIVELS = (-0.25, 0.05, 0.35, 0.65, 0.95, 1.25)
-"""Of the elbow about the line from shoulder to wrist (rad): 0 hangs down, positive lifts outwards."""
+"""Candidate swivels of the elbow about the shoulder-wrist line (rad): 0 points down, positive lifts outwards."""
 YAWS = (-0.70, -0.42, -0.14, 0.14, 0.42, 0.70)
-"""Of the hand about the palm's normal, against the grip's wish (rad)."""
+"""Candidate yaws of the hand about the palm's normal, relative to the direction that the grip prefers (rad)."""
 HABIT = 0.2
-"""The swivel that needs no reason (rad)."""
+"""Swivel without any cost (rad)."""
 EASE = {"twist": 0.8, "flexion": 0.65, "deviation": 0.30, "swivel": 0.7, "yaw": 0.5}
-"""Scale of what each costs (rad)."""
+"""Scale of the cost of each angle (rad)."""
 LIMITS = {"twist": 1.40, "flexion": 1.15, "deviation": 0.50}
-"""Joint ranges either way (rad): forearm's turn from thumb-up, wrist's bend, and its bend to thumb or little finger."""
+"""Joint limits in both directions (rad): turn of the forearm from thumb-up, flexion of the wrist, and its deviation."""
 STRETCHED = 0.985
 SPACING_S, SMOOTH_S = 0.05, 0.15
 SHARPNESS = 3.0
@@ -29,18 +29,18 @@ SHARPNESS = 3.0
 
 @dataclass(frozen=True)
 class ArmBones:
-    """Offsets of elbow and wrist at rest, and the elbow's hinge."""
+    """Offsets of elbow and wrist in the rest pose, and the hinge axis of the elbow."""
 
     upper: Float[Tensor, "3"]
     fore: Float[Tensor, "3"]
     hinge: Float[Tensor, "3"]
     palm: Float[Tensor, "3"]
-    """Of the palm from the wrist (m)."""
+    """Position of the palm relative to the wrist (m)."""
     sign: float
 
     @property
     def axis(self) -> Float[Tensor, "3"]:
-        """Along the forearm."""
+        """Unit vector along the forearm."""
         return self.fore / self.fore.norm()
 
     @property
@@ -49,8 +49,8 @@ class ArmBones:
 
 
 @dataclass(frozen=True)
-class Taken:
-    """A hold as the arm takes it."""
+class ArmPosture:
+    """A hold with the arm posture chosen for it."""
 
     wrist: Float[Tensor, "time 3"]
     hand: Float[Tensor, "time 3 3"]
@@ -58,14 +58,14 @@ class Taken:
 
 
 def elbow_pole(swivel: Float[Tensor, "*batch"], sign: float) -> Float[Tensor, "*batch 3"]:
-    """The side to which the elbow points, in the chest's axes."""
+    """Side to which the elbow points, in the chest's axes."""
     return torch.stack([torch.full_like(swivel, -0.35), sign * swivel.sin(), -swivel.cos()], -1)
 
 
 def forearm_and_wrist(
     R_forearm: Float[Tensor, "*batch 3 3"], R_hand: Float[Tensor, "*batch 3 3"], axis: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-    """The forearm's turn about its axis (rad) and the wrist's bend (rotation vector, in the turned forearm's axes).
+    """Turn of the forearm about its axis (rad) and bend of the wrist (rotation vector, in the turned forearm's axes).
 
     R_hand = R_forearm · exp(turn axis) · exp(bend) with the bend perpendicular to the axis.
     """
@@ -83,7 +83,7 @@ def take(
     R_world_chest: Float[Tensor, "time 3 3"],
     shoulder: Float[Tensor, "time 3"],
     fps: float,
-) -> Taken:
+) -> ArmPosture:
     """Choose elbow swivel and hand yaw over time: the softly least strained of a grid of both, smooth in time."""
     count = len(shoulder)
     some = np.unique(np.linspace(0, count - 1, max(int(count / fps / SPACING_S), 2)).round().astype(int))
@@ -96,7 +96,7 @@ def take(
     full = np.stack([np.interp(np.arange(count), some, row) for row in chosen], 1)
     swivel, yaw = torch.from_numpy(blur(full, SMOOTH_S, fps)).unbind(-1)
     hand = hold.hand(bones.sign, yaw)
-    return Taken(hold.palm - hand @ bones.palm, hand, swivel)
+    return ArmPosture(hold.palm - hand @ bones.palm, hand, swivel)
 
 
 def _strain(

@@ -1,4 +1,4 @@
-"""Three simulated depth cameras around a spot: what Kinects would see of a person in a world."""
+"""Three simulated depth cameras around a spot: the depth images that Kinects would record of a person in a world."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from wearcap.simulation.world import World
 KINECT = Camera("pinhole", 640, 576, 504.0, 504.0, 319.5, 287.5)
 """Azure Kinect's unbinned narrow mode: 65° x 59° of its 75° x 65°, whose rim the lens bends."""
 _CLEARANCE_M = 0.2
-"""A tripod stands no nearer to a wall or a piece of furniture."""
+"""Least distance of a tripod from a wall or a piece of furniture."""
 _TALLEST_M = 2.0
 _NEAREST_M = 1.4
 """A camera nearer than this does not see a person from head to foot."""
@@ -27,7 +27,7 @@ _NEAREST_M = 1.4
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """What a time-of-flight camera does to a depth (deviations of the data sheet's kind, the shares are ours)."""
+    """Noise of a time-of-flight camera (deviations of the data sheet's kind, the shares are ours)."""
 
     floor_m: float = 0.0015
     per_metre: float = 0.0015
@@ -35,22 +35,22 @@ class DepthNoise:
     bias_m: float = 0.003
     """Deviation of each camera's constant offset (the data sheet allows 11 mm)."""
     flying_share: float = 0.4
-    """Of the pixels along edges that lie somewhere between both surfaces."""
+    """Share of the pixels along edges that lie between both surfaces."""
     edge_m: float = 0.05
     edge_dropout: float = 0.2
     dropout: float = 0.003
     nearest_m: float = 0.25
     farthest_m: float = 5.5
-    """Nothing comes back from beyond (3.9 m by the data sheet, further from light surfaces)."""
+    """Largest measurable distance (3.9 m by the data sheet, further from light surfaces)."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRig:
-    """The rig's images (mm) and where its cameras truly stand."""
+    """Images of the rig (mm) and the true poses of its cameras."""
 
     camera: Camera
     T_world_cam: Rigid
-    """Of "camera"."""
+    """Poses over "camera"."""
     empty_mm: UInt16[np.ndarray, "camera still height width"]
     depth_mm: UInt16[np.ndarray, "camera time height width"]
 
@@ -75,7 +75,7 @@ def place_rig(
 ) -> Rigid:
     """Poses "camera" of tripods around a floor point, evenly turned, that see a person there from all sides.
 
-    The turn is the one that lets the nearest camera stand furthest off, up to `radius_m`, with nothing between.
+    The turn chosen lets the nearest camera stand furthest away, up to `radius_m`, with nothing in between.
     Raises WearcapError where one would stand nearer than 1.4 m.
     """
     reach = np.arange(0.3, radius_m + 1e-6, 0.05)
@@ -102,7 +102,7 @@ def place_rig(
 def approximate(
     poses: Rigid, rng: np.random.Generator, translation_m: float = 0.1, rotation_deg: float = 3.0
 ) -> Rigid:
-    """Poses as far off, each in a random direction, as visual localisation leaves them."""
+    """Poses with errors of the size that visual localisation leaves, each in a random direction."""
     shift, axis = (torch.from_numpy(rng.standard_normal(poses.t.shape)) for _ in range(2))
     unit = [part / part.norm(dim=-1, keepdim=True) for part in (shift, axis)]
     return Rigid(
@@ -142,7 +142,7 @@ def simulate_rig(
 def _sensed(
     depth_m: Float32[np.ndarray, "height width"], bias_m: float, noise: DepthNoise, rng: np.random.Generator
 ) -> UInt16[np.ndarray, "height width"]:
-    """A true depth image as the camera reports it, in whole millimetres, 0 where nothing comes back."""
+    """A true depth image as the camera reports it, in whole millimetres, 0 without a return."""
     true = np.where(np.isfinite(depth_m), depth_m, 2 * noise.farthest_m)
     near, far = ndimage.minimum_filter(true, 3), ndimage.maximum_filter(true, 3)
     edge = far - near > noise.edge_m + 0.02 * near

@@ -1,6 +1,6 @@
-"""What looks like handling a thing but is not: hands that stop short, gestures beside it, bending over and squatting.
+"""Motions that resemble handling an object but are not: reaching short of it, gestures, bending over and squatting.
 
-Each is done where the wearer stands, before a thing; nothing is touched and nothing is recorded as contact.
+Each is done where the wearer stands, in front of an object; nothing is touched or recorded as contact.
 """
 
 from dataclasses import replace
@@ -16,25 +16,25 @@ from wearcap.simulation.hands import ON_THIGHS, hold
 from wearcap.simulation.plan import SIDES, Plan
 
 SHORT_M = (0.05, 0.20)
-"""How far off the surface a palm stays."""
+"""Range of the palm's distance from the surface."""
 LOW_M, HOVER_LOW_M = 0.60, 0.18
-"""For places below the first one bends down, hands beside the thing."""
+"""Height of places below which one bends down, and the hands' distance then, beside the object."""
 
 
 def hover(
     plan: Plan,
     places: dict[str, GripPlace],
-    T_world_thing: Rigid,
+    T_world_object: Rigid,
     rng: np.random.Generator,
     gaze: bool = True,
 ) -> None:
-    """Reach for places on a thing as if to take hold, stop short of them, stay a while, and draw back.
+    """Reach for places on an object as if to take hold, stop short of them, stay a while, and draw back.
 
-    `places` is by hand, in the thing's axes; they must be within reach of the standing wearer.
+    `places` is by hand, in the object's axes; they must be within reach of the standing wearer.
     """
     start = plan.time + 0.1
     first = next(iter(places.values()))
-    low = float((T_world_thing.R.double() @ torch.tensor(first.point).double() + T_world_thing.t)[2])
+    low = float((T_world_object.R.double() @ torch.tensor(first.point).double() + T_world_object.t)[2])
     crouch, lean = bend_for(plan, low - float(plan.position[2]), rng) if low < LOW_M else (0.0, 0.0)
     out = float(np.clip(rng.normal(0.8, 0.18) + crouch, 0.45, 1.6)) / plan.style.briskness
     touch = start + out
@@ -52,7 +52,7 @@ def hover(
         late = float(rng.uniform(0.0, 0.3))
         grip = drawn_grip(
             replace(place, point=(x, y, z)),
-            still(T_world_thing),
+            still(T_world_object),
             touch + late,
             leave + late,
             rng,
@@ -69,12 +69,12 @@ def hover(
     bow(plan, start, touch, crouch, lean)
     bow(plan, leave, stop, 0.0, 0.0)
     if gaze:
-        _look(plan, T_world_thing, first.point, start, leave)
+        _look(plan, T_world_object, first.point, start, leave)
     plan.time = stop
 
 
-def gesture_at(plan: Plan, T_world_thing: Rigid, height: float, rng: np.random.Generator) -> None:
-    """Talk about a thing of a height (m) with the hands, looking at it now and then."""
+def gesture_at(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
+    """Gesture about an object of a height (m), looking at it now and then."""
     start, stop = plan.time, plan.time + float(rng.uniform(2.5, 6.0))
     for side in SIDES if rng.random() < 0.5 else (str(rng.choice(SIDES)),):
         hand, time, first = plan.hands[side], start + float(rng.uniform(0.1, 0.6)), True
@@ -96,12 +96,12 @@ def gesture_at(plan: Plan, T_world_thing: Rigid, height: float, rng: np.random.G
         if not first:
             hand.pose_weight.move(stop - 0.9, stop, 0.0)
     if rng.random() < 0.7:
-        _look(plan, T_world_thing, (0.0, 0.0, height), start + 0.2, stop - 0.8)
+        _look(plan, T_world_object, (0.0, 0.0, height), start + 0.2, stop - 0.8)
     plan.time = stop + 0.1
 
 
-def bend_over(plan: Plan, T_world_thing: Rigid, height: float, rng: np.random.Generator) -> None:
-    """Lean over a thing to look at it, hands hanging, on the back or on the thighs."""
+def bend_over(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
+    """Lean over an object to look at it, hands hanging, on the back or on the thighs."""
     start = plan.time + 0.1
     down = float(rng.uniform(0.8, 1.3)) / plan.style.briskness
     leave = start + down + float(rng.uniform(0.6, 3.0))
@@ -112,12 +112,12 @@ def bend_over(plan: Plan, T_world_thing: Rigid, height: float, rng: np.random.Ge
     plan.crouch.move(leave, leave + 1.1 * down, 0.0)
     if rng.random() < 0.5:
         hold(plan, SIDES, ON_THIGHS, start, leave + down, rng)
-    _look(plan, T_world_thing, (0.0, 0.0, 0.6 * height), start, leave)
+    _look(plan, T_world_object, (0.0, 0.0, 0.6 * height), start, leave)
     plan.time = leave + 1.1 * down + 0.1
 
 
-def squat_by(plan: Plan, T_world_thing: Rigid, height: float, rng: np.random.Generator) -> None:
-    """Squat before a low thing as if to lift it, hands on the thighs or before the knees, and get up without it."""
+def squat_by(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
+    """Squat in front of a low object as if to lift it, hands on the thighs or before the knees, and get up again."""
     start = plan.time + 0.1
     depth = float(rng.uniform(0.24, 0.42)) * plan.hip_height
     down = (0.7 + 1.1 * depth) * float(rng.uniform(0.9, 1.3)) / plan.style.briskness
@@ -135,21 +135,21 @@ def squat_by(plan: Plan, T_world_thing: Rigid, height: float, rng: np.random.Gen
             plan.heel_lift[side].move(leave, leave + 0.6 * up, 0.0)
     before = (0.42, float(rng.uniform(-0.05, 0.25)), float(rng.uniform(-0.75, -0.55)), 0.3, 0.2, 0.1)
     hold(plan, SIDES, ON_THIGHS if rng.random() < 0.5 else before, start, leave + 0.8 * up, rng)
-    _look(plan, T_world_thing, (0.0, 0.0, 0.6 * height), start, leave)
+    _look(plan, T_world_object, (0.0, 0.0, 0.6 * height), start, leave)
     plan.time = leave + up + 0.1
 
 
 def linger(plan: Plan, rng: np.random.Generator) -> None:
-    """Stand close before a thing, looking about."""
+    """Stand close to an object, looking about."""
     stop = plan.time + float(rng.uniform(1.0, 3.5))
     look_about(plan, plan.time, stop, rng, spread=0.4)
     plan.time = stop
 
 
 def _look(
-    plan: Plan, T_world_thing: Rigid, local: tuple[float, float, float], start: float, stop: float
+    plan: Plan, T_world_object: Rigid, local: tuple[float, float, float], start: float, stop: float
 ) -> None:
-    point = T_world_thing.R.double().numpy() @ np.array(local) + T_world_thing.t.double().numpy()
+    point = T_world_object.R.double().numpy() @ np.array(local) + T_world_object.t.double().numpy()
     plan.gaze_point.move(start, start, point)
     plan.gaze_weight.move(start, start + 0.5, 0.85)
     plan.gaze_weight.move(stop, stop + 0.6, 0.0)

@@ -1,4 +1,4 @@
-"""The wearer's own body as a head camera sees it: no head, which it sits on; skin, sleeves, trousers and shoes."""
+"""The wearer's own body as a head camera sees it: without the head; skin, sleeves, trousers and shoes."""
 
 import zlib
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ _WORN = {
     "wrist": "skin", "elbow": "forearm", "shoulder": "sleeve", "collar": "shirt", "hip": "trousers",
     "knee": "shin", "ankle": "shoe", "toe": "shoe", "pelvis": "trousers",
 }  # fmt: skip
-"""What covers the part of the body that follows each joint; the shirt covers all others."""
+"""Clothing of the body part that follows each joint; the shirt covers all others."""
 _MOTTLE = 0.06
 """Deviation of the colour from vertex to vertex, as a share: folds and veins."""
 
@@ -29,13 +29,13 @@ class EgoBody:
 
     model: BodyModel
     faces: Int32[np.ndarray, "face 3"]
-    """The model's."""
+    """Faces of the body model."""
     color: Float32[np.ndarray, "vertex 3"]
-    """RGB 0…1."""
+    """Vertex colours, RGB 0…1."""
 
 
 def ego_body(skeleton: Skeleton, shape: dict[str, float], rng: np.random.Generator) -> EgoBody:
-    """A body fitted to the skeleton's bones; the skin's tone belongs to the skeleton, the clothes are drawn.
+    """A body fitted to the skeleton's bones; the skin tone is derived from the skeleton, the clothes are drawn.
 
     Raises WearcapError as `anny_body` does.
     """
@@ -56,7 +56,7 @@ def ego_body(skeleton: Skeleton, shape: dict[str, float], rng: np.random.Generat
 
 
 def skin_tone(skeleton: Skeleton) -> Float32[np.ndarray, "3"]:
-    """RGB 0…1, always the same for the same bones."""
+    """Skin tone, RGB 0…1, always the same for the same bones."""
     own = np.random.default_rng(zlib.crc32(skeleton.t_parent_joint.numpy().tobytes()))
     place = own.uniform(0, len(_SKIN) - 1)
     tone = [np.interp(place, np.arange(len(_SKIN)), _SKIN[:, channel]) for channel in range(3)]

@@ -1,7 +1,6 @@
-"""What a camera on the simulated wearer's head sees: the surroundings, and the wearer's own arms, hands and legs.
+"""The view of a camera on the simulated wearer's head: the surroundings, and the wearer's own arms, hands and legs.
 
-Small pictures for image encoders, one ray per pixel. The motion may as well be a real one that was put into
-simulated surroundings.
+Small images for image encoders, one ray per pixel. The motion may also be a real one in simulated surroundings.
 """
 
 from collections.abc import Iterator
@@ -32,15 +31,15 @@ EGO_CAMERA = Camera("pinhole", 96, 72, 36.8, 36.8, 47.5, 35.5)
 """105° x 89°, as wide as Aria's colour camera."""
 EGO_FPS = 30.0
 PITCH_DEG, MOUNT_DEG, MOUNT_M = (10.0, 15.0), 1.5, 0.004
-"""Range of the camera's tilt downwards, and deviations of how it is mounted besides."""
+"""Range of the camera's downward tilt, and deviations of its mount in angle and position."""
 _CHUNK = 128
-"""Frames whose bodies are skinned at once."""
+"""Number of frames whose bodies are skinned at once."""
 _VIEW = View(np.eye(3), EGO_CAMERA.fx, EGO_CAMERA.cx, EGO_CAMERA.cy, EGO_CAMERA.width, EGO_CAMERA.height)
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A look of one recording: its light, and how the camera turns light into grey levels."""
+    """Appearance of one recording: its light, and how the camera turns light into grey levels."""
 
     light: Float[np.ndarray, "6"]
     """Direction to the key light, its strength, the ambient light from below and from above."""
@@ -48,7 +47,7 @@ class Shot:
     """White balance and vignetting."""
     exposure: Float32[np.ndarray, "time"]
     noise: float
-    """Grey levels."""
+    """Deviation in grey levels."""
 
     @classmethod
     def drawn(cls, frames: int, rng: np.random.Generator) -> "Shot":
@@ -97,7 +96,7 @@ def write_ego_video(
 def ego_frames(
     world: World, motion: Motion, shape: dict[str, float], stream: CameraStream, rng: np.random.Generator
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """The picture at each timestamp of the stream, which must be timestamps of the motion."""
+    """The image at each timestamp of the stream, which must be timestamps of the motion."""
     scenery, body = Scenery.of(world), ego_body(motion.skeleton, shape, rng)
     rows = torch.searchsorted(motion.timestamps, stream.timestamps.contiguous())
     T_head_cam = Rigid(stream.R_head_cam, stream.t_head_cam)
@@ -120,7 +119,7 @@ def draw_view(
     vertices: Float32[np.ndarray, "vertex 3"],
     light: Float[np.ndarray, "6"],
 ) -> tuple[Float32[np.ndarray, "height width 3"], Int32[np.ndarray, "height width"]]:
-    """Light (grey levels, unbounded) in `EGO_CAMERA`'s picture, and the body's face in each pixel, -1 elsewhere.
+    """Light (grey levels, unbounded) in the image of `EGO_CAMERA`, and the body's face in each pixel, -1 elsewhere.
 
     `vertices` are the body's in the world, `light` is laid out as `Shot.light`.
     """
@@ -139,7 +138,7 @@ def draw_view(
 
 
 def _mount(t_head_device: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Turn and place of the camera on the head."""
+    """Rotation and position of the camera on the head."""
     tilt = torch.tensor([0.0, np.deg2rad(rng.uniform(*PITCH_DEG)), 0.0])
     turn = tilt + np.deg2rad(MOUNT_DEG) * torch.from_numpy(rng.standard_normal(3))
     moved = MOUNT_M * torch.from_numpy(rng.standard_normal(3)).float()
@@ -180,7 +179,7 @@ def _surroundings(
 def _lit_body(
     body: EgoBody, in_cam: np.ndarray, pose: np.ndarray, nearness: np.ndarray, own: np.ndarray, light: np.ndarray
 ) -> UInt8[np.ndarray, "height width 3"]:  # fmt: skip
-    """The body alone, each face with its own normal, by the renderer's shading."""
+    """Image of the body alone, each face with its own normal, by the renderer's shading."""
     rays = (_RAYS * _REACH[:, None]).reshape(EGO_CAMERA.height, EGO_CAMERA.width, 3)
     none, no_map = np.zeros(len(body.faces), bool), np.zeros((0, 0), np.float32)
     out = np.empty((EGO_CAMERA.height, EGO_CAMERA.width, 3), np.uint8)

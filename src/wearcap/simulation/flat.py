@@ -14,7 +14,7 @@ from wearcap.simulation.walls import HEIGHT, THICKNESS, Wall, build_flight, buil
 from wearcap.simulation.world import Room, World
 
 STAIR_SHARE = 0.35
-"""Of the flats have a second storey."""
+"""Share of flats with a second storey."""
 NARROWEST_ROOM_M = 2.9
 
 
@@ -25,7 +25,7 @@ class Layout:
     width: float
     hall: tuple[float, float]
     depth: float
-    """Of the whole storey; equals hall[1] where side B has no rooms."""
+    """Depth of the whole storey; equals hall[1] where side B has no rooms."""
     side_a: tuple[Box, ...]
     side_b: tuple[Box, ...]
 
@@ -45,7 +45,7 @@ def lay_out(
     builder: WorldBuilder, rng: np.random.Generator, stairs: bool,
     furnish: Callable[[Plan, str, np.random.Generator], None] = Plan.furnish,
 ) -> None:  # fmt: skip
-    """Walls, floors and what `furnish` puts into each room, by its kind (`ROOM_KINDS`)."""
+    """Build walls and floors, and furnish each room by its kind (`ROOM_KINDS`)."""
     layout = _draw_layout(rng, stairs)
     hall = (0.0, layout.hall[0], layout.width, layout.hall[1])
     if stairs:
@@ -145,7 +145,7 @@ def _build_stairs(builder: WorldBuilder, layout: Layout, rng: np.random.Generato
 
 
 def _around(hall: Box, hole: Box) -> list[Box]:
-    """The upper hallway: a strip past the hole, and what lies before and behind it."""
+    """The upper hallway: a strip past the hole, and the floor in front of it and behind it."""
     return [
         (hall[0], hall[1], hall[2], hole[1]),
         (hall[0], hole[1], hole[0], hall[3]),

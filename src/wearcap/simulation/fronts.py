@@ -1,4 +1,4 @@
-"""Cabinets and wardrobes with drawers and doors that open: the carcass stays in the world, its fronts are objects."""
+"""Cabinets and wardrobes with drawers and doors that open: the carcass belongs to the world, its fronts are objects."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,9 +12,9 @@ from wearcap.simulation.furniture import wood
 from wearcap.simulation.openables import Openable, drawer, hinged
 
 Place = Callable[[tuple[float, float]], Float[np.ndarray, "3"]]
-"""Floor point in the world (m) of a point in the piece's frame."""
+"""Maps a point in the piece's frame to a floor point in the world (m)."""
 LOW_M, HIGH_M = 0.38, 1.1
-"""Fronts whose middle is within are opened, others are shut for good."""
+"""Height range of the middles of fronts that can be opened; others stay shut."""
 GAP_M = 0.006
 MOST_OPEN = np.deg2rad(100.0)
 
@@ -22,7 +22,7 @@ MOST_OPEN = np.deg2rad(100.0)
 def cabinet(
     piece: Piece, place: Place, heading: float, rng: np.random.Generator
 ) -> tuple[Piece, list[Openable]]:
-    """Of the piece's outline, 0.8–1.15 m high, in columns of drawers or a door each."""
+    """A cabinet with the piece's outline, 0.8–1.15 m high, in columns of drawers or a door each."""
     depth, width = piece.size
     height, foot = float(rng.uniform(0.8, 1.15)), 0.06
     columns = max(int(np.ceil(width / 0.8)), 1)
@@ -51,7 +51,7 @@ def cabinet(
 def wardrobe(
     piece: Piece, place: Place, heading: float, rng: np.random.Generator
 ) -> tuple[Piece, list[Openable]]:
-    """The piece with doors of 0.45–0.65 m."""
+    """A wardrobe: the piece with doors of 0.45–0.65 m."""
     depth, width = piece.size
     height, columns = piece.z_range[1], int(np.ceil(width / 0.65))
     wide = width / columns
@@ -82,7 +82,7 @@ def _door(
     place: Place, heading: float, depth: float, span: tuple[float, float], level: tuple[float, float], hand: float,
     rng: np.random.Generator,
 ) -> Openable:  # fmt: skip
-    """Hung at the right (`hand` 1, seen from before it) or left end of its span."""
+    """A door hinged at the right (`hand` 1, seen from the front) or left end of its span."""
     low, high = span
     at_low = hand > 0
     foot = place((depth / 2, low + GAP_M / 2 if at_low else high - GAP_M / 2))

@@ -1,4 +1,4 @@
-"""Puts furniture into a rectangle of floor so that it overlaps nothing, bars no door and can be used from its front."""
+"""Puts furniture into a rectangle of floor so that it overlaps nothing, blocks no door and is usable from its front."""
 
 from dataclasses import dataclass, field
 
@@ -11,7 +11,7 @@ Box = tuple[float, float, float, float]
 """x_low, y_low, x_high, y_high (m), along the builder's axes."""
 
 FRONT_M = 0.8
-"""Kept free before what is sat on or reached into."""
+"""Free space in front of seats and of furniture that one reaches into."""
 
 ROOM_KINDS: dict[str, tuple[str, ...]] = {
     "living room": ("sofa", "cabinet", "shelf", "armchair", "plant", "lamp", "shelf"),
@@ -19,13 +19,13 @@ ROOM_KINDS: dict[str, tuple[str, ...]] = {
     "kitchen": ("counter", "shelf", "cabinet", "plant"),
     "study": ("desk", "shelf", "armchair", "shelf", "cabinet", "lamp"),
 }
-"""What stands along the walls of each kind of room, the most wanted first."""
+"""Furniture along the walls of each kind of room, in order of preference."""
 
 HAS_TABLE = ("living room", "kitchen")
 
 
 def middle_and_size(box: Box) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Of a box (m)."""
+    """Middle and size of a box (m)."""
     return ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), (box[2] - box[0], box[3] - box[1])
 
 
@@ -45,7 +45,7 @@ class Plan:
     solid: list[Box] = field(default_factory=list)
 
     def try_place(self, piece: Piece, x: float, y: float, heading: float, front: float = 0.0) -> bool:
-        """Place a piece if it fits with `front` metres free before it; says whether it did."""
+        """Place a piece if it fits with `front` metres free before it; returns whether it did."""
         outline = _outline(piece.size, x, y, heading)
         ahead = _outline((front, piece.size[1]), *_ahead(x, y, heading, (piece.size[0] + front) / 2), heading)
         fits = _inside(outline, self.room) and (not front or _inside(ahead, self.room))
@@ -63,7 +63,7 @@ class Plan:
     ) -> tuple | None:
         """Put a piece with its back to a random wall; returns (x, y, heading), or None where nothing fits.
 
-        Without `front`, what is used from its front has `FRONT_M` free before it.
+        Without `front`, pieces used from their front have `FRONT_M` free before it.
         """
         if front is None:
             front = FRONT_M if piece.seats or piece.reaches else 0.0
@@ -130,7 +130,7 @@ class Plan:
                 self.builder_rug(spot, rng)
 
     def builder_rug(self, spot: tuple[float, float, float], rng: np.random.Generator) -> None:
-        """A patterned rug before a sofa: seen, but nothing to stumble over."""
+        """A patterned rug in front of a sofa: visible, but no obstacle."""
         x, y = _ahead(*spot, 1.2)
         size = (float(rng.uniform(1.2, 1.6)), float(rng.uniform(1.6, 2.2)))
         if _inside(_outline(size, x, y, spot[2]), self.room):

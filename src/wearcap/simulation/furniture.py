@@ -1,4 +1,4 @@
-"""Furniture and what stands outdoors: each maker draws sizes and colours and returns a Piece (front +x).
+"""Furniture and outdoor objects: each maker draws sizes and colours and returns a Piece (front +x).
 
 To add a kind, write a maker and enter it in `MAKERS`; rooms and gardens ask for pieces by kind.
 """
@@ -60,7 +60,7 @@ def _upholstered(rng: np.random.Generator, kind: str, places: int) -> Piece:
 
 
 def bed(rng: np.random.Generator) -> Piece:
-    """Its front, where one sits down, is a long side."""
+    """A bed; its front, where one sits down, is a long side."""
     width, length, top = rng.uniform(1.0, 1.8), 2.05, rng.uniform(0.43, 0.50)
     cover = hue(rng)
     parts = (
@@ -146,7 +146,7 @@ def wardrobe(rng: np.random.Generator) -> Piece:
 
 
 def cabinet(rng: np.random.Generator) -> Piece:
-    """A low one, with a screen or things on top."""
+    """A low cabinet, with a screen or props on top."""
     depth, width, height = rng.uniform(0.38, 0.45), rng.uniform(1.0, 1.7), rng.uniform(0.45, 0.85)
     parts = [Part((0, 0, height / 2), (depth, width, height), wood(rng), 3.0)]
     top = height
@@ -163,7 +163,7 @@ def cabinet(rng: np.random.Generator) -> Piece:
 
 
 def counter(rng: np.random.Generator) -> Piece:
-    """A kitchen's: worktop with things on it, cupboards above."""
+    """A kitchen counter: worktop with props on it, cupboards above."""
     width, color = rng.uniform(1.6, 2.8), hue(rng, (0.0, 0.35))
     parts = [
         Part((-0.02, 0, 0.43), (0.56, width, 0.86), color, 5.0),
@@ -171,10 +171,10 @@ def counter(rng: np.random.Generator) -> Piece:
         Part((-0.14, 0, 1.75), (0.34, width, 0.65), color, 5.0),
     ]
     parts += [Part((0.27, y, 0.78), (0.02, 0.14, 0.02), (0.7, 0.7, 0.7), PATTERNED) for y in np.arange(-width / 2 + 0.3, width / 2, 0.6)]  # fmt: skip
-    things = [_prop(rng, (rng.uniform(-0.15, 0.2), y, 0.91)) for y in _spread(rng, width - 0.3, 5)]
-    reaches = [(p.center[0], p.center[1], 0.91 + p.size[2] * 0.7) for p in things]
+    props = [_prop(rng, (rng.uniform(-0.15, 0.2), y, 0.91)) for y in _spread(rng, width - 0.3, 5)]
+    reaches = [(p.center[0], p.center[1], 0.91 + p.size[2] * 0.7) for p in props]
     reaches += [(0.05, y, 1.5) for y in _spread(rng, width - 0.6, 2)]
-    return Piece("counter", (0.62, width), (0.0, 2.08), (*parts, *things), reaches=tuple(reaches))
+    return Piece("counter", (0.62, width), (0.0, 2.08), (*parts, *props), reaches=tuple(reaches))
 
 
 def plant(rng: np.random.Generator) -> Piece:
@@ -249,7 +249,7 @@ def bin_(rng: np.random.Generator) -> Piece:
 
 
 def low_wall(rng: np.random.Generator) -> Piece:
-    """To sit on or walk around; its front is a long side."""
+    """A low wall to sit on or walk around; its front is a long side."""
     depth, width, height = rng.uniform(0.36, 0.45), rng.uniform(1.4, 2.6), rng.uniform(0.42, 0.47)
     parts = (
         Part(
@@ -281,7 +281,7 @@ def bollard(rng: np.random.Generator) -> Piece:
 
 
 def board(rng: np.random.Generator) -> Piece:
-    """A notice or map on two posts, pointed at from the front."""
+    """A notice board or map on two posts, pointed at from the front."""
     width, low, tall = rng.uniform(0.9, 1.4), rng.uniform(0.85, 1.0), rng.uniform(0.7, 1.0)
     posts = [
         Part((-0.03, side * (width / 2 - 0.06), (low + tall) / 2), (0.06, 0.06, low + tall), (0.3, 0.3, 0.32), 8.0)
@@ -303,7 +303,7 @@ def letter_box(rng: np.random.Generator) -> Piece:
 
 
 def car(rng: np.random.Generator) -> Piece:
-    """Parked; its front is the bonnet."""
+    """A parked car; its front is the bonnet."""
     length, width, color = rng.uniform(3.8, 4.5), rng.uniform(1.68, 1.80), hue(rng, (0.0, 0.8))
     cabin = 0.52 * length
     parts = [

@@ -1,4 +1,4 @@
-"""Feet from footprints: planted soles that roll about heel and ball, swings between them, and who bears the load."""
+"""Feet from footprints: planted soles that roll about heel and ball, swings between them, and the load on each foot."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,14 +11,14 @@ from wearcap.simulation.plan import Footprint, step_rise
 from wearcap.simulation.track import Track, ease, hermite
 
 ROLL_DOWN_S = 0.13
-"""From landing to the flat foot."""
+"""Time from landing to the flat foot."""
 ROLL_UP_S = 0.42
-"""From the flat foot to toe-off."""
+"""Time from the flat foot to toe-off."""
 SOFT_M = 0.008
 """Width over which the lowest point of a swinging sole changes from ball to heel."""
 LONG_STAND_S = 0.9
 LATE_LIFT = 0.06
-"""Height of the heel shortly before it lands, by how far the toes are up then (m/rad)."""
+"""Height of the heel shortly before it lands, per angle by which the toes are up then (m/rad)."""
 STAIR_WAIT = 0.16
 """Share of a swing up a stair during which the foot only rises, and of one down during which it only sinks."""
 
@@ -46,17 +46,17 @@ class FootMotion:
 
     ankle: Float[np.ndarray, "time 3"]
     ground: Float[np.ndarray, "time 3"]
-    """Floor point beneath the flat foot's ankle; between prints while it swings (m)."""
+    """Floor point below the flat foot's ankle; between prints during the swing (m)."""
     heading: Float[np.ndarray, "time"]
     pitch: Float[np.ndarray, "time"]
-    """Of the foot against the horizontal, toe down positive (rad)."""
+    """Pitch of the foot relative to the horizontal, toe down positive (rad)."""
     toe_bend: Float[np.ndarray, "time"]
     """Upward bend of the toes (rad)."""
     planted: Bool[np.ndarray, "time"]
     contact: Bool[np.ndarray, "time 2"]
-    """Of heel and toe tip."""
+    """Contact of heel and toe tip."""
     pressure: Float[np.ndarray, "time 3"]
-    """Where the foot presses on the floor while it stands (m)."""
+    """Centre of pressure of the foot on the floor while it stands (m)."""
     running: Bool[np.ndarray, "time"]
 
 
@@ -101,7 +101,7 @@ def foot_motion(
 
 
 class _Timeline:
-    """Which print each frame belongs to, and its numbers gathered per frame."""
+    """Index of each frame's print, and the values of that print gathered per frame."""
 
     def __init__(self, prints: list[Footprint], times: np.ndarray):
         columns = {
@@ -145,7 +145,7 @@ class _Timeline:
 def glide(
     share: Float[np.ndarray, "*batch"], ramps: tuple[float, float] = (0.36, 0.30)
 ) -> Float[np.ndarray, "*batch"]:
-    """Course of a swing from 0 to 1: speeds up over the first of `ramps` (shares of it), slows down over the last."""
+    """Progress of a swing, 0 to 1: accelerates over the first of `ramps` (shares of it), decelerates over the last."""
 
     def integral(u):
         return u**3 * (1.0 - 0.5 * u)
@@ -160,13 +160,13 @@ def glide(
 def advance(
     share: Float[np.ndarray, "*batch"], rise: Float[np.ndarray, "*#batch"]
 ) -> Float[np.ndarray, "*batch"]:
-    """Way over the floor of a swing that rises by `rise` (m) in all, from 0 to 1."""
+    """Horizontal progress of a swing that rises by `rise` (m) in total, from 0 to 1."""
     up, down = np.clip(rise / 0.12, 0.0, 1.0), np.clip(-rise / 0.12, 0.0, 1.0)
     return glide(np.clip((share - STAIR_WAIT * up) / (1.0 - STAIR_WAIT * (up + down)), 0.0, 1.0))
 
 
 def bump(share: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-    """Course of a swing's lift: 0 at both ends, 1 in the middle."""
+    """Profile of a swing's lift: 0 at both ends, 1 in the middle."""
     return 64.0 * (share * (1.0 - share)) ** 3
 
 
@@ -194,7 +194,7 @@ def _roll(at: _Timeline, heel_lift: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _pivot(at: _Timeline, roll: np.ndarray, turned: np.ndarray, shape: FootShape):
-    """The point of the foot that stands still: ball while the heel is up, heel while the toe is."""
+    """The point of the foot that is stationary: ball while the heel is up, heel while the toe is."""
     on_ball_next = at.land_pitch_next > 0
     landing_share = np.where(on_ball_next, 0.0, turned)
     share = np.where(at.planted, (roll < 0).astype(np.float64), landing_share)
@@ -221,7 +221,7 @@ def _depth(shape: FootShape, roll: np.ndarray, bend: np.ndarray, soft: np.ndarra
 def climb(
     rise: Float[np.ndarray, "*#batch"], share: Float[np.ndarray, "*batch"]
 ) -> Float[np.ndarray, "*batch"]:
-    """Course of the floor beneath a swing: up early and down late, so that the foot clears the stair's edge."""
+    """Height profile of the floor below a swing: up early and down late, so that the foot clears the stair's edge."""
     early, late = ease(share / 0.58), ease((share - 0.45) / 0.55)
     up = np.clip(0.5 + rise / 0.12, 0.0, 1.0)
     return up * early + (1.0 - up) * late
@@ -240,7 +240,7 @@ def _pressure_along(at: _Timeline, shape: FootShape) -> np.ndarray:
 def load_on_left(
     planted: Bool[np.ndarray, "time 2"], times: Float[np.ndarray, "time"], rng: np.random.Generator
 ) -> Float[np.ndarray, "time"]:
-    """Share of the weight on the left foot; in long stands it moves from leg to leg now and then."""
+    """Share of the weight on the left foot; while standing long it shifts from leg to leg now and then."""
     alone = planted[:, 0].astype(int) - planted[:, 1].astype(int)
     edges = np.flatnonzero(np.diff(alone)) + 1
     starts, stops = np.concatenate([[0], edges]), np.concatenate([edges, [len(times)]])

@@ -1,4 +1,4 @@
-"""Where the head looks: ahead of the turn to come, about in saccades, and at things that are reached for."""
+"""Gaze: ahead of the coming turn, in saccades, and at objects that are reached for."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,7 +7,7 @@ from wearcap.simulation.plan import Plan
 from wearcap.simulation.track import blur, wander
 
 LEAD_S = 0.32
-"""Gaze turns this long before the body does."""
+"""Lead of the gaze over a turn of the body."""
 YAW_LIMIT = 1.15
 PITCH_LIMITS = (-0.75, 0.95)
 
@@ -18,25 +18,25 @@ def look_about(
     stop_s: float,
     rng: np.random.Generator,
     spread: float = 0.5,
-    rest: float = 1.6,
+    pause_s: float = 1.6,
 ) -> None:
     """Head turns of 10 to 60 degrees every 1 to 4 s between two times, back to the front at the end.
 
-    `spread` is the deviation of the yaw (rad), `rest` the mean pause between turns (s).
+    `spread` is the deviation of the yaw (rad), `pause_s` the mean pause between turns (s).
     """
-    time = start_s + rng.uniform(0.2, 1.0) * rest
+    time = start_s + rng.uniform(0.2, 1.0) * pause_s
     pitch = plan.style.head_pitch
     while time < stop_s - 1.2:
         yaw, down = rng.normal(0.0, spread), pitch + rng.normal(0.0, 0.35 * spread)
         if rng.random() < 0.3:
             yaw, down = 0.15 * yaw, pitch
         time = turn_head(plan, time, (np.clip(yaw, -1.2, 1.2), np.clip(down, -0.5, 0.8)))
-        time += rest * (0.35 + rng.exponential(0.75))
+        time += pause_s * (0.35 + rng.exponential(0.75))
     turn_head(plan, max(stop_s - 0.6, start_s), (0.0, pitch))
 
 
 def turn_head(plan: Plan, start_s: float, target: tuple[float, float]) -> float:
-    """One head turn to a yaw and pitch (rad); its time grows with its size. Returns when it ends."""
+    """One head turn to a yaw and pitch (rad); its duration grows with its size. Returns the time at which it ends."""
     size = float(np.abs(np.array(target) - plan.gaze.last).max())
     stop = start_s + (0.22 + 0.45 * size) / plan.style.briskness
     plan.gaze.move(start_s, stop, target)
@@ -54,8 +54,8 @@ def head_angles(
 ) -> Float[np.ndarray, "time 3"]:
     """Yaw, pitch (down positive) and roll of the head in the world (rad).
 
-    `heading` is the body's, `chest` the chest's yaw, pitch and roll, `eyes` about where the eyes are (m). The head
-    keeps still against the trunk's swing but for a small share, and pitches against its own bob as eyes fixed on a
+    `heading` is the body's, `chest` the chest's yaw, pitch and roll, `eyes` the approximate eye position (m). The head
+    is stabilised against the trunk's swing but for a small share, and pitches against its own bob as eyes fixed on a
     point some metres ahead do.
     """
     lead = round(LEAD_S * fps)

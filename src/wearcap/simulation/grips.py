@@ -1,4 +1,4 @@
-"""Grips: a hand that holds something from one time to another, however that moves."""
+"""Grips: a hand that holds an object from one time to another, however the object moves."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,36 +15,36 @@ from wearcap.simulation.track import ease
 
 Vector = tuple[float, float, float]
 Moves = Callable[[Float[np.ndarray, "time"], Rigid], Rigid]
-"""Pose of a thing in the world at rising times (s), given the chest's pose at these times, which only what is
-carried needs."""
+"""Pose of an object in the world at increasing times (s), given the chest's pose at these times, on which only
+carried objects depend."""
 
 SKIN_M = 0.008
-"""A palm's site lies so far inside the hand: it keeps off what the hand touches."""
+"""Depth of a palm's site inside the hand: it keeps this distance from the touched surface."""
 SETTLED, DESCENT = 0.2, 0.5
-"""Shares of the way there, at its end: the hand is off its place along the normal, and comes down on it."""
+"""Shares of the approach, at its end: the hand is off its place along the normal, and comes down on it."""
 
 
 def vector(values: Float[np.ndarray, "3"]) -> Vector:
-    """The same as plain numbers."""
+    """A vector as a tuple of floats."""
     x, y, z = (float(value) for value in values)
     return x, y, z
 
 
 @dataclass(frozen=True)
 class GripPlace:
-    """Where a palm lies on a thing, in the thing's axes."""
+    """Place of a palm on an object, in the object's axes."""
 
     point: Vector
-    """Of the palm (m)."""
+    """Position of the palm (m)."""
     normal: Vector
-    """Out of the thing's surface, towards the hand: a unit vector."""
+    """Unit vector out of the object's surface, towards the hand."""
     fingers: Vector
-    """Where the fingers would best point; the arm may turn them some 40° about the normal."""
+    """Preferred direction of the fingers; the arm may turn them some 40° about the normal."""
 
 
 @dataclass(frozen=True)
 class Hold:
-    """What a grip asks of a hand over time, in the world."""
+    """Goals that a grip sets for a hand over time, in the world."""
 
     palm: Float[Tensor, "time 3"]
     normal: Float[Tensor, "time 3"]
@@ -62,7 +62,7 @@ class Hold:
 
 @dataclass(frozen=True)
 class Grip:
-    """A hand on a place of a thing from `touch_s` to `release_s`, with the ways there and back around it.
+    """A hand on a place of an object from `touch_s` to `release_s`, with the approach before and the return after it.
 
     Until it touches and after it releases, the hand's goal keeps off the surface along its normal by `hover_m`.
     """
@@ -84,13 +84,13 @@ class Grip:
         return self.release_s + self.return_s
 
     def weight(self, times: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time"]:
-        """How far the hand is led by the grip: 1 while it holds, minimum jerk before and after."""
+        """Weight of the grip's goal on the hand: 1 while it holds, minimum jerk before and after."""
         there = (times - self.start_s) / self.reach_s / (1.0 - SETTLED)
         back = 1.0 - (self.stop_s - times) / self.return_s / (1.0 - SETTLED)
         return ease(there) - ease(back)
 
     def hold(self, times: Float[np.ndarray, "time"], T_world_chest: Rigid) -> Hold:
-        """The palm's wanted place and the hand's wanted directions at times (s)."""
+        """Goal of the palm's position and of the hand's directions at times (s)."""
         T = self.moves(times, T_world_chest).to(torch.float64)
         point, normal, fingers = (
             torch.tensor(v, dtype=torch.float64)
@@ -111,20 +111,20 @@ def drawn_grip(
     rng: np.random.Generator,
     briskness: float,
 ) -> Grip:
-    """A grip whose ways there and back (0.4–1.2 s) and approach vary."""
+    """A grip with random durations of approach and return (0.4–1.2 s each) and hover distance."""
     there, back = (float(np.clip(rng.normal(0.75, 0.15) / briskness, 0.4, 1.2)) for _ in range(2))
     return Grip(place, moves, touch_s, release_s, there, back, float(rng.uniform(0.04, 0.09)))
 
 
-def still(T_world_thing: Rigid) -> Moves:
-    """Of a thing that stays where it is."""
+def still(T_world_object: Rigid) -> Moves:
+    """Motion of an object that stays where it is."""
     return lambda times, chest: Rigid(
-        T_world_thing.R.double().expand(len(times), 3, 3), T_world_thing.t.double().expand(len(times), 3)
+        T_world_object.R.double().expand(len(times), 3, 3), T_world_object.t.double().expand(len(times), 3)
     )
 
 
 def following(trajectory: Trajectory) -> Moves:
-    """Of a thing with a known way; it rests at both ends."""
+    """Motion of an object along a given trajectory; it is static before its start and after its end."""
     first, last = trajectory.timestamps[0].item(), trajectory.timestamps[-1].item()
     track = Trajectory(
         trajectory.timestamps, trajectory.R_world_body.double(), trajectory.t_world_body.double()

@@ -1,6 +1,6 @@
-"""Things carried in one hand or both: suitcases, backpacks, bottles, tools and balls, and where hands take hold of them.
+"""Objects carried in one hand or both: suitcases, backpacks, bottles, tools and balls, and where hands hold them.
 
-Each maker draws sizes and colours and returns a Handheld: front +x, origin on the floor beneath its middle.
+Each maker draws sizes and colours and returns a Handheld: front +x, origin on the floor below its middle.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,36 +21,36 @@ Side = tuple[GripPlace, GripPlace, float]
 DARK: Color = (0.13, 0.13, 0.15)
 STEEL: Color = (0.62, 0.63, 0.66)
 ROUND = 20
-"""Corners of a round outline."""
+"""Number of corners of a round outline."""
 QUARTERS = (0.0, np.pi / 2, np.pi, -np.pi / 2)
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """A way to hold a thing with one hand."""
+    """A grasp of an object with one hand."""
 
     side: str
-    """Of the hand."""
+    """Side of the hand."""
     place: GripPlace
     facing: float
-    """The holder's heading against the thing's (rad)."""
+    """Heading of the holder relative to the object's (rad)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Handheld:
-    """The shape of a hand-held thing, as it stands or lies on the floor."""
+    """Shape of a hand-held object, as it stands or lies on the floor."""
 
     mesh: Mesh
     size: tuple[float, float]
-    """Of its outline along its x and y (m)."""
+    """Size of its outline along its x and y (m)."""
     height: float
     sides: tuple[Side, ...] = ()
-    """Ways to hold it between both palms."""
+    """Options for holding it between both palms."""
     grasps: tuple[Grasp, ...] = ()
 
 
 def suitcase(rng: np.random.Generator) -> Handheld:
-    """Long along x; a bar on top is held by a hand that hangs beside the body."""
+    """A suitcase, long along x; a bar on top is held by a hand beside the body."""
     length, thick = rng.uniform(0.36, 0.50), rng.uniform(0.18, 0.24)
     body, handle = rng.uniform(0.34, 0.50), rng.uniform(0.035, 0.05)
     wheel, color = rng.uniform(0.02, 0.03), hue(rng, (0.3, 0.8))
@@ -65,12 +65,12 @@ def suitcase(rng: np.random.Generator) -> Handheld:
         for y in (-thick / 2 + 0.03, thick / 2 - 0.03):
             parts.append(_lying(_disc(wheel, 0.02, DARK), "y", (x, y, wheel)))
     level = top + handle
-    grasps = _hung((0.0, 0.0, level), (0.0, np.pi))
+    grasps = _beside_body((0.0, 0.0, level), (0.0, np.pi))
     return Handheld(merged(parts), (length, thick + 0.004), level + 0.011, (), grasps)
 
 
 def backpack(rng: np.random.Generator) -> Handheld:
-    """Upright on the floor, its pocket at the front; held by the loop on top, or between both palms."""
+    """A backpack, upright on the floor, its pocket at the front; held by the loop on top, or between both palms."""
     depth, width = rng.uniform(0.17, 0.24), rng.uniform(0.27, 0.34)
     body, color = rng.uniform(0.38, 0.48), hue(rng, (0.2, 0.8))
     outline = _squircle(depth, width, 4.0)
@@ -88,7 +88,7 @@ def backpack(rng: np.random.Generator) -> Handheld:
     parts.append(_box((0.0, 0.0, loop), (0.022, 0.114, 0.014), DARK))
     level = float(rng.uniform(0.42, 0.55)) * body
     sides = _between({0.0: width / 2, np.pi: width / 2}, level)
-    grasps = _hung((0.0, 0.0, loop), (np.pi / 2, -np.pi / 2))
+    grasps = _beside_body((0.0, 0.0, loop), (np.pi / 2, -np.pi / 2))
     return Handheld(merged(parts), (depth + 0.06, width), loop + 0.007, sides, grasps)
 
 
@@ -118,7 +118,7 @@ def tool(rng: np.random.Generator) -> Handheld:
 
 
 def hammer(rng: np.random.Generator) -> Handheld:
-    """Its head is at +x, the handle held at the other end from above."""
+    """A hammer with its head at +x, held at the other end of the handle from above."""
     length, head = rng.uniform(0.26, 0.36), rng.uniform(0.09, 0.13)
     thick = rng.uniform(0.024, 0.034)
     z, x = thick / 2, length / 2 - thick / 2
@@ -179,7 +179,7 @@ def mop(rng: np.random.Generator) -> Handheld:
 
 
 def ball(rng: np.random.Generator) -> Handheld:
-    """A round one, held between both palms."""
+    """A ball, held between both palms."""
     radius = rng.uniform(0.095, 0.125)
     angle = np.linspace(0.0, np.pi, 15)[1:-1]
     profile = [(np.sin(a), radius * (1.0 - np.cos(a))) for a in angle]
@@ -198,8 +198,8 @@ MAKERS: dict[str, Callable[[np.random.Generator], Handheld]] = {
 }  # fmt: skip
 
 
-def _hung(bar: tuple[float, float, float], facings: Sequence[float]) -> tuple[Grasp, ...]:
-    """Either hand on a bar along the holder's heading: it hangs beside the body, fingers down, palm inwards."""
+def _beside_body(bar: tuple[float, float, float], facings: Sequence[float]) -> tuple[Grasp, ...]:
+    """Grasps of either hand on a bar along the holder's heading, beside the body, fingers down, palm inwards."""
     x, y, z = bar
     out = 0.011 + SKIN_M
     return tuple(
@@ -210,7 +210,7 @@ def _hung(bar: tuple[float, float, float], facings: Sequence[float]) -> tuple[Gr
 
 
 def _from_above(x: float, top: float) -> tuple[Grasp, ...]:
-    """Either hand across a handle that lies along x, thumb towards +x."""
+    """Grasps of either hand across a handle that lies along x, thumb towards +x."""
     up, z = (0.0, 0.0, 1.0), top + SKIN_M
     return (
         Grasp("left", GripPlace((x, 0.0, z), up, (0.0, 1.0, 0.0)), np.pi / 2),
@@ -219,7 +219,7 @@ def _from_above(x: float, top: float) -> tuple[Grasp, ...]:
 
 
 def _between(halves: dict[float, float], level: float) -> tuple[Side, ...]:
-    """Both palms on opposite faces at a height, by the holder's facing: half the way between them (m)."""
+    """Both palms on opposite faces at a height; `halves` maps the holder's facing to half their distance (m)."""
     sides = []
     for facing, half in halves.items():
         left, right = (
@@ -233,7 +233,7 @@ def _between(halves: dict[float, float], level: float) -> tuple[Side, ...]:
 
 
 def _grasp(side: str, point, normal, fingers, facing: float) -> Grasp:
-    """A grasp given in the holder's axes (x ahead) about the thing's origin."""
+    """A grasp given in the holder's axes (x ahead) about the object's origin."""
     R = np.eye(3)
     R[:2, :2] = turn(facing)
     unit = np.array(fingers) / np.linalg.norm(fingers)
@@ -284,12 +284,12 @@ def _box(center: tuple[float, float, float], size: tuple[float, float, float], c
 
 
 def _disc(radius: float, thick: float, color: Color) -> Mesh:
-    """About z, its middle at the origin."""
+    """A disc about z, its middle at the origin."""
     return _loft(_round(radius), [(1.0, -thick / 2), (1.0, thick / 2)], color)
 
 
 def _lying(mesh: Mesh, axis: str, at: tuple[float, float, float]) -> Mesh:
-    """What was made about z, about another axis instead, moved (m)."""
+    """A mesh made about z, turned to another axis and moved (m)."""
     R = {"x": [[0, 0, 1], [1, 0, 0], [0, 1, 0]], "y": [[0, 1, 0], [0, 0, 1], [1, 0, 0]]}[axis]
     return _turned(mesh, np.array(R, np.float64), np.array(at))
 

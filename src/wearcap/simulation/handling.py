@@ -1,4 +1,4 @@
-"""What hands did to things: ways of the things over time, and which hands held them when."""
+"""Handlings: motions of objects over time, and which hands held them when."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from wearcap.recording.motion import Motion
 from wearcap.simulation.grips import Grip, Moves
 
 Row = tuple[float, float, tuple[bool, bool]]
-"""From when to when (s) which of `HANDS` hold."""
+"""Interval (s) with a fixed set of holding hands, one flag for each of `HANDS`."""
 
 
 @dataclass(frozen=True)
 class Handling:
-    """One thing held from the first touch to the last release, and moved meanwhile."""
+    """One object's handling from the first touch to the last release, and its motion meanwhile."""
 
     name: str
     contact_class: str
@@ -36,7 +36,7 @@ def handling_of(name: str, contact_class: str, moves: Moves, grips: Sequence[tup
 
 
 def hand_rows(held: Iterable[tuple[str, float, float]]) -> list[Row]:
-    """Stretches with a fixed set of holding hands, of (side, from, to) in s; a hand may hold several times."""
+    """Intervals with a fixed set of holding hands, from (side, start, stop) in s; a hand may hold several times."""
     held = list(held)
     edges = sorted({time for _, start, stop in held for time in (start, stop)})
     rows = []
@@ -63,10 +63,10 @@ def interactions_of(handlings: Sequence[Handling]) -> Interactions:
 
 
 def object_motion(T_world_object: Rigid, handlings: Sequence[Handling], motion: Motion) -> Trajectory:
-    """A thing's poses on a motion's timestamps: as its handlings move it, at rest between them.
+    """Poses of an object on a motion's timestamps: as its handlings move it, static between them.
 
-    `handlings` are those of this one thing; `T_world_object` is its initial pose; `motion` is the wearer's, whose
-    chest what is carried follows.
+    `handlings` are those of this one object; `T_world_object` is its initial pose; `motion` is the wearer's, whose
+    chest carried objects follow.
     """
     times, chest = motion.timestamps.numpy(), motion.joint("t8").to(torch.float64)
     R = T_world_object.R.double().repeat(len(times), 1, 1)

@@ -1,4 +1,4 @@
-"""What hands do: held postures and gestures while standing or walking, and reaching for things."""
+"""Hands: held postures and gestures while standing or walking, and reaching for objects."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ POSTURES: dict[str, tuple[tuple[str, ...], tuple[float, ...]]] = {
 """Hands, and their pose channel (`HandScore.pose`), by name."""
 
 FINGERS_USED = 0.9
-"""How far along its fingers a hand touches what it reaches for."""
+"""Share of the finger's length at which a hand touches its goal."""
 ON_THIGHS = (0.46, -0.02, -0.66, 0.35, 0.5, 0.1)
 
 
@@ -78,7 +78,7 @@ def gesture(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 
 @activity("carry", weight=1.5)
 def carry(plan: Plan, world: World, rng: np.random.Generator) -> bool:
-    """Walk to another place with something in the hands."""
+    """Walk to another place with an object in the hands."""
     start = plan.time
     if not approach(plan, world, rng, None):
         return False
@@ -113,7 +113,7 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
     side = "left" if aside > 0 else "right"
     hand, arm = plan.hands[side], plan.arm_length
     shoulder = 1.52 * plan.hip_height
-    thing, point = point, _wrist_before(plan, point, shoulder, LEFT_SIGN[side] * 0.17 * across)
+    touched, point = point, _wrist_before(plan, point, shoulder, LEFT_SIGN[side] * 0.17 * across)
     offset = point[:2] - plan.position[:2]
     low = shoulder - (point[2] - plan.position[2])
     far = float(offset @ ahead)
@@ -128,7 +128,7 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
     plan.crouch.move(start, start + out, crouch)
     hand.goal.move(start, start, point)
     hand.goal_weight.move(start, start + out, 1.0)
-    plan.gaze_point.move(start, start, thing)
+    plan.gaze_point.move(start, start, touched)
     plan.gaze_weight.move(start, start + 0.45, 1.0)
     leave = start + out + hold_s
     plan.lean.move(leave, leave + back, 0.0)
@@ -139,7 +139,7 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
 
 
 def _wrist_before(plan: Plan, point: np.ndarray, shoulder: float, aside: np.ndarray) -> np.ndarray:
-    """Where the wrist is when the fingers of a straight hand touch a point (m)."""
+    """Wrist position at which the fingers of a straight hand touch a point (m)."""
     fingers = float(np.linalg.norm(plan.skeleton.sites["left_fingertip"].t_joint_site))
-    way = point - plan.position - np.append(aside, shoulder)
-    return point - FINGERS_USED * fingers * way / np.linalg.norm(way)
+    arm_vector = point - plan.position - np.append(aside, shoulder)
+    return point - FINGERS_USED * fingers * arm_vector / np.linalg.norm(arm_vector)

@@ -1,4 +1,4 @@
-"""The camera on a simulated wearer's head: where it is, when it takes pictures, and how much it sees."""
+"""The camera on a simulated wearer's head: its mount, its clock, and the texture it sees."""
 
 from dataclasses import dataclass
 
@@ -27,16 +27,16 @@ HEAD_CAMERA_TRUTH = "head_camera"
 
 @dataclass(frozen=True)
 class HeadCameraConfig:
-    """How the camera is worn, and its clock."""
+    """Mount of the camera, and its clock."""
 
     camera_fps: float = 30.0
     clock_offset_s: float = 4.0
-    """Largest lead of the camera's clock over the suit's, or lag."""
+    """Largest offset of the camera's clock from the suit's, in either direction."""
     clock_drift_ms_per_h: tuple[float, float] = (87.0, 12.0)
-    """Mean and deviation over recordings of what the camera's clock gains."""
+    """Mean and deviation over recordings of the drift of the camera's clock."""
     mount_deg: float = 4.0
     mount_m: float = 0.008
-    """Deviations of how the camera sits on the head from its nominal mount."""
+    """Deviations of the camera's mount on the head from the nominal one."""
 
     def __post_init__(self):
         if self.camera_fps <= 0:
@@ -69,7 +69,7 @@ _GLANCE = Camera("pinhole", 48, 27, 22.0, 22.0, 23.5, 13.0)
 
 
 def view_texture(world: World, path: Trajectory, every: int = 15) -> Float[Tensor, "time"]:
-    """How much there is to see in a camera's frames: the mean texture grade (features per m²) in view.
+    """Texture in a camera's frames: the mean texture grade (features per m²) in view.
 
     Every n-th frame is looked at, those between are interpolated.
     """

@@ -21,26 +21,26 @@ from wearcap.simulation.views import Development, Scenery, render_view
 
 SOUND_HZ = 48_000
 BLUR_STEP_PX, MOST_STEPS = 3.0, 5
-"""A frame is the mean of so many moments of its exposure that none is further than this from the next."""
+"""Largest motion between the sub-frames that are averaged into a frame, and most sub-frames."""
 GLARE = 0.03
-"""Contrast while the picture shows next to nothing."""
+"""Contrast during glare, when the image shows next to nothing."""
 
 
 @dataclass(frozen=True)
 class Filming:
-    """How the head camera films."""
+    """Settings of the head camera's video."""
 
     shutter_s: float = 1 / 120
     """Exposure time; 0: no motion blur."""
     noise: float = 3.0
-    """Grey levels."""
+    """Deviation in grey levels."""
     exposure: float = 0.12
     """Deviation of the automatic exposure, as a share, over some seconds."""
     vignetting: float = 0.3
     crf: int = 17
     """H.264's constant quality: lower is better."""
     glare_s: tuple[tuple[float, float], ...] = ()
-    """Stretches (start, stop) on the camera's clock in which the picture shows next to nothing."""
+    """Intervals (start, stop) on the camera's clock in which the image shows next to nothing."""
 
 
 def film(
@@ -102,7 +102,7 @@ def write_head_video(
 
 
 def _sound(times: torch.Tensor, claps_s: Sequence[float], rng: np.random.Generator):
-    """Audio frames from the first to the last picture: a quiet room, and claps of some 10 ms."""
+    """Audio frames from the first to the last image: a quiet room, and claps of some 10 ms."""
     first, last = times[0].item(), times[-1].item()
     count = int((last - first + 0.1) * SOUND_HZ)
     wave = 0.001 * rng.standard_normal(count, np.float32)

@@ -12,11 +12,11 @@ from wearcap.simulation.walls import build_flight
 from wearcap.simulation.world import Room, World
 
 DEPTH_M = 6.2
-"""Of the whole hillside, across the slope."""
+"""Depth of the whole hillside, across the slope."""
 STAIRS_M, RAMP_M = 2.4, 3.6
-"""Across the slope, stairs and what follows them lie below the first, the ramp above the second."""
+"""Across the slope, stairs and the path after them are below the first, the ramp above the second."""
 PLATEAU_M = 6.0
-THINGS = ("bench", "planter", "tree", "bin", "street_lamp", "low_wall")
+KINDS = ("bench", "planter", "tree", "bin", "street_lamp", "low_wall")
 GROUND = (0.60, 0.58, 0.54)
 
 
@@ -25,7 +25,7 @@ class Layout:
     """Lengths in m; x rises with the slope, the middle terrace lies at z = 0 from x = 0 to `PLATEAU_M`."""
 
     rise: float
-    """From each terrace to the next."""
+    """Height from each terrace to the next."""
     steps: int
     tread: float
     slope: float
@@ -48,8 +48,8 @@ def build_hillside(rng: np.random.Generator, name: str) -> World:
     layout = Layout(steps * rise, steps, rng.uniform(0.28, 0.32), rng.uniform(0.10, 0.15))
     middle = (0.0, 0.0, PLATEAU_M, DEPTH_M)
     _terrace(builder, "middle", [middle], 0.0, rng)
-    _way(builder, layout, PLATEAU_M, 0.0)
-    _way(builder, layout, -layout.ramp, -layout.rise)
+    _stairs_and_ramp(builder, layout, PLATEAU_M, 0.0)
+    _stairs_and_ramp(builder, layout, -layout.ramp, -layout.rise)
     start = PLATEAU_M + layout.stairs
     top = PLATEAU_M + layout.ramp
     upper = [(start, 0.0, top, STAIRS_M + 0.8), (top, 0.0, top + PLATEAU_M, DEPTH_M)]
@@ -61,18 +61,18 @@ def build_hillside(rng: np.random.Generator, name: str) -> World:
 
 
 def _terrace(builder: WorldBuilder, name: str, boxes: list, z: float, rng: np.random.Generator) -> None:
-    """Level ground; the last box is the place itself, with what stands there, and open to the ways that lead to it."""
+    """Level ground; the last box is the place itself, with its furniture, and open to the paths that lead to it."""
     for box in boxes:
         slab(builder, "floor", box, z, 0.3, GROUND, 6.0)
     x_low, _, x_high, _ = boxes[-1]
     corners = np.array([[x_low, 0.0], [x_high, 0.0], [x_high, DEPTH_M], [x_low, DEPTH_M]])
     builder.rooms.append(Room(name, builder.to_world(corners), z))
     plan = Plan(builder, (x_low + 1.2, 0.3, x_high - 1.2, DEPTH_M - 0.3), z, [])
-    for kind in rng.permutation(THINGS)[:3]:
+    for kind in rng.permutation(KINDS)[:3]:
         put_somewhere(plan, str(kind), rng)
 
 
-def _way(builder: WorldBuilder, layout: Layout, x: float, base: float) -> None:
+def _stairs_and_ramp(builder: WorldBuilder, layout: Layout, x: float, base: float) -> None:
     """Stairs and a ramp from `base` to the next terrace: the ramp starts at x; above the middle the stairs do, too,
     below it they end where the ramp ends."""
     top = base + layout.rise

@@ -1,4 +1,4 @@
-"""Things held in one hand or between both: lifted off the floor, carried at the side or before the body, put down."""
+"""Objects held in one hand or between both: lifted off the floor, carried at the side or before the body, put down."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,33 +18,33 @@ from wearcap.simulation.handling import Handling, handling_of
 from wearcap.simulation.hands import ON_THIGHS, hold
 from wearcap.simulation.outline import turn
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan
-from wearcap.simulation.things import Thing
+from wearcap.simulation.things import Movable
 from wearcap.simulation.track import Track, ease
 
 BESIDE = ("suitcase", "backpack")
-"""Held by one hand, these hang beside the body; all else is before it."""
+"""Categories that hang beside the body when held by one hand; all others are held before it."""
 LONG_M = 0.4
-"""Half the length from which on a tool is a long stick."""
+"""Half length from which on a tool is a long stick."""
 LEG_M = 0.19
-"""From the body's middle to the outside of a leg, with a little room."""
+"""Distance from the body's middle to the outside of a leg, with a margin."""
 OFF_FLOOR_M = 0.07
-"""At least so far what hangs from a hand is off the floor."""
+"""Least height above the floor of an object that hangs from a hand."""
 STRETCH = 0.93
-"""A hanging arm's share of its length to the palm."""
+"""Distance from shoulder to palm of a hanging arm, as a share of its length."""
 LIFTED_M, LONG_LIFTED_M = 0.02, 0.08
-"""What is held keeps about half of this off the floor however it is turned; the second is for long sticks."""
+"""Softness of the clearance from the floor: a held object keeps about half of it; the second is for long sticks."""
 SOFT_M = 0.02
-"""Soft knees and a slouch take so much of a standing body's height."""
+"""Height that soft knees and a slouch take off a standing body."""
 SWING_M, SWING_RAD = 0.05, 0.10
-"""Of what hangs from a hand, forwards and back with each stride."""
+"""Swing of an object that hangs from a hand, forwards and back with each stride."""
 
 
 @dataclass(frozen=True)
 class Take(Errand):
-    """A thing in one hand or in both."""
+    """A plan to take an object with one hand or both, not yet written to the motion's plan."""
 
     local: Float[np.ndarray, "2"]
-    """The thing's origin from the middle of the feet, ahead and to the left, when it is lifted and put down (m)."""
+    """Object's origin from the middle of the feet, ahead and to the left, when it is lifted and put down (m)."""
 
     def _before(self, pose: np.ndarray) -> np.ndarray:
         heading = pose[2] + self.facing
@@ -57,36 +57,36 @@ class Take(Errand):
 
     @property
     def sign(self) -> float:
-        """Keys are those of the left hand, mirrored for the right."""
+        """Sign of the lateral axis: keys are those of the left hand, mirrored for the right."""
         return 1.0 if self.side is None else LEFT_SIGN[self.side]
 
     @property
     def middle(self) -> Float[np.ndarray, "3"]:
-        """Of the palms, in the thing's axes (m)."""
+        """Mean position of the palms, in the object's axes (m)."""
         return np.mean([place.point for place in self.places.values()], 0)
 
     @property
     def lies(self) -> bool:
-        """Whether it is taken up from above, to be turned in the air."""
+        """Whether it lies on the floor: it is taken up from above and turned in the air."""
         return all(place.normal[2] > 0.9 for place in self.places.values())
 
     @property
     def long(self) -> bool:
         """Whether it is a stick whose other end is held ahead."""
-        return self.thing.category == "tool" and max(self.thing.half_size) > LONG_M
+        return self.movable.category == "tool" and max(self.movable.half_size) > LONG_M
 
     @property
     def beside(self) -> bool:
-        return self.side is not None and self.thing.category in BESIDE
+        return self.side is not None and self.movable.category in BESIDE
 
     @cached_property
     def extent(self) -> Float[np.ndarray, "2"]:
-        """Half its outline ahead and across, as the holder sees it (m)."""
-        return np.abs(turn(self.facing).T) @ np.array(self.thing.half_size)
+        """Half of its outline ahead and across, as the holder sees it (m)."""
+        return np.abs(turn(self.facing).T) @ np.array(self.movable.half_size)
 
     def neutral(self) -> Float[np.ndarray, "3 3"]:
-        """Rotation against the holder's heading while the keys' angles are zero: upright, or, of what is taken from
-        above, with the back of the hand outwards and the fingers ahead."""
+        """Rotation relative to the holder's heading while the keys' angles are zero: upright, or, for objects
+        taken from above, with the back of the hand outwards and the fingers ahead."""
         if not self.lies:
             R = np.eye(3)
             R[:2, :2] = turn(-self.facing)
@@ -102,22 +102,22 @@ def _frame(normal: np.ndarray, fingers: np.ndarray) -> Float[np.ndarray, "3 3"]:
 
 @dataclass
 class Held:
-    """A thing in the hands: `go` says how it is held from time to time, `put_down` writes its grips."""
+    """An object in the hands: `go` keys its pose over time, `put_down` writes its grips."""
 
     choice: Take
     start_s: float
-    """When the plan began to go down for it."""
+    """Time at which the plan begins to bend down for it."""
     touch_s: float
     lift_s: float
     lifted_s: float
     anchor: Float[np.ndarray, "3"]
-    """The shoulder, or the middle of both, in the chest's axes (m)."""
+    """The shoulder, or the middle between both, in the chest's axes (m)."""
     reach: float
-    """From shoulder to palm (m)."""
+    """Distance from shoulder to palm (m)."""
     carry: Float[np.ndarray, "6"]
-    """How it is carried, as `keys`."""
+    """Carrying pose, laid out as `keys`."""
     keys: Track = field(init=False)
-    """The palms' middle from `anchor`, ahead, out and up along the body's heading (m), and the thing's pitch
+    """The palms' middle from `anchor`, ahead, out and up along the body's heading (m), and the object's pitch
     (forwards), yaw (outwards) and roll (outer side up) against `Take.neutral` (rad)."""
 
     def __post_init__(self):
@@ -130,31 +130,31 @@ class Held:
         """Bring it to a place, as shares of the arm's reach, and angles (rad) between two times."""
         self.keys.move(start_s, stop_s, np.array([*(self.reach * np.array(place)), pitch, yaw, roll]))
 
-    def rest(self, start_s: float, stop_s: float) -> None:
-        """Back to how it is carried."""
+    def return_to_carry(self, start_s: float, stop_s: float) -> None:
+        """Return to the carrying pose between two times (s)."""
         self.keys.move(start_s, stop_s, self.carry)
 
 
 def take_options(
     plan: Plan,
-    thing: Thing,
+    movable: Movable,
     start: Float[np.ndarray, "4"],
     stop: Float[np.ndarray, "4"],
     rng: np.random.Generator,
 ) -> Iterator[Take]:
-    """Ways to hold a thing and bring it from one pose to another, in random order; see `carrying.carry_options`.
+    """Options for holding an object and moving it to another pose, in random order; see `carrying.carry_options`.
 
-    Who takes one makes sure that one can stand at its `stand` and `goal`, goes to the first, calls `take_up`, goes
-    to the second and calls `put_down`.
+    The caller of one checks that the wearer can stand at its `stand` and `goal`, goes to the first, calls `take_up`,
+    goes to the second and calls `put_down`.
     """
     start, stop = np.asarray(start, np.float64), np.asarray(stop, np.float64)
-    ways = [({grasp.side: grasp.place}, grasp.facing) for grasp in thing.grasps]
-    ways += [(dict(zip(SIDES, (left, right))), facing) for left, right, facing in thing.sides]
-    both = [len(places) == 2 for places, _ in ways]
-    rank = rng.exponential(size=len(ways)) * np.where(both, sum(both), len(ways) - sum(both))
+    variants = [({grasp.side: grasp.place}, grasp.facing) for grasp in movable.grasps]
+    variants += [(dict(zip(SIDES, (left, right))), facing) for left, right, facing in movable.sides]
+    both = [len(places) == 2 for places, _ in variants]
+    rank = rng.exponential(size=len(variants)) * np.where(both, sum(both), len(variants) - sum(both))
     for index in np.argsort(rank):  # one hand and both come first equally often
-        places, facing = ways[index]
-        choice = Take(thing, start, stop, places, float(facing), np.zeros(2))
+        places, facing = variants[index]
+        choice = Take(movable, start, stop, places, float(facing), np.zeros(2))
         palm = turn(-facing) @ choice.middle[:2]
         ahead = plan.sole[1] + 0.07 + choice.extent[0] + float(rng.uniform(0.0, 0.08))
         if choice.beside:
@@ -164,11 +164,11 @@ def take_options(
             local = np.array([ahead + 0.02, 0.0])
         else:
             local = np.array([ahead, choice.sign * float(rng.uniform(0.08, 0.2)) - palm[1]])
-        yield Take(thing, start, stop, places, float(facing), local)
+        yield Take(movable, start, stop, places, float(facing), local)
 
 
 def take_up(plan: Plan, choice: Take, rng: np.random.Generator) -> Held:
-    """Go down, take hold and lift; the wearer stands at or near `choice.stand`. `plan.time` becomes the end."""
+    """Bend down, take hold and lift; the wearer stands at or near `choice.stand`. `plan.time` becomes the end."""
     arrive(plan, choice.stand, rng)
     start = plan.time
     bend, lean, aside = _bend(plan, choice, choice.start, rng)
@@ -180,7 +180,7 @@ def take_up(plan: Plan, choice: Take, rng: np.random.Generator) -> Held:
     bow(plan, begin, begin + rise, 0.0, float(rng.normal(-0.03, 0.03)), _counter(choice))
     _other_hand(plan, choice, bend, (start, start + 0.5 * down), (touch, begin + rise), rng)
     plan.gaze_point.move(
-        start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.thing.height)
+        start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.movable.height)
     )
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(begin + 0.3 * rise, begin + rise, 0.0)
@@ -196,7 +196,7 @@ def take_up(plan: Plan, choice: Take, rng: np.random.Generator) -> Held:
 
 
 def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
-    """Lower it to its place, let go and stand up; the wearer stands at or near `choice.goal`."""
+    """Lower the object to its place, let go and stand up; the wearer stands at or near `choice.goal`."""
     choice = held.choice
     arrive(plan, choice.goal, rng)
     start = plan.time + 0.1
@@ -210,7 +210,7 @@ def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
     plan.gaze_point.move(start, start, np.append(choice.stop[:2], choice.stop[3]))
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(release, release + 0.6, 0.0)
-    moves = _Way(held, strides(plan, held, start), (held.lift_s, held.lifted_s), (start, start + down))
+    moves = _HeldPath(held, strides(plan, held, start), (held.lift_s, held.lifted_s), (start, start + down))
     grips = []
     for side, place in choice.places.items():
         grip = Grip(
@@ -220,25 +220,25 @@ def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
         plan.grip(side, grip)
         grips.append((side, grip))
     plan.time = release + rise + float(rng.uniform(0.0, 0.3))
-    return handling_of(choice.thing.name, "sliding", moves, grips)
+    return handling_of(choice.movable.name, "sliding", moves, grips)
 
 
 def shoulder_of(plan: Plan) -> Float[np.ndarray, "3"]:
-    """The left shoulder at rest from the chest's joint (m)."""
+    """Position of the left shoulder relative to the chest's joint in the rest pose (m)."""
     skeleton = plan.skeleton
     arm = skeleton.indices("left_collar", "left_shoulder")
     return skeleton.t_parent_joint[arm].double().sum(0).numpy().copy()
 
 
 def shoulder_height(plan: Plan) -> float:
-    """Of the shoulders above the floor when standing upright (m)."""
+    """Height of the shoulders above the floor when standing upright (m)."""
     spine = plan.skeleton.indices("l5", "l3", "t12", "t8")
     above = float(plan.skeleton.t_parent_joint[spine, 2].sum()) + float(shoulder_of(plan)[2])
     return plan.hip_height + above - SOFT_M
 
 
 def _bend(plan: Plan, choice: Take, pose: np.ndarray, rng: np.random.Generator) -> tuple[float, float, float]:
-    """How far knees (m) and trunk (rad; forwards, to the right) bend for the palms on a thing at a pose."""
+    """Bend of the knees (m) and the trunk (rad; forwards, to the right) for the palms on an object at a pose."""
     low = float(pose[3] + choice.middle[2] - plan.position[2])
     if choice.side is None:
         return *bend_for(plan, low, rng), 0.0
@@ -252,14 +252,14 @@ def _bend(plan: Plan, choice: Take, pose: np.ndarray, rng: np.random.Generator) 
 
 
 def _counter(choice: Take) -> float:
-    """Who carries something heavy at one side bends to the other (rad, to the right)."""
+    """Bend to the other side when something heavy is carried at one side (rad, to the right)."""
     return 0.05 * choice.sign if choice.beside else 0.0
 
 
 def _other_hand(
     plan: Plan, choice: Take, bend: float, out: tuple[float, float], back: tuple[float, float], rng
 ) -> None:
-    """The free hand is on the thigh while the knees are bent, or hangs; two hands come from beside the thing."""
+    """Put the free hand on the thigh while the knees bend, or let it hang; two hands come from beside the object."""
     if choice.side is None:
         spread(plan, out, back)
     elif bend > 0.5 * DEEP * plan.hip_height or rng.random() < 0.3:
@@ -267,7 +267,7 @@ def _other_hand(
 
 
 def _carried(plan: Plan, choice: Take, reach: float, rng: np.random.Generator) -> Float[np.ndarray, "6"]:
-    """How it is held in walking: hanging beside a leg, hanging ahead, or before the body, as `Held.keys`."""
+    """Carrying pose in walking, as `Held.keys`: beside a leg, ahead at arm's length, or before the body."""
     shoulder, tall = shoulder_of(plan), shoulder_height(plan)
     out, up = 0.0, np.zeros(6)
     if choice.beside:
@@ -290,7 +290,7 @@ def _carried(plan: Plan, choice: Take, reach: float, rng: np.random.Generator) -
 
 
 def strides(plan: Plan, held: Held, until_s: float) -> Track:
-    """-1…1: a hand's swing against the foot of its side, between the end of the lift and a time (s)."""
+    """Swing of the hand, opposite to the foot of its side, -1…1, between the end of the lift and a time (s)."""
     track, last = Track(np.zeros(1)), held.lifted_s
     prints = [(p, side) for side in SIDES for p in plan.prints[side] if held.lifted_s < p.land_s < until_s]
     for print_, side in sorted(prints, key=lambda pair: pair[0].land_s):
@@ -308,8 +308,8 @@ def strides(plan: Plan, held: Held, until_s: float) -> Track:
 
 
 @dataclass(frozen=True)
-class _Way:
-    """A held thing's pose over time: where it stands, in the hands, and where it will stand."""
+class _HeldPath:
+    """Pose of a held object over time: where it stands, in the hands, and where it will stand."""
 
     held: Held
     strides: Track
@@ -343,7 +343,7 @@ class _Way:
     def _in_hand(
         self, times: np.ndarray, T_world_chest: Rigid
     ) -> tuple[Float[Tensor, "time 3"], Float[Tensor, "time 3 3"]]:
-        """Where the palms' middle would be (m), and the thing's rotation, were it held all the time."""
+        """Middle of the palms (m) and rotation of the object if it were held all the time."""
         choice, about = self.held.choice, rotation.about_axis
         keys = torch.from_numpy(self.held.keys.sample(times))
         swing = torch.from_numpy(self.strides.sample(times)[:, 0])
@@ -365,18 +365,18 @@ class _Way:
     def _raise(
         self, R: Float[Tensor, "time 3 3"], t: Float[Tensor, "time 3"], soft: Float[Tensor, "time"]
     ) -> Float[Tensor, "time"]:
-        """How much higher it must be to keep off the floor (m), smooth over `soft` (m)."""
+        """Height to add so that the object keeps off the floor (m), smooth over `soft` (m)."""
         below = self.held.choice.start[3] - t[:, 2] - (R[:, 2] @ self._corners.T).amin(-1)
         return (below + torch.sqrt(below**2 + soft**2 + 1e-18)) / 2
 
     @cached_property
     def _corners(self) -> Float[Tensor, "corner 3"]:
-        vertices = self.held.choice.thing.object.mesh.vertices.astype(np.float64)
+        vertices = self.held.choice.movable.object.mesh.vertices.astype(np.float64)
         return torch.from_numpy(vertices[scipy.spatial.ConvexHull(vertices).vertices])
 
 
 def _between(
     R: Float[Tensor, "time 3 3"], R_other: Float[Tensor, "time 3 3"], share: Float[Tensor, "time"]
 ) -> Float[Tensor, "time 3 3"]:
-    """A share of the way from one rotation to another."""
+    """Interpolation between two rotations by a share."""
     return R @ rotation.exp(share[:, None] * rotation.log(R.transpose(-1, -2) @ R_other))

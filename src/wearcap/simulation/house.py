@@ -1,4 +1,4 @@
-"""An interactive flat while somebody lives in it: where everything stands now, and what was moved when."""
+"""The current state of an interactive flat: where every object stands, and the handlings so far."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,40 +16,40 @@ from wearcap.simulation.handling import Handling, interactions_of, object_motion
 from wearcap.simulation.interactive_flat import InteractiveFlat, obstacle
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.plan import Plan
-from wearcap.simulation.things import Thing
+from wearcap.simulation.things import Movable
 from wearcap.simulation.world import World, WorldObject
 
-Seem = Callable[[Plan, dict[str, GripPlace], Rigid, float, np.random.Generator], None]
-"""What looks like handling a thing: given places for the hands, the thing's pose and its height (m)."""
+Distractor = Callable[[Plan, dict[str, GripPlace], Rigid, float, np.random.Generator], None]
+"""An act that resembles handling an object: given places for the hands, the object's pose and its height (m)."""
 
 
 @dataclass
 class House:
-    """Changes with every interaction that is planned."""
+    """State of an interactive flat; it changes with every interaction that is planned."""
 
     flat: InteractiveFlat
     values: dict[str, float] = field(default_factory=dict)
-    """How far each openable is from its initial pose (rad or m)."""
+    """Current value of each openable, relative to its initial pose (rad or m)."""
     poses: dict[str, Rigid] = field(default_factory=dict)
-    """Where each thing stands."""
+    """Current pose of each movable object."""
     handlings: list[Handling] = field(default_factory=list)
-    """What was held and moved, in the order of time."""
+    """Handlings so far, in the order of time."""
 
     def __post_init__(self):
         self.values = {item.name: 0.0 for item in self.flat.openables}
-        self.poses = {item.name: item.object.T_world_object.to(torch.float64) for item in self.flat.things}
+        self.poses = {item.name: item.object.T_world_object.to(torch.float64) for item in self.flat.movables}
 
-    def pose(self, item: Thing | Openable) -> Rigid:
-        """Where something is at the end of the plan."""
+    def pose(self, item: Movable | Openable) -> Rigid:
+        """Pose of an object at the end of the plan."""
         return item.pose(self.values[item.name]) if isinstance(item, Openable) else self.poses[item.name]
 
     def obstacles(self, without: tuple[str, ...] = ()) -> tuple[WorldObject, ...]:
-        """Everything that can be moved, where it is now."""
-        items = (*self.flat.things, *self.flat.openables)
+        """Everything that can be moved, at its current place."""
+        items = (*self.flat.movables, *self.flat.openables)
         return tuple(obstacle(item, self.pose(item)) for item in items if item.name not in without)
 
     def world(self, around: Float[np.ndarray, "3"], without: tuple[str, ...] = ()) -> World:
-        """The flat as it is now, walkable where one gets to from a floor point (m); seats are the fixed ones."""
+        """The flat's current state, walkable where one gets to from a floor point (m); seats are the fixed ones."""
         static, extra = self.flat.static, self.obstacles(without)
         grid = static.navigation.barred(extra, around)
         near = lambda point: _beside(grid.node_points, np.array(point))  # noqa: E731
@@ -62,7 +62,7 @@ class House:
         return now
 
     def interactions(self, until_s: float) -> Interactions:
-        """What was held when, up to the end of a recording (s)."""
+        """Intervals in which hands hold objects, up to the end of a recording (s)."""
         rows = interactions_of(self.handlings)
         kept = torch.nonzero(rows.start_s < until_s)[:, 0]
         pick = lambda names: tuple(names[k] for k in kept.tolist())  # noqa: E731
@@ -72,12 +72,12 @@ class House:
         )  # fmt: skip
 
     def object_motion(self, motion: Motion) -> dict[str, Trajectory]:
-        """Poses of everything that can be moved on a motion's timestamps; it stays where it was left."""
+        """Poses of all movable objects and openables on a motion's timestamps; each stays where it was left."""
         return {
             item.name: object_motion(
                 item.object.T_world_object, [h for h in self.handlings if h.name == item.name], motion
             )
-            for item in (*self.flat.things, *self.flat.openables)
+            for item in (*self.flat.movables, *self.flat.openables)
         }
 
 

@@ -1,4 +1,4 @@
-"""A stretch of life in an interactive flat: what is done next, getting through doors, and ordinary activities."""
+"""A stretch of life in an interactive flat: the choice of the next activity, passing doors, and ordinary activities."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -11,57 +11,57 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.actions import ACTIVITIES, follow, start_place
 from wearcap.simulation.distractors import bend_over, gesture_at, hover, linger, squat_by
 from wearcap.simulation.grips import GripPlace
-from wearcap.simulation.house import House, Seem
+from wearcap.simulation.house import Distractor, House
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.opening import operate
 from wearcap.simulation.outline import distance_to_convex
 from wearcap.simulation.plan import Plan
 from wearcap.simulation.rearranging import fetch, floor_place, rearrange, relocate
-from wearcap.simulation.things import Thing
+from wearcap.simulation.things import Movable
 from wearcap.simulation.wearer import TAIL_S, Wearer
 
 WEIGHTS = {
     "door": 1.5, "window": 2.2, "drawer": 2.2, "cabinet_door": 1.8, "sofa": 2.5, "table": 1.2, "chair": 1.2, "box": 0.8
 }  # fmt: skip
-"""How often things of a kind are gone for, all of them together."""
+"""Weight of each category in the choice of the next object."""
 HANDHELD = ("suitcase", "backpack", "bottle", "tool", "ball")
-"""What is used while it is carried."""
+"""Categories that are used while they are carried."""
 EVEN_S = 4.0
-"""Kinds are drawn by their weight over this and the time for which they were held already (s)."""
+"""Kinds are drawn by their weight divided by the sum of this and the time for which they were held already (s)."""
 AGAIN, ROOM = 0.25, 0.10
-"""How often it is what was used last, and several things of one room."""
+"""Probability of using the last object again, and of moving several objects of one room."""
 TRIES = 5
-SEEM_SHARE = 0.14
-"""How often hands do something before a thing without touching it."""
+DISTRACTOR_SHARE = 0.14
+"""Probability of an act in front of an object without touching it."""
 ORDINARY = ("stand", "look_around", "turn", "walk", "hold", "gesture", "carry", "reach", "sit", "crouch")
 CLOSE_BEHIND = 0.35
-"""How often a door is closed after walking through."""
+"""Probability of closing a door after walking through."""
 PARTLY = 0.25
-"""How often something is opened only partly, or closed not quite."""
+"""Probability of opening something only partly, or of not quite closing it."""
 BEYOND_M = 0.95
-"""Behind a door, where one goes through it."""
+"""Distance behind a door to which one walks through it."""
 REACHED_M = 0.4
 NEAR_M = 2.5
 IN_ROOM, SAME_ROOM_M = 4, 3.5
-"""Most things that are moved when a room is rearranged."""
+"""Most objects that are moved when a room is rearranged, and their largest distance from the first."""
 
 
 @dataclass(frozen=True)
 class Habits:
-    """What somebody goes for, and how eagerly."""
+    """Preferences in the choice of objects, and how often they are used."""
 
     weights: Mapping[str, float]
-    """By category."""
+    """Weight by category."""
     held_share: float
-    """Of the time in which hands hold something is aimed at."""
+    """Target share of the time in which hands hold an object."""
     even: bool = False
-    """Rather what was held less so far."""
+    """Whether kinds that were held less so far are preferred."""
     again: float = AGAIN
-    """How often it is what was used last, unless that was in the hands for long."""
+    """Probability of using the last object again, unless it was in the hands for long."""
     near_m: float = NEAR_M
-    """Things so much further off are gone for a third as often."""
-    seem_share: float = SEEM_SHARE
-    """How often hands do something before a thing without touching it."""
+    """Distance per factor 1/e in the probability of an object's choice."""
+    distractor_share: float = DISTRACTOR_SHARE
+    """Probability of an act in front of an object without touching it."""
 
 
 USUAL = Habits(WEIGHTS, 0.42)
@@ -70,31 +70,31 @@ VARIED = Habits(
         "door": 3.0, "window": 4.4, "drawer": 4.4, "cabinet_door": 4.6, "sofa": 4.5, "table": 2.6, "chair": 2.4,
         "box": 0.5, "suitcase": 1.2, "backpack": 1.2, "bottle": 1.0, "tool": 1.0, "ball": 0.9,
     },
-    0.75, even=True, again=0.7, near_m=1.5, seem_share=0.04,
+    0.75, even=True, again=0.7, near_m=1.5, distractor_share=0.04,
 )  # fmt: skip
-"""Every kind is held for a fair share of the time, hand-held things for about half of it."""
+"""Every kind is held for a fair share of the time, hand-held objects for about half of it."""
 
 
-def seem_to_handle(
-    plan: Plan, places: dict[str, GripPlace], T_world_thing: Rigid, height_m: float, rng: np.random.Generator
+def pretend_to_handle(
+    plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, height_m: float, rng: np.random.Generator
 ) -> None:
-    """One of the things that look like handling, before something of a height."""
-    low = float(T_world_thing.t[2]) + height_m < 0.95
+    """One of the acts that resemble handling, in front of an object of a height."""
+    low = float(T_world_object.t[2]) + height_m < 0.95
     chance = rng.random()
     if low and chance < 0.18:
-        bend_over(plan, T_world_thing, height_m, rng)
+        bend_over(plan, T_world_object, height_m, rng)
     elif low and chance < 0.32:
-        squat_by(plan, T_world_thing, height_m, rng)
+        squat_by(plan, T_world_object, height_m, rng)
     elif chance < 0.45:
-        gesture_at(plan, T_world_thing, height_m, rng)
+        gesture_at(plan, T_world_object, height_m, rng)
     elif chance < 0.55:
         linger(plan, rng)
     else:
-        hover(plan, places, T_world_thing, rng)
+        hover(plan, places, T_world_object, rng)
 
 
 class Household:
-    """Plans one thing after the other; what is in the house changes with it."""
+    """Plans one activity after the other; the house's state changes with it."""
 
     def __init__(self, house: House, person: Wearer, rng: np.random.Generator, habits: Habits = USUAL):
         self.house, self.rng, self.habits = house, rng, habits
@@ -105,11 +105,11 @@ class Household:
         self.plan = Plan(person.skeleton, person.style, position, heading, static.floor_height)
         self.plan.time = 0.3
         self.openables = {item.name: item for item in house.flat.openables}
-        self.things = {item.name: item for item in house.flat.things}
+        self.movables = {item.name: item for item in house.flat.movables}
         self.last: str | None = None
 
     def live(self, duration_s: float) -> None:
-        """Plan until a time (s) is full, and a little beyond."""
+        """Plan until a time (s) is reached, and a little beyond."""
         while self.plan.time < duration_s + TAIL_S:
             start = self.plan.time
             held = sum(stop - begin for h in self.house.handlings for begin, stop, _ in h.rows)
@@ -121,7 +121,7 @@ class Household:
             self.plan.label(start, name)
 
     def do_ordinary(self) -> str:
-        """One of the activities that need nothing to be moved."""
+        """One of the activities in which nothing is moved."""
         weights = np.array([ACTIVITIES[name].weight for name in ORDINARY])
         name = str(self.rng.choice(ORDINARY, p=weights / weights.sum()))
         if name == "walk" and self.rng.random() < 0.5:
@@ -131,7 +131,7 @@ class Household:
         return name
 
     def interact(self) -> str:
-        """Use something, after going through whatever doors lie on the way; "stand" where nothing could be done."""
+        """Use an object, after passing the doors on the path; "stand" where nothing could be done."""
         chance = self.rng.random()
         again = self.habits.again if self._kind(self.last) not in HANDHELD else AGAIN
         if chance < again and self.last is not None and (done := self.use(self.last)) != "stand":
@@ -139,41 +139,41 @@ class Household:
         if chance > 1.0 - ROOM:
             return self.rearrange_room()
         for _ in range(TRIES):
-            if (done := self.use(self._drawn(self.openables | self.things))) != "stand":
+            if (done := self.use(self._drawn(self.openables | self.movables))) != "stand":
                 return done
         return "stand"
 
     def use(self, name: str) -> str:
-        """Open, close or move one thing; says what was done: "walk" when one only got there, "stand" for nothing."""
+        """Open, close or move one object; returns the act's label ("walk": only got there, "stand": nothing done)."""
         start, done = self.plan.time, self._act(name)
         if not done and self.go(self.place_of(name), stop_m=1.0):
             done = self._act(name)
         if not done:
             return "walk" if self.plan.time > start else "stand"
         self.last = name
-        verb = "move" if name in self.things else "turn"
-        return f"{verb} {(self.openables | self.things)[name].category}"
+        verb = "move" if name in self.movables else "turn"
+        return f"{verb} {(self.openables | self.movables)[name].category}"
 
     def _act(self, name: str) -> bool:
-        seem = seem_to_handle if self.rng.random() < self.habits.seem_share else None
+        distractor = pretend_to_handle if self.rng.random() < self.habits.distractor_share else None
         if name in self.openables:
-            return self.turn(self.openables[name], seem)
-        thing = self.things[name]
-        act = {"box": relocate, **dict.fromkeys(HANDHELD, fetch)}.get(thing.category, rearrange)
-        return act(self.plan, self.house, self.rng, thing, seem)
+            return self.turn(self.openables[name], distractor)
+        movable = self.movables[name]
+        act = {"box": relocate, **dict.fromkeys(HANDHELD, fetch)}.get(movable.category, rearrange)
+        return act(self.plan, self.house, self.rng, movable, distractor)
 
     def rearrange_room(self) -> str:
-        """Move several things near each other, one after another."""
-        start, first = self.plan.time, self._drawn(self.things)
+        """Move several objects near each other, one after another."""
+        start, first = self.plan.time, self._drawn(self.movables)
         middle = self.place_of(first)
-        away = {name: float(np.linalg.norm(self.place_of(name) - middle)) for name in self.things}
+        away = {name: float(np.linalg.norm(self.place_of(name) - middle)) for name in self.movables}
         names = sorted((name for name in away if away[name] < SAME_ROOM_M), key=lambda name: away[name])
         for name in names[: int(self.rng.integers(2, IN_ROOM + 1))]:
             self.use(name)
         return "rearrange" if self.plan.time > start else "stand"
 
-    def turn(self, item: Openable, seem: Seem | None = None) -> bool:
-        """Open what is closed, close what is open; at times something between."""
+    def turn(self, item: Openable, distractor: Distractor | None = None) -> bool:
+        """Open a closed openable, close an open one; sometimes to a value in between."""
         at, full = self.house.values[item.name], item.openness(item.opened)
         if item.openness(at) > 0.3 * full:
             share = self.rng.uniform(0.0, 0.4) if self.rng.random() < PARTLY else 0.0
@@ -182,10 +182,10 @@ class Household:
         value = item.closed + share * (item.opened - item.closed)
         if abs(value - at) < 0.12 * full:
             return False
-        return operate(self.plan, self.house, self.rng, item, value, self._side(item), seem)
+        return operate(self.plan, self.house, self.rng, item, value, self._side(item), distractor)
 
     def go(self, goal: Float[np.ndarray, "3"], stop_m: float = 0.0) -> bool:
-        """Walk to a floor point (m), or within `stop_m` of it, opening closed doors on the way; False where that fails."""
+        """Walk to a floor point (m), or within `stop_m` of it, opening closed doors on the path; False on failure."""
         for _ in range(4):
             world = self.house.world(self.plan.position)
             points = world.navigation.node_points
@@ -233,10 +233,10 @@ class Household:
         return True
 
     def place_of(self, name: str) -> Float[np.ndarray, "3"]:
-        """Floor point at a thing, or before an openable's handle (m)."""
+        """Floor point at an object, or in front of an openable's handle (m)."""
         floor = float(self.plan.position[2])
-        if name in self.things:
-            return np.append(floor_place(self.house, self.things[name])[:2], floor)
+        if name in self.movables:
+            return np.append(floor_place(self.house, self.movables[name])[:2], floor)
         item = self.openables[name]
         if item.category == "door":
             return self._beyond(item, self._side(item), 0.6)
@@ -244,8 +244,8 @@ class Household:
         out = -(item.pose(item.closed).R.numpy() @ np.array(item.handles[0].fingers))[:2]
         return np.append(place[:2] + 0.7 * out / np.linalg.norm(out), floor)
 
-    def _drawn(self, items: Mapping[str, Thing | Openable]) -> str:
-        """The name of something to use next, rather of what is near."""
+    def _drawn(self, items: Mapping[str, Movable | Openable]) -> str:
+        """Name of the next object to use; near ones are preferred."""
         kinds = Counter(item.category for item in items.values())
         away = [np.linalg.norm(self.place_of(name)[:2] - self.plan.position[:2]) for name in items]
         weights = np.exp(-np.array(away) / self.habits.near_m)
@@ -253,33 +253,33 @@ class Household:
         return str(self.rng.choice(list(items), p=weights / weights.sum()))
 
     def _kind(self, name: str | None) -> str:
-        return (self.openables | self.things)[name].category if name is not None else ""
+        return (self.openables | self.movables)[name].category if name is not None else ""
 
     def _weight(self, category: str) -> float:
         if not self.habits.even:
             return self.habits.weights[category]
-        items = self.openables | self.things
+        items = self.openables | self.movables
         spans = [h.stop_s - h.start_s for h in self.house.handlings if items[h.name].category == category]
         return self.habits.weights[category] / (EVEN_S + sum(spans))
 
     def _side(self, door: Openable) -> int:
-        """Handle on the side where one stands: 0 where the leaf opens to."""
+        """Index of the handle on the side where one stands: 0 where the leaf opens to."""
         if len(door.handles) == 1:
             return 0
         return 0 if self._across(door, self.plan.position) > 0 else 1
 
     def _across(self, door: Openable, point: Float[np.ndarray, "3"]) -> float:
-        """How far a point is before a door's plane, positive where the leaf opens to (m)."""
+        """Signed distance of a point from a door's plane, positive where the leaf opens to (m)."""
         pose = door.pose(door.closed)
         local = pose.R.numpy().T @ (np.array([*point[:2], 0.0]) - np.array([*pose.t[:2].tolist(), 0.0]))
-        return float(local[1]) * door.way
+        return float(local[1]) * door.opening_sign
 
     def _beyond(self, door: Openable, side: int, far_m: float = BEYOND_M) -> Float[np.ndarray, "3"]:
-        """Floor point before a door's middle on a side (m)."""
+        """Floor point in front of a door's middle on a side (m)."""
         pose = door.pose(door.closed)
         width = float(door.outline[:, 0].max())
-        way = door.way if side == 0 else -door.way
-        point = pose.R.numpy() @ np.array([width / 2, way * far_m, 0.0]) + pose.t.numpy()
+        sign = door.opening_sign if side == 0 else -door.opening_sign
+        point = pose.R.numpy() @ np.array([width / 2, sign * far_m, 0.0]) + pose.t.numpy()
         return np.array([point[0], point[1], self.plan.position[2]])
 
     def _same_side(self, point: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"]) -> bool:
@@ -298,18 +298,18 @@ class Household:
         return min(float(distance_to_convex(between, wall).min()) for wall in walls) > 0.01
 
     def _door_between(self, goal: Float[np.ndarray, "3"]) -> Openable | None:
-        """The first door in the way to a point that is not open enough."""
+        """The first door on the path to a point that is not open enough."""
         shut = [door for door in self.house.flat.openables if door.blocks(self.house.values[door.name])]
         if not shut:
             return None
         world = self.house.world(self.plan.position, without=tuple(door.name for door in shut))
-        way = world.navigation.shortest(self.plan.position, goal, 1.0)
-        if way is None:
+        path = world.navigation.shortest(self.plan.position, goal, 1.0)
+        if path is None:
             return None
         first = {}
         for door in shut:
             gap = door.footprint(door.closed)
-            near = np.flatnonzero(distance_to_convex(way[:, :2], gap) < 0.12)
+            near = np.flatnonzero(distance_to_convex(path[:, :2], gap) < 0.12)
             if len(near):
                 first[door.name] = int(near[0])
         return self.openables[min(first, key=lambda name: first[name])] if first else None

@@ -1,4 +1,4 @@
-"""One simulated HPS recording: a long session in a site, seen by a suit, wrist sensors and a head camera."""
+"""One simulated HPS recording: a long session in a site, recorded by a suit, wrist sensors and a head camera."""
 
 from dataclasses import dataclass, field, replace
 
@@ -18,24 +18,24 @@ from wearcap.simulation.simulate import POOLS, person_of, world_of
 from wearcap.simulation.world import World
 
 CLAP_WIDTH_S = 0.011
-"""Deviation of the shock of two palms, as a wrist's sensor passes it on."""
+"""Deviation of the shock of two palms, as a wrist's sensor measures it."""
 SITES = {"train": 8, "val": 3, "test": 5}
 """Sites of each split, fewer than flats: each needs a scan and photos."""
 
 
 @dataclass(frozen=True)
 class HpsConfig(HeadCameraConfig):
-    """What to simulate."""
+    """Settings of a simulated recording."""
 
     fps: float = 60.0
-    """Of suit and wrist sensors."""
+    """Frame rate of suit and wrist sensors."""
     protocol: Protocol = field(default_factory=Protocol)
     suit: SuitNoise = field(default_factory=SuitNoise)
     imu: ImuNoise = field(default_factory=ImuNoise)
     localization: LocalizationNoise | None = field(default_factory=LocalizationNoise)
-    """None: to be found in the video."""
+    """Noise of the localisation; None: it is to be found from the video."""
     clap_acc: tuple[float, float] = (30.0, 60.0)
-    """Of the palms' shock (m/s²)."""
+    """Range of the palms' shock (m/s²)."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -45,21 +45,21 @@ class HpsConfig(HeadCameraConfig):
 
 @dataclass(frozen=True)
 class Simulated:
-    """A recording, and what made it."""
+    """A recording, and the world and session that it was made from."""
 
     recording: Recording
     session: SimulatedSession
     world: World
     clock: tuple[float, float]
-    """The camera's: lead over the suit's at its zero (s), and what it gains (ms per hour)."""
+    """Clock of the camera: its lead over the suit's at the suit's zero (s), and its drift (ms per hour)."""
 
     def to_camera(self, suit_s: float) -> float:
-        """The camera's time at a time of the suit."""
+        """Time of the camera's clock at a time of the suit's."""
         return suit_s * (1 + self.clock[1] / 3.6e6) + self.clock[0]
 
 
 def site_number(split: str, index: int) -> int:
-    """Which of a split's sites its index-th recording takes place in."""
+    """Number of the split's site in which its index-th recording takes place."""
     return index % min(SITES[split], POOLS[split][1])
 
 
@@ -105,7 +105,7 @@ def _wrist(
     motion: Motion, side: str, config: HpsConfig, claps_s: tuple[float, ...], strength: np.ndarray,
     rng: np.random.Generator,
 ) -> ImuStream:  # fmt: skip
-    """A wrist's sensor; palms that meet push the wrists apart for some hundredths of a second."""
+    """Readings of a wrist's sensor; palms that meet push the wrists apart for some hundredths of a second."""
     stream = synthesize_imu(motion, f"{side}_wrist", noise=config.imu, rng=rng, n=1)
     apart = (
         motion.joint(f"{side}_wrist").t - motion.joint("right_wrist" if side == "left" else "left_wrist").t

@@ -1,4 +1,4 @@
-"""A long walk by the protocol of the documents' evaluation (thesis §4.5): from a capture spot and back to it.
+"""A long walk by the protocol of the HPS thesis' evaluation (§4.5): from a capture spot and back to it.
 
 At the spot the wearer claps, stands in an A-pose, walks about and leans on the table; then goes through the site
 and comes back after given distances to do the same again.
@@ -19,27 +19,27 @@ from wearcap.simulation.world import CaptureSpot, World
 A_POSE = (0.02, 0.46, -0.84, 0.2, 0.0, 0.0)
 """Hand's pose channel (`HandScore.pose`): the arm hangs 30° off the body."""
 CLAP_HEIGHT, CLAP_AHEAD = 0.02, 0.62
-"""Of the wrists when they meet, from the shoulders, as shares of the arm's length: before the face."""
+"""Wrist positions when the palms meet, from the shoulders, as shares of the arm's length: in front of the face."""
 PALMS_M, APART_M = 0.045, 0.13
-"""Each wrist's distance from the middle when the palms meet, and by how much more it comes from."""
+"""Distance of each wrist from the middle when the palms meet, and the additional distance before."""
 IDLE = ("stand", "look_around", "gesture", "hold", "crouch", "turn")
-"""What is done between walks, now and then."""
+"""Activities between walks, now and then."""
 IDLE_SHARE = 0.3
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is recorded."""
+    """Course of a session."""
 
     returns_m: tuple[float, ...] = (70.0, 200.0, 380.0)
-    """Distances travelled after which the wearer is back at the spot, besides the start."""
+    """Travelled distances after which the wearer is back at the spot, besides the start."""
     end_m: float = 410.0
-    """The recording ends, at the spot, when about this much is travelled."""
+    """The recording ends, at the spot, when about this distance is travelled."""
     stand_s: float = 3.0
     move_s: float = 10.0
     claps: int = 3
     clap_every_s: float = 240.0
-    """Claps come at the start, at the end, and at the first stop after so much time."""
+    """Claps come at the start, at the end, and at the first stop after this time."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ def simulate_session(
     ACTIVITIES["stand"].act(plan, world, rng)
     plan.time = max(plan.time, duration + TAIL_S)
     simulated = perform(plan, world, rng, duration, fps)
-    way = simulated.motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1).cumsum(0).numpy()
+    path_so_far = simulated.motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1).cumsum(0).numpy()
     starts, stops, names = zip(*session.stretches)
-    travelled = np.interp(starts, simulated.motion.timestamps.numpy()[1:], way)
+    travelled = np.interp(starts, simulated.motion.timestamps.numpy()[1:], path_so_far)
     intervals = Intervals(
         torch.tensor(starts, dtype=torch.float64), torch.tensor(stops, dtype=torch.float64),
         torch.from_numpy(travelled).float(), names,
@@ -85,7 +85,7 @@ def simulate_session(
 
 
 class _Session:
-    """The plan in the making, with what was walked so far."""
+    """The plan in the making, and the distance walked so far."""
 
     def __init__(self, world: World, person: Wearer, rng: np.random.Generator, protocol: Protocol):
         self.world, self.rng, self.protocol = world, rng, protocol
@@ -98,7 +98,7 @@ class _Session:
         self.travelled = 0.0
         self.stretches: list[tuple[float, float, str]] = []
         self.clap_times: list[float] = []
-        self._way_home = world.navigation.lengths_from(self.home)
+        self._length_home = world.navigation.lengths_from(self.home)
 
     def walk(self, goal: np.ndarray, heading: float | None = None) -> bool:
         path = self.world.plan_path(self.plan.position, goal, self.rng)
@@ -111,17 +111,17 @@ class _Session:
         return True
 
     def wander(self, until_m: float) -> None:
-        """Walk from place to place as long as the way home leaves room for it."""
+        """Walk from place to place as long as the path home leaves room for it."""
         points = self.world.navigation.node_points
         free = (self.world.clearance(points) > FREE_M) & ~on_stairs(self.world, points)
         while True:
             there = self.world.navigation.lengths_from(self.plan.position)
             left = until_m - self.travelled
-            fits = np.flatnonzero(free & (there > 2.5) & (there + self._way_home < left + 1.5))
+            fits = np.flatnonzero(free & (there > 2.5) & (there + self._length_home < left + 1.5))
             if not len(fits):
                 return
             # the last walk before home uses up what is left; others go anywhere
-            total = there[fits] + self._way_home[fits]
+            total = there[fits] + self._length_home[fits]
             last = fits[total > left - 3.0] if left < 1.6 * total.max() else fits
             goal = points[self.rng.choice(last if len(last) else fits)]
             if not self.walk(goal) or self.rng.random() < IDLE_SHARE:
@@ -133,7 +133,7 @@ class _Session:
         self.walk(self.home, self.spot.heading)
 
     def visit(self) -> None:
-        """What is done at the spot: claps where due, the A-pose, moving about."""
+        """Activities at the spot: claps where due, the A-pose, moving about."""
         if not self.clap_times or self.plan.time - self.clap_times[-1] > self.protocol.clap_every_s:
             self.clap()
         self.stand()
@@ -165,7 +165,7 @@ class _Session:
         plan.label(start, "clap")
 
     def stand(self) -> None:
-        """An A-pose, held."""
+        """Hold an A-pose."""
         plan, start, rise = self.plan, self.plan.time, 0.9
         stop = start + rise + 0.2 + self.protocol.stand_s
         for side in SIDES:
@@ -197,16 +197,16 @@ class _Session:
         """Put both hands on the table, lean over it, and rise again."""
         plan, start = self.plan, self.plan.time
         across = np.array([-ahead[1], ahead[0]])
-        out, rest, back = 0.9, float(self.rng.uniform(1.2, 2.2)), 0.9
+        out, pause, back = 0.9, float(self.rng.uniform(1.2, 2.2)), 0.9
         for hand_side in SIDES:
             hand = plan.hands[hand_side]
             place = self.home[:2] + (self.spot.table_m + 0.06) * ahead + LEFT_SIGN[hand_side] * 0.22 * across
             height = self.home[2] + self.spot.table_z + 0.07
             hand.goal.move(start, start, np.append(place, height))
             hand.goal_weight.move(start, start + out, 1.0)
-            hand.goal_weight.move(start + out + rest, start + out + rest + back, 0.0)
+            hand.goal_weight.move(start + out + pause, start + out + pause + back, 0.0)
         plan.lean.move(start, start + out, (0.5, 0.0, 0.0))
-        plan.lean.move(start + out + rest, start + out + rest + back, 0.0)
-        plan.time = start + out + rest + back + 0.2
+        plan.lean.move(start + out + pause, start + out + pause + back, 0.0)
+        plan.time = start + out + pause + back + 0.2
         turn_to(plan, plan.heading + 1.2 * float(self.rng.choice([-1.0, 1.0])), self.rng)
         plan.label(start, "lean")

@@ -19,8 +19,8 @@ def two_bone(
 ) -> tuple[Float[Tensor, "time 3 3"], Float[Tensor, "time"]]:
     """Rotation of the upper bone in the world and bend (rad) of the hinge that bring the limb's end to `target`.
 
-    `upper` and `lower` are the bones' offsets at rest, `hinge` the unit axis that bends the limb, all in the rest
-    axes; `target` is the limb's end seen from its root and `pole` the side to which the middle joint points, both
+    `upper` and `lower` are the bones' offsets in the rest pose, `hinge` the unit axis that bends the limb, all in the
+    rest axes; `target` is the limb's end seen from its root and `pole` the side to which the middle joint points, both
     in the world. A target out of reach is approached along its direction. |upper + R(bend) lower| = |target| is
     solved in closed form: A cos bend + B sin bend = K.
     """

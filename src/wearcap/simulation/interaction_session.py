@@ -1,4 +1,4 @@
-"""Simulated iReplica recordings: somebody uses and moves what is in a flat, seen by a suit and a head camera (thesis §5.4)."""
+"""Simulated iReplica recordings: use of a flat's objects, recorded by a suit and a head camera (thesis §5.4)."""
 
 from dataclasses import dataclass, field
 
@@ -24,7 +24,7 @@ FLATS = {"train": 40, "val": 6, "test": 8}
 
 @dataclass(frozen=True)
 class InteractionConfig(HeadCameraConfig):
-    """What to simulate. Suit and camera share a clock unless told otherwise."""
+    """Settings of a simulated recording. Suit and camera share a clock by default."""
 
     fps: float = 60.0
     minutes: float = 3.0
@@ -41,18 +41,18 @@ class InteractionConfig(HeadCameraConfig):
 
 @dataclass(frozen=True)
 class SimulatedInteractions:
-    """A recording with the environment in which it took place, and that as a world."""
+    """A recording with the environment in which it took place, and the worlds it was made from."""
 
     recording: Recording
     environment: Environment
     world: World
-    """What stays where it is, with what can be moved at its initial pose."""
+    """The static world together with the movable objects at their initial poses."""
     static: World
-    """The first alone."""
+    """The static part of the world alone."""
 
 
 def flat_number(split: str, index: int) -> int:
-    """Which of a split's interactive flats its index-th recording takes place in."""
+    """Number of the split's interactive flat in which its index-th recording takes place."""
     return index % min(FLATS[split], POOLS[split][1])
 
 

@@ -1,4 +1,4 @@
-"""Seeded flats whose doors, windows, drawers and much furniture can be moved (thesis §5.2: an interactive environment)."""
+"""Seeded flats whose doors, windows, drawers and much furniture can be moved (iReplica thesis §5.2)."""
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -16,7 +16,7 @@ from wearcap.simulation.furnish import FRONT_M, Box, Plan
 from wearcap.simulation.furniture import MAKERS
 from wearcap.simulation.openables import Openable, at, direction, hinged
 from wearcap.simulation.outline import distance_to_convex, points_in_convex, rectangle, turn
-from wearcap.simulation.things import Thing, make_thing
+from wearcap.simulation.things import Movable, make_movable
 from wearcap.simulation.walls import DOOR_HEIGHT, THICKNESS, WINDOW
 from wearcap.simulation.world import Door, World, WorldObject
 
@@ -26,7 +26,7 @@ LOOSE: dict[str, tuple[str, ...]] = {
     "kitchen": ("table", "box"),
     "study": ("sofa", "table", "box", "chair"),
 }
-"""What can be moved about in each kind of room, the most wanted first; a table comes with chairs."""
+"""Movable furniture in each kind of room, in order of preference; a table comes with chairs."""
 FIXED: dict[str, tuple[str, ...]] = {
     "living room": ("cabinet", "shelf", "plant", "lamp"),
     "bedroom": ("bed", "wardrobe", "cabinet", "lamp"),
@@ -34,41 +34,41 @@ FIXED: dict[str, tuple[str, ...]] = {
     "study": ("cabinet", "desk", "shelf", "plant"),
 }
 FEWEST = {"sofa": 1, "table": 1, "chair": 1, "box": 1, "door": 2, "window": 1, "drawer": 2}
-FEWEST_THINGS = 10
+FEWEST_OBJECTS = 10
 WINDOW_SHARE, AJAR_SHARE = 0.6, 0.3
-"""Of the windows can be opened; of the doors (and half as many windows) stand open at first."""
+"""Share of the windows that can be opened; share of the doors (half that of the windows) that stand open at first."""
 LEAST_OPEN, MOST_OPEN = np.deg2rad(75.0), np.deg2rad(100.0)
-"""A leaf that cannot be opened so far is not hung; and none opens further."""
+"""Least angle to which a leaf must open, else it is left out; and largest angle to which any opens."""
 FRAME_M = 0.015
-"""How far a frame stands out of its wall."""
+"""Depth of a frame in front of its wall."""
 
 
 @dataclass(frozen=True)
 class _Loose(Piece):
-    """A thing's outline, to find a place for it."""
+    """Outline of a movable object, to find a place for it."""
 
-    thing: Thing | None = None
+    movable: Movable | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class InteractiveFlat:
-    """What stays where it is, and what can be moved."""
+    """A static world, and the objects in it that can be moved or opened."""
 
     static: World
-    things: tuple[Thing, ...]
+    movables: tuple[Movable, ...]
     openables: tuple[Openable, ...]
 
     @cached_property
     def environment(self) -> Environment:
-        return Environment(tuple(item.object for item in (*self.things, *self.openables)))
+        return Environment(tuple(item.object for item in (*self.movables, *self.openables)))
 
     @cached_property
     def world(self) -> World:
-        """Everything as it is at the beginning, as it is scanned and seen."""
+        """The world with all objects at their initial poses, as it is scanned and seen."""
         world, meshes = self.static, [self.static.mesh]
         face_object, face_texture = [world.face_object], [world.face_texture]
         objects = list(world.objects)
-        for item in (*self.things, *self.openables):
+        for item in (*self.movables, *self.openables):
             scene_object = item.object
             T = scene_object.T_world_object
             vertices = scene_object.mesh.vertices @ T.R.numpy().T + T.t.numpy()
@@ -82,8 +82,8 @@ class InteractiveFlat:
         )  # fmt: skip
 
 
-def obstacle(item: Thing | Openable, pose: Rigid | None) -> WorldObject:
-    """What a walker keeps off: an object at a pose (None: the initial one)."""
+def obstacle(item: Movable | Openable, pose: Rigid | None) -> WorldObject:
+    """Obstacle of an object at a pose (None: the initial one)."""
     pose = item.object.T_world_object if pose is None else pose
     R, t = pose.R.double().numpy(), pose.t.double().numpy()
     if isinstance(item, Openable):
@@ -98,19 +98,19 @@ def obstacle(item: Thing | Openable, pose: Rigid | None) -> WorldObject:
 
 @dataclass
 class _Builder(WorldBuilder):
-    """A builder that keeps what can be moved out of the world."""
+    """A builder that keeps movable objects out of the world."""
 
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
-    things: list[Thing] = field(default_factory=list)
+    movables: list[Movable] = field(default_factory=list)
     openables: list[Openable] = field(default_factory=list)
     shut: set[int] = field(default_factory=set)
-    """Windows that cannot be opened."""
+    """Indices of windows that cannot be opened."""
 
     def place(self, piece: Piece, position: tuple[float, float, float], heading: float) -> int:
         if isinstance(piece, _Loose):
-            assert piece.thing is not None
+            assert piece.movable is not None
             x, y, z = self.to_world(np.array(position)).tolist()
-            self.things.append(piece.thing.placed(x, y, self.heading + heading, z))
+            self.movables.append(piece.movable.placed(x, y, self.heading + heading, z))
             return -1
         if piece.kind in FRONTED:
             x, y, z = position
@@ -127,8 +127,8 @@ def build_interactive_flat(rng: np.random.Generator, name: str) -> InteractiveFl
     """A flat on one floor with at least a sofa, a table, a chair, a box, a window, doors and drawers that move."""
     while True:
         flat = _draw(np.random.default_rng(rng.integers(2**63)), name)
-        kinds = Counter(item.category for item in (*flat.things, *flat.openables))
-        if all(kinds[kind] >= least for kind, least in FEWEST.items()) and kinds.total() >= FEWEST_THINGS:
+        kinds = Counter(item.category for item in (*flat.movables, *flat.openables))
+        if all(kinds[kind] >= least for kind, least in FEWEST.items()) and kinds.total() >= FEWEST_OBJECTS:
             return flat
 
 
@@ -137,14 +137,14 @@ def _draw(rng: np.random.Generator, name: str) -> InteractiveFlat:
     builder = _Builder(name, heading, shift, rng=rng)
     lay_out(builder, rng, stairs=False, furnish=_furnish)
     static = builder.finish(cell=0.1)
-    leaves = _hang_doors(builder, static, rng) + _hang_sashes(builder, static, rng)
+    leaves = _add_door_leaves(builder, static, rng) + _add_sashes(builder, static, rng)
     return InteractiveFlat(
-        static, tuple(_numbered(builder.things)), tuple(_numbered([*leaves, *builder.openables]))
+        static, tuple(_numbered(builder.movables)), tuple(_numbered([*leaves, *builder.openables]))
     )
 
 
 def _numbered(items: list) -> list:
-    """The same with names: door_1, door_2 …"""
+    """The same items with names: door_1, door_2 …"""
     count: Counter[str] = Counter()
     out = []
     for item in items:
@@ -155,7 +155,7 @@ def _numbered(items: list) -> list:
 
 
 def _furnish(plan: Plan, kind: str, rng: np.random.Generator) -> None:
-    """What can be moved first, then what stands still along the walls, with room before windows."""
+    """Movable furniture first, then static furniture along the walls, with room in front of windows."""
     builder = plan.builder
     assert isinstance(builder, _Builder)
     for number, window in enumerate(builder.windows):
@@ -172,9 +172,9 @@ def _furnish(plan: Plan, kind: str, rng: np.random.Generator) -> None:
 
 
 def _loose(category: str, rng: np.random.Generator) -> _Loose:
-    thing = make_thing(category, category, rng)
-    size = (2 * thing.half_size[0], 2 * thing.half_size[1])
-    return _Loose(category, size, (0.0, thing.height), (), thing=thing)
+    movable = make_movable(category, category, rng)
+    size = (2 * movable.half_size[0], 2 * movable.half_size[1])
+    return _Loose(category, size, (0.0, movable.height), (), movable=movable)
 
 
 def _place_loose(plan: Plan, category: str, rng: np.random.Generator) -> None:
@@ -212,26 +212,26 @@ def _before_window(builder: WorldBuilder, window: Door) -> Box:
     return (x - half_x, y - half_y, x + half_x, y + half_y)
 
 
-def _hang_doors(builder: _Builder, static: World, rng: np.random.Generator) -> list[Openable]:
-    """Leaves in door gaps, mostly opening into rooms, on whichever side they have the space to."""
+def _add_door_leaves(builder: _Builder, static: World, rng: np.random.Generator) -> list[Openable]:
+    """Door leaves in the gaps, mostly opening into rooms, on whichever side they have the space to."""
     leaves = []
     for door in builder.doors:
-        ways = [(side, hand) for side in (-1.0, 1.0) for hand in (-1.0, 1.0)]
-        into_hall = np.array([_room_at(static, door, side).startswith("hallway") for side, _ in ways])
+        variants = [(side, hand) for side in (-1.0, 1.0) for hand in (-1.0, 1.0)]
+        into_hall = np.array([_room_at(static, door, side).startswith("hallway") for side, _ in variants])
         order = np.argsort(rng.random(4) + np.where(into_hall, rng.choice([0.0, 1.0], p=[0.2, 0.8]), 0.0))
-        for side, hand in (ways[k] for k in order):
-            foot, heading, way = _jamb(door, side, hand, door.width - 0.01)
-            leaf = hinged("door", foot, heading, way, door.width - 0.02,
+        for side, hand in (variants[k] for k in order):
+            foot, heading, opening_sign = _jamb(door, side, hand, door.width - 0.01)
+            leaf = hinged("door", foot, heading, opening_sign, door.width - 0.02,
                           (0.01, DOOR_HEIGHT - 0.04), MOST_OPEN, rng)  # fmt: skip
-            most = _free_angle(leaf, static, builder.things, door.position)
+            most = _free_angle(leaf, static, builder.movables, door.position)
             if most >= LEAST_OPEN:
                 leaves.append(_ajar(_limited(leaf, most), rng, AJAR_SHARE))
                 break
     return leaves
 
 
-def _hang_sashes(builder: _Builder, static: World, rng: np.random.Generator) -> list[Openable]:
-    """Sashes that open into the room; a window wider than one has two."""
+def _add_sashes(builder: _Builder, static: World, rng: np.random.Generator) -> list[Openable]:
+    """Window sashes that open into the room; a window wider than one sash has two."""
     sashes = []
     for number, window in enumerate(builder.windows):
         sides = [side for side in (-1.0, 1.0) if _room_at(static, window, side)]
@@ -241,17 +241,17 @@ def _hang_sashes(builder: _Builder, static: World, rng: np.random.Generator) -> 
         width = min(window.width, 0.9) if single else window.width / 2
         hands = (float(rng.choice([-1.0, 1.0])),) if single else (-1.0, 1.0)
         for hand in hands:
-            foot, heading, way = _jamb(window, sides[0], hand, window.width - 0.01)
-            sash = hinged("window", foot, heading, way, width - 0.02,
+            foot, heading, opening_sign = _jamb(window, sides[0], hand, window.width - 0.01)
+            sash = hinged("window", foot, heading, opening_sign, width - 0.02,
                           (WINDOW[0] + 0.035, WINDOW[1] - 0.035), MOST_OPEN, rng)  # fmt: skip
-            most = _free_angle(sash, static, builder.things, window.position)
+            most = _free_angle(sash, static, builder.movables, window.position)
             if most >= LEAST_OPEN:
                 sashes.append(_ajar(_limited(sash, most), rng, AJAR_SHARE / 2))
     return sashes
 
 
 def _jamb(gap: Door, side: float, hand: float, width: float) -> tuple[np.ndarray, float, float]:
-    """Hinge's foot, heading of the closed leaf and sense of opening, for a leaf that opens towards `side` of a gap."""
+    """Hinge's foot, heading of the closed leaf and sign of opening, for a leaf that opens towards `side` of a gap."""
     ahead = side * direction(gap.heading)
     along = hand * np.array([-ahead[1], ahead[0]])
     foot = np.array(gap.position)
@@ -264,22 +264,26 @@ def _jamb(gap: Door, side: float, hand: float, width: float) -> tuple[np.ndarray
 
 
 def _room_at(static: World, gap: Door, side: float) -> str:
-    """Name of the room half a metre off a gap, "" outside."""
+    """Name of the room half a metre away from a gap, "" outside."""
     point = np.array(gap.position[:2]) + side * 0.5 * direction(gap.heading)
     names = [room.name for room in static.rooms if points_in_convex(point[None], room.polygon)[0]]
     return names[0] if names else ""
 
 
-def _free_angle(leaf: Openable, static: World, things: list[Thing], gap: tuple[float, float, float]) -> float:
-    """How far a leaf opens before it touches something (rad), its own frame left aside."""
+def _free_angle(
+    leaf: Openable, static: World, movables: list[Movable], gap: tuple[float, float, float]
+) -> float:
+    """Angle to which a leaf opens before it touches something (rad), its own frame left aside."""
     solid = [item for item in static.objects if np.linalg.norm(np.array(item.position[:2]) - gap[:2]) < 4.0]
-    solid += [obstacle(thing, None) for thing in things]
+    solid += [obstacle(movable, None) for movable in movables]
     solid = [
         item for item in solid if item.z_range[0] < leaf.z_range[1] and item.z_range[1] > leaf.z_range[0]
     ]
     angles = np.deg2rad(np.arange(15.0, 106.0, 5.0))
     edge = np.linspace(0.3, 1.0, 12)[:, None] * leaf.outline[1]  # along the leaf, away from the frame
-    points = np.einsum("aij,ej->aei", leaf.pose(leaf.closed + leaf.way * angles).R[:, :2, :2].numpy(), edge)
+    points = np.einsum(
+        "aij,ej->aei", leaf.pose(leaf.closed + leaf.opening_sign * angles).R[:, :2, :2].numpy(), edge
+    )
     points = points + np.array(leaf.object.t_world_object[:2].tolist())
     apart = np.min([distance_to_convex(points, item.footprint).min(1) for item in solid], 0)
     hit = np.flatnonzero(apart < 0.02)
@@ -289,18 +293,18 @@ def _free_angle(leaf: Openable, static: World, things: list[Thing], gap: tuple[f
 
 
 def _limited(leaf: Openable, most: float) -> Openable:
-    """The leaf opening no further than `most` (rad)."""
+    """The leaf with an opening of at most `most` (rad)."""
     freedom = leaf.object.freedom
-    low, high = (min(leaf.way * most, 0.0), max(leaf.way * most, 0.0))
+    low, high = (min(leaf.opening_sign * most, 0.0), max(leaf.opening_sign * most, 0.0))
     return replace(
         leaf,
         object=replace(leaf.object, freedom=replace(freedom, limits=(low, high))),
-        opened=leaf.way * most,
+        opened=leaf.opening_sign * most,
     )
 
 
 def _ajar(leaf: Openable, rng: np.random.Generator, share: float) -> Openable:
-    """Closed, or in `share` of the cases open by 65° or more at first."""
+    """The leaf closed or, in `share` of the cases, opened by 65° or more at first."""
     if rng.random() >= share:
         return leaf
-    return at(leaf, leaf.way * float(rng.uniform(np.deg2rad(65.0), leaf.openness(leaf.opened))))
+    return at(leaf, leaf.opening_sign * float(rng.uniform(np.deg2rad(65.0), leaf.openness(leaf.opened))))

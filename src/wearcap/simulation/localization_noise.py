@@ -1,7 +1,7 @@
-"""Camera poses as localisation in a map would find them, drawn from a statistical model and not from pictures.
+"""Camera poses as localisation in a map would find them, drawn from a statistical model without images.
 
-Good frames are off by some centimetres, mostly by what the view has to do with it, so that the error stays while
-the view does; bursts of frames are plainly wrong; and for seconds nothing is found at all, mostly before blank walls.
+Good frames are off by some centimetres, mostly depending on the view, so that the error persists while the view
+does; bursts of frames are plainly wrong; and for seconds nothing is found at all, mostly in front of blank walls.
 """
 
 from dataclasses import dataclass, replace
@@ -18,26 +18,26 @@ from wearcap.recording.recording import Localization
 from wearcap.sensors.noise import smooth_noise
 
 VIEW_M, VIEW_DEG, VIEW_S = 0.8, 35.0, 12.0
-"""Moving or turning by so much, or so much time, changes a view: the lasting part of the error is another then."""
+"""Translation, rotation and time that change a view, and with it the lasting part of the error."""
 BLANK_PULL = 3.0
-"""How much more often an outage begins where the view is among the blankest than where it is rich."""
+"""Ratio of the outage rates at the blankest views and at rich ones."""
 
 
 @dataclass(frozen=True)
 class LocalizationNoise:
-    """Statistics of localisation; ranges are drawn from, evenly, once per recording."""
+    """Statistics of localisation; values are drawn uniformly from the ranges once per recording."""
 
     position_m: tuple[float, float] = (0.03, 0.07)
-    """Median distance of good frames."""
+    """Median position error of good frames."""
     rotation_deg: tuple[float, float] = (1.0, 2.0)
-    """Median angle of good frames."""
+    """Median angle error of good frames."""
     lasting: float = 0.6
-    """Share of the error's variance that stays while the view does."""
+    """Share of the error's variance that persists while the view does."""
     outliers: tuple[float, float] = (0.05, 0.15)
     """Share of the found frames that are plainly wrong."""
     outlier_m: tuple[float, float] = (0.3, 5.0)
     burst_s: float = 0.8
-    """How long one goes on being wrong, about."""
+    """Approximate duration of a burst of outliers."""
     lost: tuple[float, float] = (0.02, 0.06)
     """Share of all frames in outages."""
     outage_s: tuple[float, float] = (1.0, 60.0)
@@ -51,10 +51,10 @@ def localize_statistically(
     rng: np.random.Generator,
     texture: Float[Tensor, "time"] | None = None,
 ) -> Localization:
-    """What localisation finds of a camera's true path (OpenCV axes in the world, an even frame rate).
+    """Localisation of a camera along its true path (OpenCV axes in the world, an even frame rate).
 
-    `texture` says how much each frame has to see (any unit): outages come where it has least. Frames that are not
-    found have confidence 0, an identity rotation and position 0.
+    `texture` is the amount of texture in each frame's view (any unit): outages come where it is least. Frames that
+    are not found have confidence 0, an identity rotation and position 0.
     """
     count = len(path.timestamps)
     fps = (count - 1) / (path.timestamps[-1] - path.timestamps[0]).item()
@@ -77,7 +77,7 @@ def localize_statistically(
 
 
 def with_outage(localization: Localization, start_s: float, length_s: float) -> Localization:
-    """The same, but nothing is found for a while from `start_s` (on its own clock).
+    """The same localisation without any found frames for a while from `start_s` (on its own clock).
 
     Raises WearcapError when no frame falls into it.
     """
@@ -118,7 +118,7 @@ def _view_noise(path: Trajectory, lasting: float, rng: np.random.Generator, fps:
 def _outliers(
     count: int, noise: LocalizationNoise, rng: np.random.Generator, fps: float
 ) -> tuple[Tensor, Tensor]:
-    """Which frames are wrong, in bursts, and by how much: rotation vector and position (time, 6)."""
+    """Mask of wrong frames, in bursts, and their errors: rotation vector and position (time, 6)."""
     burst = smooth_noise(rng, count, 1, noise.burst_s, fps)[:, 0]
     wrong = burst > torch.quantile(burst[:: max(1, count // 100_000)], 1 - rng.uniform(*noise.outliers))
     number = torch.cat([wrong[:1], wrong[1:] & ~wrong[:-1]]).cumsum(0)
@@ -129,7 +129,7 @@ def _outliers(
     turn = np.deg2rad(12.0) * length * rng.standard_normal((bursts, 3))
     jumpy = np.where(
         rng.random((bursts, 1)) < 0.5, 0.6, 0.08
-    )  # some stay at one wrong place, others leap about
+    )  # Some stay at one wrong place, others leap about.
     offset = torch.from_numpy(np.concatenate([turn, length * direction], 1))[number]
     shake = torch.from_numpy(rng.standard_normal((count, 6)))
     return wrong, offset + shake * offset.abs().mean(-1, keepdim=True) * torch.from_numpy(jumpy)[number]
@@ -138,7 +138,7 @@ def _outliers(
 def _outages(
     count: int, fps: float, noise: LocalizationNoise, rng: np.random.Generator, texture: Tensor | None
 ) -> Tensor:
-    """Frames at which nothing is found: stretches with log-uniform lengths, drawn to blank views."""
+    """Mask of outages: intervals with log-uniform lengths, more likely at blank views."""
     lost = torch.zeros(count, dtype=torch.bool)
     left = rng.uniform(*noise.lost) * count
     pull = np.ones(count)
@@ -160,7 +160,7 @@ def _outages(
 def _confidence(
     relative: Tensor, wrong: Tensor, noise: LocalizationNoise, rng: np.random.Generator
 ) -> Float[Tensor, "time"]:
-    """Like a share of inliers: high where the error is small, low for most that is wrong, with much scatter."""
+    """Confidence like a share of inliers: high for small errors, low for most wrong frames, with much scatter."""
     count = len(wrong)
     good = 0.92 - 0.09 * relative.norm(dim=-1).clamp(max=6.0).double().numpy() / np.sqrt(6 / 3)
     good += 0.10 * rng.standard_normal(count)

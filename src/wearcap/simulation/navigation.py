@@ -1,4 +1,4 @@
-"""Where a walker may stand, and ways between two places: a layered height grid and shortest paths over it.
+"""Walkable floor and the paths between two places: a layered height grid and shortest paths over it.
 
 Each storey is a layer of cells with the height of its floor. Neighbouring cells whose heights differ by no more
 than a step are linked, within a layer and between layers, so stairs, ramps and kerbs need no special case.
@@ -16,17 +16,17 @@ from jaxtyping import Bool, Float, Int
 from wearcap.simulation.outline import distance_to_convex, points_in_convex
 
 STEP_M = 0.25
-"""Neighbouring cells are linked up to this difference in height: a stair's rise fits, two do not."""
+"""Neighbouring cells are linked up to this difference in height: one stair's rise, but not two."""
 DROP_M = 0.45
-"""A hole deeper than this, or the edge of the world, is kept off like a wall."""
+"""Depth from which on a hole, or the edge of the world, is an obstacle like a wall."""
 HEADROOM_M = 1.9
 LOW_M = 0.1
-"""What rises less than this above the floor is no obstacle (a rug, a kerb)."""
+"""Height above the floor below which objects are no obstacles (a rug, a kerb)."""
 CLEARANCE_M = 0.28
 FAR_M = 1.5
-"""Clearance is not told apart beyond this."""
+"""Largest clearance that is measured."""
 SNAP_M = 1.5
-"""A start or goal may lie this far from where one can stand freely."""
+"""Largest distance of a start or goal from the nearest walkable cell."""
 
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 
@@ -46,7 +46,7 @@ class NavigationGrid:
 
     @classmethod
     def build(cls, surfaces: tuple, objects: tuple, cell: float) -> "NavigationGrid":
-        """Rasterise the surfaces and measure how far each cell is from the objects that bar it."""
+        """Rasterise the surfaces and measure the distance of each cell from the objects that block it."""
         corners = np.concatenate([surface.polygon for surface in surfaces])
         origin = corners.min(0) - cell
         shape = tuple(np.ceil((corners.max(0) + cell - origin) / cell).astype(int))
@@ -64,7 +64,7 @@ class NavigationGrid:
         return cls(origin, cell, height, clearance, _largest_part(height, free))
 
     def barred(self, objects: tuple, around: Float[np.ndarray, "3"]) -> "NavigationGrid":
-        """The grid with more obstacles, walkable where one gets to from a floor point (m)."""
+        """The grid with additional obstacles, walkable where one gets to from a floor point (m)."""
         clearance = self.clearance.copy()
         _keep_off(objects, self.origin, self.cell, self.height, clearance)
         free = np.isfinite(self.height) & (clearance >= CLEARANCE_M)
@@ -86,7 +86,7 @@ class NavigationGrid:
 
     @cached_property
     def _graph(self) -> tuple[scipy.sparse.csr_array, np.ndarray, np.ndarray]:
-        """Links with their lengths (m, uphill counted), and the two nodes of each link in the matrix's order."""
+        """Links with their lengths (m, climbs included), and the two nodes of each link in the matrix's order."""
         first, second = _links(self.height, self.walkable)
         nodes = self._node.reshape(-1)
         a, b = nodes[first], nodes[second]
@@ -109,7 +109,7 @@ class NavigationGrid:
         return self.clearance[self.walkable]
 
     def layer_of(self, points: Float[np.ndarray, "*batch 3"]) -> Int[np.ndarray, "*batch"]:
-        """The layer whose floor lies nearest in height to each point."""
+        """Index of the layer whose floor is nearest in height to each point."""
         i, j = np.moveaxis(self._index_of(points[..., :2]), -1, 0)
         gap = np.abs(self.height[:, i, j] - points[..., 2])
         return np.where(np.isnan(gap), np.inf, gap).argmin(0)
@@ -139,13 +139,13 @@ class NavigationGrid:
         return nearest if distance[nearest] < SNAP_M else None
 
     def sample(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "count 3"]:
-        """Random middles of walkable cells, shifted within their cells (m)."""
+        """Random positions within walkable cells (m)."""
         points = self.node_points[rng.integers(len(self.node_points), size=count)]
         points[:, :2] += rng.uniform(-0.5, 0.5, (count, 2)) * self.cell
         return points
 
     def lengths_from(self, start: Float[np.ndarray, "3"]) -> Float[np.ndarray, "node"]:
-        """Length (m) of the shortest way from a floor point to every walkable cell (`node_points`)."""
+        """Length (m) of the shortest path from a floor point to every walkable cell (`node_points`)."""
         first = self.nearest_node(start)
         if first is None:
             return np.full(len(self.node_points), np.inf)
@@ -154,7 +154,7 @@ class NavigationGrid:
     def shortest(
         self, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], shyness: float
     ) -> Float[np.ndarray, "point 3"] | None:
-        """Middles of the cells of the cheapest way; `shyness` prices a metre at the least clearance at 1 + it."""
+        """Middles of the cells on the cheapest path; a metre at the least clearance costs 1 + `shyness`."""
         first, last = self.nearest_node(start), self.nearest_node(goal)
         if first is None or last is None:
             return None
@@ -163,16 +163,16 @@ class NavigationGrid:
         weights = graph.data * (price[source] + price[target]) / 2
         priced = scipy.sparse.csr_array((weights, graph.indices, graph.indptr), shape=graph.shape)
         _, came_from = scipy.sparse.csgraph.dijkstra(priced, indices=last, return_predecessors=True)
-        way = [first]
-        while way[-1] != last:
-            way.append(int(came_from[way[-1]]))
-        return self.node_points[way]
+        path = [first]
+        while path[-1] != last:
+            path.append(int(came_from[path[-1]]))
+        return self.node_points[path]
 
 
 def _window(outline: np.ndarray, origin: np.ndarray, cell: float, shape: tuple, margin: float) -> tuple:
     low = np.floor((outline.min(0) - margin - origin) / cell).astype(int)
     high = np.ceil((outline.max(0) + margin - origin) / cell).astype(int) + 1
-    # beside the grid nothing is left: a negative end would count from the other side
+    # Outside the grid nothing is left: a negative end would count from the other side.
     return tuple(slice(max(a, 0), max(min(b, size), 0)) for a, b, size in zip(low, high, shape))
 
 

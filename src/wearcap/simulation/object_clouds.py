@@ -1,4 +1,4 @@
-"""Clouds of the objects that a simulated household has, by the thousand."""
+"""Point clouds of the object classes of a simulated household."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from torch import Tensor
 from wearcap.data.surface_points import POINTS, object_cloud
 from wearcap.errors import WearcapError, nearest
 from wearcap.simulation.interactive_flat import build_interactive_flat
-from wearcap.simulation.things import THINGS, make_thing
+from wearcap.simulation.things import MOVABLES, make_movable
 
 OPENABLES = ("door", "window", "drawer", "cabinet_door")
 
@@ -21,32 +21,32 @@ _SEEDS = {"train": 0, "val": 1, "test": 2}
 
 
 _PER_FLAT = 3
-"""Instances of a category taken from one flat: more would be much alike."""
+"""Number of instances of a category taken from one flat: more would be much alike."""
 
 
 def check_classes(classes: Sequence[str]) -> None:
     """Raises WearcapError when a class is not generated."""
-    known = (*THINGS, *OPENABLES)
+    available = (*MOVABLES, *OPENABLES)
     for name in classes:
-        if name not in known:
-            raise WearcapError(f"no objects of class {name!r} are generated", expected=f"some of {', '.join(known)}",
-                               fix=nearest(name, known))  # fmt: skip
+        if name not in available:
+            raise WearcapError(f"no objects of class {name!r} are generated", expected=f"some of {', '.join(available)}",
+                               fix=nearest(name, available))  # fmt: skip
 
 
 def generate_clouds(
     split: str, classes: Sequence[str], per_class: int, points: int = POINTS
 ) -> tuple[Float[Tensor, "object point 3"], Int64[Tensor, "object"]]:
-    """Clouds (m, in their objects' own axes) and their classes' numbers; splits share no seed.
+    """Clouds (m, in their objects' own axes) and their class indices; splits share no seed.
 
     Raises WearcapError for an unknown class.
     """
     check_classes(classes)
     clouds, labels = [], []
     for label, name in enumerate(track(classes, f"objects to {split} on")):
-        if name in THINGS:
+        if name in MOVABLES:
             for number in range(per_class):
                 rng = np.random.default_rng([_SEEDS[split], sum(name.encode()), number])
-                clouds.append(object_cloud(make_thing(name, name, rng).object.mesh, points, number))
+                clouds.append(object_cloud(make_movable(name, name, rng).object.mesh, points, number))
                 labels.append(label)
     wanted = {name: label for label, name in enumerate(classes) if name in OPENABLES}
     taken: Counter[str] = Counter()

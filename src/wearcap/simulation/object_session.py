@@ -1,4 +1,4 @@
-"""Simulated ECHO recordings: somebody with a head device uses, moves and carries what is in a flat."""
+"""Simulated ECHO recordings: a wearer of a head device uses, moves and carries the objects of a flat."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -20,7 +20,7 @@ from wearcap.simulation.wearer import perform
 
 @dataclass(frozen=True)
 class ObjectConfig:
-    """What to simulate."""
+    """Settings of a simulated recording."""
 
     fps: float = 30.0
     minutes: float = 2.0
@@ -41,7 +41,7 @@ class SimulatedObjects:
 
 @lru_cache(maxsize=2)
 def object_flat_of(split: str, number: int) -> InteractiveFlat:
-    """A split's interactive flat with hand-held things by number, always the same."""
+    """A split's interactive flat with hand-held objects by number, always the same."""
     rng = np.random.default_rng([8, sum(map(ord, split)), number])
     while True:
         flat = build_interactive_flat(rng, f"sim-{split}-object_flat-{number:03d}")

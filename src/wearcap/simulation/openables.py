@@ -1,6 +1,6 @@
-"""Things that are opened and closed in place: door leaves, window sashes, cabinet doors and drawers.
+"""Objects that are opened and closed in place: door leaves, window sashes, cabinet doors and drawers.
 
-Own axes of what is hinged: the origin is the hinge's foot, +x leads along the leaf to its latch. Of a drawer: the
+Axes of hinged objects: the origin is the hinge's foot, +x leads along the leaf to its latch. Axes of a drawer: the
 origin is the middle of its closed front's foot, +x leads out of the cabinet.
 """
 
@@ -22,9 +22,9 @@ LEAF_M, PANEL_M = 0.04, 0.02
 """Thickness of doors and sashes, and of cabinets' fronts."""
 METAL = (0.45, 0.45, 0.47)
 SHOULDER_M = 1.3
-"""Height from which an arm comes, about: it decides how steeply a hand meets a handle."""
+"""Approximate shoulder height: it decides how steeply a hand meets a handle."""
 PASSABLE = np.deg2rad(60.0)
-"""A door that is open less stands in the way."""
+"""Least opening at which a door can be passed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +33,13 @@ class Openable:
 
     object: SceneObject
     outline: Float[np.ndarray, "4 2"]
-    """From above, in its own axes, counter-clockwise (m)."""
+    """Outline from above, in its own axes, counter-clockwise (m)."""
     z_range: tuple[float, float]
     handles: tuple[GripPlace, ...]
-    """The first on the side to which it opens, where it is pulled open; a door's second on the other side."""
+    """Handles: the first on the side to which it opens, where it is pulled open; a door's second on the other side."""
     closed: float
     opened: float
-    """As far as it goes."""
+    """Value at the limit of its opening."""
 
     @property
     def name(self) -> str:
@@ -54,18 +54,18 @@ class Openable:
         return self.object.freedom.kind == "hinge"
 
     @property
-    def way(self) -> float:
-        """Sign of the values' change in opening."""
+    def opening_sign(self) -> float:
+        """Sign of the value's change in opening."""
         return float(np.sign(self.opened - self.closed))
 
     def pose(self, value: float | Float[np.ndarray, "*batch"]) -> Rigid:
-        """In the world at some value."""
+        """Pose in the world at a value."""
         return self.object.freedom.moved(
             self.object.T_world_object, torch.as_tensor(np.asarray(value, np.float64))
         )
 
     def openness(self, value: float) -> float:
-        """How far it is open (rad or m)."""
+        """Opening at a value (rad or m)."""
         return float(abs(value - self.closed))
 
     def footprint(self, values: float | Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 4 2"]:
@@ -77,12 +77,12 @@ class Openable:
     def handle(
         self, number: int, values: float | Float[np.ndarray, "*batch"]
     ) -> Float[np.ndarray, "*batch 3"]:
-        """Where the palm lies on a handle, in the world (m)."""
+        """Position of the palm on a handle, in the world (m)."""
         pose = self.pose(values)
         return pose.t.numpy() + pose.R.numpy() @ np.array(self.handles[number].point)
 
     def blocks(self, value: float) -> bool:
-        """Whether one cannot walk through: a door that is not open enough."""
+        """Whether it is a door that is not open enough to walk through."""
         return self.category == "door" and bool(self.openness(value) < PASSABLE)
 
 
@@ -99,12 +99,12 @@ def hook(point: tuple[float, float, float], inwards: tuple[float, float]) -> Gri
 
 
 def hinged(
-    category: str, foot: Float[np.ndarray, "3"], heading: float, way: float, width: float,
+    category: str, foot: Float[np.ndarray, "3"], heading: float, opening_sign: float, width: float,
     z_range: tuple[float, float], most: float, rng: np.random.Generator,
 ) -> Openable:  # fmt: skip
-    """A leaf, still without a name, that hangs at `foot` (m), closed along `heading` (rad) and opening by `most` (rad) in the sense of `way`.
+    """An unnamed leaf with its hinge's foot at `foot` (m), closed along `heading` (rad), opening by `most` (rad).
 
-    `z_range` is above the foot (m).
+    `opening_sign` is the sense of opening about z; `z_range` is above the foot (m).
     """
     thick = PANEL_M if category == "cabinet_door" else LEAF_M
     low, high = z_range
@@ -112,10 +112,10 @@ def hinged(
     level = {"door": float(rng.uniform(1.0, 1.05)), "window": float(np.clip((low + high) / 2, 1.2, 1.5))}.get(
         category, float(np.clip(high - 0.15, low + 0.1, rng.uniform(1.0, 1.1)))
     )
-    parts = _leaf(category, width, thick, low, high, way, rng)
+    parts = _leaf(category, width, thick, low, high, opening_sign, rng)
     handles = []
-    for side in (way, -way) if category == "door" else (way,):
-        face = 0.0 if side == way else thick
+    for side in (opening_sign, -opening_sign) if category == "door" else (opening_sign,):
+        face = 0.0 if side == opening_sign else thick
         out = side * (face + 0.05)
         long = 0.11 if category != "cabinet_door" else 0.02
         middle = width - edge - long / 2
@@ -125,19 +125,29 @@ def hinged(
         parts.append(Part((width - edge, side * (face + 0.02), level), (0.02, 0.06, 0.02), METAL, PATTERNED))
         handles.append(hook((place, out, level), (0.0, -side)))
     spin = rotation.about_axis("z", torch.tensor(heading, dtype=torch.float64)).float()
-    freedom = Freedom("hinge", pivot=vector(foot), limits=(min(way * most, 0.0), max(way * most, 0.0)))
+    freedom = Freedom(
+        "hinge", pivot=vector(foot), limits=(min(opening_sign * most, 0.0), max(opening_sign * most, 0.0))
+    )
     scene_object = SceneObject(
         category, category, _mesh(category, parts), spin, torch.from_numpy(np.asarray(foot)).float(), freedom
     )
-    outline = _box_outline((0.0, width), sorted((0.0, -way * thick)))
-    return Openable(scene_object, outline, (foot[2] + low, foot[2] + high), tuple(handles), 0.0, way * most)
+    outline = _box_outline((0.0, width), sorted((0.0, -opening_sign * thick)))
+    return Openable(
+        scene_object, outline, (foot[2] + low, foot[2] + high), tuple(handles), 0.0, opening_sign * most
+    )
 
 
 def _leaf(
-    category: str, width: float, thick: float, low: float, high: float, way: float, rng: np.random.Generator
+    category: str,
+    width: float,
+    thick: float,
+    low: float,
+    high: float,
+    opening_sign: float,
+    rng: np.random.Generator,
 ) -> list[Part]:
-    """Parts of a leaf: a slab, or a frame about a pane."""
-    off, color = -way * thick / 2, wood(rng) if rng.random() < 0.5 else hue(rng, (0.0, 0.25))
+    """Parts of a leaf: a slab, or a frame around a pane."""
+    off, color = -opening_sign * thick / 2, wood(rng) if rng.random() < 0.5 else hue(rng, (0.0, 0.25))
     middle, tall = (low + high) / 2, high - low
     if category != "window":
         parts = [Part((width / 2, off, middle), (width, thick, tall), color, PLAIN)]
@@ -164,7 +174,7 @@ def drawer(
     front: Float[np.ndarray, "3"], heading: float, width: float, level: tuple[float, float], depth: float,
     travel: float, rng: np.random.Generator,
 ) -> Openable:  # fmt: skip
-    """A drawer, still without a name, whose closed front stands over the floor point `front` (m) and slides `travel` (m) along `heading`.
+    """An unnamed drawer; its closed front is over the floor point `front` (m) and slides `travel` (m) along `heading`.
 
     `level` is the front's lower and upper edge above the floor (m).
     """
@@ -197,7 +207,7 @@ def drawer(
 
 
 def at(openable: Openable, value: float) -> Openable:
-    """The same with its initial pose where the value says; what was this value is 0 then."""
+    """The same openable with its initial pose at `value`, which becomes the new zero."""
     pose, freedom = openable.pose(value), openable.object.freedom
     assert freedom.limits is not None
     limits = (min(freedom.limits[0] - value, 0.0), max(freedom.limits[1] - value, 0.0))

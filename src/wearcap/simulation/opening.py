@@ -1,4 +1,4 @@
-"""Opening and closing doors, windows, cabinet doors and drawers: a hand on the handle, the body out of the way."""
+"""Opening and closing doors, windows, cabinet doors and drawers: a hand on the handle, the body clear of the leaf."""
 
 from dataclasses import dataclass, replace
 
@@ -11,28 +11,28 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.actions import approach
 from wearcap.simulation.grips import drawn_grip
 from wearcap.simulation.handling import handling_of
-from wearcap.simulation.house import House, Seem
+from wearcap.simulation.house import Distractor, House
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.outline import distance_to_convex
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan, wrap
 from wearcap.simulation.shuffling import shuffle
-from wearcap.simulation.stances import Stances, Task, find_stances, smooth_way
+from wearcap.simulation.stances import Stances, Task, find_stances, smooth_path
 from wearcap.simulation.track import ease
 from wearcap.simulation.world import World, WorldObject
 
 KEY_S = 0.2
 NEAR_M = 2.2
-"""Things further from the handle are no hindrance."""
+"""Distance from the handle's path up to which objects are checked for collisions."""
 OTHER_HAND = 0.25
-"""How often the hand that would do worse is taken all the same."""
+"""Probability of using the hand with the higher cost."""
 YAW_MOST = 1.1
-"""A hand turns on its handle up to this (rad)."""
+"""Largest rotation of a hand on its handle (rad)."""
 BEYOND_M = 0.4
-"""Past a leaf's edge one would rather stand."""
+"""Preferred distance beyond a leaf's edge."""
 OUT_RAD, OUT_M = 0.25, 0.08
-"""From here on nothing of a leaf or a drawer's front is within its frame."""
+"""Opening from which on no part of a leaf or a drawer's front is within its frame."""
 PALM_M = 0.085
-"""From wrist to palm."""
+"""Distance from wrist to palm."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class Turn:
 
 def operate(
     plan: Plan, house: House, rng: np.random.Generator, item: Openable, value: float, handle: int = 0,
-    seem: Seem | None = None,
+    distractor: Distractor | None = None,
 ) -> bool:  # fmt: skip
-    """Go to an openable and bring it to a value by one of its handles; False, with nothing done, where one cannot.
+    """Go to an openable and bring it to a value by one of its handles; False, with nothing done, if impossible.
 
-    With `seem`, that is done there instead, and nothing is touched.
+    With `distractor`, that act is done there instead, and nothing is touched.
     """
     world = house.world(plan.position)
     turn = plan_turn(plan, house, world, rng, item, value, handle)
@@ -68,8 +68,8 @@ def operate(
     far = np.linalg.norm(goal[:2] - plan.position[:2]) > 0.1 or abs(wrap(first[2] - plan.heading)) > 0.3
     if far and not approach(plan, world, rng, goal, float(first[2])):
         return False
-    if seem is not None:
-        seem(
+    if distractor is not None:
+        distractor(
             plan, {turn.side: item.handles[handle]}, item.pose(turn.start), item.handles[handle].point[2], rng
         )
     else:
@@ -86,15 +86,15 @@ def plan_turn(
     value: float,
     handle: int,
 ) -> Turn | None:
-    """Hand, tempo and way of the body; None where the thing would hit something or one cannot stand for it."""
+    """Hand, tempo and body path; None where the leaf or drawer would hit something or one cannot stand for it."""
     start, shoulder = house.values[item.name], 1.50 * plan.hip_height
     amount = abs(value - start) / (np.deg2rad(80.0) if item.hinged else 0.4)
     seconds = float(np.clip((0.9 + 1.3 * amount) * rng.normal(1.0, 0.12) / plan.style.briskness, 1.0, 3.2))
     keys = max(round(seconds / KEY_S), 6)
     values = start + ease(np.linspace(0.0, 1.0, keys)) * (value - start)
-    way, footprint = item.handle(handle, values), item.footprint(values)
+    palms, footprint = item.handle(handle, values), item.footprint(values)
     near = [other for other in world.objects
-            if other.name != item.name and distance_to_convex(way[:, :2], other.footprint).min() < NEAR_M]  # fmt: skip
+            if other.name != item.name and distance_to_convex(palms[:, :2], other.footprint).min() < NEAR_M]  # fmt: skip
     if _hits(item, values, near):
         return None
     floor = float(plan.position[2])
@@ -102,15 +102,15 @@ def plan_turn(
     high = [
         other
         for other in solid
-        if other.z_range[1] > way[0, 2] - 0.05 and other.z_range[0] < floor + shoulder
+        if other.z_range[1] > palms[0, 2] - 0.05 and other.z_range[0] < floor + shoulder
     ]
     task = Task(
-        way, footprint, tuple(other.footprint for other in solid), tuple(other.footprint for other in high), 1.0,
-        floor + shoulder, plan.arm_length + PALM_M, low=bool(item.z_range[1] < way[0, 2] + 0.2),
+        palms, footprint, tuple(other.footprint for other in solid), tuple(other.footprint for other in high), 1.0,
+        floor + shoulder, plan.arm_length + PALM_M, low=bool(item.z_range[1] < palms[0, 2] + 0.2),
         beyond=_beyond(item, handle),
     )  # fmt: skip
     walkable = world.navigation.node_points[:, :2]
-    walkable = walkable[np.linalg.norm(walkable - way[0, :2], axis=1) < 2.0]
+    walkable = walkable[np.linalg.norm(walkable - palms[0, :2], axis=1) < 2.0]
     found = [(side, find_stances(replace(task, sign=LEFT_SIGN[side]), walkable, rng)) for side in SIDES]
     able = [(stances.cost, side, stances) for side, stances in found if stances is not None]
     if not able:
@@ -130,7 +130,7 @@ def _beyond(item: Openable, handle: int) -> tuple[Float[np.ndarray, "2"], float]
 
 
 def _hits(item: Openable, values: Float[np.ndarray, "key"], near: list[WorldObject]) -> bool:
-    """Whether a leaf or drawer, once it is out of its frame, meets what stands about."""
+    """Whether a leaf or drawer, once it is out of its frame, meets other objects."""
     others = [
         other.footprint for other in near
         if other.z_range[0] < item.z_range[1] - 0.02 and other.z_range[1] > item.z_range[0] + 0.02
@@ -142,7 +142,7 @@ def _hits(item: Openable, values: Float[np.ndarray, "key"], near: list[WorldObje
 
 
 def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> None:
-    """Write the grip, the steps, where the thing goes and who held it when."""
+    """Write the grip, the steps, the object's motion and the interactions."""
     item, start = turn.item, plan.time
     touch = start + 0.75 / plan.style.briskness
     begin = touch + float(rng.uniform(0.05, 0.25))
@@ -152,13 +152,13 @@ def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> 
     places = turn.stances.places.copy()
     here = np.array([*plan.position[:2], places[0, 2] + wrap(plan.heading - places[0, 2])])
     fade = np.linspace(1.0, 0.0, len(places))[:, None] ** 2
-    way = smooth_way(places + fade * (here - places[0]), count)
+    path = smooth_path(places + fade * (here - places[0]), count)
     times = np.linspace(begin, stop, count)
 
     def poses(at: Float[np.ndarray, "time"]) -> Rigid:
         return item.pose(turn.values((at - begin) / turn.seconds))
 
-    yaw = _hand_yaw(plan, turn, way)
+    yaw = _hand_yaw(plan, turn, path)
 
     def moves(at: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
         pose = poses(at)
@@ -173,7 +173,7 @@ def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> 
     plan.gaze_point.move(start, start, item.handle(turn.handle, np.array(turn.start)))
     plan.gaze_weight.move(start, start + 0.45, 0.8)
     plan.gaze_weight.move(begin + 0.5 * turn.seconds, begin + 0.5 * turn.seconds + 0.6, 0.0)
-    body = lambda at: np.stack([np.interp(at, times, column) for column in way.T], 1)  # noqa: E731
+    body = lambda at: np.stack([np.interp(at, times, column) for column in path.T], 1)  # noqa: E731
     shuffle(plan, rng, body, begin - 0.1, stop)
     contact_class = item.object.freedom.contact_class
     house.handlings.append(
@@ -183,12 +183,12 @@ def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> 
     plan.time = max(plan.time, release)
 
 
-def _hand_yaw(plan: Plan, turn: Turn, way: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time"]:
-    """How far the hand turns on the handle (rad), so that the fingers point where the arm does."""
-    values = turn.values(np.linspace(0.0, 1.0, len(way)))
+def _hand_yaw(plan: Plan, turn: Turn, path: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time"]:
+    """Rotation of the hand on the handle (rad), so that the fingers point along the arm."""
+    values = turn.values(np.linspace(0.0, 1.0, len(path)))
     handle, pose = turn.item.handle(turn.handle, values), turn.item.pose(values)
     fingers = (pose.R.numpy() @ np.array(turn.item.handles[turn.handle].fingers))[:, :2]
-    across = np.stack([-np.sin(way[:, 2]), np.cos(way[:, 2])], 1)
-    arm = handle[:, :2] - way[:, :2] - 0.18 * LEFT_SIGN[turn.side] * across
+    across = np.stack([-np.sin(path[:, 2]), np.cos(path[:, 2])], 1)
+    arm = handle[:, :2] - path[:, :2] - 0.18 * LEFT_SIGN[turn.side] * across
     angle = np.arctan2(fingers[:, 0] * arm[:, 1] - fingers[:, 1] * arm[:, 0], (fingers * arm).sum(1))
     return YAW_MOST * np.tanh(np.unwrap(angle) / YAW_MOST)

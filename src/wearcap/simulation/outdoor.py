@@ -13,12 +13,12 @@ from wearcap.simulation.world import Room, World
 
 KERB_STONE_M = 0.15
 LONGEST_RAMP_M = 9.5
-SQUARE_THINGS = (
+SQUARE_KINDS = (
     "tree", "bench", "board", "bin", "tree", "low_wall", "bench", "planter", "street_lamp", "bush", "bollard",
 )  # fmt: skip
-PAVEMENT_THINGS = ("street_lamp", "letter_box", "bench", "bollard", "tree", "bin")
-TERRACE_THINGS = ("bench", "planter", "bin")
-"""What stands in each part, the most wanted first."""
+PAVEMENT_KINDS = ("street_lamp", "letter_box", "bench", "bollard", "tree", "bin")
+TERRACE_KINDS = ("bench", "planter", "bin")
+"""Furniture of each part, in order of preference."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Layout:
     stair_x: float
     stair_width: float
     crossings: tuple[tuple[float, float], ...]
-    """(middle x, width) of the gaps in what lines the kerb, from left to right."""
+    """Gaps in the barriers along the kerb as (middle x, width), from left to right."""
     dropped: int
     """Which crossing's kerb is lowered to a ramp; -1: none."""
     drop: float
@@ -113,7 +113,7 @@ def _draw_crossings(rng: np.random.Generator, width: float) -> tuple[tuple[float
 
 
 def _build_ground(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) -> None:
-    """Street, kerb stones, pavement (lowered at one crossing) and square, in a meadow that is only seen."""
+    """Street, kerb stones, pavement (lowered at one crossing) and square, in a meadow that is only visible."""
     width, street, kerb = layout.width, layout.street, layout.kerb
     shade = rng.uniform(0.30, 0.42)
     asphalt, paving = (shade, shade, shade * 1.04), (0.60, 0.58, 0.54)
@@ -216,7 +216,7 @@ def _build_borders(builder: WorldBuilder, layout: Layout, rng: np.random.Generat
 
 
 def _furnish(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) -> None:
-    """Benches, trees and posts where they bar no way."""
+    """Benches, trees and posts where they block no path."""
     width, street, kerb, foot = layout.width, layout.street, layout.kerb, layout.stair_foot
     half = layout.stair_width / 2 + 0.3
     free: list[Box] = [(layout.stair_x - half, foot - 1.5, layout.stair_x + half, layout.terrace[1])]
@@ -234,9 +234,9 @@ def _furnish(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) ->
         (terrace[2] - 1.2, *inner[1:]) if layout.ramp_up < 0 else (*inner[:2], terrace[0] + 1.2, inner[3])
     )
     for room, z, kinds in (
-        (square, kerb, SQUARE_THINGS),
-        (pavement, kerb, PAVEMENT_THINGS),
-        (terrace, layout.top, TERRACE_THINGS),
+        (square, kerb, SQUARE_KINDS),
+        (pavement, kerb, PAVEMENT_KINDS),
+        (terrace, layout.top, TERRACE_KINDS),
     ):
         plan = Plan(builder, room, z, [*free, stairs_head, ramp_head])
         for kind in kinds:
@@ -245,7 +245,7 @@ def _furnish(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) ->
 
 
 def put_somewhere(plan: Plan, kind: str, rng: np.random.Generator, tries: int = 12) -> None:
-    """Put a thing at a random place, squarely, with room to use it from its front."""
+    """Put a piece of furniture at a random place, squarely, with room to use it from its front."""
     piece = MAKERS[kind](rng)
     x_low, y_low, x_high, y_high = plan.room
     front = FRONT_M + 0.1 if piece.seats or piece.reaches else 0.0

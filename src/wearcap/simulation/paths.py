@@ -1,4 +1,4 @@
-"""Ways over the floor that a person would walk: grid paths made smooth, kept off obstacles, straight on stairs."""
+"""Walking paths over the floor: grid paths made smooth, kept off obstacles, straight on stairs."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,7 +8,7 @@ from wearcap.simulation.navigation import CLEARANCE_M, NavigationGrid
 WAYPOINT_M = 0.1
 SMOOTHING_PASSES = 80
 STAIR_APPROACH_M = 0.5
-"""Stairs are entered and left straight, from this far off."""
+"""Distance from stairs within which paths are straight."""
 
 
 def plan_path(
@@ -18,11 +18,11 @@ def plan_path(
     goal: Float[np.ndarray, "3"],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "waypoint 3"] | None:
-    """A smooth way from start to goal, waypoints about 0.1 m apart; heights only to a cell. None without a way."""
-    way = grid.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
-    if way is None:
+    """A smooth path from start to goal, waypoints about 0.1 m apart; heights only to a cell. None without a path."""
+    cells = grid.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
+    if cells is None:
         return None
-    points = _evenly(np.concatenate([start[None], way, goal[None]]))
+    points = _evenly(np.concatenate([start[None], cells, goal[None]]))
     if len(points) < 4:
         return points
     layer = grid.layer_of(points)

@@ -1,4 +1,4 @@
-"""Simulated people, typical adults: bones, habits, and where the device sits on the head."""
+"""Simulated people, typical adults: bones, habits, and the device's place on the head."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ class Person:
     skeleton: Skeleton
     style: Style
     shape: dict[str, float]
-    """height (m) and weight (kg)."""
+    """Body shape: height (m) and weight (kg)."""
     t_head_device: Float[Tensor, "3"]
 
 

@@ -1,4 +1,4 @@
-"""The score of a simulated motion: footprints and keyed channels, written by activities and read by the generator."""
+"""The plan of a simulated motion: footprints and keyed channels, written by activities and read by the generator."""
 
 from dataclasses import dataclass, field, replace
 
@@ -13,53 +13,53 @@ from wearcap.simulation.track import Track
 SIDES = ("left", "right")
 LEFT_SIGN = {"left": 1.0, "right": -1.0}
 STEEPEST = 0.2
-"""A foot adapts to slopes below this, and stands level on what is steeper (a step's edge)."""
+"""A foot adapts to slopes below this, and stays level on steeper ones (a step's edge)."""
 STEP_M = 0.05
-"""Rises from print to print beyond what their slopes say count as steps from this on."""
+"""Rise from print to print, beyond that of their slopes, from which on it counts as a step."""
 
 
 @dataclass(frozen=True)
 class Footprint:
-    """Where and when a foot stands; pitches are of the sole against the floor, toe down positive (rad)."""
+    """Place and time of a foot's stance; pitches are of the sole relative to the floor, toe down positive (rad)."""
 
     ground: Float[np.ndarray, "3"]
-    """Floor point beneath the ankle of the flat foot (m)."""
+    """Floor point below the ankle of the flat foot (m)."""
     heading: float
-    """Of the foot (rad), unwrapped."""
+    """Heading of the foot (rad), unwrapped."""
     tilt: float = 0.0
-    """Of the floor along the foot, falling forwards positive (rad)."""
+    """Tilt of the floor along the foot, falling forwards positive (rad)."""
     land_s: float = -1e3
     lift_s: float = 1e6
     land_pitch: float = 0.0
     lift_pitch: float = 0.0
     clearance: float = 0.02
-    """Of the sole above the floor in the middle of the swing that ends here (m)."""
+    """Clearance of the sole above the floor in the middle of the swing that ends here (m)."""
     bow: float = 0.0
     """Outward deviation of that swing from the straight line (m)."""
     running: bool = False
 
 
 def step_rise(old: Footprint, new: Footprint) -> float:
-    """How much a new print lies above an old one (m) beyond the slope on which both stand: a step, kerb or stair."""
+    """Height of a new print above an old one (m) beyond the slope on which both stand: a step, kerb or stair."""
     rise = float(new.ground[2] - old.ground[2])
     if old.tilt == new.tilt == 0.0:
         return rise
-    way = (new.ground - old.ground)[:2]
+    offset = (new.ground - old.ground)[:2]
     slopes = (
-        -np.tan(p.tilt) * (way @ np.array([np.cos(p.heading), np.sin(p.heading)])) / 2 for p in (old, new)
+        -np.tan(p.tilt) * (offset @ np.array([np.cos(p.heading), np.sin(p.heading)])) / 2 for p in (old, new)
     )
-    rest = rise - sum(slopes)
-    return rest if abs(rest) > STEP_M else 0.0
+    remaining = rise - sum(slopes)
+    return remaining if abs(remaining) > STEP_M else 0.0
 
 
 @dataclass
 class HandScore:
-    """What one hand does beyond swinging: a held posture against the chest, and a goal in the world."""
+    """Plan of one hand beyond swinging: a held posture relative to the chest, and a goal in the world."""
 
     pose_weight: Track = field(default_factory=lambda: Track(np.zeros(1)))
     pose: Track = field(default_factory=lambda: Track(np.zeros(6)))
     """Wrist from the shoulder in the chest's axes as a share of the arm's length (left hand's mirror image for
-    the right), elbow swivel (rad, 0 hangs down, positive lifts outwards), hand roll and hand bend (rad)."""
+    the right), elbow swivel (rad, 0 points down, positive lifts outwards), hand roll and hand bend (rad)."""
     goal_weight: Track = field(default_factory=lambda: Track(np.zeros(1)))
     goal: Track = field(default_factory=lambda: Track(np.zeros(3)))
     """Wrist in the world (m)."""
@@ -73,7 +73,7 @@ class Label:
 
 
 class Plan:
-    """Everything that was decided so far. Activities append to it; `time` is when the next may start."""
+    """The motion planned so far. Activities append to it; `time` is when the next may start."""
 
     def __init__(self, skeleton: Skeleton, style: Style, position: np.ndarray, heading: float, floor_height):
         self.skeleton, self.style, self.floor_height = skeleton, style, floor_height
@@ -81,21 +81,21 @@ class Plan:
         self.labels: list[Label] = []
         self.hands = {side: HandScore() for side in SIDES}
         self.grips: dict[str, list[Grip]] = {side: [] for side in SIDES}
-        """In the order of time; one may be reached for while the one before it is left."""
+        """Grips in the order of time; one may be reached for while the one before it is left."""
         self.lean = Track(np.zeros(3))
-        """Trunk beyond its habit: forward lean, bend to the right, twist to the left (rad)."""
+        """Trunk lean beyond the habitual one: forward lean, bend to the right, twist to the left (rad)."""
         self.crouch = Track(np.zeros(1))
         """Lowering of the pelvis (m)."""
         self.shift = Track(np.zeros(2))
-        """Of the pelvis from where balance would carry it, forwards and to the left (m): who pushes leans on it."""
+        """Offset of the pelvis from its balanced place, forwards and to the left (m): pushing leans on it."""
         self.heel_lift = {side: Track(np.zeros(1)) for side in SIDES}
         """Pitch of a standing foot on its ball (rad)."""
         self.seat_weight = Track(np.zeros(2))
-        """How far the pelvis is led by `seat` rather than by the feet: in the plane, and in height."""
+        """Weight of `seat` relative to the feet in the pelvis' position: in the plane, and in height."""
         self.seat = Track(np.array([*position[:2], 0.9]))
         """Hip middle when sitting, in the world (m)."""
         self.gaze = Track(np.array([0.0, 0.0]))
-        """Head against the walking direction: yaw to the left, pitch downwards (rad)."""
+        """Head relative to the walking direction: yaw to the left, pitch downwards (rad)."""
         self.gaze_weight = Track(np.zeros(1))
         self.gaze_point = Track(np.array([*position[:2], 1.5]))
         """A point in the world that is looked at while its weight is 1 (m)."""
@@ -124,7 +124,7 @@ class Plan:
 
     @property
     def sole(self) -> tuple[float, float]:
-        """How far heel and tip of the toes are ahead of the ankle (m)."""
+        """Distances of heel and tip of the toes ahead of the ankle (m)."""
         toe, sites = self.skeleton.index("left_toe"), self.skeleton.sites
         ball = float(self.skeleton.t_parent_joint[toe, 0])
         return sites["left_heel"].t_joint_site[0], ball + sites["left_toe_tip"].t_joint_site[0]
@@ -138,10 +138,10 @@ class Plan:
         self.time = land_s
 
     def grip(self, side: str, grip: Grip) -> None:
-        """Let a hand hold something; it must have let go of what it held before."""
+        """Add a grip to a hand; the hand must have let go of its last object."""
         if self.grips[side] and self.grips[side][-1].release_s > grip.start_s + 1e-9:
             raise ValueError(
-                f"the {side} hand reaches at {grip.start_s} s for one thing while it holds another"
+                f"the {side} hand reaches at {grip.start_s} s for one object while it holds another"
             )
         self.grips[side].append(grip)
 
@@ -152,20 +152,20 @@ class Plan:
 
     @property
     def heading(self) -> float:
-        """Of the body at the end of the plan (rad)."""
+        """Heading of the body at the end of the plan (rad)."""
         left, right = (self.prints[side][-1].heading for side in SIDES)
         return right + wrap(left - right) / 2
 
     @property
     def hip_height(self) -> float:
-        """Of the hips above the floor when standing upright (m)."""
+        """Height of the hips above the floor when standing upright (m)."""
         skeleton = self.skeleton
         legs = skeleton.indices("left_knee", "left_ankle")
         return float(-skeleton.t_parent_joint[legs, 2].sum()) - skeleton.sites["left_heel"].t_joint_site[2]
 
     @property
     def arm_length(self) -> float:
-        """From shoulder to wrist (m)."""
+        """Distance from shoulder to wrist (m)."""
         joints = self.skeleton.indices("left_elbow", "left_wrist")
         return float(self.skeleton.t_parent_joint[joints].norm(dim=-1).sum())
 

@@ -18,13 +18,13 @@ SPINE = ("l5", "l3", "t12", "t8")
 GRAVITY = 9.81
 ENVELOPE_S = 0.06
 STEP_ENVELOPE_S, LEVELLED = 0.26, 0.12
-"""In walking the pelvis stays this share nearer to the height that it can keep over a whole step."""
+"""Share by which the pelvis stays nearer in walking to the height that it can keep over a whole step."""
 STAIR_APART_M, STAIRS_LEVELLED = 0.15, 0.5
-"""On stairs (feet so far apart in height) knees bend more, which evens out the pelvis' way."""
+"""On stairs (feet so far apart in height) knees bend more, which evens out the pelvis' path."""
 BOUNCE_M, BOUNCE_MIDDLE = 0.12, 0.68
 """In running the pelvis is lowest over the bent standing leg and rises in flight: by how much, about which load."""
 HIPS_AHEAD_M = 0.042
-"""How much further forward than in standing the hips are carried in walking."""
+"""Additional forward offset of the hips in walking, relative to standing."""
 STANCE_BEND = 0.9
 """More bend of a bearing knee in walking than in standing, as a share of the knee's softness."""
 
@@ -51,13 +51,13 @@ def rotation_of(angles: Float[np.ndarray, "time 3"]) -> Float[Tensor, "time 3 3"
 
 @dataclass(frozen=True)
 class Stance:
-    """What follows from the feet before the trunk is placed over them, with all that is drawn at random."""
+    """Quantities that follow from the feet before the trunk is placed over them, with all random draws."""
 
     heading: Float[np.ndarray, "time"]
     load: Float[np.ndarray, "time"]
     """Share of the weight on the left foot."""
     mass: Float[np.ndarray, "time 2"]
-    """The centre of mass over the floor (m)."""
+    """Position of the centre of mass over the floor (m)."""
     speed: Float[np.ndarray, "time"]
     acceleration: Float[np.ndarray, "time 2"]
     stride: Float[np.ndarray, "time"]
@@ -69,7 +69,7 @@ class Stance:
 
 
 HELP = ("lean", "bend", "twist", "crouch", "ahead", "aside")
-"""How the trunk helps hands to reach, columns of `help_`: as `Plan.lean` (rad), `crouch` and `shift` (m)."""
+"""Trunk motions that help hands to reach, columns of `help_`: as `Plan.lean` (rad), `crouch` and `shift` (m)."""
 
 
 def stance_motion(
@@ -79,7 +79,7 @@ def stance_motion(
     fps: float,
     rng: np.random.Generator,
 ) -> Stance:
-    """How the wearer's mass moves over the feet."""
+    """Motion of the wearer's mass over the feet."""
     left, right = (feet[side] for side in SIDES)
     count = len(times)
     heading = blur((left.heading + right.heading) / 2, 0.13, fps)

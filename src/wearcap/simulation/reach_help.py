@@ -1,4 +1,4 @@
-"""The trunk comes along where a gripping hand's goal lies beyond the arm's reach."""
+"""Trunk motion that helps a gripping hand whose goal is beyond the arm's reach."""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,9 +11,9 @@ from wearcap.simulation.posture import HELP, Spine, Stance, Trunk, spine_motion,
 from wearcap.simulation.track import blur, ease, lower_envelope
 
 REACH = 0.955
-"""From this share of the arm's length on the trunk helps."""
+"""Share of the arm's length from which on the trunk helps."""
 EASY = np.array([0.36, 0.10, 0.24, 0.04, 0.09, 0.06])
-"""How readily each of `HELP` is used (rad, m)."""
+"""Ease of using each of `HELP` (rad, m)."""
 LOW_EASY, LOW_M, LOW_BY_M = 0.13, 0.78, 0.40
 """Knees bend more readily (m) for goals that are lower above the floor than the first by up to the second (m)."""
 MOST = np.array([0.9, 0.3, 0.6, 0.45, 0.30, 0.20])
@@ -28,11 +28,11 @@ def reach_help(
     times: Float[np.ndarray, "time"],
     fps: float,
 ) -> Float[np.ndarray, "time 6"] | None:
-    """What the trunk adds to the plan, columns as `HELP`, smooth; None where nothing is held.
+    """Additional trunk motion, columns as `HELP`, smooth; None where nothing is held.
 
-    Each moment's lack of reach is shared among the trunk's ways to move by least squares (each weighed by how
-    readily it is used), in rounds, since reach is not linear; that is covered by smooth curves, and what these
-    leave open by a few rounds more, whose lacks are smooth themselves.
+    Each moment's lack of reach is shared among the trunk's degrees of freedom by least squares (each weighted by its
+    ease), in rounds, since reach is not linear; smooth curves cover the result, and a few more rounds, with smooth
+    lacks, cover what these leave open.
     """
     if not any(plan.grips.values()):
         return None
@@ -46,24 +46,24 @@ def reach_help(
         trunk = trunk_motion(plan, feet, stance, times, fps, MOST * np.tanh(wanted / MOST))
         spine = spine_motion(plan.skeleton, trunk)
         smooth = number >= ROUNDS
-        lacks, ways = zip(*(_lack(plan, side, spine, trunk, times, fps, smooth) for side in SIDES))
+        lacks, gains = zip(*(_lack(plan, side, spine, trunk, times, fps, smooth) for side in SIDES))
         if smooth and max(float(lack.max()) for lack in lacks) < 1e-4:
             break
-        step = _shared(np.stack(lacks, 1), np.stack(ways, 1), easy)
+        step = _shared(np.stack(lacks, 1), np.stack(gains, 1), easy)
         step[:, 3] = np.maximum(step[:, 3], -crouch - wanted[:, 3])
         wanted = wanted + EAGER * step
     return MOST * np.tanh(wanted / MOST)
 
 
 def _over(need: Float[np.ndarray, "time column"], fps: float) -> Float[np.ndarray, "time column"]:
-    """Smooth curves that nowhere lie below the needs."""
+    """Smooth curves that are nowhere below the needs."""
     return np.stack([-lower_envelope(-column, ENVELOPE_S, fps) for column in need.T], 1)
 
 
 def _low(
     plan: Plan, feet: dict[str, FootMotion], stance: Stance, times: np.ndarray, fps: float
 ) -> Float[np.ndarray, "time"]:
-    """How much the hands' goals are low ones, smooth."""
+    """Weight of low goals of the hands, smooth."""
     spine = spine_motion(plan.skeleton, trunk_motion(plan, feet, stance, times, fps))
     floor = np.minimum(*(feet[side].ground[:, 2] for side in SIDES))
     low = np.zeros(len(times))
@@ -77,7 +77,7 @@ def _low(
 def _lack(
     plan: Plan, side: str, spine: Spine, trunk: Trunk, times: np.ndarray, fps: float, smooth: bool
 ) -> tuple[Float[np.ndarray, "time"], Float[np.ndarray, "time 6"]]:
-    """How far a hand's goal is out of reach (m), and by how much each way to help brings the shoulder nearer."""
+    """Distance (m) by which a hand's goal is out of reach, and how much nearer each of `HELP` brings the shoulder."""
     bones = arm_bones(plan.skeleton, side)
     held = held_wrist(plan, side, spine.chest, times)
     girdle = shoulder_girdle(plan, side, trunk, spine.chest, held.wrist, held.weight)
@@ -87,7 +87,7 @@ def _lack(
     toward = (offset / distance[:, None].clamp(min=1e-6)).numpy()
     if smooth:
         lack = _over(lack[:, None], fps)[:, 0]
-    # a hand that lacks nothing should weigh little on what the other one asks
+    # A hand within reach should have little weight against the other hand's needs.
     counts = held.near.numpy() * (0.12 + 0.88 * ease(lack / 0.06))
     return counts * lack, counts[:, None] * _gains(plan, spine, trunk, girdle.at_shoulder, toward)
 
@@ -99,7 +99,7 @@ def _gains(
     shoulder: Float[Tensor, "time 3"],
     toward: Float[np.ndarray, "time 3"],
 ) -> Float[np.ndarray, "time 6"]:
-    """How far the shoulder moves along `toward` per unit of each of `HELP`: lever arms of pelvis and chest."""
+    """Motion of the shoulder along `toward` per unit of each of `HELP`: lever arms of pelvis and chest."""
     zero = np.zeros_like(trunk.heading)
     ahead = np.stack([np.cos(trunk.heading), np.sin(trunk.heading), zero], 1)
     left = np.stack([-ahead[:, 1], ahead[:, 0], zero], 1)

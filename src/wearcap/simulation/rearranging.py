@@ -1,4 +1,4 @@
-"""Finding new places for things in a flat, and ways on which neither they nor who moves them touch anything."""
+"""New places for objects in a flat, and paths on which neither they nor the person moving them touch anything."""
 
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -11,46 +11,46 @@ from wearcap.simulation.actions import approach
 from wearcap.simulation.carrying import Carry, carry_options, lift, put_down
 from wearcap.simulation.holding import Take, take_options, take_up
 from wearcap.simulation.holding import put_down as put_held_down
-from wearcap.simulation.house import House, Seem
+from wearcap.simulation.house import Distractor, House
 from wearcap.simulation.interactive_flat import obstacle
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.outline import distance_to_convex, rectangle, turn
 from wearcap.simulation.plan import Plan
 from wearcap.simulation.shuffling import step_to
 from wearcap.simulation.sliding import Slide, slide, slide_options
-from wearcap.simulation.things import Thing, floor_pose
+from wearcap.simulation.things import Movable, floor_pose
 from wearcap.simulation.using import use
 from wearcap.simulation.world import World
 
 C = TypeVar("C", Carry, Take)
-Options = Callable[[Plan, Thing, np.ndarray, np.ndarray, np.random.Generator], Iterator[C]]
+Options = Callable[[Plan, Movable, np.ndarray, np.ndarray, np.random.Generator], Iterator[C]]
 
 TRIES, OPTIONS, PLACES = 24, 4, 4
 APART_M, BODY_M = 0.04, 0.22
-"""Room kept from other things by what is moved, and by the middle of who moves it."""
+"""Distance kept from other objects by the moved object, and by the middle of the person who moves it."""
 REACHED_M = 0.35
-"""The place to stand is no further than this from where one can walk freely."""
+"""Largest distance of the place to stand from where one can walk freely."""
 FAR_M = {"sofa": (0.3, 1.6), "table": (0.3, 1.8), "chair": (0.25, 2.2)}
-"""How far things are moved."""
+"""Range of the distance by which objects are moved."""
 CARRIED_M = 5.0
 USED_BEFORE, USED_AGAIN = 0.7, 0.7
-"""How often what is held is used before it is carried, and then once more; what was not is always used there."""
+"""Probability of using a held object before it is carried, and once more after; if not before, it is used after."""
 TURN_SHARE = 0.4
 BEFORE_M = 0.45
-"""Kept free before what opens, beyond its sweep."""
-WAY_SHARE = 0.85
+"""Depth kept free in front of openables, beyond their sweep."""
+REACHABLE_SHARE = 0.85
 KEYS = np.linspace(0.0, 1.0, 9)
 
 
 def rearrange(
-    plan: Plan, house: House, rng: np.random.Generator, thing: Thing, seem: Seem | None = None
+    plan: Plan, house: House, rng: np.random.Generator, movable: Movable, distractor: Distractor | None = None
 ) -> bool:
-    """Slide a thing to another place nearby; False, with nothing done, where none is found or one cannot get to it.
+    """Slide an object to another place nearby; False, with nothing done, where none is found or reachable.
 
-    With `seem`, that is done there instead, and nothing is touched.
+    With `distractor`, that act is done there instead, and nothing is touched.
     """
     world = house.world(plan.position)
-    choice = choose_slide(plan, house, world, rng, thing)
+    choice = choose_slide(plan, house, world, rng, movable)
     if choice is None:
         return False
     x, y, heading = choice.stand
@@ -58,47 +58,47 @@ def rearrange(
     far = np.linalg.norm(goal[:2] - plan.position[:2]) > 0.25
     if far and not approach(plan, world, rng, goal, float(heading)):
         return False
-    if seem is not None:
+    if distractor is not None:
         step_to(plan, rng, choice.stand[:2], float(heading))
-        seem(
+        distractor(
             plan,
             {side: choice.places[side] for side in choice.hands[0]},
-            house.poses[thing.name],
-            thing.height,
+            house.poses[movable.name],
+            movable.height,
             rng,
         )
         return True
     house.handlings.append(slide(plan, choice, rng, float(plan.position[2])))
-    house.poses[thing.name] = floor_pose(choice.stop, float(house.poses[thing.name].t[2]))
+    house.poses[movable.name] = floor_pose(choice.stop, float(house.poses[movable.name].t[2]))
     return True
 
 
 def choose_slide(
-    plan: Plan, house: House, world: World, rng: np.random.Generator, thing: Thing
+    plan: Plan, house: House, world: World, rng: np.random.Generator, movable: Movable
 ) -> Slide | None:
-    """A new place for a thing and a way to bring it there; None where none was found."""
-    start, points = floor_place(house, thing), world.navigation.node_points[:, :2]
-    if np.linalg.norm(points - start[:2], axis=1).min() > max(thing.half_size) + 1.0:
+    """A new place for an object and a plan to slide it there; None where none was found."""
+    start, points = floor_place(house, movable), world.navigation.node_points[:, :2]
+    if np.linalg.norm(points - start[:2], axis=1).min() > max(movable.half_size) + 1.0:
         return None
     near = [
         item for item in world.objects
-        if item.name != thing.name and item.z_range[0] < 1.9 and item.z_range[1] > 0.1
+        if item.name != movable.name and item.z_range[0] < 1.9 and item.z_range[1] > 0.1
         and distance_to_convex(start[:2], item.footprint) < 5.0
     ]  # fmt: skip
-    low = [item.footprint for item in near if item.z_range[0] < thing.height]
+    low = [item.footprint for item in near if item.z_range[0] < movable.height]
     solid, zones = (
         [item.footprint for item in near],
         [zone for zone in kept_free(house) if _meets(zone, start)],
     )
     for _ in range(TRIES):
-        stop = _drawn_stop(thing, start, rng)
-        outline = rectangle((0.0, 0.0), (2 * thing.half_size[0], 2 * thing.half_size[1]))
+        stop = _drawn_stop(movable, start, rng)
+        outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
         if not apart(outlines(outline, stop[None]), low, APART_M) or not apart(
             outlines(outline, stop[None]), zones, 0.0
         ):
             continue
-        for choice in islice(slide_options(plan, thing, start, stop, rng), OPTIONS):
-            if not apart(outlines(outline, choice.thing_at(KEYS)), low, 0.5 * APART_M):
+        for choice in islice(slide_options(plan, movable, start, stop, rng), OPTIONS):
+            if not apart(outlines(outline, choice.object_at(KEYS)), low, 0.5 * APART_M):
                 continue
             body = choice.body_at(KEYS)[:, :2]
             free = min(distance_to_convex(body, footprint).min() for footprint in solid)
@@ -106,51 +106,55 @@ def choose_slide(
             if (
                 free > BODY_M
                 and reached
-                and _leaves_way(house, world, thing, choice.stop, choice.body_at(np.ones(1))[0, :2])
+                and _keeps_floor_reachable(
+                    house, world, movable, choice.stop, choice.body_at(np.ones(1))[0, :2]
+                )
             ):
                 return choice
     return None
 
 
 def relocate(
-    plan: Plan, house: House, rng: np.random.Generator, thing: Thing, seem: Seem | None = None
+    plan: Plan, house: House, rng: np.random.Generator, movable: Movable, distractor: Distractor | None = None
 ) -> bool:
-    """Carry a box to another place on the floor; False, with nothing done, where none is found or one cannot get there.
+    """Carry a box to another place on the floor; False, with nothing done, where none is found or reachable.
 
-    With `seem`, that is done before it instead, and nothing is touched.
+    With `distractor`, that act is done in front of it instead, and nothing is touched.
     """
     world = house.world(plan.position)
-    choice = choose_carry(plan, house, world, rng, thing, carry_options)
+    choice = choose_carry(plan, house, world, rng, movable, carry_options)
     floor = float(plan.position[2])
     if choice is None:
         return False
     x, y, heading = choice.stand
     if not approach(plan, world, rng, np.array([x, y, floor]), float(heading)):
         return False
-    if seem is not None:
+    if distractor is not None:
         step_to(plan, rng, choice.stand[:2], float(heading))
-        seem(plan, choice.places, house.poses[thing.name], thing.height, rng)
+        distractor(plan, choice.places, house.poses[movable.name], movable.height, rng)
         return True
     lifted = lift(plan, choice, rng)
-    there = house.world(plan.position, without=(thing.name,))
+    there = house.world(plan.position, without=(movable.name,))
     x, y, heading = choice.goal
     approach(plan, there, rng, np.array([x, y, floor]), float(heading))
     house.handlings.append(put_down(plan, lifted, rng))
-    house.poses[thing.name] = floor_pose(choice.stop[:3], float(choice.stop[3]))
+    house.poses[movable.name] = floor_pose(choice.stop[:3], float(choice.stop[3]))
     return True
 
 
-def fetch(plan: Plan, house: House, rng: np.random.Generator, thing: Thing, seem: Seem | None = None) -> bool:
-    """Take a hand-held thing, use it, and put it down elsewhere on the floor; False where that cannot be done.
+def fetch(
+    plan: Plan, house: House, rng: np.random.Generator, movable: Movable, distractor: Distractor | None = None
+) -> bool:
+    """Take a hand-held object, use it, and put it down elsewhere on the floor; False where that cannot be done.
 
-    With `seem`, that is done before it instead, and nothing is touched.
+    With `distractor`, that act is done in front of it instead, and nothing is touched.
     """
     world = house.world(plan.position)
     for _ in range(PLACES):
-        choice = choose_carry(plan, house, world, rng, thing, take_options)
+        choice = choose_carry(plan, house, world, rng, movable, take_options)
         if choice is None:
             return False
-        if _leaves_way(house, world, thing, choice.stop[:3], choice.goal[:2]):
+        if _keeps_floor_reachable(house, world, movable, choice.stop[:3], choice.goal[:2]):
             break
     else:
         return False
@@ -158,34 +162,34 @@ def fetch(plan: Plan, house: House, rng: np.random.Generator, thing: Thing, seem
     x, y, heading = choice.stand
     if not approach(plan, world, rng, np.array([x, y, floor]), float(heading)):
         return False
-    if seem is not None:
+    if distractor is not None:
         step_to(plan, rng, choice.stand[:2], float(heading))
-        seem(plan, choice.places, house.poses[thing.name], thing.height, rng)
+        distractor(plan, choice.places, house.poses[movable.name], movable.height, rng)
         return True
     held = take_up(plan, choice, rng)
     early = rng.random() < USED_BEFORE
     if early:
         use(plan, held, rng)
-    there = house.world(plan.position, without=(thing.name,))
+    there = house.world(plan.position, without=(movable.name,))
     x, y, heading = choice.goal
     approach(plan, there, rng, np.array([x, y, floor]), float(heading))
     if rng.random() < (USED_AGAIN if early else 1.0):
         use(plan, held, rng)
     house.handlings.append(put_held_down(plan, held, rng))
-    house.poses[thing.name] = floor_pose(choice.stop[:3], float(choice.stop[3]))
+    house.poses[movable.name] = floor_pose(choice.stop[:3], float(choice.stop[3]))
     return True
 
 
 def choose_carry(
-    plan: Plan, house: House, world: World, rng: np.random.Generator, thing: Thing, options: Options[C]
+    plan: Plan, house: House, world: World, rng: np.random.Generator, movable: Movable, options: Options[C]
 ) -> C | None:
-    """A free place on the floor for a thing and a way to hold it; None where none was found."""
-    place, level = floor_place(house, thing), float(house.poses[thing.name].t[2])
+    """A free place on the floor for an object and an option to hold it; None where none was found."""
+    place, level = floor_place(house, movable), float(house.poses[movable.name].t[2])
     points = world.navigation.node_points[:, :2]
     if np.linalg.norm(points - place[:2], axis=1).min() > 1.0:
         return None
-    others = [item.footprint for item in world.objects if item.name != thing.name and item.z_range[0] < 1.5]
-    outline = rectangle((0.0, 0.0), (2 * thing.half_size[0], 2 * thing.half_size[1]))
+    others = [item.footprint for item in world.objects if item.name != movable.name and item.z_range[0] < 1.5]
+    outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
     zones = kept_free(house)
     for _ in range(TRIES):
         spot = points[rng.integers(len(points))] + rng.uniform(-0.3, 0.3, 2)
@@ -193,7 +197,7 @@ def choose_carry(
         far = 0.8 < np.linalg.norm(spot - place[:2]) < CARRIED_M
         if not far or not apart(outlines(outline, stop[None]), [*others, *zones], APART_M):
             continue
-        for choice in options(plan, thing, np.append(place, level), np.append(stop, level), rng):
+        for choice in options(plan, movable, np.append(place, level), np.append(stop, level), rng):
             ends = np.stack([choice.stand[:2], choice.goal[:2]])
             free = min(distance_to_convex(ends, footprint).min() for footprint in others)
             away = np.linalg.norm(ends[:, None] - points[None], axis=-1).min(1)
@@ -202,21 +206,21 @@ def choose_carry(
     return None
 
 
-def _leaves_way(
-    house: House, world: World, thing: Thing, stop: Float[np.ndarray, "3"], body: Float[np.ndarray, "2"]
+def _keeps_floor_reachable(
+    house: House, world: World, movable: Movable, stop: Float[np.ndarray, "3"], body: Float[np.ndarray, "2"]
 ) -> bool:
-    """Whether one who has moved a thing, and stands at `body`, still gets to most of the floor that one got to before."""
-    end = np.append(body, float(house.poses[thing.name].t[2]))
-    placed = obstacle(thing, floor_pose(stop, end[2]))
-    grid = house.flat.static.navigation.barred((*house.obstacles((thing.name,)), placed), end)
+    """Whether most of the floor stays reachable after an object was moved and its mover stands at `body`."""
+    end = np.append(body, float(house.poses[movable.name].t[2]))
+    placed = obstacle(movable, floor_pose(stop, end[2]))
+    grid = house.flat.static.navigation.barred((*house.obstacles((movable.name,)), placed), end)
     away = np.linalg.norm(grid.node_points[:, :2] - end[:2], axis=1)
-    enough = grid.walkable.sum() > WAY_SHARE * world.navigation.walkable.sum()
+    enough = grid.walkable.sum() > REACHABLE_SHARE * world.navigation.walkable.sum()
     return bool(enough) and float(away.min()) < REACHED_M
 
 
-def floor_place(house: House, thing: Thing) -> Float[np.ndarray, "3"]:
-    """Where a thing stands: x, y (m) and heading (rad)."""
-    pose = house.poses[thing.name]
+def floor_place(house: House, movable: Movable) -> Float[np.ndarray, "3"]:
+    """Floor pose of an object: x, y (m) and heading (rad)."""
+    pose = house.poses[movable.name]
     return np.array([*pose.t[:2].tolist(), float(np.arctan2(pose.R[1, 0], pose.R[0, 0]))])
 
 
@@ -236,7 +240,7 @@ def kept_free(house: House) -> list[Float[np.ndarray, "4 2"]]:
 
 def _swept(item: Openable) -> Float[np.ndarray, "4 2"]:
     """A square over a leaf's quarter circle and, for a door, the floor on the wall's other side."""
-    width, sign = float(item.outline[:, 0].max()), item.way
+    width, sign = float(item.outline[:, 0].max()), item.opening_sign
     behind = -0.9 if item.category == "door" else 0.0
     low, high = sorted((sign * (width + 0.1), sign * behind))
     return _local(
@@ -250,16 +254,16 @@ def _local(pose, corners: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "4 2"]:
 
 
 def _meets(zone: Float[np.ndarray, "4 2"], start: Float[np.ndarray, "3"]) -> bool:
-    """Whether a zone matters for what stands at `start`: it is near, and not where the thing is already."""
+    """Whether a zone matters for an object at `start`: it is near, and the object is not in it already."""
     distance = float(distance_to_convex(start[:2], zone))
     return distance < 4.0
 
 
 def _drawn_stop(
-    thing: Thing, start: Float[np.ndarray, "3"], rng: np.random.Generator
+    movable: Movable, start: Float[np.ndarray, "3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "3"]:
-    """Somewhere else, mostly along the thing's own axes, now and then turned."""
-    low, high = FAR_M[thing.category]
+    """A new place, mostly displaced along the object's own axes, now and then turned."""
+    low, high = FAR_M[movable.category]
     along = rng.choice(4) * np.pi / 2 + start[2] if rng.random() < 0.7 else rng.uniform(-np.pi, np.pi)
     angle = float(along + rng.normal(0.0, 0.15))
     far = float(rng.uniform(low, high))
@@ -280,7 +284,7 @@ def outlines(
 def apart(
     outlines: Float[np.ndarray, "key 4 2"], others: list[Float[np.ndarray, "corner 2"]], least_m: float
 ) -> bool:
-    """Whether outlines keep off others: neither's border comes near the other."""
+    """Whether outlines keep a distance from others: neither's border comes near the other."""
     share = np.linspace(0.0, 1.0, 7)[:-1, None]
     border = lambda corners: np.concatenate(  # noqa: E731
         [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0))]

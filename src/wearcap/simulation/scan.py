@@ -12,25 +12,25 @@ from wearcap.simulation.views import CUBE, Scenery, View, visible
 from wearcap.simulation.world import World
 
 CHUNK = 1_000_000
-"""Surface samples that are measured at a time."""
+"""Number of surface samples that are measured at a time."""
 CELL_M = 1.0
 """Side of the cells that share a list of near stations."""
 TRIED = 40
-"""So many of the nearest stations are asked whether they see a point."""
+"""Number of nearest stations that are checked for visibility of a point."""
 PROBES = 6
-"""Random points of each face that decide whether it is seen at all."""
+"""Random points per face that decide whether it is seen at all."""
 
 
 @dataclass(frozen=True)
 class Scanner:
-    """How a scan comes about."""
+    """Settings of a scan."""
 
     station_m: float = 2.2
-    """Between stations."""
+    """Distance between stations."""
     clearance_m: float = 0.45
     height_m: float = 1.75
     full_m: float = 4.0
-    """Up to this distance surfaces are met as densely as asked for; beyond it with the square of the distance less."""
+    """Distance up to which surfaces have the full density; beyond it, density falls with the square of the distance."""
     max_m: float = 15.0
     noise_m: float = 0.003
     """Deviation of the range."""
@@ -39,16 +39,16 @@ class Scanner:
     wrong: float = 0.0004
     """Share of points with a range that is plainly wrong."""
     view_px: int = 224
-    """Side of the six visibility pictures of a station."""
+    """Side of the six visibility images of a station."""
 
 
 def scan_world(
     scenery: Scenery, spacing_m: float, rng: np.random.Generator, scanner: Scanner = Scanner(),
     walked: World | None = None,
 ) -> Scan:  # fmt: skip
-    """The scan of a world: points about `spacing_m` apart on what some station sees, in the world's axes (m).
+    """The scan of a world: points about `spacing_m` apart on surfaces seen by any station, in the world's axes (m).
 
-    Stations stand where one can walk in the world, or in `walked`: the same with its doors taken out.
+    Stations stand where one can walk in the world, or in `walked`: the same world without its doors.
     Raises WearcapError for a spacing that is not positive.
     """
     if not spacing_m > 0:
@@ -67,7 +67,7 @@ def scan_world(
 
 
 def _measured(scenery: Scenery, survey: tuple, scanner: Scanner, face, place, rng) -> tuple:
-    """Measured places of surface samples, and which were measured at all."""
+    """Measured positions of surface samples, and a mask of those that were measured."""
     measured, kept = np.empty_like(place), np.zeros(len(place), bool)
     scan_kernels.measure(
         place, scenery.paint.frames[face, 9:12], *survey, rng.random((len(place), 3)), scanner.full_m,
@@ -79,7 +79,7 @@ def _measured(scenery: Scenery, survey: tuple, scanner: Scanner, face, place, rn
 def _faces_seen(
     scenery: Scenery, survey: tuple, scanner: Scanner, rng: np.random.Generator
 ) -> Bool[np.ndarray, "face"]:
-    """Faces of which at least one of some random points is seen: most of a world's are inside or beneath others."""
+    """Faces of which at least one of some random points is seen: most of a world's are inside or below others."""
     face = np.repeat(np.arange(len(scenery.faces)), PROBES)
     _, kept = _measured(scenery, survey, scanner, face, _on_faces(scenery, face, rng), rng)
     return kept.reshape(-1, PROBES).any(1)
@@ -103,7 +103,7 @@ def place_stations(
 def _surroundings(
     scenery: Scenery, stations: Float[np.ndarray, "station 3"], size: int
 ) -> Float32[np.ndarray, "station 6 row column"]:
-    """1/depth of what each station sees through the sides of a cube whose axes are the world's."""
+    """1/depth of each station's view through the sides of a cube along the world's axes."""
     out = np.empty((len(stations), 6, size, size), np.float32)
     half = (size - 1) / 2
     for number, station in enumerate(stations):

@@ -1,4 +1,4 @@
-"""Which samples of a world's surfaces a scanner's stations see, and what it measures of them."""
+"""Visibility of a world's surface samples from a scanner's stations, and their measurement."""
 
 import math
 
@@ -27,7 +27,7 @@ def cube_pixel(x, y, z, size):
 @compiled
 def measure(points, normals, stations, near_stations, near_first, cell, origin, shape, nearness, luck, full_m, max_m,
             noise_m, mixed, wrong, draws, out, kept):  # fmt: skip
-    """Measured place of every point that a station sees; `kept` says which.
+    """Measured position of every point that a station sees; `kept` is their mask.
 
     The stations of a point's cell are tried from near to far; `nearness` is 1/depth (station side row column).
     Beyond `full_m` fewer points are met. Range noise, range errors and points that float between an outline and

@@ -1,7 +1,7 @@
 """A simulated scene on disk, as a scanning company would deliver it: cloud, fisheye photos, their poses.
 
-Every file is written whole and named by what it is, so that several processes may fill one folder, and a run that
-was killed is continued.
+Every file is written atomically under a deterministic name, so that several processes may fill one folder, and a
+killed run can be continued.
 """
 
 import json
@@ -34,15 +34,15 @@ MADE = "made.json"
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """How finely a scene is scanned and photographed."""
+    """Resolution of a scene's scan and photos."""
 
     spacing_m: float = 0.015
-    """Between points of the scan."""
+    """Spacing of the scan's points."""
     photo_m: float = 1.5
-    """Between the rig's stations; 0: no photos."""
+    """Spacing of the rig's stations; 0: no photos."""
     photo_size: int = 800
     noise: float = 2.0
-    """Of the photos (grey levels)."""
+    """Noise of the photos (grey levels)."""
     scanner: Scanner = field(default_factory=Scanner)
 
 
@@ -73,10 +73,10 @@ def plan_photos(scenery: Scenery, settings: SceneSettings) -> list[Photo]:
 def write_scene(
     scenery: Scenery, folder: str | Path, settings: SceneSettings, seed: int, turn: int = 0
 ) -> None:
-    """Write what is missing of a scene: `pointcloud.ply`, `photos/*.jpg`, `photos.json`, and `made.json`, which says how.
+    """Write the missing files of a scene: `pointcloud.ply`, `photos/*.jpg`, `photos.json`; settings go to `made.json`.
 
-    Files of other settings or another seed are made again. Processes that fill one folder at once do well to come
-    with different `turn`s: each begins with other photos.
+    Files of other settings or another seed are made again. Processes that fill one folder at once should have different
+    `turn`s: each begins with other photos.
     """
     folder = Path(folder)
     wanted = json.dumps(
@@ -100,7 +100,7 @@ def write_scene(
 
 
 def _discard_stale(folder: Path, wanted: str) -> None:
-    """Remove what was made with other settings, and say in `made.json` what is being made."""
+    """Remove files of other settings, and write the new settings to `made.json`."""
     note = folder / MADE
     if note.is_file() and note.read_text(encoding="utf-8") == wanted:
         return

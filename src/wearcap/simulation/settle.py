@@ -1,4 +1,4 @@
-"""Coming down and getting up: sitting on the world's seats, crouching and picking things up."""
+"""Sitting down and getting up: on the world's seats, crouching and picking objects up."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from wearcap.simulation.plan import SIDES, Plan
 from wearcap.simulation.world import World
 
 HIP_OVER_SEAT_M = 0.10
-"""The hip joints of a sitter above the seat."""
+"""Height of a sitter's hip joints above the seat."""
 
 
 @activity("sit", weight=2.0)
@@ -36,12 +36,12 @@ def sit(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 def _down_and_up(
     plan: Plan, start: float, down: float, leave: float, up: float, rng: np.random.Generator
 ) -> None:
-    """Lean forward 40–45°, hips back and down, lean back; and the other way round (Schenkman et al. 1990)."""
-    bow, rest = np.deg2rad(rng.uniform(36, 44)), rng.normal(-0.06, 0.06)
+    """Lean forward 40–45°, hips back and down, lean back; and in reverse order (Schenkman et al. 1990)."""
+    bow, seated_lean = np.deg2rad(rng.uniform(36, 44)), rng.normal(-0.06, 0.06)
     plan.lean.move(start, start + 0.55 * down, (bow, 0.0, 0.0))
     plan.seat_weight.move(start, start + 0.85 * down, (1.0, 0.0))
     plan.seat_weight.move(start + 0.15 * down, start + down, (1.0, 1.0))
-    plan.lean.move(start + 0.60 * down, start + 1.35 * down, (rest, 0.0, 0.0))
+    plan.lean.move(start + 0.60 * down, start + 1.35 * down, (seated_lean, 0.0, 0.0))
     plan.lean.move(leave - 0.35 * up, leave + 0.25 * up, (bow, 0.0, 0.0))
     plan.seat_weight.move(leave, leave + 0.85 * up, (1.0, 0.0))
     plan.seat_weight.move(leave + 0.1 * up, leave + 0.95 * up, (0.0, 0.0))
@@ -74,7 +74,7 @@ def crouch(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 def _touch_floor(
     plan: Plan, start: float, down: float, leave: float, up: float, rng: np.random.Generator
 ) -> None:
-    """One hand goes to something that lies before the feet."""
+    """Touch an object that lies in front of the feet with one hand."""
     side = str(rng.choice(SIDES))
     angle = plan.heading + rng.normal(0.0, 0.3) + (0.25 if side == "left" else -0.25)
     reach = rng.uniform(0.32, 0.5)

@@ -1,4 +1,4 @@
-"""One simulated recording: a world, a person, what they do, and what their sensors say of it."""
+"""One simulated recording: a world, a person, activities, and the sensor readings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -39,7 +39,7 @@ OUTDOOR_SHARE = 0.3
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """What to simulate. `activities` names entries of `simulation.actions.ACTIVITIES`; None draws from all.
+    """Settings. `activities` names entries of `simulation.actions.ACTIVITIES`; None draws from all.
 
     `world` is "flat", "outdoor", "site", or None: one of the first two, drawn for each recording, three in ten
     outdoors. Raises WearcapError for another.
@@ -53,10 +53,10 @@ class SimulationConfig:
     head_noise: SlamNoise | None = field(default_factory=SlamNoise)
     imu_noise: ImuNoise | None = field(default_factory=ImuNoise)
     suit: SuitNoise | None = field(default_factory=SuitNoise)
-    """None: no suit is worn."""
+    """Noise of the suit; None: no suit is worn."""
     world: str | None = None
     camera: bool = False
-    """Film what a camera on the head sees."""
+    """Whether to film the view of a camera on the head."""
 
     def __post_init__(self):
         if self.world is not None and self.world not in WORLDS:
@@ -70,8 +70,8 @@ def simulate_recording(
 ) -> Recording:
     """The recording of a seed: subject and location are drawn from the split's own pools.
 
-    The camera's video goes to `folder`/videos. All else is the same with a camera and without. Raises WearcapError
-    for a camera without a folder.
+    The camera's video goes to `folder`/videos. Everything else is the same with and without a camera. Raises
+    WearcapError for a camera without a folder.
     """
     if config.camera and folder is None:
         raise WearcapError("no folder for the head camera's video", expected="one for the data set")
@@ -112,7 +112,7 @@ def sense(
     simulated: SimulatedMotion,
     rng: np.random.Generator,
 ) -> Recording:
-    """Put sensors on a simulated motion."""
+    """Add sensor readings to a simulated motion."""
     motion = simulated.motion
     head = head_stream(motion, person.t_head_device, config.head_noise, rng)
     imu = {
@@ -132,7 +132,7 @@ def sense(
 
 
 def activity_of(labels: Sequence[Label]) -> str:
-    """What was done, the longest first."""
+    """Activities of a recording, the longest first."""
     seconds: dict[str, float] = {}
     for label in labels:
         seconds[label.name] = seconds.get(label.name, 0.0) + float(label.stop_s - label.start_s)

@@ -1,4 +1,4 @@
-"""Seeded large sites of about 1000 m²: rooms, a corridor and halls, a terrace before them, stairs and a ramp to a yard."""
+"""Seeded sites of about 1000 m²: rooms, a corridor, halls, a terrace in front, stairs and a ramp to a yard."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,7 +19,7 @@ SPOT_M = 4.0
 """Side of the capture spot."""
 RISE_M, RISERS, TREAD_M = 0.16, 2, 0.31
 RAMP_SLOPE = 0.08
-HALL_THINGS = (
+HALL_KINDS = (
     "shelf",
     "board",
     "cabinet",
@@ -32,12 +32,12 @@ HALL_THINGS = (
     "plant",
     "shelf",
 )
-YARD_THINGS = (
+YARD_KINDS = (
     "tree", "bench", "board", "planter", "bush", "tree", "low_wall", "street_lamp", "bin", "bench", "letter_box",
     "tree", "bush", "planter", "bollard", "tree", "low_wall", "street_lamp",
 )  # fmt: skip
-TERRACE_THINGS = ("bench", "planter", "bin", "board")
-"""What stands in each part, the most wanted first."""
+TERRACE_KINDS = ("bench", "planter", "bin", "board")
+"""Furniture of each part, in order of preference."""
 
 
 @dataclass(frozen=True)
@@ -218,13 +218,13 @@ def _furnish_inside(builder: WorldBuilder, layout: Layout, rng: np.random.Genera
         _pillars(plan, rng)
         for _ in range(3):
             plan.table_with_chairs(rng)
-        for thing in HALL_THINGS:
-            plan.against_wall(MAKERS[thing](rng), rng)
-        for thing in ("board", "bench", "plant"):
-            put_somewhere(plan, thing, rng)
+        for kind in HALL_KINDS:
+            plan.against_wall(MAKERS[kind](rng), rng)
+        for kind in ("board", "bench", "plant"):
+            put_somewhere(plan, kind, rng)
     corridor = Plan(builder, _inner(layout.corridor, inset), 0.0, list(free))
-    for thing in ("plant", "cabinet", "plant"):
-        corridor.against_wall(MAKERS[thing](rng), rng)
+    for kind in ("plant", "cabinet", "plant"):
+        corridor.against_wall(MAKERS[kind](rng), rng)
 
 
 def _inner(box: Box, inset: float) -> Box:
@@ -253,7 +253,7 @@ def _capture_spot(plan: Plan, rng: np.random.Generator) -> None:
 
 
 def _pillars(plan: Plan, rng: np.random.Generator) -> None:
-    """Columns down the middle of a hall, where nothing is in the way, with notices on them."""
+    """Columns down the middle of a hall, out of the walkers' path, with notices on them."""
     x_low, y_low, x_high, y_high = plan.room
     y, color = (y_low + y_high) / 2, hue(rng, (0.0, 0.1))
     for x in np.arange(x_low + 2.5, x_high - 1.5, 4.2):
@@ -274,10 +274,10 @@ def _furnish_open_air(builder: WorldBuilder, layout: Layout, rng: np.random.Gene
     ramp = (layout.ramp[0] - 0.3, edge - 1.5, layout.ramp[2] + 0.3, layout.ramp[3] + 1.6)
     free = [stairs, ramp, *(before_door(builder, door) for door in builder.doors)]
     base = -RISERS * RISE_M
-    for box, z, things in (
-        (_inner(layout.yard, 0.4), base, YARD_THINGS),
-        (_inner(layout.terrace, 0.2), 0.0, TERRACE_THINGS),
+    for box, z, kinds in (
+        (_inner(layout.yard, 0.4), base, YARD_KINDS),
+        (_inner(layout.terrace, 0.2), 0.0, TERRACE_KINDS),
     ):
         plan = Plan(builder, box, z, list(free))
-        for thing in things:
-            put_somewhere(plan, thing, rng)
+        for kind in kinds:
+            put_somewhere(plan, kind, rng)

@@ -14,47 +14,47 @@ from wearcap.simulation.grips import Grip, GripPlace, Moves, drawn_grip
 from wearcap.simulation.handling import Handling, handling_of
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan, wrap
 from wearcap.simulation.shuffling import shuffle, step_to
-from wearcap.simulation.things import Rail, Thing, floor_pose
+from wearcap.simulation.things import Movable, Rail, floor_pose
 from wearcap.simulation.track import ease
 
 SPEEDS = {"sofa": (0.12, 0.26), "table": (0.13, 0.32), "chair": (0.18, 0.42)}
-"""Mean speed of what is moved (m/s); the greatest is about 1.5 times that."""
+"""Range of an object's mean speed (m/s); the peak is about 1.5 times that."""
 EFFORT = {"sofa": 1.0, "table": 0.6, "chair": 0.2}
-"""How heavy it is, for the body's lean."""
+"""Relative weight of an object, for the body's lean."""
 TURN_LEVER_M = 0.7
-"""A turn of one radian takes as long as so much way (m)."""
+"""Path length that takes as long as a turn of one radian (m)."""
 TURN_FREE = np.deg2rad(4.0)
-"""Turned by more, a thing needs both hands."""
+"""Turn from which on an object needs both hands."""
 PUSH, PULL = np.deg2rad(62.0), np.deg2rad(118.0)
-"""Ways within the first against the holder's heading are pushed, beyond the second pulled, between them sideways."""
+"""Directions within the first angle of the holder's heading are pushes, beyond the second pulls, else sideways."""
 
 
 @dataclass(frozen=True)
 class Slide:
-    """How somebody will move a thing, decided but not yet on the plan."""
+    """A plan to slide an object, not yet written to the motion's plan."""
 
-    thing: Thing
+    movable: Movable
     start: Float[np.ndarray, "3"]
-    """Where it stands: x, y (m), heading (rad)."""
+    """Pose of the object before: x, y (m), heading (rad)."""
     stop: Float[np.ndarray, "3"]
-    """Where it will stand, the heading unwrapped."""
+    """Pose of the object after, its heading unwrapped."""
     bow: float
-    """Sideways deviation of its way from the straight line (m)."""
+    """Sideways deviation of its path from the straight line (m)."""
     rail: Rail
     places: dict[str, GripPlace]
-    """By hand."""
+    """Palm places by hand."""
     hands: tuple[tuple[str, ...], ...]
-    """Sets of hands, one after the other."""
+    """Sets of holding hands, one after the other."""
     local: Float[np.ndarray, "3"]
-    """The body in the thing's axes: x, y, heading."""
+    """Pose of the body in the object's axes: x, y, heading."""
     seconds: float
     pause_s: float
-    """Rest in the middle of the way, hands on; 0 for none."""
-    way_angle: float
-    """Of the way against the body's heading, -π … π."""
+    """Pause in the middle of the path, hands on; 0 for none."""
+    travel_angle: float
+    """Direction of travel relative to the body's heading, -π … π."""
 
-    def thing_at(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
-        """The thing's x, y and heading when a share of the way is done."""
+    def object_at(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
+        """Pose of the object (x, y, heading) at a share of the path."""
         change = self.stop - self.start
         across = np.array([-change[1], change[0], 0.0])
         across /= max(float(np.linalg.norm(across)), 1e-9)
@@ -63,8 +63,8 @@ class Slide:
         )
 
     def body_at(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
-        """The wearer's x, y and heading then."""
-        x, y, heading = self.thing_at(share).T
+        """Pose of the wearer (x, y, heading) at a share of the path."""
+        x, y, heading = self.object_at(share).T
         cos, sin = np.cos(heading), np.sin(heading)
         return np.stack(
             [x + cos * self.local[0] - sin * self.local[1], y + sin * self.local[0] + cos * self.local[1],
@@ -73,11 +73,11 @@ class Slide:
 
     @property
     def stand(self) -> Float[np.ndarray, "3"]:
-        """Where the wearer goes first: x, y, heading."""
+        """Initial pose of the wearer: x, y, heading."""
         return self.body_at(np.zeros(1))[0]
 
     def share(self, since: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time"]:
-        """Share of the way after so many seconds, with the pause."""
+        """Share of the path after these times (s), with the pause."""
         if self.pause_s == 0.0:
             return glide(np.clip(since / self.seconds, 0.0, 1.0), (0.4, 0.4))
         half = self.seconds / 2
@@ -91,49 +91,51 @@ class Slide:
 
 def slide_options(
     plan: Plan,
-    thing: Thing,
+    movable: Movable,
     start: Float[np.ndarray, "3"],
     stop: Float[np.ndarray, "3"],
     rng: np.random.Generator,
 ) -> Iterator[Slide]:
-    """Ways for this wearer to bring a sliding thing from one place to another (x, y in m, heading in rad).
+    """Options for sliding an object from one place to another (x, y in m, heading in rad) for this wearer.
 
-    They come in a random order that prefers pushing and pulling to moving sideways. Who takes one makes sure that
-    its `thing_at` and `body_at` are free, goes to its `stand` and calls `slide`.
+    They come in a random order that prefers pushing and pulling to moving sideways. The caller of an option checks that
+    its `object_at` and `body_at` are free, goes to its `stand` and calls `slide`.
     """
     start = np.asarray(start, np.float64)
     stop = np.append(np.asarray(stop, np.float64)[:2], start[2] + wrap(stop[2] - start[2]))
     turns = bool(abs(stop[2] - start[2]) > TURN_FREE)
     if not turns:
         stop[2] = start[2]
-    way = stop[:2] - start[:2]
+    displacement = stop[:2] - start[:2]
     found = []
-    for rail in thing.rails:
+    for rail in movable.rails:
         angle = (
-            wrap(float(np.arctan2(way[1], way[0])) - start[2] - rail.facing) if np.hypot(*way) > 0.05 else 0.0
+            wrap(float(np.arctan2(displacement[1], displacement[0])) - start[2] - rail.facing)
+            if np.hypot(*displacement) > 0.05
+            else 0.0
         )
         for both in (True, False):
             if (both and not rail.both_hands) or (turns and not both):
                 continue
             aside = PUSH < abs(angle) < PULL
-            if aside and thing.category == "sofa":
+            if aside and movable.category == "sofa":
                 continue
             weight = (0.25 if aside else 1.0) * (
-                1.0 if both else {"chair": 1.5, "table": 0.5}.get(thing.category, 0.25)
+                1.0 if both else {"chair": 1.5, "table": 0.5}.get(movable.category, 0.25)
             )
             found.append((rng.exponential(1.0) / weight, rail, both, angle))
     for _, rail, both, angle in sorted(found, key=lambda option: option[0]):
-        yield _drawn(plan, thing, start, stop, rail, both, angle, rng)
+        yield _drawn(plan, movable, start, stop, rail, both, angle, rng)
 
 
 def _drawn(
-    plan: Plan, thing: Thing, start: np.ndarray, stop: np.ndarray, rail: Rail, both: bool, angle: float,
+    plan: Plan, movable: Movable, start: np.ndarray, stop: np.ndarray, rail: Rail, both: bool, angle: float,
     rng: np.random.Generator,
 ) -> Slide:  # fmt: skip
-    """Draw what is left open: hands and their places, tempo, pause, distance."""
+    """Draw the remaining choices: hands and their places, tempo, pause, distance."""
     change = stop - start
     length, turned = float(np.linalg.norm(change[:2])), abs(change[2])
-    low, high = SPEEDS[thing.category]
+    low, high = SPEEDS[movable.category]
     speed = float(rng.uniform(low, high)) * plan.style.briskness**0.5
     if PUSH < abs(angle) < PULL:
         speed *= 0.75
@@ -147,7 +149,7 @@ def _drawn(
     apart = min(wide * rng.uniform(0.75, 1.5), rail.length) if len(used) > 1 else 0.0
     reach = max(rail.length - apart, 0.0) / 2
     middle = rail.length / 2 + float(np.clip(rng.normal(0.0, 0.4), -1, 1)) * min(reach, 0.5)
-    if turned > 0.5:  # the lever is longer near an end
+    if turned > 0.5:  # The lever is longer near an end.
         middle = rail.length / 2 + float(rng.choice([-1.0, 1.0])) * reach * rng.uniform(0.0, 0.8)
     tilt = float(rng.uniform(0.0, 0.18))
     places, offsets = {}, {}
@@ -156,15 +158,15 @@ def _drawn(
         along = float(np.clip(middle + offsets[side], 0.0, rail.length))
         places[side] = rail.at(along, tilt + float(rng.normal(0.0, 0.05)))
     return Slide(
-        thing, start, stop, float(np.clip(rng.normal(0.0, 0.05), -0.1, 0.1)) * length if turned == 0 else 0.0, rail,
-        places, hands, _body(plan, rail, places, speed, angle, EFFORT[thing.category], rng), seconds, pause, angle,
+        movable, start, stop, float(np.clip(rng.normal(0.0, 0.05), -0.1, 0.1)) * length if turned == 0 else 0.0, rail,
+        places, hands, _body(plan, rail, places, speed, angle, EFFORT[movable.category], rng), seconds, pause, angle,
     )  # fmt: skip
 
 
 def _hand_sets(
     both: bool, turns: bool, seconds: float, rng: np.random.Generator
 ) -> tuple[tuple[str, ...], ...]:
-    """Which hands hold, one set after the other; only both may turn a thing."""
+    """Sets of holding hands, one after the other; only both may turn an object."""
     if turns:
         return (SIDES,)
     first = SIDES[int(rng.random() < 0.6)]
@@ -185,7 +187,7 @@ def _body(
     effort: float,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "3"]:
-    """Where the feet's middle is in the thing's axes: toes clear of the thing, hands before their shoulders."""
+    """Middle of the feet in the object's axes: toes clear of the object, hands in front of their shoulders."""
     point = np.mean([place.point for place in places.values()], 0)
     ahead = np.array([np.cos(rail.facing), np.sin(rail.facing)])
     left = np.array([-ahead[1], ahead[0]])
@@ -202,9 +204,9 @@ def _body(
 
 
 def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 0.0) -> Handling:
-    """Take hold of a thing, move it and let go; the wearer stands at or near `choice.stand`.
+    """Take hold of an object, move it and let go; the wearer stands at or near `choice.stand`.
 
-    Writes footsteps, lean, grips and gaze; `plan.time` becomes the end. The thing rests at `choice.stop` then.
+    Writes footsteps, lean, grips and gaze; `plan.time` becomes the end. The object is static at `choice.stop` then.
     """
     if (
         np.hypot(*(choice.stand[:2] - plan.position[:2])) > 0.03
@@ -216,7 +218,7 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
     end = begin + choice.duration_s
 
     def moves(times: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
-        return floor_pose(choice.thing_at(choice.share(times - begin)), floor_z)
+        return floor_pose(choice.object_at(choice.share(times - begin)), floor_z)
 
     release = end + float(rng.uniform(0.1, 0.7))
     grips = _grips(plan, choice, moves, (touch, begin, end, release), rng)
@@ -233,13 +235,13 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
 
     shuffle(plan, rng, body, begin, end)
     plan.time = max(plan.time, release + 0.5 * max(grip.return_s for _, grip in grips))
-    return handling_of(choice.thing.name, "sliding", moves, grips)
+    return handling_of(choice.movable.name, "sliding", moves, grips)
 
 
 def _grips(
     plan: Plan, choice: Slide, moves: Moves, when: tuple[float, float, float, float], rng: np.random.Generator
 ) -> list[tuple[str, Grip]]:
-    """A grip per hand, from the first to the last set that it belongs to; sets change while the thing moves."""
+    """One grip per hand, from its first to its last set; sets change while the object moves."""
     touch, begin, end, release = when
     count = len(choice.hands)
     cuts = begin + (end - begin) * (np.arange(1, count) + 0.25 * rng.uniform(-1, 1, count - 1)) / count
@@ -247,7 +249,7 @@ def _grips(
     for side in choice.places:
         member = [k for k, group in enumerate(choice.hands) if side in group]
         first, last = member[0], member[-1]
-        # who comes takes hold a little before the other lets go
+        # The new hand takes hold a little before the other lets go.
         start = touch + _stagger(rng) if first == 0 else cuts[first - 1] - float(rng.uniform(0.1, 0.4))
         stop = release + _stagger(rng) if last == count - 1 else cuts[last]
         grips.append((side, drawn_grip(choice.places[side], moves, start, stop, rng, plan.style.briskness)))
@@ -255,7 +257,7 @@ def _grips(
 
 
 def _stagger(rng: np.random.Generator) -> float:
-    """Hands come and go together, or one after the other (s)."""
+    """Delay between hands (s): they come and go together, or one after the other."""
     return float(rng.uniform(0.05, 0.25)) if rng.random() < 0.5 else 0.0
 
 
@@ -268,9 +270,9 @@ def _lean(
     release: float,
     rng: np.random.Generator,
 ) -> None:
-    """Into a push, back in a pull; a little already when taking hold."""
-    effort = EFFORT[choice.thing.category]
-    pushes, pulls = abs(choice.way_angle) < PUSH, abs(choice.way_angle) > PULL
+    """Lean into a push, back in a pull; a little already when taking hold."""
+    effort = EFFORT[choice.movable.category]
+    pushes, pulls = abs(choice.travel_angle) < PUSH, abs(choice.travel_angle) > PULL
     ready = float(np.clip(rng.normal(0.22, 0.06), 0.08, 0.4))
     lean, shift, crouch = ready, 0.0, 0.0
     if pushes:
@@ -300,14 +302,14 @@ def _look(
     floor_z: float,
     rng: np.random.Generator,
 ) -> None:
-    """At the place of the grip, then about where the way leads."""
+    """Look at the place of the grip, then about where the path leads."""
     local = torch.tensor(next(iter(choice.places.values())).point, dtype=torch.float64)
     pose = floor_pose(choice.start, floor_z)
     point = (pose.R @ local + pose.t).numpy()
     plan.gaze_point.move(touch - 0.6, touch - 0.6, point)
     plan.gaze_weight.move(touch - 0.6, touch - 0.2, 0.85)
     plan.gaze_weight.move(begin + 0.1, begin + 0.8, 0.0)
-    time, back = begin + 0.6, abs(choice.way_angle) > PULL
+    time, back = begin + 0.6, abs(choice.travel_angle) > PULL
     while time < end - 0.8:
         side = (
             float(rng.choice([-1.0, 1.0])) * rng.uniform(0.7, 1.1)

@@ -1,6 +1,6 @@
-"""Where to stand while a hand follows a handle: a way of the body that keeps within reach and out of the way.
+"""Standing places while a hand follows a handle: a body path that keeps within reach and clear of obstacles.
 
-Places on a grid are rated for every moment; the cheapest way through them is found by dynamic programming.
+Places on a grid have a cost at every key; the cheapest path through them is found by dynamic programming.
 """
 
 from dataclasses import dataclass
@@ -13,47 +13,47 @@ from wearcap.simulation.outline import distance_to_convex
 
 SPACING_M = 0.07
 AROUND_M = 1.15
-"""Of the handle's way: places that are looked at."""
+"""Distance from the handle's path within which places are considered."""
 BODY_M, ARM_M = 0.25, 0.02
-"""Half the room that a body needs, and an arm."""
+"""Half the width that a body needs, and an arm."""
 EASY_M = 0.12
-"""More room than `BODY_M` is worth something up to this."""
+"""Additional clearance over `BODY_M` up to which the cost falls."""
 STEP_M = 0.30
-"""Most between two moments."""
+"""Largest step between two keys."""
 HELP_M = 0.30
-"""Beyond an arm's reach the trunk helps by as much."""
+"""Distance beyond an arm's reach that the trunk can cover."""
 ASIDE = 0.35
-"""A hand works best so far to its own side of the body's heading (rad)."""
+"""Preferred bearing of a hand to its own side of the body's heading (rad)."""
 SHOULDER_ASIDE_M = 0.18
 
 
 @dataclass(frozen=True)
 class Task:
-    """A handle's way and what moves with it; keys are evenly spaced moments."""
+    """Path of a handle and of the object that moves with it; keys are evenly spaced in time."""
 
     handle: Float[np.ndarray, "key 3"]
-    """Of the palm (m)."""
+    """Position of the palm (m)."""
     footprint: Float[np.ndarray, "key 4 2"]
-    """Of the thing that is moved."""
+    """Outline of the moved object."""
     solid: tuple[Float[np.ndarray, "corner 2"], ...]
-    """Outlines that a body does not enter."""
+    """Outlines of obstacles for the body."""
     high: tuple[Float[np.ndarray, "corner 2"], ...]
-    """Those of them that an arm cannot pass over."""
+    """Outlines of the obstacles that an arm cannot pass over."""
     sign: float
     """1 for the left hand, -1 for the right."""
     shoulder_m: float
     """Height of the shoulders (m)."""
     reach_m: float
-    """From shoulder to palm."""
+    """Distance from shoulder to palm."""
     low: bool = False
-    """The moved thing is so low that an arm passes over it."""
+    """Whether the moved object is so low that an arm passes over it."""
     beyond: tuple[Float[np.ndarray, "2"], float] | None = None
-    """A point, and how far off it one would rather stand (m): who pulls a leaf does not step behind it."""
+    """A point, and the preferred distance from it (m): who pulls a leaf does not step behind it."""
 
 
 @dataclass(frozen=True)
 class Stances:
-    """Floor points between the feet and headings (m, m, rad unwrapped) at the task's keys, and what they cost."""
+    """Floor points between the feet and headings (m, m, rad unwrapped) at the task's keys, and their total cost."""
 
     places: Float[np.ndarray, "key 3"]
     cost: float
@@ -62,7 +62,7 @@ class Stances:
 def find_stances(
     task: Task, walkable: Float[np.ndarray, "point 2"], rng: np.random.Generator
 ) -> Stances | None:
-    """The cheapest way, or None where none keeps free; it begins within 0.45 m of a walkable point."""
+    """The cheapest path, or None where none is free; it begins within 0.45 m of a walkable point."""
     low, high = task.handle[:, :2].min(0) - AROUND_M, task.handle[:, :2].max(0) + AROUND_M
     axes = [np.arange(a, b, SPACING_M) for a, b in zip(low, high)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
@@ -87,7 +87,7 @@ def find_stances(
 def _rated(
     task: Task, points: Float[np.ndarray, "point 2"], room: Float[np.ndarray, "point"]
 ) -> tuple[Float[np.ndarray, "key point"], Float[np.ndarray, "key point"]]:
-    """Cost of standing at each point at each key, infinite where it cannot be, and the heading there."""
+    """Cost of standing at each point at each key, infinite where it is impossible, and the heading there."""
     offset = task.handle[:, None, :2] - points
     toward = np.arctan2(offset[..., 1], offset[..., 0])
     heading = toward - task.sign * ASIDE
@@ -114,7 +114,7 @@ def _arm_hits(
     task: Task, shoulder: Float[np.ndarray, "key point 2"], arm: Float[np.ndarray, "key point 2"],
     far: Float[np.ndarray, "key point"],
 ) -> Bool[np.ndarray, "key point"]:  # fmt: skip
-    """Whether the straight arm, but for its last 7 cm, passes through the thing that it moves or another."""
+    """Whether the straight arm, except its last 7 cm, passes through the moved object or another."""
     last = np.clip(1.0 - 0.07 / np.maximum(far, 0.1), 0.0, 1.0)[..., None]
     hits = np.zeros(far.shape, bool)
     for share in np.linspace(0.25, 1.0, 7):
@@ -142,7 +142,7 @@ def _within(
 def _cheapest(
     points: Float[np.ndarray, "point 2"], cost: Float[np.ndarray, "key point"]
 ) -> tuple[np.ndarray | None, float]:
-    """Points by key with the least sum of their costs and of squared ways between them."""
+    """Points by key with the least sum of their costs and of squared distances between them."""
     usable = np.isfinite(cost).any(0)
     points, cost, number = points[usable], cost[:, usable], np.flatnonzero(usable)
     if not len(points):
@@ -157,14 +157,14 @@ def _cheapest(
         total = through[best, np.arange(len(points))] + cost[key]
     if not np.isfinite(total).any():
         return None, np.inf
-    way = [int(total.argmin())]
+    path = [int(total.argmin())]
     for best in reversed(came):
-        way.append(int(best[way[-1]]))
-    return number[way[::-1]], float(total.min())
+        path.append(int(best[path[-1]]))
+    return number[path[::-1]], float(total.min())
 
 
-def smooth_way(places: Float[np.ndarray, "key 3"], count: int) -> Float[np.ndarray, "time 3"]:
-    """The way at `count` even moments, smooth, its ends kept."""
+def smooth_path(places: Float[np.ndarray, "key 3"], count: int) -> Float[np.ndarray, "time 3"]:
+    """The path at `count` even times, smooth, its ends kept."""
     at = np.linspace(0.0, len(places) - 1.0, count)
     fine = np.stack([np.interp(at, np.arange(len(places)), column) for column in places.T], 1)
     sigma = 0.9 * count / len(places)

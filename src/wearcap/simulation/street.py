@@ -1,4 +1,4 @@
-"""What lines an outdoor place: house fronts, rows of barriers, ramps with their walls, kerbs to step over."""
+"""Borders of an outdoor place: house fronts, rows of barriers, ramps with their walls, kerbs to step over."""
 
 import numpy as np
 
@@ -61,7 +61,7 @@ def sloped_rail(
 
 
 def _sloped_bar(builder, ends, heights, low_high, thick: float, color, texture: float, item: int) -> None:
-    """A straight beam between two points; `low` None lets it reach down to the base."""
+    """A straight beam between two points; with `low` None it reaches down to the base."""
     (a, b), (base_z, *tops), (low, high) = ends, heights, low_high
     left = np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a) * thick / 2
     ring = np.stack([a - left, b - left, b + left, a + left])
@@ -75,7 +75,7 @@ def _sloped_bar(builder, ends, heights, low_high, thick: float, color, texture: 
 
 def barrier(builder: WorldBuilder, x_low: float, x_high: float, y: float, z: tuple[float, float],
             rng: np.random.Generator, cars: bool) -> None:  # fmt: skip
-    """Bars the kerb at y (ground at z[0] before it, z[1] behind) from one x to another with what lines streets."""
+    """Barriers along the kerb at y (ground at z[0] before it, z[1] behind) from one x to another."""
     length = x_high - x_low
     if length < 0.15:
         return
@@ -119,7 +119,7 @@ def build_facade(
 
 
 def _opening(builder, center, size: tuple[float, float], frame, pane, item: int) -> None:
-    """A window or door, a little proud of the wall."""
+    """A window or door, slightly in front of the wall."""
     x, y, z = center
     wide, tall = size
     builder.add_box((x, y - 0.01, z), (wide, 0.04, tall), pane, 8.0, 0.0, item)

@@ -1,4 +1,4 @@
-"""Hand-held things on the free floor of an interactive flat."""
+"""Hand-held objects on the free floor of an interactive flat."""
 
 import numpy as np
 
@@ -8,57 +8,57 @@ from wearcap.simulation.interactive_flat import InteractiveFlat, obstacle
 from wearcap.simulation.openables import at
 from wearcap.simulation.outline import rectangle
 from wearcap.simulation.rearranging import APART_M, apart, kept_free, outlines
-from wearcap.simulation.things import Thing, make_thing
+from wearcap.simulation.things import Movable, make_movable
 
 TWICE = 0.4
-"""How often there are two of a kind."""
+"""Probability of two objects of a kind."""
 TRIES = 60
 OPEN_SHARE, WIDE = 0.75, np.deg2rad(66.0)
-"""Of the doors that are shut stand open; at least so far."""
-WAY_SHARE = 0.96
-"""So much of the floor one must still get to when a thing has been put there."""
+"""Share of the shut doors that are opened; least angle to which they are."""
+REACHABLE_SHARE = 0.96
+"""Share of the floor that must stay reachable when an object has been put there."""
 
 
 def with_handhelds(flat: InteractiveFlat, rng: np.random.Generator) -> InteractiveFlat | None:
-    """The flat with most doors open and one or two of each hand-held kind where one gets to.
+    """The flat with most doors open and one or two of each hand-held kind at reachable places.
 
-    They lie out of the way of doors, drawers and walkers. None where a kind finds no place.
+    They are clear of doors, drawers and walkers. None where a kind finds no place.
     """
     openables = tuple(
-        at(item, item.way * float(rng.uniform(WIDE, item.openness(item.opened))))
+        at(item, item.opening_sign * float(rng.uniform(WIDE, item.openness(item.opened))))
         if item.category == "door" and item.blocks(0.0) and rng.random() < OPEN_SHARE
         else item
         for item in flat.openables
     )
-    flat = InteractiveFlat(flat.static, flat.things, openables)
+    flat = InteractiveFlat(flat.static, flat.movables, openables)
     names = [
         f"{category}_{number}" for category in MAKERS for number in range(1, 2 + int(rng.random() < TWICE))
     ]
     for name in names:
-        thing = make_thing(name.rpartition("_")[0], name, rng)
-        if (placed := _placed(flat, thing, rng)) is not None:
-            flat = InteractiveFlat(flat.static, (*flat.things, placed), openables)
-    kinds = {thing.category for thing in flat.things}
+        movable = make_movable(name.rpartition("_")[0], name, rng)
+        if (placed := _placed(flat, movable, rng)) is not None:
+            flat = InteractiveFlat(flat.static, (*flat.movables, placed), openables)
+    kinds = {movable.category for movable in flat.movables}
     return flat if kinds.issuperset(MAKERS) else None
 
 
-def _placed(flat: InteractiveFlat, thing: Thing, rng: np.random.Generator) -> Thing | None:
-    """The thing at a free place of the floor; None where none was found."""
+def _placed(flat: InteractiveFlat, movable: Movable, rng: np.random.Generator) -> Movable | None:
+    """The object at a free place of the floor; None where none was found."""
     house, navigation = House(flat), flat.static.navigation
     standing = house.obstacles()
     solid = [item.footprint for item in (*flat.static.objects, *standing) if item.z_range[0] < 1.0]
     zones = kept_free(house)
     rooms = [navigation.barred(standing, point) for point in flat.static.sample_floor(rng, 6)]
     points = max(rooms, key=lambda grid: int(grid.walkable.sum())).node_points
-    outline = rectangle((0.0, 0.0), (2 * thing.half_size[0], 2 * thing.half_size[1]))
+    outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
     for _ in range(TRIES):
         x, y, z = points[rng.integers(len(points))]
         x, y, heading = (float(v) for v in (*rng.normal((x, y), 0.15), rng.uniform(-np.pi, np.pi)))
         if not apart(outlines(outline, np.array([[x, y, heading]])), [*solid, *zones], APART_M):
             continue
-        placed = thing.placed(x, y, heading, float(z))
+        placed = movable.placed(x, y, heading, float(z))
         for around in points[rng.integers(len(points), size=2)]:
             left = navigation.barred((*standing, obstacle(placed, None)), around).walkable.sum()
-            if left > WAY_SHARE * len(points):
+            if left > REACHABLE_SHARE * len(points):
                 return placed
     return None

@@ -1,4 +1,4 @@
-"""What makes one person's way of moving their own: habits drawn once per person, varied a little per recording."""
+"""Habits that make one person's movement their own, drawn once per person, varied a little per recording."""
 
 from dataclasses import dataclass, fields
 

@@ -1,7 +1,7 @@
-"""What a captured motion rests on: seats beneath who sits, steps and rungs beneath who climbs.
+"""Supports of a captured motion: seats below sitters, steps and rungs below climbers.
 
-Found by balance: whoever stays still with bent hips while the centre of mass is not over the feet, or both feet
-are off the floor, sits; a lower foot that rests above the floor while the body does not fly stands on something.
+Found by balance: a body that is still with bent hips while its centre of mass is not over the feet, or both feet
+are off the floor, sits; a lower foot at rest above the floor while the body does not fly stands on a step.
 The floor is at z = 0.
 """
 
@@ -20,40 +20,40 @@ from wearcap.simulation.furniture import MAKERS, wood
 from wearcap.simulation.outline import rectangle, turn
 
 STILL = 0.3
-"""A pelvis slower than this (m/s) may sit."""
+"""Speed of the pelvis below which it may sit (m/s)."""
 OFF_BALANCE_M = 0.06
 SIT_S = 0.4
 BENT_DEG = 35.0
-"""Thighs of sitters are at least so far from hanging down."""
+"""Least angle of a sitter's thighs from vertical."""
 PELVIS_OVER_SEAT_M = 0.10
 
 RESTING = 0.5
-"""A patch of a foot slower than this (m/s) carries weight …"""
+"""Speed of a foot patch below which it carries weight (m/s) …"""
 FLYING = -6.0
-"""… unless the body falls faster than this (m/s²)."""
+"""… unless the body accelerates downwards by more than this (m/s²)."""
 STEP_S, LOWEST_STEP_M = 0.08, 0.09
 FOOT_REST_S = 0.5
-"""So long a sitter's foot rests before something is put beneath it."""
+"""Least time for which a sitter's foot is at rest before a step is put below it."""
 SOLE_WIDTH_M = 0.10
 SOFT_M = (0.05, 0.08)
-"""So far thighs and buttocks may press into a seat: first try, and where nothing fits."""
+"""Depth to which thighs and buttocks may press into a seat: first try, and where nothing fits."""
 ON_STEP = {"foot": 0.05, "hand": 0.05, "shin": 0.02}
-"""So far (m) feet may reach into a step (captured soles are centimetres off), hands into what they hold on to."""
+"""Depth (m) to which feet may reach into a step (captured soles are centimetres off), hands into a handhold."""
 NEAR_SEAT = {"hand": 0.08, "foot": 0.03, "shin": 0.02}
 SEATS = ("chair", "bench", "armchair", "sofa", "bed", "stool", "stool", "pedestal")
 THICK_M = 0.04
-"""Of boards and rungs."""
+"""Thickness of boards and rungs."""
 POST_M = 0.035
 
 
 @dataclass(frozen=True, eq=False)
 class Sit:
-    """A stretch of sitting in one place."""
+    """An interval of sitting in one place."""
 
     start: int
     stop: int
     place: Float[np.ndarray, "3"]
-    """Where the buttocks rest (m)."""
+    """Position of the buttocks (m)."""
     heading: float
 
 
@@ -73,12 +73,12 @@ class Tread:
 
     @property
     def center(self) -> Float[np.ndarray, "2"]:
-        """In the world (m)."""
+        """Centre in the world (m)."""
         return turn(self.heading) @ ((self.low + self.high) / 2)
 
 
 def find_sits(motion: Motion) -> list[Sit]:
-    """Every seat that the motion needs, the longest sat on first; sits in one place share one."""
+    """Every seat that the motion needs, the longest used first; sits in one place share one."""
     feet = foot_points(motion)
     pelvis = motion.joint("pelvis")
     place = pelvis.t.double().numpy()
@@ -94,14 +94,14 @@ def find_sits(motion: Motion) -> list[Sit]:
         same = [k for k, other in enumerate(sits) if np.linalg.norm(middle - other.place) < 0.35]
         if not same:
             sits.append(Sit(start, stop, middle, float(np.arctan2(y, x))))
-        elif middle[2] < sits[same[0]].place[2]:  # a seat does not reach into its lowest sitter
+        elif middle[2] < sits[same[0]].place[2]:  # A seat does not reach into its lowest sitter.
             at = sits[same[0]].place
             sits[same[0]] = replace(sits[same[0]], place=np.array([at[0], at[1], middle[2]]))
     return sits
 
 
 def find_treads(motion: Motion, sits: list[Sit]) -> list[Tread]:
-    """Rectangles beneath feet that rest above the floor, those of one step merged into one."""
+    """Rectangles below feet at rest above the floor, those of one step merged into one."""
     feet, mass = foot_points(motion), mass_center(motion)[:, 2]
     step_s = 1.0 / motion.fps
     smooth = scipy.ndimage.gaussian_filter1d(mass, 2.0, mode="nearest")
@@ -162,7 +162,7 @@ def _one_step(a: Tread, b: Tread) -> bool:
 def build_seat(
     builder: WorldBuilder, body: BodySpace, sit: Sit, rng: np.random.Generator
 ) -> tuple[Piece, np.ndarray, float] | None:
-    """Place a seat of fitting height that the body touches with nothing but what it sits on.
+    """Place a seat of fitting height that the body touches only with the parts it sits on.
 
     Returns the piece with its place and heading in the builder's frame; None where not even a stool fits.
     """
@@ -200,7 +200,7 @@ def meets(
 
 
 def box_size(part: Part) -> tuple[float, float, float]:
-    """Of the box around a part of a piece (m)."""
+    """Size of the box around a part of a piece (m)."""
     return part.size if part.sides == 4 else (part.size[0], part.size[0], part.size[2])
 
 
@@ -264,7 +264,7 @@ def build_tread(
 
 
 _FORMS = ((True, 1.0), (True, 0.7), (True, 0.45), (False, 1.0), (False, 0.6), (False, 0.35), (False, 0.15))
-"""Solid or a board, and the share of the feet's length that rests on it."""
+"""Forms of a step: whether solid or a board, and the share of the feet's length on it."""
 
 
 def _clear(body: BodySpace, tread: Tread, solid: bool) -> bool:
@@ -274,20 +274,20 @@ def _clear(body: BodySpace, tread: Tread, solid: bool) -> bool:
 
 
 def _grown(body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator) -> Tread:
-    """The tread widened on all sides while nothing of the body is in the way, up to a drawn size."""
+    """The tread widened on all sides while the body is clear of it, up to a drawn size."""
     most = (
         np.array([rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)])
         if solid
         else np.array([0.0, rng.uniform(0.45, 0.6)])
     )
-    open_sides = [(axis, way) for axis in (1, 0) for way in (-1, 1)]
+    open_sides = [(axis, sign) for axis in (1, 0) for sign in (-1, 1)]
     while open_sides:
-        for axis, way in list(open_sides):
+        for axis, sign in list(open_sides):
             low, high = tread.low.copy(), tread.high.copy()
-            (low if way < 0 else high)[axis] += 0.03 * way
+            (low if sign < 0 else high)[axis] += 0.03 * sign
             wider = replace(tread, low=low, high=high)
             if wider.size[axis] > most[axis] or not _clear(body, wider, solid):
-                open_sides.remove((axis, way))
+                open_sides.remove((axis, sign))
             else:
                 tread = wider
     return tread
@@ -315,7 +315,7 @@ def _add_step(
 
 
 def _thigh_angle(motion: Motion) -> Float[np.ndarray, "time"]:
-    """How far the less bent thigh is from hanging down (rad)."""
+    """Angle of the less bent thigh from vertical (rad)."""
     angles = []
     for side in ("left", "right"):
         thigh = (motion.joint(f"{side}_knee").t - motion.joint(f"{side}_hip").t).double().numpy()

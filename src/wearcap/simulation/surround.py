@@ -1,7 +1,7 @@
-"""Surroundings for a motion that was captured in an empty hall: a room or a street that fits what the person does.
+"""Surroundings for a motion that was captured in an empty hall: a room or a street that fits the activity.
 
-Walls and furniture stand beside the way, some within arm's reach, and nothing ever meets the body; beneath sitters
-stands a seat, beneath climbers a step. The floor is at z = 0, where `prepare.mocap` puts it.
+Walls and furniture stand beside the path, some within arm's reach, and nothing ever meets the body; below sitters
+stands a seat, below climbers a step. The floor is at z = 0, where `prepare.mocap` puts it.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from wearcap.simulation.builder import Piece, WorldBuilder, hue
 from wearcap.simulation.flat import before_door
 from wearcap.simulation.furnish import ROOM_KINDS, Box, Plan, middle_and_size
 from wearcap.simulation.furniture import MAKERS, wood
-from wearcap.simulation.outdoor import PAVEMENT_THINGS, SQUARE_THINGS, put_somewhere
+from wearcap.simulation.outdoor import PAVEMENT_KINDS, SQUARE_KINDS, put_somewhere
 from wearcap.simulation.outline import rectangle
 from wearcap.simulation.street import barrier, build_facade, slab
 from wearcap.simulation.supports import box_size, build_seat, build_tread, find_sits, find_treads, meets
@@ -23,15 +23,15 @@ from wearcap.simulation.walls import HEIGHT, Wall, build_wall
 from wearcap.simulation.world import Room, World
 
 MARGIN_M = 0.12
-"""Nothing comes nearer to the body than this, but for what it rests on."""
+"""Least distance of anything from the body, except its supports."""
 NEAR_M = (0.3, 0.8)
-"""How far from the body stands what is put beside its way."""
+"""Distance of furniture from the body beside its path."""
 WALL_M = (0.6, 3.0)
-"""From the body to walls."""
+"""Distance from the body to walls."""
 BEYOND_M = 5.0
-"""Of floor around the body that are looked at."""
+"""Margin of the checked floor around the body."""
 FAST, TALL_M = 2.0, HEIGHT - 0.25
-"""Whoever travels faster (m/s), or reaches higher, is mostly, or always, outdoors."""
+"""Speed (m/s) and reach above which a motion is mostly, or always, outdoors."""
 NEAR_INDOORS = (
     "table",
     "chair",
@@ -60,15 +60,15 @@ NEAR_OUTDOORS = (
 
 @dataclass(kw_only=True)
 class FreePlan(Plan):
-    """A plan that also keeps off the space that a moving body takes."""
+    """A plan that also keeps off the space that a moving body occupies."""
 
     body: BodySpace
-    """In the world."""
+    """Space of the body in the world."""
     swept: SweptFloor
-    """In the builder's frame."""
+    """Floor swept by the body, in the builder's frame."""
 
     def distance(self, piece: Piece, x: float, y: float, heading: float) -> float:
-        """From the body to a piece's outline up to its height (m)."""
+        """Distance from the body to a piece's outline up to its height (m)."""
         return self.swept.distance((x, y), piece.size, heading, piece.z_range[1])
 
     def try_place(self, piece: Piece, x: float, y: float, heading: float, front: float = 0.0) -> bool:
@@ -87,7 +87,7 @@ def _overhangs(piece: Piece) -> bool:
 
 
 def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
-    """The same world for the same motion and generator; `motion` needs xsens23's joints and sites.
+    """A world around a motion, deterministic for its motion and generator; `motion` needs xsens23's joints and sites.
 
     Raises WearcapError for another skeleton.
     """
@@ -101,9 +101,9 @@ def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
     swept = SweptFloor.of(here, BEYOND_M)
     plan = FreePlan(builder, (0.0, 0.0, 0.0, 0.0), 0.0, body=body, swept=swept)
     _support(plan, motion, rng)
-    way = builder.from_world(path)
+    local_path = builder.from_world(path)
     reach = _extent(here)
-    (_street if outdoors else _room)(plan, reach, way, rng)
+    (_street if outdoors else _room)(plan, reach, local_path, rng)
     return builder.finish(cell=0.1)
 
 
@@ -115,7 +115,7 @@ def _is_outdoors(motion: Motion, path: np.ndarray, body: BodySpace, rng: np.rand
 
 
 def _heading(path: Float[np.ndarray, "time 2"], rng: np.random.Generator) -> float:
-    """Rooms lie along the way, more or less; around who stays in one place anyhow."""
+    """Heading of a room: roughly along the path; random for a body that stays in one place."""
     offset = path - path.mean(0)
     if np.ptp(offset, axis=0).max() < 2.0:
         return float(rng.uniform(-np.pi, np.pi))
@@ -130,7 +130,7 @@ def _extent(body: BodySpace) -> Box:
 
 
 def _support(plan: FreePlan, motion: Motion, rng: np.random.Generator) -> None:
-    """Seats and steps where the motion rests on some."""
+    """Seats and steps where the motion needs support."""
     builder, sits = plan.builder, find_sits(motion)
     for sit in sits:
         if (built := build_seat(builder, plan.body, sit, rng)) is not None:
@@ -147,8 +147,8 @@ def _around(points: Float[np.ndarray, "point 2"]) -> Box:
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
-def _room(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generator) -> None:
-    """Four walls with doors and windows, furniture beside the way, then along the walls."""
+def _room(plan: FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator) -> None:
+    """Four walls with doors and windows, furniture beside the path, then along the walls."""
     builder = plan.builder
     gap = rng.uniform(*WALL_M, 4)
     box = (reach[0] - gap[0], reach[1] - gap[1], reach[2] + gap[2], reach[3] + gap[3])
@@ -169,18 +169,18 @@ def _room(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generator)
         build_wall(builder, wall, color, rng)
     plan.room = (box[0] + 0.07, box[1] + 0.07, box[2] - 0.07, box[3] - 0.07)
     plan.kept_free += [before_door(builder, door) for door in builder.doors]
-    _beside(plan, NEAR_INDOORS, way, rng)
+    _beside(plan, NEAR_INDOORS, path, rng)
     plan.furnish(str(rng.choice(list(ROOM_KINDS))), rng)
 
 
 def _walls(box: Box) -> list[Wall]:
-    """Around a rectangle, its inside to their left."""
+    """Walls around a rectangle, its inside to their left."""
     corners = [(box[0], box[1]), (box[2], box[1]), (box[2], box[3]), (box[0], box[3])]
     return [Wall(a, b) for a, b in zip(corners, (*corners[1:], corners[0]))]
 
 
 def _passage(builder: WorldBuilder, wall: Wall, color: tuple, rng: np.random.Generator) -> None:
-    """What is seen through a door: a bit of hallway."""
+    """The view through a door: a bit of hallway."""
     deep = rng.uniform(1.3, 1.8)
     a, b = wall.at(-0.06, -deep), wall.at(wall.length + 0.06, -deep)
     outline = np.array([wall.at(-0.06, -deep), wall.at(wall.length + 0.06, -deep), wall.at(wall.length + 0.06, -0.06), wall.at(-0.06, -0.06)])  # fmt: skip
@@ -189,14 +189,14 @@ def _passage(builder: WorldBuilder, wall: Wall, color: tuple, rng: np.random.Gen
         build_wall(builder, Wall(start, end), color, rng)
 
 
-def _beside(plan: FreePlan, kinds: tuple[str, ...], way: np.ndarray, rng: np.random.Generator) -> None:
-    """Things within `NEAR_M` of the body, about one for every metre and a half of its way."""
-    length = float(np.linalg.norm(np.diff(way[::30], axis=0), axis=1).sum())
+def _beside(plan: FreePlan, kinds: tuple[str, ...], path: np.ndarray, rng: np.random.Generator) -> None:
+    """Furniture within `NEAR_M` of the body, about one piece per metre and a half of its path."""
+    length = float(np.linalg.norm(np.diff(path[::30], axis=0), axis=1).sum())
     for _ in range(int(np.clip(2 + length / 1.5, 2, 7))):
         piece = MAKERS[str(rng.choice(kinds))](rng)
         for _ in range(40):
             angle, reach = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 2.2)
-            x, y = way[rng.integers(len(way))] + reach * np.array([np.cos(angle), np.sin(angle)])
+            x, y = path[rng.integers(len(path))] + reach * np.array([np.cos(angle), np.sin(angle)])
             heading = float(
                 rng.integers(4) * np.pi / 2 + (rng.normal(0.0, 0.3) if piece.kind == "chair" else 0.0)
             )
@@ -205,7 +205,7 @@ def _beside(plan: FreePlan, kinds: tuple[str, ...], way: np.ndarray, rng: np.ran
                 break
 
 
-def _street(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generator) -> None:
+def _street(plan: FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator) -> None:
     """A pavement before a house front, with a row of barriers across, open at its ends."""
     builder = plan.builder
     ends, front, across = rng.uniform(2.5, 5.0, 2), rng.uniform(0.8, 3.0), rng.uniform(1.0, 4.0)
@@ -232,6 +232,6 @@ def _street(plan: FreePlan, reach: Box, way: np.ndarray, rng: np.random.Generato
     for x in rng.uniform(box[0] - 4.0, box[2] + 4.0, 6):
         builder.place(MAKERS["tree"](rng), (float(x), float(box[1] - rng.uniform(3.0, 9.0)), -0.06), 0.0)
     plan.room = (box[0] + 0.2, box[1] + 0.7, box[2] - 0.2, box[3] - 0.1)
-    _beside(plan, NEAR_OUTDOORS, way, rng)
-    for kind in (*PAVEMENT_THINGS, *SQUARE_THINGS)[:: int(rng.integers(1, 4))]:
+    _beside(plan, NEAR_OUTDOORS, path, rng)
+    for kind in (*PAVEMENT_KINDS, *SQUARE_KINDS)[:: int(rng.integers(1, 4))]:
         put_somewhere(plan, kind, rng)

@@ -1,7 +1,7 @@
-"""What a simulated world looks like: a material, a seed and a place on its pattern for every face.
+"""Appearance of a simulated world: a material, a seed and a place on its pattern for every face.
 
-Materials follow from what a face belongs to (`WorldObject.kind`), its texture grade, colour and normal; walls stay
-nearly blank, which is the hazard of visual localisation. Patterns ride on their objects: what is moved keeps its look.
+Materials follow from the face's object (`WorldObject.kind`), its texture grade, colour and normal; walls stay nearly
+blank, which is the hazard of visual localisation. Patterns move with their objects: a moved object looks the same.
 """
 
 import zlib
@@ -33,7 +33,7 @@ _WOODEN = (
 )
 _STONY = ("low_wall", "planter", "garden_wall")
 _PRINTED = 95.0
-"""Visual features per m² from which on a face carries a print."""
+"""Visual features per m² from which on a face has a print."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Paint:
 
     @classmethod
     def of(cls, world: World) -> "Paint":
-        """The look of a world, the same for the same world."""
+        """Appearance of a world, the same for the same world."""
         corners = world.mesh.vertices[world.mesh.faces].astype(np.float64)
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
@@ -91,7 +91,7 @@ def light_table() -> Float[np.ndarray, "6"]:
 
 
 def _headings(world: World) -> Float[np.ndarray, "face"]:
-    """Of each face's object, or of the shell (rad)."""
+    """Heading of each face's object, or of the shell (rad)."""
     edge = world.surfaces[0].polygon[1] - world.surfaces[0].polygon[0]
     headings = [item.heading for item in world.objects] + [float(np.arctan2(edge[1], edge[0]))]
     return np.array(headings)[world.face_object]

@@ -1,4 +1,4 @@
-"""Procedural colours, one point at a time: patterns of 2 to 50 cm that repeat nowhere.
+"""Procedural colours, one point at a time: patterns of 2 to 50 cm without repetition.
 
 A pattern is a function of a point's place on its face (a, b in m), of a seed and of the footprint: how wide (m)
 the pixel or sample is that will hold the colour. What is finer than about two footprints fades to its mean, so
@@ -15,7 +15,7 @@ FABRIC, FOLIAGE, ASPHALT, STONE, PAINT, CEILING, LAMP = range(8, 15)
 
 @compiled
 def chance(i, j, seed):
-    """A number in [0, 1) that belongs to a cell."""
+    """A deterministic number in [0, 1) for a cell."""
     h = (int(i) * 374761393 + int(j) * 668265263 + int(seed) * 974634777) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 1911520717) & 0xFFFFFFFF
@@ -24,7 +24,7 @@ def chance(i, j, seed):
 
 @compiled
 def fade(wavelength, footprint):
-    """1 for what a footprint resolves, 0 for what it does not."""
+    """1 for wavelengths that a footprint resolves, 0 for finer ones."""
     return min(1.0, max(0.0, 0.6 * wavelength / footprint - 0.8))
 
 
@@ -45,13 +45,13 @@ def noise(a, b, wavelength, seed, footprint):
 
 @compiled
 def inside(distance, footprint):
-    """How much of a footprint lies within an edge that is `distance` away, positive inwards."""
+    """Share of a footprint within an edge that is `distance` away, positive inwards."""
     return min(1.0, max(0.0, 0.5 + distance / footprint))
 
 
 @compiled
 def joint(place, period, width, footprint):
-    """How much of a footprint lies on lines of a width, one per period."""
+    """Share of a footprint on lines of a width, one per period."""
     off = place - period * math.floor(place / period + 0.5)
     if footprint > 0.5 * period:
         return width / period
@@ -65,13 +65,13 @@ def over(below, above, share):
 
 @compiled
 def covered(red, green, blue, r, g, b, share):
-    """One colour over another, by its share."""
+    """One colour blended over another by its share."""
     return over(red, r, share), over(green, g, share), over(blue, b, share)
 
 
 @compiled
 def hue(h):
-    """A strong colour of an angle 0…1."""
+    """A saturated colour of a hue angle 0…1."""
     red = min(1.0, max(0.0, abs(6.0 * h - 3.0) - 1.0))
     green = min(1.0, max(0.0, 2.0 - abs(6.0 * h - 2.0)))
     blue = min(1.0, max(0.0, 2.0 - abs(6.0 * h - 4.0)))
@@ -80,7 +80,7 @@ def hue(h):
 
 @compiled
 def _socket(a, b, seed, footprint):
-    """Whiteness and darkness of the sockets that sit 30 cm above the floor on some stretches of wall."""
+    """Whiteness and darkness of the sockets that are 30 cm above the floor on some stretches of wall."""
     cell = math.floor(a / 1.7)
     if chance(cell, 3, seed) > 0.5:
         return 0.0, 0.0
@@ -130,7 +130,7 @@ def brick(a, b, red, green, blue, seed, footprint):
 
 @compiled
 def _sheet(x, y, wide, tall, red, green, blue, seed, footprint):
-    """A print of wide x tall metres at (x, y) from its corner: shapes on a ground, lines of text beneath."""
+    """A print of wide x tall metres at (x, y) from its corner: shapes on a ground, lines of text below."""
     least = min(wide, tall)
     for shape in range(9):
         cx, cy = wide * chance(shape, 0, seed), tall * (0.25 + 0.75 * chance(shape, 1, seed))
@@ -162,7 +162,7 @@ def _sheet(x, y, wide, tall, red, green, blue, seed, footprint):
 
 @compiled
 def poster(a, b, extent, red, green, blue, seed, footprint):
-    """A framed print; a large board carries several sheets; what is small (a switch, a mug) gets a mark."""
+    """A framed print; a large board has several sheets; a small object (a switch, a mug) gets a mark."""
     wide, tall = extent[1] - extent[0], extent[3] - extent[2]
     x, y = a - extent[0], b - extent[2]
     if min(wide, tall) < 0.12:
@@ -288,7 +288,7 @@ def foliage(a, b, red, green, blue, seed, footprint):
 
 @compiled
 def asphalt(a, b, red, green, blue, seed, footprint):
-    """Gravelly, mended in patches, cracked."""
+    """Asphalt: gravelly, mended in patches, cracked."""
     tone = 0.14 * noise(a, b, 0.045, seed, footprint) + 0.10 * noise(a, b, 0.13, seed + 1, footprint)
     tone += 0.10 * noise(a, b, 1.6, seed + 2, footprint)
     i, j = math.floor(a / 1.9), math.floor(b / 1.9)
@@ -393,7 +393,7 @@ def shaded(face, x, y, z, facing, footprint, frames, extents, colors, materials,
 
 @compiled
 def color_points(points, face, facing, footprint, frames, extents, colors, materials, seeds, light, out):
-    """Colours (0…255 and beyond) of points of faces; none (face -1) keep what is there."""
+    """Colours (0…255 and beyond) of points of faces; entries without a face (-1) keep their value."""
     for k in range(len(points)):
         if face[k] >= 0:
             out[k] = shaded(face[k], points[k, 0], points[k, 1], points[k, 2], facing[k], footprint[k], frames,

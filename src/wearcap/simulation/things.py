@@ -1,4 +1,4 @@
-"""Things that a wearer slides or carries: their shape, what they stand on, and where hands take hold of them."""
+"""Objects that a wearer slides or carries: their shape, their support, and the places where hands hold them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,17 +18,17 @@ from wearcap.simulation.handhelds import Grasp, Handheld
 
 @dataclass(frozen=True)
 class Rail:
-    """A straight stretch of a thing on which hands lie, for someone who stands on one side of it; thing's axes."""
+    """A straight segment of an object on which hands rest, for a holder on one side of it; in the object's axes."""
 
     start: Vector
-    """Its end on the holder's left (m)."""
+    """End on the holder's left (m)."""
     stop: Vector
     normal: Vector
     fingers: Vector
     facing: float
-    """The holder's heading against the thing's (rad)."""
+    """Heading of the holder relative to the object's (rad)."""
     stand_off: float
-    """From the middle of the rail back to the footprint's edge, against `facing` (m)."""
+    """Distance from the middle of the rail back to the footprint's edge, against `facing` (m)."""
     both_hands: bool = True
 
     @property
@@ -47,19 +47,19 @@ class Rail:
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
-    """An object to be moved by hand; its own axes have the front at +x, the origin on the floor beneath its middle."""
+class Movable:
+    """An object to be moved by hand; its own axes have the front at +x, the origin on the floor below its middle."""
 
     object: SceneObject
     half_size: tuple[float, float]
-    """Of the footprint along the thing's x and y (m)."""
+    """Half size of the footprint along the object's x and y (m)."""
     height: float
     rails: tuple[Rail, ...] = ()
-    """Where it is pushed and pulled."""
+    """Rails where it is pushed and pulled."""
     sides: tuple[tuple[GripPlace, GripPlace, float], ...] = ()
-    """Ways to lift it between both hands: the left and right palm's places and the holder's heading against it."""
+    """Options for lifting it between both hands: the left and right palm's places and the holder's relative heading."""
     grasps: tuple[Grasp, ...] = ()
-    """Ways to lift it with one hand."""
+    """Options for lifting it with one hand."""
 
     @property
     def name(self) -> str:
@@ -69,26 +69,26 @@ class Thing:
     def category(self) -> str:
         return self.object.category
 
-    def placed(self, x: float, y: float, heading: float, z: float = 0.0) -> "Thing":
-        """The same thing, initially elsewhere (m, rad)."""
+    def placed(self, x: float, y: float, heading: float, z: float = 0.0) -> "Movable":
+        """The same object with another initial pose (m, rad)."""
         R, t = rotation.about_axis("z", torch.tensor(heading)), torch.tensor([x, y, z])
         return replace(self, object=replace(self.object, R_world_object=R, t_world_object=t))
 
 
 def floor_pose(place: Float[np.ndarray, "*batch 3"], z: float | np.ndarray = 0.0) -> Rigid:
-    """Pose of a thing that stands at x, y with a heading (m, m, rad), `z` above the world's zero (m)."""
+    """Pose of an object that stands at x, y with a heading (m, m, rad), `z` above the world's zero (m)."""
     at = torch.from_numpy(np.asarray(place, np.float64))
     height = torch.as_tensor(np.asarray(z, np.float64)).expand(at.shape[:-1])
     return Rigid(rotation.about_axis("z", at[..., 2]), torch.cat([at[..., :2], height[..., None]], -1))
 
 
-def make_thing(category: str, name: str, rng: np.random.Generator) -> Thing:
-    """A thing of a category of `THINGS` with drawn size and colour, at the world's origin."""
-    return THINGS[category](name, rng)
+def make_movable(category: str, name: str, rng: np.random.Generator) -> Movable:
+    """A movable object of a category of `MOVABLES` with drawn size and colour, at the world's origin."""
+    return MOVABLES[category](name, rng)
 
 
-def _sofa(name: str, rng: np.random.Generator) -> Thing:
-    """Held at the upper edge of its back from behind, or of an arm from that side."""
+def _sofa(name: str, rng: np.random.Generator) -> Movable:
+    """A sofa, held at the upper edge of its back from behind, or of an arm from that side."""
     piece = furniture.armchair(rng) if rng.random() < 0.3 else furniture.sofa(rng)
     half_depth, half_width = piece.size[0] / 2, piece.size[1] / 2
     back = Rail((-half_depth + 0.012, half_width - 0.1, 0.85), (-half_depth + 0.012, 0.1 - half_width, 0.85),
@@ -103,12 +103,12 @@ def _sofa(name: str, rng: np.random.Generator) -> Thing:
     return _sliding(name, "sofa", piece, rails)
 
 
-def _table(name: str, rng: np.random.Generator) -> Thing:
-    """Held at its top's edges."""
+def _table(name: str, rng: np.random.Generator) -> Movable:
+    """A table, held at its top's edges."""
     piece = furniture.table(rng)
     bare = replace(
         piece, parts=piece.parts[:5]
-    )  # four legs and the top; nothing stands on a table that is moved
+    )  # The four legs and the top; nothing stands on a table that is moved.
     half_depth, half_width = piece.size[0] / 2, piece.size[1] / 2
     top = piece.z_range[1]
     rails = []
@@ -117,7 +117,7 @@ def _table(name: str, rng: np.random.Generator) -> Thing:
         deep = abs(ahead @ np.array([half_depth, half_width]))
         wide = abs(left @ np.array([half_depth, half_width])) - 0.08
         edge = -(deep - 0.012) * ahead
-        ends = (np.append(edge + way * wide * left, top) for way in (1.0, -1.0))
+        ends = (np.append(edge + sign * wide * left, top) for sign in (1.0, -1.0))
         start, stop = (vector(end) for end in ends)
         rails.append(
             Rail(start, stop, (0.0, 0.0, 1.0), (float(ahead[0]), float(ahead[1]), 0.0), facing, 0.012)
@@ -125,8 +125,8 @@ def _table(name: str, rng: np.random.Generator) -> Thing:
     return _sliding(name, "table", bare, rails)
 
 
-def _chair(name: str, rng: np.random.Generator) -> Thing:
-    """Held at the top of its backrest, from behind or, with one hand, from beside it."""
+def _chair(name: str, rng: np.random.Generator) -> Movable:
+    """A chair, held at the top of its backrest, from behind or, with one hand, from beside it."""
     piece = furniture.chair(rng)
     half_depth, half_width, top = piece.size[0] / 2, piece.size[1] / 2, piece.z_range[1]
     x = -half_depth + 0.02
@@ -138,8 +138,8 @@ def _chair(name: str, rng: np.random.Generator) -> Thing:
     return _sliding(name, "chair", piece, rails)
 
 
-def _box(name: str, rng: np.random.Generator) -> Thing:
-    """Lifted between the palms, which press on two opposite faces."""
+def _box(name: str, rng: np.random.Generator) -> Movable:
+    """A box, lifted between the palms, which press on two opposite faces."""
     depth, width = rng.uniform(0.20, 0.45), rng.uniform(0.25, 0.55)
     height, color = (
         rng.uniform(0.20, 0.50),
@@ -162,36 +162,36 @@ def _box(name: str, rng: np.random.Generator) -> Thing:
         )
         fingers = vector((ahead - 0.35 * np.array(up)) / np.hypot(1.0, 0.35))
         hands = (
-            GripPlace(vector(way * (half + SKIN_M) * left + [0.0, 0.0, level]), vector(way * left), fingers)
-            for way in (1.0, -1.0)
+            GripPlace(vector(sign * (half + SKIN_M) * left + [0.0, 0.0, level]), vector(sign * left), fingers)
+            for sign in (1.0, -1.0)
         )
         sides.append((*hands, facing))
-    thing = _of_piece(name, "box", piece, Freedom("free"))
-    return replace(thing, sides=tuple(sides))
+    movable = _of_piece(name, "box", piece, Freedom("free"))
+    return replace(movable, sides=tuple(sides))
 
 
-def _held(
+def _handheld(
     category: str, make: Callable[[np.random.Generator], Handheld]
-) -> Callable[[str, np.random.Generator], Thing]:
-    def thing(name: str, rng: np.random.Generator) -> Thing:
+) -> Callable[[str, np.random.Generator], Movable]:
+    def movable(name: str, rng: np.random.Generator) -> Movable:
         shape = make(rng)
         scene_object = SceneObject(name, category, shape.mesh, torch.eye(3), torch.zeros(3), Freedom("free"))
         half_size = (shape.size[0] / 2, shape.size[1] / 2)
-        return Thing(scene_object, half_size, shape.height, sides=shape.sides, grasps=shape.grasps)
+        return Movable(scene_object, half_size, shape.height, sides=shape.sides, grasps=shape.grasps)
 
-    return thing
+    return movable
 
 
-def _sliding(name: str, category: str, piece: Piece, rails: list[Rail]) -> Thing:
+def _sliding(name: str, category: str, piece: Piece, rails: list[Rail]) -> Movable:
     return replace(_of_piece(name, category, piece, Freedom("plane")), rails=tuple(rails))
 
 
-def _of_piece(name: str, category: str, piece: Piece, freedom: Freedom) -> Thing:
+def _of_piece(name: str, category: str, piece: Piece, freedom: Freedom) -> Movable:
     scene_object = SceneObject(name, category, piece_mesh(piece), torch.eye(3), torch.zeros(3), freedom)
-    return Thing(scene_object, (piece.size[0] / 2, piece.size[1] / 2), piece.z_range[1])
+    return Movable(scene_object, (piece.size[0] / 2, piece.size[1] / 2), piece.z_range[1])
 
 
-THINGS: dict[str, Callable[[str, np.random.Generator], Thing]] = {
+MOVABLES: dict[str, Callable[[str, np.random.Generator], Movable]] = {
     "sofa": _sofa, "table": _table, "chair": _chair, "box": _box,
-    **{category: _held(category, make) for category, make in handhelds.MAKERS.items()},
+    **{category: _handheld(category, make) for category, make in handhelds.MAKERS.items()},
 }  # fmt: skip

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 
 def ease(share: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-    """Minimum-jerk course from 0 to 1 while `share` runs from 0 to 1 (Flash and Hogan 1985); constant outside."""
+    """Minimum-jerk profile from 0 to 1 while `share` runs from 0 to 1 (Flash and Hogan 1985); constant outside."""
     u = np.clip(share, 0.0, 1.0)
     return np.asarray(u**3 * (10.0 + u * (6.0 * u - 15.0)))
 
@@ -30,7 +30,7 @@ def hermite(
 
 @dataclass
 class Track:
-    """A channel of numbers that rests at values and moves between them with minimum jerk.
+    """A channel of numbers with constant values and minimum-jerk transitions between them.
 
     Transitions may overlap: each adds its own rise, so the sum stays twice continuously differentiable.
     """
@@ -44,7 +44,7 @@ class Track:
 
     @property
     def last(self) -> Float[np.ndarray, "feature"]:
-        """Where the channel rests after its last transition."""
+        """Value of the channel after its last transition."""
         return self._last
 
     def move(self, start_s: float, stop_s: float, value) -> None:
@@ -65,7 +65,7 @@ class Track:
 
 
 def blur(signal: np.ndarray, sigma_s: float, fps: float) -> np.ndarray:
-    """Gaussian average along the first axis (time), the ends held."""
+    """Gaussian average along the first axis (time), the ends extended."""
     return scipy.ndimage.gaussian_filter1d(signal, sigma_s * fps, axis=0, mode="nearest", truncate=3.5)
 
 

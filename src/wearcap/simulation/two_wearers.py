@@ -1,7 +1,7 @@
 """Two simulated wearers of one session: one world, one clock, face to face when it begins.
 
-The second is put before the first after both were simulated, so that walking may lead them through each other, walls
-and furniture: by default they stay where they are.
+The second is placed in front of the first after both were simulated, so walking may lead them through each other,
+walls and furniture: by default they stay where they are.
 """
 
 from dataclasses import replace
@@ -52,7 +52,7 @@ def simulate_two_wearers(
 
 
 def face_to_face(first: SimulatedMotion, second: SimulatedMotion, distance_m: float) -> SimulatedMotion:
-    """The second motion, turned and shifted as a whole so that in its first frame it faces the first, on its floor."""
+    """The second motion, turned and shifted as a whole so that it faces the first in its first frame, on its floor."""
     a, b = first.motion, second.motion
     ahead, heading = (rotation.yaw_of(motion.R_parent_joint[0, 0]) for motion in (a, b))
     R = rotation.about_axis("z", ahead + torch.pi - heading)

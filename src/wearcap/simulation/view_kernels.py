@@ -1,4 +1,4 @@
-"""Where the rays of a picture's pixels meet the faces that are visible in them."""
+"""Intersections of the rays of an image's pixels with the faces that are visible in them."""
 
 import math
 
@@ -10,9 +10,9 @@ def meet_faces(rays, slots, reach, pixel_angle, pose, index, nearness, frames, s
                distance, light):  # fmt: skip
     """Point, face, side (1 front, -1 back), footprint (m) and distance along the ray (m) of every pixel.
 
-    `rays` are unit, in the camera's axes; `slots` names for each the sample of the (flat) visibility buffers that it
-    falls into, -1 where the lens shows nothing, and `reach` turns that sample's depth into distance along the ray.
-    `frames` are `Paint.frames`. What shows no face (-1) gets its colour in `light`: black, or the sky's.
+    `rays` are unit, in the camera's axes; `slots` are the indices of their samples in the (flat) visibility buffers, -1
+    where the lens shows nothing, and `reach` turns that sample's depth into distance along the ray. `frames` are
+    `Paint.frames`. A pixel without a face (-1) gets its colour in `light`: black, or the sky's.
     """
     for k in range(len(slots)):
         slot = slots[k]
@@ -32,7 +32,7 @@ def meet_faces(rays, slots, reach, pixel_angle, pose, index, nearness, frames, s
         f = frames[number]
         slope = dx * f[9] + dy * f[10] + dz * f[11]
         above = (pose[0, 3] - f[0]) * f[9] + (pose[1, 3] - f[1]) * f[10] + (pose[2, 3] - f[2]) * f[11]
-        # a pixel's ray misses its face by up to a sample at outlines: it stays near the depth that was drawn
+        # A pixel's ray misses its face by up to a sample at outlines: it stays near the drawn depth.
         near = reach[k] / nearness[slot]
         d = (f[12] - above) / slope if abs(slope) > 1e-9 else near
         d = min(1.08 * near, max(0.92 * near, d))

@@ -1,4 +1,4 @@
-"""Photographs of a simulated world: what is visible comes from the z-buffer, its colour from the texture.
+"""Photographs of a simulated world: visibility comes from the z-buffer, colour from the texture.
 
 Visibility is found through pinhole views (one, or the sides of a cube for fisheyes) that are at least as fine as
 the picture; each pixel's own ray then meets the plane of its face, so that lenses bend texture exactly.
@@ -24,12 +24,12 @@ from wearcap.simulation.world import World
 
 NEAR_M = 0.03
 SKY = np.array([[0.80, 0.84, 0.88], [0.48, 0.63, 0.85]]) * 255.0
-"""At the horizon and overhead."""
+"""Sky colour at the horizon and overhead."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scenery:
-    """A world made ready to be photographed and scanned. Make it with `Scenery.of`."""
+    """A world prepared for photographs and scans. Make it with `Scenery.of`."""
 
     world: World
     paint: Paint
@@ -46,9 +46,9 @@ _GROUND_M2 = 0.25
 
 
 def _apart(world: World) -> Float32[np.ndarray, "vertex 3"]:
-    """The mesh's vertices with every solid but the ground grown by its own hair's breadth (at most 2.4 mm).
+    """The mesh's vertices with every solid but the ground grown by its own tiny margin (at most 2.4 mm).
 
-    Solids that touch share planes, and which one is seen would change from pixel to pixel.
+    Solids that touch share planes; which one is seen would change from pixel to pixel.
     """
     vertices, faces = world.mesh.vertices.astype(np.float64), world.mesh.faces
     ends = (np.concatenate([faces[:, 0], faces[:, 0]]), np.concatenate([faces[:, 1], faces[:, 2]]))
@@ -71,11 +71,11 @@ def _apart(world: World) -> Float32[np.ndarray, "vertex 3"]:
 
 @dataclass(frozen=True)
 class Development:
-    """From light to grey levels; the defaults make a clean picture."""
+    """Conversion of light to grey levels; the defaults make a clean image."""
 
     exposure: float = 1.0
     contrast: float = 1.0
-    """Below 1 the picture fades towards its mean: haze, glare, a fogged lens."""
+    """Contrast; below 1 the image fades towards its mean: haze, glare, a fogged lens."""
     noise: float = 0.0
     """Deviation of every pixel and channel (grey levels)."""
     vignetting: float = 0.0
@@ -90,7 +90,7 @@ def render_view(
     rng: np.random.Generator | None = None,
     samples: int = 1,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The picture that a camera takes; several poses ("frame 3 3", "frame 3") are averaged: motion blur.
+    """The image of a camera; several poses ("frame 3 3", "frame 3") are averaged: motion blur.
 
     `samples` n averages n x n rays per pixel (smooth outlines). `rng` is needed for noise alone.
     """
@@ -106,7 +106,7 @@ def render_view(
 
 
 def view_depth(scenery: Scenery, camera: Camera, T_world_cam: Rigid) -> Float32[np.ndarray, "height width"]:
-    """Distance along each pixel's ray (m); infinite where nothing is."""
+    """Distance along each pixel's ray (m); infinite without a surface."""
     return _exposed(scenery, camera, T_world_cam)[1]
 
 
@@ -145,7 +145,7 @@ class View:
 class _Lens:
     rays: Float32[np.ndarray, "height width 3"]
     slots: np.ndarray
-    """Number of the sample in all views one after the other; -1 where the lens shows nothing."""
+    """Index of the sample in all views one after the other; -1 where the lens shows nothing."""
     reach: Float32[np.ndarray, "height width"]
     """Distance along the ray per metre of the view's depth."""
     views: tuple[View, ...]

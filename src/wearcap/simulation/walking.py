@@ -12,19 +12,19 @@ from wearcap.simulation.track import blur
 SPACING_M = 0.02
 RUN_SPEED = 2.1
 JOG_SPEED = 1.4
-"""One who means to run does so from this speed on (m/s): at its start, its end and in curves."""
+"""Speed (m/s) from which on a person who intends to run does so: at the start, the end and in curves."""
 ACCELERATION, BRAKING = 1.0, 0.85
 END_SPEED = 0.32
 MIN_CADENCE = 80.0
 READY_S = 0.42
-"""Between the decision to walk and the first foot's lift the weight moves to the other leg."""
+"""Time between the decision to walk and the first foot's lift, in which the weight moves to the other leg."""
 CURVE_SPEED = 0.95
 """Speed (m/s) in a curve of radius 1 m, for a wearer whose own speed is 1.3 m/s (two-thirds power law)."""
 HEEL_ROOM_M, TOE_ROOM_M, EDGE_M = 0.055, 0.015, 0.08
-"""On treads: heel behind the ankle, toes before the next riser, and, going down, the ankle past the edge."""
+"""Margins on treads: heel behind the ankle, toes before the next riser, and, going down, the ankle past the edge."""
 
 PAST_KERB_M = 0.16
-"""Where the ankle of the foot that steps over a kerb's edge stands beyond it."""
+"""Distance of the ankle beyond a kerb's edge after stepping over it."""
 
 
 @dataclass(frozen=True)
@@ -35,20 +35,20 @@ class Course:
     heading: Float[np.ndarray, "point"]
     speed: Float[np.ndarray, "point"]
     time: Float[np.ndarray, "point"]
-    """Since the start (s)."""
+    """Time since the start (s)."""
     phase: Float[np.ndarray, "point"]
-    """Steps since the start; the foot of step k stands where phase is k."""
+    """Number of steps since the start; the foot of step k stands where phase is k."""
     on_stairs: Float[np.ndarray, "point"]
     """+1 going up, -1 going down, else 0."""
     run_from: float
-    """Speed (m/s) from which on it is run."""
+    """Speed (m/s) from which on the gait is running."""
 
     def at_phase(self, name: str, phase: float) -> float:
-        """Heading, speed, time or on_stairs where the phase has a value; ends held."""
+        """Heading, speed, time or on_stairs at the phase; clamped at the ends."""
         return float(np.interp(phase, self.phase, getattr(self, name)))
 
     def point_at(self, phase: float) -> Float[np.ndarray, "3"]:
-        """Floor point where the phase has a value (m); ends held."""
+        """Floor point at the phase (m); clamped at the ends."""
         return np.array([np.interp(phase, self.phase, column) for column in self.points.T])
 
 
@@ -83,7 +83,7 @@ def walk_along(
 
 
 def double_support(speed: float, running: bool) -> float:
-    """Share of a step's time that both feet stand; negative in running, where neither does."""
+    """Share of a step's time in which both feet stand; negative in running, where neither does."""
     if running:
         return float(np.clip(-0.22 - 0.08 * (speed - RUN_SPEED), -0.38, -0.12))
     return float(np.clip(0.24 + 0.16 * (1.3 - speed), 0.14, 0.42))
@@ -163,10 +163,10 @@ def plan_course(plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float,
     anchors = [anchor for flight in flights for anchor in _tread_anchors(points, flight, foot)]
     anchors = sorted(anchors, key=lambda anchor: anchor[0])
     stairs = np.zeros(len(points))
-    for at, way, tread, _rise in anchors:
+    for at, direction, tread, _rise in anchors:
         near = np.abs(length - at) < 0.55 * tread
-        stairs[near] = way
-        beat = (0.58 if way > 0 else 0.54) / plan.style.briskness**0.5
+        stairs[near] = direction
+        beat = (0.58 if direction > 0 else 0.54) / plan.style.briskness**0.5
         limit[near] = np.minimum(limit[near], tread / beat)
     limit = blur(_ramped(limit), 0.10, 1 / SPACING_M)
     stride = np.minimum(np.sqrt(60 * plan.style.walk_ratio * limit), limit * 60 / MIN_CADENCE)
@@ -204,7 +204,7 @@ def _ramped(limit: np.ndarray) -> np.ndarray:
 
 
 def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float, int, float, float]]:
-    """(arc length, way up or down, tread, rise) of the places on a path where a foot must stand on a flight.
+    """(arc length, direction up or down, tread, rise) of the places on a path where a foot must stand on a flight.
 
     `foot` is how far the toes are ahead of the ankle (m).
     """
@@ -232,7 +232,7 @@ def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float,
 
 
 def _anchored(raw: np.ndarray, length: np.ndarray, anchors: list[float]) -> np.ndarray:
-    """The phase stretched piece by piece, so that it is a whole number at every anchor and at the end."""
+    """The phase stretched piecewise, so that it is a whole number at every anchor and at the end."""
     ends = [a for a in anchors if 0.1 < a < length[-1] - 0.1] + [length[-1]]
     knots, whole, previous = [0.0], [0], 0.0
     for end in ends:

@@ -12,14 +12,14 @@ THICKNESS = 0.12
 HEIGHT = 2.5
 DOOR_HEIGHT = 2.05
 WINDOW = (0.9, 2.1)
-"""Sill and lintel above the floor (m)."""
+"""Heights of sill and lintel above the floor (m)."""
 BLANK = 0.4
 """Visual features per m² of a painted wall."""
 
 
 @dataclass
 class Wall:
-    """An upright wall between two points of the builder's plane; openings as (distance from start, width)."""
+    """An upright wall between two points of the builder's plane; openings are (distance from start, width)."""
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -45,7 +45,7 @@ class Wall:
 
 
 def build_wall(builder: WorldBuilder, wall: Wall, color: tuple, rng: np.random.Generator) -> None:
-    """Solid pieces between the openings, what stands above and below those, frames, pictures and switches."""
+    """Solid pieces between the openings, the wall above and below those, frames, pictures and switches."""
     openings = sorted(
         [(*door, "door") for door in wall.doors] + [(*window, "window") for window in wall.windows]
     )
@@ -87,7 +87,7 @@ def _panel(
 
 
 def _frame(builder: WorldBuilder, wall: Wall, middle: float, width: float, low: float, high: float) -> None:
-    """Posts beside an opening and a bar above it, a little proud of the wall."""
+    """Posts beside an opening and a bar above it, slightly in front of the wall."""
     color, z = (0.85, 0.83, 0.78), wall.z + (low + high) / 2
     for side in (-1, 1):
         x, y = wall.at(middle + side * (width / 2 + 0.03))
@@ -109,7 +109,7 @@ def _switch(builder: WorldBuilder, wall: Wall, distance: float, side: int) -> No
 
 
 def _pictures(builder: WorldBuilder, wall: Wall, openings: list, side: int, rng: np.random.Generator) -> None:
-    """Prints on the wall where no opening is."""
+    """Prints on the wall beside the openings."""
     for distance in np.arange(0.6, wall.length - 0.6, 1.1):
         if rng.uniform() < 0.6 or any(
             abs(distance - middle) < width / 2 + 0.5 for middle, width, _ in openings

@@ -27,17 +27,17 @@ from wearcap.simulation.track import blur
 from wearcap.simulation.world import World
 
 __all__ = ["SimulatedMotion", "hands", "settle", "simulate_motion"]
-"""`hands` and `settle` are imported because that enters their activities."""
+"""`hands` and `settle` are imported because that registers their activities."""
 
 NECK_SHARE = 0.45
 TOUCH_M = 0.02
 TAIL_S = 1.5
-"""Simulated beyond the end and cut off: a body in motion looks this far ahead."""
+"""Time simulated beyond the end and cut off, because a body in motion looks this far ahead."""
 
 
 @runtime_checkable
 class Wearer(Protocol):
-    """Who is simulated: a skeleton with the person's own bones (xsens23's joints), and habits of moving."""
+    """A wearer: a skeleton with the person's own bones (xsens23's joints), and habits of moving."""
 
     @property
     def skeleton(self) -> Skeleton: ...
@@ -47,15 +47,15 @@ class Wearer(Protocol):
 
 @dataclass(frozen=True)
 class SimulatedMotion:
-    """A motion with what is true beside it."""
+    """A motion with its ground truth."""
 
     motion: Motion
     contact: Bool[Tensor, "time patch"]
-    """Of `FOOT_PATCHES`."""
+    """Contact of `FOOT_PATCHES`."""
     floor_height: Float[Tensor, "time"]
-    """Of the floor beneath the wearer (m)."""
+    """Height of the floor below the wearer (m)."""
     labels: tuple[Label, ...]
-    """What was done when, in order."""
+    """Activities with their times, in order."""
 
 
 def simulate_motion(
@@ -68,7 +68,7 @@ def simulate_motion(
 ) -> SimulatedMotion:
     """A person's whole-body motion in a world, deterministic for a given state of `rng`.
 
-    `activities` names entries of `actions.ACTIVITIES` to be done in turn, over and over until the time is full;
+    `activities` names entries of `actions.ACTIVITIES` to be done in turn, repeatedly until the time is reached;
     None draws them at random by their weights.
     """
     plan = _plan(world, person, rng, duration_s + TAIL_S, activities)
@@ -105,7 +105,7 @@ def perform(
 
 
 def _over_floor(world: World, motion: Motion) -> Bool[Tensor, "time patch"]:
-    """Whether the floor is close beneath each patch: a heel or toes may stand over a stair's edge."""
+    """Whether the floor is close below each patch: a heel or toes may stand over a stair's edge."""
     sites = [motion.skeleton.sites[name] for name in FOOT_PATCHES]
     patches = torch.stack([motion.joint(site.joint) @ torch.tensor(site.t_joint_site) for site in sites], 1)
     points = patches.double().numpy()
@@ -179,7 +179,7 @@ def _set_arm(skeleton: Skeleton, R: Tensor, side: str, arm: ArmMotion) -> None:
 
 
 def _leg(skeleton: Skeleton, R: Tensor, side: str, foot: FootMotion, trunk: Trunk) -> None:
-    """Hip and knee that carry the pelvis over the ankle; foot and toes as the step says."""
+    """Rotations of hip and knee that carry the pelvis over the ankle, and of foot and toes as planned."""
     hip, knee, ankle = (
         skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double()
         for joint in ("hip", "knee", "ankle")

@@ -1,8 +1,8 @@
-"""The surroundings of a simulated wearer: what can be stood on, sat on, reached, bumped into and seen.
+"""The surroundings of a simulated wearer: surfaces to stand on, seats, reach targets, obstacles and the visible mesh.
 
 World frame: metres, z up, the ground floor at z = 0. Headings are angles (rad) about z, 0 along +x.
-A builder (`flat.build_flat`, `outdoor.build_outdoor`, `site.build_site`) fills the lists; walking and planning live in
-`navigation`, which sees only surfaces (stood on) and objects (bumped into), so that a new kind of object
+A builder (`flat.build_flat`, `outdoor.build_outdoor`, `site.build_site`) fills the lists; walking and planning use
+`navigation`, which sees only surfaces (stood on) and objects (obstacles), so that a new kind of object
 needs no change there.
 """
 
@@ -18,12 +18,12 @@ from wearcap.simulation.outline import points_in_convex
 from wearcap.simulation.paths import plan_path
 
 STEP_UP_M = 0.35
-"""A foot finds no floor higher than this above where it was."""
+"""Largest height above the last floor at which a foot finds a floor."""
 
 
 @dataclass(frozen=True)
 class WorldObject:
-    """A thing with a footprint, which walkers keep off; its faces are those of the world's mesh with its index."""
+    """An obstacle with a footprint, which walkers keep off; its faces are those of the world's mesh with its index."""
 
     name: str
     kind: str
@@ -37,7 +37,7 @@ class WorldObject:
 
 @dataclass(frozen=True)
 class Surface:
-    """Something to stand on: a convex polygon seen from above, on the plane z = a x + b y + c."""
+    """A walkable surface: a convex polygon seen from above, on the plane z = a x + b y + c."""
 
     kind: str
     """"floor", "stairs_step", "ramp" or "kerb"."""
@@ -58,16 +58,16 @@ class Seat:
     position: tuple[float, float, float]
     heading: float
     height: float
-    """Of the seat above the floor (m)."""
+    """Height of the seat above the floor (m)."""
     depth: float
-    """From `position` forward to the seat's front edge (m)."""
+    """Distance from `position` forward to the seat's front edge (m)."""
 
     @property
     def floor_z(self) -> float:
         return self.position[2] - self.height
 
     def standing_point(self, calf_to_edge: float = 0.12) -> Float[np.ndarray, "3"]:
-        """Floor point beneath the pelvis of one who stands before the seat, ready to sit down (m)."""
+        """Floor point below the pelvis of someone who stands in front of the seat, ready to sit down (m)."""
         reach = self.depth + calf_to_edge
         return np.array(
             [
@@ -80,7 +80,7 @@ class Seat:
 
 @dataclass(frozen=True)
 class ReachTarget:
-    """A point that a hand reaches for, and where and how to stand for it."""
+    """A point that a hand reaches for, and where to stand for it and which way to face."""
 
     position: tuple[float, float, float]
     stand: tuple[float, float, float]
@@ -92,13 +92,14 @@ class ReachTarget:
 class Flight:
     """Straight stairs: step k = 1 … steps rises to base_z + k · rise; the last step is the upper floor itself.
 
-    With a single step it is a place at which a kerb is crossed. Step k < steps covers [(k − 1) · tread, k · tread] along `direction` from `start`.
+    With a single step it is a place at which a kerb is crossed. Step k < steps covers [(k − 1) · tread, k · tread]
+    along `direction` from `start`.
     """
 
     start: tuple[float, float]
     """Middle of the foot of the first riser (m)."""
     direction: float
-    """Heading of going up (rad)."""
+    """Heading when going up (rad)."""
     steps: int
     rise: float
     tread: float
@@ -116,11 +117,11 @@ class Flight:
 
     @property
     def left(self) -> np.ndarray:
-        """Unit vector to the left of who goes up."""
+        """Unit vector to the left when going up."""
         return np.array([-np.sin(self.direction), np.cos(self.direction)])
 
     def up_and_left(self, points_xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far (m) points are from `start` on the way up, and to its left."""
+        """Distances (m) of points from `start` along `direction`, and to its left."""
         along = np.array([np.cos(self.direction), np.sin(self.direction)])
         offset = points_xy - np.array(self.start)
         return offset @ along, offset @ self.left
@@ -136,16 +137,16 @@ class Room:
 
 @dataclass(frozen=True)
 class CaptureSpot:
-    """A free square of floor beside a table, to which a recording comes back again and again."""
+    """A free square of floor beside a table, to which a recording returns repeatedly."""
 
     position: tuple[float, float, float]
-    """Its middle on the floor (m)."""
+    """Middle of the square on the floor (m)."""
     heading: float
-    """Towards the table (rad)."""
+    """Heading towards the table (rad)."""
     size: float
     """Side of the square (m)."""
     table_m: float
-    """From the middle to the table's edge."""
+    """Distance from the middle to the table's edge."""
     table_z: float
     """Height of the table's top above the floor (m)."""
 
@@ -207,11 +208,11 @@ class World:
     def plan_path(
         self, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], rng: np.random.Generator
     ) -> Float[np.ndarray, "waypoint 3"] | None:
-        """A smooth way over the floor from start to goal, both floor points (m), across stairs too.
+        """A smooth path over the floor from start to goal, both floor points (m), across stairs too.
 
         Waypoints stand about 0.1 m apart on the floor, the first is `start`, the last `goal`; they keep 0.28 m
         off obstacles, except on the last steps to a start or goal that is nearer to one itself (a seat).
-        `rng` varies how far from walls this walk likes to be. None when no way leads there.
+        `rng` varies how far from walls this walk likes to be. None when no path leads there.
         """
         path = plan_path(self.navigation, self.flights, start, goal, rng)
         if path is not None:
