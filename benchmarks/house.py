@@ -1,0 +1,120 @@
+"""How large and how simple the code is: one JSON line per figure, for this checkout or another one.
+
+    python benchmarks/house.py [--root DIR]
+
+`followed` counts the modules of this package that a newcomer opens to follow `wearcap capture pipeline=X` from the verb
+to the motion: the verb, and what it reaches by imports within cli/, evaluation/, runtime/ and the system's folder.
+"""
+
+import argparse
+import ast
+import json
+import re
+from collections import Counter
+from pathlib import Path
+
+SYSTEMS = ("hps", "ireplica", "hmd2", "mocap_every", "echo")
+MANY_ARGUMENTS = 10
+
+
+def functions(tree: ast.AST) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
+    return [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+
+
+def public_names(tree: ast.Module) -> list[str]:
+    """Top-level names that do not begin with an underscore."""
+    names = []
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.append(node.name)
+        elif isinstance(node, ast.Assign):
+            names += [target.id for target in node.targets if isinstance(target, ast.Name)]
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            names.append(node.target.id)
+    return [name for name in names if not name.startswith("_")]
+
+
+def called_once(trees: dict[Path, ast.Module]) -> tuple[int, int]:
+    """Private functions and methods that are named in one place of their module beside their definition; and all."""
+    once = every = 0
+    for tree in trees.values():
+        used = Counter(node.id for node in ast.walk(tree) if isinstance(node, ast.Name))
+        used += Counter(node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute))
+        for function in functions(tree):
+            if function.name.startswith("_") and not function.name.startswith("__"):
+                every += 1
+                once += used[function.name] == 1
+    return once, every
+
+
+def wide_constructors(trees: dict[Path, ast.Module]) -> list[str]:
+    """Classes whose constructor, or whose dataclass fields, are more than `MANY_ARGUMENTS`."""
+    found = []
+    for path, tree in trees.items():
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.ClassDef):
+                continue
+            made = next(
+                (f for f in node.body if isinstance(f, ast.FunctionDef) and f.name == "__init__"), None
+            )
+            fields = [part for part in node.body if isinstance(part, ast.AnnAssign)]
+            dataclass = any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list)
+            count = (
+                len(made.args.args) + len(made.args.kwonlyargs) - 1
+                if made
+                else len(fields)
+                if dataclass
+                else 0
+            )
+            if count > MANY_ARGUMENTS:
+                found.append(f"{path.stem}.{node.name}")
+    return found
+
+
+def followed(source: Path, trees: dict[Path, ast.Module], system: str) -> int:
+    """Modules from the verb `capture` to the system's pipeline and all that this reaches in its own folder."""
+    rooms = ("cli", "evaluation", "runtime", f"systems/{system}")
+    by_name = {".".join(("wearcap", *path.relative_to(source).with_suffix("").parts)): path for path in trees}
+    rest = [source / "cli" / "capture.py", source / "systems" / system / "pipeline.py"]
+    reached: set[Path] = set()
+    while rest:
+        path = rest.pop()
+        if path in reached or path not in trees:
+            continue
+        reached.add(path)
+        for node in ast.walk(trees[path]):
+            names = []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            there = [by_name[name] for name in names if name in by_name]
+            rest += [p for p in there if p.relative_to(source).as_posix().startswith(rooms)]
+    return len(reached)
+
+
+def figures(root: Path) -> dict[str, object]:
+    source = root / "src" / "wearcap"
+    texts = {path: path.read_text(encoding="utf-8") for path in sorted(source.rglob("*.py"))}
+    trees = {path: ast.parse(text) for path, text in texts.items()}
+    lines = {path: len(text.splitlines()) for path, text in texts.items()}
+    once, every = called_once(trees)
+    return {
+        "lines": sum(lines.values()), "files": len(lines),
+        "simulation_lines": sum(count for path, count in lines.items() if "simulation" in path.relative_to(source).parts),
+        "fmt_skip": sum(len(re.findall(r"# fmt: skip", text)) for text in texts.values()),
+        "private_functions_called_once": round(once / every, 3), "public_names": sum(len(public_names(tree)) for tree in trees.values()),
+        "wide_constructors": wide_constructors(trees),
+        "followed": {system: followed(source, trees, system) for system in SYSTEMS if (source / "systems" / system).is_dir()},
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[1], help="a checkout")
+    for name, value in figures(parser.parse_args().root).items():
+        print(json.dumps({"name": name, "value": value}))
+
+
+if __name__ == "__main__":
+    main()
