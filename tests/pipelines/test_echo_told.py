@@ -86,7 +86,7 @@ FAULTS = {
     "acts, but no objects": (lambda: replace(scenario_of(RECORDING), environment=None), "carry: acts of 'box_1', but no objects"),
     "wrists swapped": (swapped, "carry: the left wrist is .* cm to the right of the right one.*Swap the two trackers"),
     "no wrists": (
-        lambda: scenario_of(replace(RECORDING, motion=None)), "carry: wrists are tracked by nothing.*Expected `tracked` poses of left_wrist and"),
+        lambda: scenario_of(replace(RECORDING, motion=None)), "carry: this recording has no tracked wrists.*Expected `tracked` poses of left_wrist and"),
     "one wrist": (
         lambda: scenario_of(replace(RECORDING, tracked={"left_wrist": track()})), "carry: only left_wrist is tracked. Expected `tracked` poses of left_wrist and"),
     "wrists with NaN": (lambda: tracked(left_wrist=track(broken=True)), "carry: poses of wrists that are NaN"),
@@ -94,7 +94,7 @@ FAULTS = {
         lambda: tracked(left_wrist=track(slice(0, 10))), "carry: tracking of left_wrist from 0.00 to 0.30 s. Expected all of 0.00 to 0.97 s"),
     "a wrist of another clock": (lambda: tracked(left_wrist=track(shift=60.0)), "tracking of left_wrist from 60.00"),
     "a wrist at a single time": (lambda: tracked(left_wrist=track(slice(0, 1))), "tracking of left_wrist at 1 times"),
-    "a wrist whose times fall": (lambda: tracked(left_wrist=track(torch.arange(30).flip(0))), "30 times that do not grow"),
+    "a wrist whose times fall": (lambda: tracked(left_wrist=track(torch.arange(30).flip(0))), "30 times that do not increase"),
     "a body observed too late": (lambda: observing(motion=late_motion()), "carry: an observation at 1.* beyond the recording.*Expected times from 0.00 to 0.97"),
     "an object observed too late": (
         lambda: observing(object_motion={"box_1": replace(BOX, timestamps=BOX.timestamps + 2.0)}), "carry: an observation at 2.* s, beyond"),
