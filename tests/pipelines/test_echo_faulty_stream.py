@@ -168,7 +168,7 @@ def test_whatever_comes_it_goes_on(echo, recording, seed):
         session._chunks,
         session._finished,
         session._track._poses,
-        session._waiting,
+        session._pending,
         *session._wrists.values(),
     )
     assert max(map(len, sizes)) < 100

@@ -292,7 +292,7 @@ def test_a_head_that_is_lost_holds_nothing_back():
         outputs = session.poses()
         count += 0 if outputs is None else len(outputs)
     assert count >= 30
-    assert session._waiting == []
+    assert session._pending == []
     assert session.poses(ended=True) is None
 
 
@@ -310,7 +310,7 @@ def test_a_long_stream_needs_no_more_than_a_short_one():
                 session.activate("box_1" if frame % 20 else None, time)
                 session.see_object("box_1", time, recording.object_motion["box_1"].T_world_body[frame])
             session.poses()
-        sizes.append((*(len(part) for part in session._wrists.values()), len(session._acts), len(session._seen), len(session._waiting), len(session._chunks)))  # fmt: skip
+        sizes.append((*(len(part) for part in session._wrists.values()), len(session._acts), len(session._seen), len(session._pending), len(session._chunks)))  # fmt: skip
     assert sizes[3] == sizes[1]
 
 
