@@ -1,4 +1,4 @@
-"""Which way a captured head really faces, where the capture's head frame was never aligned with the face."""
+"""The facing direction of a captured head whose frame was not aligned with the face."""
 
 import math
 
@@ -11,7 +11,7 @@ from wearcap.body.skeleton import Skeleton
 
 UPRIGHT = math.cos(math.radians(25))
 NATURAL_PITCH = math.radians(7)
-"""How far people look down on average while upright (ours)."""
+"""Average downward pitch of the head of an upright person (ours)."""
 
 
 def head_level(
