@@ -1,4 +1,4 @@
-"""What ECHO cannot be told: each fault with its own message, that says where and what was expected."""
+"""Invalid input of ECHO: each fault has its own message with the place and the expected value."""
 
 import copy
 from dataclasses import replace
@@ -118,8 +118,8 @@ def test_a_fault_is_named(fault):
     assert str(copy.copy(caught.value)) == str(caught.value)
 
 
-def test_a_wrist_that_is_lost_rests_where_it_was_seen():
-    """Short gaps are bridged; times in a long one, and behind the end, have the last pose before."""
+def test_a_lost_wrist_keeps_its_last_pose():
+    """Short gaps are interpolated; in long gaps and after the end the last pose is kept."""
     times = torch.tensor([0.0, 0.2, 0.6, 1.4, 1.5], dtype=torch.float64)
     place = torch.stack([times.float(), torch.zeros(5), torch.zeros(5)], 1)
     at = torch.tensor([-1.0, 0.1, 0.2, 0.4, 0.6, 0.61, 1.39, 1.4, 1.45, 1.5, 9.0], dtype=torch.float64)
@@ -141,12 +141,12 @@ def test_arms_of_a_true_motion_may_be_crossed():
         conditioning(scenario_of(replace(crossed, tracked=tracks)))
 
 
-def test_what_is_sound_passes():
+def test_valid_input_passes():
     assert conditioning(tracked()).valid.all()
     assert conditioning(scenario_of(RECORDING)).has_object.any()
 
 
-def test_what_is_seen_of_an_object_while_it_is_not_active_is_not_believed():
+def test_observations_of_inactive_objects_are_ignored():
     scenario = observing(object_motion={"box_1": BOX})
     seen = conditioning(scenario)
     assert torch.equal(seen.is_observed[0, :, 1], seen.has_object[0])

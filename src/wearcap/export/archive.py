@@ -1,4 +1,5 @@
-"""Checks of `.pt2` archives before loading: PyTorch runs some of their strings as Python, so only known forms are allowed."""
+"""Checks of `.pt2` archives before loading: PyTorch runs some of their strings as Python, so only known forms are
+allowed."""
 
 import re
 import zipfile
@@ -30,8 +31,8 @@ MAX_JSON_BYTES = 1 << 26
 def check_archive(path: str | Path) -> None:
     """Raise WearcapError unless an archive has only tensors and a graph of tensor operations.
 
-    Refused are pickled objects, compressed parts, guards and sizes other than arithmetic, and calls of functions that are
-    not ATen operations. Raises zipfile.BadZipFile for a file that is no archive or is damaged.
+    Refused are pickled objects, compressed parts, guards and sizes other than arithmetic, and calls of functions that
+    are not ATen operations. Raises zipfile.BadZipFile for a file that is no archive or is damaged.
     """
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()

@@ -11,8 +11,8 @@ from wearcap.errors import WearcapError
 def parser(name: str, about: str | None, recording: str, output: str) -> argparse.ArgumentParser:
     """Parser for the paths of an exported model, an input recording and the output.
 
-    `name` is the module's name in `wearcap.export`, `about` the docstring of its `main`; `recording` and `output` describe
-    the required inputs and the result in the help text.
+    `name` is the module's name in `wearcap.export`, `about` the docstring of its `main`; `recording` and `output`
+    describe the required inputs and the result in the help text.
     """
     found = argparse.ArgumentParser(prog=f"python -m wearcap.export.{name}", description=about)
     found.add_argument(

@@ -2,9 +2,9 @@
 
     python -m wearcap.export.echo MODEL.onnx RECORDING.safetensors MOTION.safetensors
 
-One graph has the denoiser: unnormalised conditions, x_t and noise levels go in, x̂0 comes out. Features, queue and guidance
-are the eager pipeline's, and so is the small object encoder: its neighbour search exports poorly. Its weights are beside
-the model, in NAME.objects.safetensors.
+One graph has the denoiser: unnormalised conditions, x_t and noise levels go in, x̂0 comes out. Features, queue and
+guidance are the eager pipeline's, and so is the small object encoder: its neighbour search exports poorly. Its
+weights are beside the model, in NAME.objects.safetensors.
 """
 
 from dataclasses import asdict

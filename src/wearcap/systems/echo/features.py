@@ -76,7 +76,8 @@ class EchoFeatures:
 
     @property
     def condition_size(self) -> int:
-        """Features per frame: 54 (ECHO), 2 more of the heading if frame is "own", and the head's height and limb lengths."""
+        """Features per frame: 54 (ECHO), 2 more of the heading if frame is "own", and the head's height and limb
+        lengths."""
         return 54 + (2 if self.frame == "own" else 0) + (1 + len(LIMBS) if self.body else 0)
 
     @property
@@ -119,7 +120,8 @@ class EchoFeatures:
         size: Float[Tensor, "batch limb"],
         frame: Rigid | None = None,
     ) -> Float[Tensor, "batch time condition"]:
-        """[R, ω, J, v] of the three points (ECHO eq. 4): ω is the rotation since the previous frame as 6D, v the velocity (m/s).
+        """[R, ω, J, v] of the three points (ECHO eq. 4): ω is the rotation since the previous frame as 6D, v the
+        velocity (m/s).
 
         `frame`: the canonical frame of the points, if it was computed already.
         """

@@ -70,8 +70,8 @@ class GuidedScene:
     def costs(
         self, x0_hat: Float[Tensor, "batch frame feature"], threshold: float
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Squared distances (m²) of body points in contact to the object, and of feet in contact to the floor: means over
-        each frame's points, summed over frames."""
+        """Squared distances (m²) of body points in contact to the object, and of feet in contact to the floor: means
+        over each frame's points, summed over frames."""
         mean, scale = self.net.motion_normalizer.mean.to(x0_hat), self.net.motion_normalizer.scale.to(x0_hat)
         human, scene_object, contact = (x0_hat * scale + mean).split(self.net.sizes, -1)
         body, T_object = (

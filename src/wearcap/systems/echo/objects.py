@@ -53,7 +53,8 @@ class ObjectShape:
 
     @property
     def spread(self) -> Float[Tensor, "3 3"]:
-        """Second moment of the cloud's points (m²), from which the points' mean squared displacement by a rotation follows."""
+        """Second moment of the cloud's points (m²), from which the points' mean squared displacement by a rotation
+        follows."""
         return self.cloud.mT @ self.cloud / len(self.cloud)
 
 
@@ -63,8 +64,8 @@ class ObjectReader:
     def __init__(
         self, features: EchoFeatures, encoder: PointNeXt | None, embed: Callable[[Tensor], Tensor] | None = None
     ):  # fmt: skip
-        """`encoder` None: codes are class and extents alone, for features without shape. `embed`: the network's layer on
-        codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
+        """`encoder` None: codes are class and extents alone, for features without shape. `embed`: the network's layer
+        on codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
         self.features, self.encoder, self._embed = features, encoder, embed
         self.nothing: Float[Tensor, "code"] = self._embedded(torch.zeros(1, features.object_condition_size))[
             0

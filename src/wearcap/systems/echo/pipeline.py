@@ -34,7 +34,8 @@ from wearcap.tracking.head_path import HeadPath, head_path
 
 @dataclass
 class Echo:
-    """Captures recordings with a rolling schedule over frames (the conveyor); batching recordings does not change results."""
+    """Captures recordings with a rolling schedule over frames (the conveyor); batching recordings does not change
+    results."""
 
     net: EchoDenoiser
     features: EchoFeatures
@@ -48,7 +49,8 @@ class Echo:
     context: int = 4
     """Clean frames kept before the ramp: a pose is final once window - context - 1 more frames have arrived."""
     per_frame: int = 2
-    """Denoising steps per new frame; with a window of 60 and a context of 4, each frame takes 112 in all (ECHO: 100)."""
+    """Denoising steps per new frame; with a window of 60 and a context of 4, each frame takes 112 in all (ECHO:
+    100)."""
     spacing: float = 2.0
     eta: float = 0.0
     step: str = "posterior"
@@ -139,8 +141,8 @@ class Echo:
     def scenario(self, recording: Recording, environment: Environment | None) -> Scenario:
         """A recording with its active objects, according to `acts`.
 
-        Without an environment, or without interactions and object poses, the human alone is captured, unless `acts` is a
-        list.
+        Without an environment, or without interactions and object poses, the human alone is captured, unless `acts`
+        is a list.
         """
         if self.acts == "truth":
             tracked = bool(recording.object_motion) or recording.interactions is not None
@@ -241,7 +243,8 @@ class Echo:
 
 
 def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str]) -> Motion:
-    """Outputs of one batch item as a motion, anchored to the measured head if `anchor`; observed frames are unchanged."""
+    """Outputs of one batch item as a motion, anchored to the measured head if `anchor`; observed frames are
+    unchanged."""
     path, contact = item.path, outputs.contact_prob[0]
     motion = Motion(
         path.timestamps, path.skeleton, outputs.R_parent_joint[0], outputs.t_world_root[0], contact[:, BODY_POINTS:],
@@ -270,8 +273,8 @@ def pulled_by(
 
 
 def object_tracks(item: BatchItem, outputs: Outputs) -> dict[str, Trajectory]:
-    """Poses of each object: as predicted while it is active, else constant since its last active frame (before the first:
-    as in the first)."""
+    """Poses of each object: as predicted while it is active, else constant since its last active frame (before the
+    first: as in the first)."""
     active = torch.where(item.conditioning.has_object[0], item.conditioning.object_number[0], -1.0)
     T = Rigid(outputs.R_world_object[0], outputs.t_world_object[0])
     tracks = {}

@@ -134,9 +134,9 @@ def _decoded(features: EchoFeatures, outputs: Float[Tensor, "time feature"], ite
 
 @dataclass(frozen=True, eq=False)
 class RigidWrist:
-    """Another method's body with the object rigidly attached to a wrist, at its class's mean offset from that wrist in
-    training frames with contact. The wrist is the one that is closer, on average over the object's active frames, to the
-    class's mean position relative to the head."""
+    """Another method's body with the object rigidly attached to a wrist, at its class's mean offset from that wrist
+    in training frames with contact. The wrist is the one that is closer, on average over the object's active frames,
+    to the class's mean position relative to the head."""
 
     features: EchoFeatures
     encoder: PointNeXt | None

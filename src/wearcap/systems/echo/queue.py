@@ -17,8 +17,8 @@ from wearcap.systems.echo.model import EchoDenoiser
 
 
 class Conditioning(NamedTuple):
-    """Conditioning of frames of several batch items: three tracked points, the active object, and observed values of the
-    outputs."""
+    """Conditioning of frames of several batch items: three tracked points, the active object, and observed values of
+    the outputs."""
 
     R_world_point: Float[Tensor, "batch frame point 3 3"]
     t_world_point: Float[Tensor, "batch frame point 3"]

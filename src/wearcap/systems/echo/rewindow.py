@@ -1,4 +1,5 @@
-"""Overlapping windows in place of the conveyor: each is denoised from scratch with its overlap inpainted (ECHO Fig. 3, left)."""
+"""Overlapping windows in place of the conveyor: each is denoised from scratch with its overlap inpainted (ECHO Fig.
+3, left)."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -14,8 +15,8 @@ from wearcap.systems.echo.queue import Conditioning, EchoQueue, Model, Outputs
 
 
 class Rewindow(EchoQueue):
-    """Windows that advance by `stride` frames: the last final frames (at most the context) are inpainted, the next `stride`
-    frames become final, and the rest is discarded.
+    """Windows that advance by `stride` frames: the last final frames (at most the context) are inpainted, the next
+    `stride` frames become final, and the rest is discarded.
 
     With the conveyor's context and steps, a frame sees as much of the past and future as on the conveyor.
     """

@@ -1,4 +1,5 @@
-"""ECHO's tables: metrics of body, object and contacts of whole recordings, and sparse observations of the ground truth."""
+"""ECHO's tables: metrics of body, object and contacts of whole recordings, and sparse observations of the ground
+truth."""
 
 from dataclasses import dataclass
 
@@ -58,7 +59,8 @@ class Truth:
 
 
 def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: ObjectReader) -> Truth:
-    """Ground truth at `timestamps` (s). Raises WearcapError for a recording without a motion or an active object's poses."""
+    """Ground truth at `timestamps` (s). Raises WearcapError for a recording without a motion or an active object's
+    poses."""
     recording, environment = scenario.recording, scenario.environment
     if recording.motion is None:
         raise WearcapError("no true motion to compare with", where=recording.name, expected="a recording with `motion`")  # fmt: skip
@@ -93,8 +95,8 @@ def _poses_at(track: Trajectory, times: Float64[Tensor, "time"]) -> Rigid:
 
 
 def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
-    """ECHO's metrics of one capture in world coordinates without alignment: body over all frames, object over the frames
-    in which one is active."""
+    """ECHO's metrics of one capture in world coordinates without alignment: body over all frames, object over the
+    frames in which one is active."""
     joints, true = motion.T_world_joint.t, truth.motion.T_world_joint.t
     skeleton = motion.skeleton
     scores = {

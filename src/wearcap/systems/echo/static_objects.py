@@ -34,8 +34,8 @@ def _ends(
 
 
 def inside(touched: Bool[Tensor, "batch frame"]) -> Bool[Tensor, "batch frame"]:
-    """Contacts without their first and last `INSIDE` frames; of a short contact the middle remains. Contacts at the first
-    or last frame count as continuing beyond it."""
+    """Contacts without their first and last `INSIDE` frames; of a short contact the middle remains. Contacts at the
+    first or last frame count as continuing beyond it."""
     count = touched.shape[1]
     frames, far = torch.arange(count), 2 * count
     start, stop = _ends(touched)
@@ -46,9 +46,9 @@ def inside(touched: Bool[Tensor, "batch frame"]) -> Bool[Tensor, "batch frame"]:
 
 
 def with_static_objects(conditioning: Conditioning, outputs: Outputs, threshold: float) -> Outputs:
-    """Outputs in which untouched objects are static: at their pose in the last contact or, before their first contact, at
-    its pose, both `INSIDE` frames within the contact. At the start of the next contact an object blends to its predicted
-    pose over `FADE` frames. Objects without any contact are unchanged."""
+    """Outputs in which untouched objects are static: at their pose in the last contact or, before their first
+    contact, at its pose, both `INSIDE` frames within the contact. At the start of the next contact an object blends
+    to its predicted pose over `FADE` frames. Objects without any contact are unchanged."""
     touched, observed = is_touched(conditioning, outputs, threshold), conditioning.is_observed[..., 1]
     active = torch.where(conditioning.has_object, conditioning.object_number, -1.0)
     count = active.shape[1]
@@ -78,15 +78,15 @@ def _taken(R: Tensor, t: Tensor, frame: Int64[Tensor, "batch frame"]) -> Rigid:
 def _static(
     outputs: Outputs, predicted: Rigid, left: Rigid, found: Rigid, weight: Float[Tensor, "batch frame"]
 ) -> Outputs:
-    """Predicted object poses, corrected by the share `weight` of the difference between the static pose (`left`) and the
-    predicted pose at the contact's start (`found`); rotation in world axes about the centre."""
+    """Predicted object poses, corrected by the share `weight` of the difference between the static pose (`left`) and
+    the predicted pose at the contact's start (`found`); rotation in world axes about the centre."""
     turn = rotation.exp(weight[..., None] * rotation.log(left.R @ found.R.mT))
     return outputs._replace(R_world_object=turn @ predicted.R, t_world_object=predicted.t + weight[..., None] * (left.t - found.t))  # fmt: skip
 
 
 class StaticObjects:
-    """The causal static-object constraint, frame by frame for one batch item: an untouched object keeps its last touched
-    pose and blends from it when touched again; before its first contact it is unchanged."""
+    """The causal static-object constraint, frame by frame for one batch item: an untouched object keeps its last
+    touched pose and blends from it when touched again; before its first contact it is unchanged."""
 
     def __init__(self, threshold: float):
         self.threshold = threshold

@@ -22,8 +22,8 @@ MOST_WINDOWS = 8
 class EchoPlans:
     """Cache of a network's level-dependent activations (`EchoDenoiser.plan`), computed once per triple of levels.
 
-    The network's weights must not change. Triples repeat between frames, while the levels of whole windows rarely do when
-    an object enters: its first frame moves through the window.
+    The network's weights must not change. Triples repeat between frames, while the levels of whole windows rarely do
+    when an object enters: its first frame moves through the window.
     """
 
     def __init__(self, net: EchoDenoiser):
@@ -134,7 +134,8 @@ class EchoRunner:
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Callable[[Tensor, Tensor], Tensor]:
-        """x̂0 as a function of x_t "batch time feature" and levels "batch time modality"; the condition is encoded once.
+        """x̂0 as a function of x_t "batch time feature" and levels "batch time modality"; the condition is encoded
+        once.
 
         Inputs and outputs are on the CPU.
         """

@@ -1,7 +1,7 @@
 """Streaming ECHO: tracked points go in as they arrive, bodies and objects come out frame by frame.
 
-The outputs equal those of `Echo` on the whole recording with the same seed, up to inputs that arrive too late; the latency
-of a pose is `Echo.latency_s`. Memory use is bounded.
+The outputs equal those of `Echo` on the whole recording with the same seed, up to inputs that arrive too late; the
+latency of a pose is `Echo.latency_s`. Memory use is bounded.
 """
 
 import math
@@ -228,7 +228,8 @@ class EchoSession:
     def poses(self, ended: bool = False) -> Motion | None:
         """Frames that became final since the last call, or None; `ended`: no more input will arrive.
 
-        After the head device's clock was set back, this returns the frames before; call again for those on the new clock.
+        After the head device's clock was set back, this returns the frames before; call again for those on the new
+        clock.
         """
         if ended:
             for time, pose in self._entry.end():
@@ -311,7 +312,8 @@ class EchoSession:
         return torch.ones(1, dtype=torch.bool), self._shapes[name].code[None], number
 
     def _with_observed_object(self, conditioning: Conditioning, time: float) -> Conditioning:
-        """Conditioning of a frame with the active object's pose observed nearest in time, if one is within half a frame."""
+        """Conditioning of a frame with the active object's pose observed nearest in time, if one is within half a
+        frame."""
         if not conditioning.has_object.item():
             return conditioning
         active, near = list(self._shapes)[int(conditioning.object_number)], 0.5 / self.pipeline.fps + 1e-6

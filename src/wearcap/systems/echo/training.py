@@ -27,11 +27,11 @@ from wearcap.training.base import SeededSteps, WeighedTerms
 class EchoDiffusion(SeededSteps, WeighedTerms):
     """x0-prediction with an independent noise level for every frame and modality.
 
-    Loss terms, weighted by `loss_weights`: "human", "object" and "contact" are mean squares in normalised space (the first
-    three of eq. 12; squares are ours: their minimiser is the posterior mean, which the sampler's step expects as x̂0);
-    "object_vertices" (root mean square over the surface, in closed form without vertices), "joints" and "skate" are
-    distances in metres (its last three); "velocity" of the joints is ours. Frames without an active object do not count
-    in the object terms.
+    Loss terms, weighted by `loss_weights`: "human", "object" and "contact" are mean squares in normalised space (the
+    first three of eq. 12; squares are ours: their minimiser is the posterior mean, which the sampler's step expects
+    as x̂0); "object_vertices" (root mean square over the surface, in closed form without vertices), "joints" and
+    "skate" are distances in metres (its last three); "velocity" of the joints is ours. Frames without an active
+    object do not count in the object terms.
     """
 
     def __init__(
@@ -90,8 +90,8 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
             self.encoder.load_state_dict(dataset.encoder.state_dict())
 
     def _range(self, rows: Float[Tensor, "row value"]) -> tuple[Tensor, Tensor]:
-        """Mean and scale per value. If outputs are re-expressed as the window advances, root and object vectors get zero
-        mean and one scale each, so that isotropic noise stays isotropic under rotation."""
+        """Mean and scale per value. If outputs are re-expressed as the window advances, root and object vectors get
+        zero mean and one scale each, so that isotropic noise stays isotropic under rotation."""
         if not len(rows):
             return torch.zeros(rows.shape[1]), torch.ones(rows.shape[1])
         mean, scale = rows.mean(0), rows.std(0).clamp_min(MIN_SCALE)

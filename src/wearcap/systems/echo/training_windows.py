@@ -59,7 +59,8 @@ class EchoWindow(NamedTuple):
     noise: Float[Tensor, "*batch time feature"]
     level_draws: Float[Tensor, "*batch time 4"]
     draws: Float[Tensor, "*batch draw"]
-    """Diffusion noise and the uniform draws for noise levels: functions of seed and step, independent of worker processes."""
+    """Diffusion noise and the uniform draws for noise levels: functions of seed and step, independent of worker
+    processes."""
 
     @property
     def points(self) -> ThreePoints:
@@ -113,7 +114,8 @@ def three_points(recording: Recording, take: Tensor) -> ThreePoints:
 def echo_track(
     recording: Recording, environment: Environment | None, reader: ObjectReader, every: int, within_m: float
 ) -> EchoTrack:
-    """Every `every`-th frame of a recording with ground truth; contact is a distance to the object within `within_m`."""
+    """Every `every`-th frame of a recording with ground truth; contact is a distance to the object within
+    `within_m`."""
     motion = recording.motion
     assert motion is not None
     take = torch.arange(0, len(motion), every)
@@ -164,8 +166,8 @@ class EchoDataset(Dataset):
         stride: int, mirror: bool = False, balance: float = 1.0, beginnings: float = 0.0, within_m: float = TOUCH_M,
         objects: bool = True,
     ):  # fmt: skip
-        """`beginnings` is the share of windows that are not full, as the first and last ones of a capture; with `objects`
-        False all recordings are of humans alone."""
+        """`beginnings` is the share of windows that are not full, as the first and last ones of a capture; with
+        `objects` False all recordings are of humans alone."""
         self.features, self.encoder = features, encoder
         self.window, self.stride, self.mirror = window, stride, mirror
         self.beginnings, self.within_m, self.objects = beginnings, within_m, objects
@@ -218,8 +220,8 @@ class EchoDataset(Dataset):
     def _cut(
         self, track: EchoTrack, start: int, length: int, mirrored: bool, random: torch.Generator
     ) -> EchoWindow:
-        """Frames start…start+length-1, padded to a full window by repeating the last one; with the codes of the mirrored
-        objects if the window will be mirrored."""
+        """Frames start…start+length-1, padded to a full window by repeating the last one; with the codes of the
+        mirrored objects if the window will be mirrored."""
         stop = min(start + length, len(track.floor_height))
         take = start + torch.arange(self.window).clamp_max(stop - start - 1)
         active = track.active[take]
