@@ -31,8 +31,7 @@ _BUILDS = (
     {"muscle": 0.5, "weight": 1.0},
     {"muscle": 0.0, "weight": 1.0},
 )
-"""Phenotypes from the lightest to the heaviest (about 44 to 112 kg at 1.72 m): Anny's weight alone spans 58 to 72
-kg."""
+"""Phenotypes from lightest to heaviest (about 44 to 112 kg at 1.72 m): Anny's weight alone spans 58 to 72 kg."""
 
 
 def anny_body(

@@ -32,8 +32,7 @@ def reach(
     end: Float[Tensor, "*batch 3"],
     goal: Float[Tensor, "*batch 3"],
 ) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 3"]]:
-    """World rotations to multiply from the left onto those of the upper and the lower bone so that `end` reaches
-    `goal`.
+    """World rotations to left-multiply onto those of the upper and the lower bone so that `end` reaches `goal`.
 
     Bone lengths and the plane of the bend are kept; a goal out of reach is approached along its direction.
     """

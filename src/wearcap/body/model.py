@@ -26,8 +26,7 @@ class BodyModel:
     regions: dict[str, Int64[Tensor, "_"]] = field(default_factory=dict)
     """Vertices of {left,right}_{toes,heel,sole,palm}."""
     pose_blend: Float[Tensor, "feature vertex 3"] | None = None
-    """Pose blend shapes (SMPL): offsets of the rest surface per entry of (R_parent_joint - I) of all joints but the
-    root."""
+    """Pose blend shapes (SMPL): offsets of the rest surface per entry of (R_parent_joint - I), without the root."""
 
     def vertices(self, T_world_joint: Rigid, region: str | None = None) -> Float[Tensor, "*batch vertex 3"]:
         """World positions (m) by linear blend skinning, of all vertices or of one region's.

@@ -1,5 +1,4 @@
-"""Checks of `.pt2` archives before loading: PyTorch runs some of their strings as Python, so only known forms are
-allowed."""
+"""Checks of `.pt2` archives before loading: PyTorch runs some strings as Python, so only known forms are allowed."""
 
 import re
 import zipfile

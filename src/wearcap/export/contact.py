@@ -33,8 +33,7 @@ class _MiddleFrame(nn.Module):
 def export_contact(detector: ContactDetector, path: str | Path, format: str) -> ExportReport:
     """Write a detector's network as `path` (.onnx or .pt2) and its sidecar as the same name with .json.
 
-    Its input is `pose` "batch 61 feature", its output probabilities "batch hand class". Raises what `export_network`
-    raises.
+    It maps `pose` "batch 61 feature" to probabilities "batch hand class". Raises what `export_network` raises.
     """
     skeleton, random = detector.features.skeleton, torch.Generator().manual_seed(0)
     turns = 0.3 * torch.randn(3, FRAMES, len(skeleton), 3, generator=random)

@@ -76,8 +76,7 @@ class EchoFeatures:
 
     @property
     def condition_size(self) -> int:
-        """Features per frame: 54 (ECHO), 2 more of the heading if frame is "own", and the head's height and limb
-        lengths."""
+        """Features per frame: 54 (ECHO), 2 of the heading if frame is "own", and the head's height and limb lengths."""
         return 54 + (2 if self.frame == "own" else 0) + (1 + len(LIMBS) if self.body else 0)
 
     @property

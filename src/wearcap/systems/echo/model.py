@@ -31,8 +31,7 @@ class EchoPlan(NamedTuple):
 
 
 class EchoDenoiser(nn.Module):
-    """(x̂_H, x̂_O, x̂_I) = D(x_t, levels, E, C_O), the three modalities side by side in the features of a frame (eq.
-    7).
+    """(x̂_H, x̂_O, x̂_I) = D(x_t, levels, E, C_O), with the modalities concatenated per frame (ECHO eq. 7).
 
     `streams` 1: one token per frame, the sum of its modalities' embeddings. 3: one token per frame and modality,
     sharing the frame's position. The active object conditions each frame (ours: ECHO has one object per window), so
@@ -91,8 +90,7 @@ class EchoDenoiser(nn.Module):
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time width"]:
-        """Encoded condition of each frame, the same in every step. `scene_object`: object codes, embedded by
-        `self.object`."""
+        """Encoded condition of each frame, the same in every step. `scene_object`: codes embedded by `self.object`."""
         mask = valid[..., None].to(condition.dtype)
         wide = self.widen(torch.cat([self.condition_normalizer(condition) * mask, mask], -1))
         scene_object = torch.where(has_object[..., None], scene_object, self.no_object)

@@ -106,8 +106,7 @@ class ObjectClouds(SeededWindows):
         seed: int = 0,
         augmentation: CloudAugmentation | None = None,
     ):
-        """`per_class` objects of each of `classes` for training, `val_per_class` others for validation, cached in
-        `root`.
+        """`per_class` objects per class for training and `val_per_class` others for validation, cached in `root`.
 
         `generate` creates missing clouds from a split, classes, a number of objects per class and a number of points:
         clouds "object point 3" (m) and class indices "object". A batch has `batch_size` objects with two views each.

@@ -53,8 +53,7 @@ class ObjectShape:
 
     @property
     def spread(self) -> Float[Tensor, "3 3"]:
-        """Second moment of the cloud's points (m²), from which the points' mean squared displacement by a rotation
-        follows."""
+        """Second moment of the cloud's points (m²), which gives their mean squared displacement by a rotation."""
         return self.cloud.mT @ self.cloud / len(self.cloud)
 
 

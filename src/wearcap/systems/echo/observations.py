@@ -1,5 +1,4 @@
-"""ECHO's conditioning from a recording, at the model's rate: tracked points, floor, active objects, and
-observations."""
+"""ECHO's conditioning from a recording at the model's rate: tracked points, floor, active objects, observations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -127,8 +126,8 @@ def _tracked_points(
 
 
 def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
-    """Poses of a tracked wrist at any times; in gaps longer than `MAX_GAP_S` and after the end the last pose is
-    kept."""
+    """Poses of a tracked wrist at any times; gaps longer than `MAX_GAP_S` and times after the end have the last
+    pose."""
     times = track.timestamps
     inside = at.clamp(times[0].item(), times[-1].item())
     last = (torch.searchsorted(times, inside + SAME_S, right=True) - 1).clamp_min(0)

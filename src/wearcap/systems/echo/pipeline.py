@@ -34,8 +34,7 @@ from wearcap.tracking.head_path import HeadPath, head_path
 
 @dataclass
 class Echo:
-    """Captures recordings with a rolling schedule over frames (the conveyor); batching recordings does not change
-    results."""
+    """Captures recordings with a rolling schedule over frames (the conveyor); batching does not change results."""
 
     net: EchoDenoiser
     features: EchoFeatures
@@ -49,8 +48,7 @@ class Echo:
     context: int = 4
     """Clean frames kept before the ramp: a pose is final once window - context - 1 more frames have arrived."""
     per_frame: int = 2
-    """Denoising steps per new frame; with a window of 60 and a context of 4, each frame takes 112 in all (ECHO:
-    100)."""
+    """Denoising steps per new frame; with a window of 60 and a context of 4 a frame takes 112 in all (ECHO: 100)."""
     spacing: float = 2.0
     eta: float = 0.0
     step: str = "posterior"
@@ -243,8 +241,7 @@ class Echo:
 
 
 def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str]) -> Motion:
-    """Outputs of one batch item as a motion, anchored to the measured head if `anchor`; observed frames are
-    unchanged."""
+    """Outputs of one batch item as a motion, if `anchor` anchored to the measured head except in observed frames."""
     path, contact = item.path, outputs.contact_prob[0]
     motion = Motion(
         path.timestamps, path.skeleton, outputs.R_parent_joint[0], outputs.t_world_root[0], contact[:, BODY_POINTS:],

@@ -1,5 +1,4 @@
-"""Overlapping windows in place of the conveyor: each is denoised from scratch with its overlap inpainted (ECHO Fig.
-3, left)."""
+"""Overlapping windows in place of the conveyor, denoised from scratch with inpainted overlap (ECHO Fig. 3, left)."""
 
 from collections.abc import Sequence
 from itertools import pairwise

@@ -1,5 +1,4 @@
-"""ECHO's tables: metrics of body, object and contacts of whole recordings, and sparse observations of the ground
-truth."""
+"""ECHO's tables: metrics of body, object and contacts, and sparse observations drawn from the ground truth."""
 
 from dataclasses import dataclass
 
@@ -59,8 +58,7 @@ class Truth:
 
 
 def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: ObjectReader) -> Truth:
-    """Ground truth at `timestamps` (s). Raises WearcapError for a recording without a motion or an active object's
-    poses."""
+    """Ground truth at `timestamps` (s). Raises WearcapError if motion or an active object's poses are missing."""
     recording, environment = scenario.recording, scenario.environment
     if recording.motion is None:
         raise WearcapError("no true motion to compare with", where=recording.name, expected="a recording with `motion`")  # fmt: skip

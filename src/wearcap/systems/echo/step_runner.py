@@ -134,8 +134,7 @@ class EchoRunner:
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Callable[[Tensor, Tensor], Tensor]:
-        """x̂0 as a function of x_t "batch time feature" and levels "batch time modality"; the condition is encoded
-        once.
+        """x̂0 as a function of x_t "batch time feature" and levels "batch time modality", encoding conditions once.
 
         Inputs and outputs are on the CPU.
         """

@@ -228,8 +228,7 @@ class EchoSession:
     def poses(self, ended: bool = False) -> Motion | None:
         """Frames that became final since the last call, or None; `ended`: no more input will arrive.
 
-        After the head device's clock was set back, this returns the frames before; call again for those on the new
-        clock.
+        After the head device's clock was set back, the frames before come first; call again for the new clock's.
         """
         if ended:
             for time, pose in self._entry.end():
@@ -312,8 +311,7 @@ class EchoSession:
         return torch.ones(1, dtype=torch.bool), self._shapes[name].code[None], number
 
     def _with_observed_object(self, conditioning: Conditioning, time: float) -> Conditioning:
-        """Conditioning of a frame with the active object's pose observed nearest in time, if one is within half a
-        frame."""
+        """The conditioning with the active object's observation nearest in time, if one is within half a frame."""
         if not conditioning.has_object.item():
             return conditioning
         active, near = list(self._shapes)[int(conditioning.object_number)], 0.5 / self.pipeline.fps + 1e-6

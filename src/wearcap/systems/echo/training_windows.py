@@ -59,8 +59,7 @@ class EchoWindow(NamedTuple):
     noise: Float[Tensor, "*batch time feature"]
     level_draws: Float[Tensor, "*batch time 4"]
     draws: Float[Tensor, "*batch draw"]
-    """Diffusion noise and the uniform draws for noise levels: functions of seed and step, independent of worker
-    processes."""
+    """Diffusion noise and uniform draws for noise levels: functions of seed and step, whatever the worker process."""
 
     @property
     def points(self) -> ThreePoints:
@@ -114,8 +113,7 @@ def three_points(recording: Recording, take: Tensor) -> ThreePoints:
 def echo_track(
     recording: Recording, environment: Environment | None, reader: ObjectReader, every: int, within_m: float
 ) -> EchoTrack:
-    """Every `every`-th frame of a recording with ground truth; contact is a distance to the object within
-    `within_m`."""
+    """Every `every`-th frame of a recording with ground truth; contact is a distance of at most `within_m` (m)."""
     motion = recording.motion
     assert motion is not None
     take = torch.arange(0, len(motion), every)
