@@ -202,7 +202,7 @@ class Echo:
         shapes: Sequence[dict[str, float]],
         objects: Sequence[Sequence[ObjectShape]],
     ) -> EchoQueue:
-        """An empty queue of as many lanes, with what guidance pulls at where there is guidance."""
+        """An empty queue for a batch, with the bodies and objects that guidance needs, if any."""
         queue = EchoQueue(self, skeletons, seeds)
         if self.rewindow is not None:
             queue = Rewindow(self, skeletons, seeds, self.rewindow)
