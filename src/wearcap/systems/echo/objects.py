@@ -66,9 +66,8 @@ class ObjectReader:
         """`encoder` None: codes are class and extents alone, for features without shape. `embed`: the network's layer
         on codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
         self.features, self.encoder, self._embed = features, encoder, embed
-        self.nothing: Float[Tensor, "code"] = self._embedded(torch.zeros(1, features.object_condition_size))[
-            0
-        ]
+        empty = torch.zeros(1, features.object_condition_size)
+        self.nothing: Float[Tensor, "code"] = self._embedded(empty)[0]
         """Placeholder code for frames without an active object."""
         self._shapes: dict[tuple[int, str], ObjectShape] = {}
 
