@@ -1,4 +1,4 @@
-"""A walking person who carries boxes beside their wrists, without errors, and an ECHO whose network has drawn weights."""
+"""A walking person who carries boxes beside the wrists, free of measurement errors, and an ECHO with random weights."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,11 +31,11 @@ HALF, MIDDLE = np.array([0.15, 0.1, 0.05]), np.array([0.04, 0.0, 0.02])
 GRIP = Rigid(rotation.exp(torch.tensor([0.2, 0.4, -0.7])), torch.tensor([0.08, 0.0, -0.06]))
 """T_wrist_box."""
 CARRIED = (("box_1", "left", 0.4, 1.2),)
-"""Box, side, from when to when (s) it is told to be held; it is beside that wrist all the time."""
+"""Box, side, start and stop (s) of its interaction; the box is beside that wrist all the time."""
 
 
 def box_mesh(half=HALF, middle=MIDDLE) -> Mesh:
-    """A box about a point of its own axes."""
+    """A box centred on a point `middle` of its own axes (m)."""
     return mesh_between(np.subtract(middle, half), np.add(middle, half))
 
 
@@ -44,7 +44,7 @@ def scene_object(name: str, category: str = "box", mesh: Mesh | None = None) -> 
 
 
 def boxes(carried=CARRIED) -> Environment:
-    """The boxes that are carried, the second one a chair of other measures."""
+    """An environment with the carried boxes; the second one is a chair of another size."""
     names = dict.fromkeys(name for name, *_ in carried)
     return Environment(
         tuple(
@@ -65,13 +65,13 @@ def carrying(seconds: float = 2.0, name: str = "carry", carried=CARRIED, fps: fl
         tracks[box] = Trajectory(time, T.R, T.t)
     start, stop = (torch.tensor([row[k] for row in carried], dtype=torch.float64) for k in (2, 3))
     hands = torch.tensor([[row[1] == "left", row[1] == "right"] for row in carried]).bool().reshape(-1, 2)
-    observation = Interactions(
+    interactions = Interactions(
         start, stop, hands, tuple(row[0] for row in carried), ("sliding",) * len(carried)
     )
     return Recording(
         name, head=HeadStream(time, T_world_device.R, T_world_device.t, SEAT.R, SEAT.t), motion=motion,
         contacts=ContactTrack(time, FOOT_PATCHES, contact), floor=FloorTrack(time, torch.zeros(len(time))),
-        skeleton=motion.skeleton, object_motion=tracks, interactions=observation if carried else None,
+        skeleton=motion.skeleton, object_motion=tracks, interactions=interactions if carried else None,
         subject=f"subject_{name}", location="nowhere", license="MIT",
     )  # fmt: skip
 
@@ -93,7 +93,7 @@ def small_features(frame: str = "own", **changes) -> EchoFeatures:
 
 
 def small_net(features: EchoFeatures, **changes) -> EchoDenoiser:
-    """Drawn weights, and statistics with which anything it says is a pose."""
+    """A network with random weights, and statistics with which any output is a valid pose."""
     torch.manual_seed(0)
     sizes = (
         features.human_size,
@@ -114,13 +114,13 @@ def small_net(features: EchoFeatures, **changes) -> EchoDenoiser:
 
 
 def drawn_echo(frame: str = "own", net=None, **settings) -> Echo:
-    """A small pipeline; a pose is final when seven frames have followed it, and objects are as drawn."""
+    """A small pipeline with a lookahead of seven frames and without the static-object constraint."""
     features = small_features(frame)
-    given = {"context": 8, "per_frame": 1, "static_threshold": None, **settings}
-    return Echo(net or small_net(features), features, CosineSchedule(), xsens23(), **given)
+    settings = {"context": 8, "per_frame": 1, "static_threshold": None, **settings}
+    return Echo(net or small_net(features), features, CosineSchedule(), xsens23(), **settings)
 
 
 def scenario_of(recording: Recording, carried=CARRIED, margin_s: float = 0.1, **changes) -> Scenario:
-    """What is told of a walk with boxes."""
+    """The scenario of a walk with boxes."""
     acts = tuple(true_acts(recording, margin_s)) if recording.object_motion else ()
     return Scenario(recording, boxes(carried), acts, **changes)

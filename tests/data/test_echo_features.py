@@ -1,4 +1,4 @@
-"""What ECHO is told and says: it comes back as it went in, and does not depend on north where it must not."""
+"""ECHO's features: encoding is invertible, and independent of heading and position where it must be."""
 
 import pytest
 import torch
@@ -16,8 +16,8 @@ BOX = "box_1"
 
 
 @pytest.fixture(scope="module")
-def conditioning() -> tuple[ThreePoints, Body, Rigid, torch.Tensor]:
-    """Of a walk: tracked points, body, box, floor; each with a batch axis of one."""
+def walked() -> tuple[ThreePoints, Body, Rigid, torch.Tensor]:
+    """Tracked points, body, box and floor of a walk; each with a batch axis of one."""
     recording = carrying(1.0)
     motion, track = recording.motion, recording.object_motion[BOX]
     at = motion.T_world_joint[:, motion.skeleton.indices("head", "left_wrist", "right_wrist")]
@@ -31,8 +31,8 @@ def moved(points: ThreePoints) -> ThreePoints:
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_body_and_object_come_back_as_they_went_in(conditioning, frame):
-    points, body, box, _ = conditioning
+def test_body_and_object_come_back_as_they_went_in(walked, frame):
+    points, body, box, _ = walked
     features = small_features(frame)
     at = features.canonical(points)
     human, scene_object = features.encode_body(body, at), features.encode_object(box, at)
@@ -46,17 +46,17 @@ def test_body_and_object_come_back_as_they_went_in(conditioning, frame):
 
 @pytest.mark.parametrize("body", [True, False])
 @pytest.mark.parametrize(("frame", "size"), [("window", 54), ("world", 54), ("own", 56)])
-def test_sizes_are_the_documents(conditioning, frame, size, body):
+def test_sizes_are_the_papers(walked, frame, size, body):
     features = small_features(frame, body=body)
     assert features.condition_size == size + 5 * body
-    points, *_, floor = conditioning
+    points, *_, floor = walked
     assert features.condition(points, floor, SIZE).shape == (1, 30, features.condition_size)
     assert features.moves == (frame == "window")
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_north_and_place_matter_in_the_world_alone(conditioning, frame):
-    points, body, box, floor = conditioning
+def test_north_and_place_matter_in_the_world_alone(walked, frame):
+    points, body, box, floor = walked
     features, turned = small_features(frame), moved(points)
     here, there = features.canonical(points), features.canonical(turned)
     root = TURN @ Rigid(body.R_parent_joint[:, :, 0], body.t_world_root)
@@ -71,8 +71,8 @@ def test_north_and_place_matter_in_the_world_alone(conditioning, frame):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_canonical_frames_are_the_heads_and_upright(conditioning, frame):
-    points, *_ = conditioning
+def test_canonical_frames_are_the_heads_and_upright(walked, frame):
+    points, *_ = walked
     at = small_features(frame).canonical(points)
     up = at.R[..., 2]
     torch.testing.assert_close(up, torch.tensor([0.0, 0.0, 1.0]).expand_as(up))
@@ -82,29 +82,29 @@ def test_canonical_frames_are_the_heads_and_upright(conditioning, frame):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_what_is_told_is_eq_4(conditioning, frame):
-    """Rotations, their turns since the frame before, places and velocities, written out point by point."""
-    points, *_, floor = conditioning
+def test_the_condition_is_eq_4(walked, frame):
+    """Rotations, their change since the previous frame, positions and velocities, written out point by point."""
+    points, *_, floor = walked
     features = small_features(frame, body=False)
-    told_so = features.condition(points, floor, SIZE)[0]
+    condition = features.condition(points, floor, SIZE)[0]
     at, (R, t) = features.canonical(points), points
     for k in (1, 17):
         own = at.R[0, min(k, at.R.shape[1] - 1)].mT
         origin = at.t[0, min(k, at.t.shape[1] - 1)]
         for p in range(3):
             turned = own @ R[0, k, p]
-            torch.testing.assert_close(told_so[k, 6 * p : 6 * p + 6], turned[:, :2].T.flatten(), atol=1e-5, rtol=0)  # fmt: skip
+            torch.testing.assert_close(condition[k, 6 * p : 6 * p + 6], turned[:, :2].T.flatten(), atol=1e-5, rtol=0)  # fmt: skip
             step = R[0, k - 1, p].mT @ R[0, k, p]
-            torch.testing.assert_close(told_so[k, 18 + 6 * p : 24 + 6 * p], step[:, :2].T.flatten(), atol=1e-5, rtol=0)  # fmt: skip
+            torch.testing.assert_close(condition[k, 18 + 6 * p : 24 + 6 * p], step[:, :2].T.flatten(), atol=1e-5, rtol=0)  # fmt: skip
             velocity = own @ (t[0, k, p] - t[0, k - 1, p]) * 30
-            torch.testing.assert_close(told_so[k, 45 + 3 * p : 48 + 3 * p], velocity, atol=1e-4, rtol=0)
+            torch.testing.assert_close(condition[k, 45 + 3 * p : 48 + 3 * p], velocity, atol=1e-4, rtol=0)
             if p or frame != "own":
                 place = own @ (t[0, k, p] - origin)
-                torch.testing.assert_close(told_so[k, 36 + 3 * p : 39 + 3 * p], place, atol=1e-5, rtol=0)
+                torch.testing.assert_close(condition[k, 36 + 3 * p : 39 + 3 * p], place, atol=1e-5, rtol=0)
 
 
-def test_in_its_own_frame_the_head_is_told_from_the_windows_first_one(conditioning):
-    points, *_, floor = conditioning
+def test_in_its_own_frame_the_heads_path_is_relative_to_the_windows_first_frame(walked):
+    points, *_, floor = walked
     own, window = (small_features(frame, body=False).condition(points, floor, SIZE) for frame in ("own", "window"))  # fmt: skip
     torch.testing.assert_close(own[..., 36:39], window[..., 36:39], atol=1e-5, rtol=0)
     heading = own[0, :, 54:]
@@ -112,13 +112,13 @@ def test_in_its_own_frame_the_head_is_told_from_the_windows_first_one(conditioni
     torch.testing.assert_close(heading[0], torch.tensor([1.0, 0.0]), atol=1e-5, rtol=0)
 
 
-def test_a_single_frame_can_be_told():
+def test_a_single_frame_can_be_encoded():
     points = ThreePoints(torch.eye(3).expand(1, 1, 3, 3, 3), torch.rand(1, 1, 3, 3))
-    conditioning = small_features().condition(points, torch.zeros(1, 1), SIZE)
-    assert conditioning.isfinite().all()
+    condition = small_features().condition(points, torch.zeros(1, 1), SIZE)
+    assert condition.isfinite().all()
 
 
-def test_classes_are_told_by_one_number_each():
+def test_classes_are_one_hot_codes():
     features = small_features()
     codes = torch.stack([features.class_code(name) for name in CLASSES])
     assert torch.equal(codes, torch.eye(len(CLASSES)))

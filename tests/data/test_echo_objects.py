@@ -1,4 +1,4 @@
-"""Objects as ECHO is told them, and which points of a body are on them."""
+"""Objects as conditions of ECHO, and contact of body points with them."""
 
 import pytest
 import torch
@@ -26,7 +26,7 @@ def distance_to_box(points: torch.Tensor) -> torch.Tensor:
     return torch.where(outside > 0, outside, -beyond.amax(-1))
 
 
-def test_it_is_told_by_class_and_extents(shape):
+def test_its_code_is_class_and_extents(shape):
     assert shape.code[:2].tolist() == [1.0, 0.0]
     torch.testing.assert_close(shape.code[2:5], torch.tensor(HALF).float(), atol=5e-3, rtol=0)
     torch.testing.assert_close(shape.middle, torch.tensor(MIDDLE).float(), atol=5e-3, rtol=0)
@@ -38,13 +38,13 @@ def test_its_feature_is_the_encoders_and_its_mirror_images(shape):
     torch.manual_seed(0)
     encoder = PointNeXt(4, (6,), (0,), (8,), 0.3).eval()
     reader = ObjectReader(small_features(shape_size=encoder.size), encoder)
-    conditioning = reader(scene_object("box_1"))
-    assert len(conditioning.code) == reader.features.object_condition_size
-    torch.testing.assert_close(conditioning.code[8:], encoder(conditioning.cloud[None])[0], atol=1e-5, rtol=0)
-    flipped = conditioning.cloud * torch.tensor([1.0, -1.0, 1.0])
-    torch.testing.assert_close(conditioning.code_mirrored[8:], encoder(flipped[None])[0], atol=1e-5, rtol=0)
-    assert torch.equal(conditioning.code[:2], conditioning.code_mirrored[:2])
-    assert not conditioning.code.requires_grad
+    encoded = reader(scene_object("box_1"))
+    assert len(encoded.code) == reader.features.object_condition_size
+    torch.testing.assert_close(encoded.code[8:], encoder(encoded.cloud[None])[0], atol=1e-5, rtol=0)
+    flipped = encoded.cloud * torch.tensor([1.0, -1.0, 1.0])
+    torch.testing.assert_close(encoded.code_mirrored[8:], encoder(flipped[None])[0], atol=1e-5, rtol=0)
+    assert torch.equal(encoded.code[:2], encoded.code_mirrored[:2])
+    assert not encoded.code.requires_grad
 
 
 def test_a_mesh_is_read_once_for_all_objects_that_have_it():
@@ -98,6 +98,6 @@ def test_poses_are_the_recordings_or_the_environments(shape):
     torch.testing.assert_close(still.t, shape.middle.expand(2, 3))
 
 
-def test_a_class_that_is_not_known_is_named():
+def test_an_unknown_class_is_named():
     with pytest.raises(WearcapError, match="no object class 'piano'. Expected one of box, chair"):
         ObjectReader(small_features(), None)(scene_object("p", "piano"))

@@ -190,7 +190,7 @@ def test_an_object_may_change_within_a_window():
     assert not torch.equal(window.object_spread[4], window.object_spread[5])
 
 
-def test_a_track_without_an_active_object_says_so():
+def test_a_track_without_an_active_object_has_index_minus_one():
     recording = carrying(4.0, carried=(("box_1", "left", 3.5, 3.8),))
     track = track_of(recording, boxes())
     assert (track.active[:40] == -1).all()
@@ -222,7 +222,7 @@ def test_windows_travel_to_other_processes(root):
     assert torch.equal(next(iter(loader))[0].t_world_root, windows[0].t_world_root)
 
 
-def test_the_measured_head_is_told_and_not_the_true_one():
+def test_the_measured_head_is_the_condition_and_not_the_true_one():
     recording = carrying(0.5)
     head = replace(recording.head, t_world_device=recording.head.t_world_device + 0.1)
     track = track_of(replace(recording, head=head))

@@ -80,7 +80,7 @@ def test_rotations_are_rotations_and_uniform():
     assert trace.square().mean() == pytest.approx(1.0, abs=0.1)
 
 
-def test_views_are_turned_as_told():
+def test_views_are_rotated_as_configured():
     points = object_cloud(two_triangles(), 500)
     still = CloudAugmentation(stretch=0.0, jitter_m=0.0, least_kept=0.6, turned=0.0)
     view = still(points, torch.Generator().manual_seed(3))

@@ -1,4 +1,4 @@
-"""ECHO's network leaves the house: the same motion from the file, and files that do not belong are refused."""
+"""Exported ECHO: the same motion from the file, and files that do not belong together are refused."""
 
 import json
 import shutil
@@ -42,10 +42,10 @@ def exports(tmp_path_factory):
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_the_file_says_what_the_network_says(exports, format):
+def test_the_file_predicts_what_the_network_predicts(exports, format):
     report, eager = exports[format], drawn()
     assert report.max_abs_error < 1e-4
-    # Long enough for windows that fill, run and end, and a lane that ends before the other.
+    # Long enough for windows that fill, run and end, and a batch item that ends before the other.
     scenarios = [scenario_of(carrying(1.3)), scenario_of(carrying(0.9))]
     there = replace(load_exported_echo(report.path), guidance=None)
     for motion, expected in zip(*(echo.capture_scenarios(scenarios, [3, 4]) for echo in (there, eager))):
@@ -57,7 +57,7 @@ def test_the_file_says_what_the_network_says(exports, format):
             torch.testing.assert_close(found.t_world_body, track.t_world_body, atol=1e-3, rtol=0)
 
 
-def test_the_sidecar_tells_everything_else(exports):
+def test_the_sidecar_has_everything_else(exports):
     pipeline, there = drawn(guidance=Guidance(object=2.0)), load_exported_echo(exports["pt2"].path)
     assert isinstance(there.schedule, CosineSchedule)
     assert (there.net.window, there.context, there.per_frame) == (WINDOW, 8, 1)

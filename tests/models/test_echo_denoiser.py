@@ -1,4 +1,4 @@
-"""ECHO's denoiser: levels of every modality, absent objects, padding, the document's size."""
+"""ECHO's denoiser: levels of every modality, absent objects, padding, the paper's size."""
 
 import pytest
 import torch
@@ -35,7 +35,7 @@ def net(request):
 
 @nets
 @pytest.mark.parametrize("modality", range(3))
-def test_each_modalitys_level_and_noise_reach_all_that_is_said(net, modality):
+def test_each_modalitys_level_and_noise_reach_all_outputs(net, modality):
     x_t, level, *conditioning = inputs(net)
     before = outputs(net, x_t, level, *conditioning)
     assert before.shape == x_t.shape
@@ -114,7 +114,7 @@ def test_streams_are_one_or_one_per_modality():
         small_net(FEATURES, streams=2)
 
 
-def test_the_documents_size():
+def test_the_papers_size():
     config = compose("train", ["experiment=echo", "model=echo", "paths.run=none"])
     count = sum(parameter.numel() for parameter in instantiate(config.model, _convert_="all").net.parameters())  # fmt: skip
     assert 44.9e6 <= count <= 49.7e6, f"{count / 1e6:.1f} M parameters"

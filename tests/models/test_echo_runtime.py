@@ -1,4 +1,4 @@
-"""However ECHO's steps are run, they say the same; what levels ask for is worked out once and does not pile up."""
+"""ECHO's runtimes agree with each other; level-dependent activations are computed once, and their cache is bounded."""
 
 import os
 import shutil
@@ -16,7 +16,7 @@ from wearcap.systems.echo.step_runner import EchoPlans, EchoRunner
 
 
 def levels_of(items: int, frames: int, start: int) -> torch.Tensor:
-    """As on a queue, with an object that comes in at another frame in every lane."""
+    """Levels as on a queue, with an object that enters at another frame in every batch item."""
     level = torch.linspace(0, 1, frames)[None, :, None].repeat(items, 1, 3)
     for batch_item in range(items):
         level[batch_item, : max(start - batch_item, 0), 1] = 1.0
@@ -55,13 +55,13 @@ def test_plans_do_not_pile_up(monkeypatch):
         assert len(plans._windows) <= echo_runtime.MOST_WINDOWS
 
 
-def test_lanes_of_the_same_levels_share_a_plan():
+def test_batch_items_of_the_same_levels_share_a_plan():
     plans = EchoPlans(small_net(small_features()))
     assert plans(levels_of(1, WINDOW, 2).repeat(4, 1, 1)).shape == (1, WINDOW, plans.size)
 
 
 def outputs(runner: EchoRunner) -> list[torch.Tensor]:
-    """Of a whole window, and of some that are not full yet."""
+    """x̂0 of a full window, and of some that are not full yet."""
     answers, random = [], torch.Generator().manual_seed(1)
     for items, frames in ((1, WINDOW), (2, 5)):
         level = levels_of(items, frames, 3)
@@ -80,13 +80,13 @@ def worst_of(runtime: str, device: str = "cpu") -> float:
 
 
 @pytest.mark.slow
-def test_onnx_runtime_says_the_same():
+def test_onnx_runtime_agrees_with_eager():
     pytest.importorskip("onnxruntime")
     assert worst_of("onnx") < 1e-4
 
 
 def worst_of_compiled(device: str) -> float:
-    """In a process of its own: what checks the shapes in tests cannot be compiled."""
+    """In its own process: the tests' shape checks cannot be compiled."""
     program = f"from test_echo_runtime import worst_of; print(worst_of('compile', {device!r}))"
     here = Path(__file__).parent
     paths = os.pathsep.join([str(here), str(here.parent)])
@@ -99,12 +99,12 @@ def worst_of_compiled(device: str) -> float:
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
-def test_compiled_it_says_the_same():
+def test_compiled_steps_agree_with_eager():
     assert worst_of_compiled("cpu") < 1e-4
 
 
 @pytest.mark.gpu
-def test_on_a_gpu_it_says_the_same():
+def test_gpu_steps_agree_with_eager():
     assert worst_of_compiled("cuda") < 1e-3
 
 

@@ -1,4 +1,5 @@
-"""ECHO on whole recordings: what is known comes out as it is, frames of reference change nothing, lanes are alone."""
+"""ECHO on whole recordings: observations are kept, the frame of reference does not matter, batch items are
+independent."""
 
 from dataclasses import replace
 
@@ -29,7 +30,7 @@ def batch_item(echo: Echo, scenario):
 
 
 def everything(recording) -> Observed:
-    """The truth of all modalities at every frame; contacts in a pattern."""
+    """Ground truth of all modalities at every frame; contacts in a pattern."""
     motion, count = recording.motion, len(recording.motion)
     contact = (torch.arange(count)[:, None] + torch.arange(CONTACTS)) % 3 == 0
     return Observed(motion, recording.object_motion, motion.timestamps, contact.float())
@@ -61,7 +62,7 @@ def test_what_is_observed_comes_out_as_it_is(frame, rewindow):
 
 
 @pytest.mark.parametrize("modality", range(3))
-def test_known_frames_of_one_modality_enter_at_level_0(modality):
+def test_observed_frames_of_one_modality_enter_at_level_0(modality):
     recording, take = carrying(1.2), torch.tensor([4, 17, 30])
     all_of_it, times = everything(recording), recording.motion.timestamps[take]
     motion = replace(recording.motion, timestamps=times, R_parent_joint=recording.motion.R_parent_joint[take], t_world_root=recording.motion.t_world_root[take])  # fmt: skip
@@ -102,7 +103,7 @@ def test_known_frames_of_one_modality_enter_at_level_0(modality):
 
 
 def truth_of(echo: Echo, conditioning: Conditioning, frame: Rigid) -> torch.Tensor:
-    """x0 as the frame sees what stands beside what is told."""
+    """x0 in coordinates of the frame, from the observed values of the conditioning."""
     body = echo.features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
     scene_object = echo.features.encode_object(
         Rigid(conditioning.R_world_object, conditioning.t_world_object), frame
@@ -111,7 +112,7 @@ def truth_of(echo: Echo, conditioning: Conditioning, frame: Rigid) -> torch.Tens
 
 
 class Knowing(Echo):
-    """Whose denoiser is perfect."""
+    """A pipeline with a perfect denoiser."""
 
     def denoiser(self, queue, conditioning, frame):
         truth = truth_of(self, conditioning, frame)
@@ -139,8 +140,8 @@ def knowing(frame: str, **settings) -> Echo:
         (lambda *given: Rewindow(*given, stride=3), "posterior"),
     ],
 )
-def test_a_perfect_denoiser_says_the_truth_in_any_frame(frame, make, step):
-    """And what is clean stays the truth while the windows' frame of reference moves."""
+def test_a_perfect_denoiser_gives_the_ground_truth_in_any_frame(frame, make, step):
+    """Clean frames stay the ground truth while the window's frame of reference moves."""
     recording = carrying(1.0, carried=TWO)
     echo = knowing(frame, step=step)
     conditioning = batch_item(echo, scenario_of(recording, TWO, observed=everything(recording))).conditioning
@@ -157,11 +158,11 @@ def test_a_perfect_denoiser_says_the_truth_in_any_frame(frame, make, step):
     torch.testing.assert_close(
         outputs.R_world_object[there], conditioning.R_world_object[there], atol=2e-4, rtol=0
     )
-    assert max(part.max() for part in queue.seen) < 5e-3, "clean frames are what they were said to be"
+    assert max(part.max() for part in queue.seen) < 5e-3, "clean frames are the ground truth"
 
 
-def test_what_moves_with_the_window_is_noised_in_the_new_frame():
-    """z' = A z + √ᾱ b against encoding there, with the same noise turned."""
+def test_noised_frames_are_re_expressed_when_the_window_advances():
+    """z' = A z + √ᾱ b equals encoding in the new frame with rotated noise."""
     echo = drawn_echo("window")
     queue, recording = EchoQueue(echo, [echo.skeleton], [0]), carrying(1.6)
     conditioning = batch_item(
@@ -189,7 +190,7 @@ def test_what_moves_with_the_window_is_noised_in_the_new_frame():
 
 
 @pytest.mark.parametrize("settings", [{}, {"frame": "window"}, {"rewindow": 3}, {"per_frame": 2}])
-def test_lanes_do_not_know_of_each_other(settings):
+def test_batch_items_are_independent(settings):
     echo = drawn_echo(**settings)
     scenarios = [scenario_of(carrying(0.9)), scenario_of(carrying(0.7, carried=TWO[1:]), TWO[1:])]
     together = echo.capture_scenarios(scenarios, [3, 4])
@@ -200,7 +201,7 @@ def test_lanes_do_not_know_of_each_other(settings):
         assert set(motion.object_motion or {}) == set(alone.object_motion or {})
 
 
-def test_a_seed_says_what_is_drawn():
+def test_a_seed_determines_the_sample():
     echo, scenario = drawn_echo(), scenario_of(carrying(0.9))
     one, two, other = echo.capture_scenarios([scenario] * 3, [1, 1, 2])
     torch.testing.assert_close(one.R_parent_joint, two.R_parent_joint, atol=1e-4, rtol=0)
@@ -209,7 +210,7 @@ def test_a_seed_says_what_is_drawn():
 
 @pytest.mark.parametrize("seconds", [0.55, 1.1])
 @pytest.mark.parametrize("rewindow", [None, 3, 8])
-def test_every_frame_is_said_however_short_the_recording(seconds, rewindow):
+def test_every_frame_is_output_however_short_the_recording(seconds, rewindow):
     recording = carrying(seconds)
     motion = drawn_echo(rewindow=rewindow).capture([recording], [0])[0]
     assert torch.equal(motion.timestamps, recording.motion.timestamps)
@@ -222,12 +223,12 @@ def test_windows_that_would_leave_frames_out_are_refused():
         drawn_echo(rewindow=9)
 
 
-def test_windows_from_scratch_know_no_redrawn_noise():
+def test_redrawn_noise_needs_the_conveyor():
     with pytest.raises(WearcapError, match="step=redraw with windows.*Expected step=posterior"):
         drawn_echo(rewindow=3, step="redraw")
 
 
-def test_the_body_hangs_from_the_measured_head():
+def test_the_body_is_anchored_to_the_measured_head():
     recording = carrying(1.0)
     motion = drawn_echo().capture([recording], [0])[0]
     head, true = motion.joint("head"), recording.motion.joint("head")
@@ -237,7 +238,7 @@ def test_the_body_hangs_from_the_measured_head():
     assert not torch.allclose(standing.joint("head").t, true.t, atol=1e-2)
 
 
-def test_an_observed_body_does_not_hang():
+def test_an_observed_body_is_not_anchored():
     recording = carrying(1.0)
     truth, device = recording.motion, recording.head
     seen = replace(truth, timestamps=truth.timestamps[9:10], R_parent_joint=truth.R_parent_joint[9:10], t_world_root=truth.t_world_root[9:10])  # fmt: skip
@@ -248,7 +249,7 @@ def test_an_observed_body_does_not_hang():
     torch.testing.assert_close(head[10:], true[10:] + 0.02, atol=1e-4, rtol=0)
 
 
-def test_objects_rest_between_the_times_they_are_active():
+def test_objects_are_static_between_the_times_they_are_active():
     recording = carrying(1.2, carried=TWO)
     scenario = scenario_of(recording, TWO)
     motion = drawn_echo().capture_scenarios([scenario], [0])[0]
@@ -272,7 +273,7 @@ def with_gap(recording, first: int, stop: int):
     return replace(recording, head=replace(head, timestamps=head.timestamps[keep], R_world_device=head.R_world_device[keep], t_world_device=head.t_world_device[keep]))  # fmt: skip
 
 
-def test_behind_a_gap_of_the_head_it_begins_anew():
+def test_after_a_gap_of_the_head_the_capture_restarts():
     whole = carrying(2.5)
     broken = with_gap(whole, 25, 55)
     echo = drawn_echo()
@@ -284,7 +285,7 @@ def test_behind_a_gap_of_the_head_it_begins_anew():
     torch.testing.assert_close(motion.R_parent_joint[:25], first.R_parent_joint, atol=1e-4, rtol=0)
 
 
-def test_a_frame_waits_for_the_ramp():
+def test_the_latency_is_the_ramp():
     echo, recording = drawn_echo(), carrying(1.0)
     assert echo.latency_s == pytest.approx(7 / FPS)
     queue, conditioning = (
@@ -295,7 +296,7 @@ def test_a_frame_waits_for_the_ramp():
     assert given == [False] * 7 + [True] * 23
 
 
-def test_a_queue_needs_no_more_the_longer_it_runs():
+def test_a_queues_memory_is_bounded():
     echo = drawn_echo()
     queue, conditioning = (
         EchoQueue(echo, [echo.skeleton], [0]),
@@ -306,17 +307,17 @@ def test_a_queue_needs_no_more_the_longer_it_runs():
         assert queue.conditioning.valid.shape[1] == queue.conveyor.x.shape[1] <= WINDOW
 
 
-def test_acts_may_be_given():
+def test_acts_may_be_listed():
     recording, environment = carrying(1.5), boxes()
     acts = [{"object": "box_1", "start_s": 0.9, "stop_s": 1.2}, {"object": "box_1", "start_s": 0.2, "stop_s": 0.4}]  # fmt: skip
-    conditioning = drawn_echo(acts=acts).scenario(recording, environment).acts
-    assert [act.start_s for act in conditioning] == [0.2, 0.9]
+    found = drawn_echo(acts=acts).scenario(recording, environment).acts
+    assert [act.start_s for act in found] == [0.2, 0.9]
     assert drawn_echo(acts="none").scenario(recording, environment).acts == ()
     assert [act.object for act in drawn_echo().scenario(recording, environment).acts] == ["box_1"]
     assert drawn_echo().scenario(carrying(1.0, carried=()), None).acts == ()
 
 
-def test_interactions_tell_which_object_is_active_where_nothing_tells_its_poses():
+def test_interactions_name_the_active_object_without_its_poses():
     recording = replace(carrying(1.5), object_motion={})
     assert [act.object for act in drawn_echo().scenario(recording, boxes()).acts] == ["box_1"]
     assert drawn_echo().scenario(replace(recording, interactions=None), boxes()).acts == ()
@@ -325,13 +326,13 @@ def test_interactions_tell_which_object_is_active_where_nothing_tells_its_poses(
 @pytest.mark.parametrize(
     "wrong", ["guess", [{"object": "a"}], [{"object": "a", "start_s": 0.0, "end_s": 1.0}]]
 )
-def test_acts_that_are_none_are_refused(wrong):
+def test_invalid_acts_are_refused(wrong):
     with pytest.raises(WearcapError, match="acts.*Expected .*a list of {object, start_s, stop_s}"):
         drawn_echo(acts=wrong)
 
 
 def tracked(recording, **changes):
-    """With wrists from controllers at another rate, in place of the true ones."""
+    """The recording with wrists from controllers at another rate, in place of the ground truth."""
     motion = carrying(recording.motion.timestamps[-1].item() + 0.1, fps=90.0).motion
     tracks = {}
     for joint in ("left_wrist", "right_wrist"):

@@ -1,4 +1,5 @@
-"""ECHO's scores and its baselines: the truth is perfect, what is wrong is wrong by as much, and baselines find their like."""
+"""ECHO's scores and its baselines: the truth is perfect, what is wrong is wrong by as much, and baselines find their
+like."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -38,7 +38,7 @@ def feed(session, recording, frame: int, shift: float = 0.0, tracked: bool = Tru
     return given(session)
 
 
-def static_threshold(session) -> list[Motion]:
+def remaining_poses(session) -> list[Motion]:
     return given(session, ended=True) + given(session, ended=True)
 
 
@@ -49,7 +49,7 @@ def whole(session, recording, happen=None) -> Motion:
         if happen is not None and frame == FAULT:
             happen(session)
         parts += feed(session, recording, frame)
-    return joined(parts + static_threshold(session))
+    return joined(parts + remaining_poses(session))
 
 
 @pytest.fixture(scope="module")
@@ -103,8 +103,8 @@ def test_where_the_clock_moves_it_goes_on(echo, recording, shift):
         late += feed(session, recording, frame, 1.2 + shift)
         expected += feed(fresh, recording, frame, 1.2 + shift, frame >= AGREEING - 1)
     late, expected = (
-        joined(before + late + static_threshold(session)),
-        joined(expected + static_threshold(fresh)),
+        joined(before + late + remaining_poses(session)),
+        joined(expected + remaining_poses(fresh)),
     )
     assert len(late) == 40 + FRAMES
     new = slice(40, None)
@@ -119,7 +119,7 @@ def test_the_active_object_stays_active_where_the_clock_goes_back(echo, recordin
     session.activate("box_1", 50.1)
     parts = [motion for frame in range(FRAMES) for motion in feed(session, recording, frame, 50.0)]
     parts += [motion for frame in range(FRAMES) for motion in feed(session, recording, frame)]
-    parts += static_threshold(session)
+    parts += remaining_poses(session)
     assert all((motion.timestamps.diff() > 0).all() for motion in parts)
     seen = torch.cat([motion.object_motion["box_1"].timestamps for motion in parts if motion.object_motion])
     assert int((seen < 10).sum()) == FRAMES
@@ -155,7 +155,7 @@ def test_whatever_comes_it_goes_on(echo, recording, seed):
         motions += feed(session, recording, k, 4.0)
     motions = [
         motion
-        for motion in (*motions, *static_threshold(session), *static_threshold(session))
+        for motion in (*motions, *remaining_poses(session), *remaining_poses(session))
         if motion is not None
     ]
     assert max(motion.timestamps[-1].item() for motion in motions) >= 4.9
@@ -168,7 +168,7 @@ def test_whatever_comes_it_goes_on(echo, recording, seed):
         session._chunks,
         session._finished,
         session._track._poses,
-        session._waiting,
+        session._pending,
         *session._wrists.values(),
     )
     assert max(map(len, sizes)) < 100

@@ -1,4 +1,4 @@
-"""Guidance goes down the gradient of what it says it costs: objects come to hands, feet to the floor, and nothing else."""
+"""Guidance follows the negative gradient of its costs: objects move to hands, feet to the floor, and nothing else."""
 
 from dataclasses import replace
 
@@ -20,7 +20,8 @@ LEFT_HAND = slice(0, 7)
 
 
 def scene_of(frame: str = "own", shift=(0.0, 0.0, 0.0), lift: float = 0.0, contact=None):
-    """A walk as x̂0, the box shifted and the body lifted (m); touching where `contact` says, else the left hand and all feet."""
+    """A walk as x̂0, the box shifted and the body lifted (m); contacts as in `contact`, else of the left hand and all
+    feet."""
     recording, echo = carrying(0.6), drawn_echo(frame)
     motion = recording.motion
     batch_item = batch_item_of(scenario_of(recording, margin_s=9.0, observed=Observed(motion, recording.object_motion)), head_path(recording, echo.skeleton, echo.fps), echo.reader())  # fmt: skip
@@ -112,13 +113,13 @@ def test_gradients_are_those_of_finite_differences(frame):
         (gradient,) = torch.autograd.grad(scene.costs(x, 0.5)[cost], x)
         random = torch.Generator().manual_seed(cost)
         for _ in range(4):
-            way = torch.randn(x.shape, generator=random, dtype=torch.float64)
-            way[..., scene.net.sizes[0] + OBJECT_SIZE :] = 0.0
-            there, back = (scene.costs(x.detach() + sign * step * way, 0.5)[cost] for sign in (1, -1))
-            assert (gradient * way).sum().item() == pytest.approx(((there - back) / (2 * step)).item(), rel=1e-4, abs=1e-8)  # fmt: skip
+            direction = torch.randn(x.shape, generator=random, dtype=torch.float64)
+            direction[..., scene.net.sizes[0] + OBJECT_SIZE :] = 0.0
+            there, back = (scene.costs(x.detach() + sign * step * direction, 0.5)[cost] for sign in (1, -1))
+            assert (gradient * direction).sum().item() == pytest.approx(((there - back) / (2 * step)).item(), rel=1e-4, abs=1e-8)  # fmt: skip
 
 
-def test_lanes_have_their_own_bodies_and_objects():
+def test_batch_items_have_their_own_bodies_and_objects():
     one, x = scene_of(shift=(0.1, 0.05, -0.1))
     two, y = scene_of(shift=(-0.1, 0.0, 0.2))
     both = GuidedScene(
@@ -156,7 +157,7 @@ def test_a_network_without_contacts_is_not_guided():
     assert torch.equal(plain.t_world_root, asked.t_world_root)
 
 
-def test_each_lane_is_pulled_at_its_own_objects():
+def test_each_batch_item_is_guided_by_its_own_objects():
     recording = carrying(0.8)
     small = Environment((scene_object("box_1", mesh=box_mesh([0.05, 0.05, 0.05])),))
     echo = drawn_echo(guidance=Guidance(threshold=0.0))

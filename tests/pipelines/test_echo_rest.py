@@ -1,4 +1,4 @@
-"""Objects rest while nothing touches them: where they were touched last, and before that where they will be."""
+"""Static-object constraint: untouched objects keep their last touched pose, before their first contact its pose."""
 
 from itertools import pairwise
 
@@ -36,10 +36,10 @@ def frames(active=ACTS, touched=TOUCHED, observed=()) -> tuple[Conditioning, Out
         eye[:, :, None].repeat(1, 1, 3, 1, 1), zeros[:, :, None].repeat(1, 1, 3, 1), zeros[..., 0], number >= 0, zeros[..., :1],
         number, number > -2, eye[:, :, None], zeros, eye, zeros, contact, observed_parts,
     )  # fmt: skip
-    way = torch.arange(count, dtype=torch.float32)
-    turn = rotation.exp(torch.stack([0 * way, 0 * way, 0.1 * way], -1))
+    path = torch.arange(count, dtype=torch.float32)
+    turn = rotation.exp(torch.stack([0 * path, 0 * path, 0.1 * path], -1))
     return conditioning, Outputs(
-        eye[:, :, None], zeros, turn[None], torch.stack([way, 0 * way, 0 * way], -1)[None], contact
+        eye[:, :, None], zeros, turn[None], torch.stack([path, 0 * path, 0 * path], -1)[None], contact
     )
 
 
@@ -75,9 +75,9 @@ def test_poses_from_within_a_contact_count():
 def test_an_object_waits_where_it_is_drawn_within_the_contact():
     stop = 10 + 3 * INSIDE
     conditioning, outputs = frames([0] * 60, list(range(10, stop)))
-    way = with_static_objects(conditioning, outputs, TOUCH).t_world_object[0, :, 0].long().tolist()
+    path = with_static_objects(conditioning, outputs, TOUCH).t_world_object[0, :, 0].long().tolist()
     first, last = 10 + INSIDE, stop - 1 - INSIDE
-    assert way == [min(max(k, first), last) for k in range(60)]
+    assert path == [min(max(k, first), last) for k in range(60)]
 
 
 def again(observed=()) -> tuple[Conditioning, Outputs, int]:
@@ -87,42 +87,42 @@ def again(observed=()) -> tuple[Conditioning, Outputs, int]:
 
 
 def test_an_object_that_is_touched_again_comes_from_where_it_was_left():
-    """Without a jump, though it is drawn elsewhere."""
+    """Without a jump, although the predicted pose is elsewhere."""
     conditioning, outputs, back = again()
     found = with_static_objects(conditioning, outputs, TOUCH)
-    way = found.t_world_object[0, :, 0]
+    path = found.t_world_object[0, :, 0]
     left, begin = 49 - INSIDE, back + INSIDE
-    assert way[left : begin + 1].tolist() == [left] * (begin + 1 - left)
-    assert way[begin + FADE :].tolist() == list(range(begin + FADE, 140))
-    assert (way.diff() >= 0).all()
-    assert way.diff().max() <= 1 + (begin - left) / FADE + 1e-4
+    assert path[left : begin + 1].tolist() == [left] * (begin + 1 - left)
+    assert path[begin + FADE :].tolist() == list(range(begin + FADE, 140))
+    assert (path.diff() >= 0).all()
+    assert path.diff().max() <= 1 + (begin - left) / FADE + 1e-4
     R = found.R_world_object[0]
     steps = rotation.log(R[1:] @ R[:-1].mT).norm(dim=-1)
-    assert steps.max() <= 0.1 + torch.pi / FADE + 1e-4, "it turns the shorter way round"
+    assert steps.max() <= 0.1 + torch.pi / FADE + 1e-4, "it takes the shorter rotation"
 
 
 def test_frame_by_frame_it_comes_from_there_too():
     conditioning, outputs, back = again()
-    step, way = StaticObjects(TOUCH), []
+    step, path = StaticObjects(TOUCH), []
     for k in range(140):
         one = slice(k, k + 1)
-        way.append(
+        path.append(
             step(conditioning.frames(one), Outputs(*(field[:, one] for field in outputs)))
             .t_world_object[0, 0, 0]
             .item()
         )
-    assert way[49 : back + 1] == [49.0] * (back + 1 - 49)
-    assert way[back + FADE :] == list(range(back + FADE, 140))
-    assert max(b - a for a, b in pairwise(way)) <= 1 + (back - 49) / FADE + 1e-4
+    assert path[49 : back + 1] == [49.0] * (back + 1 - 49)
+    assert path[back + FADE :] == list(range(back + FADE, 140))
+    assert max(b - a for a, b in pairwise(path)) <= 1 + (back - 49) / FADE + 1e-4
 
 
 def test_from_an_observed_pose_on_nothing_fades():
-    """What is seen, and what is drawn after it, stays as it is."""
+    """The observed pose and the predictions after it are unchanged."""
     seen = 85
     conditioning, outputs, _ = again(observed=[seen])
-    way = with_static_objects(conditioning, outputs, TOUCH).t_world_object[0, :, 0]
-    assert way[seen:].tolist() == list(range(seen, 140))
-    assert way[seen - 1] < seen - 1
+    path = with_static_objects(conditioning, outputs, TOUCH).t_world_object[0, :, 0]
+    assert path[seen:].tolist() == list(range(seen, 140))
+    assert path[seen - 1] < seen - 1
     step, streamed = StaticObjects(TOUCH), []
     for k in range(140):
         one = slice(k, k + 1)
@@ -161,7 +161,7 @@ def test_feet_on_the_floor_touch_no_object():
     assert places(with_static_objects(conditioning, outputs, 0.65)) == list(range(len(ACTS)))
 
 
-def test_lanes_rest_on_their_own():
+def test_static_objects_of_batch_items_are_independent():
     one, other = frames(), frames(touched=[5, 9])
     both = [type(a)(*(torch.cat(fields) for fields in zip(a, b))) for a, b in zip(one, other)]
     found = with_static_objects(*both, TOUCH)
@@ -174,15 +174,15 @@ def test_lanes_rest_on_their_own():
 def test_frame_by_frame_it_is_the_same_from_the_first_contact_on():
     conditioning, outputs = frames()
     step = StaticObjects(TOUCH)
-    way = []
+    path = []
     for k in range(len(ACTS)):
         one = slice(k, k + 1)
-        way.append(
+        path.append(
             step(conditioning.frames(one), Outputs(*(field[:, one] for field in outputs))).t_world_object[
                 0, 0, 0
             ]
         )
-    assert [int(x) for x in way] == [0, 1, 2, *MOVED[3:7], 7, 8, 9, *MOVED[10:15], 4], (
+    assert [int(x) for x in path] == [0, 1, 2, *MOVED[3:7], 7, 8, 9, *MOVED[10:15], 4], (
         "the last is touched, and still left"
     )
 

@@ -1,4 +1,4 @@
-"""ECHO as a stream: the same motion and objects as in one go, and what becomes known late is heard while it can be."""
+"""Streaming ECHO: the same motion and objects as a whole capture; late input counts while its frames are not final."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def streamed(
     return joined([part for part in parts if part is not None]), counts
 
 
-def told_acts(session: EchoSession, scenario) -> None:
+def activate_acts(session: EchoSession, scenario) -> None:
     for act in scenario.acts:
         session.activate(act.object, act.start_s)
         session.activate(None, act.stop_s)
@@ -69,28 +69,29 @@ def assert_same(motion: Motion, whole: Motion, scenario) -> None:
 @pytest.mark.parametrize(
     "settings", [{}, {"frame": "window"}, {"anchor": False}, {"per_frame": 2, "context": 0}, {"placed": True}]
 )
-def test_a_stream_says_what_a_whole_capture_says(settings):
+def test_a_stream_equals_a_capture_of_the_whole_recording(settings):
     """Two objects, one after the other, with nothing between."""
     recording, echo = carrying(1.2, carried=TWO), drawn_echo(**settings)
     scenario = replace(scenario_of(recording, TWO), placed=echo.placed)
     session = EchoSession(echo, wearer(recording), boxes(TWO), seed=3)
-    told_acts(session, scenario)
+    activate_acts(session, scenario)
     motion, counts = streamed(session, recording)
     assert_same(motion, echo.capture_scenarios([scenario], [3])[0], scenario)
-    waiting = round(echo.latency_s * echo.fps)
-    assert counts == [max(0, k - waiting) + (k >= waiting) for k in range(len(counts))]
+    latency = round(echo.latency_s * echo.fps)
+    assert counts == [max(0, k - latency) + (k >= latency) for k in range(len(counts))]
     assert session.dropped == session.silent == 0
 
 
-def test_objects_rest_in_a_stream_from_their_first_contact_on():
-    """What comes before it is final before the contact is known; then it moves while it is touched alone."""
+def test_objects_in_a_stream_are_static_from_their_first_contact_on():
+    """Frames before the first contact are final before it is detected; afterwards the object moves only while
+    touched."""
     recording = carrying(1.2, carried=TWO)
     scenario = scenario_of(recording, TWO)
     drawn = drawn_echo().capture_scenarios([scenario], [3])[0]
     likely = drawn.body_contact_prob.amax(1)
     threshold = likely[likely > 0].median().item()
     session = EchoSession(drawn_echo(static_threshold=threshold), wearer(recording), boxes(TWO), seed=3)
-    told_acts(session, scenario)
+    activate_acts(session, scenario)
     motion, _ = streamed(session, recording)
     for act in scenario.acts:
         active = (active_at([act], [act.object], drawn.timestamps) == 0).nonzero()[:, 0]
@@ -98,8 +99,8 @@ def test_objects_rest_in_a_stream_from_their_first_contact_on():
         first = int(touched.nonzero()[0])
         assert not touched[first:].all()
         found = motion.object_motion[act.object].t_world_body
-        way = drawn.object_motion[act.object].t_world_body[active]
-        torch.testing.assert_close(found[: first + 1], way[: first + 1], atol=1e-3, rtol=0)
+        path = drawn.object_motion[act.object].t_world_body[active]
+        torch.testing.assert_close(found[: first + 1], path[: first + 1], atol=1e-3, rtol=0)
         moves = found.diff(dim=0).norm(dim=1) > 1e-6
         assert not (moves & ~touched[1:])[first:].any()
         assert (moves & touched[1:])[first:].any()
@@ -114,8 +115,8 @@ def test_a_human_alone_needs_no_objects():
 
 
 @pytest.mark.parametrize("late", [0, 3, 6])
-def test_an_object_may_be_told_of_before_its_frames_are_final(late):
-    """The act begins at frame 20; frames that are out already stay as they were."""
+def test_an_object_may_be_activated_until_its_frames_are_final(late):
+    """The act begins at frame 20; frames that were output already do not change."""
     recording, echo = carrying(1.4), drawn_echo()
     session = EchoSession(echo, wearer(recording), boxes(), seed=3)
     start = recording.motion.timestamps[20].item()
@@ -135,7 +136,7 @@ def test_what_is_final_stays_as_it_was():
     assert motion.object_motion["box_1"].timestamps[0].item() == pytest.approx(18 / 30, abs=1e-6)
 
 
-def test_an_object_that_is_seen_is_where_it_was_seen():
+def test_an_observed_object_is_at_its_observed_pose():
     recording, echo = carrying(1.4), drawn_echo(anchor=False)
     session = EchoSession(echo, wearer(recording), boxes(), seed=3)
     session.activate("box_1", 0.0)
@@ -153,7 +154,7 @@ def test_an_object_that_is_seen_is_where_it_was_seen():
     assert (found.t_world_body[18] - track.t_world_body[18]).norm() > 0.01
 
 
-def test_of_several_sights_of_an_object_the_nearest_in_time_counts():
+def test_the_observation_nearest_in_time_counts():
     recording, echo = carrying(1.0), drawn_echo(anchor=False)
     session = EchoSession(echo, wearer(recording), boxes(), seed=3)
     session.activate("box_1", 0.0)
@@ -171,7 +172,7 @@ def test_of_several_sights_of_an_object_the_nearest_in_time_counts():
     torch.testing.assert_close(found, track.t_world_body[10], atol=1e-4, rtol=0)
 
 
-def test_what_was_seen_of_one_object_is_not_believed_of_another():
+def test_observations_of_one_object_do_not_apply_to_another():
     recording, echo = carrying(1.4, carried=TWO), drawn_echo(anchor=False)
     session = EchoSession(echo, wearer(recording), boxes(TWO), seed=3)
     session.activate("box_1", 0.0)
@@ -250,7 +251,7 @@ def test_a_pose_that_comes_twice_is_left_out_however_late():
     assert joined([part for part in parts if part is not None]).R_parent_joint.isfinite().all()
 
 
-def test_a_silent_wrist_is_counted_and_holds_nothing_up():
+def test_a_silent_wrist_is_counted_and_does_not_block():
     recording = carrying(2.0)
     session = EchoSession(drawn_echo(), wearer(recording), seed=3)
     motion, _ = streamed(session, recording, wrists=("left_wrist",))
@@ -259,7 +260,7 @@ def test_a_silent_wrist_is_counted_and_holds_nothing_up():
     assert motion.R_parent_joint.isfinite().all()
 
 
-def test_behind_a_gap_it_begins_anew_as_the_whole_capture_does():
+def test_after_a_gap_it_restarts_as_the_whole_capture_does():
     recording, echo = carrying(3.0), drawn_echo()
     keep = [*range(30), *range(60, 90)]
     head = recording.head
@@ -280,7 +281,7 @@ def test_behind_a_gap_it_begins_anew_as_the_whole_capture_does():
     torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t[keep], atol=1e-3, rtol=0)
 
 
-def test_a_head_that_is_lost_holds_nothing_back():
+def test_a_lost_head_does_not_block_output():
     recording = carrying(2.0)
     session = EchoSession(drawn_echo(), wearer(recording), seed=5)
     count = 0
@@ -292,11 +293,11 @@ def test_a_head_that_is_lost_holds_nothing_back():
         outputs = session.poses()
         count += 0 if outputs is None else len(outputs)
     assert count >= 30
-    assert session._waiting == []
+    assert session._pending == []
     assert session.poses(ended=True) is None
 
 
-def test_a_long_stream_needs_no_more_than_a_short_one():
+def test_a_streams_memory_is_bounded():
     recording, echo = carrying(2.0), drawn_echo()
     session = EchoSession(echo, wearer(recording), boxes(), seed=3)
     sizes = []
@@ -310,11 +311,11 @@ def test_a_long_stream_needs_no_more_than_a_short_one():
                 session.activate("box_1" if frame % 20 else None, time)
                 session.see_object("box_1", time, recording.object_motion["box_1"].T_world_body[frame])
             session.poses()
-        sizes.append((*(len(part) for part in session._wrists.values()), len(session._acts), len(session._seen), len(session._waiting), len(session._chunks)))  # fmt: skip
+        sizes.append((*(len(part) for part in session._wrists.values()), len(session._acts), len(session._seen), len(session._pending), len(session._chunks)))  # fmt: skip
     assert sizes[3] == sizes[1]
 
 
-def test_the_floor_is_where_one_who_stands_has_it():
+def test_the_floor_follows_from_a_standing_wearer():
     recording = carrying(0.6)
     session = EchoSession(drawn_echo(), wearer(recording, floor_m=None), seed=0)
     streamed(session, recording)
@@ -322,7 +323,7 @@ def test_the_floor_is_where_one_who_stands_has_it():
     assert floor[0, -1].item() == pytest.approx(0.0, abs=0.1)
 
 
-def test_who_sits_at_first_and_stands_up_has_a_floor():
+def test_the_floor_is_found_after_sitting_and_standing_up():
     recording = carrying(0.6)
     session = EchoSession(drawn_echo(), wearer(recording, floor_m=None), seed=0)
     head, low = recording.motion.joint("head")[:1], torch.tensor([0.0, 0.0, 0.5])
@@ -351,7 +352,7 @@ def test_objects_that_cannot_be_used_are_refused_when_they_are_named():
     session = EchoSession(drawn_echo(), EchoWearer(carrying(0.6).skeleton), things)
     with pytest.raises(WearcapError, match="object 'a': .*looks like millimetres"):
         session.activate("a", 0.0)
-    with pytest.raises(WearcapError, match="knows no object class 'piano'"):
+    with pytest.raises(WearcapError, match="has no object class 'piano'"):
         session.activate("b", 0.0)
     with pytest.raises(WearcapError, match="no object 'c'"):
         session.activate("c", 0.0)

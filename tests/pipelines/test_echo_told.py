@@ -1,4 +1,4 @@
-"""What ECHO cannot be told: each fault with its own message, that says where and what was expected."""
+"""Invalid input of ECHO: each fault has its own message with the place and the expected value."""
 
 import copy
 from dataclasses import replace
@@ -86,7 +86,7 @@ FAULTS = {
     "acts, but no objects": (lambda: replace(scenario_of(RECORDING), environment=None), "carry: acts of 'box_1', but no objects"),
     "wrists swapped": (swapped, "carry: the left wrist is .* cm to the right of the right one.*Swap the two trackers"),
     "no wrists": (
-        lambda: scenario_of(replace(RECORDING, motion=None)), "carry: wrists are tracked by nothing.*Expected `tracked` poses of left_wrist and"),
+        lambda: scenario_of(replace(RECORDING, motion=None)), "carry: this recording has no tracked wrists.*Expected `tracked` poses of left_wrist and"),
     "one wrist": (
         lambda: scenario_of(replace(RECORDING, tracked={"left_wrist": track()})), "carry: only left_wrist is tracked. Expected `tracked` poses of left_wrist and"),
     "wrists with NaN": (lambda: tracked(left_wrist=track(broken=True)), "carry: poses of wrists that are NaN"),
@@ -94,7 +94,7 @@ FAULTS = {
         lambda: tracked(left_wrist=track(slice(0, 10))), "carry: tracking of left_wrist from 0.00 to 0.30 s. Expected all of 0.00 to 0.97 s"),
     "a wrist of another clock": (lambda: tracked(left_wrist=track(shift=60.0)), "tracking of left_wrist from 60.00"),
     "a wrist at a single time": (lambda: tracked(left_wrist=track(slice(0, 1))), "tracking of left_wrist at 1 times"),
-    "a wrist whose times fall": (lambda: tracked(left_wrist=track(torch.arange(30).flip(0))), "30 times that do not grow"),
+    "a wrist whose times fall": (lambda: tracked(left_wrist=track(torch.arange(30).flip(0))), "30 times that do not increase"),
     "a body observed too late": (lambda: observing(motion=late_motion()), "carry: an observation at 1.* beyond the recording.*Expected times from 0.00 to 0.97"),
     "an object observed too late": (
         lambda: observing(object_motion={"box_1": replace(BOX, timestamps=BOX.timestamps + 2.0)}), "carry: an observation at 2.* s, beyond"),
@@ -118,8 +118,8 @@ def test_a_fault_is_named(fault):
     assert str(copy.copy(caught.value)) == str(caught.value)
 
 
-def test_a_wrist_that_is_lost_rests_where_it_was_seen():
-    """Short gaps are bridged; times in a long one, and behind the end, have the last pose before."""
+def test_a_lost_wrist_keeps_its_last_pose():
+    """Short gaps are interpolated; in long gaps and after the end the last pose is kept."""
     times = torch.tensor([0.0, 0.2, 0.6, 1.4, 1.5], dtype=torch.float64)
     place = torch.stack([times.float(), torch.zeros(5), torch.zeros(5)], 1)
     at = torch.tensor([-1.0, 0.1, 0.2, 0.4, 0.6, 0.61, 1.39, 1.4, 1.45, 1.5, 9.0], dtype=torch.float64)
@@ -141,12 +141,12 @@ def test_arms_of_a_true_motion_may_be_crossed():
         conditioning(scenario_of(replace(crossed, tracked=tracks)))
 
 
-def test_what_is_sound_passes():
+def test_valid_input_passes():
     assert conditioning(tracked()).valid.all()
     assert conditioning(scenario_of(RECORDING)).has_object.any()
 
 
-def test_what_is_seen_of_an_object_while_it_is_not_active_is_not_believed():
+def test_observations_of_inactive_objects_are_ignored():
     scenario = observing(object_motion={"box_1": BOX})
     seen = conditioning(scenario)
     assert torch.equal(seen.is_observed[0, :, 1], seen.has_object[0])

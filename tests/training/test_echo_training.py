@@ -64,7 +64,7 @@ def learner(net=None, frame: str = "own", **changes) -> EchoDiffusion:
 
 
 class Oracle(EchoDenoiser):
-    """Says what it was told to."""
+    """A network with a fixed output."""
 
     def forward(self, x_t, level, encoded, valid):
         return self.outputs

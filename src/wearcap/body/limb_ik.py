@@ -1,4 +1,4 @@
-"""Two bones that reach for a point, in closed form and for whole motions at once."""
+"""Two-bone inverse kinematics in closed form, batched over whole motions."""
 
 import torch
 from jaxtyping import Float
@@ -32,7 +32,7 @@ def reach(
     end: Float[Tensor, "*batch 3"],
     goal: Float[Tensor, "*batch 3"],
 ) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 3"]]:
-    """World rotations to put before the upper and the lower bone's so that `end` comes to `goal`.
+    """World rotations to left-multiply onto those of the upper and the lower bone so that `end` reaches `goal`.
 
     Bone lengths and the plane of the bend are kept; a goal out of reach is approached along its direction.
     """

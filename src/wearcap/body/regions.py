@@ -8,12 +8,12 @@ from wearcap.body.landmarks import landmarks
 from wearcap.body.skeleton import Skeleton
 
 SOLE_HEIGHT = 0.025
-"""A foot's vertices within this of its lowest (m) are its sole."""
+"""Largest height (m) of a sole's vertices above the foot's lowest vertex."""
 
 FOOT_REGIONS = {
     "left_heel": "left_heel", "left_toe_tip": "left_toes", "right_heel": "right_heel", "right_toe_tip": "right_toes",
 }  # fmt: skip
-"""The region of the surface behind each of `FOOT_PATCHES`, in their order."""
+"""Surface region of each of `FOOT_PATCHES`, in their order."""
 
 
 def contact_regions(
@@ -33,14 +33,14 @@ def contact_regions(
     regions: dict[str, Tensor] = {}
     for side in ("left", "right"):
         ankle, wrist = marks.limb[f"{side}_leg"][2], marks.limb[f"{side}_arm"][2]
-        foot = _held(skeleton, weights, ankle) & (vertices[:, 2] < joints[ankle, 2] + 0.02)
+        foot = _carried_by(skeleton, weights, ankle) & (vertices[:, 2] < joints[ankle, 2] + 0.02)
         low, high = vertices[foot].min(0).values, vertices[foot].max(0).values
         along = (vertices[:, 0] - low[0]) / (high[0] - low[0])
         sole = foot & (vertices[:, 2] < low[2] + SOLE_HEIGHT) & (down > 0.3)
         regions[f"{side}_toes"] = (sole & (along > 0.75)).nonzero()[:, 0]
         regions[f"{side}_heel"] = (sole & (along < 0.30)).nonzero()[:, 0]
         regions[f"{side}_sole"] = sole.nonzero()[:, 0]
-        hand = _held(skeleton, weights, wrist)
+        hand = _carried_by(skeleton, weights, wrist)
         reach = (vertices[:, 1] - joints[wrist, 1]).abs()
         near = hand & (reach < 0.55 * reach[hand].max()) & (reach > 0.01)
         regions[f"{side}_palm"] = (near & (down > 0.5)).nonzero()[:, 0]
@@ -59,8 +59,10 @@ def vertex_normals(
     return torch.nn.functional.normalize(total, dim=-1)
 
 
-def _held(skeleton: Skeleton, weights: Float[Tensor, "vertex joint"], joint: int) -> Bool[Tensor, "vertex"]:
-    """Vertices that a joint and all below it hold by more than half."""
+def _carried_by(
+    skeleton: Skeleton, weights: Float[Tensor, "vertex joint"], joint: int
+) -> Bool[Tensor, "vertex"]:
+    """Vertices whose skinning weights on a joint and its descendants sum to more than one half."""
     below = [joint]
     below += [j for j in range(joint + 1, len(skeleton)) if _descends(skeleton, j, joint)]
     return weights[:, below].sum(1) > 0.5

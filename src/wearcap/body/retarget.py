@@ -1,7 +1,7 @@
-"""Motion of one skeleton worn by another, and a skeleton given another's bone lengths.
+"""Retargeting: motion from one skeleton to another, and skeletons fitted to another's bone lengths.
 
-A joint's *turn* is its rotation from the T-pose to the moment's, in world axes; turns mean the same in every
-skeleton, whatever its bind pose, and are what is carried across.
+A joint's *turn* is its world-axes rotation from the T-pose to the current pose. Turns are comparable between skeletons,
+whatever their bind poses, and are what retargeting transfers.
 """
 
 from dataclasses import replace
@@ -27,7 +27,7 @@ _SIDES = ("left", "right")
 def _overlaps(
     source: Float[Tensor, "knot_s"], target: Float[Tensor, "knot_t"]
 ) -> Float[Tensor, "seg_t seg_s"]:
-    """Share of each target segment that lies in each source segment, both chains stretched to length 1."""
+    """Share of each target segment that overlaps each source segment, both chains scaled to length 1."""
     source, target = source / source[-1].clamp_min(1e-9), target / target[-1].clamp_min(1e-9)
     low = torch.maximum(target[:-1, None], source[None, :-1])
     high = torch.minimum(target[1:, None], source[None, 1:])
@@ -55,7 +55,7 @@ def _spread(
 def _carry(
     turn: Float[Tensor, "*batch joint 3 3"], source: TPose, target: TPose, parents: tuple[int, ...]
 ) -> Float[Tensor, "*batch joint_t 3 3"]:
-    """Turns of the target's joints from the source's; joints without a counterpart follow their parent."""
+    """Turns of the target's joints, transferred from the source; joints without a counterpart follow their parent."""
     from_s, to = source.marks, target.marks
     given: dict[int, Tensor] = {to.root: turn[..., from_s.root, :, :], to.head: turn[..., from_s.head, :, :]}
 
@@ -93,9 +93,9 @@ def retarget(
     """Rotations and root translation (m) of `target` that repeat the motion of `source`.
 
     The hips' centre is kept, bones point where the source's point, spine and neck share their bend by arc
-    length, and elbows and knees then give way a little so that wrists and ankles land on the source's (or as
-    near as the target's bones reach). Nothing is scaled: for a wearer of another size use `fit_offsets` first.
-    Raises WearcapError where a skeleton's limbs are not recognised.
+    length, and inverse kinematics of arms and legs then puts wrists and ankles on the source's (or as near as the
+    target's bones reach). Nothing is scaled: for a wearer of another size use `fit_offsets` first.
+    Raises WearcapError for a skeleton whose limbs are not recognised.
     """
     pose_s, pose_t = t_pose(source), t_pose(target)
     T_world_source = forward_kinematics(source, R_parent_joint, t_world_root)
@@ -112,7 +112,7 @@ def retarget(
 def _landed(
     T_world: Rigid, t_source: Float[Tensor, "*batch joint_s 3"], source: Landmarks, target: Landmarks
 ) -> Float[Tensor, "*batch joint 3 3"]:
-    """World rotations with limbs bent so that ankles and wrists meet the source's; hands and feet keep theirs."""
+    """World rotations with limbs bent so that ankles and wrists meet the source's; hands' and feet's are unchanged."""
     R = T_world.R.clone()
     for name, (first, second, third) in target.limb.items():
         # In double precision: a nearly straight limb's bend is the root of a difference of squares.

@@ -1,10 +1,10 @@
-"""Body shape from what a person knows of themselves: height, weight, sex, build."""
+"""Body shape from height, weight, sex and build."""
 
 from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.errors import WearcapError
 
 DENSITY = 1000.0
-"""Of a human body (kg/m³), lungs half full."""
+"""Density of a human body with half-full lungs (kg/m³)."""
 
 
 def stature(skeleton: Skeleton) -> float:
@@ -23,9 +23,9 @@ def skeleton_of_height(height_m: float, skeleton: Skeleton | None = None) -> Ske
 
 
 def phenotype_of(shape: dict[str, float]) -> dict[str, float]:
-    """Anny's phenotypes that a recording's shape states outright, each 0…1 (gender: 0 male, 1 female).
+    """Anny's phenotypes in a recording's shape, each 0…1 (gender: 0 male, 1 female).
 
-    Other models' coefficients are passed over.
+    Other models' coefficients are ignored.
     """
     return {name: float(shape[name]) for name in ("gender", "muscle", "proportions") if name in shape}
 

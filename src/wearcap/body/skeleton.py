@@ -16,17 +16,17 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 
 FOOT_PATCHES = ("left_heel", "left_toe_tip", "right_heel", "right_toe_tip")
-"""Sites whose floor contact is sensed, predicted and stored, always in this order."""
+"""Sites with floor contact labels and predictions, always in this order."""
 
 MIRROR = (1.0, -1.0, 1.0)
-"""Of every position, where left and right change places: y is turned round."""
+"""Factors that mirror a position left to right: y changes its sign."""
 
 _ALIASES = {
     "left_toe": "left_foot", "right_toe": "right_foot",
     "left_foot": "left_toe", "right_foot": "right_toe",
     "left_collar": "left_clavicle", "right_collar": "right_clavicle",
 }  # fmt: skip
-"""Names that answer to another skeleton's word for the same joint, where the first is absent."""
+"""Aliases of joint names: other skeletons' names for the same joint, used if the first name is absent."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Site:
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A tree of joints; parents stand before their children, the root first with parent -1."""
+    """A tree of joints; parents come before their children, the root first with parent -1."""
 
     name: str
     joint_names: tuple[str, ...]
@@ -98,7 +98,7 @@ class Skeleton:
 
     @cached_property
     def levels(self) -> tuple[tuple[int, ...], ...]:
-        """Joints by depth in the tree, the root's level first: what one batched step can compute at once."""
+        """Joints by depth in the tree, the root's level first, for one batched step per level."""
         depth = [0] * len(self)
         for joint in range(1, len(self)):
             depth[joint] = depth[self.parents[joint]] + 1
@@ -143,12 +143,12 @@ class Skeleton:
         return replace(self, t_parent_joint=t_parent_joint, sites=sites)
 
     def scaled(self, scale: float) -> "Skeleton":
-        """Every bone and site times one factor."""
+        """The skeleton with all bones and sites scaled by one factor."""
         return self.with_offsets(self.t_parent_joint * scale)
 
 
 def mirrored(rows: list[tuple[str, str, tuple[float, float, float]]]) -> list:
-    """The right-hand twins (y negated, left→right) of rows that describe the left side."""
+    """The right side's rows (y negated, left→right in names) for rows that describe the left side."""
     swap = lambda name: name.replace("left", "right")  # noqa: E731
     return [(swap(name), swap(parent), (x, -y, z)) for name, parent, (x, y, z) in rows]
 

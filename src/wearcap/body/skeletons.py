@@ -1,4 +1,4 @@
-"""The skeletons that have a name, at the size of one 1.75 m adult.
+"""The named skeletons, at the size of a 1.75 m adult.
 
 Joint names and their order are those of SMPL, SMPL+H, SMPL-X and CMU. The offsets are this project's own
 proportions, shared with `xsens23`, and not those of SMPL's licensed template: to get a wearer's or a model

@@ -13,7 +13,7 @@ from wearcap.body.skeletons import skeleton_by_name
 from wearcap.errors import WearcapError
 
 _WORLD_MODEL = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""The files' axes (x left, y up, z forward) into ours."""
+"""Rotation that maps the files' axes (x left, y up, z forward) to ours."""
 _SKELETON_OF = {24: "smpl24", 52: "smplh52", 55: "smplx22"}
 
 
@@ -24,7 +24,7 @@ class SmplArrays:
     template: Float[Tensor, "vertex 3"]
     shape_directions: Float[Tensor, "vertex 3 beta"]
     pose_directions: Float[Tensor, "vertex 3 feature"] | None
-    """Offsets per entry of (R_parent_joint - I) of all joints but the root."""
+    """Pose blend shapes: offsets per entry of (R_parent_joint - I) of all joints but the root."""
     joint_regressor: Float[Tensor, "joint vertex"]
     weights: Float[Tensor, "vertex joint"]
     parents: tuple[int, ...]
@@ -42,9 +42,9 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
         raise WearcapError(
             f"a body model of {count} joints", expected="24 (SMPL), 52 (SMPL+H) or 55 (SMPL-X)"
         )
-    known = arrays.shape_directions.shape[-1]
-    if betas is not None and len(betas) > known:
-        raise WearcapError(f"{len(betas)} shape coefficients", expected=f"at most this file's {known}")
+    available = arrays.shape_directions.shape[-1]
+    if betas is not None and len(betas) > available:
+        raise WearcapError(f"{len(betas)} shape coefficients", expected=f"at most this file's {available}")
     vertices = arrays.template
     if betas is not None:
         vertices = vertices + arrays.shape_directions[..., : len(betas)] @ betas.to(vertices)
@@ -56,7 +56,7 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
         1, torch.tensor(carrier), arrays.weights
     )
     if arrays.parents[: len(named)] != named.parents:
-        raise WearcapError(f"joints that hang otherwise than {named.name}'s", expected="an SMPL family file")
+        raise WearcapError(f"a joint tree other than {named.name}'s", expected="an SMPL family file")
     offsets = joints[: len(named)] - joints[[max(parent, 0) for parent in named.parents]]
     skeleton = named.with_offsets(offsets.float())
     skin_joints, skin_weights = four_weights(weights)
@@ -71,7 +71,7 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
 
 
 def _carriers(parents: tuple[int, ...], kept: int) -> list[int]:
-    """For each joint of the file the nearest one above it that the skeleton keeps."""
+    """The nearest ancestor that the skeleton keeps, for each joint of the file."""
     carrier = list(range(len(parents)))
     for joint in range(kept, len(parents)):
         carrier[joint] = carrier[parents[joint]]
@@ -81,7 +81,7 @@ def _carriers(parents: tuple[int, ...], kept: int) -> list[int]:
 def _surface_sites(
     skeleton: Skeleton, vertices: Float[Tensor, "vertex 3"], regions: dict[str, Tensor]
 ) -> dict[str, Site]:
-    """Heels, toe tips and crown on the surface itself."""
+    """Heels, toe tips and crown, found on the surface."""
     at = {"crown": ("head", vertices[vertices[:, 2].argmax()])}
     for side in ("left", "right"):
         heel, toes = (vertices[regions[f"{side}_{part}"]] for part in ("heel", "toes"))

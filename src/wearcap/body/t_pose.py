@@ -1,4 +1,4 @@
-"""One T-pose for every skeleton, whatever its bind pose: what makes rotations comparable."""
+"""The T-pose of any skeleton, whatever its bind pose, which makes rotations of different skeletons comparable."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ _SPLAY = 0.17
 
 @dataclass(frozen=True)
 class TPose:
-    """A skeleton brought to the T-pose, root at the origin: what its parts are and where they then stand."""
+    """A skeleton in T-pose with its root at the origin: landmarks, rotations and joint positions."""
 
     marks: Landmarks
     R: Float[Tensor, "joint 3 3"]
@@ -30,7 +30,7 @@ class TPose:
 
 
 def t_pose(skeleton: Skeleton) -> TPose:
-    """Legs straight down, arms straight sideways, the rest as it lies in the bind pose."""
+    """The T-pose: legs straight down, arms straight sideways, all else as in the bind pose."""
     marks = landmarks(skeleton)
     rest = skeleton.rest_joints.double()
     aim: dict[int, tuple[Tensor, Tensor]] = {}

@@ -1,6 +1,6 @@
-"""Networks as ONNX or torch.export archives, with what is needed to run them elsewhere.
+"""Export of networks to ONNX or torch.export archives, and pipelines that run the exported files.
 
-`network.py` writes any of them and compares it with the eager one; `sidecar.py` says beside it what the file does not.
-Each system has a module of its name, and iReplica's are `contact.py` and `contact_runner.py`; open `mocap_every.py`
-first, the shortest whole way there and back.
+`network.py` writes any network and compares it with the eager one; `sidecar.py` writes the metadata beside it. Each
+system has a module of its name; iReplica's are `contact.py` and `contact_runner.py`. Open `mocap_every.py` first: the
+shortest complete export and import.
 """

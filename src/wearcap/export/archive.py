@@ -1,4 +1,4 @@
-"""What a `.pt2` archive may hold: PyTorch runs some of its texts as Python, so only those that exports have are let in."""
+"""Checks of `.pt2` archives before loading: PyTorch runs some strings as Python, so only known forms are allowed."""
 
 import re
 import zipfile
@@ -14,24 +14,24 @@ _EXPRESSION = re.compile(
     rf"(?:{_SYMBOL}|Integer\(-?\d{{1,18}}\)|[su]\d{{1,6}}|-?\d{{1,18}}"
     r"|(?:Mul|Add|Pow|Min|Max|Mod|PythonMod|FloorDiv|CleanDiv|CeilDiv|ModularIndexing)\(|[(), ])+"
 )
-"""Symbolic sizes, which SymPy evaluates."""
+"""Allowed symbolic sizes, which SymPy evaluates."""
 _SIZE = r"L\['\w{1,60}'\]\.size\(\)\[\d{1,2}\]"
 _GUARD = re.compile(rf"{_SIZE} (?:==|!=|<=|>=|<|>) (?:{_SIZE}|\d{{1,18}})")
-"""Comparisons of the inputs' sizes, which PyTorch compiles into a function."""
+"""Allowed comparisons of input sizes, which PyTorch compiles into a function."""
 _TARGET = re.compile(
     r"torch\.ops\.aten\.\w+\.\w+|_operator\.(?:add|sub|mul|floordiv|mod|neg|eq|ne|ge|gt|le|lt|getitem)"
 )
-"""What a graph may call."""
+"""Operations that a graph may call."""
 _METADATA = ("stack_trace", "nn_module_stack", "torch_fn")
 MAX_JSON_BYTES = 1 << 26
-"""Longest description of a graph (64 MiB); ours have 1 MiB."""
+"""Largest allowed JSON description of a graph (64 MiB); exported ones have about 1 MiB."""
 
 
 def check_archive(path: str | Path) -> None:
-    """Raise WearcapError unless an archive holds tensors and a graph of tensor operations alone.
+    """Raise WearcapError unless an archive has only tensors and a graph of tensor operations.
 
-    Refused are pickled objects, compressed parts, guards and sizes that are more than arithmetic, and calls of anything
-    but ATen's operations. Raises zipfile.BadZipFile for a file that is no archive or is damaged.
+    Refused are pickled objects, compressed parts, guards and sizes other than arithmetic, and calls of functions that
+    are not ATen operations. Raises zipfile.BadZipFile for a file that is no archive or is damaged.
     """
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()

@@ -1,4 +1,4 @@
-"""Contact networks as ONNX or torch.export, with a sidecar, and back as detectors without the network's code."""
+"""Export of contact networks to ONNX or torch.export with a sidecar, and detectors that run the exported files."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +20,7 @@ MAX_ERROR = 1e-5
 
 
 class _MiddleFrame(nn.Module):
-    """61 poses' features to the calibrated probabilities of the middle one."""
+    """Calibrated contact probabilities of the middle frame from the features of 61 frames."""
 
     def __init__(self, net: ContactNetwork):
         super().__init__()
@@ -33,7 +33,7 @@ class _MiddleFrame(nn.Module):
 def export_contact(detector: ContactDetector, path: str | Path, format: str) -> ExportReport:
     """Write a detector's network as `path` (.onnx or .pt2) and its sidecar as the same name with .json.
 
-    It takes `pose` "batch 61 feature" and gives probabilities "batch hand class". Raises what `export_network` raises.
+    It maps `pose` "batch 61 feature" to probabilities "batch hand class". Raises what `export_network` raises.
     """
     skeleton, random = detector.features.skeleton, torch.Generator().manual_seed(0)
     turns = 0.3 * torch.randn(3, FRAMES, len(skeleton), 3, generator=random)
@@ -49,7 +49,7 @@ def export_contact(detector: ContactDetector, path: str | Path, format: str) -> 
 
 
 class ExportedContact(ContactNetwork):
-    """A contact network whose weights live in an exported file, run on the CPU: 61 frames in, one answer out."""
+    """A contact network whose weights are in an exported file, run on the CPU: 61 frames in, one prediction out."""
 
     frames_per_pass = 1000
 

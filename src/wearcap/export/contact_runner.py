@@ -2,7 +2,7 @@
 
     python -m wearcap.export.contact_runner MODEL.onnx RECORDING.safetensors CONTACT.csv
 
-Poses come one by one and wait for the 30 that follow; the state is the last 61 frames.
+Poses are processed frame by frame with a lookahead of 30 frames; the state is the last 61 frames.
 """
 
 import torch
@@ -18,7 +18,7 @@ from wearcap.systems.ireplica.features import pose_frames
 
 
 def main(arguments: list[str]) -> None:
-    """Tell hand contact in one recording with an exported model and write it as a table."""
+    """Predict hand contact in one recording with an exported model and write it as a table."""
     parser = command.parser(
         "contact_runner", main.__doc__, "a suit, or a motion", "times and probabilities (.csv)"
     )
@@ -31,11 +31,11 @@ def main(arguments: list[str]) -> None:
                            expected="a suit, or a motion")  # fmt: skip
     times, R = pose_frames(motion, detector.features.skeleton, detector.fps)
     stream = ContactStream((detector,), detector.features.skeleton)
-    answers = [answer for frame in R if (answer := stream.push(frame)) is not None] + stream.finish()
+    predictions = [found for frame in R if (found := stream.push(frame)) is not None] + stream.finish()
     header = ["time_s", *(f"{hand}_{name}" for name in detector.classes for hand in HANDS)]
     rows = [
-        [f"{time:.6f}", *(f"{p:.7f}" for p in torch.cat([answer[name] for name in detector.classes]).tolist())]
-        for time, answer in zip(times.tolist(), answers)
+        [f"{time:.6f}", *(f"{p:.7f}" for p in torch.cat([found[name] for name in detector.classes]).tolist())]
+        for time, found in zip(times.tolist(), predictions)
     ]  # fmt: skip
     write_text(options.output, "".join(",".join(row) + "\n" for row in [header, *rows]))
     print(f"{len(rows)} frames at {detector.fps:.0f} Hz: {options.output}")

@@ -1,10 +1,10 @@
-"""ECHO's denoiser as ONNX or torch.export, with a sidecar, and back as a pipeline without the network's code.
+"""Export of ECHO's denoiser to ONNX or torch.export with a sidecar, and a pipeline that runs the exported files.
 
     python -m wearcap.export.echo MODEL.onnx RECORDING.safetensors MOTION.safetensors
 
-One graph holds the denoiser: what frames are told, their noise and its levels go in raw, x̂0 comes out. Features, queue
-and guidance are the pipeline's own, and so is the small encoder of objects: it searches among points, which no graph
-does well. Its weights lie beside the model, as NAME.objects.safetensors.
+One graph has the denoiser: unnormalised conditions, x_t and noise levels go in, x̂0 comes out. Features, queue and
+guidance are the eager pipeline's, and so is the small object encoder: its neighbour search exports poorly. Its
+weights are beside the model, in NAME.objects.safetensors.
 """
 
 from dataclasses import asdict
@@ -50,7 +50,7 @@ _CONVEYOR = ("context", "per_frame", "spacing", "eta", "step", "rewindow", "anch
 
 
 class _DenoiserGraph(nn.Module):
-    """x̂0 of windows, normalised, from what is known of them."""
+    """Normalised x̂0 of windows, from raw conditions, x_t and levels."""
 
     def __init__(self, net: EchoDenoiser):
         super().__init__()
@@ -74,7 +74,7 @@ def export_echo(pipeline: Echo, path: str | Path, format: str) -> ExportReport:
     """Write the denoiser as `path` (.onnx or .pt2), its sidecar as the same name with .json, and the weights of the
     objects' encoder beside them.
 
-    It takes a whole window of frames; those that are not there yet are not `valid`. Raises what `export_network` raises.
+    The graph takes full windows, whose padding frames are not `valid`. Raises what `export_network` raises.
     """
     net, features, schedule = pipeline.net, pipeline.features, pipeline.schedule
     if isinstance(net, ExportedEchoDenoiser):
@@ -114,7 +114,7 @@ def _example(net: EchoDenoiser, features: EchoFeatures) -> dict[str, Tensor]:
 
 
 def condition_channels(features: EchoFeatures) -> list[str]:
-    """Names of what a frame is told, in order; they enter the network raw."""
+    """Names of a frame's condition channels in order; they enter the network unnormalised."""
     heading = [f"heading_{axis}" for axis in "xy"] if features.frame == "own" else []
     wearer = ["height", *(f"size.{limb}" for limb in LIMBS)] if features.body else []
     return [
@@ -126,7 +126,7 @@ def condition_channels(features: EchoFeatures) -> list[str]:
 
 
 def motion_channels(skeleton: Skeleton) -> list[str]:
-    """Names of what is said of a frame, in order; normalised by `motion_mean` and `motion_scale`."""
+    """Names of a frame's output channels in order; normalised by `motion_mean` and `motion_scale`."""
     return [
         *(f"root_{axis}" for axis in "xyz"), *(f"{joint}.{entry}" for joint in skeleton.joint_names for entry in ROT6D),
         *(f"object_{axis}" for axis in "xyz"), *(f"object.{entry}" for entry in ROT6D),
@@ -135,7 +135,7 @@ def motion_channels(skeleton: Skeleton) -> list[str]:
 
 
 def encoder_path(path: str | Path) -> Path:
-    """File of the objects' encoder that lies beside a model."""
+    """Path of the object encoder's file beside a model."""
     path = Path(path)
     return path.with_name(f"{path.stem}.objects.safetensors")
 
@@ -163,7 +163,7 @@ def _read_encoder(about: dict[str, Any] | None, path: str | Path) -> PointNeXt |
 
 
 class ExportedEchoDenoiser(EchoDenoiser):
-    """A denoiser whose weights live in an exported file, run on the CPU; it is told anew in every step."""
+    """A denoiser whose weights are in an exported file, run on the CPU; it encodes the condition in every step."""
 
     def __init__(self, run: Run, about: dict[str, Any]):
         """`about`: the sidecar."""
@@ -173,7 +173,7 @@ class ExportedEchoDenoiser(EchoDenoiser):
         self.motion_normalizer = Normalizer(sum(self.sizes))
         self.motion_normalizer.set(torch.tensor(about["motion_mean"]), torch.tensor(about["motion_scale"]))
         self.object = nn.Identity()
-        self._conditioning = len(about["condition_channels"]), len(about["object_channels"]), 1
+        self._input_sizes = len(about["condition_channels"]), len(about["object_channels"]), 1
 
     def encode(
         self,
@@ -182,7 +182,7 @@ class ExportedEchoDenoiser(EchoDenoiser):
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time width"]:
-        """What is told, side by side: the file's network embeds and encodes it itself."""
+        """The raw conditions, concatenated: the exported network embeds and encodes them itself."""
         return torch.cat([condition, scene_object, has_object[..., None].to(condition.dtype)], -1)
 
     def plan(self, level: Float[Tensor, "batch time modality"]) -> EchoPlan:
@@ -197,22 +197,21 @@ class ExportedEchoDenoiser(EchoDenoiser):
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time feature"]:
         batch, count, _ = x_t.shape
-        condition, object_code, has_object = encoded.split(self._conditioning, -1)
+        condition, object_code, has_object = encoded.split(self._input_sizes, -1)
         level = plan.worth[0].expand(batch, -1, -1)
-        conditioning = {
+        inputs = {
             "condition": condition, "object_code": object_code, "has_object": has_object[..., 0] > 0, "valid": valid,
             "x_t": x_t, "level": level,
         }  # fmt: skip
         missing = self.window - count
         whole = {
-            name: F.pad(value, (0, 0) * (value.ndim - 2) + (0, missing))
-            for name, value in conditioning.items()
+            name: F.pad(value, (0, 0) * (value.ndim - 2) + (0, missing)) for name, value in inputs.items()
         }
         return self._run[0](**whole)[:, :count]
 
 
 def load_exported_echo(path: str | Path) -> Echo:
-    """The pipeline of an exported model (.onnx or .pt2) and what was written beside it.
+    """The pipeline of an exported model (.onnx or .pt2) and the files beside it.
 
     Raises WearcapError when a file is missing, unreadable, or does not belong to the others.
     """
@@ -227,7 +226,7 @@ def load_exported_echo(path: str | Path) -> Echo:
 
 
 def main(arguments: list[str]) -> None:
-    """Capture one recording, with the objects that it names, with an exported model."""
+    """Capture one recording and its objects with an exported model."""
     parser = command.parser("echo", main.__doc__, "a head and two wrists", "the motion (.safetensors)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the noise (default 0)")
     options = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""Opening exported networks: each becomes a function from named tensors to a tensor."""
+"""Opens exported networks, each as a function from named tensors to a tensor."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +11,7 @@ from wearcap.export.archive import check_archive
 
 Run = Callable[..., Tensor]
 """Called with the network's arguments by name."""
-_AGAIN = "Copy it again, or make it anew with `wearcap export`."
+_AGAIN = "Copy it again, or export it again with `wearcap export`."
 
 
 def open_onnx(path: str | Path) -> Run:
@@ -39,8 +39,8 @@ def open_onnx(path: str | Path) -> Run:
 
 
 def open_pt2(path: str | Path) -> Run:
-    """A torch.export archive on the CPU. Raises WearcapError when it is missing, not readable, or holds anything
-    that `check_archive` refuses: PyTorch alone would run code of it.
+    """A torch.export archive on the CPU. Raises WearcapError when it is missing, not readable, or refused by
+    `check_archive`: PyTorch by itself would run code from it.
     """
     _require_file(path)
     try:
@@ -48,7 +48,7 @@ def open_pt2(path: str | Path) -> Run:
         module = torch.export.load(str(path)).module()
     except WearcapError:
         raise
-    except Exception as error:  # what PyTorch raises on a graph that it did not write is anything
+    except Exception as error:  # PyTorch raises arbitrary exceptions on a graph that it did not write
         raise WearcapError(
             f"not a readable .pt2 archive ({_first_line(error)})", where=path, fix=_AGAIN
         ) from error
@@ -68,7 +68,7 @@ RUN_BY_FORMAT: dict[str, Callable[[str | Path], Run]] = {"onnx": open_onnx, "pt2
 
 
 def open_exported(path: str | Path) -> Run:
-    """An exported network of either format, known by the file's ending."""
+    """An exported network of either format, chosen by the file's suffix."""
     format = Path(path).suffix.removeprefix(".")
     if format not in RUN_BY_FORMAT:
         raise WearcapError("not an exported model", where=path, expected="a file that ends in .onnx or .pt2")

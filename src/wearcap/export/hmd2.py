@@ -1,4 +1,4 @@
-"""HMD²'s denoiser as ONNX or torch.export, with a sidecar, and back as a pipeline without the network's code.
+"""Export of HMD²'s denoiser to ONNX or torch.export with a sidecar, and a pipeline that runs the exported files.
 
     python -m wearcap.export.hmd2 MODEL.onnx RECORDING.safetensors MOTION.safetensors
 
@@ -42,7 +42,7 @@ MAX_ERROR = 1e-4
 
 
 class ConditionGraph(nn.Module):
-    """What of a denoiser is computed once per window."""
+    """The part of a denoiser that is computed once per window: the encoding of its conditions."""
 
     def __init__(self, net: MotionDenoiser):
         super().__init__()
@@ -66,7 +66,7 @@ class ConditionGraph(nn.Module):
 
 
 class PlaceGraph(nn.Module):
-    """Codes of grids (m) of the points around the body."""
+    """Codes of voxel grids (m) of the points around the body."""
 
     def __init__(self, encoder: VoxelAutoencoder):
         super().__init__()
@@ -80,8 +80,8 @@ def export_hmd2(pipeline: HMD2, path: str | Path, format: str) -> dict[str, Expo
     """Write the pipeline's networks in a format, .onnx or .pt2, and a sidecar of `path`'s name with .json.
 
     `path` is the step (x_t, level, encoded, valid, and last with self-conditioning); NAME.conditions makes `encoded`
-    once per window; NAME.places, where the network listens to points, codes of the grids around the body. Reports by
-    these names. Raises what `export_network` raises.
+    once per window; NAME.places, for a network with point conditioning, encodes the grids around the body. Returns the
+    reports by these names. Raises what `export_network` raises.
     """
     net, random, path = pipeline.net, torch.Generator().manual_seed(0), Path(path)
     shape = 2, net.window
@@ -91,8 +91,8 @@ def export_hmd2(pipeline: HMD2, path: str | Path, format: str) -> dict[str, Expo
     inputs = {"head": normalizer.mean.cpu() + normalizer.scale.cpu() * noise, "valid": valid}
     for name, size in (("points", net.points_size), ("image", net.image_size)):
         if size:
-            there = valid & (torch.rand(shape, generator=random) < 0.7)
-            inputs |= {name: torch.randn(*shape, size, generator=random), f"{name}_valid": there}
+            present = valid & (torch.rand(shape, generator=random) < 0.7)
+            inputs |= {name: torch.randn(*shape, size, generator=random), f"{name}_valid": present}
     tokens, width = net.window // net.frames_per_token, net.motion_encoder.linear.out_features
     x_t, last = torch.randn(2, *shape, net.motion_size, generator=random)
     step = {
@@ -118,7 +118,7 @@ def export_hmd2(pipeline: HMD2, path: str | Path, format: str) -> dict[str, Expo
 
 
 def describe(pipeline: HMD2, reports: dict[str, ExportReport]) -> dict:
-    """Everything a runner needs beside the networks. Rotations of the motion are 6D in `features.frame`."""
+    """The sidecar: everything that running the networks needs. Rotations of the motion are 6D in `features.frame`."""
     net, features, schedule = pipeline.net, pipeline.features, pipeline.schedule
     if type(schedule).__name__ not in SCHEDULES:
         raise WearcapError(f"schedule {type(schedule).__name__} cannot be exported",
@@ -157,7 +157,7 @@ def describe(pipeline: HMD2, reports: dict[str, ExportReport]) -> dict:
 
 
 def condition_channels(features: HeadFeatures) -> list[str]:
-    """Names of the head's channels in order; they enter the network raw."""
+    """Names of the head's channels in order; they enter the network unnormalised."""
     horizontal = ["offset_x", "offset_y"] if features.frame == "window" else []
     return [
         *horizontal, f"height_{features.height}", *(f"head.{entry}" for entry in ROT6D),
@@ -173,7 +173,7 @@ def motion_channels(features: HeadFeatures, skeleton: Skeleton) -> list[str]:
 
 
 class ExportedDenoiser(MotionDenoiser):
-    """A `MotionDenoiser` whose weights live in exported files, run on the CPU."""
+    """A `MotionDenoiser` whose weights are in exported files, run on the CPU."""
 
     def __init__(self, step: Run, conditions: Run, about: dict):
         """`about`: the sidecar."""
@@ -220,7 +220,7 @@ class ExportedDenoiser(MotionDenoiser):
 
 
 class ExportedPlaces(VoxelAutoencoder):
-    """The encoder of the points around the body, its weights in an exported file."""
+    """The encoder of the points around the body, with its weights in an exported file."""
 
     def __init__(self, run: Run, grid: VoxelGrid, size: int):
         nn.Module.__init__(self)
@@ -232,7 +232,7 @@ class ExportedPlaces(VoxelAutoencoder):
 
 
 def load_exported_hmd2(path: str | Path) -> HMD2:
-    """The pipeline of an exported model, from the step's file (.onnx or .pt2) and what was written beside it.
+    """The pipeline of an exported model, from the step's file (.onnx or .pt2) and the files beside it.
 
     Raises WearcapError when one of the files is missing, unreadable, or does not belong to the others.
     """

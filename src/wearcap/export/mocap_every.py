@@ -1,8 +1,8 @@
-"""MocapEvery's estimator as ONNX or torch.export, with a sidecar, and back as a pipeline without the network's code.
+"""Export of MocapEvery's estimator to ONNX or torch.export with a sidecar, and a pipeline that runs the exported file.
 
     python -m wearcap.export.mocap_every MODEL.onnx RECORDING.safetensors MOTION.safetensors
 
-The file holds the network alone; frames, floor and windows are the pipeline's own.
+The file has the network alone; coordinate frames, floor and windows are the eager pipeline's.
 """
 
 from dataclasses import asdict
@@ -27,7 +27,7 @@ MAX_ERROR = 1e-4
 
 
 class _Joined(nn.Module):
-    """Motion and contact of the last frames, in one tensor."""
+    """Motion and contact logits of the last frames, in one tensor."""
 
     def __init__(self, net: WatchEstimator):
         super().__init__()
@@ -43,8 +43,8 @@ class _Joined(nn.Module):
 def export_mocap_every(pipeline: MocapEvery, path: str | Path, format: str) -> ExportReport:
     """Write the estimator as `path` (.onnx or .pt2) and its sidecar as the same name with .json.
 
-    It takes raw `features` "batch window feature" and gives motion and contact logits "batch said motion+2". Raises
-    what `export_network` raises.
+    Its input is unnormalised `features` "batch window feature", its output motion and contact logits
+    "batch predicted motion+2". Raises what `export_network` raises.
     """
     net, features, random = pipeline.net, pipeline.features, torch.Generator().manual_seed(0)
     if not isinstance(net, TrainedEstimator):
@@ -63,7 +63,7 @@ def export_mocap_every(pipeline: MocapEvery, path: str | Path, format: str) -> E
 
 
 class ExportedEstimator(WatchEstimator):
-    """An estimator whose weights live in an exported file, run on the CPU."""
+    """An estimator whose weights are in an exported file, run on the CPU."""
 
     def __init__(self, run: Run, window: int):
         super().__init__()

@@ -1,4 +1,4 @@
-"""A network written as ONNX or as a torch.export archive, and compared with the eager network before it counts."""
+"""Writes a network as ONNX or as a torch.export archive, after checking it against the eager network."""
 
 import copy
 import importlib.util
@@ -20,7 +20,7 @@ TIMED_RUNS = 5
 
 @dataclass(frozen=True)
 class ExportReport:
-    """How an exported network compares with the eager one on this machine's CPU."""
+    """Comparison of an exported network with the eager one on this machine's CPU."""
 
     path: str
     format: str
@@ -28,8 +28,9 @@ class ExportReport:
     max_abs_error: float
     """Largest difference of any output over batches of one and of three windows."""
     latency_ms: float
-    """Median time of one window, exported."""
+    """Median time of the exported network for one window."""
     eager_latency_ms: float
+    """Median time of the eager network for one window."""
 
 
 def export_network(
@@ -79,11 +80,11 @@ def _require_libraries(format: str) -> None:
 
 
 def _batch_of(example: dict[str, Tensor], batch: int) -> dict[str, Tensor]:
-    """The example's first row, as often as asked; floats get a different ripple in every row."""
+    """The example's first row, repeated `batch` times; floats are scaled differently in every row."""
     rows = {name: value[:1].repeat(batch, *[1] * (value.ndim - 1)) for name, value in example.items()}
-    ripple = 1 + 0.1 * torch.arange(batch)
+    divisor = 1 + 0.1 * torch.arange(batch)
     return {
-        name: value / ripple.reshape(-1, *[1] * (value.ndim - 1)) if value.is_floating_point() else value
+        name: value / divisor.reshape(-1, *[1] * (value.ndim - 1)) if value.is_floating_point() else value
         for name, value in rows.items()
     }
 

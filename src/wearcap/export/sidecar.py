@@ -1,4 +1,4 @@
-"""What an exported network's file does not say: statistics, features, skeleton and more. JSON, written beside it."""
+"""The sidecar of an exported network: a JSON file beside it with statistics, features, skeleton and more."""
 
 import json
 from dataclasses import asdict
@@ -19,7 +19,7 @@ ROT6D = tuple(f"{column}{axis}" for column in "xy" for axis in "xyz")
 
 
 def part_path(path: str | Path, part: str) -> Path:
-    """File of a part that lies beside the step's."""
+    """Path of another part's file, beside the step's file."""
     path = Path(path)
     return path.with_name(f"{path.stem}.{part}{path.suffix}")
 
@@ -33,12 +33,12 @@ def write_sidecar(path: str | Path, about: dict) -> None:
 
 
 def header(network: str, report: ExportReport) -> dict:
-    """What the sidecar of every kind of network begins with."""
+    """The first entries of every network's sidecar."""
     return {"wearcap_export": VERSION, "network": network, "model": file_entry(report)}
 
 
 def file_entry(report: ExportReport) -> dict:
-    """A model file: its name, its checksum, and how it was made."""
+    """Entry of a model file: its name, its checksum, and its export report."""
     return {"file": Path(report.path).name, "sha256": sha256_of(report.path), **asdict(report)}
 
 
@@ -69,7 +69,7 @@ def read_sidecar(path: str | Path, network: str) -> dict:
                            "beside the model", fix="Copy both files.") from error  # fmt: skip
     if not isinstance(tree, dict) or tree.get("wearcap_export") != VERSION:
         raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
-    # The first sidecars did not say: all were denoisers'.
+    # The first sidecars had no "network" entry: all were denoisers'.
     if (kind := tree.get("network", "denoiser")) != network:
         raise WearcapError(f"a {kind} network", where=path, expected=f"a {network} network")
     files = {Path(path): tree["model"]} | {

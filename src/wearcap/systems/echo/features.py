@@ -1,4 +1,4 @@
-"""What ECHO is told and says (ECHO §3.1): three tracked points in; body, object and contacts out."""
+"""ECHO's inputs and outputs as features (ECHO §3.1): three tracked points in; body, object and contacts out."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,17 +15,19 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 
 POINTS = ("head", "left_wrist", "right_wrist")
-"""Joints that are tracked, in this order."""
+"""The tracked joints, in this order."""
 FRAMES = ("own", "window", "world")
+"""Coordinate frames that features can be expressed in (`EchoFeatures.frame`)."""
 CONTACTS = BODY_POINTS + len(FOOT_PATCHES)
+"""Number of contact labels per frame."""
 OBJECT_SIZE = 9
-"""Translation and 6D rotation."""
+"""Features of an object's pose: translation and 6D rotation."""
 EXTENTS = 6
-"""Half extents along the canonical axes and the bounding box's middle (m)."""
+"""Features of an object's size: half extents along its canonical axes and its bounding box's centre (m)."""
 
 
 class ThreePoints(NamedTuple):
-    """Head and wrists, frame by frame at the model's rate."""
+    """World poses of head and wrists at the model's frame rate."""
 
     R_world_point: Float[Tensor, "*batch time point 3 3"]
     t_world_point: Float[Tensor, "*batch time point 3"]
@@ -37,11 +39,11 @@ class Modalities(NamedTuple):
     human: Float[Tensor, "batch time human"]
     object: Float[Tensor, "batch time 9"]
     contact: Float[Tensor, "batch time contact"]
-    """64 body points, then `FOOT_PATCHES`: 1 touches, -1 does not."""
+    """64 body points, then `FOOT_PATCHES`: 1 for contact, -1 for none."""
 
 
 class Body(NamedTuple):
-    """A body's motion in the world."""
+    """A body's motion: local joint rotations and the root's position in the world (m)."""
 
     R_parent_joint: Float[Tensor, "*batch time joint 3 3"]
     t_world_root: Float[Tensor, "*batch time 3"]
@@ -49,22 +51,24 @@ class Body(NamedTuple):
 
 @dataclass(frozen=True)
 class EchoFeatures:
-    """Encodes three tracked points, bodies and objects, in the world or from a head.
+    """Encodes three tracked points, bodies and objects in world or head-centred coordinates.
 
-    frame "window": gravity-aligned, at the head of the window's first frame (the document). "own" (ours): each frame
-    in its own head's heading and place, so that nothing depends on where in the window it happens, and nothing has to
-    be re-expressed when the window moves. "world": as it was recorded (the document's row without canonical frame).
+    frame "window": gravity-aligned, at the head of the window's first frame (ECHO). "own" (ours): each frame in its
+    own head-centred, yaw-aligned coordinates, so that features do not depend on the position within the window and
+    need not be re-expressed when the window advances. "world": as recorded (ECHO's ablation without canonical frame).
     """
 
     frame: str = "own"
     body: bool = True
-    """Whether the wearer's size and the head's height over the floor are told (ours)."""
+    """Whether the wearer's size and the head's height above the floor are part of the condition (ours)."""
     classes: tuple[str, ...] | list[str] = ()
     """Names of the object classes, in the order of their one-hot code."""
     shape_size: int = 256
-    """Of the object encoder's feature; 0: objects are told by class and extents alone."""
+    """Size of the object encoder's feature; 0: class and extents alone describe an object."""
     joints: int = 23
+    """Number of joints of the skeleton."""
     fps: float = 30.0
+    """Frame rate of the model (Hz)."""
 
     def __post_init__(self):
         if self.frame not in FRAMES:
@@ -72,34 +76,35 @@ class EchoFeatures:
 
     @property
     def condition_size(self) -> int:
-        """54 (the document), 2 of the head's heading in its own frame, 1 of the floor and the body's size."""
+        """Features per frame: 54 (ECHO), 2 of the heading if frame is "own", and the head's height and limb lengths."""
         return 54 + (2 if self.frame == "own" else 0) + (1 + len(LIMBS) if self.body else 0)
 
     @property
     def human_size(self) -> int:
-        """Root translation, and 6D rotations of all joints."""
+        """Features of a body's pose: root translation and 6D rotations of all joints."""
         return 3 + 6 * self.joints
 
     @property
     def object_condition_size(self) -> int:
+        """Features of an object: one-hot class, extents, and the encoder's feature."""
         return len(self.classes) + EXTENTS + self.shape_size
 
     @property
     def moves(self) -> bool:
-        """Whether what is said has to be re-expressed when the window moves."""
+        """Whether outputs must be re-expressed when the window advances."""
         return self.frame == "window"
 
     def class_code(self, name: str) -> Float[Tensor, "class"]:
-        """One-hot code of a class. Raises WearcapError for one that the model does not know."""
+        """One-hot code of a class. Raises WearcapError for a class that the model was not built for."""
         if name not in self.classes:
-            raise WearcapError(f"the model knows no object class {name!r}", expected=f"one of {', '.join(self.classes)}",
+            raise WearcapError(f"the model has no object class {name!r}", expected=f"one of {', '.join(self.classes)}",
                                fix="Give the object's category the name of the class that is most like it.")  # fmt: skip
         return torch.nn.functional.one_hot(
             torch.tensor(list(self.classes).index(name)), len(self.classes)
         ).float()
 
     def canonical(self, points: ThreePoints) -> Rigid:
-        """Poses in the world of the frames that windows are said in: R "batch #time 3 3", t "batch #time 3"."""
+        """World poses of the canonical frames of windows: R "batch #time 3 3", t "batch #time 3"."""
         R, t = points.R_world_point[:, :, 0], points.t_world_point[:, :, 0]
         if self.frame == "world":
             return Rigid(torch.eye(3).to(R).expand(len(R), 1, 3, 3), torch.zeros_like(t[:, :1]))
@@ -114,9 +119,10 @@ class EchoFeatures:
         size: Float[Tensor, "batch limb"],
         frame: Rigid | None = None,
     ) -> Float[Tensor, "batch time condition"]:
-        """[R, ω, J, v] of the three points (ECHO eq. 4): ω is the turn since the frame before, as 6D, v the velocity (m/s).
+        """[R, ω, J, v] of the three points (ECHO eq. 4): ω is the rotation since the previous frame as 6D, v the
+        velocity (m/s).
 
-        `frame`: what `canonical` says of the points, where it is known already.
+        `frame`: the canonical frame of the points, if it was computed already.
         """
         R, t = points
         frame = self.canonical(points) if frame is None else frame
@@ -124,18 +130,18 @@ class EchoFeatures:
         turn = torch.cat([torch.eye(3).to(R).expand_as(R[:, :1]), R[:, :-1].mT @ R[:, 1:]], 1)
         step = t.diff(dim=1) * self.fps
         step = torch.cat([step[:, :1] if step.shape[1] else torch.zeros_like(t), step], 1)
-        places = (R_canonical_world @ (t - frame.t[:, :, None])[..., None])[..., 0]
+        positions = (R_canonical_world @ (t - frame.t[:, :, None])[..., None])[..., 0]
         first = Rigid(
             rotation.about_axis("z", rotation.yaw_of(R[:, :1, 0])), t[:, :1, 0]
-        )  # of the first head
+        )  # yaw-aligned frame of the window's first head pose
         parts = [
             rotation.rot6d_from_matrix(R_canonical_world @ R).flatten(-2),
             rotation.rot6d_from_matrix(turn).flatten(-2),
-            places.flatten(-2),
+            positions.flatten(-2),
             (R_canonical_world @ step[..., None])[..., 0].flatten(-2),
         ]
         if self.frame == "own":
-            # The head is at its own origin: its place and heading are told from the window's first head instead.
+            # The head is at its own origin: its position and heading are relative to the window's first head instead.
             parts[2] = torch.cat([first.inverse() @ t[:, :, 0], parts[2][..., 3:]], -1)
             parts.append((first.R.mT @ frame.R)[..., :2, 0])
         if self.body:
@@ -144,7 +150,7 @@ class EchoFeatures:
         return torch.cat(parts, -1)
 
     def encode_body(self, body: Body, frame: Rigid) -> Float[Tensor, "batch time human"]:
-        """Root and local rotations, the root's pose as `frame` sees it."""
+        """Root translation and 6D joint rotations, with the root's pose in coordinates of `frame`."""
         root = frame.inverse() @ Rigid(body.R_parent_joint[:, :, 0], body.t_world_root)
         R = torch.cat([root.R[:, :, None], body.R_parent_joint[:, :, 1:]], 2)
         return torch.cat([root.t, rotation.rot6d_from_matrix(R).flatten(-2)], -1)
@@ -156,7 +162,7 @@ class EchoFeatures:
         return Body(torch.cat([root.R[:, :, None], R[:, :, 1:]], 2), root.t)
 
     def encode_object(self, T_world_object: Rigid, frame: Rigid) -> Float[Tensor, "batch time 9"]:
-        """Translation and 6D rotation of an object as `frame` sees it."""
+        """Translation and 6D rotation of an object in coordinates of `frame`."""
         T = frame.inverse() @ T_world_object
         return torch.cat([T.t, rotation.rot6d_from_matrix(T.R)], -1)
 

@@ -1,4 +1,4 @@
-"""ECHO's guidance (ECHO §3.3): the prediction is pulled to the contacts that it itself predicts."""
+"""ECHO's guidance (ECHO §3.3): gradient steps pull body and object towards the contacts that the network predicts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,22 +21,25 @@ from wearcap.systems.echo.queue import Conditioning
 
 @dataclass(frozen=True)
 class Guidance:
-    """How far x̂0 goes down the gradient in every step. Costs are squares of metres, each frame's mean over its points;
-    ours are the weights, and that the body is moved less than the object: it is known better."""
+    """Step sizes along the negative gradient that x̂0 takes in every denoising step.
+
+    Costs are squared distances (m²), each frame's mean over its points. The weights are ours, and so is moving the body
+    less than the object: its pose is more certain.
+    """
 
     object: float = 3.0
-    """By which the object comes to the body's points that touch it."""
+    """Step size of the object towards the body points in contact."""
     human: float = 0.3
-    """By which the body comes to the object."""
+    """Step size of the body towards the object."""
     feet: float = 1.0
-    """By which feet that touch the floor come to it."""
+    """Step size of the body that brings feet in contact to the floor."""
     threshold: float = 0.5
-    """From which probability on something touches."""
+    """Contact probability from which a point counts as in contact."""
 
     def corrected(
         self, x0_hat: Float[Tensor, "batch frame feature"], scene: "GuidedScene"
     ) -> Float[Tensor, "batch frame feature"]:
-        """x̂0 after one step down the gradient (classifier guidance, Dhariwal and Nichol 2021)."""
+        """x̂0 after one gradient step (classifier guidance, Dhariwal and Nichol 2021)."""
         with torch.enable_grad():
             x = x0_hat.detach().clone().requires_grad_(True)
             touch, stand = scene.costs(x, self.threshold)
@@ -53,37 +56,37 @@ class Guidance:
 
 @dataclass(frozen=True, eq=False)
 class GuidedScene:
-    """What a window's prediction is held against."""
+    """Bodies, objects and conditioning of one window, against which its prediction is guided."""
 
     net: EchoDenoiser
     features: EchoFeatures
     conditioning: Conditioning
     frame: Rigid
     surfaces: Sequence[BodyModel]
-    """Each lane's contact points."""
+    """Contact points on the body of each batch item."""
     objects: Sequence[Sequence[KDTree]]
-    """Points of each lane's objects, about their middles."""
+    """Surface points of the objects of each batch item, relative to the objects' centres (m)."""
 
     def costs(
         self, x0_hat: Float[Tensor, "batch frame feature"], threshold: float
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Squared distances (m²) of touching points to the object, and of standing feet to the floor: means over each
-        frame's points, summed over frames."""
+        """Squared distances (m²) of body points in contact to the object, and of feet in contact to the floor: means
+        over each frame's points, summed over frames."""
         mean, scale = self.net.motion_normalizer.mean.to(x0_hat), self.net.motion_normalizer.scale.to(x0_hat)
         human, scene_object, contact = (x0_hat * scale + mean).split(self.net.sizes, -1)
         body, T_object = (
             self.features.decode_body(human, self.frame),
             self.features.decode_object(scene_object, self.frame),
         )
-        outputs = (contact.detach() + 1) / 2 > threshold
-        there = self.conditioning.valid & self.conditioning.has_object
+        in_contact = (contact.detach() + 1) / 2 > threshold
+        has_object = self.conditioning.valid & self.conditioning.has_object
         touch, stand = x0_hat.new_zeros(()), x0_hat.new_zeros(())
         for item, surface in enumerate(self.surfaces):
             pose = forward_kinematics(surface.skeleton, body.R_parent_joint[item], body.t_world_root[item])
-            touches = outputs[item, :, :BODY_POINTS] & there[item, :, None]
+            touches = in_contact[item, :, :BODY_POINTS] & has_object[item, :, None]
             if touches.any():
                 touch = touch + self._to_object(item, surface, pose, T_object[item], touches)
-            stands = outputs[item, :, BODY_POINTS:] & self.conditioning.valid[item, :, None]
+            stands = in_contact[item, :, BODY_POINTS:] & self.conditioning.valid[item, :, None]
             soles = site_positions(surface.skeleton, pose, FOOT_PATCHES)
             height = soles[..., 2] - self.conditioning.floor_height[item, :, None]
             stand = stand + (height.square() * stands / stands.sum(1, keepdim=True).clamp_min(1)).sum()
@@ -92,7 +95,8 @@ class GuidedScene:
     def _to_object(
         self, item: int, surface: BodyModel, pose: Rigid, T_object: Rigid, touches: Tensor
     ) -> Float[Tensor, ""]:
-        """Of one lane, to the nearest point of the surface, through which the gradient goes."""
+        """Squared distances of one batch item's touching points to the nearest surface points, which stay fixed in the
+        gradient."""
         frame, point = touches.nonzero(as_tuple=True)
         arm = surface.vertices(pose)[frame, point] - T_object.t[frame]
         local = (T_object.R[frame].mT @ arm[..., None])[..., 0]

@@ -1,5 +1,5 @@
-"""ECHO's denoiser (ECHO §3.2): a diffusion transformer over human, object and contacts, each frame and modality with a
-noise level of its own."""
+"""ECHO's denoiser (ECHO §3.2): a diffusion transformer over human, object and contacts, with an independent noise level
+for each frame and modality."""
 
 from typing import NamedTuple
 
@@ -22,19 +22,20 @@ MODALITIES = ("human", "object", "contact")
 
 
 class EchoPlan(NamedTuple):
-    """What of a step depends on the noise levels alone."""
+    """The part of a denoising step that depends on the noise levels alone."""
 
     worth: tuple[Float[Tensor, "batch token width"], ...]
-    """Per modality."""
+    """Level-dependent input scaling of each modality's encoder (`MotionEncoder.plan`)."""
     blocks: tuple[Float[Tensor, "batch token modulation"], ...]
+    """Adaptive layer-norm modulation of each block."""
 
 
 class EchoDenoiser(nn.Module):
-    """(x̂_H, x̂_O, x̂_I) = D(x_t, levels, E, C_O), the three modalities side by side in the features of a frame (eq. 7).
+    """(x̂_H, x̂_O, x̂_I) = D(x_t, levels, E, C_O), with the modalities concatenated per frame (ECHO eq. 7).
 
-    `streams` 1: one token per frame, the sum of what is known of it. 3: a token per frame and modality, which share the
-    frame's position. The active object is told with every frame (ours: the document has one for a window), so that a
-    wearer may turn from one to the next; where there is none, a learned null vector is. `blend`: see `MotionDenoiser`.
+    `streams` 1: one token per frame, the sum of its modalities' embeddings. 3: one token per frame and modality,
+    sharing the frame's position. The active object conditions each frame (ours: ECHO has one object per window), so
+    that it may change within a window; frames without one get a learned null vector. `blend`: see `MotionDenoiser`.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class EchoDenoiser(nn.Module):
         context: int = 7,
         blend: int = 0,
     ):
-        """`context`: frames before and behind its own that a token's condition sees."""
+        """`context`: frames before and after its own that the convolution over conditions sees."""
         super().__init__()
         if streams not in (1, len(MODALITIES)):
             raise ValueError(f"{streams} streams, but there are {len(MODALITIES)} modalities")
@@ -62,7 +63,7 @@ class EchoDenoiser(nn.Module):
         self.sizes = (human_size, object_size, contact_size)
         self.motion_normalizer = Normalizer(sum(self.sizes))
         self.condition_normalizer = Normalizer(condition_size)
-        # One more channel says which frames exist: padding would else look like the mean condition.
+        # One more channel marks valid frames: padding would otherwise look like the mean condition.
         self.widen = Widening(condition_size + 1, 2 * width, 1, context)
         self.object = nn.Sequential(
             nn.Linear(object_condition_size, width), nn.GELU(), nn.Linear(width, 2 * width)
@@ -89,14 +90,14 @@ class EchoDenoiser(nn.Module):
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time width"]:
-        """What a window's frames are told, the same in every step. `scene_object`: their objects' codes, through `object`."""
+        """Encoded condition of each frame, the same in every step. `scene_object`: codes embedded by `self.object`."""
         mask = valid[..., None].to(condition.dtype)
         wide = self.widen(torch.cat([self.condition_normalizer(condition) * mask, mask], -1))
         scene_object = torch.where(has_object[..., None], scene_object, self.no_object)
         return self.narrow(F.gelu(wide + scene_object))
 
     def plan(self, level: Float[Tensor, "batch time modality"]) -> EchoPlan:
-        """The levels' part of a step; a queue that runs repeats it."""
+        """The part of a step that depends on the levels alone; a conveyor in steady state repeats its levels."""
         embedded = [embed(level[..., k]) for k, embed in enumerate(self.levels)]
         worth = tuple(encoder.plan(each) for encoder, each in zip(self.motion_encoders, embedded))
         together = torch.stack(embedded).sum(0)
@@ -111,7 +112,7 @@ class EchoDenoiser(nn.Module):
         encoded: Float[Tensor, "batch time width"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time feature"]:
-        """x̂0 in normalised space."""
+        """x̂0 in normalised space, from x_t, the levels' plan and the encoded condition."""
         parts = x_t.split(self.sizes, -1)
         tokens = [
             encoder(part, worth, valid)
@@ -135,10 +136,10 @@ class EchoDenoiser(nn.Module):
         encoded: Float[Tensor, "batch time width"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time feature"]:
-        """x̂0 in normalised space, from x_t and what `encode` said."""
+        """x̂0 in normalised space, from x_t, its levels and the result of `encode`."""
         return self.step(x_t, self.plan(level), encoded, valid)
 
     def per_feature(self, level: Float[Tensor, "batch time modality"]) -> Float[Tensor, "batch time feature"]:
-        """A modality's level for each of its features."""
+        """Each modality's level, repeated for its features."""
         sizes = torch.tensor(self.sizes, device=level.device)
         return level.repeat_interleave(sizes, -1, output_size=sum(self.sizes))

@@ -1,4 +1,4 @@
-"""Objects as clouds of points: surfaces sampled by area, and generated instances by the thousand, turned and worn."""
+"""Objects as point clouds: augmented views of generated instances, for training the object encoder."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ _KEY = "made_of"
 
 
 class ObjectViews(NamedTuple):
-    """One object's cloud (m), varied a few times over, or a batch of such (a leading "batch" axis)."""
+    """Augmented views of one object's point cloud (m), or a batch of objects (a leading "batch" axis)."""
 
     points: Float[Tensor, "*batch view point 3"]
     label: Int64[Tensor, "*batch"]
@@ -30,19 +30,19 @@ class ObjectViews(NamedTuple):
 
 @dataclass(frozen=True)
 class CloudAugmentation:
-    """How a view of a cloud is varied; the object is stretched along its own axes, then turned."""
+    """Augmentation of a cloud: anisotropic scaling along the object's axes, jitter, rotation, and dropped points."""
 
     stretch: float = 0.1
-    """Each axis by another factor, within 1 ± this."""
+    """Largest deviation of each axis's scale factor from 1."""
     jitter_m: float = 0.002
-    """Deviation of each coordinate."""
+    """Standard deviation of the noise on each coordinate (m)."""
     least_kept: float = 0.5
-    """Up to the rest of the points is replaced by repeats of others."""
+    """Smallest share of points that are kept; dropped points are replaced by duplicates of kept ones."""
     turned: float = 0.5
-    """Share of views turned in any way; the others about the vertical."""
+    """Share of views with a uniformly random rotation; the others are rotated about the vertical axis."""
 
     def __call__(self, points: Float[Tensor, "point 3"], random: torch.Generator) -> Float[Tensor, "point 3"]:
-        """A varied cloud (m); what is drawn is a function of the generator."""
+        """An augmented cloud (m); all randomness comes from the generator."""
         points = points * (1 + self.stretch * (2 * torch.rand(3, generator=random) - 1))
         points = points + self.jitter_m * torch.randn(points.shape, generator=random)
         any_way, angle, share = torch.rand(3, generator=random).tolist()
@@ -55,16 +55,16 @@ class CloudAugmentation:
 
 
 def random_rotation(random: torch.Generator) -> Float[Tensor, "3 3"]:
-    """Uniform over all rotations: the directions of Gaussian columns, made right-handed."""
+    """A uniformly random rotation: Q of a Gaussian matrix's QR decomposition, made right-handed."""
     q, r = torch.linalg.qr(torch.randn(3, 3, generator=random))
     R = q * r.diagonal().sign()
     return R * R.det().sign()
 
 
 class ObjectCloudDataset(Dataset):
-    """Two views of each generated object: both varied in training, else one as it is and one varied.
+    """Two views of each generated object: both augmented in training, else one original and one augmented.
 
-    An item is asked for by (object, seed), or by its number alone.
+    An item's index is (object, seed), or the object alone.
     """
 
     def __init__(
@@ -106,10 +106,10 @@ class ObjectClouds(SeededWindows):
         seed: int = 0,
         augmentation: CloudAugmentation | None = None,
     ):
-        """`per_class` objects of each of `classes` for training, `val_per_class` others for validation, kept under `root`.
+        """`per_class` objects per class for training and `val_per_class` others for validation, cached in `root`.
 
-        `generate` makes what is not there from a split, classes, a number of each and a number of points: clouds
-        "object point 3" (m) and the classes' numbers "object". A batch holds `batch_size` objects, of two views each.
+        `generate` creates missing clouds from a split, classes, a number of objects per class and a number of points:
+        clouds "object point 3" (m) and class indices "object". A batch has `batch_size` objects with two views each.
         """
         super().__init__({}, batch_size, steps_per_epoch, val_windows, workers, seed, None)
         self.root, self.generate, self.classes, self.points = Path(root), generate, tuple(classes), points
@@ -117,7 +117,7 @@ class ObjectClouds(SeededWindows):
         self.augmentation = augmentation or CloudAugmentation()
 
     def dataset(self, split: str) -> ObjectCloudDataset:
-        """Objects of a split, generated where its file is missing or of other settings."""
+        """Objects of a split, generated if their file is missing or was made with other settings."""
         clouds, labels = cached_clouds(
             self.root, self.generate, split, self.classes, self.counts[split], self.points
         )
@@ -132,7 +132,7 @@ def cached_clouds(
     per_class: int,
     points: int,
 ) -> tuple[Float[Tensor, "object point 3"], Int64[Tensor, "object"]]:
-    """Clouds (m, in their objects' own axes) and their classes' numbers, of a file under `root`, made if need be."""
+    """Clouds (m, in their objects' own axes) and class indices from a file in `root`, which is created if needed."""
     path, made_of = root / f"{split}.safetensors", json.dumps([list(classes), per_class, points])
     if _made_of(path) != made_of:
         clouds, labels = generate(split, classes, per_class, points)

@@ -1,4 +1,4 @@
-"""Training of the object encoder: what its feature must tell of an object is asked of it."""
+"""Training of the object encoder: classification, size regression and instance discrimination from its feature."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ _TEMPERATURE = 0.1
 
 
 class ObjectEncoding(WeighedTerms):
-    """Its category, its half extents as it is turned, and that two views of one object are of one."""
+    """Trains the feature to predict the category and the half extents, and to match two views of the same object."""
 
     def __init__(
         self,
@@ -30,22 +30,22 @@ class ObjectEncoding(WeighedTerms):
         self._optimizer, self._scheduler = optimizer, scheduler
 
     def set_statistics(self, dataset: ObjectCloudDataset) -> None:
-        """None: clouds are scaled each by itself, and batch norm finds its own."""
+        """Nothing to set: each cloud is normalised by itself, and batch norm keeps its own statistics."""
 
     def terms(self, batch: ObjectViews) -> dict[str, Tensor]:
-        """Loss terms, and the share of each view that is told rightly ("accuracy_1", "accuracy_2")."""
+        """Loss terms, and the classification accuracy on each view ("accuracy_1", "accuracy_2")."""
         clouds, views = batch.points.flatten(0, 1), batch.points.shape[1]
         feature = self.net.encoder(clouds)
         logits, labels = self.net.category(feature), batch.label.repeat_interleave(views)
         _, radius = to_unit_sphere(clouds)
         extents = bounds(clouds)[0] / radius[:, None]
-        right = (logits.argmax(-1) == labels).float().unflatten(0, (-1, views)).mean(0)
-        seen = self.net.instance(feature).unflatten(0, (-1, views))
+        accuracy = (logits.argmax(-1) == labels).float().unflatten(0, (-1, views)).mean(0)
+        embedding = self.net.instance(feature).unflatten(0, (-1, views))
         return {
             "category": F.cross_entropy(logits, labels),
             "extents": F.l1_loss(self.net.extents(feature), extents),
-            "instance": instance_loss(seen[:, 0], seen[:, 1]),
-            **{f"accuracy_{view + 1}": share for view, share in enumerate(right)},
+            "instance": instance_loss(embedding[:, 0], embedding[:, 1]),
+            **{f"accuracy_{view + 1}": share for view, share in enumerate(accuracy)},
         }
 
 
@@ -54,7 +54,7 @@ def instance_loss(
     other: Float[Tensor, "batch feature"],
     temperature: float = _TEMPERATURE,
 ) -> Float[Tensor, ""]:
-    """Cross entropy of finding each object's other view among the batch's, both ways (InfoNCE, van den Oord et al. 2018)."""
-    alike = F.normalize(one, dim=-1) @ F.normalize(other, dim=-1).T / temperature
-    itself: Int64[Tensor, "batch"] = torch.arange(len(one), device=one.device)
-    return (F.cross_entropy(alike, itself) + F.cross_entropy(alike.T, itself)) / 2
+    """Symmetric InfoNCE loss between two views of each object (van den Oord et al. 2018)."""
+    similarity = F.normalize(one, dim=-1) @ F.normalize(other, dim=-1).T / temperature
+    target: Int64[Tensor, "batch"] = torch.arange(len(one), device=one.device)
+    return (F.cross_entropy(similarity, target) + F.cross_entropy(similarity.T, target)) / 2

@@ -1,4 +1,4 @@
-"""Objects as ECHO is told them: class, extents and an encoder's feature; and as its losses see them."""
+"""Objects as conditions of ECHO (class, extents and an encoder's feature), their poses, and body contact with them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,23 +22,24 @@ from wearcap.systems.echo.features import EchoFeatures
 
 @dataclass(frozen=True, eq=False)
 class ObjectShape:
-    """An object about the middle of its bounding box, in its own axes; its pose is that of this middle."""
+    """An object in its own axes, centred on its bounding box; its pose is the pose of this centre."""
 
     name: str
     category: str
     mesh: Mesh
     middle: Float[Tensor, "3"]
-    """In the axes and from the origin of its mesh (m)."""
+    """Centre of the bounding box in coordinates of the mesh (m)."""
     cloud: Float[Tensor, "point 3"]
-    """Points of its surface about the middle (m)."""
+    """Surface points relative to the centre (m)."""
     code: Float[Tensor, "code"]
-    """What the network is told: class, extents, feature; or what it makes of them (`ObjectReader`)."""
+    """Condition for the network: class, extents and feature, raw or embedded (`ObjectReader`)."""
     code_mirrored: Float[Tensor, "code"]
-    """The same of the object seen in a mirror across its own y axis."""
+    """Condition for the object mirrored along its own y axis."""
     surface: TriangleIndex
+    """Spatial index of the mesh's triangles."""
 
     def centred(self, T_world_object: Rigid) -> Rigid:
-        """Pose of the middle, of the mesh's pose."""
+        """Pose of the bounding box's centre, given the mesh's pose."""
         return Rigid(T_world_object.R, T_world_object @ self.middle.to(T_world_object.t))
 
     def of_mesh(self, T_world_middle: Rigid) -> Rigid:
@@ -47,38 +48,37 @@ class ObjectShape:
 
     @property
     def mean(self) -> Float[Tensor, "3"]:
-        """Of the cloud's points (m)."""
+        """Mean of the cloud's points (m)."""
         return self.cloud.mean(0)
 
     @property
     def spread(self) -> Float[Tensor, "3 3"]:
-        """Mean outer product of the cloud's points with themselves (m²): rotations move points by it."""
+        """Second moment of the cloud's points (m²), which gives their mean squared displacement by a rotation."""
         return self.cloud.mT @ self.cloud / len(self.cloud)
 
 
 class ObjectReader:
-    """Makes objects into what the network is told, each mesh once."""
+    """Turns objects into conditions for the network; each mesh is processed once."""
 
     def __init__(
         self, features: EchoFeatures, encoder: PointNeXt | None, embed: Callable[[Tensor], Tensor] | None = None
     ):  # fmt: skip
-        """`encoder` None tells class and extents alone, where the features have no shape. `embed`: the network's layer on
-        codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
+        """`encoder` None: codes are class and extents alone, for features without shape. `embed`: the network's layer
+        on codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
         self.features, self.encoder, self._embed = features, encoder, embed
-        self.nothing: Float[Tensor, "code"] = self._conditioning(
-            torch.zeros(1, features.object_condition_size)
-        )[0]
-        """Stands where no object is active."""
-        self._observed: dict[tuple[int, str], ObjectShape] = {}
+        empty = torch.zeros(1, features.object_condition_size)
+        self.nothing: Float[Tensor, "code"] = self._embedded(empty)[0]
+        """Placeholder code for frames without an active object."""
+        self._shapes: dict[tuple[int, str], ObjectShape] = {}
 
     @torch.inference_mode()
     def __call__(self, item: SceneObject) -> ObjectShape:
-        """Raises WearcapError for a class that the model does not know."""
+        """Shape and codes of an object. Raises WearcapError for a class that the model was not built for."""
         key = (id(item.mesh), item.category)
-        if key not in self._observed:
-            self._observed[key] = self._read(item)
-        observed = self._observed[key]
-        return ObjectShape(item.name, *(getattr(observed, name) for name in ObjectShape.__dataclass_fields__ if name != "name"))  # fmt: skip
+        if key not in self._shapes:
+            self._shapes[key] = self._read(item)
+        shape = self._shapes[key]
+        return ObjectShape(item.name, *(getattr(shape, name) for name in ObjectShape.__dataclass_fields__ if name != "name"))  # fmt: skip
 
     def _read(self, item: SceneObject) -> ObjectShape:
         one_hot = self.features.class_code(item.category)
@@ -88,22 +88,22 @@ class ObjectReader:
         parts = [one_hot.expand(2, -1), cloud_extents(both)]
         if self.encoder is not None and self.features.shape_size:
             parts.append(self.encoder(both))
-        code, code_mirrored = self._conditioning(torch.cat(parts, -1)).unbind(0)
+        code, code_mirrored = self._embedded(torch.cat(parts, -1)).unbind(0)
         return ObjectShape(
             item.name, item.category, item.mesh, middle, both[0].clone(), code, code_mirrored, surface_index(item.mesh)
         )  # fmt: skip
 
     @torch.no_grad()
-    def _conditioning(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:
+    def _embedded(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:
         return (codes if self._embed is None else self._embed(codes)).clone()
 
 
 def object_poses(
     recording: Recording, environment: Environment, name: str, shape: ObjectShape, take: Tensor
 ) -> Rigid:
-    """True poses of an object's middle at some frames of the motion, which its trajectory shares the clock of.
+    """Ground-truth poses of an object's centre at frames `take` of the motion, whose clock its trajectory shares.
 
-    An object without a trajectory stays where the environment has it.
+    An object without a trajectory stays at its pose in the environment.
     """
     track = recording.object_motion.get(name)
     if track is None:
@@ -122,7 +122,7 @@ def body_contact(
 ) -> Tensor:
     """Whether each contact point of the body is within τ_c (`within_m`) of the object's surface (ECHO §3.1).
 
-    Distances are exact, to the surface and not to its vertices (ours), which may be further apart than τ_c.
+    Distances are to the exact surface, not to its vertices (ours), which may be further apart than τ_c.
     """
     T_object_world = shape.of_mesh(T_world_middle).inverse()
     R, t = T_object_world.R.double(), T_object_world.t.double()

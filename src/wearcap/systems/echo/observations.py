@@ -1,4 +1,4 @@
-"""What ECHO is told of a recording, at its own rate: tracked points, floor, active objects, and what is observed."""
+"""ECHO's conditioning from a recording at the model's rate: tracked points, floor, active objects, observations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -27,36 +27,38 @@ from wearcap.tracking.head_path import HeadPath
 
 WRISTS = POINTS[1:]
 MAX_GAP_S = 0.5
+"""Longest gap in a wrist's tracking that is interpolated (s)."""
 SAME_S = 1e-4
-"""Times nearer than this are one."""
+"""Times closer than this count as equal (s)."""
 SWAPPED_M = 0.02
-"""The left wrist is this far to the right of the right one, by the median, where the two are swapped."""
+"""Median distance of the left wrist to the right of the right wrist from which the two count as swapped (m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Parts of the answer that are known beforehand, at whatever times they are (ECHO §4.2)."""
+    """Sparse observations of the output modalities, each at its own times (ECHO §4.2)."""
 
     motion: Motion | None = None
-    """The body, at the frames in which it is known."""
+    """The body, at the frames in which it is observed."""
     object_motion: Mapping[str, Trajectory] = field(default_factory=dict)
-    """Objects' poses, likewise."""
+    """Poses of objects by name, at the times at which they are observed."""
     contact_times: Float64[Tensor, "frame"] | None = None
+    """Times of the observed contacts (s)."""
     contact: Float[Tensor, "frame contact"] | None = None
-    """64 body points on the active object, then `FOOT_PATCHES` on the floor: 1 touches."""
+    """64 body points on the active object, then `FOOT_PATCHES` on the floor: 1 for contact."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A recording, the objects in it, and when which of them is active."""
+    """A recording, the objects in it, and the intervals in which each of them is active."""
 
     recording: Recording
     environment: Environment | None = None
     acts: tuple[Act, ...] = ()
-    """None: no object is active, and the human alone is captured."""
+    """Intervals with an active object; empty: the human alone is captured."""
     observed: Observed = field(default_factory=Observed)
     placed: bool = False
-    """Whether objects are known to begin where the environment has them."""
+    """Whether the environment's pose of each object counts as observed in its first active frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +67,13 @@ class BatchItem:
 
     path: HeadPath
     conditioning: Conditioning
-    """With a lane axis of one."""
+    """Conditioning of all frames, with a batch axis of one."""
     objects: list[ObjectShape]
+    """Objects that are active at some time, in the order of `Conditioning.object_number`."""
 
 
 def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> BatchItem:
-    """What is told, frame by frame of the head's path.
+    """Conditioning of a scenario, for every frame of the head path.
 
     Raises WearcapError for wrists that are not tracked or are swapped, for acts of unknown objects, for objects whose
     mesh or class cannot be used, and for observations beyond the recording.
@@ -92,7 +95,7 @@ def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> B
 def _tracked_points(
     recording: Recording, path: HeadPath
 ) -> tuple[Float[Tensor, "time point 3 3"], Float[Tensor, "time point 3"]]:
-    """Head as measured, wrists as tracked; those of the true motion where nothing tracks them."""
+    """Measured head and tracked wrists; the ground-truth wrists if the recording tracks none."""
     poses = [path.T_world_head]
     truth = recording.motion
     found = [joint for joint in WRISTS if joint in recording.tracked]
@@ -108,14 +111,14 @@ def _tracked_points(
         truth = at_times(truth, times)
         poses += [truth.joint(joint) for joint in WRISTS]
     else:
-        raise WearcapError("wrists are tracked by nothing in this recording", where=recording.name,
+        raise WearcapError("this recording has no tracked wrists", where=recording.name,
                            expected=f"`tracked` poses of {' and '.join(WRISTS)}, or a true motion")  # fmt: skip
     R, t = torch.stack([T.R.float() for T in poses], 1), torch.stack([T.t.float() for T in poses], 1)
     if not (R.isfinite().all() and t.isfinite().all()):
         raise WearcapError("poses of wrists that are NaN or infinite", where=recording.name, expected="finite poses")  # fmt: skip
     heading = rotation.about_axis("z", rotation.yaw_of(R[:, 0]))
     apart = (heading.mT @ (t[:, 1] - t[:, 2])[..., None])[:, 1, 0].median().item()
-    # Those of a true motion are no trackers: somebody crosses the arms.
+    # Wrists of a ground-truth motion cannot be swapped trackers: the wearer crosses the arms.
     if found and apart < -SWAPPED_M:
         raise WearcapError(f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median", where=recording.name,
                            expected="the left wrist on the left", fix="Swap the two trackers.")  # fmt: skip
@@ -123,8 +126,8 @@ def _tracked_points(
 
 
 def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
-    """Poses of a tracked wrist at any times: where it is not tracked for longer than `MAX_GAP_S`, and behind the end, it
-    rests where it was seen last."""
+    """Poses of a tracked wrist at any times; gaps longer than `MAX_GAP_S` and times after the end have the last
+    pose."""
     times = track.timestamps
     inside = at.clamp(times[0].item(), times[-1].item())
     last = (torch.searchsorted(times, inside + SAME_S, right=True) - 1).clamp_min(0)
@@ -132,16 +135,16 @@ def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
         inside - times[last] <= SAME_S
     )
     found = resample(track, inside).T_world_body if len(times) > 1 else track.T_world_body[last]
-    observation = track.T_world_body[last]
+    last_tracked = track.T_world_body[last]
     return Rigid(
-        torch.where(gone[:, None, None], observation.R, found.R),
-        torch.where(gone[:, None], observation.t, found.t),
+        torch.where(gone[:, None, None], last_tracked.R, found.R),
+        torch.where(gone[:, None], last_tracked.t, found.t),
     )
 
 
 def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, where: str) -> None:
     if len(times) < 2 or not (times.diff() > 0).all():
-        raise WearcapError(f"{what} at {len(times)} times that do not grow", where=where, expected="rising timestamps (s)")  # fmt: skip
+        raise WearcapError(f"{what} at {len(times)} times that do not increase", where=where, expected="increasing timestamps (s)")  # fmt: skip
     late, early = times[0] - path.timestamps[0], path.timestamps[-1] - times[-1]
     if max(late.item(), early.item()) > 0.5:
         raise WearcapError(f"{what} from {times[0]:.2f} to {times[-1]:.2f} s", where=where,
@@ -168,7 +171,7 @@ def _objects(scenario: Scenario, names: list[str], reader: ObjectReader) -> list
 def _observed(
     scenario: Scenario, path: HeadPath, names: list[str], objects: list[ObjectShape], active: Tensor
 ) -> tuple[Tensor, ...]:
-    """Observed values at the frames next to them, and where there are any."""
+    """Observed values, each at its nearest frame, and a mask of observed frames per modality."""
     count, seen, where = len(path.timestamps), scenario.observed, scenario.recording.name
     joints = len(path.skeleton)
     R, root = torch.eye(3).repeat(count, joints, 1, 1), torch.zeros(count, 3)
@@ -212,7 +215,7 @@ def _observed(
 
 
 def _frames(times: Float64[Tensor, "frame"], path: HeadPath, where: str) -> Tensor:
-    """Numbers of the frames next to some times. Raises WearcapError for times beyond the recording."""
+    """Indices of the frames nearest to `times`. Raises WearcapError for times beyond the recording."""
     clock = path.timestamps
     step = (clock[1] - clock[0]).item() if len(clock) > 1 else 0.0
     beyond = ~((times >= clock[0] - step) & (times <= clock[-1] + step))

@@ -1,4 +1,4 @@
-"""ECHO (Petrov et al.): human, object and contacts from head and wrists, by one diffusion model, endlessly."""
+"""ECHO (Petrov et al.): human, object and contacts from head and wrists, with one diffusion model, at any length."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -34,49 +34,50 @@ from wearcap.tracking.head_path import HeadPath, head_path
 
 @dataclass
 class Echo:
-    """Captures whole recordings on a conveyor of frames; recordings share batches, which changes nothing but the time."""
+    """Captures recordings with a rolling schedule over frames (the conveyor); batching does not change results."""
 
     net: EchoDenoiser
     features: EchoFeatures
     schedule: Schedule
     skeleton: Skeleton
-    """For recordings that do not say whose body it is."""
+    """Skeleton for recordings without one."""
     encoder: PointNeXt | None = None
+    """Object encoder; None: objects are described by class and extents alone."""
     contacts: bool = True
     """Whether the network was trained on contacts."""
     context: int = 4
-    """Clean frames that are kept before the ramp: a pose is final when window - context - 1 frames have followed it."""
+    """Clean frames kept before the ramp: a pose is final once window - context - 1 more frames have arrived."""
     per_frame: int = 2
-    """Steps for every frame that enters; with a window of 60 and a context of 4 it takes 112 for each (the document: 100)."""
+    """Denoising steps per new frame; with a window of 60 and a context of 4 a frame takes 112 in all (ECHO: 100)."""
     spacing: float = 2.0
     eta: float = 0.0
     step: str = "posterior"
     """See `diffusion.conveyor.RollingSchedule`."""
     rewindow: int | None = None
-    """Frames by which windows advance that are denoised from scratch, as is usual; None: a conveyor."""
+    """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor."""
     anchor: bool = True
-    """Whether the body hangs from the measured head (ours) or stands where it was drawn (the document)."""
+    """Whether the body is anchored to the measured head (ours) or keeps its sampled position (ECHO)."""
     static_threshold: float | None = 0.7
-    """Objects stay where they are in frames in which nothing touches them with this probability (ours); None: they are as
-    drawn (the document), and so they are where the network knows no contacts."""
+    """Objects stay static in frames whose largest contact probability is below this (ours); None: objects keep their
+    sampled poses (ECHO). Without effect if the network was trained without contacts."""
     guidance: Guidance | None = None
-    """None: the prediction is left as it is, and so it is where the network knows no contacts."""
+    """None: no guidance. Without effect if the network was trained without contacts."""
     acts: str | Sequence[Mapping[str, Any]] | Callable[[Motion, Environment], tuple[Act, ...]] = "truth"
-    """Which object is active when: "truth", as the recording's interactions say; "none": the human alone; a list of
+    """Which object is active when: "truth", the recording's interactions; "none": the human alone; a list of
     {object, start_s, stop_s}; or a search."""
     environment: str | None = None
-    """File of the objects; None: what the recording names."""
+    """File of the objects; None: the recording's own."""
     placed: bool = False
-    """Whether objects are known to begin where the environment has them (ours; the document knows no places)."""
+    """Whether the objects' initial poses in the environment count as observed (ours; ECHO has no initial poses)."""
     runtime: str = "eager"
-    """See `systems.echo.step_runner`."""
+    """How denoising steps are run: see `systems.echo.step_runner`."""
     device: str = "cpu"
     _runner: EchoRunner | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self):
         if isinstance(self.acts, str) and self.acts not in ("truth", "none"):
-            raise WearcapError(f"no acts {self.acts!r}", expected="truth, none, or a list of {object, start_s, stop_s}")  # fmt: skip
-        ramp, _ = self.rolling.ramp, self._given_acts()
+            raise WearcapError(f"unknown acts {self.acts!r}", expected="truth, none, or a list of {object, start_s, stop_s}")  # fmt: skip
+        ramp, _ = self.rolling.ramp, self._listed_acts()
         if self.rewindow is not None and not 0 < self.rewindow <= ramp:
             raise WearcapError(f"windows that advance by {self.rewindow} frames", expected=f"1 to {ramp}, the window less the context")  # fmt: skip
         if self.rewindow is not None and self.step == "redraw":
@@ -85,38 +86,39 @@ class Echo:
 
     @property
     def rolling(self) -> RollingSchedule:
-        """How the conveyor runs."""
+        """The conveyor's rolling schedule."""
         return RollingSchedule(
             self.net.window, self.context, self.per_frame, self.spacing, self.eta, self.step
         )
 
     @property
     def fps(self) -> float:
+        """Frame rate of captures (Hz)."""
         return self.features.fps
 
     @property
     def latency_s(self) -> float:
-        """Between a frame and its final pose."""
+        """Time between a frame and its final pose (s)."""
         return (self.rolling.ramp - 1) / self.fps
 
     @property
     def static_below(self) -> float | None:
-        """`static_threshold`, where the network knows contacts."""
+        """`static_threshold`, or None for a network without contacts."""
         return self.static_threshold if self.contacts else None
 
     @property
     def guided_by(self) -> Guidance | None:
-        """`guidance`, where the network knows contacts."""
+        """`guidance`, or None for a network without contacts."""
         return self.guidance if self.contacts else None
 
     def prepare(self) -> None:
-        """Bring the network to its device and into the form it runs in; what is exported or compiled is made once."""
+        """Move the network to its device and set up its runtime; exporting or compiling happens once."""
         self.net.to(self.device).eval()
         if self._runner is None or self.runtime == "eager":
             self._runner = EchoRunner(self.net, self.runtime)
 
     def reader(self) -> ObjectReader:
-        """What turns objects into what the network is told, which embeds each once."""
+        """A reader that turns objects into embedded conditions for the network, each once."""
         self.prepare()
         return ObjectReader(
             self.features, self.encoder, lambda codes: self.net.object(codes.to(self.device)).cpu()
@@ -126,7 +128,7 @@ class Echo:
         """One motion of the human alone per (recording, seed); with objects: `capture_scenarios`."""
         return self.capture_scenarios([Scenario(recording) for recording in recordings], seeds)
 
-    def _given_acts(self) -> tuple[Act, ...]:
+    def _listed_acts(self) -> tuple[Act, ...]:
         if isinstance(self.acts, str) or callable(self.acts):
             return ()
         try:
@@ -135,20 +137,20 @@ class Echo:
             raise WearcapError(f"acts {self.acts!r}", expected="a list of {object, start_s, stop_s}") from error  # fmt: skip
 
     def scenario(self, recording: Recording, environment: Environment | None) -> Scenario:
-        """A recording with the objects that are active in it, as `acts` says.
+        """A recording with its active objects, according to `acts`.
 
-        A recording without an environment, or without interactions and objects' poses, is of a human alone, unless acts
-        were given.
+        Without an environment, or without interactions and object poses, the human alone is captured, unless `acts`
+        is a list.
         """
         if self.acts == "truth":
             tracked = bool(recording.object_motion) or recording.interactions is not None
-            there = environment is not None and tracked
-            acts = tuple(true_acts(recording)) if there else ()
+            has_objects = environment is not None and tracked
+            acts = tuple(true_acts(recording)) if has_objects else ()
             return Scenario(recording, environment, acts, placed=self.placed)
         if callable(self.acts) and environment is not None:
             alone = self.capture_scenarios([Scenario(recording)], [0])[0]
             return Scenario(recording, environment, self.acts(alone, environment), placed=self.placed)
-        return Scenario(recording, environment, self._given_acts(), placed=self.placed)
+        return Scenario(recording, environment, self._listed_acts(), placed=self.placed)
 
     @torch.no_grad()
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
@@ -157,13 +159,13 @@ class Echo:
         Raises WearcapError as `head_path` and `batch_item_of` do.
         """
         self.prepare()
-        # 1. the three tracked points on the model's clock, and the active objects' codes; once for all seeds
+        # 1. Conditioning: three tracked points at the model's rate and codes of the active objects, once for all seeds.
         reader, once = self.reader(), {id(scenario): scenario for scenario in scenarios}
         item_by = {key: self._item(scenario, reader) for key, scenario in once.items()}
         items = [item_by[id(scenario)] for scenario in scenarios]
-        # 2. frame after frame enters as noise and leaves clean
-        outputs = self._conveyed(items, [scenario.recording for scenario in scenarios], seeds)
-        # 3. the body hangs from the measured head; objects rest while nothing touches them
+        # 2. Sampling with the rolling schedule: frames enter as noise one by one and leave clean.
+        outputs = self._sampled(items, [scenario.recording for scenario in scenarios], seeds)
+        # 3. Untouched objects are made static, and the body is anchored to the measured head.
         if (threshold := self.static_below) is not None:
             outputs = [
                 with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)
@@ -173,10 +175,10 @@ class Echo:
     def _item(self, scenario: Scenario, reader: ObjectReader) -> BatchItem:
         return batch_item_of(scenario, head_path(scenario.recording, self.skeleton, self.fps), reader)
 
-    def _conveyed(
+    def _sampled(
         self, items: Sequence[BatchItem], recordings: Sequence[Recording], seeds: Sequence[int]
     ) -> list[Outputs]:
-        """All frames of every lane: its stretches side by side, what lies between them as it was before."""
+        """All frames of every batch item: its stretches are sampled side by side, gaps repeat the frame before them."""
         parts = [(k, *stretch) for k, item in enumerate(items) for stretch in item.path.stretches]
         longest = max(stop - start for _, start, stop in parts)
         queue = self.queue(
@@ -200,7 +202,7 @@ class Echo:
         shapes: Sequence[dict[str, float]],
         objects: Sequence[Sequence[ObjectShape]],
     ) -> EchoQueue:
-        """An empty queue of as many lanes, with what guidance pulls at where there is guidance."""
+        """An empty queue for a batch, with the bodies and objects that guidance needs, if any."""
         queue = EchoQueue(self, skeletons, seeds)
         if self.rewindow is not None:
             queue = Rewindow(self, skeletons, seeds, self.rewindow)
@@ -211,9 +213,9 @@ class Echo:
     def denoiser(
         self, queue: EchoQueue, conditioning: Conditioning, frame: Rigid
     ) -> tuple[Denoise, Correction | None]:
-        """x̂0 of the frames on a conveyor as a function of x_t and levels, and what guidance makes of it.
+        """x̂0 of the conveyor's frames as a function of x_t and levels, and the guidance that corrects it, if any.
 
-        What the frames are told is encoded once, what their levels do is kept for when the same ones come again.
+        The condition is encoded once per call; the level-dependent part is cached between calls.
         """
         condition = self.features.condition(conditioning.points, conditioning.floor_height, queue.size, frame)
         if self._runner is None:
@@ -230,7 +232,7 @@ class Echo:
         return denoise, lambda x0_hat: guidance.corrected(x0_hat, scene)
 
     def settings(self) -> dict[str, str]:
-        """What the motion depends on, beside the network."""
+        """Settings that a capture depends on, for its provenance."""
         return {
             "pipeline": "echo", "context": str(self.context), "per_frame": str(self.per_frame), "spacing": str(self.spacing),
             "eta": str(self.eta), "step": self.step, "rewindow": str(self.rewindow), "anchor": str(self.anchor),
@@ -238,20 +240,20 @@ class Echo:
         }  # fmt: skip
 
 
-def motion_of(item: BatchItem, outputs: Outputs, anchored: bool, provenance: dict[str, str]) -> Motion:
-    """What was said of a lane as a motion, hung from the measured head or not; a body that is observed stays as it is."""
+def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str]) -> Motion:
+    """Outputs of one batch item as a motion, if `anchor` anchored to the measured head except in observed frames."""
     path, contact = item.path, outputs.contact_prob[0]
     motion = Motion(
         path.timestamps, path.skeleton, outputs.R_parent_joint[0], outputs.t_world_root[0], contact[:, BODY_POINTS:],
         body_contact_prob=contact[:, :BODY_POINTS] * item.conditioning.has_object[0, :, None],
         object_motion=object_tracks(item, outputs) or None, provenance=provenance,
     )  # fmt: skip
-    if not anchored:
+    if not anchor:
         return motion
-    anchored_motion = anchored_to_head(motion, path.T_world_head)
-    seen = item.conditioning.is_observed[0, :, 0]
-    R = torch.where(seen[:, None, None, None], motion.R_parent_joint, anchored_motion.R_parent_joint)
-    t = torch.where(seen[:, None], motion.t_world_root, anchored_motion.t_world_root)
+    anchored = anchored_to_head(motion, path.T_world_head)
+    is_observed = item.conditioning.is_observed[0, :, 0]
+    R = torch.where(is_observed[:, None, None, None], motion.R_parent_joint, anchored.R_parent_joint)
+    t = torch.where(is_observed[:, None], motion.t_world_root, anchored.t_world_root)
     return replace(motion, R_parent_joint=R, t_world_root=t)
 
 
@@ -260,7 +262,7 @@ def pulled_by(
     shapes: Sequence[dict[str, float]],
     objects: Sequence[Sequence[ObjectShape]],
 ) -> tuple[list, list]:
-    """Contact points of every lane's body, and trees over its objects' points: what guidance pulls at."""
+    """Inputs of guidance per batch item: contact points of the body, and KD-trees over the points of its objects."""
     surfaces = [
         contact_points(anny_body(skeleton, shape or None)) for skeleton, shape in zip(skeletons, shapes)
     ]
@@ -268,7 +270,8 @@ def pulled_by(
 
 
 def object_tracks(item: BatchItem, outputs: Outputs) -> dict[str, Trajectory]:
-    """Each object's poses: as said while it is active, as it was last (before the first time: as it will be first) else."""
+    """Poses of each object: as predicted while it is active, else constant since its last active frame (before the
+    first: as in the first)."""
     active = torch.where(item.conditioning.has_object[0], item.conditioning.object_number[0], -1.0)
     T = Rigid(outputs.R_world_object[0], outputs.t_world_object[0])
     tracks = {}
@@ -283,19 +286,19 @@ def object_tracks(item: BatchItem, outputs: Outputs) -> dict[str, Trajectory]:
 
 
 def stretch_seed(seed: int, start: int) -> int:
-    """Of a stretch that begins at a frame: stretches of one recording have noise of their own."""
+    """Seed of the stretch that begins at frame `start`: every stretch of a recording has its own noise."""
     return seed + 1_000_003 * start
 
 
 def _padded(conditioning: Conditioning, start: int, stop: int, length: int) -> Conditioning:
-    """Frames start…stop-1, up to a length: the last one again, not valid."""
+    """Frames start…stop-1, padded to `length` by repeating the last one as not valid."""
     take = (start + torch.arange(length)).clamp_max(stop - 1)
-    there = torch.arange(length) < stop - start
+    inside = torch.arange(length) < stop - start
     padded = conditioning.frames(take)
-    return padded._replace(valid=padded.valid & there, is_observed=padded.is_observed & there[:, None])
+    return padded._replace(valid=padded.valid & inside, is_observed=padded.is_observed & inside[:, None])
 
 
 def _bridged(outputs: list[Outputs], path: HeadPath) -> Outputs:
-    """Stretches as one; frames in the gaps between them are as the one before."""
+    """Stretches joined into one; frames in the gaps between them repeat the frame before."""
     whole, frames = Outputs(*(torch.cat(fields, 1) for fields in zip(*outputs))), path.held_frames
     return Outputs(*(field[:, frames] for field in whole))

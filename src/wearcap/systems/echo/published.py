@@ -1,4 +1,4 @@
-"""What ECHO must beat: the training window whose three points moved most alike, and an object that is stuck to a wrist."""
+"""Baselines of ECHO: nearest-neighbour retrieval of training windows, and objects rigidly attached to a wrist."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ from wearcap.systems.echo.training_windows import EchoDataset, EchoTrack
 from wearcap.tracking.head_path import head_path
 
 NO_CLASS = "none"
-"""Stands for the class where no object is active."""
+"""Class label of windows without an active object."""
 
 
 def _own(features: EchoFeatures) -> EchoFeatures:
@@ -32,32 +32,36 @@ def _own(features: EchoFeatures) -> EchoFeatures:
 
 
 def _channels(features: EchoFeatures, points: ThreePoints, floor_height: Tensor, size: Tensor) -> Float[Tensor, "time channel"]:  # fmt: skip
-    """What each frame's three points are like, seen from its own head: the condition without the head's way and heading
-    since the window began, and without the body's size."""
-    conditioning = features.condition(ThreePoints(*(part[None] for part in points)), floor_height[None], size[None])[0]  # fmt: skip
-    return torch.cat([conditioning[:, :36], conditioning[:, 39:54], conditioning[:, 56:57]], 1)
+    """Descriptor of each frame's three points in head-centred coordinates: the condition without the head's path and
+    heading since the window's start, and without limb lengths."""
+    condition = features.condition(ThreePoints(*(part[None] for part in points)), floor_height[None], size[None])[0]  # fmt: skip
+    return torch.cat([condition[:, :36], condition[:, 39:54], condition[:, 56:57]], 1)
 
 
 @dataclass(frozen=True, eq=False)
 class NearestEcho:
-    """Pastes body, object and contacts of the training window with the most similar motion of head and wrists, among
-    those with an object of the same class, all seen from the head. Windows overlap by half and are cross-faded."""
+    """Retrieves the training window with the most similar motion of head and wrists among those with the same object
+    class, and copies its body, object and contacts in head-centred coordinates. Windows overlap by half and are
+    cross-faded."""
 
     features: EchoFeatures
     encoder: PointNeXt | None
     window: int
+    """Frames per window."""
     sample: int
+    """Stride (frames) of the frames that describe a window."""
     mean: Float[Tensor, "channel"]
     scale: Float[Tensor, "channel"]
     descriptor: dict[str, Float[Tensor, "window feature"]]
-    """By class; `NO_CLASS` without an object."""
+    """Descriptors of the windows by class; `NO_CLASS` without an object."""
     frames: dict[str, Int64[Tensor, "window"]]
-    """First frame of each window."""
+    """Index in `outputs` of each window's first frame, by class."""
     outputs: Float[Tensor, "frame value"]
+    """Ground truth of all training frames."""
 
     @classmethod
     def fit(cls, dataset: EchoDataset, window: int = 30, stride: int = 3, sample: int = 3) -> "NearestEcho":
-        """Describe a training split's windows."""
+        """Compute descriptors of a training split's windows."""
         features = _own(dataset.features)
         channels, outputs, starts, labels, first = [], [], [], [], 0
         for number in range(len(dataset.recordings)):
@@ -83,7 +87,7 @@ class NearestEcho:
         )
 
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per scenario; nothing is drawn."""
+        """One motion per scenario; deterministic, seeds are ignored."""
         reader = ObjectReader(self.features, self.encoder)
         return [self._capture(scenario, reader) for scenario in scenarios]
 
@@ -105,14 +109,14 @@ class NearestEcho:
             name = name if name in self.descriptor else NO_CLASS
             query = channels[take[:: self.sample]].flatten()
             best = (self.descriptor[name] - query).square().sum(1).argmin()
-            pasted = self.outputs[self.frames[name][best] + offsets]
-            total.index_add_(0, take, pasted * triangle)
+            retrieved = self.outputs[self.frames[name][best] + offsets]
+            total.index_add_(0, take, retrieved * triangle)
             weight.index_add_(0, take, triangle)
         return motion_of(item, _decoded(self.features, total / weight, item), True, {"pipeline": "nearest_echo"})  # fmt: skip
 
 
 def _outputs_of(features: EchoFeatures, track: EchoTrack) -> Float[Tensor, "time feature"]:
-    """A track's truth, seen from each frame's head."""
+    """Ground truth of a track in each frame's head-centred coordinates."""
     batch = lambda parts: type(parts)(*(part[None] for part in parts))  # noqa: E731
     frame = features.canonical(batch(track.points))
     T = Rigid(track.T_world_object.R[None], track.T_world_object.t[None])
@@ -130,22 +134,22 @@ def _decoded(features: EchoFeatures, outputs: Float[Tensor, "time feature"], ite
 
 @dataclass(frozen=True, eq=False)
 class RigidWrist:
-    """Another method's body, with the object stuck to a wrist: where it is from that wrist on the average of its class,
-    in training frames in which that hand touches it. Of the two wrists it is the one that is nearer to where objects of
-    the class are on average, seen from the head, over each stretch in which the object is active."""
+    """Another method's body with the object rigidly attached to a wrist, at its class's mean offset from that wrist
+    in training frames with contact. The wrist is the one that is closer, on average over the object's active frames,
+    to the class's mean position relative to the head."""
 
     features: EchoFeatures
     encoder: PointNeXt | None
     place: dict[str, Float[Tensor, "3"]]
-    """Mean place of each class seen from the head (m)."""
+    """Mean position of each class in head-centred, yaw-aligned coordinates (m)."""
     offset: dict[str, Float[Tensor, "wrist 3"]]
-    """Mean way from each wrist to the object, in the head's heading (m)."""
+    """Mean displacement between each wrist and the object, in yaw-aligned head axes (m)."""
     turn: dict[str, Float[Tensor, "3 3"]]
-    """Mean orientation of each class in the head's heading."""
+    """Mean orientation of each class in yaw-aligned head axes."""
 
     @classmethod
     def fit(cls, dataset: EchoDataset) -> "RigidWrist":
-        """Average a training split."""
+        """Compute the means over a training split."""
         features = _own(dataset.features)
         rows: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
         for number in range(len(dataset.recordings)):
@@ -153,24 +157,24 @@ class RigidWrist:
             frame = features.canonical(ThreePoints(*(part[None] for part in track.points)))
             heading = frame.R[0]
             for index, shape in enumerate(track.objects):
-                observation = (track.active == index) & (track.contact[:, :BODY_POINTS].amax(1) > 0)
-                T, wrists = track.T_world_object[observation], track.points.t_world_point[observation, 1:]
-                back = heading[observation].mT
-                place = (back @ (T.t - frame.t[0][observation])[..., None])[..., 0]
+                touched = (track.active == index) & (track.contact[:, :BODY_POINTS].amax(1) > 0)
+                T, wrists = track.T_world_object[touched], track.points.t_world_point[touched, 1:]
+                back = heading[touched].mT
+                place = (back @ (T.t - frame.t[0][touched])[..., None])[..., 0]
                 offset = (back[:, None] @ (T.t[:, None] - wrists)[..., None])[..., 0]
                 rows.setdefault(shape.category, []).append((place, offset, back @ T.R))
         place, offset, turn = {}, {}, {}
         for name, parts in rows.items():
-            where, way, R = (torch.cat(each) for each in zip(*parts))
-            if len(where):
-                place[name], offset[name] = where.mean(0), way.mean(0)
+            places, offsets, R = (torch.cat(each) for each in zip(*parts))
+            if len(places):
+                place[name], offset[name] = places.mean(0), offsets.mean(0)
                 turn[name] = rotation.mean_rotation(R)
         if not place:
-            raise WearcapError("nothing is touched in these training windows", expected="recordings with objects in hands")  # fmt: skip
+            raise WearcapError("these training recordings have no contact with objects", expected="recordings with objects in hands")  # fmt: skip
         return cls(features, dataset.encoder, place, offset, turn)
 
     def attached(self, motion: Motion, item: BatchItem) -> Motion:
-        """The motion with its objects stuck to wrists."""
+        """The motion with its objects attached to wrists."""
         points = item.conditioning.points
         frame = self.features.canonical(points)
         heading, head = frame.R[0], frame.t[0]

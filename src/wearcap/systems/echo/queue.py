@@ -1,4 +1,4 @@
-"""ECHO's queue of frames (ECHO §3.3): what is told of them comes in one by one, what is said of them goes out."""
+"""ECHO's queue of frames (ECHO §3.3): conditioning enters frame by frame, final outputs leave frame by frame."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -17,55 +17,62 @@ from wearcap.systems.echo.model import EchoDenoiser
 
 
 class Conditioning(NamedTuple):
-    """Frames of several lanes, as they are sensed: three tracked points, and which object is active; and what of the
-    truth is observed."""
+    """Conditioning of frames of several batch items: three tracked points, the active object, and observed values of
+    the outputs."""
 
     R_world_point: Float[Tensor, "batch frame point 3 3"]
     t_world_point: Float[Tensor, "batch frame point 3"]
     floor_height: Float[Tensor, "batch frame"]
+    """World z of the floor (m)."""
     has_object: Bool[Tensor, "batch frame"]
+    """Whether an object is active."""
     object_code: Float[Tensor, "batch frame code"]
+    """Condition for the active object (`ObjectShape.code`)."""
     object_number: Float[Tensor, "batch frame"]
-    """Which of the lane's objects it is."""
+    """Index of the active object among the batch item's objects, -1 without one."""
     valid: Bool[Tensor, "batch frame"]
+    """False for padding."""
     R_parent_joint: Float[Tensor, "batch frame joint 3 3"]
     t_world_root: Float[Tensor, "batch frame 3"]
     R_world_object: Float[Tensor, "batch frame 3 3"]
     t_world_object: Float[Tensor, "batch frame 3"]
     contact: Float[Tensor, "batch frame contact"]
-    """Observations, any numbers where they are none."""
+    """These five are observed values; arbitrary in frames whose modality is not observed."""
     is_observed: Bool[Tensor, "batch frame modality"]
 
-    def frames(self, part: slice | Tensor) -> "Told":
+    def frames(self, part: slice | Tensor) -> "Conditioning":
+        """A selection of frames."""
         return Conditioning(*(field[:, part] for field in self))
 
     @property
     def points(self) -> ThreePoints:
+        """The three tracked points."""
         return ThreePoints(self.R_world_point, self.t_world_point)
 
 
 class Outputs(NamedTuple):
-    """What is final, in the world."""
+    """Final body, object pose and contacts of frames, in world coordinates."""
 
     R_parent_joint: Float[Tensor, "batch frame joint 3 3"]
     t_world_root: Float[Tensor, "batch frame 3"]
     R_world_object: Float[Tensor, "batch frame 3 3"]
-    """Of the active object's middle; means nothing where none is active."""
+    """Orientation of the active object; arbitrary in frames without one."""
     t_world_object: Float[Tensor, "batch frame 3"]
+    """Position of the active object's centre (m)."""
     contact_prob: Float[Tensor, "batch frame contact"]
     """64 body points on the object, then `FOOT_PATCHES` on the floor."""
 
 
 @runtime_checkable
 class Correction(Protocol):
-    """Changes x̂0 as guidance wants it."""
+    """Corrects x̂0, as guidance does."""
 
     def __call__(self, x0_hat: Float[Tensor, "batch frame feature"]) -> Float[Tensor, "batch frame feature"]: ...  # fmt: skip
 
 
 @runtime_checkable
 class Model(Protocol):
-    """What of a pipeline the queue needs."""
+    """The part of a pipeline that the queue uses."""
 
     net: EchoDenoiser
     features: EchoFeatures
@@ -82,7 +89,7 @@ class Model(Protocol):
 
 
 class EchoQueue:
-    """Several lanes' frames, a window of them at most; every frame has noise of its lane's own seed."""
+    """Frames of several batch items, at most a window of them; each batch item's noise comes from its own seed."""
 
     def __init__(self, pipeline: Model, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
         self.pipeline = pipeline
@@ -92,13 +99,14 @@ class EchoQueue:
         self.conveyor = Conveyor(self.rolling, pipeline.schedule, net.sizes, len(seeds))
         self.conditioning: Conditioning | None = None
         self.guided: tuple[list, list] | None = None
-        """Bodies' contact points and objects per lane, for a pipeline with guidance."""
+        """Contact points of bodies and KD-trees of objects per batch item, for a pipeline with guidance."""
         self._random = [torch.Generator().manual_seed(seed) for seed in seeds]
         self._frame: Rigid | None = None
 
     @torch.no_grad()
     def push(self, fresh: Conditioning) -> Outputs | None:
-        """Take one more frame of every lane in (padding behind a lane's end); the frame that has become final, if one has."""
+        """Add one frame of every batch item (padding after a batch item's end); returns the frame that became final, if
+        any."""
         noise = self._noise(1)[:, 0]
         full = self.conveyor.push(noise)
         self.conditioning = (
@@ -121,22 +129,22 @@ class EchoQueue:
         return self._outputs(clean - 1, frame) if clean else None
 
     def run(self, whole: Conditioning) -> Outputs:
-        """All frames of some lanes, to the end."""
+        """Outputs of all frames of a batch."""
         count, first = whole.valid.shape[1], self.rolling.ramp - 1
         out = None
         for frame in range(count + first):
             outputs = self.push(whole.frames(slice(frame, frame + 1)) if frame < count else self.padding())
             if outputs is None:
                 continue
-            if out is None:  # room for all: small pieces that stay scatter the memory between them
+            if out is None:  # allocate once: keeping small per-frame tensors fragments memory
                 out = Outputs(*(field.new_empty(len(field), count, *field.shape[2:]) for field in outputs))
-            for kept, field in zip(out, outputs):
-                kept[:, frame - first] = field[:, 0]
+            for all_frames, field in zip(out, outputs):
+                all_frames[:, frame - first] = field[:, 0]
         assert out is not None
         return out
 
     def padding(self) -> Conditioning:
-        """A frame behind the end of all lanes: the last one again, not valid."""
+        """A padding frame for all batch items: the last frame repeated as not valid."""
         assert self.conditioning is not None
         last = self.conditioning.frames(slice(-1, None))
         return last._replace(
@@ -148,7 +156,7 @@ class EchoQueue:
         return torch.stack([torch.randn(rows, width, generator=random) for random in self._random])
 
     def _observation(self, conditioning: Conditioning, frame: Rigid) -> Observation:
-        """What is observed, in normalised space; what is not there stays noise."""
+        """Observed values in normalised space; absent modalities stay noise."""
         observed = torch.zeros(*conditioning.valid.shape, sum(self.pipeline.net.sizes))
         if conditioning.is_observed.any():
             features = self.pipeline.features
@@ -158,14 +166,14 @@ class EchoQueue:
             )
             raw = torch.cat([body, scene_object, 2 * conditioning.contact - 1], -1)
             observed = self.pipeline.net.motion_normalizer(raw.to(self.pipeline.device)).cpu()
-        always = torch.zeros_like(conditioning.has_object)
-        absent = [always, ~conditioning.has_object, always if self.pipeline.contacts else ~always]
+        never = torch.zeros_like(conditioning.has_object)
+        absent = [never, ~conditioning.has_object, never if self.pipeline.contacts else ~never]
         is_observed = conditioning.is_observed.clone()
         is_observed[..., 1] &= conditioning.has_object
         return Observation(observed, is_observed, torch.stack(absent, -1) & ~is_observed)
 
     def _move(self, frame: Rigid) -> None:
-        """Re-express what is on the conveyor where the window's frame has moved."""
+        """Re-express the conveyor's frames in the window's new canonical frame."""
         assert self._frame is not None
         assert self.conditioning is not None
         change = frame.inverse() @ self._frame
@@ -182,9 +190,9 @@ class EchoQueue:
         net, alpha_bar = self.pipeline.net, self.pipeline.schedule(level).sqrt()
         scale = net.motion_normalizer.scale.cpu()
         x = x.clone()
-        for modality, at, there in ((0, 0, None), (1, net.sizes[0], conditioning.has_object[..., None])):
+        for modality, at, present in ((0, 0, None), (1, net.sizes[0], conditioning.has_object[..., None])):
             shift = alpha_bar[..., modality, None] * (change.t / scale[at])
-            shift = shift if there is None else shift * there
+            shift = shift if present is None else shift * present
             x[..., at : at + 3] = self._turned(x[..., at : at + 3], change.R) + shift
             for column in (at + 3, at + 6):
                 x[..., column : column + 3] = self._turned(x[..., column : column + 3], change.R)
@@ -195,11 +203,11 @@ class EchoQueue:
         return (R @ value[..., None])[..., 0]
 
     def _outputs(self, number: int, frame: Rigid) -> Outputs:
-        """One frame that is final."""
+        """Outputs of one frame of the window."""
         return self._decoded(self.conveyor.x, slice(number, number + 1), frame)
 
     def _decoded(self, x: Float[Tensor, "batch frame feature"], part: slice, frame: Rigid) -> Outputs:
-        """Some of a window's frames, out of normalised space and in the world."""
+        """Some of a window's frames, converted from normalised space to world coordinates."""
         net, features = self.pipeline.net, self.pipeline.features
         human, scene_object, contact = (
             net.motion_normalizer.inverse(x[:, part].to(self.pipeline.device)).cpu().split(net.sizes, -1)

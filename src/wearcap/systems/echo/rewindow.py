@@ -1,4 +1,4 @@
-"""The usual way to make a window model endless: each window denoised from scratch, a part of it kept (ECHO Fig. 3, left)."""
+"""Overlapping windows in place of the conveyor, denoised from scratch with inpainted overlap (ECHO Fig. 3, left)."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -14,10 +14,10 @@ from wearcap.systems.echo.queue import Conditioning, EchoQueue, Model, Outputs
 
 
 class Rewindow(EchoQueue):
-    """Windows that advance by `stride` frames: what they share with the last one before its kept frames is known to
-    them (at most the context), the next `stride` frames are kept, and what is behind them is thrown away.
+    """Windows that advance by `stride` frames: the last final frames (at most the context) are inpainted, the next
+    `stride` frames become final, and the rest is discarded.
 
-    With the conveyor's context and steps its frames see as much of what was and will be.
+    With the conveyor's context and steps, a frame sees as much of the past and future as on the conveyor.
     """
 
     def __init__(self, pipeline: Model, skeletons: Sequence, seeds: Sequence[int], stride: int = 10):
@@ -25,15 +25,15 @@ class Rewindow(EchoQueue):
         self.stride = stride
 
     @torch.no_grad()
-    def window(self, conditioning: Conditioning, before: Float[Tensor, "batch known feature"]) -> Float[Tensor, "batch frame feature"]:  # fmt: skip
-        """x̂0 of a window, of whose frames the first ones are known, in normalised space."""
+    def window(self, conditioning: Conditioning, before: Float[Tensor, "batch observed feature"]) -> Float[Tensor, "batch frame feature"]:  # fmt: skip
+        """A sampled window in normalised space, whose first frames are inpainted with `before`."""
         frame = self.pipeline.features.canonical(conditioning.points)
         count = conditioning.valid.shape[1]
         observed_frames = before.shape[1]
         observation = self._observation(conditioning, frame)
         denoise, correct = self.pipeline.denoiser(self, conditioning, frame)
         levels = step_levels(self.rolling.steps, self.rolling.spacing)
-        # As much for a window that is not full: what is drawn for a lane does not depend on how long others are.
+        # Always a full window's noise: a batch item's noise must not depend on the length of the others.
         x = self._noise(self.rolling.window)[:, :count]
         observed = observation.observed.clone()
         observed[:, :observed_frames] = before
@@ -56,9 +56,9 @@ class Rewindow(EchoQueue):
 
     @torch.no_grad()
     def run(self, whole: Conditioning) -> Outputs:
-        """All frames of some lanes."""
+        """Outputs of all frames of a batch."""
         context, count = self.rolling.context, whole.valid.shape[1]
-        given: list[Outputs] = []
+        outputs: list[Outputs] = []
         before, start = torch.zeros(len(whole.valid), 0, sum(self.pipeline.net.sizes)), 0
         while start < count:
             first = max(0, start - context)
@@ -70,7 +70,7 @@ class Rewindow(EchoQueue):
             self._frame = frame
             x = self.window(conditioning, before)
             stop = min(start + self.stride, count)
-            given.append(self._decoded(x, slice(start - first, stop - first), frame))
-            kept = x[:, : stop - first]
-            before, start = kept[:, -context:] if context else kept[:, :0], stop
-        return Outputs(*(torch.cat(parts, 1) for parts in zip(*given)))
+            outputs.append(self._decoded(x, slice(start - first, stop - first), frame))
+            final = x[:, : stop - first]
+            before, start = final[:, -context:] if context else final[:, :0], stop
+        return Outputs(*(torch.cat(parts, 1) for parts in zip(*outputs)))

@@ -1,4 +1,4 @@
-"""ECHO's tables: body, object and contacts of whole recordings against the truth; and what of the truth is observed."""
+"""ECHO's tables: metrics of body, object and contacts, and sparse observations drawn from the ground truth."""
 
 from dataclasses import dataclass
 
@@ -42,22 +42,23 @@ MEASURES = (
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is true of a scenario at a capture's frames."""
+    """Ground truth of a scenario at a capture's frames."""
 
     motion: Motion
     floor_height: Float[Tensor, "time"]
     objects: list[ObjectShape]
     active: Int64[Tensor, "time"]
-    """Number of the active object in `objects`, -1 without one."""
+    """Index of the active object in `objects`, -1 without one."""
     T_world_object: list[Rigid]
-    """Of each object's middle, over time."""
+    """Poses of each object's centre over time."""
     touch: Bool[Tensor, "time point"]
-    """Whether the body's points are on the active object."""
+    """Contact of the body's points with the active object."""
     foot_contact: Float[Tensor, "time patch"]
+    """Contact of `FOOT_PATCHES` with the floor."""
 
 
 def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: ObjectReader) -> Truth:
-    """The truth at some times. Raises WearcapError for a recording without a true motion or an object's true poses."""
+    """Ground truth at `timestamps` (s). Raises WearcapError if motion or an active object's poses are missing."""
     recording, environment = scenario.recording, scenario.environment
     if recording.motion is None:
         raise WearcapError("no true motion to compare with", where=recording.name, expected="a recording with `motion`")  # fmt: skip
@@ -92,8 +93,8 @@ def _poses_at(track: Trajectory, times: Float64[Tensor, "time"]) -> Rigid:
 
 
 def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
-    """ECHO's measures of one capture, in the world, nothing aligned: the body over all frames, the object over those
-    in which one is active."""
+    """ECHO's metrics of one capture in world coordinates without alignment: body over all frames, object over the
+    frames in which one is active."""
     joints, true = motion.T_world_joint.t, truth.motion.T_world_joint.t
     skeleton = motion.skeleton
     scores = {
@@ -116,7 +117,7 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
 
 
 def _object_scores(motion: Motion, truth: Truth) -> dict[str, float]:
-    """Means over the frames in which an object is active; nothing where the capture has no objects."""
+    """Means over the frames in which an object is active; empty if the capture has no objects."""
     parts: dict[str, list[Tensor]] = {}
     for number, (shape, T_true) in enumerate(zip(truth.objects, truth.T_world_object)):
         rows = (truth.active == number).nonzero()[:, 0]
@@ -136,7 +137,7 @@ def _object_scores(motion: Motion, truth: Truth) -> dict[str, float]:
 
 
 def observed_share(truth: Truth, modality: str, share: float, seed: int) -> Observed:
-    """A share of the frames of one modality as it truly was, drawn evenly at random (ECHO Tables 3, S2).
+    """Ground truth of one modality in a random share of the frames, drawn uniformly (ECHO Tables 3, S2).
 
     Raises WearcapError for an unknown modality.
     """

@@ -1,4 +1,4 @@
-"""Objects rest while nothing touches them: what ECHO says of an object counts in the frames of its contacts (ours)."""
+"""Static-object constraint (ours): an object moves only in frames with contact; elsewhere its pose is constant."""
 
 import torch
 import torch.nn.functional as F
@@ -11,13 +11,13 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.systems.echo.queue import Conditioning, Outputs
 
 INSIDE = 10
-"""Frames (at 30 Hz) by which a moment of a contact is away from its beginning and end, where objects are drawn worse."""
+"""Frames (at 30 Hz) to trim from both ends of a contact, where predicted object poses are less accurate."""
 FADE = 20
-"""Frames over which an object that is touched again comes from where it was left to where it is drawn."""
+"""Frames over which an object that is touched again blends from its static pose to its predicted pose."""
 
 
 def is_touched(conditioning: Conditioning, outputs: Outputs, threshold: float) -> Bool[Tensor, "batch frame"]:
-    """Whether something touches the active object with this probability, or its pose is observed."""
+    """Whether a contact probability on the active object reaches the threshold, or the object's pose is observed."""
     touch = outputs.contact_prob[..., :BODY_POINTS].amax(-1) >= threshold
     return conditioning.has_object & (touch | conditioning.is_observed[..., 1])
 
@@ -25,7 +25,7 @@ def is_touched(conditioning: Conditioning, outputs: Outputs, threshold: float) -
 def _ends(
     touched: Bool[Tensor, "batch frame"],
 ) -> tuple[Int64[Tensor, "batch frame"], Int64[Tensor, "batch frame"]]:
-    """Of the contact that a frame belongs to, the first and the last frame."""
+    """First and last frame of the contact that each frame belongs to."""
     count = touched.shape[1]
     frames = torch.arange(count).expand(touched.shape)
     start = torch.where(touched & ~F.pad(touched[:, :-1], (1, 0)), frames, 0).cummax(1).values
@@ -34,8 +34,8 @@ def _ends(
 
 
 def inside(touched: Bool[Tensor, "batch frame"]) -> Bool[Tensor, "batch frame"]:
-    """Without the first and last `INSIDE` frames of every contact; of a short one its middle is left. What is touched in
-    the very first or last frame is taken to be so before or after it, too."""
+    """Contacts without their first and last `INSIDE` frames; of a short contact the middle remains. Contacts at the
+    first or last frame count as continuing beyond it."""
     count = touched.shape[1]
     frames, far = torch.arange(count), 2 * count
     start, stop = _ends(touched)
@@ -46,9 +46,9 @@ def inside(touched: Bool[Tensor, "batch frame"]) -> Bool[Tensor, "batch frame"]:
 
 
 def with_static_objects(conditioning: Conditioning, outputs: Outputs, threshold: float) -> Outputs:
-    """With objects that do not move untouched: each is where it was last touched, before its first time where it will be,
-    both `INSIDE` frames within the contact. Where the next contact has it elsewhere, it comes there over `FADE` frames. One
-    that nothing touches is left as it is."""
+    """Outputs in which untouched objects are static: at their pose in the last contact or, before their first
+    contact, at its pose, both `INSIDE` frames within the contact. At the start of the next contact an object blends
+    to its predicted pose over `FADE` frames. Objects without any contact are unchanged."""
     touched, observed = is_touched(conditioning, outputs, threshold), conditioning.is_observed[..., 1]
     active = torch.where(conditioning.has_object, conditioning.object_number, -1.0)
     count = active.shape[1]
@@ -76,28 +76,28 @@ def _taken(R: Tensor, t: Tensor, frame: Int64[Tensor, "batch frame"]) -> Rigid:
 
 
 def _static(
-    outputs: Outputs, drawn: Rigid, left: Rigid, found: Rigid, weight: Float[Tensor, "batch frame"]
+    outputs: Outputs, predicted: Rigid, left: Rigid, found: Rigid, weight: Float[Tensor, "batch frame"]
 ) -> Outputs:
-    """Objects as drawn, shifted and turned by a share of what lies between where they were left and where they are found
-    (world axes, about their middles)."""
+    """Predicted object poses, corrected by the share `weight` of the difference between the static pose (`left`) and
+    the predicted pose at the contact's start (`found`); rotation in world axes about the centre."""
     turn = rotation.exp(weight[..., None] * rotation.log(left.R @ found.R.mT))
-    return outputs._replace(R_world_object=turn @ drawn.R, t_world_object=drawn.t + weight[..., None] * (left.t - found.t))  # fmt: skip
+    return outputs._replace(R_world_object=turn @ predicted.R, t_world_object=predicted.t + weight[..., None] * (left.t - found.t))  # fmt: skip
 
 
 class StaticObjects:
-    """Frame by frame, for one lane, nothing known of later ones: an object rests where it was touched last and comes from
-    there when it is touched again; before its first contact it is where it is drawn."""
+    """The causal static-object constraint, frame by frame for one batch item: an untouched object keeps its last
+    touched pose and blends from it when touched again; before its first contact it is unchanged."""
 
     def __init__(self, threshold: float):
         self.threshold = threshold
         self._last: dict[float, Rigid] = {}
-        """Where each object was when it was last touched."""
+        """Pose of each object in its last frame with contact, by object number."""
         self._fading: tuple[float, Rigid, Rigid, int] | None = None
-        """What is touched now, where it was left and found, and how many frames ago."""
+        """The object in contact, its static pose, its predicted pose at the contact's start, and frames since then."""
 
     def __call__(self, conditioning: Conditioning, outputs: Outputs) -> Outputs:
-        """One frame."""
-        number, drawn = (
+        """Outputs of one frame with static objects."""
+        number, predicted = (
             conditioning.object_number.item(),
             Rigid(outputs.R_world_object, outputs.t_world_object),
         )
@@ -109,13 +109,13 @@ class StaticObjects:
             last = self._last.get(number)
             return outputs if last is None else outputs._replace(R_world_object=last.R, t_world_object=last.t)
         if conditioning.is_observed[..., 1].item():
-            self._fading = (number, drawn, drawn, 0)
+            self._fading = (number, predicted, predicted, 0)
         elif self._fading is None or self._fading[0] != number:
-            self._fading = (number, self._last.get(number, drawn), drawn, 0)
+            self._fading = (number, self._last.get(number, predicted), predicted, 0)
         _, left, found, ago = self._fading
         self._fading = (number, left, found, ago + 1)
         static = _static(
-            outputs, drawn, left, found, outputs.contact_prob.new_full((1, 1), max(0.0, 1 - ago / FADE))
+            outputs, predicted, left, found, outputs.contact_prob.new_full((1, 1), max(0.0, 1 - ago / FADE))
         )
         self._last[number] = Rigid(static.R_world_object, static.t_world_object)
         return static

@@ -1,5 +1,4 @@
-"""The steps of ECHO's denoiser by the fastest means at hand: what levels ask for is kept, the rest runs in PyTorch or in
-ONNX Runtime."""
+"""Fast denoising steps for ECHO: level-dependent activations are cached, the rest runs in PyTorch or ONNX Runtime."""
 
 from collections.abc import Callable
 
@@ -13,17 +12,18 @@ from wearcap.runtime.onnx import missing_libraries, onnx_runner
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser, EchoPlan
 
 RUNTIMES = ("eager", "onnx", "compile")
-"""onnx: ONNX Runtime, on the CPU. compile: for a GPU, replayed as CUDA graphs. Both take some seconds to begin."""
+"""onnx: ONNX Runtime, on the CPU. compile: for a GPU, replayed as CUDA graphs. Both take some seconds to start."""
 MOST_ROWS = 1024
-"""Triples of levels whose plans are kept: a queue has as many as steps, times what is known or absent."""
+"""Level triples whose plans are cached: a queue has one per step and combination of observed and absent modalities."""
 MOST_WINDOWS = 8
-"""Windows of levels whose plans are kept side by side: a queue that runs repeats as many as it has steps per frame."""
+"""Windows of levels whose plans are cached: a queue in steady state repeats as many as it has steps per frame."""
 
 
 class EchoPlans:
-    """What levels ask of a network whose weights do not change, worked out once for every triple of them.
+    """Cache of a network's level-dependent activations (`EchoDenoiser.plan`), computed once per triple of levels.
 
-    An object that comes into a window moves through it, so that hardly a window's levels are there twice; a frame's are.
+    The network's weights must not change. Triples repeat between frames, while the levels of whole windows rarely do
+    when an object enters: its first frame moves through the window.
     """
 
     def __init__(self, net: EchoDenoiser):
@@ -43,17 +43,17 @@ class EchoPlans:
 
     @torch.no_grad()
     def __call__(self, level: Float[Tensor, "batch frame modality"]) -> Float[Tensor, "#batch frame column"]:
-        """Of all lanes, or of one where all have the same levels (on the CPU)."""
+        """Plans of all batch items, or of one if all have the same levels. Levels are on the CPU."""
         if len(level) > 1 and (level == level[:1]).all():
             level = level[:1]
         key = bytes(str(tuple(level.shape)), "ascii") + level.numpy().tobytes()
         if key not in self._windows:
             if len(self._windows) >= MOST_WINDOWS:
                 self._windows.pop(next(iter(self._windows)))
-            self._windows[key] = self._of(level)
+            self._windows[key] = self._computed(level)
         return self._windows[key]
 
-    def _of(self, level: Float[Tensor, "batch frame modality"]) -> Float[Tensor, "batch frame column"]:
+    def _computed(self, level: Float[Tensor, "batch frame modality"]) -> Float[Tensor, "batch frame column"]:
         triples = [tuple(row) for row in level.flatten(0, 1).tolist()]
         if len(self._number) > MOST_ROWS:
             self._number.clear()
@@ -68,7 +68,7 @@ class EchoPlans:
         return self._rows[take].unflatten(0, level.shape[:2])
 
     def plan(self, columns: Float[Tensor, "batch frame column"]) -> EchoPlan:
-        """As the network takes it."""
+        """The plan in the form that the network takes."""
         parts = columns.split(self._sizes, -1)
         worth, blocks = parts[: self._worth], parts[self._worth :]
         if self.net.streams > 1:
@@ -77,7 +77,7 @@ class EchoPlans:
 
 
 class _StepGraph(nn.Module):
-    """One step, its levels' plan as one tensor."""
+    """One denoising step, with the levels' plan as a single tensor."""
 
     def __init__(self, plans: EchoPlans):
         super().__init__()
@@ -93,8 +93,8 @@ class _StepGraph(nn.Module):
         return self.net.step(x_t, self._plans[0].plan(plan), encoded, valid)
 
 
-class _ConditioningGraph(nn.Module):
-    """What a window's frames are told."""
+class _EncodeGraph(nn.Module):
+    """Encoding of a window's conditions."""
 
     def __init__(self, net: EchoDenoiser):
         super().__init__()
@@ -111,23 +111,20 @@ class _ConditioningGraph(nn.Module):
 
 
 class EchoRunner:
-    """x̂0 of windows. The network's weights must not change while it is used."""
+    """Computes x̂0 of windows. The network's weights must not change while it is in use."""
 
     def __init__(self, net: EchoDenoiser, runtime: str = "eager"):
         """Raises WearcapError for a runtime that is unknown, not installed, or not for the network's device."""
         self._device = net.motion_normalizer.mean.device
         require_runtime(runtime, self._device)
         self.net, self.plans = net, EchoPlans(net)
-        step, conditioning = _StepGraph(self.plans).eval(), _ConditioningGraph(net).eval()
+        step, encode = _StepGraph(self.plans).eval(), _EncodeGraph(net).eval()
         self._step: Callable[..., Tensor] = step
-        self._conditioning: Callable[..., Tensor] = conditioning
+        self._encode: Callable[..., Tensor] = encode
         if runtime == "onnx":
-            self._step, self._conditioning = _onnx(net, self.plans.size, step, conditioning)
+            self._step, self._encode = _onnx(net, self.plans.size, step, encode)
         elif runtime == "compile":
-            self._step, self._conditioning = (
-                _compiled(step, self._device),
-                _compiled(conditioning, self._device),
-            )
+            self._step, self._encode = _compiled(step, self._device), _compiled(encode, self._device)
         self._window = None if runtime == "eager" else net.window
 
     def begin(
@@ -137,25 +134,25 @@ class EchoRunner:
         has_object: Bool[Tensor, "batch time"],
         valid: Bool[Tensor, "batch time"],
     ) -> Callable[[Tensor, Tensor], Tensor]:
-        """x̂0 as a function of x_t "batch time feature" and levels "batch time modality"; what is told is encoded once.
+        """x̂0 as a function of x_t "batch time feature" and levels "batch time modality", encoding conditions once.
 
-        Everything goes in and comes out on the CPU.
+        Inputs and outputs are on the CPU.
         """
         count = valid.shape[1]
-        conditioning = [self._whole(part) for part in (condition, scene_object, has_object, valid)]
-        encoded, there = self._conditioning(*conditioning), conditioning[-1]
+        inputs = [self._whole(part) for part in (condition, scene_object, has_object, valid)]
+        encoded, whole_valid = self._encode(*inputs), inputs[-1]
 
         def denoise(x_t: Tensor, level: Tensor) -> Tensor:
-            plan = self.plans(self._filled(level))
-            return self._step(self._whole(x_t), plan, encoded, there)[:, :count].float().cpu()
+            plan = self.plans(self._padded(level))
+            return self._step(self._whole(x_t), plan, encoded, whole_valid)[:, :count].float().cpu()
 
         return denoise
 
     def _whole(self, value: Tensor) -> Tensor:
-        """On the device; where the network takes whole windows alone, with frames behind the last that are not valid."""
-        return self._filled(value).to(self._device)
+        """A tensor on the device, padded to a full window for runtimes with fixed shapes."""
+        return self._padded(value).to(self._device)
 
-    def _filled(self, value: Tensor) -> Tensor:
+    def _padded(self, value: Tensor) -> Tensor:
         more = 0 if self._window is None else self._window - value.shape[1]
         return F.pad(value, (0, 0) * (value.ndim - 2) + (0, more)) if more else value
 
@@ -163,7 +160,7 @@ class EchoRunner:
 def require_runtime(runtime: str, device: str | torch.device) -> None:
     """Raises WearcapError for a runtime that is unknown, not installed, or not for a device."""
     if runtime not in RUNTIMES:
-        raise WearcapError(f"no runtime {runtime!r}", expected=f"one of {', '.join(RUNTIMES)}", fix=nearest(runtime, RUNTIMES))  # fmt: skip
+        raise WearcapError(f"unknown runtime {runtime!r}", expected=f"one of {', '.join(RUNTIMES)}", fix=nearest(runtime, RUNTIMES))  # fmt: skip
     missing = missing_libraries() if runtime == "onnx" else []
     if missing or (runtime == "onnx" and torch.device(device).type != "cpu"):
         raise WearcapError(
@@ -173,28 +170,29 @@ def require_runtime(runtime: str, device: str | torch.device) -> None:
 
 
 def _onnx(
-    net: EchoDenoiser, columns: int, step: nn.Module, conditioning: nn.Module
+    net: EchoDenoiser, columns: int, step: nn.Module, encode: nn.Module
 ) -> tuple[Callable[..., Tensor], Callable[..., Tensor]]:
     frames = 2, net.window
-    there = torch.ones(frames, dtype=torch.bool)
-    codes = {
+    valid = torch.ones(frames, dtype=torch.bool)
+    encode_inputs = {
         "condition": torch.zeros(*frames, len(net.condition_normalizer.mean)),
-        "thing": torch.zeros(*frames, len(net.no_object)), "has_object": there, "valid": there.clone(),
+        "scene_object": torch.zeros(*frames, len(net.no_object)), "has_object": valid, "valid": valid.clone(),
     }  # fmt: skip
-    inputs = {
+    step_inputs = {
         "x_t": torch.zeros(*frames, sum(net.sizes)), "plan": torch.zeros(*frames, columns),
-        "encoded": torch.zeros(*frames, net.narrow.out_features), "valid": there,
+        "encoded": torch.zeros(*frames, net.narrow.out_features), "valid": valid,
     }  # fmt: skip
-    run_step, run_conditioning = onnx_runner(step, inputs), onnx_runner(conditioning, codes)
+    run_step, run_encode = onnx_runner(step, step_inputs), onnx_runner(encode, encode_inputs)
 
     def stepped(x_t: Tensor, plan: Tensor, encoded: Tensor, valid: Tensor) -> Tensor:
         return run_step(x_t, plan.expand(len(x_t), -1, -1), encoded, valid)[0]
 
-    return stepped, lambda *given: run_conditioning(*given)[0]
+    return stepped, lambda *inputs: run_encode(*inputs)[0]
 
 
 def _compiled(graph: nn.Module, device: torch.device) -> Callable[..., Tensor]:
-    """Static shapes; on a GPU, replayed as CUDA graphs, which overwrite what they give out."""
+    """The compiled graph with static shapes; on a GPU replayed as CUDA graphs, whose outputs must be cloned: the next
+    replay overwrites them."""
     mode = "reduce-overhead" if device.type == "cuda" else None
     compiled = torch.compile(graph, dynamic=False, fullgraph=True, mode=mode)
-    return lambda *given: compiled(*given).clone()
+    return lambda *inputs: compiled(*inputs).clone()

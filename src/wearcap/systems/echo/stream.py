@@ -1,7 +1,7 @@
-"""ECHO while things happen: tracked points go in as they come, bodies and objects come out frame by frame.
+"""Streaming ECHO: tracked points go in as they arrive, bodies and objects come out frame by frame.
 
-What is said is what `Echo` says of the whole recording with the same seed, as far as it is known in time; a pose comes
-`Echo.latency_s` after its moment. Memory does not grow.
+The outputs equal those of `Echo` on the whole recording with the same seed, up to inputs that arrive too late; the
+latency of a pose is `Echo.latency_s`. Memory use is bounded.
 """
 
 import math
@@ -49,29 +49,29 @@ from wearcap.tracking.head_track import Chunk, HeadTrack
 
 WRISTS = POINTS[1:]
 MAX_SEEN = 1000
-"""Sights of objects that wait for their frames; the oldest make room."""
+"""Most object observations that are buffered; the oldest are dropped."""
 ASIDE_M, BELOW = 0.25, 0.47
-"""Where a wrist hangs: beside the head (m), and below it as a share of the head's height."""
+"""Position of a wrist with the arm down: beside the head (m), and below it as a share of the head's height."""
 
 
 @dataclass(frozen=True, eq=False)
 class EchoWearer:
-    """Who wears the kit, and how the head device sits."""
+    """The wearer's body, and how the head device is mounted."""
 
     skeleton: Skeleton
     shape: Mapping[str, float] = field(default_factory=dict)
     R_head_device: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
     t_head_device: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
     floor_m: float | None = None
-    """Height of the floor; None: the head's usual height in the last half minute, less that of one who stands. A capture
-    of the whole recording knows what comes, too."""
+    """World z of the floor; None: estimated from the head's usual height in the last half minute and the height of a
+    standing head. A capture of the whole recording uses later frames, too."""
 
 
 class EchoSession:
-    """A streaming capture of one wearer among some objects.
+    """A streaming capture of one wearer and some objects.
 
-    What cannot be true (`sensors.packets`) is `refused`. Where the head device's clock goes back for good, the capture
-    begins anew as a new session would, with the object that was active; everything else is on that clock.
+    Invalid packets (`sensors.packets`) are counted as `refused`. If the head device's clock is set back for good, the
+    capture restarts like a new session, keeping the active object; all other times refer to the new clock.
     """
 
     def __init__(
@@ -83,46 +83,46 @@ class EchoSession:
         pipeline.prepare()
         self.pipeline, self.wearer, self.seed = pipeline, wearer, seed
         self.silent = 0
-        """Frames for which a wrist had nothing to say."""
+        """Wrist poses that were missing, counted per frame and wrist."""
         self._environment, self._reader = environment, pipeline.reader()
         self._shapes: dict[str, ObjectShape] = {}
-        """Objects that have been named so far, in that order."""
-        self._door, self._track = HeadDoor(), HeadTrack(pipeline.fps, 1)
+        """Objects that were named so far, in order of their first use."""
+        self._entry, self._track = HeadDoor(), HeadTrack(pipeline.fps, 1)
         self._wrists: dict[str, list[tuple[float, Tensor, Tensor]]] = {joint: [] for joint in WRISTS}
         self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
         self._acts: list[tuple[float, str | None]] = []
         self._seen: list[tuple[float, str, Rigid]] = []
         self._finished: list[Motion] = []
-        """Of before the clock went back, not given yet."""
+        """Final motions with times of a previous clock, not returned yet."""
         self._begin()
 
     def _begin(self) -> None:
-        """Begin anew: what was said of wrists and objects stays, and the counts."""
+        """Restart the capture; wrist poses, object events and counts are kept."""
         dropped, pipeline = self._track.dropped, self.pipeline
         self._track = HeadTrack(pipeline.fps, 1)
         self._track.dropped = dropped
         self._chunks: list[Chunk] = []
         self._queue: EchoQueue | None = None
-        self._waiting: list[tuple[float, Conditioning, Rigid]] = []
-        """Times, what was told, and the head, of frames that are taken and not given yet."""
+        self._pending: list[tuple[float, Conditioning, Rigid]] = []
+        """Time, conditioning and head pose of frames that were consumed but not output yet."""
         self._floor = FloorTracker(self.wearer.skeleton.height_of("head"), pipeline.fps)
         threshold = pipeline.static_below
         self._static = None if threshold is None else StaticObjects(threshold)
 
     @property
     def dropped(self) -> int:
-        """Head poses that came too late, twice, or were refused."""
-        return self._track.dropped + self._door.dropped
+        """Number of head poses that came too late, were duplicates, or were refused."""
+        return self._track.dropped + self._entry.dropped
 
     @property
     def refused(self) -> dict[str, int]:
-        """How many packets were refused, by reason: "left_wrist: not a rotation"."""
-        return dict(self._door.refused)
+        """Number of refused packets by reason, such as "left_wrist: not a rotation"."""
+        return dict(self._entry.refused)
 
     def head(self, timestamp: float, T_world_device: Rigid | None) -> None:
-        """Take in a moment of the head device: its pose, if tracking has one."""
-        if self._door.timely(timestamp):
-            self._take(self._door.admit(float(timestamp), self._door.pose(T_world_device)))
+        """Add a sample of the head device (times in s); None if tracking is lost."""
+        if self._entry.timely(timestamp):
+            self._take(self._entry.admit(float(timestamp), self._entry.pose(T_world_device)))
 
     def _take(self, admitted: Admitted) -> None:
         if admitted.begins:
@@ -141,68 +141,69 @@ class EchoSession:
             self._track.take(time, pose)
 
     def _rejoin(self, joint: str, time: float | None) -> None:
-        """Keep of a wrist what belongs to the clock that begins at a time; None: nothing does."""
-        observed = self._wrists[joint]
-        kept = [] if time is None else observed[connected([pose[0] for pose in observed], time)]
+        """Keep the poses of a wrist that are on the clock that starts at `time`; None: no pose is."""
+        poses = self._wrists[joint]
+        kept = [] if time is None else poses[connected([pose[0] for pose in poses], time)]
         refused = self._clocks[joint].set(kept[-1][0] if kept else None)
-        self._refuse(joint, refused if time is None else refused + len(observed) - len(kept))
+        self._refuse(joint, refused if time is None else refused + len(poses) - len(kept))
         self._wrists[joint] = kept
 
     def _refuse(self, stream: str, count: int) -> None:
         if count:
-            self._door.refuse(stream, OFF_THE_CLOCK, count)
+            self._entry.refuse(stream, OFF_THE_CLOCK, count)
 
     def wrist(self, joint: str, timestamp: float, T_world_joint: Rigid) -> None:
-        """Take in the pose of a wrist joint; what comes twice is left out.
+        """Add a pose of a wrist joint; duplicates are ignored.
 
-        Raises WearcapError for another joint than the wrists.
+        Raises WearcapError for any other joint.
         """
         if joint not in self._wrists:
             raise WearcapError(f"no tracked joint {joint!r}", expected=" or ".join(WRISTS))
         if fault := time_fault(timestamp) or pose_fault(T_world_joint):
-            self._door.refuse(joint, fault)
+            self._entry.refuse(joint, fault)
             return
-        leader = self._door.clock.newest
+        leader = self._entry.clock.newest
         admitted = self._clocks[joint].admit(float(timestamp), owned_pose(T_world_joint), leader)
         self._refuse(joint, admitted.refused)
         if admitted.begins:
             first = bisect_left(self._wrists[joint], admitted.packets[0][0], key=_time)
             self._wrists[joint] = self._wrists[joint][: first if admitted.again else 0]
         for time, T in admitted.packets:
-            observed = self._wrists[joint]
-            place = bisect_left(observed, time, key=_time)
-            if place == len(observed) or observed[place][0] != time:
-                observed.insert(place, (time, T.R, T.t))
-                del observed[:-MAX_WAITING]
+            poses = self._wrists[joint]
+            place = bisect_left(poses, time, key=_time)
+            if place == len(poses) or poses[place][0] != time:
+                poses.insert(place, (time, T.R, T.t))
+                del poses[:-MAX_WAITING]
 
     def activate(self, name: str | None, timestamp: float) -> None:
-        """From a time (s) on this object is the active one; None: none is. Frames whose poses are not final yet, too.
+        """Make an object the active one from `timestamp` (s) on; None: no object is active.
 
-        Raises WearcapError for an unknown object, and for one whose mesh or class cannot be used.
+        Frames that are not final yet are updated. Raises WearcapError for an unknown object, and for one whose mesh or
+        class cannot be used.
         """
         if fault := time_fault(timestamp):
-            self._door.refuse("activate", fault)
+            self._entry.refuse("activate", fault)
             return
         if name is not None:
-            observed = name in self._shapes
+            used_before = name in self._shapes
             self._shape(name)
-            if self.pipeline.placed and not observed and self._environment is not None:
-                # In the middle between then and one frame later: the first frame from then on is the one nearby.
+            if self.pipeline.placed and not used_before and self._environment is not None:
+                # Half a frame later, so that the first frame from `timestamp` on is the nearest one.
                 soon = timestamp + 0.499 / self.pipeline.fps
                 self._see(name, soon, self._environment.by_name(name).T_world_object)
         self._acts = [act for act in self._acts if act[0] < timestamp] + [(timestamp, name)]
         del self._acts[:-MAX_WAITING]
-        self._retell()
+        self._update_pending()
 
     def see_object(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
-        """An object's pose is known at a moment, from a camera for instance (ECHO §4.2).
+        """Add an observed pose of an object at a time (s), from a camera for instance (ECHO §4.2).
 
         Raises as `activate` does.
         """
         self._shape(name)
-        newest = self._door.clock.newest
+        newest = self._entry.clock.newest
         if fault := time_fault(timestamp) or pose_fault(T_world_object):
-            self._door.refuse(name, fault)
+            self._entry.refuse(name, fault)
         elif math.isfinite(newest) and abs(timestamp - newest) > CONNECTED_S:
             self._refuse(name, 1)
         else:
@@ -211,7 +212,7 @@ class EchoSession:
     def _see(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
         self._seen.append((timestamp, name, self._shape(name).centred(T_world_object)))
         del self._seen[:-MAX_SEEN]
-        self._retell()
+        self._update_pending()
 
     def _shape(self, name: str) -> ObjectShape:
         if name not in self._shapes:
@@ -225,36 +226,36 @@ class EchoSession:
         return self._shapes[name]
 
     def poses(self, ended: bool = False) -> Motion | None:
-        """The frames that are final since the last time; `ended`: nothing more will come.
+        """Frames that became final since the last call, or None; `ended`: no more input will arrive.
 
-        Where the head device's clock has gone back these are the frames before; call again for those with the new times.
+        After the head device's clock was set back, the frames before come first; call again for the new clock's.
         """
         if ended:
-            for time, pose in self._door.end():
+            for time, pose in self._entry.end():
                 self._track.take(time, pose)
         return self._finished.pop(0) if self._finished else self._final(ended)
 
     def _final(self, ended: bool) -> Motion | None:
         while (chunk := self._track.next(ended)) is not None:
             self._chunks.append(chunk)
-        given: list[Motion] = []
+        motions: list[Motion] = []
         with undisturbed(self.pipeline.runtime == "onnx"):
-            while self._chunks and (ended or self._conditioning(self._chunks[0])):
-                given += self._advance(self._chunks.pop(0))
+            while self._chunks and (ended or self._wrists_arrived(self._chunks[0])):
+                motions += self._advance(self._chunks.pop(0))
             if ended or not (self._chunks or self._track.inside):
-                given += self._finish()
-        return joined(given)
+                motions += self._finish()
+        return joined(motions)
 
-    def _conditioning(self, chunk: Chunk) -> bool:
-        """Whether both wrists have said where they are at a frame, or are silent."""
+    def _wrists_arrived(self, chunk: Chunk) -> bool:
+        """Whether the poses of both wrists at a frame have arrived, or count as lost."""
         time, head = chunk.timestamps[-1].item(), self._track.newest
         newest = [poses[-1][0] if poses else -math.inf for poses in self._wrists.values()]
         return all(last >= time - 1e-6 or head > max(time, last) + MAX_GAP_S for last in newest)
 
     def _advance(self, chunk: Chunk) -> list[Motion]:
-        given: list[Motion] = []
+        motions: list[Motion] = []
         if chunk.begins or self._queue is None:
-            given += self._finish()
+            motions += self._finish()
             skeleton = self.wearer.skeleton
             self._queue = self.pipeline.queue(
                 [skeleton], [stretch_seed(self.seed, chunk.first)], [dict(self.wearer.shape)],
@@ -266,51 +267,51 @@ class EchoSession:
         time = chunk.timestamps[0].item()
         conditioning = self._frame(time, T_world_head)
         outputs = self._queue.push(conditioning)
-        self._waiting.append((time, conditioning, T_world_head))
-        return given + self._give(outputs)
+        self._pending.append((time, conditioning, T_world_head))
+        return motions + self._emit(outputs)
 
     def _correct(self, T_world_head: Rigid) -> None:
-        """Put the head of the last frames where it turned out to have been."""
-        count = min(len(T_world_head.t), len(self._waiting))
+        """Replace the head poses of the last frames by corrected ones."""
+        count = min(len(T_world_head.t), len(self._pending))
         for k in range(count):
-            time, conditioning, _ = self._waiting[-count + k]
+            time, conditioning, _ = self._pending[-count + k]
             at = T_world_head[len(T_world_head.t) - count + k : len(T_world_head.t) - count + k + 1]
             R, t = conditioning.R_world_point.clone(), conditioning.t_world_point.clone()
             R[0, 0, 0], t[0, 0, 0] = at.R[0], at.t[0]
-            self._waiting[-count + k] = (time, conditioning._replace(R_world_point=R, t_world_point=t), at)
+            self._pending[-count + k] = (time, conditioning._replace(R_world_point=R, t_world_point=t), at)
         if count:
-            self._retell()
+            self._update_pending()
 
     def _finish(self) -> list[Motion]:
-        """The frames of a stretch that has ended."""
-        given: list[Motion] = []
-        while self._queue is not None and self._waiting:
-            given += self._give(self._queue.push(self._queue.padding()))
+        """The remaining frames of a stretch that has ended."""
+        motions: list[Motion] = []
+        while self._queue is not None and self._pending:
+            motions += self._emit(self._queue.push(self._queue.padding()))
         self._queue = None
-        return given
+        return motions
 
     def _frame(self, time: float, T_world_head: Rigid) -> Conditioning:
         poses = [T_world_head, *(self._wrist_at(joint, time, T_world_head) for joint in WRISTS)]
         R, t = torch.stack([T.R for T in poses], 1), torch.stack([T.t for T in poses], 1)
         joints = len(self.wearer.skeleton)
-        one = torch.ones(1, dtype=torch.bool)
-        unseen = (torch.eye(3).repeat(1, joints, 1, 1), torch.zeros(1, 3), torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, CONTACTS))  # fmt: skip
+        valid = torch.ones(1, dtype=torch.bool)
+        unobserved = (torch.eye(3).repeat(1, joints, 1, 1), torch.zeros(1, 3), torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, CONTACTS))  # fmt: skip
         floor = torch.full((1,), self.wearer.floor_m or 0.0)
         if self.wearer.floor_m is None:
             floor = self._floor.follow(T_world_head.t)
-        fields = (R, t, floor, *self._active(time), one, *unseen, torch.zeros(1, len(MODALITIES), dtype=torch.bool))  # fmt: skip
-        return self._observed(Conditioning(*(value[None] for value in fields)), time)
+        fields = (R, t, floor, *self._active(time), valid, *unobserved, torch.zeros(1, len(MODALITIES), dtype=torch.bool))  # fmt: skip
+        return self._with_observed_object(Conditioning(*(value[None] for value in fields)), time)
 
     def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Whether an object is active at a time, its code and its number."""
+        """Whether an object is active at a time, its code and its index."""
         name = next((name for start, name in reversed(self._acts) if start <= time + SAME_S), None)
         if name is None:
             return torch.zeros(1, dtype=torch.bool), self._reader.nothing[None], torch.full((1,), -1.0)
         number = torch.full((1,), float(list(self._shapes).index(name)))
         return torch.ones(1, dtype=torch.bool), self._shapes[name].code[None], number
 
-    def _observed(self, conditioning: Conditioning, time: float) -> Conditioning:
-        """With the active object's pose, where it was seen within half a frame: the one that is nearest in time."""
+    def _with_observed_object(self, conditioning: Conditioning, time: float) -> Conditioning:
+        """The conditioning with the active object's observation nearest in time, if one is within half a frame."""
         if not conditioning.has_object.item():
             return conditioning
         active, near = list(self._shapes)[int(conditioning.object_number)], 0.5 / self.pipeline.fps + 1e-6
@@ -320,19 +321,19 @@ class EchoSession:
         if not seen:
             return conditioning
         _, T = min(seen, key=lambda pair: pair[0])
-        observed = conditioning.is_observed.clone()
-        observed[..., 1] = True
+        is_observed = conditioning.is_observed.clone()
+        is_observed[..., 1] = True
         return conditioning._replace(
-            R_world_object=T.R[None, None], t_world_object=T.t[None, None], is_observed=observed
+            R_world_object=T.R[None, None], t_world_object=T.t[None, None], is_observed=is_observed
         )
 
-    def _retell(self) -> None:
-        """What has become known of the frames that are on the conveyor."""
-        if self._queue is None or self._queue.conditioning is None or not self._waiting:
+    def _update_pending(self) -> None:
+        """Update the conditioning of the conveyor's frames with inputs that arrived after them."""
+        if self._queue is None or self._queue.conditioning is None or not self._pending:
             return
-        whole, first = self._queue.conditioning, self._queue.conditioning.valid.shape[1] - len(self._waiting)
+        whole, first = self._queue.conditioning, self._queue.conditioning.valid.shape[1] - len(self._pending)
         frames = [whole.frames(slice(k, k + 1)) for k in range(max(first, 0))]
-        for k, (time, conditioning, head) in enumerate(self._waiting):
+        for k, (time, conditioning, head) in enumerate(self._pending):
             has, code, number = (value[None] for value in self._active(time))
             changed = conditioning._replace(
                 has_object=has,
@@ -340,36 +341,36 @@ class EchoSession:
                 object_number=number,
                 is_observed=torch.zeros_like(conditioning.is_observed),
             )
-            changed = self._observed(changed, time)
-            self._waiting[k] = (time, changed, head)
+            changed = self._with_observed_object(changed, time)
+            self._pending[k] = (time, changed, head)
             frames.append(changed)
         self._queue.conditioning = Conditioning(*(torch.cat(fields, 1) for fields in zip(*frames)))
 
-    def _hanging(self, joint: str, T_world_head: Rigid) -> Rigid:
-        """Of a wrist that has not been seen yet: beside the body, arms down."""
+    def _arm_down(self, joint: str, T_world_head: Rigid) -> Rigid:
+        """Default pose of a wrist that was not tracked yet: beside the body, arms down."""
         heading = rotation.about_axis("z", rotation.yaw_of(T_world_head.R))
         aside = ASIDE_M if joint == WRISTS[0] else -ASIDE_M
         below = torch.tensor([0.0, aside, -BELOW * self.wearer.skeleton.height_of("head")])
         return Rigid(heading, T_world_head.t + (heading @ below[:, None])[..., 0])
 
     def _wrist_at(self, joint: str, time: float, T_world_head: Rigid) -> Rigid:
-        observed = self._wrists[joint]
-        if not observed or observed[-1][0] < time - MAX_GAP_S:
+        poses = self._wrists[joint]
+        if not poses or poses[-1][0] < time - MAX_GAP_S:
             self.silent += 1
-        if not observed:
-            return self._hanging(joint, T_world_head)
-        times, R, t = zip(*observed)
+        if not poses:
+            return self._arm_down(joint, T_world_head)
+        times, R, t = zip(*poses)
         track = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
         pose = wrist_poses(track, torch.tensor([time], dtype=torch.float64))
-        # What came before the last second is asked for no more, but for where the wrist was when it began.
-        old = bisect_left(observed, time - 1.0, key=lambda sample: sample[0]) - 1
-        self._wrists[joint] = observed[max(old, 0) :]
+        # Only the last second is needed, and one pose before it.
+        old = bisect_left(poses, time - 1.0, key=lambda sample: sample[0]) - 1
+        self._wrists[joint] = poses[max(old, 0) :]
         return Rigid(pose.R.float(), pose.t.float())
 
-    def _give(self, outputs: Outputs | None) -> list[Motion]:
-        if outputs is None or not self._waiting:
+    def _emit(self, outputs: Outputs | None) -> list[Motion]:
+        if outputs is None or not self._pending:
             return []
-        time, conditioning, T_world_head = self._waiting.pop(0)
+        time, conditioning, T_world_head = self._pending.pop(0)
         path = HeadPath(
             torch.tensor([time], dtype=torch.float64), T_world_head, T_world_head, conditioning.floor_height[0],
             self.wearer.skeleton, ((0, 1),),
@@ -381,7 +382,7 @@ class EchoSession:
         return [motion_of(batch_item, outputs, self.pipeline.anchor, self.pipeline.settings())]
 
     def _forget(self, time: float) -> None:
-        """What no later frame asks for."""
+        """Drop object events that no later frame needs."""
         self._seen = [row for row in self._seen if row[0] > time - 1.0]
         past = [k for k, (start, _) in enumerate(self._acts) if start <= time]
         self._acts = self._acts[past[-1] :] if past else self._acts

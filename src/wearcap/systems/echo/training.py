@@ -25,13 +25,13 @@ from wearcap.training.base import SeededSteps, WeighedTerms
 
 
 class EchoDiffusion(SeededSteps, WeighedTerms):
-    """x0-prediction with a noise level for every frame and modality.
+    """x0-prediction with an independent noise level for every frame and modality.
 
-    Loss terms, weighed by `loss_weights`: "human", "object" and "contact" are mean squares in normalised space (eq. 12's
-    first three; squares are ours: their minimum is the mean that the posterior step takes x̂0 for); "object_vertices"
-    (the root of the mean square over the surface, which needs no vertices), "joints" and "skate" are distances in metres
-    (its last three); "velocity" of the joints is ours. Frames without an active object have no part in what is said of
-    one.
+    Loss terms, weighted by `loss_weights`: "human", "object" and "contact" are mean squares in normalised space (the
+    first three of eq. 12; squares are ours: their minimiser is the posterior mean, which the sampler's step expects
+    as x̂0); "object_vertices" (root mean square over the surface, in closed form without vertices), "joints" and
+    "skate" are distances in metres (its last three); "velocity" of the joints is ours. Frames without an active
+    object do not count in the object terms.
     """
 
     def __init__(
@@ -48,8 +48,8 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         contacts: bool = True,
         seed: int = 0,
     ):
-        """`encoder` (frozen) makes the objects' features. `contacts` False leaves that modality out, as a row of the
-        document does."""
+        """`encoder` (frozen) computes the objects' features. `contacts` False leaves that modality out, as in ECHO's
+        ablation."""
         super().__init__()
         self.net = net(
             human_size=features.human_size, object_size=OBJECT_SIZE, contact_size=CONTACTS,
@@ -62,9 +62,9 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         self._feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
 
     def set_statistics(self, dataset: EchoDataset, limit: int = 1500) -> None:
-        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        """Compute normalisation from a training split; a resumed run loads it with the weights."""
         if dataset.features != self.features:
-            raise WearcapError("windows of other features than the model's", expected="data.features and model.features alike")  # fmt: skip
+            raise WearcapError("windows of other features than the model's", expected="equal data.features and model.features")  # fmt: skip
         random = torch.Generator().manual_seed(0)
         drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
         rows: dict[str, list[Tensor]] = {"human": [], "object": [], "condition": []}
@@ -90,8 +90,8 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
             self.encoder.load_state_dict(dataset.encoder.state_dict())
 
     def _range(self, rows: Float[Tensor, "row value"]) -> tuple[Tensor, Tensor]:
-        """Mean and scale per value; of vectors that move with the window (root and object) one scale, about zero, so
-        that noise stays noise when they are turned."""
+        """Mean and scale per value. If outputs are re-expressed as the window advances, root and object vectors get
+        zero mean and one scale each, so that isotropic noise stays isotropic under rotation."""
         if not len(rows):
             return torch.zeros(rows.shape[1]), torch.ones(rows.shape[1])
         mean, scale = rows.mean(0), rows.std(0).clamp_min(MIN_SCALE)
@@ -101,21 +101,21 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         return mean, scale
 
     def pipeline_parts(self) -> dict[str, Any]:
-        """What an `Echo` pipeline is built around."""
+        """The arguments of an `Echo` pipeline that come from training."""
         return {
             "net": self.net, "features": self.features, "schedule": self.schedule, "skeleton": self.skeleton,
             "encoder": self.encoder, "contacts": self.contacts,
         }  # fmt: skip
 
     def train(self, mode: bool = True) -> "EchoDiffusion":
-        """The encoder of objects stays as it is."""
+        """Set the mode; the frozen object encoder stays in evaluation mode."""
         super().train(mode)
         if self.encoder is not None:
             self.encoder.eval()
         return self
 
     def _levels(self, batch: EchoWindow) -> Float[Tensor, "batch time modality"]:
-        """Of a batch; an object that is not there is noise alone."""
+        """Noise levels of a batch; absent modalities are at level 1, pure noise."""
         levels = self.mix.levels(batch.level_draws, batch.draws)
         human, scene_object, contact = levels.unbind(-1)
         scene_object = torch.where(batch.has_object, scene_object, 1.0)
@@ -123,19 +123,19 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         return torch.stack([human, scene_object, contact], -1)
 
     def _truth(self, batch: EchoWindow, frame: Rigid) -> Float[Tensor, "batch time feature"]:
-        """x0, normalised."""
+        """Ground truth x0 in normalised space."""
         human = self.features.encode_body(batch.body, frame)
         scene_object = self.features.encode_object(batch.T_world_object, frame)
         x0 = self.net.motion_normalizer(torch.cat([human, scene_object, 2 * batch.contact - 1], -1))
         return torch.where(self._counts(batch), x0, self._blank(x0))
 
     def _blank(self, x0: Tensor) -> Tensor:
-        """What stands for the object and the body's contacts where there is no object: nothing, and no contact."""
+        """x0 for frames without an object: zeros for its pose, and no contact."""
         human, scene_object, contact = x0.split(self.net.sizes, -1)
         return torch.cat([human, torch.zeros_like(scene_object), -torch.ones_like(contact)], -1)
 
     def _counts(self, batch: EchoWindow) -> Tensor:
-        """Which features mean something: all with an object, human and feet without."""
+        """Mask of meaningful features: all with an active object, else human and foot contacts."""
         always = torch.ones(sum(self.net.sizes), dtype=torch.bool, device=batch.valid.device)
         first = self.net.sizes[0]
         always[first : first + OBJECT_SIZE + BODY_POINTS] = False
@@ -151,7 +151,7 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
             condition, self.net.object(batch.object_code), batch.has_object, batch.valid
         )
         x0_hat = self.net(x_t, levels, encoded, batch.valid).float()
-        # Millimetres are lost in half precision.
+        # Half precision is too coarse for millimetres.
         with torch.autocast(x0_hat.device.type, enabled=False):
             return self._compared(x0_hat, x0, batch, frame)
 
@@ -175,13 +175,14 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         return terms
 
     def _joints(self, body: Body, batch: EchoWindow) -> Float[Tensor, "batch time joint 3"]:
-        """Joints (m) in the world."""
+        """Joint positions in the world (m)."""
         return forward_kinematics(self.skeleton, *body, batch.t_parent_joint[:, None]).t
 
     def _vertices(
         self, outputs: Float[Tensor, "batch time feature"], batch: EchoWindow, frame: Rigid
     ) -> Float[Tensor, ""]:
-        """Root of the mean squared way (m) between the surface as said and as it is: ‖Δt‖² + 2 Δt·ΔR μ + tr ΔR S ΔRᵀ."""
+        """Root mean squared distance (m) between the points of the predicted and the true surface:
+        ‖Δt‖² + 2 Δt·ΔR μ + tr ΔR S ΔRᵀ."""
         first = self.net.sizes[0]
         T = self.features.decode_object(outputs[..., first : first + OBJECT_SIZE], frame)
         turn, shift = T.R - batch.R_world_object, T.t - batch.t_world_object

@@ -1,4 +1,4 @@
-"""Windows of three tracked points, with body, active object and contacts behind them, for ECHO."""
+"""Training windows for ECHO: three tracked points with ground-truth body, active object and contacts."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -29,7 +29,7 @@ from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, POINTS, Body, E
 from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact, object_poses
 
 MIN_FRAMES = 6
-"""Shortest window that is trained on."""
+"""Length of the shortest training window (frames)."""
 
 
 class EchoWindow(NamedTuple):
@@ -44,38 +44,42 @@ class EchoWindow(NamedTuple):
     R_parent_joint: Float[Tensor, "*batch time joint 3 3"]
     t_world_root: Float[Tensor, "*batch time 3"]
     contact: Float[Tensor, "*batch time contact"]
-    """64 body points on the active object, then `FOOT_PATCHES` on the floor: 1 touches."""
+    """64 body points on the active object, then `FOOT_PATCHES` on the floor: 1 for contact."""
     has_object: Bool[Tensor, "*batch time"]
-    """Whether an object is active; without one its pose and the body's contacts mean nothing."""
+    """Whether an object is active; otherwise object pose and body contacts are arbitrary."""
     object_code: Float[Tensor, "*batch time code"]
     """Class, extents and feature of the active object (`ObjectShape.code`)."""
     R_world_object: Float[Tensor, "*batch time 3 3"]
     t_world_object: Float[Tensor, "*batch time 3"]
     object_mean: Float[Tensor, "*batch time 3"]
     object_spread: Float[Tensor, "*batch time 3 3"]
-    """Of the object's points about its middle (`ObjectShape`)."""
+    """Mean (m) and second moment (m²) of the object's points about its centre (`ObjectShape`)."""
     valid: Bool[Tensor, "*batch time"]
+    """False for padding."""
     noise: Float[Tensor, "*batch time feature"]
     level_draws: Float[Tensor, "*batch time 4"]
     draws: Float[Tensor, "*batch draw"]
-    """Diffusion noise and what levels are drawn from: functions of seed and step, not of the process."""
+    """Diffusion noise and uniform draws for noise levels: functions of seed and step, whatever the worker process."""
 
     @property
     def points(self) -> ThreePoints:
+        """The three tracked points."""
         return ThreePoints(self.R_world_point, self.t_world_point)
 
     @property
     def body(self) -> Body:
+        """The ground-truth body."""
         return Body(self.R_parent_joint, self.t_world_root)
 
     @property
     def T_world_object(self) -> Rigid:
+        """The ground-truth pose of the active object's centre."""
         return Rigid(self.R_world_object, self.t_world_object)
 
 
 @dataclass(frozen=True, eq=False)
 class EchoTrack:
-    """A whole recording at the model's rate: what is told of it and what is true."""
+    """Conditioning and ground truth of a whole recording at the model's rate."""
 
     points: ThreePoints
     floor_height: Float[Tensor, "time"]
@@ -85,15 +89,15 @@ class EchoTrack:
     contact: Float[Tensor, "time contact"]
     objects: list[ObjectShape]
     active: Int64[Tensor, "time"]
-    """Number of the active object in `objects`."""
+    """Index of the active object in `objects`, -1 without one."""
     T_world_object: Rigid
-    """Of the middle of the active object; the identity without one."""
+    """Pose of the active object's centre; the identity without one."""
 
 
 def three_points(recording: Recording, take: Tensor) -> ThreePoints:
-    """The measured head and the true wrists, at some frames of the motion.
+    """The measured head and the ground-truth wrists at frames `take` of the motion.
 
-    A recording without a head stream of the motion's length has the true head.
+    Recordings without a head stream of the motion's length get the ground-truth head.
     """
     motion, head = recording.motion, recording.head
     assert motion is not None
@@ -109,7 +113,7 @@ def three_points(recording: Recording, take: Tensor) -> ThreePoints:
 def echo_track(
     recording: Recording, environment: Environment | None, reader: ObjectReader, every: int, within_m: float
 ) -> EchoTrack:
-    """Every `every`-th frame of a recording whose truth is known."""
+    """Every `every`-th frame of a recording with ground truth; contact is a distance of at most `within_m` (m)."""
     motion = recording.motion
     assert motion is not None
     take = torch.arange(0, len(motion), every)
@@ -139,7 +143,7 @@ def echo_track(
 
 
 def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
-    """Contact of `FOOT_PATCHES` with the floor, as recorded. Raises WearcapError where it was not."""
+    """Recorded contact of `FOOT_PATCHES` with the floor. Raises WearcapError for a recording without it."""
     track, motion = recording.contacts, recording.motion
     assert motion is not None
     if track is None or not set(FOOT_PATCHES) <= set(track.parts) or len(track.contact) != len(motion):
@@ -149,10 +153,10 @@ def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
 
 
 class EchoDataset(Dataset):
-    """Windows of one split of one or more data sets, of any rates that are whole multiples of the model's.
+    """Windows of one split of one or more data sets whose frame rates are integer multiples of the model's.
 
-    Recordings without objects are of humans alone. An item is asked for by (window, seed), or by its window alone.
-    Tracks are made when a recording is first touched, and kept.
+    Recordings without objects are of humans alone. An item's index is (window, seed), or the window alone. Tracks are
+    built on first access and cached.
     """
 
     def __init__(
@@ -160,8 +164,8 @@ class EchoDataset(Dataset):
         stride: int, mirror: bool = False, balance: float = 1.0, beginnings: float = 0.0, within_m: float = TOUCH_M,
         objects: bool = True,
     ):  # fmt: skip
-        """`beginnings` is the share of windows that end before they are full, as a capture's first and last ones do;
-        with `objects` False all recordings are of humans alone."""
+        """`beginnings` is the share of windows that are not full, as the first and last ones of a capture; with
+        `objects` False all recordings are of humans alone."""
         self.features, self.encoder = features, encoder
         self.window, self.stride, self.mirror = window, stride, mirror
         self.beginnings, self.within_m, self.objects = beginnings, within_m, objects
@@ -187,7 +191,7 @@ class EchoDataset(Dataset):
         return len(self.starts)
 
     def track(self, number: int) -> EchoTrack:
-        """A whole recording, by its number in `recordings`."""
+        """The track of a whole recording, by its index in `recordings`."""
         if number not in self._tracks:
             self._tracks[number] = self._read_track(number)
         return self._tracks[number]
@@ -214,8 +218,8 @@ class EchoDataset(Dataset):
     def _cut(
         self, track: EchoTrack, start: int, length: int, mirrored: bool, random: torch.Generator
     ) -> EchoWindow:
-        """Frames start…start+length-1, the last one repeated as padding up to a whole window; objects' codes are those
-        of their mirror images where the window will be mirrored."""
+        """Frames start…start+length-1, padded to a full window by repeating the last one; with the codes of the
+        mirrored objects if the window will be mirrored."""
         stop = min(start + length, len(track.floor_height))
         take = start + torch.arange(self.window).clamp_max(stop - start - 1)
         active = track.active[take]
@@ -236,7 +240,7 @@ class EchoDataset(Dataset):
 
 
 def _every(source: Source, split: str, fps: float) -> int:
-    """Frames of a data set per frame of the model. Raises WearcapError for a rate that is no multiple."""
+    """Frames of a data set per frame of the model. Raises WearcapError for a rate that is not an integer multiple."""
     store = RecordingStore.open(source.root)
     rates = {store.entries[name].fps for name in store.names(split)}
     rate = next(iter(rates), fps)
@@ -247,9 +251,9 @@ def _every(source: Source, split: str, fps: float) -> int:
 
 
 def mirror_window(window: EchoWindow, skeleton: Skeleton) -> EchoWindow:
-    """The same seen in a mirror that swaps left and right; objects' codes are their mirror images' already.
+    """The window mirrored left to right; object codes are those of the mirrored objects already.
 
-    An object's own axes are mirrored across its y axis, so that its pose stays a rotation.
+    An object is also mirrored along its own y axis, so that its pose stays a rotation.
     """
     flip = torch.tensor(MIRROR)
     turn = torch.outer(flip, flip)
@@ -279,9 +283,9 @@ class EchoWindows(SeededWindows):
         augment: bool = True, balance: float = 1.0, beginnings: float = 0.0, within_m: float = TOUCH_M,
         objects: bool = True, encoder: PointNeXt | str | None = "object_encoder", val_sources: dict[str, dict | None] | None = None,
     ):  # fmt: skip
-        """See `SeededWindows` and `EchoDataset`; what varies windows is for training alone.
+        """See `SeededWindows` and `EchoDataset`; augmentation is for training alone.
 
-        `encoder` is a checkpoint of experiment=object_encoder, or another PointNeXt; None: objects have no feature.
+        `encoder` is a checkpoint of experiment=object_encoder, or another PointNeXt; None: no shape feature.
         """
         super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
         self.features, self.window, self.stride = features, window, stride
@@ -290,6 +294,7 @@ class EchoWindows(SeededWindows):
         self.within_m, self.objects = within_m, objects
 
     def dataset(self, split: str) -> EchoDataset:
+        """Windows of a split."""
         train = split == "train"
         return EchoDataset(
             self.sources if train else self.val_sources, split, features=self.features, encoder=self.encoder,
