@@ -12,7 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.export.network import ExportReport
 from wearcap.files import parse_json, sha256_of, write_text
 
-VERSION = 4
+VERSION = 5
 SCHEDULES = {cls.__name__: cls for cls in (CosineSchedule, LinearSchedule)}
 ROT6D = tuple(f"{column}{axis}" for column in "xy" for axis in "xyz")
 """First two columns of a rotation matrix, one after the other."""
