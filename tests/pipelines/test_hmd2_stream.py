@@ -315,7 +315,7 @@ def test_points_beyond_the_memory_are_forgotten(pipeline):
         points = at + 8 * torch.rand(100, 3, generator=random) - 4
         session.push([[Sensed(i / 60, Rigid(torch.eye(3), at), points)]])
     places = session._items[0].places
-    kept = torch.cat([points for points, _ in places._known + places._new])
+    kept = torch.cat([points for points, _ in places._tracked + places._new])
     assert len(kept) == len(places._map) <= 2000 + 1000
     assert (kept - at)[:, :2].norm(dim=-1).min() < 1.0
 
