@@ -31,7 +31,7 @@ class Conditions(NamedTuple):
 
 
 class OptionalInput(nn.Module):
-    """Encodes a modality that may be missing: standardised features, or a learned null vector where they are missing."""
+    """Encodes a modality that may be missing: standardised features, or a learned null vector in their place."""
 
     def __init__(self, size: int, width: int, frames_per_token: int):
         super().__init__()
@@ -95,8 +95,8 @@ class MotionDenoiser(nn.Module):
     A token is the sum of the encoded condition and the encoded x_t of its frames (the thesis leaves open where x_t
     enters). The encoded condition (`encode`) is the same in every sampling step and computed once.
     `frames_per_token` > 1 is ours: neighbouring frames share a token, which divides the cost of a window by about that
-    number; `blend` > 0 (also ours) mixes that many neighbouring frames of x̂0, which removes the seams between tokens and
-    most of a partly trained network's jitter. `self_conditioning` (Chen et al. 2023) also takes in the last x̂0.
+    number; `blend` > 0 (also ours) mixes that many neighbouring frames of x̂0, which removes the seams between tokens
+    and most of a partly trained network's jitter. `self_conditioning` (Chen et al. 2023) also takes in the last x̂0.
     """
 
     def __init__(

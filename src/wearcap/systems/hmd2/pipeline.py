@@ -1,4 +1,4 @@
-"""HMD² (thesis ch. 6): environment-aware full-body motion from a head-mounted device by conditional motion diffusion."""
+"""HMD² (thesis ch. 6): environment-aware full-body capture from a head-mounted device by conditional diffusion."""
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -33,7 +33,7 @@ MODALITIES = ("points", "images")
 
 @dataclass
 class HMD2:
-    """HMD²'s capture of whole recordings in overlapping windows (thesis eq. 6.5), and the settings it shares with streams."""
+    """Captures whole recordings in overlapping windows (thesis eq. 6.5); its fields also set up streams."""
 
     net: MotionDenoiser
     features: HeadFeatures
@@ -49,7 +49,7 @@ class HMD2:
     steps: int = 5
     """Number of denoising steps."""
     stride: int | None = None
-    """Frames by which windows advance; None: half a window, or with `inpaint` three quarters (the thesis's 180 of 240)."""
+    """Frames by which windows advance; None: half a window, or with `inpaint` three quarters (thesis: 180 of 240)."""
     eta: float = 1.0
     """Stochasticity of the steps: 1 samples the posterior (thesis eq. 6.2, 6.3), 0 is DDIM."""
     guidance: float = 1.0
@@ -59,7 +59,7 @@ class HMD2:
     spacing: float = 1.0
     """Spacing of the steps' noise levels (`diffusion.sampler.step_levels`)."""
     inpaint: bool = False
-    """Whether every step overwrites the overlap with the last window's poses (thesis eq. 6.5) or re-denoises it (ours)."""
+    """Whether steps overwrite the overlap with the last window's poses (thesis eq. 6.5) or re-denoise it (ours)."""
     fade: int = 20
     """Frames over which the difference between successive windows fades out after their seam (without `inpaint`)."""
     lookahead: int | None = None
@@ -88,7 +88,7 @@ class HMD2:
 
     @property
     def lookahead_frames(self) -> int:
-        """Frames at a window's end that the next window re-denoises. Raises WearcapError when the overlap is shorter."""
+        """Frames at a window's end that the next one re-denoises. Raises WearcapError when the overlap is shorter."""
         shared = self.net.window - self.advance
         lookahead_frames = (0 if self.inpaint else shared // 2) if self.lookahead is None else self.lookahead
         if not 0 <= lookahead_frames <= shared:

@@ -1,9 +1,9 @@
 """HMD²'s overlapping windows: each continues the last one's prediction by a few frames (thesis eq. 6.5).
 
-In the thesis every denoising step of a window overwrites the overlap with the last window's prediction (inpainting). With
-small strides a window then accumulates its own errors. Ours (`inpaint` off) re-denoises each window from the same noise,
-which is drawn per frame and moves along with its frame: predictions of successive windows for the same frame differ only
-by what the later window has seen since, and at the last final frame that difference fades out over `fade` frames.
+In the thesis every denoising step of a window overwrites the overlap with the last window's prediction (inpainting).
+With small strides a window then accumulates its own errors. Ours (`inpaint` off) re-denoises each window from the same
+noise, which is drawn per frame and moves along with its frame: successive windows' predictions for a frame differ only
+by what the later window has seen since, and after the last final frame that difference fades out over `fade` frames.
 Captures of whole recordings and streams both use this module, so that the same noise gives the same poses.
 """
 
@@ -33,7 +33,7 @@ class Frames(NamedTuple):
     image: Float[Tensor, "batch time image_feature"]
     image_valid: Bool[Tensor, "batch time"]
     valid: Bool[Tensor, "batch time"]
-    """False where the head pose is missing and after a recording's end; the other fields are then any finite numbers."""
+    """False where the head pose is missing and after a recording's end; other fields are any finite numbers there."""
 
 
 class Poses(NamedTuple):
