@@ -41,7 +41,7 @@ class Sensed(NamedTuple):
     T_world_device: Rigid | None = None
     """R "3 3", t "3" (m); the device's axes are the head's."""
     points_world: Float[Tensor, "point 3"] | None = None
-    """New points of the surroundings (m), in the world of the poses. Zero rows: tracking has a map, but no new points."""
+    """New points of the surroundings (m), in the world of the poses; zero rows: there is a map, but nothing new."""
     embedding: Float[Tensor, "feature"] | None = None
     """Embedding of the head camera's image at this timestamp."""
     floor_height: float | None = None
