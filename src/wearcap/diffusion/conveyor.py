@@ -105,10 +105,10 @@ class Conveyor:
         correct: Callable[[Float[Tensor, "batch frame feature"]], Float[Tensor, "batch frame feature"]]
         | None = None,
     ) -> None:
-        """Denoise by the steps between two frames; `noise` has the noise of each, `correct` changes every x̂0 (guidance).
+        """Take the steps between two frames; `noise` has the noise of each, `correct` changes every x̂0 (guidance).
 
-        A modality that was absent before goes from noise to its frame's level in one step; one that becomes absent or is
-        no longer observed becomes noise, except in final frames.
+        A modality that was absent goes from noise to its frame's level in one step; one that becomes absent or is no
+        longer observed becomes noise, except in final frames.
         """
         lost = self._observed & ~observation.is_observed & (self.age < self.rolling.steps)[:, None]
         observed, gone = self.wide(observation.is_observed), (observation.is_absent & (self.level < 1)) | lost

@@ -39,8 +39,8 @@ class LevelMix:
             or self.independent + self.conveyor > 1 + 1e-9
             or not 0 <= self.whole < 1
         ):
-            raise WearcapError(f"shares {self.independent} and {self.conveyor}, {self.whole} of windows known whole, ramps of {low} to {high} frames",
-                               expected="shares that add up to no more than 1, less than 1 known whole, and a rising pair of 1 or more frames")  # fmt: skip
+            raise WearcapError(f"shares {self.independent} and {self.conveyor}, {self.whole} of windows fully observed, ramps of {low} to {high} frames",
+                               expected="shares that add up to no more than 1, less than 1 fully observed, and a rising pair of 1 or more frames")  # fmt: skip
 
     def levels(
         self, frames: Float[Tensor, "batch time draw"], draws: Float[Tensor, "batch 9"]
