@@ -1,4 +1,4 @@
-"""Large pretrained image encoders, with weights that the user has: CLIP ViT-L/14 and DINOv2 ViT-L/14.
+"""Large pretrained image encoders with the user's own weights: CLIP ViT-L/14 and DINOv2 ViT-L/14.
 
 Nothing is downloaded: weights come from a path, an environment variable, or the cache where other programs left them.
 The networks are open_clip's and timm's, both optional packages.
@@ -27,13 +27,13 @@ SIDE = 224
 
 @dataclass(frozen=True)
 class Pretrained:
-    """One published network, and where its weights may lie."""
+    """One published network, and where its weights may be."""
 
     name: str
     title: str
     package: str
     install: str
-    """What pip calls the package."""
+    """Name of the package for pip."""
     network: Callable[[ModuleType], nn.Module]
     """Builds it with random weights."""
     tensors: Callable[[dict[str, Tensor]], dict[str, Tensor]]
@@ -113,7 +113,7 @@ class PretrainedEncoder:
 
 
 def clip(weights: str | Path | None = None, device: str | None = None) -> PretrainedEncoder:
-    """CLIP ViT-L/14 as OpenAI published it (768-d, the document's choice)."""
+    """CLIP ViT-L/14 as OpenAI published it (768-d, the thesis's choice)."""
     return PretrainedEncoder(CLIP, weights, device)
 
 
@@ -125,7 +125,7 @@ def dinov2(weights: str | Path | None = None, device: str | None = None) -> Pret
 def find_weights(kind: Pretrained, given: str | Path | None) -> Path:
     """The file given, else the one that `kind.variable` names, else the first in the user's caches.
 
-    The Hugging Face cache lies at $HF_HUB_CACHE, $HF_HOME/hub or ~/.cache/huggingface/hub. Raises WearcapError that
+    The Hugging Face cache is at $HF_HUB_CACHE, $HF_HOME/hub or ~/.cache/huggingface/hub. Raises WearcapError that
     lists the places when there is none.
     """
     named = given or os.environ.get(kind.variable)
