@@ -9,7 +9,7 @@ from wearcap.systems.hmd2.windows import Frames, advance, blended
 from wearcap.tracking.head_path import head_path
 
 
-def test_what_is_new_goes_on_from_what_is_known_and_fades_into_what_is_said():
+def test_new_frames_continue_from_observed_ones_and_fade_into_the_prediction():
     torch.manual_seed(0)
     x0_hat, observed = torch.randn(3, 30, 4), torch.randn(3, 30, 4)
     x0_hat[1], observed[1] = 0.0, torch.arange(30.0)[:, None]
@@ -17,7 +17,7 @@ def test_what_is_new_goes_on_from_what_is_known_and_fades_into_what_is_said():
     is_observed = torch.stack([number < 0, number < 10, number < 1])
     whole = blended(x0_hat, observed, is_observed, 8)
     assert torch.equal(whole[is_observed], observed[is_observed])
-    assert torch.equal(whole[0], x0_hat[0]), "nothing is known"
+    assert torch.equal(whole[0], x0_hat[0]), "nothing is observed"
     assert torch.allclose(whole[:, 17:], x0_hat[:, 17:], atol=1e-6)
     assert torch.allclose(whole[2, 8:], x0_hat[2, 8:], atol=1e-6), "one frame has no slope"
     steps = whole[1, 8:19, 0].diff()

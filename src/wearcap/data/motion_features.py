@@ -43,7 +43,7 @@ class MotionFeatures:
     In this order: yaw rate (rad/s), the root's horizontal velocity (m/s) and height over the floor (m); the other
     joints' positions (m), seen from where the root stands on the floor; all joints' velocities (m/s); whether
     ankles and toes stand on the floor (0 or 1; low and slow). Of a motion at `fps` only every `every`-th frame is
-    looked at: 20 of 60 in a second. Bodies keep their size.
+    used: 20 of 60 in a second. Bodies keep their size.
     """
 
     skeleton: Skeleton
@@ -55,7 +55,7 @@ class MotionFeatures:
         return 6 * len(self.skeleton) + 5
 
     def movement(self, motion: Motion, floor_height: Float[Tensor, "frame"] | None = None) -> Movement:
-        """A whole motion at the frames that are looked at, by default over its own floor (the lowest joint around).
+        """Joint positions of a whole motion, by default above its own floor (the lowest joint within a second).
 
         Raises WearcapError for a motion of other joints, or at another rate than `fps`.
         """

@@ -34,8 +34,8 @@ class ImageEncoder(Protocol):
 def letterboxed(
     frames: UInt8[Tensor, "batch height width 3"], width: int, height: int, mean: Sequence[float], std: Sequence[float]
 ) -> Float[Tensor, "batch 3 new_height new_width"]:  # fmt: skip
-    """Images normalised per channel (`mean`, `std` of values in 0…1), resized without cropping or distortion and centred
-    in width x height pixels; the margins are 0."""
+    """Images normalised per channel (`mean`, `std` of values in 0…1), resized without cropping or distortion, and
+    centred in width x height pixels; the margins are 0."""
     x = frames.movedim(-1, 1).float()
     scale = min(width / x.shape[3], height / x.shape[2])
     rows, columns = max(1, round(scale * x.shape[2])), max(1, round(scale * x.shape[3]))

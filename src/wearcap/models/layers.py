@@ -60,7 +60,7 @@ class RotaryAttention(nn.Module):
 
 
 def attention_mask(valid: Bool[Tensor, "batch token"]) -> Bool[Tensor, "batch 1 token token"]:
-    """Attention mask: every token attends to the valid ones, and padding also to itself, since an empty row gives NaN."""
+    """Attention mask: all tokens attend to the valid ones, padding also to itself, since an empty row gives NaN."""
     number = torch.arange(valid.shape[1], device=valid.device)
     return valid[:, None, None, :] | (number == number[:, None])
 
@@ -142,7 +142,7 @@ class TemporalBlend(nn.Module):
 
 
 class Widening(nn.Conv1d):
-    """A strided convolution over frames with one output per token, as one matrix product (several times faster on CPU)."""
+    """A strided convolution over frames with one output per token, as one matrix product (much faster on the CPU)."""
 
     def __init__(self, size: int, width: int, frames_per_token: int, context: int = 0, bias: bool = True):
         """Each token covers its own frames and `context` frames before and after them."""

@@ -14,7 +14,7 @@ class MotionAutoencoder(nn.Module):
     The remaining time axis after the convolutions is flattened, not averaged, so that the vector keeps the temporal
     order. Each of the `latent` dimensions has mean 0 and variance 1 over the training windows (batch normalisation
     without affine parameters), so that distances are comparable between trainings. We use 64 dimensions, in which the
-    covariance can be estimated from a few thousand overlapping windows; the protocol's 512 would need tens of thousands.
+    covariance can be estimated from a few thousand overlapping windows; the protocol's 512 need tens of thousands.
     """
 
     def __init__(

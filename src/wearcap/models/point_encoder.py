@@ -59,8 +59,8 @@ class PointNeXt(nn.Module):
         """Each stage keeps one point of `strides`, doubles `width`, and adds `blocks` InvResMLPs.
 
         The first gathers `neighbours` within `radius` (of the unit sphere), later ones within `radius_scaling` times as
-        much. `normalized`: positions in a ball are divided by its radius. `y_up`: the weights know objects whose y points
-        up instead of z. The defaults are PointNeXt-S for ModelNet40, 1024-d. Raises WearcapError for lists of different lengths.
+        much. `normalized`: positions in a ball are divided by its radius. `y_up`: the weights were trained on objects
+        whose y axis points up instead of z. The defaults are PointNeXt-S for ModelNet40, 1024-d. Raises WearcapError for lists of different lengths.
         """
         super().__init__()
         if not len(strides) == len(blocks) == len(neighbours):

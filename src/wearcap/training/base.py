@@ -18,7 +18,7 @@ class SeededSteps(lightning.LightningModule):
 
 
 class GivenOptimizer(lightning.LightningModule):
-    """Optimises `net` with the constructor's optimiser and, if there is one, its scheduler, which advances every step."""
+    """Optimises `net` with the constructor's optimiser and, if there is one, scheduler, which advances every step."""
 
     _optimizer: Callable[..., torch.optim.Optimizer]
     _scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None

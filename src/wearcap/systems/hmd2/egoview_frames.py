@@ -89,7 +89,7 @@ class EgoFrames(Dataset):
                 intrinsics.append(torch.tensor([lens.fx, lens.fy, lens.cx, lens.cy]).expand(len(frames), 4))
                 self._pictures.append(frames)
         if not points:
-            raise WearcapError(f"no head camera's pictures in split {split!r}", where=", ".join(s.root for s in sources),
+            raise WearcapError(f"no head camera images in split {split!r}", where=", ".join(s.root for s in sources),
                                fix="Prepare a data set with them: wearcap prepare simulated camera=true")  # fmt: skip
         self.point_cam, self.visible, self.weights = torch.cat(points), torch.cat(visible), torch.cat(weights)
         self.intrinsics = torch.cat(intrinsics)
