@@ -157,11 +157,11 @@ class HMD2:
             image = camera.embedding[number].float()
             image_valid &= image.isfinite().all(-1)
             image = image.nan_to_num(0.0, 0.0, 0.0)
-        item = Frames(
+        frames = Frames(
             path.T_world_head.R, path.T_world_head.t, self._floor(recording, path), points, points_valid,
             image, image_valid, torch.ones(count, dtype=torch.bool),
         )  # fmt: skip
-        return Frames(*(part[None] for part in item))
+        return Frames(*(part[None] for part in frames))
 
     def _uses_points(self, recording: Recording) -> bool:
         return bool(self.net.points_size) and "points" in self.use and recording.points is not None

@@ -51,7 +51,7 @@ class Session:
             memory or Memory(),
             pipeline.lookahead_frames,
         )
-        self._items = [
+        self._wearers = [
             WearerState(pipeline, wearer, seed, self.memory) for wearer, seed in zip(wearers, seeds)
         ]
         self._embedded = False
@@ -60,12 +60,12 @@ class Session:
     @property
     def dropped(self) -> list[int]:
         """Number of each wearer's poses that were late, duplicated or refused."""
-        return [item.dropped for item in self._items]
+        return [state.dropped for state in self._wearers]
 
     @property
     def refused(self) -> list[dict[str, int]]:
         """Number of each wearer's refused packets, or parts of packets, by reason ("head: not a rotation")."""
-        return [dict(item.door.refused) for item in self._items]
+        return [dict(state.door.refused) for state in self._wearers]
 
     def push(self, sensed: Sequence[Sequence[Sensed]]) -> list[Motion | None]:
         """Process each wearer's new packets (any number, also none); returns each wearer's newly final poses or None.
@@ -74,42 +74,42 @@ class Session:
         Raises WearcapError, without processing anything, for an embedding of another length than the network's as long
         as none of the right length has arrived; later ones are refused.
         """
-        if len(sensed) != len(self._items):
-            raise WearcapError(f"moments of {len(sensed)} wearers", expected=f"of {len(self._items)}, as the session has")  # fmt: skip
+        if len(sensed) != len(self._wearers):
+            raise WearcapError(f"packets of {len(sensed)} wearers", expected=f"of {len(self._wearers)}, as the session has")  # fmt: skip
         if not self._embedded:
             self._require_embeddings(sensed)
         before: dict[int, list[Motion]] = {}
         for i, moments in enumerate(sensed):
             for moment in moments:
-                before.setdefault(i, []).extend(self._take(i, self._items[i].admit(moment)))
+                before.setdefault(i, []).extend(self._take(i, self._wearers[i].admit(moment)))
         begun = {i for i, parts in before.items() if parts}
-        predicted = self._run([i for i in range(len(self._items)) if i not in begun], ended=False)
+        predicted = self._run([i for i in range(len(self._wearers)) if i not in begun], ended=False)
         return [joined(before[i]) if i in begun else motion for i, motion in enumerate(predicted)]
 
     def flush(self) -> list[Motion | None]:
         """Poses of all remaining frames, at the end of the stream."""
-        for item in self._items:
-            for _, moment in item.door.end():
-                item.take(moment)
-        return self._run(range(len(self._items)), ended=True)
+        for state in self._wearers:
+            for _, moment in state.door.end():
+                state.take(moment)
+        return self._run(range(len(self._wearers)), ended=True)
 
     def _take(self, number: int, admitted: Admitted) -> list[Motion]:
         """Process one wearer's accepted packets; returns the poses that remained before a reset of the clock."""
-        item, left = self._items[number], []
+        state, left = self._wearers[number], []
         if admitted.begins:
             last = self._run([number], ended=True)[number] if admitted.again else None
             left = [] if last is None else [last]
-            item.begin()
+            state.begin()
         for _, moment in admitted.packets:
-            item.take(moment)
+            state.take(moment)
         return left
 
     def _require_embeddings(self, sensed: Sequence[Sequence[Sensed]]) -> None:
         size = self.pipeline.net.image_size
-        for item, moments in zip(self._items, sensed):
+        for state, moments in zip(self._wearers, sensed):
             for moment in moments:
                 embedding = getattr(moment, "embedding", None)
-                if not item.shows_pictures or not isinstance(embedding, Tensor) or embedding.ndim != 1:
+                if not state.shows_pictures or not isinstance(embedding, Tensor) or embedding.ndim != 1:
                     continue
                 if embedding.shape == (size,):
                     self._embedded = True
@@ -119,17 +119,17 @@ class Session:
 
     def _run(self, wearers: Sequence[int], ended: bool) -> list[Motion | None]:
         """The next poses of some wearers; None for the others."""
-        predicted: list[list[Motion]] = [[] for _ in self._items]
-        while chunks := {i: chunk for i in wearers if (chunk := self._items[i].track.next(ended))}:
+        predicted: list[list[Motion]] = [[] for _ in self._wearers]
+        while chunks := {i: chunk for i in wearers if (chunk := self._wearers[i].track.next(ended))}:
             for i, chunk in chunks.items():
                 if chunk.begins:
-                    predicted[i] += self._items[i].finalize(0)
+                    predicted[i] += self._wearers[i].finalize(0)
             with self.pipeline.undisturbed():
                 self._advance(chunks)
             for i in chunks:
-                predicted[i] += self._items[i].finalize(self._lookahead_frames)
+                predicted[i] += self._wearers[i].finalize(self._lookahead_frames)
         for i in wearers if ended else ():
-            predicted[i] += self._items[i].finalize(0)
+            predicted[i] += self._wearers[i].finalize(0)
         return [joined(parts) for parts in predicted]
 
     @torch.inference_mode()
@@ -137,20 +137,20 @@ class Session:
         """Sample the next chunk of some wearers, in one batch."""
         samplers, fresh = [], []
         for i, chunk in chunks.items():
-            item = self._items[i]
-            T_device_head = Rigid(item.wearer.R_head_device, item.wearer.t_head_device).inverse()
-            fresh.append(item.frames(chunk, chunk.T_world_device @ T_device_head))
-            item.times = torch.cat([item.times, chunk.timestamps])
-            if chunk.begins or item.sampler is None:
-                item.sampler = self.pipeline.sampler(item.wearer.skeleton, item.seed, chunk.first)
+            state = self._wearers[i]
+            T_device_head = Rigid(state.wearer.R_head_device, state.wearer.t_head_device).inverse()
+            fresh.append(state.frames(chunk, chunk.T_world_device @ T_device_head))
+            state.times = torch.cat([state.times, chunk.timestamps])
+            if chunk.begins or state.sampler is None:
+                state.sampler = self.pipeline.sampler(state.wearer.skeleton, state.seed, chunk.first)
             elif len(chunk.corrected.t):
-                item.sampler.correct(chunk.corrected @ T_device_head)
-            samplers.append(item.sampler)
+                state.sampler.correct(chunk.corrected @ T_device_head)
+            samplers.append(state.sampler)
         advance(samplers, fresh)
 
     def save(self, path: str | Path) -> None:
         """Write everything that future poses depend on, except the pipeline (.safetensors)."""
-        write(path, self.pipeline, self._items, self._embedded)
+        write(path, self.pipeline, self._wearers, self._embedded)
 
     @classmethod
     def load(cls, path: str | Path, pipeline: HMD2) -> "Session":
@@ -161,7 +161,7 @@ class Session:
         saved = read(path, pipeline)
         wearers, seeds = zip(*((state.wearer, state.seed) for state in saved.wearers))
         session = cls(pipeline, wearers, seeds, saved.memory)
-        session._items, session._embedded = saved.wearers, saved.embedded
+        session._wearers, session._embedded = saved.wearers, saved.embedded
         return session
 
 
