@@ -169,7 +169,7 @@ def test_what_waits_for_a_lost_head_is_bounded(hmd2, recording, monkeypatch):
     session = Session(hmd2, [wearer(recording)], [0], Memory(max_points=1000))
     for k in range(200):
         session.push([[Sensed(k / 60, None, torch.rand(100, 3), torch.zeros(IMAGE), 0.0)]])
-    state = session._items[0]
+    state = session._wearers[0]
     assert len(state.pictures) == len(state.floors) == 30
     assert len(state.places._map) == sum(len(points) for points, _ in state.places._new) <= 4000
 
@@ -194,7 +194,7 @@ def test_whatever_comes_it_goes_on(hmd2, recording, seed):
         assert alone is None or torch.allclose(alone.t_world_root, predicted[1].t_world_root, atol=1e-4)
     well = run(session, conditions, 4.0)
     assert max(motion.timestamps[-1].item() for motion in well) > 5.1
-    state = session._items[0]
+    state = session._wearers[0]
     assert len(state.pictures) + len(state.floors) + len(state.track._poses) < 300
 
 

@@ -225,7 +225,7 @@ def test_poses_that_are_missing_at_a_chunks_end_are_held_and_put_right(pipeline)
     assert len(motion) == 70
     assert torch.allclose(head[38:40], head[37].expand(2, 3), atol=1e-4)
     assert torch.allclose(head[40:], recording.head.T_world_head.t[40:], atol=1e-4)
-    window = session._items[0].sampler.frames.t_world_head[0]
+    window = session._wearers[0].sampler.frames.t_world_head[0]
     true = recording.head.T_world_head.t[70 - 60 : 70]
     assert torch.allclose(window[:60], true, atol=2e-4)
 
@@ -303,7 +303,7 @@ def test_a_floor_that_is_told_is_believed(pipeline):
     session = Session(pipeline(), [wearer(recording)], [0])
     stream(session, [moment._replace(floor_height=0.01 * i) for i, moment in enumerate(moments(recording))])
     assert torch.allclose(
-        session._items[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5
+        session._wearers[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5
     )
 
 
@@ -314,8 +314,8 @@ def test_points_beyond_the_memory_are_forgotten(pipeline):
         at = torch.tensor([0.1 * i, 0.0, 1.6])
         points = at + 8 * torch.rand(100, 3, generator=random) - 4
         session.push([[Sensed(i / 60, Rigid(torch.eye(3), at), points)]])
-    places = session._items[0].places
-    kept = torch.cat([points for points, _ in places._known + places._new])
+    places = session._wearers[0].places
+    kept = torch.cat([points for points, _ in places._tracked + places._new])
     assert len(kept) == len(places._map) <= 2000 + 1000
     assert (kept - at)[:, :2].norm(dim=-1).min() < 1.0
 

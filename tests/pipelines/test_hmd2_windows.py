@@ -5,26 +5,26 @@ import torch
 from test_hmd2 import pipeline, seeing_recording
 
 from wearcap.errors import WearcapError
-from wearcap.systems.hmd2.windows import Frames, advance, joined
+from wearcap.systems.hmd2.windows import Frames, advance, blended
 from wearcap.tracking.head_path import head_path
 
 
-def test_what_is_new_goes_on_from_what_is_known_and_fades_into_what_is_said():
+def test_new_frames_continue_from_observed_ones_and_fade_into_the_prediction():
     torch.manual_seed(0)
     x0_hat, observed = torch.randn(3, 30, 4), torch.randn(3, 30, 4)
     x0_hat[1], observed[1] = 0.0, torch.arange(30.0)[:, None]
     number = torch.arange(30)
     is_observed = torch.stack([number < 0, number < 10, number < 1])
-    whole = joined(x0_hat, observed, is_observed, 8)
+    whole = blended(x0_hat, observed, is_observed, 8)
     assert torch.equal(whole[is_observed], observed[is_observed])
-    assert torch.equal(whole[0], x0_hat[0]), "nothing is known"
+    assert torch.equal(whole[0], x0_hat[0]), "nothing is observed"
     assert torch.allclose(whole[:, 17:], x0_hat[:, 17:], atol=1e-6)
     assert torch.allclose(whole[2, 8:], x0_hat[2, 8:], atol=1e-6), "one frame has no slope"
     steps = whole[1, 8:19, 0].diff()
     assert steps[0] == pytest.approx(1.0)
     assert 0.3 < steps[1] < 1.0, "it goes on as it went, and turns back"
     assert steps.diff().abs().max() < 1.1, "without a kink, on a way of nine in eight frames"
-    step = joined(x0_hat, observed, is_observed, 0)
+    step = blended(x0_hat, observed, is_observed, 0)
     assert torch.equal(step, torch.where(is_observed[..., None], observed, x0_hat))
 
 
@@ -51,19 +51,19 @@ def test_every_window_sees_the_same_noise_at_the_same_moment():
     assert last.std() == pytest.approx(1.0, abs=0.02)
 
 
-def test_what_is_final_stays_and_what_waits_is_said_again():
-    given, waited = [], []
+def test_final_poses_stay_and_lookahead_frames_are_re_denoised():
+    final_poses, lookahead = [], []
     for sampler in windows(pipeline(fade=8), 100, 10):
-        poses = sampler.give(20).poses.R_parent_joint[0]
+        poses = sampler.finalize(20).poses.R_parent_joint[0]
         if len(poses):
-            final = sampler.given
+            final = sampler.final
             assert torch.equal(sampler.predicted.R_parent_joint[0, final - len(poses) : final], poses)
-            held = torch.cat([*given, poses])[-final:]
-            assert torch.equal(sampler.predicted.R_parent_joint[0, final - len(held) : final], held)
-        given.append(poses)
-        waited.append(sampler.predicted.R_parent_joint[0, sampler.given :])
-    assert len(torch.cat(given)) == 80
-    assert not torch.allclose(waited[-2][10:], waited[-1][:10], atol=1e-5)
+            output = torch.cat([*final_poses, poses])[-final:]
+            assert torch.equal(sampler.predicted.R_parent_joint[0, final - len(output) : final], output)
+        final_poses.append(poses)
+        lookahead.append(sampler.predicted.R_parent_joint[0, sampler.final :])
+    assert len(torch.cat(final_poses)) == 80
+    assert not torch.allclose(lookahead[-2][10:], lookahead[-1][:10], atol=1e-5)
 
 
 def test_windows_do_not_look_further_ahead_than_they_share():

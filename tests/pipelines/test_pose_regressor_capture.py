@@ -70,7 +70,7 @@ def test_passes_and_company_change_nothing():
 def test_hands_need_a_true_motion_and_the_head_does_not():
     recording = replace(recording_of(swaying_motion(100), "r"), motion=None)
     assert len(pipeline()(recording)) == 100
-    with pytest.raises(WearcapError, match="hands are tracked by nothing"):
+    with pytest.raises(WearcapError, match="no tracked hands in this recording"):
         pipeline(HANDS)(recording)
 
 

@@ -1,4 +1,4 @@
-"""Windows of recordings, drawn for training, and the DataModules around them.
+"""Windows of recordings for training, and their DataModules.
 
 Open `windows.py` first: each system's `training_windows.py` is made alike. Where recordings come from: `wearcap.prepare`.
 """

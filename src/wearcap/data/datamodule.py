@@ -1,4 +1,4 @@
-"""Windows for Lightning: datasets and loaders, composed and nothing else."""
+"""Lightning DataModules of windows."""
 
 from collections.abc import Sized
 from typing import Protocol, runtime_checkable
@@ -15,7 +15,7 @@ from wearcap.recording.store import RecordingStore
 
 @runtime_checkable
 class Drawn(Sized, Protocol):
-    """A dataset whose windows are drawn by weight; an item is asked for by (window, seed)."""
+    """A dataset of windows with sampling weights, indexed by (window, seed)."""
 
     weights: Tensor
 
@@ -23,7 +23,7 @@ class Drawn(Sized, Protocol):
 
 
 class SeededWindows(lightning.LightningDataModule):
-    """Training windows drawn afresh each epoch by seed, validation windows always the same."""
+    """Training windows sampled anew each epoch from a seed; fixed validation windows."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class SeededWindows(lightning.LightningDataModule):
         self.workers, self.seed = workers, seed
 
     def dataset(self, split: str) -> Drawn:
-        """Windows of a split; those of the training split are varied."""
+        """Windows of a split; the training split is augmented."""
         raise NotImplementedError
 
     def setup(self, stage: str) -> None:
@@ -80,7 +80,7 @@ class SeededWindows(lightning.LightningDataModule):
 
 
 class MotionWindows(SeededWindows):
-    """Windows of head paths and motions, for the motion diffusion."""
+    """Windows of head paths and motions, for HMD²'s training."""
 
     def __init__(
         self,
@@ -99,14 +99,14 @@ class MotionWindows(SeededWindows):
         surroundings: Surroundings = NOTHING,
         beginnings: float = 0.0,
     ):
-        """See `SeededWindows`; `balance` and `beginnings`: see `WindowDataset`, for training alone."""
+        """See `SeededWindows`; `balance` and `beginnings` (training only): see `WindowDataset`."""
         super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
         self.window, self.stride, self.fps = window, stride, fps
         self.augment, self.balance = augment, balance
         self.surroundings, self.beginnings = surroundings, beginnings
 
     def dataset(self, split: str) -> WindowDataset:
-        """Windows of a split; the training split is jittered and mirrored. Codes of points are made where they lack."""
+        """Windows of a split; the training split is shifted and mirrored. Missing codes of points are computed."""
         train = split == "train"
         sources = self.sources if train else self.val_sources
         if self.surroundings.places is not None:

@@ -1,4 +1,4 @@
-"""Embeddings of a head camera's pictures, made once per file and encoder."""
+"""Embeddings of a head camera's images, computed once per file and encoder."""
 
 import hashlib
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ _KEYS = ("embedding", "embedding_mirrored")
 
 
 def embedding_name(encoder: ImageEncoder) -> str:
-    """What a camera stream calls its embeddings: the encoder's name and fingerprint, as different weights do not mix."""
+    """Name of an encoder's embeddings in a camera stream: NAME-FINGERPRINT, as other weights give other embeddings."""
     return f"{encoder.name}-{encoder.fingerprint}"
 
 
@@ -53,7 +53,7 @@ def embed_camera(
 
 
 def pictures(camera: CameraStream, folder: Path) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """A stream's pictures in order, from its video or its image files. Raises WearcapError as `embed_camera` does."""
+    """A stream's images in order, from its video or its image files. Raises WearcapError as `embed_camera` does."""
     files = _files(camera, folder)
     if camera.video is not None:
         yield from (frame for _, frame in read_frames(files[0]))
@@ -81,7 +81,7 @@ def _content(files: list[Path]) -> str:
 
 
 def _read(path: Path, size: int) -> dict[str, Tensor] | None:
-    """What is kept; None where there is nothing, or nothing whole."""
+    """Cached embeddings, or None if they are missing or incomplete."""
     try:
         tensors = load_file(path)
     except (FileNotFoundError, SafetensorError, OSError):
@@ -104,7 +104,7 @@ def _embed(
 def _batches(
     frames: Iterator[UInt8[np.ndarray, "height width 3"]],
 ) -> Iterator[UInt8[Tensor, "batch height width 3"]]:
-    """Neighbours of one size together."""
+    """Batches of successive frames of equal size."""
     batch: list[np.ndarray] = []
     for frame in frames:
         if batch and (len(batch) == BATCH or frame.shape != batch[0].shape):

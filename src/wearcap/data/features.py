@@ -1,4 +1,4 @@
-"""What the head-driven networks see and say: head paths to conditions, poses to vectors and back."""
+"""Features that the head-driven networks share: body size and frame differences."""
 
 import torch
 from jaxtyping import Float
@@ -13,7 +13,7 @@ LIMBS = {
     "arm": ("left_elbow", "left_wrist"),
     "trunk": ("l5", "l3", "t12", "t8", "neck", "head"),
 }
-"""What of a body's size is told, by the joints whose bones add up to it."""
+"""Measures of body size, each as the chain of joints whose bones add up to it."""
 
 
 def body_size(skeleton: Skeleton) -> Float[Tensor, "limb"]:
@@ -26,5 +26,5 @@ def body_size(skeleton: Skeleton) -> Float[Tensor, "limb"]:
 
 
 def first_repeated(step: Float[Tensor, "batch step *rest"]) -> Float[Tensor, "batch time *rest"]:
-    """Changes since the frame before, one per frame: the first frame repeats the second's."""
+    """Differences to the previous frame for every frame; the first frame repeats the second's."""
     return torch.cat([step[:, :1], step], 1)

@@ -1,4 +1,4 @@
-"""What a motion autoencoder sees of a window: a body's movement, wherever it is and whichever way it faces."""
+"""Features of the motion autoencoder: a body's movement, independent of its place and heading."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,21 +16,21 @@ from wearcap.metrics.physics import CONTACT_SPEED_M_S, local_floor
 from wearcap.recording import Motion
 
 CONTACT_HEIGHT_M = {"ankle": 0.12, "toe": 0.05}
-"""About 5 cm above where ankle and toe joint are when the foot is flat; the floor here is where toe joints get."""
+"""Heights (m) about 5 cm above those of ankle and toe joint in a flat foot; the floor here is at the toe joints."""
 FLOOR_WINDOW_S = 1.0
-"""The floor is the lowest true joint this near in time: ten seconds, as for floor penetration, span a flight of stairs,
-and heights over its foot say nothing of a pose."""
+"""Half width (s) of the interval whose lowest true joint is the floor. The ten seconds of floor penetration would span
+a flight of stairs, and heights above its foot do not describe a pose."""
 
 
 class Movement(NamedTuple):
-    """A body in the world, at the frames that are looked at; or windows of one, with leading axes."""
+    """Joint positions of a motion at the autoencoder's frame rate, or windows of one (with leading axes)."""
 
     joints: Float[Tensor, "*window frame joint 3"]
     R_world_root: Float[Tensor, "*window frame 3 3"]
     floor_height: Float[Tensor, "*window frame"]
 
     def windows(self, length: int, stride: int) -> "Movement":
-        """All whole windows of a movement, in one more leading axis."""
+        """All complete windows of a movement, along a new leading axis."""
         count = max(0, len(self.floor_height) - length) // stride + (len(self.floor_height) >= length)
         frames = stride * torch.arange(count)[:, None] + torch.arange(length)
         return Movement(*(part[frames] for part in self))
@@ -43,7 +43,7 @@ class MotionFeatures:
     In this order: yaw rate (rad/s), the root's horizontal velocity (m/s) and height over the floor (m); the other
     joints' positions (m), seen from where the root stands on the floor; all joints' velocities (m/s); whether
     ankles and toes stand on the floor (0 or 1; low and slow). Of a motion at `fps` only every `every`-th frame is
-    looked at: 20 of 60 in a second. Bodies keep their size.
+    used: 20 of 60 in a second. Bodies keep their size.
     """
 
     skeleton: Skeleton
@@ -55,7 +55,7 @@ class MotionFeatures:
         return 6 * len(self.skeleton) + 5
 
     def movement(self, motion: Motion, floor_height: Float[Tensor, "frame"] | None = None) -> Movement:
-        """A whole motion at the frames that are looked at, by default over its own floor (the lowest joint around).
+        """Joint positions of a whole motion, by default above its own floor (the lowest joint within a second).
 
         Raises WearcapError for a motion of other joints, or at another rate than `fps`.
         """
@@ -99,7 +99,7 @@ class MotionFeatures:
     def joints(
         self, features: Float[Tensor, "window frame feature"]
     ) -> Float[Tensor, "window frame joint 3"]:
-        """Joint positions (m) in the heading frame above the root's place on the floor, out of their features."""
+        """Joint positions (m) decoded from features, in the heading frame with origin on the floor below the root."""
         others = features[..., 4 : 1 + 3 * len(self.skeleton)].unflatten(-1, (-1, 3))
         root = torch.cat([torch.zeros_like(features[..., :2]), features[..., 3:4]], -1)
         return torch.cat([root[..., None, :], others], -2)

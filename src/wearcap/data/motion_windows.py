@@ -17,9 +17,9 @@ from wearcap.recording.store import RecordingFile
 
 
 class MovementDataset(Dataset):
-    """Whole windows of one split of one or more data sets. An item is asked for by (window, seed), or by window alone.
+    """Complete windows of one split of one or more data sets, indexed by (window, seed) or by window alone.
 
-    A recording's joints are found when it is first touched, and kept: 17 MB per hour at 20 frames a second.
+    A recording's joints are computed at its first use and kept: 17 MB per hour at 20 frames a second.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ def _movement(path: Path, features: MotionFeatures) -> Movement:
 
 
 def mirror(movement: Movement, skeleton: Skeleton) -> Movement:
-    """The same movement seen in a mirror that swaps left and right."""
+    """The movement mirrored left to right."""
     flip = movement.joints.new_tensor(MIRROR)
     twins = joint_twins(skeleton)
     return movement._replace(

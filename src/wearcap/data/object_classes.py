@@ -1,4 +1,4 @@
-"""The classes of objects that people handle, and which of them the data sets' own names belong to."""
+"""Object classes, and the class of every object name in the data sets."""
 
 from wearcap.errors import WearcapError, nearest
 
@@ -7,7 +7,7 @@ OBJECT_CLASSES: tuple[str, ...] = (
     "floorlamp", "keyboard", "monitor", "mop", "sofa", "stool", "suitcase", "table", "tool", "toolbox", "trashcan",
     "tripod", "vacuum", "window", "yogamat",
 )  # fmt: skip
-"""Sorted: a class' number is its place here."""
+"""All classes in alphabetical order; a class's index is its position here."""
 
 _OTHER_NAMES = {
     "ball": ("basketball", "yogaball"),
@@ -17,7 +17,7 @@ _OTHER_NAMES = {
     "table": ("largetable", "smalltable", "tablesmall", "tablesquare"),
     "trashcan": ("trashbin",),
 }
-"""BEHAVE's and OMOMO's names by class, where they are not the class' own."""
+"""BEHAVE's and OMOMO's names by class, where they differ from the class's name."""
 
 _CLASS_OF = {name: name for name in OBJECT_CLASSES} | {
     name: kind for kind, names in _OTHER_NAMES.items() for name in names
@@ -27,7 +27,7 @@ _CLASS_OF = {name: name for name in OBJECT_CLASSES} | {
 def object_class(name: str) -> str:
     """The class (of `OBJECT_CLASSES`) of an object by a data set's name, such as "largebox".
 
-    Raises WearcapError, with the names that are known, for any other.
+    Raises WearcapError, which lists the accepted names, for any other.
     """
     if name not in _CLASS_OF:
         near = nearest(name, _CLASS_OF)

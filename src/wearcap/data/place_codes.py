@@ -1,4 +1,4 @@
-"""Codes of the points around the body at every frame of a recording, made once per encoder and kept beside the data."""
+"""Codes of the points around the body at every frame of a recording, cached beside the data per encoder."""
 
 import hashlib
 from collections.abc import Iterable
@@ -23,10 +23,10 @@ _AT_ONCE = 2048
 
 
 class PlaceCodes:
-    """What a trained autoencoder's encoder says of the points around the body (thesis §6.2)."""
+    """Codes of the points around the body by a trained voxel autoencoder (thesis §6.2)."""
 
     def __init__(self, checkpoint: str | Path):
-        """`checkpoint`: path or name of one of experiment=voxel_autoencoder."""
+        """`checkpoint`: path or name of a checkpoint of experiment=voxel_autoencoder."""
         self.checkpoint = checkpoint
 
     @cached_property
@@ -40,23 +40,25 @@ class PlaceCodes:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Changes when the weights or the grid do (16 digits)."""
+        """16 hex digits that depend on the weights and the grid."""
         digest = hashlib.sha256(repr(self.encoder.grid).encode())
         for name, value in sorted(self.encoder.state_dict().items()):
             digest.update(name.encode() + value.contiguous().numpy().tobytes())
         return digest.hexdigest()[:16]
 
     def file_of(self, root: Path, entry: Entry) -> Path:
-        """File of a recording's codes, made if it is not there yet: `code` and, of the surroundings seen in a mirror that
-        swaps left and right, `code_mirrored` ("time feature", float16) on the head stream's timestamps; no rows where a
-        recording has no points."""
+        """File of a recording's codes, made if it is missing.
+
+        It contains `code` and, for the surroundings mirrored left to right, `code_mirrored` ("time feature", float16)
+        at the head stream's timestamps; no rows for a recording without points.
+        """
         path = root / "cache" / f"places-{self.fingerprint}" / f"{entry.sha256}.safetensors"
         if not path.is_file():
             self._make(path, root, entry)
         return path
 
     def prepare(self, store: RecordingStore, names: Iterable[str]) -> None:
-        """Make the codes of recordings that lack them."""
+        """Compute the missing codes of recordings."""
         folder = store.root / "cache" / f"places-{self.fingerprint}"
         todo = [
             name for name in names if not (folder / f"{store.entries[name].sha256}.safetensors").is_file()
@@ -75,14 +77,14 @@ class PlaceCodes:
 def place_codes(
     cloud: PointCloud | None, head: HeadStream, encoder: VoxelAutoencoder
 ) -> tuple[Float16[Tensor, "time feature"], Float16[Tensor, "time feature"]]:
-    """Codes of the points that had been seen by each of the head's frames, and of the same seen in a mirror.
+    """Codes of the points that had been seen by each head frame, and of the same points mirrored left to right.
 
     No rows without points.
     """
-    known = cloud is not None and len(cloud.points_world) > 0
-    code = torch.zeros(len(head.timestamps) if known else 0, encoder.size, dtype=torch.float16)
+    has_points = cloud is not None and len(cloud.points_world) > 0
+    code = torch.zeros(len(head.timestamps) if has_points else 0, encoder.size, dtype=torch.float16)
     code_mirrored = code.clone()
-    if cloud is None or not known:
+    if cloud is None or not has_points:
         return code, code_mirrored
     surroundings = VoxelMap(encoder.grid)
     surroundings.add(cloud.points_world, cloud.first_seen)

@@ -7,9 +7,9 @@ import torch
 W = TypeVar("W", bound=tuple)
 
 MIN_SCALE = 0.05
-"""No feature is stretched more than this: rotations that hardly vary would otherwise be mostly noise."""
+"""Smallest standard deviation that features are divided by: rotations that hardly vary would become mostly noise."""
 
 
 def collate(windows: list[W]) -> W:
-    """Windows, each a tuple of tensors, as one with a leading batch axis."""
+    """Stacks windows (named tuples of tensors) along a leading batch axis."""
     return type(windows[0])(*(torch.stack(field) for field in zip(*windows)))

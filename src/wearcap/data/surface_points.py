@@ -1,4 +1,4 @@
-"""An object's surface as a cloud of points: what its encoder sees."""
+"""Point clouds of objects' surfaces, the input of the object encoder."""
 
 import numpy as np
 import torch
@@ -12,9 +12,9 @@ POINTS = 1500
 
 
 def object_cloud(mesh: Mesh, count: int = POINTS, seed: int = 0) -> Float[Tensor, "point 3"]:
-    """`count` points (m) spread evenly by area over a surface, or drawn from the vertices where there are no faces.
+    """`count` points (m) spread evenly by area over a surface, or sampled from the vertices if there are no faces.
 
-    Always the same for a seed. Raises WearcapError for a mesh without vertices, or with some that are not finite.
+    Deterministic for a seed. Raises WearcapError for a mesh without vertices, or with some that are not finite.
     """
     if not len(mesh.vertices) or not np.isfinite(mesh.vertices).all():
         raise WearcapError(f"a mesh of {len(mesh.vertices)} vertices, some perhaps NaN or infinite, has no cloud",

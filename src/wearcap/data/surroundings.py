@@ -1,4 +1,4 @@
-"""What the windows of a recording tell beside the head's path: the points around the body, the head camera's pictures."""
+"""Conditions of a window beside the head's path: codes of the points around the body, and image embeddings."""
 
 import re
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from wearcap.errors import WearcapError
 from wearcap.recording.store import RecordingFile, RecordingStore
 
 MAX_PICTURE_AGE_S = 0.2
-"""A picture older than this says nothing of a frame any more."""
+"""Largest age (s) at which an image still conditions a frame."""
 
 
 class Seen(NamedTuple):
-    """Points and pictures of some frames, and on which of them there are any."""
+    """Point codes and image embeddings of some frames, and which frames have them."""
 
     points: Float[Tensor, "*batch time point_feature"]
     points_valid: Bool[Tensor, "*batch time"]
@@ -30,25 +30,25 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Which modalities windows carry: None leaves one out (no columns)."""
+    """Modalities that windows contain; None leaves one out (no columns)."""
 
     places: PlaceCodes | None = None
     images: str | None = None
     """Name of the encoder whose embeddings are read from the recordings' cameras."""
 
     def image_size(self, stores: list[RecordingStore]) -> int:
-        """Dimension of the embeddings, as the data has it.
+        """Dimension of the embeddings in the data.
 
-        Raises WearcapError when no recording has any of this encoder, or when their dimensions differ.
+        Raises WearcapError when no recording has embeddings of this encoder, or when their dimensions differ.
         """
         return 0 if self.images is None else embeddings_of(self.images, stores)[1]
 
     def read(
         self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int
     ) -> Seen:
-        """Frames start…stop-1 on the head stream's clock; `mirrored`: as a mirror that swaps left and right shows them.
+        """Frames start…stop-1 of the head stream; with `mirrored`, those of the surroundings mirrored left to right.
 
-        Raises what `PlaceCodes.file_of` raises.
+        Raises WearcapError as `PlaceCodes.file_of` does.
         """
         path, count = store.path_of(name), stop - start
         points, points_valid = torch.zeros(count, 0), torch.zeros(count, dtype=torch.bool)
@@ -72,14 +72,13 @@ class Surroundings:
 NOTHING = Surroundings()
 
 _ENCODER_NAME = re.compile(r"[\w.-]+")
-"""A name becomes a value of the training's config, where `${…}` would be resolved."""
+"""Names become values of the training's config, in which `${…}` would be resolved."""
 
 
 def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]:
-    """Full name (`NAME-FINGERPRINT` of its weights) and dimension of the embeddings that data sets have of an encoder,
-    which is named by its full name or by NAME alone.
+    """Full name (`NAME-FINGERPRINT` of its weights) and dimension of an encoder's embeddings in data sets.
 
-    Raises WearcapError where there are none of it, or several kinds.
+    `encoder` is the full name or NAME alone. Raises WearcapError when there are none, or several kinds.
     """
     kinds: set[tuple[str, int]] = set()
     for file in (_open(store.path_of(name)) for store in stores for name in store.names()):
@@ -126,7 +125,7 @@ def _latest(path: Path) -> tuple[Int64[Tensor, "time"], Bool[Tensor, "time"]]:
 def latest_before(
     timestamps: Float64[Tensor, "picture"], wanted: Float64[Tensor, "time"]
 ) -> tuple[Int64[Tensor, "time"], Bool[Tensor, "time"]]:
-    """Number of the newest picture at each time (30 Hz pictures serve two frames at 60 Hz), and whether it is fresh."""
+    """Index of the newest image at each time (30 Hz images serve two frames at 60 Hz), and whether it is recent."""
     if not len(timestamps):
         return torch.zeros(len(wanted), dtype=torch.long), torch.zeros(len(wanted), dtype=torch.bool)
     newest = torch.searchsorted(timestamps.contiguous(), wanted + 1e-4, right=True) - 1

@@ -1,4 +1,4 @@
-"""Windows of recordings, sliced from the memory map; content and order are functions of seed and step."""
+"""Windows of recordings, read from memory-mapped files; content and order are functions of seed and step."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.tracking.floor import floor_from_path, floor_from_points
 
 MIN_FRAMES = 10
-"""Shortest beginning of a capture that is trained on."""
+"""Fewest frames of an incomplete first window in training (`beginnings`)."""
 
 
 class Window(NamedTuple):
@@ -32,9 +32,9 @@ class Window(NamedTuple):
     R_world_head: Float[Tensor, "*batch time 3 3"]
     t_world_head: Float[Tensor, "*batch time 3"]
     floor_height: Float[Tensor, "*batch time"]
-    """Floor beneath the head (m), from points where there are any."""
+    """Floor height (m) below the head, from points if there are any, else from the head's path."""
     floor_from_head: Float[Tensor, "*batch time"]
-    """The same as the head's path alone tells it."""
+    """Floor height (m) below the head, from the head's path alone."""
     valid: Bool[Tensor, "*batch time"]
     t_parent_joint: Float[Tensor, "*batch joint 3"]
     size: Float[Tensor, "*batch limb"]
@@ -45,12 +45,12 @@ class Window(NamedTuple):
     points_valid: Bool[Tensor, "*batch time"]
     image: Float[Tensor, "*batch time image_feature"]
     image_valid: Bool[Tensor, "*batch time"]
-    """See `Surroundings`; no columns where a modality is left out."""
+    """Points and images: see `Surroundings`; no columns for a modality that is left out."""
     noise: Float[Tensor, "*batch time motion"]
     level: Float[Tensor, "*batch 1"]
     chance: Float[Tensor, "*batch 3"]
-    """Diffusion noise and level, and chances to drop modalities and to condition on oneself, drawn here so that they
-    depend on seed and step and not on the process."""
+    """Diffusion noise and level, and uniform random numbers that decide on dropped modalities and self-conditioning;
+    drawn here so that they depend on seed and step, not on the process."""
 
     @property
     def stature(self) -> Float[Tensor, "*batch"]:
@@ -60,7 +60,7 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class Source:
-    """One data set to draw windows from, with its share of the draws."""
+    """One data set to sample windows from, with its sampling weight."""
 
     root: str
     weight: float = 1.0
@@ -77,10 +77,10 @@ def share_out(
     min_frames: int = 30,
 ) -> tuple[list[tuple[RecordingStore, str]], Int64[Tensor, "window 3"], Float64[Tensor, "window"]]:
     """Recordings of a split (data set and name), its windows as (recording, first frame, frames of the recording), and
-    the windows' shares of the draws.
+    the windows' sampling weights.
 
-    Recordings shorter than `min_frames` are left out. Raises WearcapError for one of another rate than `fps`, and
-    where no window is left.
+    Recordings shorter than `min_frames` are left out. Raises WearcapError for a recording at another rate than `fps`,
+    and when there are no windows.
     """
     recordings: list[tuple[RecordingStore, str]] = []
     starts, weights = [], []
@@ -110,16 +110,16 @@ def _usable(store: RecordingStore, split: str, fps: float, min_frames: int) -> I
 
 
 def asked_for(item: tuple[int, int] | int) -> tuple[int, torch.Generator]:
-    """Number of the window that is asked for, and what its variations are drawn from: its seed.
+    """Window index of a data set's item, and the random generator of its augmentation.
 
-    A number alone comes from Lightning's overfit_batches, which puts its own sampler in: the same draws each time.
+    An index without a seed comes from Lightning's overfit_batches, which replaces the sampler: the index is the seed.
     """
     index, seed = item if isinstance(item, tuple) else (item, item)
     return index, torch.Generator().manual_seed(seed)
 
 
 class WindowDataset(Dataset):
-    """Windows of one split of one or more data sets. An item is asked for by (window, seed), or by its window alone."""
+    """Windows of one split of one or more data sets, indexed by (window, seed) or by window alone."""
 
     def __init__(
         self,
@@ -135,10 +135,10 @@ class WindowDataset(Dataset):
         surroundings: Surroundings = NOTHING,
         beginnings: float = 0.0,
     ):
-        """A recording's share of the draws grows with its number of windows to the power of `balance`.
+        """A recording's sampling weight is its number of windows to the power of `balance`.
 
-        1 draws all windows alike, 0 all recordings. `beginnings` is the share of windows that end before they are full,
-        as the first ones of a capture do.
+        1 samples all windows equally, 0 all recordings. `beginnings` is the share of incomplete windows, as the first
+        ones of a capture are.
         """
         self.window, self.stride, self.fps, self.mirror = window, stride, fps, mirror
         self.surroundings, self.beginnings = surroundings, beginnings
@@ -168,7 +168,7 @@ class WindowDataset(Dataset):
         mirrored: bool,
         random: torch.Generator,
     ) -> Window:
-        """Frames start…start+length-1 of a recording, the last one repeated as padding up to a whole window."""
+        """Frames start…start+length-1 of a recording, padded to a whole window by the last frame."""
         file = _open(store.path_of(name))
         constants = _constants(file.path)
         stop = min(start + length, file.length("motion.timestamps"))
@@ -191,13 +191,13 @@ class WindowDataset(Dataset):
 
 @cache
 def _open(path: Path) -> RecordingFile:
-    """Kept open per process: a window then costs its own bytes alone."""
+    """Files stay open per process, so that a window reads its own bytes only."""
     return RecordingFile(path)
 
 
 @dataclass(frozen=True)
 class _Constants:
-    """What is the same for all windows of a recording, or cheap to keep whole."""
+    """Values that all windows of a recording share, and per-frame values that are cheap to keep in memory."""
 
     skeleton: Skeleton
     T_device_head: Rigid
@@ -218,17 +218,17 @@ def _constants(path: Path) -> _Constants:
     assert head is not None
     assert motion is not None
     stature, t_world_head = motion.skeleton.height_of("head"), head.T_world_head.t
-    blind = floor_from_path(head.timestamps, t_world_head, stature)
-    seen = floor_from_points(recording.points, t_world_head, stature)
+    from_path = floor_from_path(head.timestamps, t_world_head, stature)
+    from_points = floor_from_points(recording.points, t_world_head, stature)
     mount = Rigid(head.R_head_device, head.t_head_device)
     return _Constants(
-        motion.skeleton, mount.inverse(), body_size(motion.skeleton), blind if seen is None else seen, blind,
-        true_foot_contact(recording).float(),
+        motion.skeleton, mount.inverse(), body_size(motion.skeleton),
+        from_path if from_points is None else from_points, from_path, true_foot_contact(recording).float(),
     )  # fmt: skip
 
 
 def true_foot_contact(recording: Recording) -> Bool[Tensor, "time foot"]:
-    """Contact of the left and right foot at the motion's frames: as recorded, else judged from the true motion."""
+    """Contact of the left and right foot at the motion's frames, as recorded or else estimated from the true motion."""
     motion, track = recording.motion, recording.contacts
     assert motion is not None
     if track is not None and set(FOOT_PATCHES) <= set(track.parts) and len(track.contact) == len(motion):
@@ -239,7 +239,7 @@ def true_foot_contact(recording: Recording) -> Bool[Tensor, "time foot"]:
 
 
 def mirror_window(window: Window, skeleton: Skeleton) -> Window:
-    """The same motion seen in a mirror that swaps left and right; its surroundings are read as mirrored already."""
+    """The window mirrored left to right; its surroundings must be mirrored already."""
     flip = torch.tensor(MIRROR)
     return window._replace(
         R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton),
@@ -253,18 +253,18 @@ def mirror_window(window: Window, skeleton: Skeleton) -> Window:
 def mirrored_rotations(
     R_parent_joint: Float[Tensor, "*batch joint 3 3"], skeleton: Skeleton
 ) -> Float[Tensor, "*batch joint 3 3"]:
-    """A pose seen in a mirror that swaps left and right."""
+    """Local rotations of the pose mirrored left to right."""
     flip = R_parent_joint.new_tensor(MIRROR)
     return R_parent_joint[..., joint_twins(skeleton), :, :] * torch.outer(flip, flip)
 
 
 def joint_twins(skeleton: Skeleton) -> list[int]:
-    """Number of each joint's twin on the other side."""
+    """Index of each joint's counterpart on the other side."""
     return [skeleton.index(mirrored_name(name)) for name in skeleton.joint_names]
 
 
 def mirrored_name(name: str) -> str:
-    """left_… for right_… and the other way round; the name itself on the midline."""
+    """The name with left and right exchanged; unchanged for joints on the midline."""
     for side, other in (("left", "right"), ("right", "left")):
         if name.startswith(side):
             return other + name.removeprefix(side)
@@ -272,10 +272,10 @@ def mirrored_name(name: str) -> str:
 
 
 class SeededSampler(Sampler):
-    """Weighted draws of (window, seed), for one epoch of a fixed number of steps.
+    """Weighted random samples of (window, seed), for epochs of a fixed number of steps.
 
-    What is drawn at a step depends on seed, epoch and position alone: a resumed run continues with the same
-    samples, and ranks of a distributed run share out one sequence.
+    The sample at a step depends on seed, epoch and position alone: a resumed run continues with the same samples, and
+    the ranks of a distributed run split one sequence.
     """
 
     def __init__(self, weights: Tensor, count: int, seed: int, rank: int = 0, world: int = 1):
@@ -298,7 +298,7 @@ class SeededSampler(Sampler):
 
 
 class FixedSampler(Sampler):
-    """Evenly spread windows, each with its own fixed seed: validation sees the same noise every time."""
+    """Evenly spread windows with fixed seeds, so that every validation uses the same noise."""
 
     def __init__(self, windows: int, limit: int | None = None):
         count = min(windows, limit or windows)

@@ -1,6 +1,6 @@
-"""A conveyor of frames whose noise grows towards its end (ECHO §3.3): frames enter as noise and leave clean.
+"""Conveyor inference (ECHO §3.3): a queue whose noise level grows along it; frames enter as noise and leave clean.
 
-All lanes of a conveyor take a frame at the same moment; a recording that has ended sends padding.
+All batch items take in a frame at the same time; a recording that has ended adds padding.
 """
 
 from collections.abc import Callable
@@ -19,23 +19,23 @@ Denoise = Callable[
     [Float[Tensor, "batch frame feature"], Float[Tensor, "batch frame modality"]],
     Float[Tensor, "batch frame feature"],
 ]
-"""x̂0 from x_t and its levels, of all the frames on the conveyor."""
+"""x̂0 from x_t and its noise levels, for all frames on the conveyor."""
 
 
 @dataclass(frozen=True)
 class RollingSchedule:
-    """How a conveyor runs: `context` clean frames are kept before the ramp, on which a frame is denoised `per_frame`
-    times for every frame that enters. Raises WearcapError for a context that leaves no ramp, and for unknown steps."""
+    """Schedule of a conveyor: `context` clean frames are kept before the ramp, on which every frame is denoised
+    `per_frame` times per frame that enters. Raises WearcapError for a context without a ramp and for unknown steps."""
 
     window: int
     context: int
     per_frame: int = 1
     spacing: float = 1.0
-    """1: levels fall evenly; more: smaller steps where little noise is left."""
+    """Exponent of the levels: 1 spaces them evenly, more takes smaller steps at low noise levels."""
     eta: float = 1.0
-    """1: the stochastic posterior; 0: DDIM."""
+    """Stochasticity of the steps: 1 samples the posterior, 0 is DDIM."""
     step: str = "posterior"
-    """"redraw": x̂0 is noised anew in every step, as ECHO eq. 11 is printed."""
+    """Update rule, one of `STEPS`; "redraw" adds fresh noise to x̂0 in every step, as ECHO eq. 11 is printed."""
 
     def __post_init__(self):
         if not 0 <= self.context < self.window:
@@ -50,45 +50,45 @@ class RollingSchedule:
 
     @property
     def ramp(self) -> int:
-        """Frames on their way from noise to clean; a pose is final when as many frames, less one, have followed it."""
+        """Number of frames that are neither context nor clean; a pose is final when `ramp` - 1 frames have followed."""
         return self.window - self.context
 
     @property
     def steps(self) -> int:
-        """That a frame is denoised by in all (the document: 100)."""
+        """Total number of denoising steps of a frame (ECHO: 100)."""
         return self.ramp * self.per_frame
 
     def levels(self, age: Int64[Tensor, "frame"]) -> Float[Tensor, "frame"]:
-        """Of frames that have been denoised `age` times: 1 for new ones, 0 for clean ones."""
+        """Noise levels of frames that have been denoised `age` times: 1 for new frames, 0 for clean ones."""
         return (1 - age / self.steps).clamp(0, 1) ** self.spacing
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What of the frames on a conveyor is not to be denoised."""
+    """Observed and absent modalities of the frames on a conveyor, which are not denoised."""
 
     observed: Float[Tensor, "batch frame feature"]
     is_observed: Bool[Tensor, "batch frame modality"]
-    """Observed: at level 0, as `observed` says."""
+    """Modalities that are fixed to `observed`, at level 0."""
     is_absent: Bool[Tensor, "batch frame modality"]
-    """Not there at all: stays noise."""
+    """Modalities that do not exist, such as the object without an object; they remain noise at level 1."""
 
 
 class Conveyor:
-    """The frames of several lanes, the oldest first; never more than the window."""
+    """The frames of several batch items, the oldest first; at most a window."""
 
     def __init__(self, rolling: RollingSchedule, schedule: Schedule, sizes: tuple[int, ...], items: int):
-        """`sizes`: features of each modality."""
+        """`sizes`: number of features of each modality; `items`: batch size."""
         self.rolling, self.schedule, self.sizes = rolling, schedule, sizes
         self.x = torch.zeros(items, 0, sum(sizes))
         self.age = torch.zeros(0, dtype=torch.long)
         self.level = torch.zeros(items, 0, len(sizes))
-        """Where each frame's modalities have come to."""
+        """Current noise level of each frame's modalities."""
         self._observed = torch.zeros(items, 0, len(sizes), dtype=torch.bool)
         self._modality = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
 
     def push(self, noise: Float[Tensor, "batch feature"]) -> bool:
-        """Take a new frame on; True where the oldest one had to make room."""
+        """Add a new frame of noise; returns whether the oldest frame was removed for it."""
         full = len(self.age) == self.rolling.window
         self.x = torch.cat([self.x[:, int(full) :], noise[:, None].to(self.x)], 1)
         self.age = torch.cat([self.age[int(full) :], self.age.new_zeros(1)])
@@ -105,10 +105,10 @@ class Conveyor:
         correct: Callable[[Float[Tensor, "batch frame feature"]], Float[Tensor, "batch frame feature"]]
         | None = None,
     ) -> None:
-        """As many steps as there are between two frames; `noise` is what each adds. `correct` changes every x̂0 (guidance).
+        """Take the steps between two frames; `noise` has the noise of each, `correct` changes every x̂0 (guidance).
 
-        What was absent and is there now comes from noise to its frame's level in one step; what is there or known no more
-        becomes noise, but in frames that are final.
+        A modality that was absent goes from noise to its frame's level in one step; one that becomes absent or is no
+        longer observed becomes noise, except in final frames.
         """
         lost = self._observed & ~observation.is_observed & (self.age < self.rolling.steps)[:, None]
         observed, gone = self.wide(observation.is_observed), (observation.is_absent & (self.level < 1)) | lost
@@ -135,9 +135,9 @@ class Conveyor:
 
     @property
     def clean(self) -> int:
-        """Frames that are final."""
+        """Number of final frames."""
         return int((self.age >= self.rolling.steps).sum())
 
     def wide(self, value: Tensor) -> Tensor:
-        """Per feature instead of per modality."""
+        """Values per modality repeated for each of its features."""
         return value.index_select(-1, self._modality)

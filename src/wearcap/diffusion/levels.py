@@ -1,4 +1,4 @@
-"""Noise levels per frame and modality, as training draws them (ECHO §3.2, §3.3)."""
+"""Training distribution of noise levels per frame and modality (ECHO §3.2, §3.3)."""
 
 from dataclasses import dataclass
 
@@ -14,22 +14,22 @@ DRAWS = 9
 
 @dataclass(frozen=True)
 class LevelMix:
-    """Shares of the windows whose levels are drawn in each way; what is left of 1 has one level per modality.
+    """Shares of the windows whose levels are drawn by each scheme; the remaining windows have one level per modality.
 
-    independent: for every frame and modality (ECHO eq. 6). conveyor: grows along the window, as in a queue that fills,
-    runs or empties. One level per modality for the whole window, independent between them, is TriDi's. Some windows
-    have known frames in one modality, at level 0 (`observed`), as sparse observations are.
+    independent: a level for every frame and modality (ECHO eq. 6). conveyor: levels grow along the window, as in a
+    conveyor that fills, runs or empties. One level per modality for the whole window is TriDi's scheme. In a share
+    `observed` of the windows some frames of one modality are at level 0, as sparse observations are.
     """
 
     independent: float = 0.25
     conveyor: float = 0.6
     observed: float = 0.15
     whole: float = 0.0
-    """Share of those windows in which all of that modality's frames are known."""
+    """Share of the windows with observations in which all frames of that modality are observed."""
     ramp: tuple[int, int] | list[int] = (10, 60)
-    """Fewest and most frames over which a conveyor's level grows from 0 to 1."""
+    """Smallest and largest number of frames over which a conveyor's level grows from 0 to 1."""
     together: bool = False
-    """Whether the modalities share the windows' one level (BoDiffusion's)."""
+    """Whether all modalities share a window's single level, as in BoDiffusion."""
 
     def __post_init__(self):
         low, high = self.ramp
@@ -39,8 +39,8 @@ class LevelMix:
             or self.independent + self.conveyor > 1 + 1e-9
             or not 0 <= self.whole < 1
         ):
-            raise WearcapError(f"shares {self.independent} and {self.conveyor}, {self.whole} of windows known whole, ramps of {low} to {high} frames",
-                               expected="shares that add up to no more than 1, less than 1 known whole, and a rising pair of 1 or more frames")  # fmt: skip
+            raise WearcapError(f"shares {self.independent} and {self.conveyor}, {self.whole} of windows fully observed, ramps of {low} to {high} frames",
+                               expected="shares that add up to no more than 1, less than 1 fully observed, and a rising pair of 1 or more frames")  # fmt: skip
 
     def levels(
         self, frames: Float[Tensor, "batch time draw"], draws: Float[Tensor, "batch 9"]
@@ -51,7 +51,7 @@ class LevelMix:
         kind, ramp_at, tail_at, observed_parts, which, share, *_ = draws[..., None, None].unbind(1)
         low, high = self.ramp
         ramp = (low + (high - low) * ramp_at).round()
-        # The queue's newest frame, at level 1, may lie behind the window: then the recording has ended.
+        # The conveyor's newest frame, at level 1, may be after the window's end: then the recording has ended.
         tail = tail_at * (time - 1 + ramp)
         place = torch.arange(time, device=frames.device)[None, :, None]
         grows = (1 - (tail - place) / ramp).clamp(0, 1).expand(-1, -1, count)
@@ -63,6 +63,6 @@ class LevelMix:
             torch.where(kind < self.independent + self.conveyor, grows, single),
         )
         modality = torch.arange(count, device=frames.device) == (which * count).long()
-        # Few frames are known as often as many: the share of known frames grows with the cube, up to all of them.
+        # The share of observed frames is the cube of a uniform number, so that few are as frequent as many.
         seen = chance < (share / (1 - self.whole)) ** 3
         return torch.where((observed_parts < self.observed) & modality & seen, 0.0, levels)

@@ -34,8 +34,8 @@ def posterior_step(
 ) -> Float[Tensor, "batch time feature"]:
     """Sample x at `level_next` ≤ `level` from q(x_next | x_t, x̂0) (thesis eq. 6.2, 6.3).
 
-    `eta` 1 is the stochastic posterior of the document, 0 the deterministic step (DDIM); both leave the marginals of
-    a perfect x̂0 as they are. What does not change its level keeps x_t; what reaches level 0 becomes x̂0.
+    `eta` 1 is the thesis's stochastic posterior, 0 the deterministic step (DDIM); both preserve the marginals for a
+    perfect x̂0. Where the level does not change, x_t stays; where it reaches 0, the result is x̂0.
     """
     level, level_next = _wide(level), _wide(level_next)
     now, after = schedule(level), schedule(level_next)

@@ -1,4 +1,4 @@
-"""Strided sampling of whole windows, with frames that are already known held fixed."""
+"""Strided sampling of whole windows, with inpainting of observed frames."""
 
 from collections.abc import Callable
 
@@ -12,13 +12,13 @@ from wearcap.diffusion.schedule import Schedule
 Denoise = Callable[
     [Float[Tensor, "batch time feature"], Float[Tensor, "batch 1"]], Float[Tensor, "batch time feature"]
 ]
-"""x̂0 from x_t and its level."""
+"""x̂0 from x_t and its noise level."""
 
 
 def step_levels(steps: int, spacing: float = 1.0) -> Float[Tensor, "level"]:
-    """The levels from 1 to 0 between which `steps` steps lead: (1 - i / steps) to the power of `spacing`.
+    """The `steps` + 1 levels from 1 to 0 of a sampler: (1 - i / steps) to the power of `spacing`.
 
-    1 strides evenly, as the document does; more takes smaller steps where little noise is left, less where much is.
+    1 spaces them evenly, as the thesis does; more takes smaller steps at low noise levels, less at high ones.
     """
     return torch.linspace(1, 0, steps + 1) ** spacing
 

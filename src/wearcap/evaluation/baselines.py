@@ -1,6 +1,6 @@
-"""What a learned pipeline must beat: the mean pose, and the training window with the most similar head path.
+"""Baselines of HMD²: the mean pose, and the training window with the most similar head path.
 
-Both see what HMD² sees (the head's path, the floor, the body's size) and hang from the measured head as it does.
+Both have HMD²'s inputs (the head's path, the floor, the body's size) and are anchored to the measured head.
 """
 
 import json
@@ -28,19 +28,19 @@ QUERY_BATCH = 256
 
 
 class _Baseline:
-    """The coat that `evaluation.evaluate` expects."""
+    """The interface that `evaluation.evaluate` expects."""
 
     def __call__(self, recording: Recording) -> Motion:
         raise NotImplementedError
 
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per recording; nothing is drawn, so seeds change nothing."""
+        """One motion per recording; seeds have no effect."""
         return [self(recording) for recording in recordings]
 
 
 @dataclass(frozen=True, eq=False)
 class MeanPose(_Baseline):
-    """One pose for every frame: the chordal mean over the training split, turned to where the head looks."""
+    """One pose for every frame: the chordal mean over the training split, turned to the head's heading."""
 
     joint_names: tuple[str, ...]
     fps: float
@@ -58,7 +58,7 @@ class MeanPose(_Baseline):
         return cls(names, fps, torch.stack([rotation.mean_rotation(R[None]) for R in total]).float())
 
     def __call__(self, recording: Recording) -> Motion:
-        """The mean pose hung from the recording's head."""
+        """The mean pose anchored to the recording's head."""
         path = _query_path(recording, self.joint_names, self.fps)
         R = self.R_parent_joint.repeat(len(path.timestamps), 1, 1, 1)
         return _anchored(path, R, "mean_pose")
@@ -91,7 +91,7 @@ class NearestWindow(_Baseline):
     descriptor: Float[Tensor, "window feature"]
     first_frame: Int64[Tensor, "window"]
     last_frame: Int64[Tensor, "window"]
-    """Last frame of the recording that a window is from: shorter recordings hold their last pose."""
+    """Last frame of a window's recording; windows of shorter recordings repeat their last pose."""
     pose: Float[Tensor, "frame motion"]
     """6D rotations of all training frames, the root's in the head's heading frame; half precision."""
 
@@ -128,7 +128,7 @@ class NearestWindow(_Baseline):
         )  # fmt: skip
 
     def __call__(self, recording: Recording) -> Motion:
-        """The pasted motion hung from the recording's head."""
+        """The pasted motion anchored to the recording's head."""
         path = _query_path(recording, self.joint_names, self.fps)
         count = len(path.timestamps)
         end = max(count - self.window, 0)
@@ -202,7 +202,7 @@ def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPa
 
 
 def _read(store: RecordingStore, name: str) -> Recording:
-    """The parts that a baseline learns from; clouds and images stay on the disk."""
+    """The parts that baselines are fitted to; images, and clouds beside a known floor, are not read."""
     file = store.open_file(name)
     floor = file.part("floor")
     points = file.part("points") if floor is None else None
@@ -226,7 +226,7 @@ def _query_path(recording: Recording, joint_names: tuple[str, ...], fps: float) 
 def _in_heading(
     R_parent_joint: Float[Tensor, "time joint 3 3"], R_world_head: Float[Tensor, "time 3 3"]
 ) -> Float[Tensor, "time joint 3 3"]:
-    """Local rotations, the root's seen from the head's heading."""
+    """Local rotations, the root's relative to the head's heading."""
     R_heading_world = rotation.about_axis("z", -rotation.yaw_of(R_world_head))
     return torch.cat([(R_heading_world @ R_parent_joint[:, 0])[:, None], R_parent_joint[:, 1:]], 1)
 
@@ -246,7 +246,7 @@ def _describe(
 
 
 def _anchored(path: HeadPath, R_heading: Float[Tensor, "time joint 3 3"], name: str) -> Motion:
-    """Turn the root from the head's heading into the world and hang the body from the head."""
+    """Rotate the root from the head's heading frame into the world and anchor the body to the head."""
     R_world_heading = rotation.about_axis("z", rotation.yaw_of(path.T_world_head.R))
     R = torch.cat([(R_world_heading @ R_heading[:, 0])[:, None], R_heading[:, 1:]], 1)
     origin = torch.zeros(len(path.timestamps), 3)

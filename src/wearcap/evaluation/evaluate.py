@@ -1,4 +1,4 @@
-"""Score a pipeline on whole recordings, never cut, over several seeds."""
+"""Scores of a pipeline on whole, uncut recordings, over several seeds."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Protocol, runtime_checkable
@@ -10,7 +10,7 @@ from wearcap.recording import Motion, Recording, RecordingStore
 
 @runtime_checkable
 class Pipeline(Protocol):
-    """What every capture system looks like from outside."""
+    """The interface of every capture system."""
 
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]: ...
 
@@ -19,9 +19,10 @@ def evaluate(
     pipeline: Pipeline, store: RecordingStore, names: Iterable[str], seeds: Sequence[int], batch_size: int = 16,
     measure: Measure | None = None,
 ) -> Iterator[Row]:  # fmt: skip
-    """Capture every recording with every seed, hang the body from the true head, and score it.
+    """Capture every recording with every seed, anchor the body to the true head, and score it.
 
-    `batch_size` recordings share a batch; `measure` takes the place of `score`. Raises WearcapError when a recording has no true motion.
+    `batch_size` recordings share a batch; `measure` replaces `score`. Raises WearcapError when a recording has no true
+    motion.
     """
     names = sorted(names, key=lambda name: store.entries[name].frames)
     jobs = [(name, seed) for name in names for seed in seeds]

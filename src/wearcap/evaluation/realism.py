@@ -1,4 +1,4 @@
-"""Whether captured motions are distributed as true ones are: FID and Diversity (thesis §6.4; Guo et al. 2020)."""
+"""FID and Diversity of captured motions against true ones (thesis §6.4; Guo et al. 2020)."""
 
 import math
 from collections import defaultdict
@@ -15,15 +15,15 @@ from wearcap.models.motion_autoencoder import MotionAutoencoder
 from wearcap.recording import Motion, Recording
 
 MIN_WINDOWS = 2000
-"""Fewer windows say nothing about a distribution."""
+"""Fewest windows that FID and Diversity are computed from."""
 ENCODED_AT_ONCE = 512
 
 
 class Realism:
-    """Gathers windows of captures and of their truth, in the latent space of a motion autoencoder, by method and seed.
+    """Collects latent vectors of captured and true windows in a motion autoencoder, by method and seed.
 
-    Windows are `stride_s` apart and lie in one recording; captures hang from the true head, as for position errors,
-    and stand over the same floor as their truth.
+    Windows are `stride_s` apart and within one recording; captures are anchored to the true head, as for position
+    errors, and use the same floor as the ground truth.
     """
 
     def __init__(self, net: MotionAutoencoder, features: MotionFeatures, stride_s: float = 1.0):
@@ -34,7 +34,7 @@ class Realism:
         self._seen = defaultdict(lambda: defaultdict(dict))
 
     def beside(self, measure: Measure, method: str) -> Measure:
-        """A measure that also takes every motion it scores into the distribution of `method`."""
+        """A measure that also adds every motion it scores to the distribution of `method`."""
 
         def both(motion: Motion, recording: Recording, name: str, seed: int):
             self.add(motion, recording, name, seed, method)
@@ -43,7 +43,7 @@ class Realism:
         return both
 
     def add(self, motion: Motion, recording: Recording, name: str, seed: int, method: str) -> None:
-        """Take one capture in. Raises WearcapError as `score` does, and for motions of another rate than the network's."""
+        """Add one capture. Raises WearcapError as `score` does, and for another frame rate than the network's."""
         anchored, truth, _ = comparable(motion, recording, name)
         key = (name, len(truth))
         if key not in self._true:
@@ -63,7 +63,7 @@ class Realism:
         return torch.cat(latents)
 
     def windows(self, method: str) -> int:
-        """Windows of a method's smallest seed."""
+        """Smallest number of a method's windows over its seeds."""
         return min((len(self._sets(method, seed)[0]) for seed in self._seen[method]), default=0)
 
     def _sets(self, method: str, seed: int) -> tuple[Tensor, Tensor]:
@@ -72,7 +72,7 @@ class Realism:
         return torch.cat([latent for latent, _ in pairs]), torch.cat([true for _, true in pairs])
 
     def scores(self, method: str) -> dict[str, Summary]:
-        """`fid`, `diversity` and `truth_diversity`, over seeds; NaN where there are fewer than `MIN_WINDOWS`."""
+        """`fid`, `diversity` and `truth_diversity` over seeds; NaN with fewer than `MIN_WINDOWS` windows."""
         values: dict[str, list[float]] = {"fid": [], "diversity": [], "truth_diversity": []}
         enough = self.windows(method) >= MIN_WINDOWS
         for seed in self._seen[method]:
@@ -83,7 +83,7 @@ class Realism:
         return {name: summarize(per_seed) for name, per_seed in values.items()}
 
     def notice(self, method: str) -> str | None:
-        """What to tell a reader of NaN, if anything."""
+        """An explanation of NaN scores, or None if there are enough windows."""
         found = self.windows(method)
         if found >= MIN_WINDOWS:
             return None

@@ -1,4 +1,4 @@
-"""Networks from a checkpoint's config, which is plain data that a stranger may have written.
+"""Builds networks from a checkpoint's config, which is plain, untrusted data.
 
 Nothing in the config is resolved or imported: `_target_` is a key of a closed table of classes, `${` is refused, and the
 model is first rehearsed on PyTorch's meta device, where tensors have shapes and no memory. Only a model whose weights
@@ -57,22 +57,22 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "MultiStepLR", "OneCycleLR", "PolynomialLR", "StepLR",
     ),
 }  # fmt: skip
-"""What a model may be made of: classes (and two functions that return plain objects) by the module that defines them."""
+"""Classes (and functions that return plain objects) that a model's config may name, by their modules."""
 
 _BY_NAME = {f"{module}.{name}": (module, name) for module, names in TARGETS.items() for name in names}
 _TARGET, _PARTIAL = "_target_", "_partial_"
 MAX_VALUES, MAX_TEXT = 10_000, 1000
-"""Most values of a model's config, and longest text (characters) in it; those we share have 150 values at most."""
+"""Largest number of values in a model's config, and longest string in it; our checkpoints have at most 150 values."""
 MAX_SIZE = 1 << 20
-"""Largest whole number of a config: widths, windows, counts of layers."""
+"""Largest integer in a config: widths, windows, numbers of layers."""
 _ANY_SIZE = ("seed", "optimizer", "scheduler")
-"""Parts whose numbers take no memory: seeds, counts of steps."""
+"""Parts of a config whose numbers do not affect memory: seeds, numbers of steps."""
 MAX_CALLS = 20_000
-"""Most tensor operations that building a model takes; the largest of ours takes 400."""
+"""Largest number of tensor operations for building a model; our largest takes 400."""
 ALLOWANCE = 1 << 26
 """Bytes (64 MiB) that building may take beyond what follows from the size of the file's weights."""
 TIMES_WEIGHTS = 8
-"""What building writes altogether, as a multiple of the weights: 2.5 for ours: each is made, then filled."""
+"""Limit of the memory that building writes, as a multiple of the weights' size; ours write 2.5 times it."""
 
 
 def check_config(config: Any, where: str | Path) -> None:
@@ -124,9 +124,9 @@ def _refused(what: str, where: str | Path) -> WearcapError:
 def build(
     config: dict[str, Any], state: Mapping[str, Tensor], where: str | Path, *, prefix: str = ""
 ) -> nn.Module:
-    """The module that a config describes, filled with the weights of a file, in evaluation mode.
+    """The module that a config describes, with the weights of a file, in evaluation mode.
 
-    `prefix`: only weights whose names begin so are the module's ("net."). Raises WearcapError for a config that
+    `prefix`: only weights whose names start with it belong to the module ("net."). Raises WearcapError for a config that
     `check_config` refuses, that cannot be built or takes more memory than the file's weights explain, and for weights
     of other names or shapes.
     """
@@ -144,7 +144,7 @@ def build(
         if error.where:
             raise
         raise _unbuildable(error, where) from error
-    except Exception as error:  # what constructors say of arguments that no release of ours wrote is anything
+    except Exception as error:  # constructors may raise anything for arguments that no release of ours wrote
         raise _unbuildable(error, where) from error
     module.load_state_dict(own)
     return module.eval()
@@ -168,7 +168,7 @@ def check_weights(own: Mapping[str, Tensor], state: Mapping[str, Tensor], where:
 
 
 def _made(value: Any) -> Any:
-    """A config with every part that has a target called, inner parts first."""
+    """Instantiates every part of a config that has a target, inner parts first."""
     if isinstance(value, list):
         return [_made(item) for item in value]
     if not isinstance(value, dict):
@@ -182,7 +182,7 @@ def _made(value: Any) -> Any:
 
 
 class _Rehearsal(TorchDispatchMode):
-    """Counts what tensor operations would write, and ends those that go beyond a number of bytes or of calls."""
+    """Counts the bytes that tensor operations write, and stops beyond a number of bytes or of calls."""
 
     def __init__(self, max_bytes: int):
         super().__init__()

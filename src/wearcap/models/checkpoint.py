@@ -26,7 +26,7 @@ from wearcap.models.build import build, check_config
 Network = TypeVar("Network", bound=nn.Module)
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
-"""How weights may be stored in a shared file."""
+"""Number formats of weights in a shared file."""
 
 MAX_CONFIG_BYTES = 1 << 20
 """Longest config (1 MiB of JSON) that a checkpoint may carry; a training run's has 10 kB."""
@@ -48,11 +48,11 @@ def checkpoint_file(path: str | Path) -> Path:
     path = Path(path)
     if path.exists() or not _NAME.fullmatch(str(path)):
         return path
-    known = shared_checkpoints()
-    if path.name not in known:
+    shared = shared_checkpoints()
+    if path.name not in shared:
         raise WearcapError("no such checkpoint", where=path.name,
-                           expected="a file, or the name of a checkpoint that comes with wearcap", fix=nearest(path.name, known))  # fmt: skip
-    return known[path.name]
+                           expected="a file, or the name of a checkpoint that comes with wearcap", fix=nearest(path.name, shared))  # fmt: skip
+    return shared[path.name]
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -81,7 +81,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
 
 
 def read_run_file(path: str | Path) -> dict[str, Any]:
-    """Everything that a run's `.ckpt` holds: tensors and plain values alone.
+    """The contents of a run's `.ckpt`: tensors and plain values only.
 
     Raises WearcapError for a file that is damaged (by the checksums of its parts), compressed or no checkpoint, and for
     a pickle that asks for anything but data.
@@ -118,7 +118,7 @@ def _read_run(path: Path) -> tuple[str, dict[str, Tensor]]:
 
 
 def _is_plain(name: Any, value: Any) -> bool:
-    """Whether a weight is a tensor whose memory is in the file: none that repeats a few numbers over any size."""
+    """Whether a weight is a tensor whose memory is in the file, not an expansion of a few numbers to any size."""
     return (
         isinstance(name, str) and isinstance(value, Tensor) and value.device.type == "cpu"
         and value.layout == torch.strided and not value.is_quantized
@@ -159,8 +159,8 @@ def _digest(config: Mapping[str, Any], state: Mapping[str, Tensor]) -> str:
 def load_network(path: str | Path, kind: type[Network], experiment: str, *, part: str = "net") -> Network:
     """A network of a checkpoint's model with its weights, in evaluation mode.
 
-    `part`: where it stands, in the model's config and in the names of the weights. Raises WearcapError as
-    `read_checkpoint` and `build` do, and when another network than `kind` stands there.
+    `part`: its key in the model's config and prefix in the names of the weights. Raises WearcapError as
+    `read_checkpoint` and `build` do, and when the part is not of class `kind`.
     """
     config, state = read_checkpoint(path)
     found: Any = config["model"]
@@ -178,7 +178,7 @@ def load_network(path: str | Path, kind: type[Network], experiment: str, *, part
 
 
 def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float32") -> None:
-    """Write what of a checkpoint others need: averaged weights, statistics, the model's config, names of the data.
+    """Write a shareable file of a checkpoint: averaged weights, statistics, the model's config, names of the data.
 
     Weights of two or more axes are stored as `dtype` (of `DTYPES`); biases, norms and statistics stay as they are.
     Folders of this machine are left out. Raises WearcapError for a source that `read_checkpoint` refuses, a target

@@ -1,4 +1,4 @@
-"""Pictures to embeddings: what an image encoder is, and our own small one for a head camera's frames."""
+"""Image encoders: their interface, and our own small encoder for a head camera's frames."""
 
 import hashlib
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from wearcap.models.checkpoint import load_network
 
 @runtime_checkable
 class ImageEncoder(Protocol):
-    """What embeddings are made with."""
+    """The interface of an image encoder."""
 
     name: str
     size: int
@@ -23,19 +23,19 @@ class ImageEncoder(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """Changes (8 hex digits) when the same picture would get another embedding."""
+        """8 hex digits that differ between encoders with different embeddings of the same image."""
         ...
 
     def embed(self, frames: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch feature"]:
-        """Embeddings of RGB pictures of any size, on the encoder's device."""
+        """Embeddings of RGB images of any size, on the encoder's device."""
         ...
 
 
 def letterboxed(
     frames: UInt8[Tensor, "batch height width 3"], width: int, height: int, mean: Sequence[float], std: Sequence[float]
 ) -> Float[Tensor, "batch 3 new_height new_width"]:  # fmt: skip
-    """Pictures normalised by channel (`mean`, `std` of values in 0…1) and resized, whole and undistorted, into the
-    middle of width x height pixels; the rest is 0."""
+    """Images normalised per channel (`mean`, `std` of values in 0…1), resized without cropping or distortion, and
+    centred in width x height pixels; the margins are 0."""
     x = frames.movedim(-1, 1).float()
     scale = min(width / x.shape[3], height / x.shape[2])
     rows, columns = max(1, round(scale * x.shape[2])), max(1, round(scale * x.shape[3]))
@@ -47,7 +47,7 @@ def letterboxed(
 
 
 def fingerprint_of(network: nn.Module, *settings: object) -> str:
-    """8 hex digits of a network's weights and of settings (by their repr)."""
+    """8 hex digits that depend on a network's weights and on settings (by their repr)."""
     digest = hashlib.sha256(repr(settings).encode())
     for key, value in sorted(network.state_dict().items()):
         digest.update(key.encode())
@@ -71,10 +71,10 @@ class _Block(nn.Module):
 
 
 class EgoViewEncoder(nn.Module):
-    """A small residual network over 96x72 pixels of a head camera; where things are is kept up to the bottleneck.
+    """A small residual network for 96x72 pixels of a head camera; positions are kept up to the bottleneck.
 
-    Embeddings have zero mean and unit variance over their features. Its name says what it is not: a stand-in for a
-    large pretrained encoder, trained on where a wearer's own limbs are seen (systems/hmd2/egoview_training.py).
+    Embeddings have zero mean and unit variance over their features. It is a substitute for a large pretrained encoder,
+    trained to locate the wearer's own limbs (systems/hmd2/egoview_training.py).
     """
 
     name = "egoview"
@@ -97,7 +97,7 @@ class EgoViewEncoder(nn.Module):
         self.bottleneck = nn.Linear(squeezed * cells, size)
 
     def forward(self, pictures: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch feature"]:
-        """Embeddings of pictures that are normalised and of the network's own size."""
+        """Embeddings of normalised images of the network's size."""
         x = F.pixel_unshuffle(pictures, 2).contiguous(memory_format=torch.channels_last)
         x = self.bottleneck(self.stages(x).flatten(1))
         return F.layer_norm(x, x.shape[-1:])
@@ -113,5 +113,5 @@ class EgoViewEncoder(nn.Module):
 
     @classmethod
     def load(cls, checkpoint: str | Path) -> "EgoViewEncoder":
-        """From a checkpoint of `wearcap train experiment=egoview`. Raises WearcapError for any other file."""
+        """Load a checkpoint of `wearcap train experiment=egoview`. Raises WearcapError for any other file."""
         return load_network(checkpoint, cls, "egoview")

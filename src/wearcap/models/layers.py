@@ -31,7 +31,7 @@ class RotaryAttention(nn.Module):
     sin: Tensor
 
     def __init__(self, width: int, heads: int, max_tokens: int, streams: int = 1):
-        """Of `streams`, one behind the other, tokens of one number share a position."""
+        """Tokens of the same index in each of `streams` concatenated sequences share a position."""
         super().__init__()
         if width % (2 * heads):
             raise ValueError(f"width {width} must be a multiple of twice the number of heads ({heads})")
@@ -60,7 +60,7 @@ class RotaryAttention(nn.Module):
 
 
 def attention_mask(valid: Bool[Tensor, "batch token"]) -> Bool[Tensor, "batch 1 token token"]:
-    """Who may see whom: all see what is valid. A row with nothing to see would be NaN: padding may always see itself."""
+    """Attention mask: all tokens attend to the valid ones, padding also to itself, since an empty row gives NaN."""
     number = torch.arange(valid.shape[1], device=valid.device)
     return valid[:, None, None, :] | (number == number[:, None])
 
@@ -83,7 +83,7 @@ class AdaptiveBlock(nn.Module):
         nn.init.zeros_(self.modulation.bias)
 
     def plan(self, level: Float[Tensor, "batch #token width"]) -> Float[Tensor, "batch #token modulation"]:
-        """Shifts, scales and gates: what of the block depends on the level alone."""
+        """Shifts, scales and gates, which depend on the noise level alone."""
         return self.modulation(F.silu(level))
 
     def forward(
@@ -98,7 +98,7 @@ class AdaptiveBlock(nn.Module):
 
 
 class Normalizer(nn.Module):
-    """Per-feature mean and scale, kept with the weights so that a checkpoint carries its own statistics."""
+    """Standardises features by mean and scale, which are stored with the weights in a checkpoint."""
 
     mean: Tensor
     scale: Tensor
@@ -120,7 +120,7 @@ class Normalizer(nn.Module):
 
 
 class TemporalBlend(nn.Module):
-    """A learned weighted mean of neighbouring frames, the same for all features; it never looks at padding."""
+    """A learned weighted mean of neighbouring frames, with the same weights for all features; padding is ignored."""
 
     def __init__(self, frames: int, spread: float = 1.5):
         """`frames` (odd) are blended; the weights start as a Gaussian of `spread` frames."""
@@ -132,7 +132,7 @@ class TemporalBlend(nn.Module):
         self, x: Float[Tensor, "batch time feature"], valid: Bool[Tensor, "batch time"]
     ) -> Float[Tensor, "batch time feature"]:
         kernel = self.weight.softmax(0)
-        # As a matrix over frames: on the CPU much faster than a convolution of so many channels one by one.
+        # A matrix over frames is much faster on the CPU than a depthwise convolution.
         frame = torch.arange(x.shape[1], device=x.device)
         place = frame - frame[:, None] + len(kernel) // 2
         near = (place >= 0) & (place < len(kernel))
@@ -142,10 +142,10 @@ class TemporalBlend(nn.Module):
 
 
 class Widening(nn.Conv1d):
-    """A convolution over frames that gives one vector per token, as one product: on the CPU several times faster."""
+    """A strided convolution over frames with one output per token, as one matrix product (much faster on the CPU)."""
 
     def __init__(self, size: int, width: int, frames_per_token: int, context: int = 0, bias: bool = True):
-        """Each token sees its own frames and `context` before and behind them."""
+        """Each token covers its own frames and `context` frames before and after them."""
         super().__init__(size, width, frames_per_token + 2 * context, frames_per_token, context, bias=bias)
 
     def forward(self, frames: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch token width"]:
@@ -155,10 +155,10 @@ class Widening(nn.Conv1d):
 
 
 class MotionEncoder(nn.Module):
-    """x_t as one vector per token, scaled by what its noise level makes it worth (ours).
+    """Encodes x_t as one vector per token, with a learned scale that depends on its noise level (ours).
 
-    Concatenated with the conditions instead, the noise of high levels drowns them: the network then needs several
-    times the steps to read the gait from the head.
+    If x_t is concatenated with the conditions instead, its noise at high levels hides them: the network then needs
+    several times the training steps to infer the gait from the head.
     """
 
     def __init__(self, size: int, width: int, frames_per_token: int):
@@ -170,7 +170,7 @@ class MotionEncoder(nn.Module):
         nn.init.zeros_(self.worth.bias)
 
     def plan(self, level: Float[Tensor, "batch #token width"]) -> Float[Tensor, "batch #token width"]:
-        """What x_t is worth at a level, per channel."""
+        """The scale of the encoded x_t at a noise level, per channel."""
         return 1 + self.worth(F.silu(level))
 
     def forward(

@@ -1,4 +1,4 @@
-"""LightGlue (Lindenberger, Sarlin & Pollefeys 2023): which keypoints of two pictures are the same point.
+"""LightGlue (Lindenberger, Sarlin & Pollefeys 2023): matches keypoints of two images.
 
 Modules carry the names of the published weights (`superpoint_lightglue.pth`); `renamed` turns the release's older
 names into them.
@@ -16,21 +16,21 @@ from torch.nn import functional as F
 def normalized(
     keypoints: Float[Tensor, "batch keypoint 2"], size: Float[Tensor, "batch 2"]
 ) -> Float[Tensor, "batch keypoint 2"]:
-    """Pixels about the middle of a picture of `size` (width, height), in halves of its longer side."""
+    """Pixels relative to the centre of an image of `size` (width, height), in halves of its longer side."""
     return (keypoints - size[:, None] / 2) / (size.amax(-1)[:, None, None] / 2)
 
 
 def _rotate(
     x: Float[Tensor, "batch head keypoint depth"], turn: Float[Tensor, "2 batch 1 keypoint pair"]
 ) -> Float[Tensor, "batch head keypoint depth"]:
-    """Neighbouring features turned in pairs by the keypoint's angles."""
+    """Pairs of neighbouring features rotated by the keypoint's angles."""
     cos, sin = turn
     even, odd = x.unflatten(-1, (-1, 2)).unbind(-1)
     return torch.stack([even * cos - odd * sin, odd * cos + even * sin], -1).flatten(-2)
 
 
 class RotaryPosition(nn.Module):
-    """Angles linear in a keypoint's place (eq. 7): attention then sees only where keypoints lie to each other."""
+    """Angles linear in a keypoint's position (eq. 7), so that attention depends on relative positions only."""
 
     def __init__(self, depth: int):
         super().__init__()
@@ -44,7 +44,7 @@ class RotaryPosition(nn.Module):
 
 
 def _feedforward(width: int) -> nn.Sequential:
-    """Of a token beside its message."""
+    """MLP of a token concatenated with its message."""
     return nn.Sequential(
         nn.Linear(2 * width, 2 * width),
         nn.LayerNorm(2 * width),
@@ -54,7 +54,7 @@ def _feedforward(width: int) -> nn.Sequential:
 
 
 class SelfBlock(nn.Module):
-    """Each keypoint attends to those of its own picture."""
+    """Self-attention: each keypoint attends to those of its own image."""
 
     def __init__(self, width: int, heads: int):
         super().__init__()
@@ -66,7 +66,7 @@ class SelfBlock(nn.Module):
     def forward(
         self, x: Float[Tensor, "batch keypoint width"], turn: Float[Tensor, "2 batch 1 keypoint pair"]
     ) -> Float[Tensor, "batch keypoint width"]:
-        # The published weights hold q, k and v of a feature side by side.
+        # In the published weights q, k and v of a feature are adjacent.
         q, k, v = self.Wqkv(x).unflatten(-1, (self.heads, -1, 3)).transpose(1, 2).unbind(-1)
         seen = F.scaled_dot_product_attention(_rotate(q, turn), _rotate(k, turn), v)
         message = self.out_proj(seen.transpose(1, 2).flatten(-2))
@@ -74,7 +74,7 @@ class SelfBlock(nn.Module):
 
 
 class CrossBlock(nn.Module):
-    """Each keypoint attends to those of the other picture; keys and queries share one projection."""
+    """Cross-attention: each keypoint attends to those of the other image; keys and queries share one projection."""
 
     def __init__(self, width: int, heads: int):
         super().__init__()
@@ -103,7 +103,7 @@ class CrossBlock(nn.Module):
 
 
 class Layer(nn.Module):
-    """One self-attention in each picture, then one across."""
+    """Self-attention in each image, then cross-attention."""
 
     def __init__(self, width: int, heads: int):
         super().__init__()
@@ -121,7 +121,7 @@ class Layer(nn.Module):
 
 
 class MatchAssignment(nn.Module):
-    """Soft partial assignment (eq. 8-9): both-way softmax of similarity, times both keypoints' matchability."""
+    """Soft partial assignment (eq. 8-9): dual softmax of similarity, times both keypoints' matchability."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -139,7 +139,7 @@ class MatchAssignment(nn.Module):
 
 
 class TokenConfidence(nn.Module):
-    """How sure a keypoint is that further layers will not change its match (eq. 10)."""
+    """Confidence of a keypoint that further layers will not change its match (eq. 10)."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -152,7 +152,7 @@ class TokenConfidence(nn.Module):
 def mutual_matches(
     log_assignment: Float[Tensor, "batch keypoint0 keypoint1"], threshold: float
 ) -> tuple[Int[Tensor, "batch keypoint0"], Float[Tensor, "batch keypoint0"]]:
-    """For every keypoint of the first picture its partner in the second (-1: none) and the match's probability.
+    """The match in the second image of every keypoint of the first (-1: none), and its probability.
 
     A match is the best of its row and of its column and more probable than `threshold`.
     """
@@ -167,8 +167,8 @@ def mutual_matches(
 class LightGlue(nn.Module):
     """Nine layers of self- and cross-attention over two sets of keypoints with descriptors.
 
-    `stop_confidence` (eq. 11): stop after the first layer where more than this share of the keypoints is sure; None
-    runs all layers, which export needs. The paper's pruning of keypoints is not here.
+    `stop_confidence` (eq. 11): stop after the first layer where more than this share of the keypoints is confident;
+    None runs all layers, which export needs. The paper's pruning of keypoints is not implemented.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A convolutional autoencoder of motion windows, in whose latent space motions are compared (Guo et al. 2020)."""
+"""A convolutional autoencoder of motion windows, whose latent space FID and Diversity use (Guo et al. 2020)."""
 
 from itertools import pairwise
 
@@ -11,17 +11,16 @@ from wearcap.models.layers import Normalizer
 class MotionAutoencoder(nn.Module):
     """Strided convolutions over time, as in Guo et al.'s movement encoder and decoder, around one vector per window.
 
-    What the convolutions leave of the time axis is flattened, not averaged, so that the vector keeps the order of
-    what happened. Each of its `latent` dimensions has mean 0 and variance 1 over the training windows (a batch
-    normalisation without parameters of its own): distances mean the same after every training. 64 dimensions,
-    because the covariance of a few thousand overlapping windows has to be estimated in them: 512 as in the protocol
-    would want tens of thousands.
+    The remaining time axis after the convolutions is flattened, not averaged, so that the vector keeps the temporal
+    order. Each of the `latent` dimensions has mean 0 and variance 1 over the training windows (batch normalisation
+    without affine parameters), so that distances are comparable between trainings. We use 64 dimensions, in which the
+    covariance can be estimated from a few thousand overlapping windows; the protocol's 512 need tens of thousands.
     """
 
     def __init__(
         self, size: int, frames: int = 80, channels: tuple[int, ...] | list[int] = (128, 192, 192), latent: int = 64
     ):  # fmt: skip
-        """`size` features per frame; every convolution halves the `frames`. Raises ValueError where it cannot."""
+        """`size` features per frame; every convolution halves `frames`. Raises ValueError if they are not divisible."""
         super().__init__()
         if frames % 2 ** len(channels):
             raise ValueError(f"{frames} frames cannot be halved {len(channels)} times")
@@ -42,7 +41,7 @@ class MotionAutoencoder(nn.Module):
         )  # fmt: skip
 
     def encode(self, features: Float[Tensor, "window frame feature"]) -> Float[Tensor, "window latent"]:
-        """One vector per window; features as they are, not normalised."""
+        """Latent vector of every window, from features that are not normalised."""
         return self.encoder(self.normalizer(features).transpose(1, 2))
 
     def decode(self, latent: Float[Tensor, "window latent"]) -> Float[Tensor, "window frame feature"]:
@@ -52,5 +51,5 @@ class MotionAutoencoder(nn.Module):
     def forward(
         self, features: Float[Tensor, "window frame feature"]
     ) -> Float[Tensor, "window frame feature"]:
-        """The window again, in normalised features."""
+        """Reconstructed windows in normalised features."""
         return self.decode(self.encode(features))

@@ -1,4 +1,4 @@
-"""NetVLAD (Arandjelović et al. 2016): one vector per picture, near for pictures of the same place.
+"""NetVLAD (Arandjelović et al. 2016): a global image descriptor, similar for images of the same place.
 
 Modules carry the names of pytorch-NetVlad's checkpoints (`encoder.N`, `pool.conv`, `pool.centroids`) and of
 Patch-NetVLAD's whitening (`WPCA.0`).
@@ -58,7 +58,7 @@ class NetVLAD(nn.Module):
             )
 
     def forward(self, image: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch feature"]:
-        """Unit vectors of RGB pictures in [0, 1]."""
+        """Unit descriptors of RGB images in [0, 1]."""
         vlad = self.pool(self.encoder((image - self.mean) / self.scale))
         if self.WPCA is None:
             return vlad

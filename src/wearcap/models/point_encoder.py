@@ -1,4 +1,4 @@
-"""PointNeXt: the points of an object's surface as one feature vector (Qian et al. 2022; what ECHO is told of an object)."""
+"""PointNeXt (Qian et al. 2022): the feature of an object's surface points that conditions ECHO."""
 
 from collections.abc import Sequence
 from math import prod
@@ -25,23 +25,23 @@ def bounds(
 
 
 def cloud_extents(points: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch 6"]:
-    """Half extents and centre along the clouds' axes (m): what `PointNeXt` does not tell."""
+    """Half extents and centre along the clouds' axes (m), which `PointNeXt`'s feature does not contain."""
     return torch.cat(bounds(points), -1)
 
 
 def to_unit_sphere(
     points: Float[Tensor, "batch point 3"],
 ) -> tuple[Float[Tensor, "batch point 3"], Float[Tensor, "batch"]]:
-    """Clouds about their boxes' centres in the unit sphere, and the radius (in the points' unit) they had."""
+    """Clouds centred at their bounding boxes' centres and scaled to the unit sphere, and their radii before scaling."""
     centered = points - bounds(points)[1][:, None]
     radius = centered.norm(dim=-1).amax(1).clamp_min(_LEAST_M)
     return centered / radius[:, None, None], radius
 
 
 class PointNeXt(nn.Module):
-    """Set abstraction after set abstraction, then the maximum over what points are left.
+    """A sequence of set abstractions, then the maximum over the remaining points.
 
-    Neither the order of the points nor where the cloud lies nor how large it is changes the feature; its turning does.
+    The feature is invariant to the order of the points and to the cloud's translation and scale, not to rotation.
     """
 
     def __init__(
@@ -59,8 +59,8 @@ class PointNeXt(nn.Module):
         """Each stage keeps one point of `strides`, doubles `width`, and adds `blocks` InvResMLPs.
 
         The first gathers `neighbours` within `radius` (of the unit sphere), later ones within `radius_scaling` times as
-        much. `normalized`: positions in a ball are divided by its radius. `y_up`: the weights know objects whose y points
-        up instead of z. The defaults are PointNeXt-S for ModelNet40, 1024-d. Raises WearcapError for lists of different lengths.
+        much. `normalized`: positions in a ball are divided by its radius. `y_up`: the weights were trained on objects
+        whose y axis points up instead of z. The defaults are PointNeXt-S for ModelNet40, 1024-d. Raises WearcapError for lists of different lengths.
         """
         super().__init__()
         if not len(strides) == len(blocks) == len(neighbours):
@@ -73,7 +73,7 @@ class PointNeXt(nn.Module):
             "width": width, "strides": list(strides), "blocks": list(blocks), "neighbours": list(neighbours), "radius": radius,
             "radius_scaling": radius_scaling, "expansion": expansion, "normalized": normalized, "y_up": y_up,
         }  # fmt: skip
-        """That make another one like it."""
+        """Constructor arguments that make another encoder of the same kind."""
         self.stem = nn.Linear(3, width)
         stages = []
         for stage, (stride, count, most) in enumerate(zip(strides, blocks, neighbours)):
@@ -94,7 +94,7 @@ class PointNeXt(nn.Module):
         unit, _ = to_unit_sphere(points)
         if self.y_up:
             unit = torch.stack([unit[..., 0], unit[..., 2], -unit[..., 1]], -1)
-        # Whoever is farthest from each other of all is so, too, of the first: later stages keep the first ones.
+        # A prefix of a farthest-point sample is one itself: later stages keep the first points.
         p = rows_at(unit, spread_first(unit, unit.shape[1] // self.strides[0]))
         f = self.stem(p)
         for stage in self.stages:
@@ -106,7 +106,7 @@ class PointNeXt(nn.Module):
 
 
 class SetAbstraction(nn.Module):
-    """Of the first points each takes the maximum over its ball, of an MLP, and adds it to what it was."""
+    """Keeps the first points; each adds the maximum of an MLP over its ball to its feature."""
 
     def __init__(self, width: int, wide: int, stride: int, radius: float, neighbours: int, normalized: bool):
         super().__init__()
@@ -126,7 +126,7 @@ class SetAbstraction(nn.Module):
 
 
 class InvResMLP(nn.Module):
-    """The maximum over each point's ball, then a wide MLP, added to what the point was."""
+    """A residual block: the maximum over each point's ball, then a wide MLP, added to the point's feature."""
 
     def __init__(self, width: int, radius: float, neighbours: int, normalized: bool, expansion: int):
         super().__init__()
@@ -137,14 +137,14 @@ class InvResMLP(nn.Module):
     def forward(
         self, p: Float[Tensor, "batch point 3"], f: Float[Tensor, "batch point feature"]
     ) -> tuple[Float[Tensor, "batch point 3"], Float[Tensor, "batch point feature"]]:
-        """The same positions, and other features."""
+        """The same positions with new features."""
         index = ball_query(p, p, self.radius, self.neighbours)
         most = F.relu(self.ball(p, f, index)).max(2).values
         return p, F.relu(f + self.narrow(F.relu(self.widen(most))))
 
 
 class _Stage(nn.ModuleList):
-    """A set abstraction and what follows it."""
+    """A set abstraction and the residual blocks after it."""
 
     def forward(
         self, p: Float[Tensor, "batch point 3"], f: Float[Tensor, "batch point feature"]
@@ -170,7 +170,7 @@ class _Layer(nn.Module):
 class _BallLayer(_Layer):
     """The same over each neighbour's relative position and feature.
 
-    What is linear is done once per point, and gathered only then: W (p - c, f) = W (p, f) - W (c, 0).
+    The linear layer runs once per point, before gathering: W (p - c, f) = W (p, f) - W (c, 0).
     """
 
     def __init__(self, width: int, wide: int, unit: float):
@@ -184,7 +184,7 @@ class _BallLayer(_Layer):
         f: Float[Tensor, "batch point feature"],
         index: Int64[Tensor, "batch center neighbour"],
     ) -> Float[Tensor, "batch center neighbour wide"]:
-        """Of the first points' neighbours."""
+        """Features of the first points' neighbours."""
         where = F.linear(p / self.unit, self.linear.weight[:, :3])
         what = where + F.linear(f, self.linear.weight[:, 3:])
         y = rows_at(what, index) - where[:, : index.shape[1], None]
@@ -192,10 +192,10 @@ class _BallLayer(_Layer):
 
 
 class ObjectNetwork(nn.Module):
-    """An encoder, and what its feature is asked in training: the category, the extents, which object it was."""
+    """An encoder with its training heads: category, extents, and identity of the object."""
 
     def __init__(self, encoder: PointNeXt, classes: Sequence[str], projection: int = 64):
-        """Categories to tell apart; instances are told apart by `projection` numbers."""
+        """`projection` is the size of the embedding that distinguishes object instances."""
         super().__init__()
         self.encoder, self.classes = encoder, tuple(classes)
         self.category = nn.Linear(encoder.size, len(self.classes))

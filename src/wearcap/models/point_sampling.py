@@ -1,4 +1,4 @@
-"""Which points of a cloud stand for all, and which lie about each: batched, exact, and blind to the points' order."""
+"""Farthest-point sampling and neighbourhoods of point clouds: batched, exact, and independent of the points' order."""
 
 import torch
 from jaxtyping import Float, Int64
@@ -7,9 +7,9 @@ from torch import Tensor
 
 @torch.no_grad()
 def farthest_points(points: Float[Tensor, "batch point 3"], count: int) -> Int64[Tensor, "batch chosen"]:
-    """Numbers of `count` points, each the farthest from all before it; the first is the farthest from the origin.
+    """Indices of `count` points, each the farthest from all before it; the first is the farthest from the origin.
 
-    The first n of them are the farthest n. Of points that lie in one place, one is taken before any is taken twice.
+    Its first n indices are the farthest-point sample of n. Points at equal positions are used once before any repeats.
     """
     x, y, z = (axis.contiguous() for axis in points.unbind(-1))
     chosen = torch.empty(len(points), count, dtype=torch.int64, device=points.device)
@@ -27,7 +27,7 @@ def farthest_points(points: Float[Tensor, "batch point 3"], count: int) -> Int64
 
 @torch.no_grad()
 def spread_first(points: Float[Tensor, "batch point 3"], count: int) -> Int64[Tensor, "batch point"]:
-    """An order of all points that begins with the `count` farthest from each other."""
+    """A permutation of all points that starts with the farthest-point sample of `count`."""
     chosen = farthest_points(points, count)
     rank = torch.full(points.shape[:2], count, dtype=torch.int64, device=points.device)
     rank.scatter_(1, chosen, torch.arange(count, device=points.device).expand_as(chosen))
@@ -41,9 +41,9 @@ def ball_query(
     radius: float,
     neighbours: int,
 ) -> Int64[Tensor, "batch center neighbour"]:
-    """Numbers of the `neighbours` points nearest to each centre within a radius; where fewer are, the nearest again.
+    """Indices of the `neighbours` points nearest to each centre within a radius, filled up by the nearest one.
 
-    The nearest is taken from however far.
+    The nearest point is included at any distance.
     """
     apart = torch.cdist(centers, points, compute_mode="donot_use_mm_for_euclid_dist")
     near, index = apart.topk(min(neighbours, points.shape[1]), largest=False)
@@ -53,7 +53,7 @@ def ball_query(
 def rows_at(
     values: Float[Tensor, "batch point feature"], index: Int64[Tensor, "batch *at"]
 ) -> Float[Tensor, "batch *at feature"]:
-    """The rows of a batch of tables by their numbers."""
+    """Gathers rows of a batch of tables by index."""
     batch, count, width = values.shape
     first = torch.arange(batch, device=index.device) * count
     flat = (index.flatten(1) + first[:, None]).flatten()

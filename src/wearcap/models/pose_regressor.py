@@ -1,4 +1,4 @@
-"""A pose from the recent past of tracked points, after AvatarPoser (Jiang et al. 2022): what HMD² is compared with."""
+"""Pose regression from the recent past of tracked points (AvatarPoser, Jiang et al. 2022), a baseline of HMD²."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,7 +8,7 @@ from wearcap.models.layers import Normalizer
 
 
 class _Layer(nn.Module):
-    """Attention and MLP, each after a layer norm; with `last` only the last token asks and comes out."""
+    """Attention and MLP, each after a layer norm; with `last` only the last token is a query and an output."""
 
     def __init__(self, width: int, heads: int, feedforward: int, dropout: float):
         super().__init__()
@@ -30,7 +30,7 @@ class _Layer(nn.Module):
 class PoseRegressor(nn.Module):
     """The pose of a window's last frame, by a transformer encoder over the window.
 
-    As in AvatarPoser one small MLP tells the root's rotation, another the joints'. Positions of tokens are learned
+    As in AvatarPoser one small MLP predicts the root's rotation, another the joints'. Positions of tokens are learned
     (AvatarPoser has none, its order of frames shows in the velocities alone). `frames_per_token` > 1 (ours, for CPUs)
     lets neighbouring frames share a token.
     """
@@ -52,7 +52,7 @@ class PoseRegressor(nn.Module):
             raise ValueError(f"a window of {window} frames does not split into tokens of {frames_per_token}")
         self.window, self.frames_per_token = window, frames_per_token
         self.feature_normalizer, self.motion_normalizer = Normalizer(feature_size), Normalizer(motion_size)
-        # One more channel says which frames exist: the frames before the first would else look like the mean frame.
+        # One more channel marks valid frames: frames before the first would otherwise look like the mean frame.
         self.embed = nn.Linear(frames_per_token * (feature_size + 1), width)
         self.position = nn.Parameter(0.02 * torch.randn(window // frames_per_token, width))
         self.layers = nn.ModuleList(_Layer(width, heads, feedforward, dropout) for _ in range(layers))
@@ -65,7 +65,7 @@ class PoseRegressor(nn.Module):
     def forward(
         self, features: Float[Tensor, "batch window feature"], valid: Bool[Tensor, "batch window"]
     ) -> Float[Tensor, "batch motion"]:
-        """6D rotations of the last frame, which must be valid; `features` are raw, invalid frames are not looked at."""
+        """6D rotations of the last frame, which must be valid; `features` are not normalised, invalid ones ignored."""
         mask = valid[..., None].to(features.dtype)
         frames = torch.cat([self.feature_normalizer(features) * mask, mask], -1)
         x = self.embed(frames.unflatten(1, (-1, self.frames_per_token)).flatten(2)) + self.position

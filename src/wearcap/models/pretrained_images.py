@@ -1,4 +1,4 @@
-"""Large pretrained image encoders, with weights that the user has: CLIP ViT-L/14 and DINOv2 ViT-L/14.
+"""Large pretrained image encoders with the user's own weights: CLIP ViT-L/14 and DINOv2 ViT-L/14.
 
 Nothing is downloaded: weights come from a path, an environment variable, or the cache where other programs left them.
 The networks are open_clip's and timm's, both optional packages.
@@ -22,33 +22,33 @@ from wearcap.models.image_encoder import fingerprint_of, letterboxed
 from wearcap.models.weights import load_weights, read_weights
 
 SIDE = 224
-"""Pixels of the square that a picture is fitted into."""
+"""Side of the square (pixels) that an image is fitted into."""
 
 
 @dataclass(frozen=True)
 class Pretrained:
-    """One published network, and where its weights may lie."""
+    """One published network, and where its weights may be."""
 
     name: str
     title: str
     package: str
     install: str
-    """What pip calls the package."""
+    """Name of the package for pip."""
     network: Callable[[ModuleType], nn.Module]
-    """Builds it with random weights."""
+    """Builds the network with random weights."""
     tensors: Callable[[dict[str, Tensor]], dict[str, Tensor]]
-    """The network's own among those of a file."""
+    """Selects the network's own tensors among those of a file."""
     size: int
     mean: tuple[float, float, float]
     std: tuple[float, float, float]
     variable: str
-    """Environment variable with a path."""
+    """Environment variable with a path to the weights."""
     hub: str
     """Repository of the Hugging Face hub."""
     files: tuple[str, ...]
-    """Of the repository, the best first."""
+    """Names of the repository's weight files, the best first."""
     elsewhere: tuple[str, ...]
-    """Other places, below the user's cache."""
+    """Other places of the weights, relative to the user's cache."""
 
 
 def _clip_visual(open_clip: ModuleType) -> nn.Module:
@@ -67,7 +67,7 @@ def _dinov2(timm: ModuleType) -> nn.Module:
 
 
 def _without_mask(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The original files carry a token that only training masks with."""
+    """The original files contain a mask token that only training uses."""
     return {key: value for key, value in tensors.items() if key != "mask_token"}
 
 
@@ -86,7 +86,7 @@ DINOV2 = Pretrained(
 
 
 class PretrainedEncoder:
-    """An `ImageEncoder` around a published network; pictures are seen whole, fitted into its square."""
+    """An `ImageEncoder` around a published network; images are fitted uncropped into its square."""
 
     def __init__(self, kind: Pretrained, weights: str | Path | None = None, device: str | None = None):
         """`weights`: a file; None looks where `find_weights` says. `device`: None takes a GPU where there is one.
@@ -113,7 +113,7 @@ class PretrainedEncoder:
 
 
 def clip(weights: str | Path | None = None, device: str | None = None) -> PretrainedEncoder:
-    """CLIP ViT-L/14 as OpenAI published it (768-d, the document's choice)."""
+    """CLIP ViT-L/14 as OpenAI published it (768-d, the thesis's choice)."""
     return PretrainedEncoder(CLIP, weights, device)
 
 
@@ -125,7 +125,7 @@ def dinov2(weights: str | Path | None = None, device: str | None = None) -> Pret
 def find_weights(kind: Pretrained, given: str | Path | None) -> Path:
     """The file given, else the one that `kind.variable` names, else the first in the user's caches.
 
-    The Hugging Face cache lies at $HF_HUB_CACHE, $HF_HOME/hub or ~/.cache/huggingface/hub. Raises WearcapError that
+    The Hugging Face cache is at $HF_HUB_CACHE, $HF_HOME/hub or ~/.cache/huggingface/hub. Raises WearcapError that
     lists the places when there is none.
     """
     named = given or os.environ.get(kind.variable)

@@ -1,4 +1,4 @@
-"""PointNeXt-S with weights that the user has: OpenPoints' checkpoints of its ModelNet40 config (ECHO says
+"""PointNeXt-S with the user's own weights: OpenPoints' checkpoints of its ModelNet40 config (ECHO says
 PointNeXt; which one is our reading).
 
 Of `cfgs/modelnet40ply2048/pointnext-s.yaml`; with C=64 the feature has 1024 numbers, with C=32 it has 512.
@@ -14,7 +14,7 @@ from wearcap.models.point_encoder import PointNeXt
 from wearcap.models.weights import load_weights, read_weights
 
 _LAST = 5
-"""Number of the stage that pools what is left; 0 is the stem."""
+"""Index of the stage that pools all remaining points; 0 is the stem."""
 _LAYER = {"0": "linear", "1": "norm"}
 _HEAD = "prediction."
 _NAME = re.compile(
@@ -25,7 +25,7 @@ _NAME = re.compile(
 def load_openpoints(path: str | Path, normalized: bool = True) -> PointNeXt:
     """The encoder of a `.pth` or `.safetensors` file that OpenPoints' training wrote, in evaluation mode, frozen.
 
-    Its classification head is left out. ModelNet40's objects have y up: ours are turned so. `normalized`: positions in a
+    Its classification head is left out. ModelNet40's objects have y up: ours are rotated to that. `normalized`: positions in a
     ball were divided by its radius in training, as published; false for a config without `normalize_dp: True`, to which
     the ModelNet40 file's `normalize_xyz` means nothing in newer OpenPoints. Raises WearcapError for a file of another
     format or with code in it, and for weights of another network.
@@ -47,7 +47,7 @@ def load_openpoints(path: str | Path, normalized: bool = True) -> PointNeXt:
 
 
 def _own_name(name: str) -> str:
-    """OpenPoints' name of a tensor as ours; an unknown one as it is."""
+    """Our name of an OpenPoints tensor; unknown names stay."""
     found = _NAME.fullmatch(name)
     if found is None:
         return name
@@ -65,5 +65,5 @@ def _own_name(name: str) -> str:
 
 
 def _flat(value: Tensor) -> Tensor:
-    """A convolution over single points as the matrix it is."""
+    """The weights of a pointwise convolution as a matrix."""
     return value.flatten(1) if value.ndim > 2 and value.shape[2:].numel() == 1 else value

@@ -1,4 +1,4 @@
-"""SuperPoint (DeTone, Malisiewicz & Rabinovich 2018): keypoints and descriptors of a grey picture in one pass.
+"""SuperPoint (DeTone, Malisiewicz & Rabinovich 2018): keypoints and descriptors of a grey image in one pass.
 
 Layers carry the names of the published weights (`superpoint_v1.pth`), so that a user's file loads as it is.
 """
@@ -20,11 +20,11 @@ def _pooled_max(x: Float[Tensor, "batch height width"], radius: int) -> Float[Te
 def suppress(
     heat: Float[Tensor, "batch height width"], radius: int, rounds: int = 3
 ) -> Float[Tensor, "batch height width"]:
-    """Non-maximum suppression: `heat` where it is kept, 0 elsewhere.
+    """Non-maximum suppression: `heat` at its maxima, 0 elsewhere.
 
-    Each round keeps the maxima of the (2 radius + 1)² squares among the pixels that no kept one suppresses yet, which
-    tends to greedy suppression in order of score; published weights are used with three rounds. Equal neighbours are
-    kept together.
+    Each round keeps the maxima of the (2 radius + 1)² squares among the pixels that are not suppressed yet, which
+    approximates greedy suppression in order of score; published weights are used with three rounds. Equal neighbours
+    are all kept.
     """
     zero = torch.zeros_like(heat)
     kept = torch.zeros_like(heat, dtype=torch.bool)
@@ -39,9 +39,9 @@ def suppress(
 def top_keypoints(
     heat: Float[Tensor, "batch height width"], count: int, border: int
 ) -> tuple[Float[Tensor, "batch keypoint 2"], Float[Tensor, "batch keypoint"]]:
-    """The `count` highest pixels (fewer if the picture is smaller), best first, none within `border` of the rim.
+    """The `count` highest pixels (fewer in smaller images), best first, none within `border` of the image's border.
 
-    Keypoints are (x, y) pixels, centres at integers; a score of 0 or less marks a place that is filled up only.
+    Keypoints are (x, y) pixels, centres at integers; a score of 0 or less marks padding.
     """
     batch, height, width = heat.shape
     inside = torch.zeros_like(heat, dtype=torch.bool)
@@ -56,8 +56,8 @@ def sample_descriptors(
 ) -> Float[Tensor, "batch keypoint feature"]:
     """Bilinear samples of the coarse map at pixels, of unit length.
 
-    The published sampling puts the first cell's centre at pixel 3.5, where it lies, but the last of n at 8 n - 1
-    instead of 8 n - 4.5. It is kept so, because the published matchers were trained behind it.
+    The published sampling puts the first cell's centre at pixel 3.5, which is right, but the last of n at 8 n - 1
+    instead of 8 n - 4.5. We keep it, because the published matchers were trained with it.
     """
     rows, columns = coarse.shape[-2:]
     first = (CELL - 1) / 2
@@ -68,7 +68,7 @@ def sample_descriptors(
 
 
 class SuperPoint(nn.Module):
-    """A VGG-like encoder to an eighth of the size, a detector head (64 places + "none") and a descriptor head."""
+    """A VGG-like encoder to an eighth of the size, a detector head (64 positions + "none") and a descriptor head."""
 
     def __init__(self, nms_radius: int = 4, border: int = 4, max_keypoints: int = 4096):
         super().__init__()

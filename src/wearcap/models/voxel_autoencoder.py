@@ -1,4 +1,4 @@
-"""Autoencoders of voxel grids: the points around the body as one short vector (thesis §6.2.1, §6.4)."""
+"""Autoencoders of voxel grids of the points around the body (thesis §6.2.1, §6.4)."""
 
 from itertools import pairwise
 
@@ -11,15 +11,15 @@ from wearcap.errors import WearcapError
 from wearcap.scene.voxels import VoxelGrid
 
 _KERNELS = 4 * 2
-"""Cells by which four convolutions of kernel 3 shorten an axis."""
+"""Number of cells by which four convolutions of kernel 3 shorten an axis."""
 _SEEN = 1e-4
-"""A cell whose nearness exceeds this holds a point."""
+"""Nearness above which a cell contains a point."""
 
 
 class VoxelAutoencoder(nn.Module):
     """Grids of truncated distances (m) to codes and back, by `layers` of one of two kinds.
 
-    "convolutions": the document's. "sparse": ours, which takes a grid as what it is, a few points in much emptiness.
+    "convolutions": the thesis's. "sparse": ours, which uses that few cells contain points.
     """
 
     def __init__(
@@ -31,7 +31,7 @@ class VoxelAutoencoder(nn.Module):
         size: int = 128,
         layers: str = "sparse",
     ):
-        """The grid's settings (see `VoxelGrid`), and the code's `size`. Raises WearcapError for layers of another name."""
+        """The grid's settings (see `VoxelGrid`), and the code's `size`. Raises WearcapError for other layers."""
         super().__init__()
         self.grid, self.size = VoxelGrid(cells, size_m, below_m, clip_m), size
         kinds = {"convolutions": ConvolutionLayers, "sparse": SparseLayers}
@@ -40,32 +40,32 @@ class VoxelAutoencoder(nn.Module):
         self.layers = kinds[layers](cells, size)
 
     def encode(self, grids: Float[Tensor, "*batch x y z"]) -> Float[Tensor, "*batch feature"]:
-        """Codes of grids (m)."""
+        """Codes of grids of truncated distances (m)."""
         flat = self._nearness(grids).reshape(-1, *grids.shape[-3:])
         return self.layers.encode(flat).reshape(*grids.shape[:-3], self.size)
 
     def decode(self, code: Float[Tensor, "*batch feature"]) -> Float[Tensor, "*batch x y z"]:
-        """Grids (m) of codes, between 0 and `clip_m`, which is where there is no point."""
+        """Grids (m) decoded from codes, between 0 and `clip_m` (no point)."""
         nearness = self.layers.decode(code.reshape(-1, self.size)).clamp(0, 1)
         return self.grid.clip_m * (1 - nearness).reshape(*code.shape[:-1], *[self.grid.cells] * 3)
 
     def loss(self, grids: Float[Tensor, "batch x y z"]) -> Float[Tensor, ""]:
-        """How far grids are from what their codes tell."""
+        """Reconstruction loss of grids."""
         return self.layers.loss(self._nearness(grids))
 
     def start_from(self, grids: Float[Tensor, "batch x y z"]) -> None:
-        """Take first weights from some grids of a training split."""
+        """Initialise the weights from some grids of a training split."""
         self.layers.start_from(self._nearness(grids))
 
     def _nearness(self, grids: Tensor) -> Tensor:
-        """1 where a point lies in the cell's centre, 0 where there is none."""
+        """Nearness of grids: 1 for a point in the cell's centre, 0 for no point."""
         return 1 - grids / self.grid.clip_m
 
 
 class ConvolutionLayers(nn.Module):
-    """Four convolutions, averaged into one vector; as many transposed ones back; plain squared error (thesis §6.4).
+    """Four convolutions and average pooling; four transposed convolutions back; plain squared error (thesis §6.4).
 
-    No padding: 10 cells become 8, 6, 4 and 2 a side, which is what is averaged and what decoding starts from.
+    Without padding 10 cells become 8, 6, 4 and 2 per side; the last are averaged, and decoding starts from as many.
     """
 
     def __init__(self, cells: int, size: int):
@@ -95,15 +95,15 @@ class ConvolutionLayers(nn.Module):
         return F.mse_loss(self.decode(self.encode(nearness)), nearness)
 
     def start_from(self, nearness: Float[Tensor, "batch x y z"]) -> None:
-        """Its weights are drawn."""
+        """Nothing to do: these weights are initialised at random."""
 
 
 class SparseLayers(nn.Module):
-    """A linear code, and the sparse grid that explains it, found in a few learned steps (LISTA, Gregor & LeCun 2010).
+    """A linear code, decoded to a sparse grid in a few learned steps (LISTA, Gregor & LeCun 2010).
 
-    Of 1000 cells some tens hold a point. That many can be found from 128 sums over all cells by thresholded gradient
-    steps on the codes' difference. Sums, steps and thresholds are learned: binary cross-entropy says which
-    cells hold a point, squared error how near it is. The sums begin as principal components.
+    A few tens of the 1000 cells contain a point; that many can be recovered from 128 linear measurements by thresholded
+    gradient steps on the code's error. Measurements, steps and thresholds are learned, by binary cross-entropy for the
+    cells that contain a point and squared error for its nearness. The measurements start as principal components.
     """
 
     def __init__(self, cells: int, size: int, steps: int = 6, nearness_weight: float = 5.0):
@@ -120,7 +120,7 @@ class SparseLayers(nn.Module):
         self.border = nn.Parameter(torch.full((count,), 0.1))
         self.register_buffer("unit", torch.ones(size))
         self.unit: Tensor
-        """Deviation of each sum at the start: codes are about 1."""
+        """Initial standard deviation of each measurement, which scales codes to about 1."""
         self.scale, self.shift = nn.Parameter(torch.tensor(1.0)), nn.Parameter(torch.tensor(0.0))
 
     def encode(self, nearness: Float[Tensor, "batch x y z"]) -> Float[Tensor, "batch feature"]:
@@ -131,7 +131,7 @@ class SparseLayers(nn.Module):
         return torch.where(logits > 0, nearness, 0).reshape(-1, *[self.cells] * 3)
 
     def _explained(self, code: Tensor) -> tuple[Float[Tensor, "batch cell"], Float[Tensor, "batch cell"]]:
-        """Logits of cells' holding a point, and its nearness if so."""
+        """Logits that cells contain a point, and the point's nearness if they do."""
         sums = code * self.unit
         found = guess = self.step[0] * sums @ self.back.T
         for step, threshold in zip(self.step[1:], self.threshold):
@@ -142,9 +142,9 @@ class SparseLayers(nn.Module):
     def loss(self, nearness: Float[Tensor, "batch x y z"]) -> Float[Tensor, ""]:
         logits, found = self._explained(self.encode(nearness))
         true = nearness.flatten(1)
-        held: Bool[Tensor, "batch cell"] = true > _SEEN
-        which = F.binary_cross_entropy_with_logits(logits, held.to(logits.dtype), reduction="sum")
-        return (which + self.nearness_weight * ((found - true).square() * held).sum()) / len(true)
+        occupied: Bool[Tensor, "batch cell"] = true > _SEEN
+        which = F.binary_cross_entropy_with_logits(logits, occupied.to(logits.dtype), reduction="sum")
+        return (which + self.nearness_weight * ((found - true).square() * occupied).sum()) / len(true)
 
     @torch.no_grad()
     def start_from(self, nearness: Float[Tensor, "batch x y z"]) -> None:

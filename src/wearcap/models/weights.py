@@ -1,4 +1,4 @@
-"""Weights that a user brings: read without running anything from the file, and checked against the network."""
+"""Reads the user's own weights without executing anything from the file, and checks them against the network."""
 
 import pickle
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ _NESTED = (
     "state_dict",
     "model_state_dict",
     "model",
-)  # where training scripts keep the weights among other things
+)  # keys of the weights in the files of training scripts
 # A score beside the weights, as training scripts save it, is a NumPy number: plain data, but unknown to torch.load.
 _SCALAR = np.float64(0).__reduce__()[0]
 _NUMBERS = [
@@ -68,7 +68,7 @@ def _load_pickle(path: Path) -> object:
             expected="a .safetensors file, or a .pth file with tensors only",
             fix="If you trust its origin, save its state_dict with safetensors.torch.save_file.",
         ) from error
-    except Exception as error:  # what torch.load raises on bytes of another format is anything
+    except Exception as error:  # torch.load may raise anything on bytes of another format
         raise WearcapError("not a readable PyTorch file", where=path) from error
 
 

@@ -1,4 +1,4 @@
-"""What a value is made of, as one short text: equal content gives an equal digest, on every machine."""
+"""Content digests: equal values give equal digests on every machine."""
 
 import ast
 import dataclasses
@@ -19,10 +19,10 @@ PACKAGE = Path(__file__).parents[1]
 
 
 def digest(*values: Any) -> str:
-    """SHA-256 of settings, tensors, containers of them, and of what lies in files (`Path`).
+    """SHA-256 of settings, tensors, containers of them, and the contents of files (`Path`).
 
-    Objects count with their class and attributes, networks with their weights. Raises WearcapError for a file that is
-    not there and TypeError for what has no content of its own (a lambda, an open file).
+    Objects are digested by class and attributes, networks by their weights. Raises WearcapError for a missing file and
+    TypeError for values without comparable content (a lambda, an open file).
     """
     sha = hashlib.sha256()
     for part in _parts(values):
@@ -114,7 +114,7 @@ def _parts(value: Any) -> Iterator[bytes | memoryview]:
         yield from _parts((value.func, value.args, value.keywords))
     elif isinstance(value, Callable) and hasattr(value, "__qualname__"):
         if "<lambda>" in value.__qualname__:
-            raise TypeError("a lambda cannot be told from another")
+            raise TypeError("a lambda has no digest: it cannot be distinguished from another one")
         yield f"{value.__module__}.{value.__qualname__}".encode()
     elif dataclasses.is_dataclass(value):
         yield from _parts({field.name: getattr(value, field.name) for field in dataclasses.fields(value)})

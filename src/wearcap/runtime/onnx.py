@@ -1,4 +1,4 @@
-"""A network in ONNX Runtime, made and opened within the process: weights packed, small operations fused."""
+"""Runs a network in ONNX Runtime, exported and loaded within the process."""
 
 import contextlib
 import copy
@@ -14,30 +14,31 @@ from torch import Tensor, nn
 
 LIBRARIES = ("onnx", "onnxscript", "onnxruntime")
 Runner = Callable[..., list[Tensor]]
-"""Called with the network's arguments in order; None for those that it does not have."""
+"""Called with the network's arguments in order, None for those it does not take; returns its outputs."""
 
 
 def missing_libraries() -> list[str]:
-    """What of ONNX Runtime and its exporter is not installed."""
+    """Names of the packages for ONNX Runtime and its exporter that are not installed."""
     return [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
 
 
 def onnx_runner(
     net: nn.Module, example: dict[str, Tensor], *, fixed: tuple[str, ...] = (), int8: bool = False
 ) -> Runner:
-    """The network on the CPU; its arguments have a leading batch axis of any length, but for those that are `fixed`.
+    """The network on the CPU with its current weights.
 
-    int8: weights as int8 per channel, activations scaled as they come. Weights are those of now.
+    All arguments except those in `fixed` have a leading batch axis of any length. int8: weights are quantised to int8
+    per channel, activations dynamically.
     """
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 3
-    # Threads spin between the operations of a step; behind it they leave the cores to what else runs.
+    # Threads spin between the operations of a step; after it they yield the cores to other work.
     options.add_session_config_entry("session.force_spinning_stop", "1")
-    lanes = {0: torch.export.Dim("batch", min=1)}
-    dynamic = {name: None if name in fixed else lanes for name in example}
+    batch_axis = {0: torch.export.Dim("batch", min=1)}
+    dynamic = {name: None if name in fixed else batch_axis for name in example}
     with tempfile.TemporaryDirectory() as folder, quiet(), torch.no_grad():
         path = Path(folder) / "network.onnx"
         plain = copy.deepcopy(net).cpu().eval()
@@ -48,8 +49,8 @@ def onnx_runner(
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     names = [entry.name for entry in session.get_inputs()]
 
-    def run(*told: Tensor | None) -> list[Tensor]:
-        arrays = {name: value.contiguous().numpy() for name, value in zip(names, told) if value is not None}
+    def run(*inputs: Tensor | None) -> list[Tensor]:
+        arrays = {name: value.contiguous().numpy() for name, value in zip(names, inputs) if value is not None}
         return [torch.from_numpy(value) for value in session.run(None, arrays)]
 
     return run
@@ -57,7 +58,7 @@ def onnx_runner(
 
 @contextlib.contextmanager
 def undisturbed(onnx: bool = True) -> Iterator[None]:
-    """For few small windows: PyTorch's threads, which wait by spinning, leave the cores to ONNX Runtime's."""
+    """A context for small batches in which PyTorch's spinning threads leave the cores to ONNX Runtime's."""
     threads = torch.get_num_threads()
     if onnx:
         torch.set_num_threads(1)
@@ -77,7 +78,7 @@ def _narrowed(path: Path) -> Path:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """The exporters speak at length of optional libraries and of what they fold together."""
+    """A context that silences the exporters' messages about optional libraries and constant folding."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

@@ -1,8 +1,8 @@
-"""A pipeline's steps as stages: each one's result is kept by what it was made from, and made again only when that changes.
+"""Pipelines as cached stages: a stage's result is stored by a digest of its inputs and recomputed when they change.
 
-A stage's key is a digest of its name, of what it reads (settings, streams, files), of the results of the stages that it
-follows, and of its code: the module that makes it, the modules of what it reads, and all that these import. A change
-therefore reaches the stages behind it, and only as far as results differ.
+A stage's key is a digest of its name, its inputs (settings, streams, files), the results of the stages that it follows,
+and its code: the module that computes it, the modules of its inputs, and all that these import. A change therefore
+propagates to later stages only as far as results differ.
 """
 
 import json
@@ -30,34 +30,34 @@ from wearcap.sensors.clock import Clock
 from wearcap.sensors.initialization import Initialization
 
 RESULTS = KNOWN | {cls.__name__: cls for cls in (Clock, Initialization, Solution, HpsState)}
-"""What may come back from a cache."""
+"""Classes that a cached result may contain."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A step that can be kept."""
+    """A step of a pipeline whose result can be cached."""
 
     name: str
     make: Callable[[dict[str, Any]], Any]
-    """Given the results of earlier stages by name."""
+    """Computes the result from the results of earlier stages by name."""
     reads: Callable[[], Sequence[Any]]
-    """All that decides the result but for earlier stages: settings, streams, and files as paths. Asked for only where
-    there is a cache."""
+    """Returns all inputs other than earlier results: settings, streams, and files as paths. Called only with a
+    cache."""
     after: tuple[str, ...] = ()
-    """Earlier stages whose results it takes."""
+    """Names of the earlier stages whose results it takes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A recording, and where the files lie that belong to it."""
+    """A recording, and the files that belong to it."""
 
     recording: Recording
     folder: Path = Path()
-    """The data set's."""
+    """Folder of the data set."""
     scan: Path | Scan | None = None
-    """The scene's cloud, or its file."""
+    """The scene's point cloud, or its file."""
     metres_per_unit: float | int | None = None
-    """Of that file; None: it is in metres."""
+    """Unit of that file (m); None: metres."""
 
     def read_scan(self) -> Scan | None:
         if isinstance(self.scan, Path):
@@ -68,42 +68,42 @@ class Source:
 
 @runtime_checkable
 class StagedPipeline(Protocol):
-    """A pipeline that is run stage by stage."""
+    """A pipeline that consists of stages."""
 
     @property
     def name(self) -> str: ...
 
     def stages(self, source: Source) -> list[Stage]:
-        """In order. Raises WearcapError when the recording lacks what the pipeline needs."""
+        """The stages in order. Raises WearcapError when the recording lacks an input of the pipeline."""
         ...
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
-        """The motion after the stages that were run; None where there is none yet."""
+        """The motion after the stages that were run; None if there is none yet."""
         ...
 
     def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
-        """What the stages found, for JSON."""
+        """Findings of the stages, as plain data for JSON."""
         ...
 
 
 @dataclass(frozen=True)
 class StageRun:
-    """How a stage's result came about."""
+    """How a stage's result was obtained."""
 
     stage: str
     seconds: float
-    """That making it took, now or when it was kept."""
+    """Time that computing it took, now or when it was cached."""
     reused: bool
 
 
 @dataclass(frozen=True)
 class StageCache:
-    """Results in a folder: per stage and key a .safetensors file, and a .json file that is written last."""
+    """Cached results in a folder: a .safetensors file per stage and key, and a .json file that is written last."""
 
     folder: Path
 
     def read(self, stage: str, key: str) -> tuple[Any, str, float] | None:
-        """(result, its digest, seconds), or None when nothing is kept. Raises WearcapError when it is damaged."""
+        """(result, its digest, seconds), or None if it is not cached. Raises WearcapError when it is damaged."""
         note, tensors = self._files(stage, key)
         try:
             kept = json.loads(note.read_text(encoding="utf-8"))
@@ -123,7 +123,7 @@ class StageCache:
         return value, found, seconds
 
     def write(self, stage: str, key: str, value: Any, seconds: float) -> str:
-        """Keep a result; its digest."""
+        """Store a result; returns its digest."""
         note, tensors = self._files(stage, key)
         tree, content = flatten({"value": value})
         tree = json.loads(dumps(tree))
@@ -144,9 +144,9 @@ def run_stages(
     until: str | None = None,
     console: Console | None = None,
 ) -> tuple[dict[str, Any], list[StageRun]]:
-    """Results by stage, up to and with `until`, and how each came about; the console shows a line for each.
+    """Results by stage, up to and including `until`, and how each was obtained; the console shows a line for each.
 
-    What the cache holds is reused, what it holds damaged is made again. Raises WearcapError for an unknown `until`.
+    Cached results are reused; damaged ones are recomputed. Raises WearcapError for an unknown `until`.
     """
     names = [stage.name for stage in stages]
     if until is not None and until not in names:
@@ -199,7 +199,7 @@ def _kept(
 
 @dataclass(frozen=True, eq=False)
 class Captured:
-    """What came out, as far as the stages went."""
+    """The motion and the report after the stages that were run."""
 
     motion: Motion | None
     report: dict[str, Any]
@@ -207,19 +207,19 @@ class Captured:
 
 @dataclass(frozen=True, eq=False)
 class StagedCapture:
-    """Runs a staged pipeline on recordings of a data set; wears the coat that evaluation expects."""
+    """Runs a staged pipeline on recordings of a data set, by the interface that evaluation expects."""
 
     pipeline: StagedPipeline
     folder: Path
-    """Of the data set."""
+    """Folder of the data set."""
     scene: Path | None = None
-    """The scene's folder or cloud; None: what each recording names."""
+    """The scene's folder or point cloud; None: the one that each recording names."""
     metres_per_unit: float | int | None = None
     cache: Path | None = None
     console: Console | None = None
 
     def run(self, recording: Recording, until: str | None = None) -> Captured:
-        """One recording, up to and with the stage `until`."""
+        """Capture one recording, up to and including the stage `until`."""
         source = Source(recording, self.folder, self._scan(recording), self.metres_per_unit)
         cache = None if self.cache is None else StageCache(self.cache / recording.name)
         results, runs = run_stages(self.pipeline.stages(source), cache, until, self.console)
@@ -231,12 +231,12 @@ class StagedCapture:
         return Captured(self.pipeline.motion_of(results), report | self.pipeline.report(source, results))  # fmt: skip
 
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per recording; nothing is drawn, so seeds change nothing."""
+        """One motion per recording; seeds have no effect."""
         motions = [self.run(recording).motion for recording in recordings]
         return [motion for motion in motions if motion is not None]
 
     def _scan(self, recording: Recording) -> Path | None:
-        """The scene's cloud. Raises WearcapError when the scene that was given has none."""
+        """The scene's point cloud. Raises WearcapError when the given scene has none."""
         if self.scene is None:
             return self.folder / recording.scene if recording.scene else None
         return cloud_file(self.scene)

@@ -1,4 +1,4 @@
-"""Hang a pose from a joint whose pose is measured: the body follows, the joint is where it must be."""
+"""Anchor a body to a joint whose pose is measured, and move a hand to a measured position."""
 
 from dataclasses import replace
 
@@ -22,8 +22,8 @@ def anchor(
 ) -> tuple[Float[Tensor, "*batch joint 3 3"], Rigid]:
     """Match position and orientation of `joint` to `T_world_measured` (thesis §6.2).
 
-    The root keeps its orientation; the joint itself turns against its parent until its world orientation is the
-    measured one, and the whole body is shifted. Returns (R_parent_joint, poses of all joints in the world).
+    The root keeps its orientation; the joint's local rotation is set so that its world orientation is the measured
+    one, and the whole body is translated. Returns (R_parent_joint, world poses of all joints).
     """
     at, parent = skeleton.index(joint), skeleton.parents[skeleton.index(joint)]
     origin = torch.zeros_like(R_parent_joint[..., 0, :, 0])
@@ -50,7 +50,7 @@ def anchor(
 
 
 def anchored_to_head(motion: Motion, T_world_head: Rigid) -> Motion:
-    """Last step: shift the body and turn its head so that the head is where it was measured."""
+    """The motion with its head joint at the measured poses: the body is translated, the head joint rotated."""
     R_parent_joint, T_world_joint = anchor(motion.skeleton, motion.R_parent_joint, T_world_head)
     return replace(motion, R_parent_joint=R_parent_joint, t_world_root=T_world_joint.t[:, 0])
 
@@ -61,7 +61,7 @@ def with_hand_moved(motion: Motion, side: str, offset: Float[Tensor, "time 3"]) 
     shoulder, elbow, wrist = skeleton.indices(
         *(f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist"))
     )
-    # in double precision: a nearly straight arm's bend is the root of a difference of squares
+    # Double precision, as the bend of a nearly straight arm is the root of a small difference of squares.
     start, middle, end = (T.t[:, joint].double() for joint in (shoulder, elbow, wrist))
     upper, lower = (turn.to(T.R) for turn in reach(start, middle, end, end + offset.double()))
     R = T.R.clone()

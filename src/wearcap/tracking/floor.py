@@ -1,4 +1,4 @@
-"""The floor beneath the wearer, as sensed: from points of the surroundings, or from the head's path alone."""
+"""Floor height below the wearer, estimated from points of the surroundings or from the head's path alone."""
 
 from collections import defaultdict, deque
 from contextlib import suppress
@@ -15,24 +15,27 @@ from wearcap.recording import PointCloud
 from wearcap.scene.floor import estimate_floor
 
 MIN_POINTS = 500
-"""Fewer points than this say nothing about a floor."""
+"""Fewest points that a floor is estimated from."""
 UPRIGHT_WITHIN_S = 30.0
-"""Someone stands or walks upright for a tenth of any such stretch."""
+"""People are assumed to be upright for a tenth of any interval of this length (s)."""
 _LOOK_EVERY_S = 0.25
+"""Sampling interval (s) of the head's height in `floor_from_path`."""
 LOOK_FRAMES = 10
-"""A tracked floor is looked at once in so many frames."""
+"""Frames between updates of a tracked floor."""
 RECENT_S = 6.0
-"""Stretch of the path that a tracked floor is found for."""
+"""Length of the recent path (s) that a tracked floor is estimated for."""
 _STOREYS_M = 30.0
-"""A path does not rise by so much in `RECENT_S`: what is further above or below was a mistake of the tracking."""
+"""Height difference (m) that no path covers in `RECENT_S`; positions beyond it are tracking errors."""
 _TILE_M = 2.5
+"""Side of the square tiles (m) that sort a tracker's points."""
 
 
 def floor_from_path(
     timestamps: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"], stature: float
 ) -> Float[Tensor, "time"]:
-    """Floor height (m) beneath each head position from the head alone: its usual height within half a minute, less
-    `stature`, the head joint's height in the rest pose (m). Stairs are followed late, long sits mistaken for steps.
+    """Floor height (m) below each head position from the head alone: the 90th percentile of its height within half a
+    minute, minus `stature`, the head joint's height in the rest pose (m). Stairs are followed late; long sitting is
+    mistaken for a step down.
     """
     every = torch.arange(timestamps[0].item(), timestamps[-1].item() + _LOOK_EVERY_S, _LOOK_EVERY_S).double()
     seen = interpolate_clamped(timestamps, t_world_head[:, 2], every).numpy()
@@ -43,7 +46,7 @@ def floor_from_path(
 def floor_from_points(
     cloud: PointCloud | None, t_world_head: Float[Tensor, "time 3"], stature: float
 ) -> Float[Tensor, "time"] | None:
-    """Floor height (m) beneath each head position from points; None where there are too few.
+    """Floor height (m) below each head position from points; None if there are too few.
 
     `stature` is the head joint's height in the rest pose (m).
     """
@@ -56,23 +59,23 @@ def floor_from_points(
 
 
 class FloorTracker:
-    """The floor beneath a moving head from what has been seen so far, for captures that run while things happen.
+    """Estimates the floor below a moving head from the data so far, for streaming captures.
 
-    It looks again once in `LOOK_FRAMES` frames, at the last metres of the path and the points around them.
+    Every `LOOK_FRAMES` frames it is estimated again from the recent path and the points around it.
     """
 
     def __init__(self, stature: float, fps: float):
-        """`stature` is the head joint's height in the rest pose (m); `fps` the rate of the poses to come."""
+        """`stature` is the head joint's height in the rest pose (m), `fps` the frame rate of the poses."""
         self.stature = stature
         self._heights: deque[float] = deque(maxlen=int(UPRIGHT_WITHIN_S * fps / LOOK_FRAMES))
         self._path: deque[np.ndarray] = deque(maxlen=int(RECENT_S * fps / LOOK_FRAMES))
         self._tiles: defaultdict[tuple[int, int], list[np.ndarray]] = defaultdict(list)
         self.frames = 0
-        """Followed so far."""
+        """Number of frames so far."""
         self._height = 0.0
 
     def state(self) -> dict[str, Tensor]:
-        """Everything but the points, which are to be shown again."""
+        """The state as tensors, without the points, which must be added again."""
         return {
             "heights": torch.tensor(list(self._heights), dtype=torch.float64),
             "path": torch.from_numpy(np.array(self._path).reshape(-1, 3)),
@@ -80,14 +83,14 @@ class FloorTracker:
         }
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Continue from what `state` returned."""
         self._heights.extend(state["heights"].tolist())
         self._path.extend(state["path"].numpy())
         frames, self._height = state["now"].tolist()
         self.frames = int(frames)
 
     def see(self, points_world: Float[Tensor, "point 3"]) -> None:
-        """Take in points (m); those that are not finite are left out."""
+        """Add points (m); points that are not finite are left out."""
         points = points_world.detach().cpu().numpy()
         points = points[np.isfinite(points).all(1)]
         tiles, which = np.unique(
@@ -97,7 +100,7 @@ class FloorTracker:
             self._tiles[x, y].append(points[which.reshape(-1) == number])
 
     def follow(self, t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
-        """Floor height (m) beneath the next head positions."""
+        """Floor height (m) below the next head positions."""
         floor = torch.empty(len(t_world_head))
         done = 0
         while done < len(floor):
@@ -116,13 +119,13 @@ class FloorTracker:
             path = np.array(self._path)
             path = torch.from_numpy(path[np.abs(path[:, 2] - head[2]) <= _STOREYS_M])
             cloud = torch.from_numpy(points)
-            with suppress(WearcapError):  # none of them lies beneath the path: the last answer stands
+            with suppress(WearcapError):  # no point is below the path: the last height stays
                 self._height = float(estimate_floor(cloud, path, self.stature).height[-1])
         else:
             self._height = float(np.percentile(self._heights, 90)) - self.stature
 
     def _around(self) -> np.ndarray:
-        """Points in the tiles that the recent path crosses, and next to them."""
+        """Points in the tiles that the recent path crosses and in the adjacent tiles."""
         crossed = np.unique(np.floor(np.array(self._path)[:, :2] / _TILE_M).astype(np.int64), axis=0)
         near = {(x + i, y + j) for x, y in crossed.tolist() for i in (-1, 0, 1) for j in (-1, 0, 1)}
         parts = []
@@ -140,9 +143,9 @@ def tracked_floor(
     stature: float,
     fps: float,
 ) -> Float[Tensor, "time"]:
-    """Floor height (m) beneath each head position from what had been seen by then: what `FloorTracker` says.
+    """Floor height (m) below each head position from the data up to that frame, by a `FloorTracker`.
 
-    Points without a time count from the beginning.
+    A cloud without times is used from the first frame on.
     """
     tracker = FloorTracker(stature, fps)
     points, seen = torch.zeros(0, 3), torch.zeros(0, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""A head's path at a steady rate: what every system that follows a head begins with."""
+"""The head's path at a constant frame rate, the input of every head-driven system."""
 
 from dataclasses import dataclass
 
@@ -16,28 +16,29 @@ from wearcap.recording.recording import MIN_DURATION_S
 from wearcap.tracking.floor import floor_from_path
 
 MAX_GAP_S = 0.5
-"""Head poses further apart than this say nothing of what was between: the capture begins anew behind the gap."""
+"""Longest interval (s) between head poses that is interpolated; a longer one is a gap, after which capture restarts."""
 
 
 MAX_FILL = 600
-"""Frames of the model's rate per head pose that a recording may have at most: what has more has another unit of time."""
+"""Largest ratio of frames at the model's rate to head poses; above it the timestamps are not in seconds."""
 
 
 MAX_SPEED_M_S = 12.0
-"""No head moves faster (sprinters do not): a step that asks for more is a jump of the tracking."""
+"""Highest plausible speed of a head (faster than sprinters); a faster step is a jump of the tracking."""
 
 
 @dataclass(frozen=True)
 class HeadPath:
-    """What the model is told about one recording's head, at the model's frame rate."""
+    """One recording's head path at the model's frame rate, with the wearer's skeleton and the floor below."""
 
     timestamps: Float64[Tensor, "time"]
     T_world_head: Rigid
     T_world_device: Rigid
     floor_height: Float[Tensor, "time"]
+    """Floor height (m) below the head, estimated from the head's path alone."""
     skeleton: Skeleton
     stretches: tuple[tuple[int, int], ...]
-    """Frames (start, stop) between gaps and jumps of the tracking; poses in the gaps are interpolated."""
+    """Frame ranges (start, stop) between gaps and jumps of the tracking; head poses in the gaps are interpolated."""
 
     @property
     def stature(self) -> float:
@@ -46,33 +47,33 @@ class HeadPath:
 
     @property
     def held_frames(self) -> Int64[Tensor, "time"]:
-        """Which frame of all stretches' together counts at each time: in a gap the last one before it."""
+        """Index into the concatenated stretches for each frame; frames in a gap repeat the last index before it."""
         frames = torch.cat([torch.arange(start, stop) for start, stop in self.stretches])
         count = len(self.timestamps)
         return torch.searchsorted(frames, torch.arange(count), right=True).sub(1).clamp_min(0)
 
 
 def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
-    """Step 1: the head joint's path at `fps`, and the floor beneath it as the path tells it. Poses that are not finite count as missing.
+    """Step 1: the head joint's path at `fps` and the floor below it. Poses that are not finite count as missing.
 
-    Raises WearcapError when the recording has no head stream, or hardly one, for timestamps that do not grow, and for poses
-    that are no rotations or hardly any for their time.
+    Raises WearcapError when the head stream is missing or too short, for timestamps that do not increase, for matrices
+    that are not rotations, and for too few poses for their time span.
     """
     if recording.head is None:
         raise WearcapError("no head poses in this recording", where=recording.name,
                            expected="a recording with a `head` stream")  # fmt: skip
     head = recording.head
-    known = head.R_world_device.isfinite().all(-1).all(-1) & head.t_world_device.isfinite().all(-1)
-    times = head.timestamps[known]
+    finite = head.R_world_device.isfinite().all(-1).all(-1) & head.t_world_device.isfinite().all(-1)
+    times = head.timestamps[finite]
     if len(times) < 2 or times[-1] - times[0] < MIN_DURATION_S:
         raise WearcapError(f"head poses of {len(times)} frames", where=recording.name,
                            expected=f"at least {MIN_DURATION_S} s")  # fmt: skip
     if not (times.diff() > 0).all():
         raise WearcapError("head poses whose timestamps do not grow", where=recording.name,
                            fix="Sort the head stream by time and leave repeated poses out.")  # fmt: skip
-    _require_plausible(head.R_world_device[known], times, fps, recording.name)
+    _require_plausible(head.R_world_device[finite], times, fps, recording.name)
     skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
-    trajectory = Trajectory(times, head.R_world_device[known], head.t_world_device[known])
+    trajectory = Trajectory(times, head.R_world_device[finite], head.t_world_device[finite])
     broken = breaks(trajectory)
     count = int((times[-1] - times[0]).item() * fps + 1e-3) + 1
     timestamps = times[0] + torch.arange(count, dtype=torch.float64) / fps
@@ -95,7 +96,7 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
 def _require_plausible(
     R_world_device: Float[Tensor, "time 3 3"], times: Float64[Tensor, "time"], fps: float, name: str
 ) -> None:
-    """Raise WearcapError for matrices that are no rotations, and for clocks that are none of seconds."""
+    """Raise WearcapError for matrices that are not rotations, and for timestamps that are not in seconds."""
     skewed = (R_world_device.transpose(-1, -2) @ R_world_device - torch.eye(3)).abs().amax((-1, -2)) > 0.05
     if skewed.any():
         raise WearcapError(f"the head pose at {times[skewed][0].item():.3f} s is no rotation", where=name,
@@ -107,7 +108,7 @@ def _require_plausible(
 
 
 def breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
-    """Times (last before, first behind) of gaps and of jumps."""
+    """Gaps and jumps of a trajectory, each as the times of the last pose before and the first pose after it."""
     step = trajectory.timestamps.diff()
     speed = trajectory.t_world_body.diff(dim=0).norm(dim=-1) / step
     turn = rotation.geodesic(trajectory.R_world_body[:-1], trajectory.R_world_body[1:]) / step

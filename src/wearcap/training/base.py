@@ -1,4 +1,4 @@
-"""What all systems do alike: an optimiser that is given, and a step that logs what it measured."""
+"""Base classes of the LightningModules: seeded steps, optimiser from the config, logged losses."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class SeededSteps(lightning.LightningModule):
-    """What a step draws (dropout, augmentation) is a function of seed and step, so that a resumed run repeats it."""
+    """Makes a step's randomness (dropout, augmentation) a function of seed and step, so that resumed runs repeat it."""
 
     seed: int
 
@@ -18,7 +18,7 @@ class SeededSteps(lightning.LightningModule):
 
 
 class GivenOptimizer(lightning.LightningModule):
-    """Optimises `net` with the optimiser and, where there is one, the schedule of every step that it was given."""
+    """Optimises `net` with the constructor's optimiser and, if there is one, scheduler, which advances every step."""
 
     _optimizer: Callable[..., torch.optim.Optimizer]
     _scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None
@@ -34,14 +34,14 @@ class GivenOptimizer(lightning.LightningModule):
 
 
 class Measured(GivenOptimizer):
-    """Trains on the "loss" among what `measure` says of a batch, and logs all of it, in training and validation."""
+    """Trains on the "loss" that `measure` returns, and logs all of its values, in training and validation."""
 
     def measure(self, batch: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        """The loss and whatever else is worth a curve."""
+        """The "loss" of a batch and further values to log."""
         raise NotImplementedError
 
     def pipeline_parts(self) -> dict[str, Any]:
-        """What a pipeline around this network is made with, beside its own settings."""
+        """Constructor arguments of the pipeline that belong to the trained model."""
         raise NotImplementedError
 
     def _step(self, batch: tuple[Tensor, ...], stage: str) -> Tensor:
@@ -61,7 +61,7 @@ class Measured(GivenOptimizer):
 
 
 class WeighedTerms(Measured):
-    """The loss is the sum of `terms` by their weights; a term without one is only logged."""
+    """The loss is the sum of `terms` times `loss_weights`; a term without a weight is only logged."""
 
     loss_weights: dict[str, float]
 

@@ -1,4 +1,4 @@
-"""Callbacks: they watch a training run and never define what is measured."""
+"""Callbacks, which observe a training run and do not change it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,22 +16,22 @@ from wearcap.training.base import Measured
 
 
 def is_due(trainer: lightning.Trainer, every_n_epochs: int) -> bool:
-    """Whether what watches every n-th validation, and the training's last one, is to look now, in this process."""
+    """Whether a callback that runs at every n-th and at the last validation is due now, in this process."""
     last = trainer.max_steps > 0 and trainer.global_step >= trainer.max_steps
     due = last or (trainer.current_epoch + 1) % every_n_epochs == 0
     return due and trainer.is_global_zero and not trainer.sanity_checking
 
 
 class Captures(Protocol):
-    """A pipeline around the network that is trained."""
+    """A pipeline around the network in training."""
 
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]: ...
 
 
 class CaptureValidation(Callback):
-    """Captures some validation recordings with the current weights: logs their metrics, draws them beside truth.
+    """Captures some validation recordings with the current weights; logs metrics and draws them beside ground truth.
 
-    Stands before the weight averaging in the list of callbacks, so that it sees the averaged weights.
+    It must come before the weight averaging in the list of callbacks, so that it uses the averaged weights.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class CaptureValidation(Callback):
         every_n_epochs: int = 5,
         draw: Callable[[Path, dict[str, Motion]], None] | None = None,
     ):
-        """`pipeline` is made with the module's `pipeline_parts`; `draw` writes a picture of motions by their labels."""
+        """`pipeline` is called with the module's `pipeline_parts`; `draw` writes an image of labelled motions."""
         self.pipeline, self.folder = pipeline, Path(folder)
         self.recordings, self.max_seconds, self.every_n_epochs = recordings, max_seconds, every_n_epochs
         self.draw = draw
@@ -63,7 +63,7 @@ class CaptureValidation(Callback):
             self.draw(path, {"truth": recordings[0].motion, "capture": motions[0]})
 
     def _recordings(self, root: str) -> list[Recording]:
-        """Validation recordings spread over the list, cut to their first seconds: a look, not the evaluation."""
+        """Evenly chosen validation recordings, cut to their first seconds; this does not replace an evaluation."""
         store = RecordingStore.open(root)
         names = store.names("val")
         chosen = names[:: max(1, len(names) // self.recordings)][: self.recordings]

@@ -1,4 +1,4 @@
-"""What a training run puts into its checkpoints beside weights, and how their files are written and read."""
+"""Contents of a training run's checkpoints beside the weights, and how their files are written and read."""
 
 import io
 import json
@@ -19,7 +19,7 @@ from wearcap.models.checkpoint import read_run_file
 
 
 class ConfigInCheckpoint(Callback):
-    """Puts the composed config and the version into every checkpoint."""
+    """Adds the composed config and the version to every checkpoint."""
 
     def __init__(self, config: dict[str, Any]):
         self.config = config
@@ -29,9 +29,9 @@ class ConfigInCheckpoint(Callback):
 
 
 class RunCheckpointIO(CheckpointIO):
-    """Writes checkpoints beside their target, synced and renamed: a killed run leaves the old file or the new one.
+    """Writes checkpoints atomically (synced beside the target, then renamed): a killed run leaves the old or new file.
 
-    Lightning's own copies over the old file where the folder of temporary files lies on another file system.
+    Lightning's own writer copies over the old file when the folder of temporary files is on another file system.
     """
 
     def __init__(self, folder: str | Path):
@@ -42,7 +42,7 @@ class RunCheckpointIO(CheckpointIO):
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
         """Write a checkpoint. Raises WearcapError when the disk is full or the folder cannot be written."""
-        content = io.BytesIO()  # PyTorch's own writing to a file says nothing of why it failed
+        content = io.BytesIO()  # PyTorch's own writing to a file does not report why it failed
         torch.save(checkpoint, content)
         with atomic_path(path) as temporary:
             temporary.write_bytes(content.getbuffer())
@@ -61,13 +61,13 @@ class RunCheckpointIO(CheckpointIO):
 
 
 TRAINING_STATE = ("state_dict", "optimizer_states", "lr_schedulers", "loops", "epoch", "global_step")
-"""What a training goes on from."""
+"""Entries of a checkpoint that resuming a training requires."""
 
 
 def require_resumable(path: str | Path, own: Mapping[str, Tensor]) -> None:
     """Raise WearcapError unless a file is a training run's checkpoint whose weights fit a model's own.
 
-    Its config is not read: what is trained is what the command line says.
+    Its config is not read: the command line defines the training.
     """
     saved = read_run_file(path)
     missing = [key for key in TRAINING_STATE if key not in saved]

@@ -1,4 +1,4 @@
-"""What a run writes about itself while it trains."""
+"""Loggers of a training run."""
 
 import csv
 import io
@@ -16,7 +16,7 @@ Row = dict[str, float | str]
 
 class RunCSVLogger(CSVLogger):
     """`metrics.csv` of a run. A resumed run keeps the rows before its first step; one from scratch keeps the old file
-    as `metrics.previous.csv`. Lightning's own deletes the file before there is anything new to write."""
+    as `metrics.previous.csv`. Lightning's own logger deletes the file before there are new rows."""
 
     def __init__(self, save_dir: str, resume: str | None = None, flush_logs_every_n_steps: int = 100):
         super().__init__(save_dir, name="", version="", flush_logs_every_n_steps=flush_logs_every_n_steps)
@@ -38,7 +38,7 @@ class MetricsFile(ExperimentWriter):
         self.path, self._resumed, self._begun = Path(self.metrics_file_path), resumed, False
 
     def _check_log_dir_exists(self) -> None:
-        """The file that is there stays until there are rows to write."""
+        """Does nothing: an existing file stays until there are rows to write."""
 
     def save(self) -> None:
         """Write the rows logged since the last time."""
@@ -73,7 +73,7 @@ class MetricsFile(ExperimentWriter):
 
 
 def read_metrics(path: Path) -> list[Row]:
-    """Rows of a `metrics.csv`, without empty values and without a last line that was cut short; none without a file."""
+    """Rows of a `metrics.csv` without empty values and without an incomplete last line; none without a file."""
     if not path.is_file():
         return []
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)

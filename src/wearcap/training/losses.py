@@ -1,4 +1,4 @@
-"""Loss terms: pure functions of predictions and truth, averaged over frames, which have weights: none for padding."""
+"""Loss terms: pure functions of predictions and ground truth, averaged over weighted frames (0 on padding)."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -8,10 +8,9 @@ EPSILON_M2 = 1e-6
 
 
 def masked_mean(value: Float[Tensor, "batch time"], weight: Float[Tensor, "batch time"]) -> Float[Tensor, ""]:
-    """Mean over all frames, padding (no weight) counting as zero.
+    """Mean over all frames, in which padding (weight 0) counts as zero.
 
-    Divided by the number of valid frames instead, the gradient would depend on how a batch is shared out among
-    processes: each would weigh its own padding.
+    With a division by the number of valid frames the gradient would depend on how a batch is split among processes.
     """
     return (value * weight).mean()
 
@@ -30,7 +29,7 @@ def joint_position(
     target: Float[Tensor, "batch time joint 3"],
     weight: Float[Tensor, "batch time"],
 ) -> Float[Tensor, ""]:
-    """Distance of joints, both bodies hung from the same head (m; ours)."""
+    """Distance of joints with both bodies anchored to the same head (m; ours)."""
     distance = ((prediction - target).square().sum(-1) + EPSILON_M2).sqrt()
     return masked_mean(distance.mean(-1), weight)
 
@@ -52,7 +51,7 @@ def foot_skate(
     weight: Float[Tensor, "batch time"],
     fps: float,
 ) -> Float[Tensor, ""]:
-    """Squared speed (m²/s²) of the slowest point of a foot while the truth says that the foot touches (ours)."""
+    """Squared speed (m²/s²) of the slowest point of a foot during its ground-truth contacts (ours)."""
     speed = (feet.diff(dim=1) * fps).square().sum(-1).amin(-1)
     stands = contact[:, 1:] * contact[:, :-1]
     return masked_mean((speed * stands).mean(-1), weight[:, 1:])

@@ -1,4 +1,4 @@
-"""Training of the autoencoder in whose latent space FID and Diversity are taken."""
+"""Training of the autoencoder whose latent space FID and Diversity are computed in."""
 
 from collections.abc import Callable
 
@@ -14,11 +14,11 @@ from wearcap.models.motion_autoencoder import MotionAutoencoder
 from wearcap.training.base import Measured
 
 MIN_SCALE = 0.02
-"""No feature is stretched more than this: what hardly varies would otherwise be mostly noise."""
+"""Smallest standard deviation that features are divided by: those that hardly vary would become mostly noise."""
 
 
 class MotionEncoding(Measured):
-    """Windows of true motion are compressed and rebuilt; the loss is the smooth L1 of normalised features."""
+    """Reconstruction of windows of true motion; the loss is the smooth L1 of normalised features."""
 
     def __init__(
         self,
@@ -34,7 +34,7 @@ class MotionEncoding(Measured):
         self._optimizer, self._scheduler = optimizer, scheduler
 
     def set_statistics(self, dataset: MovementDataset, limit: int = 1000) -> None:
-        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        """Compute normalisation from a training split; a resumed run loads it with the weights."""
         random = torch.Generator().manual_seed(0)
         drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
         features = self.features.encode(collate([dataset[item] for item in zip(drawn, range(limit))]))
@@ -42,7 +42,7 @@ class MotionEncoding(Measured):
         self.net.normalizer.set(mean, scale)
 
     def measure(self, batch: Movement) -> dict[str, Tensor]:
-        """The loss, and the mean error of rebuilt joints (cm)."""
+        """The loss, and the mean error of reconstructed joints (cm)."""
         features = self.features.encode(batch)
         rebuilt = self.net(features)
         loss = F.smooth_l1_loss(rebuilt, self.net.normalizer(features))

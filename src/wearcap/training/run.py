@@ -1,4 +1,4 @@
-"""One training run: its folder, its resumption, its record of what made it."""
+"""One training run: its folder, resuming, and the record of config, commit and library versions."""
 
 import ctypes
 import importlib.metadata
@@ -19,7 +19,7 @@ from wearcap.training.checkpoint import require_resumable
 
 @runtime_checkable
 class System(Protocol):
-    """A LightningModule that normalises its inputs by what its training windows hold."""
+    """A LightningModule that normalises its inputs by statistics of its training windows."""
 
     def set_statistics(self, dataset: Any) -> None: ...
 
@@ -27,7 +27,7 @@ class System(Protocol):
 
 
 def fit(system: System, data: SeededWindows, trainer: lightning.Trainer, resume: Path | None = None) -> None:
-    """Train from scratch or go on from a checkpoint; a run that was killed repeats nothing and misses nothing."""
+    """Train from scratch or resume from a checkpoint; a killed run resumes without repeating or skipping a step."""
     if resume is None:
         system.set_statistics(data.dataset("train"))
     else:
@@ -36,10 +36,10 @@ def fit(system: System, data: SeededWindows, trainer: lightning.Trainer, resume:
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep what a training step frees for the next one, instead of handing it back page by page.
+    """Make glibc keep freed memory for the next training step instead of returning it to the system.
 
-    On the CPU a step frees and takes hundreds of megabytes; taking them anew costs about a fifth of its time. Elsewhere
-    than with glibc nothing happens.
+    On the CPU a step frees and allocates hundreds of megabytes; allocating them again costs about a fifth of its time.
+    Without glibc this does nothing.
     """
     if platform.libc_ver()[0] != "glibc":
         return
@@ -50,8 +50,8 @@ def keep_freed_memory() -> None:
 
 
 def resume_path(resume: str | None, own: Path, runs: Path) -> Path | None:
-    """A checkpoint to go on from: none, a path, or with "auto" the `last.ckpt` of the run's own folder, else the newest
-    below `runs`."""
+    """The checkpoint to resume from: none, a path, or with "auto" the `last.ckpt` of the run's own folder, else the
+    newest in `runs`."""
     if resume is None:
         return None
     if resume != "auto":

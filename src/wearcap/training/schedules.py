@@ -1,4 +1,4 @@
-"""Learning rate over steps."""
+"""Learning-rate schedules."""
 
 import math
 

@@ -1,6 +1,6 @@
-"""Variations of head camera frames: other light and colours, the camera turned on the head, mirror images.
+"""Augmentation of head camera frames: light and colours, the camera's rotation on the head, mirror images.
 
-Pictures are normalised and of the encoder's size; draws come from torch's current generator.
+Images are normalised and have the encoder's size; random numbers come from torch's default generator.
 """
 
 import math
@@ -14,11 +14,11 @@ from wearcap.geometry import rotation
 from wearcap.systems.hmd2.egoview_frames import POINTS
 
 _SWAPPED = [index ^ 1 for index in range(len(POINTS))]
-"""Left for right: they alternate in `POINTS`."""
+"""Index of each point's counterpart on the other side; left and right alternate in `POINTS`."""
 
 
 def relit(pictures: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 3 height width"]:
-    """Other light, other colours (channels mixed), other noise, picture by picture."""
+    """Images with random gain, shift, channel mixing and noise, drawn per image."""
     like = pictures[:, :1, :1, :1]
     mix = torch.eye(3, device=pictures.device) + 0.3 * torch.randn(
         len(pictures), 3, 3, device=pictures.device
@@ -39,10 +39,10 @@ def turned(
 ) -> tuple[
     Float[Tensor, "batch 3 height width"], Float[Tensor, "batch point 3"], Bool[Tensor, "batch point"]
 ]:
-    """The pictures that the camera would take if it sat on the head a little turned, and its points.
+    """Images and points as seen by a slightly rotated camera, with angles of `deviation_deg` per axis.
 
-    `intrinsics` are fx, fy, cx, cy of the pictures (lens distortion is left out, as turns are small). What comes into
-    view is grey, and points there are not visible.
+    `intrinsics` are fx, fy, cx, cy of the images (lens distortion is ignored, as rotations are small). Areas outside
+    the original image are grey, and points there are not visible.
     """
     height, width = pictures.shape[2:]
     axis = math.radians(deviation_deg) * torch.randn(len(pictures), 3, device=pictures.device)
@@ -67,7 +67,7 @@ def half_mirrored(
 ) -> tuple[
     Float[Tensor, "batch 3 height width"], Float[Tensor, "batch point 3"], Bool[Tensor, "batch point"]
 ]:
-    """Half of the pictures flipped left to right, with left hands for right ones."""
+    """A random half of the images flipped horizontally, with left and right points exchanged."""
     flip = torch.rand(len(pictures), device=pictures.device) < 0.5
     across = point_cam.new_tensor([-1.0, 1.0, 1.0])
     return (

@@ -1,4 +1,4 @@
-"""Frames of a head camera, with where the wearer's own limbs are in them: what our image encoder learns from."""
+"""Head camera frames labelled with the positions of the wearer's own limbs, to train our image encoder."""
 
 import hashlib
 from functools import cache
@@ -23,7 +23,7 @@ from wearcap.recording.recording import CameraStream
 from wearcap.recording.store import RecordingFile, RecordingStore
 
 POINTS = tuple(f"{side}_{part}" for part in ("palm", "fingertip", "wrist", "elbow", "knee", "toe_tip") for side in ("left", "right"))  # fmt: skip
-"""Joints and sites whose places in the camera's frame are learned; left and right alternate."""
+"""Joints and sites whose positions in the camera's frame are learned; left and right alternate."""
 HANDS = tuple(f"{side}_palm" for side in ("left", "right"))
 
 
@@ -34,17 +34,17 @@ class EgoFrame(NamedTuple):
     point_cam: Float[Tensor, "*batch point 3"]
     """`POINTS` in the camera's axes (m)."""
     visible: Bool[Tensor, "*batch point"]
-    """Within the picture; what stands before them is not looked at."""
+    """Whether a point is within the image; occlusion is ignored."""
     intrinsics: Float[Tensor, "*batch 4"]
-    """fx, fy, cx, cy of the picture."""
+    """fx, fy, cx, cy of the image (pixels)."""
 
 
 def limb_points(
     motion: Motion, camera: CameraStream
 ) -> tuple[Float[Tensor, "time point 3"], Bool[Tensor, "time point"]]:
-    """`POINTS` in the camera's axes (m) and which of them are within the picture, at the camera's timestamps.
+    """`POINTS` in the camera's axes (m) and whether they are within the image, at the camera's timestamps.
 
-    Raises WearcapError when the motion does not span them.
+    Raises WearcapError when the motion does not span the camera's timestamps.
     """
     T_world_joint, skeleton = motion.T_world_joint, motion.skeleton
     places = []
@@ -59,11 +59,11 @@ def limb_points(
 
 
 class EgoFrames(Dataset):
-    """Every `every`-th frame of the recordings of one split that have a motion and a head camera's pictures.
+    """Every `every`-th frame of the recordings of one split that have a motion and a head camera's images.
 
-    Pictures are decoded once, into arrays below each data set's `cache`, and read from the memory map. An item is asked
-    for by (frame, seed), or by frame. By their weights, frames that show a hand make up `hand_share` of the draws
-    (0: their own share).
+    Images are decoded once, into arrays in each data set's `cache`, and memory-mapped. Items are indexed by
+    (frame, seed), or by frame. Weights are set so that frames that show a hand make up `hand_share` of the draws
+    (0: their natural share).
     """
 
     def __init__(self, sources: list[Source], split: str, every: int, hand_share: float = 0.0):
@@ -89,7 +89,7 @@ class EgoFrames(Dataset):
                 intrinsics.append(torch.tensor([lens.fx, lens.fy, lens.cx, lens.cy]).expand(len(frames), 4))
                 self._pictures.append(frames)
         if not points:
-            raise WearcapError(f"no head camera's pictures in split {split!r}", where=", ".join(s.root for s in sources),
+            raise WearcapError(f"no head camera images in split {split!r}", where=", ".join(s.root for s in sources),
                                fix="Prepare a data set with them: wearcap prepare simulated camera=true")  # fmt: skip
         self.point_cam, self.visible, self.weights = torch.cat(points), torch.cat(visible), torch.cat(weights)
         self.intrinsics = torch.cat(intrinsics)
@@ -120,9 +120,9 @@ def _array(path: Path) -> UInt8[np.ndarray, "time height width 3"]:
 
 
 def decoded(camera: CameraStream, root: Path, every: int) -> UInt8[np.ndarray, "time height width 3"]:
-    """Every `every`-th picture of a stream, memory-mapped from a file below `root`/cache that is made when it is missing.
+    """Every `every`-th image of a stream, memory-mapped from a file in `root`/cache that is made if it is missing.
 
-    Raises WearcapError for pictures of several sizes, another number of them than of timestamps, and as `pictures` does.
+    Raises WearcapError for images of several sizes, another number of them than of timestamps, and as `pictures` does.
     """
     named = camera.video or "\n".join(camera.image_files or ())
     first = root / (camera.video or (camera.image_files or ("",))[0])
@@ -143,7 +143,7 @@ def decoded(camera: CameraStream, root: Path, every: int) -> UInt8[np.ndarray, "
 
 
 class EgoViewFrames(SeededWindows):
-    """Frames for the image encoder's training; see `EgoFrames` and `SeededWindows`, with single frames for windows."""
+    """Lightning data of the image encoder's training; see `EgoFrames`, and `SeededWindows` with frames for windows."""
 
     def __init__(
         self,
@@ -161,7 +161,7 @@ class EgoViewFrames(SeededWindows):
         self.every, self.hand_share = every, hand_share
 
     def dataset(self, split: str) -> EgoFrames:
-        """Frames of a split; those of the training split are drawn more often where they show a hand."""
+        """Frames of a split; in the training split frames that show a hand are drawn with `hand_share`."""
         if split == "train":
             return EgoFrames(self.sources, split, self.every, self.hand_share)
         return EgoFrames(self.val_sources, split, self.every)

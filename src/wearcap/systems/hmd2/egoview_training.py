@@ -1,4 +1,4 @@
-"""Training of our small image encoder: where a wearer's own limbs are in a head camera's frame."""
+"""Training of our small image encoder to locate the wearer's own limbs in a head camera's frame."""
 
 from collections.abc import Callable
 
@@ -18,10 +18,11 @@ LEAST_SPREAD_M = 0.02
 
 
 class EgoView(SeededSteps):
-    """Linear heads on the embedding tell which of `POINTS` are in the picture, and where they are.
+    """Linear heads on the embedding predict which of `POINTS` are in the image, and their positions.
 
-    The loss is their binary cross-entropy plus the Huber loss of the places, in standard deviations, of those that are.
-    Linear, so that it is the embedding that carries what is known. `turn_deg`: see `ego_augment.turned`.
+    The loss is the binary cross-entropy of visibility plus the Huber loss of visible points' positions in standard
+    deviations. The heads are linear so that the embedding itself represents the positions. `turn_deg`: the
+    `deviation_deg` of `egoview_augmentation.turned`.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class EgoView(SeededSteps):
         self._validated: list[tuple[Tensor, Tensor, EgoFrame]] = []
 
     def set_statistics(self, dataset: EgoFrames) -> None:
-        """Mean and deviation of every point's place, over the frames where it is in the picture."""
+        """Set mean and deviation of every point's position over the frames where it is visible."""
         weight = dataset.visible.double()[..., None]
         count = weight.sum(0).clamp_min(1)
         mean = (weight * dataset.point_cam).sum(0) / count
@@ -52,18 +53,18 @@ class EgoView(SeededSteps):
     def forward(
         self, pictures: Float[Tensor, "batch 3 height width"]
     ) -> tuple[Float[Tensor, "batch point"], Float[Tensor, "batch point 3"]]:
-        """Logits of being in the picture, and places (m)."""
+        """Logits of visibility, and positions in the camera's axes (m)."""
         logits, places = self.heads(self.dropout(self.net(pictures))).split(
             [len(POINTS), 3 * len(POINTS)], -1
         )
         return logits, self.normalizer.inverse(places).unflatten(-1, (len(POINTS), 3))
 
     def pictures(self, batch: EgoFrame) -> Float[Tensor, "batch 3 height width"]:
-        """The batch's pictures as the network takes them in."""
+        """The batch's images, letterboxed and normalised for the network."""
         return letterboxed(batch.picture, self.net.width, self.net.height, self.net.mean, self.net.std)
 
     def _intrinsics(self, batch: EgoFrame) -> Float[Tensor, "batch 4"]:
-        """Of the letterboxed pictures."""
+        """Intrinsics of the letterboxed images."""
         height, width = batch.picture.shape[1:3]
         scale = min(self.net.width / width, self.net.height / height)
         margin = (torch.tensor([self.net.width, self.net.height]) - scale * torch.tensor([width, height])) / 2
@@ -128,9 +129,11 @@ def view_scores(
     point_cam: Float[Tensor, "frame point 3"],
     visible: Bool[Tensor, "frame point"],
 ) -> dict[str, float]:
-    """Average precision of telling which hands are in the picture, and the mean error (cm) of those that are, by side's
-    mean; beside each what it is for someone who knows the training split's share and mean place alone. The same error
-    for all points."""
+    """Average precision of detecting the hands, mean position error (cm) of visible hands, and that of all points.
+
+    Each is averaged over sides or points. "hand_share" and the "_of_mean" errors are those of a predictor that always
+    outputs the training split's mean.
+    """
     left, right = (POINTS.index(name) for name in HANDS)
     errors = {"": places, "_of_mean": mean_places}
     scores = {
@@ -148,5 +151,5 @@ def view_scores(
 
 
 def _mean(values: list[float]) -> float:
-    """Of those that are defined."""
+    """Mean of the values that are not NaN."""
     return float(torch.tensor(values).nanmean())

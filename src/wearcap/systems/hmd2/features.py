@@ -1,4 +1,4 @@
-"""What HMD²'s network sees of a head's path and says of a body: head paths to conditions, poses to vectors and back."""
+"""HMD²'s feature encoding: head paths to conditions, poses to motion vectors and back."""
 
 from dataclasses import dataclass
 
@@ -17,20 +17,20 @@ from wearcap.geometry import rotation
 class HeadFeatures:
     """Encodes a head path (thesis §6.1: p = {t, R, v, ω}) and body poses in a gravity-keeping frame.
 
-    frame "window": yaw and horizontal position of the window's first frame are removed (the document, as we read
-    it). frame "heading": every frame's own head yaw is removed and no absolute position enters (ours; the root's
-    rotation is told relative to where the head points, so nothing has to be re-expressed when windows move).
-    height "relative": height of the head over its first frame's; "floor": over the floor (m); "stature": over the
-    floor, as a share of the head's height in the rest pose.
+    frame "window": yaw and horizontal position of the window's first frame are removed (our reading of the thesis).
+    frame "heading": every frame's own head yaw is removed and no absolute position enters (ours; the root's rotation
+    is relative to the head's heading, so nothing has to be re-expressed when windows move).
+    height "relative": height of the head above its first frame (m); "floor": above the floor (m); "stature": above
+    the floor, as a share of the head's height in the rest pose.
     """
 
     frame: str = "heading"
     height: str = "stature"
     joints: int = 23
     contacts: bool = False
-    """Whether the motion carries the contact of both feet, too (EDGE; ours), as ±1."""
+    """Whether the motion vector includes both feet's contacts as ±1 (as in EDGE; ours)."""
     body: bool = False
-    """Whether the condition tells the wearer's size (ours): stature, length of leg, of arm and of trunk."""
+    """Whether the condition includes the wearer's body size (ours): stature, length of leg, arm and trunk (m)."""
 
     def __post_init__(self):
         for name, allowed in (("frame", ("heading", "window")), ("height", ("stature", "floor", "relative"))):
@@ -47,7 +47,7 @@ class HeadFeatures:
         return 6 * self.joints + (FEET if self.contacts else 0)
 
     def frame_of(self, R_world_head: Float[Tensor, "batch time 3 3"]) -> Float[Tensor, "batch #time 3 3"]:
-        """R_world_canonical of every frame (one for all frames when the frame is the window's)."""
+        """R_world_canonical of every frame, or one for all frames when `frame` is "window"."""
         if self.frame == "window":
             R_world_head = R_world_head[:, :1]
         return rotation.about_axis("z", rotation.yaw_of(R_world_head))
@@ -75,7 +75,7 @@ class HeadFeatures:
         if self.height == "stature":
             height = height / size[:, None, :1]
         horizontal = [offset[..., :2, 0]] if self.frame == "window" else []
-        conditions = [size[:, None].expand(-1, height.shape[1], -1)] if self.body else []
+        body_size = [size[:, None].expand(-1, height.shape[1], -1)] if self.body else []
         return torch.cat(
             [
                 *horizontal,
@@ -83,7 +83,7 @@ class HeadFeatures:
                 rotation.rot6d_from_matrix(R_canonical_head),
                 velocity,
                 angular,
-                *conditions,
+                *body_size,
             ],
             -1,
         )
@@ -94,7 +94,7 @@ class HeadFeatures:
         R_world_head: Float[Tensor, "batch time 3 3"],
         foot_contact: Float[Tensor, "batch time foot"],
     ) -> Float[Tensor, "batch time motion"]:
-        """Local rotations as 6D, the root's in the canonical frame (thesis: F = 23 × 6), and contact where asked for."""
+        """Local rotations as 6D, the root's in the canonical frame (thesis: F = 23 × 6); contacts if `contacts`."""
         R_root = self.frame_of(R_world_head).transpose(-1, -2) @ R_parent_joint[:, :, 0]
         R = torch.cat([R_root[:, :, None], R_parent_joint[:, :, 1:]], 2)
         motion = rotation.rot6d_from_matrix(R).flatten(-2)
@@ -103,7 +103,7 @@ class HeadFeatures:
     def decode(
         self, motion: Float[Tensor, "batch time motion"], R_world_head: Float[Tensor, "batch time 3 3"]
     ) -> tuple[Float[Tensor, "batch time joint 3 3"], Float[Tensor, "batch time foot"]]:
-        """The inverse of `encode`: R_parent_joint, the root's entry in the world; and contact (0 where it is not told)."""
+        """The inverse of `encode`: R_parent_joint (the root's in the world) and foot contact (0 without `contacts`)."""
         R = rotation.matrix_from_rot6d(motion[..., : 6 * self.joints].unflatten(-1, (-1, 6)))
         R_root = self.frame_of(R_world_head) @ R[:, :, 0]
         contact = (
@@ -117,7 +117,7 @@ class HeadFeatures:
 def feature_statistics(
     dataset: WindowDataset, features: HeadFeatures, limit: int = 2000
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """(mean, scale) of "motion", "head", "points" and "image" over at most `limit` windows, drawn by the dataset's weights."""
+    """(mean, scale) of "motion", "head", "points" and "image" over at most `limit` windows drawn by dataset weights."""
     random = torch.Generator().manual_seed(0)
     count = min(limit, 4 * len(dataset))
     windows = torch.multinomial(dataset.weights, count, replacement=True, generator=random).tolist()

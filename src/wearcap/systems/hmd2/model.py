@@ -19,19 +19,19 @@ from wearcap.models.layers import (
 
 
 class Conditions(NamedTuple):
-    """What a window is told, raw. Frames without points or picture hold any finite numbers where "valid" is False."""
+    """Conditioning of a window, not normalised. Where a "valid" flag is False the features are any finite numbers."""
 
     head: Float[Tensor, "batch time head_feature"]
     points: Float[Tensor, "batch time point_feature"]
     """Code of the points around the body (`VoxelAutoencoder`); no columns for a network without points."""
     points_valid: Bool[Tensor, "batch time"]
     image: Float[Tensor, "batch time image_feature"]
-    """Embedding of the head camera's picture; no columns for a network without images."""
+    """Embedding of the head camera's image; no columns for a network without images."""
     image_valid: Bool[Tensor, "batch time"]
 
 
 class OptionalInput(nn.Module):
-    """A modality that may be missing: standardised, or a learned null vector on the frames that lack it."""
+    """Encodes a modality that may be missing: standardised features, or a learned null vector in their place."""
 
     def __init__(self, size: int, width: int, frames_per_token: int):
         super().__init__()
@@ -43,7 +43,7 @@ class OptionalInput(nn.Module):
         self, x: Float[Tensor, "batch time feature"], valid: Bool[Tensor, "batch time"]
     ) -> Float[Tensor, "batch token width"]:
         there = valid[..., None]
-        # The flag beside the vector lets the network tell null from a scene that looks like it.
+        # The flag lets the network distinguish the null vector from features that resemble it.
         frames = torch.where(there, self.normalizer(x), self.null)
         return self.widen(torch.cat([frames, there.to(x.dtype)], -1))
 
@@ -51,16 +51,16 @@ class OptionalInput(nn.Module):
 class ConditionEncoder(nn.Module):
     """Concatenates a frame's conditions and narrows them to one vector per token by an MLP (thesis §6.2).
 
-    The MLP's first layer is written as one product per modality, their sum: that is what a layer on the concatenation
-    is. Of the head it sees `context` frames before the token's own and as many behind them (ours): a stride shows in
-    half a second of a head's sway, not in one frame.
+    The MLP's first layer is the sum of one linear layer per modality, which equals a linear layer on the concatenation.
+    The head's features cover `context` frames before and after the token's own (ours): a step shows in half a second of
+    head sway, not in one frame.
     """
 
     def __init__(
         self, head_size: int, points_size: int, image_size: int, width: int, frames_per_token: int, context: int
     ):  # fmt: skip
         super().__init__()
-        # One more channel says which frames exist: padding would else look like the mean condition.
+        # One more channel marks valid frames: padding would otherwise look like the mean condition.
         self.normalizer = Normalizer(head_size)
         self.widen = Widening(head_size + 1, 2 * width, frames_per_token, context)
         self.points = OptionalInput(points_size, 2 * width, frames_per_token) if points_size else None
@@ -81,20 +81,22 @@ class ConditionEncoder(nn.Module):
 
 
 class LevelPlan(NamedTuple):
-    """What of a step depends on its noise level alone; with a level per step, the same for all windows."""
+    """The part of a step that depends on the noise level alone; with one level per step all windows share it."""
 
     worth: Float[Tensor, "batch #token width"]
+    """Per-channel scale of the encoded x_t (`MotionEncoder.plan`)."""
     blocks: tuple[Float[Tensor, "batch #token modulation"], ...]
+    """Modulation of every adaptive transformer block."""
 
 
 class MotionDenoiser(nn.Module):
     """x̂0 = D(x_t, c, level): one token per frame (or per few frames) through adaptive transformer blocks.
 
-    A token is the sum of what the condition and x_t say about its frames; where x_t joins the conditions the document
-    leaves open. The condition's part, `encode`, is the same in every step of sampling and computed once.
-    `frames_per_token` > 1 is ours: neighbouring frames share a token, which cuts the cost of a window about as many
-    times; `blend` > 0 (ours too) mixes that many neighbouring frames of x̂0, which removes the seams between tokens and
-    most of an unfinished network's jitter. `self_conditioning` (Chen et al. 2023) shows the network its last x̂0.
+    A token is the sum of the encoded condition and the encoded x_t of its frames (the thesis leaves open where x_t
+    enters). The encoded condition (`encode`) is the same in every sampling step and computed once.
+    `frames_per_token` > 1 is ours: neighbouring frames share a token, which divides the cost of a window by about that
+    number; `blend` > 0 (also ours) mixes that many neighbouring frames of x̂0, which removes the seams between tokens
+    and most of a partly trained network's jitter. `self_conditioning` (Chen et al. 2023) also takes in the last x̂0.
     """
 
     def __init__(
@@ -143,7 +145,7 @@ class MotionDenoiser(nn.Module):
     def encode(
         self, conditions: Conditions, valid: Bool[Tensor, "batch time"]
     ) -> Float[Tensor, "batch token width"]:
-        """The conditions' part of every token; `valid` is False on padding."""
+        """The encoded condition of every token; `valid` is False on padding."""
         return self.condition_encoder(conditions, valid)
 
     def forward(
@@ -154,14 +156,14 @@ class MotionDenoiser(nn.Module):
         valid: Bool[Tensor, "batch time"],
         last: Float[Tensor, "batch time motion"] | None = None,
     ) -> Float[Tensor, "batch time motion"]:
-        """x̂0 in normalised motion space from x_t and what `encode` said.
+        """x̂0 in normalised motion space from x_t and the output of `encode`.
 
-        last: with self-conditioning, the x̂0 of the step before (None: there is none yet).
+        last: with self-conditioning, the x̂0 of the previous step (None in the first step).
         """
         return self.step(x_t, self.plan(level), encoded, valid, last)
 
     def plan(self, level: Float[Tensor, "batch #time"]) -> LevelPlan:
-        """The levels' part of a step; sampling computes it once for all windows."""
+        """The level-dependent part of a step; sampling computes it once for all windows."""
         k = self.frames_per_token
         token_level = level if level.shape[1] == 1 else level.unflatten(1, (-1, k)).mean(-1)
         embedded = self.level(token_level)
@@ -177,7 +179,7 @@ class MotionDenoiser(nn.Module):
         valid: Bool[Tensor, "batch time"],
         last: Float[Tensor, "batch time motion"] | None = None,
     ) -> Float[Tensor, "batch time motion"]:
-        """`forward` with what `plan` said of the level, of which one may serve the whole batch."""
+        """`forward` with the level's precomputed plan, which has a batch axis of 1 or of the batch's length."""
         batch, time, _ = x_t.shape
         mask = attention_mask(valid.unflatten(1, (-1, self.frames_per_token)).any(-1))
         if self.self_conditioning:

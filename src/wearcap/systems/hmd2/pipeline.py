@@ -1,4 +1,4 @@
-"""HMD² (thesis ch. 6): environment-aware full-body motion from a head-mounted device by conditional motion diffusion."""
+"""HMD² (thesis ch. 6): environment-aware full-body capture from a head-mounted device by conditional diffusion."""
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -33,40 +33,42 @@ MODALITIES = ("points", "images")
 
 @dataclass
 class HMD2:
-    """Captures whole recordings in overlapping windows (thesis eq. 6.5)."""
+    """Captures whole recordings in overlapping windows (thesis eq. 6.5); its fields also set up streams."""
 
     net: MotionDenoiser
     features: HeadFeatures
     schedule: Schedule
     skeleton: Skeleton
-    """For recordings that do not say whose body it is."""
+    """Skeleton for recordings without one of their own."""
     fps: float
     place_encoder: VoxelAutoencoder | None = None
     image_encoder: str | None = None
     """Name of the encoder whose embeddings the network was trained on."""
     use: Sequence[str] = MODALITIES
-    """Modalities that are listened to, of those that the network knows and a recording has."""
+    """Modalities that condition the model, of those that it was trained on and the recording contains."""
     steps: int = 5
+    """Number of denoising steps."""
     stride: int | None = None
-    """Frames by which windows advance; None: half a window, or with `inpaint` three quarters (the document's 180 of 240)."""
+    """Frames by which windows advance; None: half a window, or with `inpaint` three quarters (thesis: 180 of 240)."""
     eta: float = 1.0
+    """Stochasticity of the steps: 1 samples the posterior (thesis eq. 6.2, 6.3), 0 is DDIM."""
     guidance: float = 1.0
-    """Classifier-free guidance by points and images (Ho & Salimans 2022; ours): 1 leaves it out."""
+    """Scale of classifier-free guidance by points and images (Ho & Salimans 2022; ours); 1 turns it off."""
     live: bool = False
-    """Whether even the floor is told only from what has been sensed by then, as it must be in a stream."""
+    """Whether the floor at a frame is estimated from earlier data only, as it must be in a stream."""
     spacing: float = 1.0
-    """How the steps' levels are spaced (`diffusion.sampler.step_levels`)."""
+    """Spacing of the steps' noise levels (`diffusion.sampler.step_levels`)."""
     inpaint: bool = False
-    """Whether windows hold on to what was said before in every step (thesis eq. 6.5) or say it anew (ours)."""
+    """Whether steps overwrite the overlap with the last window's poses (thesis eq. 6.5) or re-denoise it (ours)."""
     fade: int = 20
-    """Frames over which what windows differ by fades out where one goes on from the other (without `inpaint`)."""
+    """Frames over which the difference between successive windows fades out after their seam (without `inpaint`)."""
     lookahead: int | None = None
-    """Frames that must follow a pose before it is final (ours): what comes next says what the feet are about to do.
-    None: half of what windows share, so that poses come from their middle; with `inpaint` none."""
+    """Frames that must follow a pose before it is final (ours): the next frames show where the feet are going.
+    None: half of the overlap, so that poses come from the windows' middle; with `inpaint` none."""
     runtime: str = "eager"
-    """What the steps run on (`systems.hmd2.step_runner.RUNTIMES`); all but eager take some seconds to begin."""
+    """Backend of the denoising steps (`systems.hmd2.step_runner.RUNTIMES`); all but eager take seconds to start."""
     precision: str = "auto"
-    """Of the steps' products (`systems.hmd2.step_runner.PRECISIONS`)."""
+    """Number format of the steps' matrix products (`systems.hmd2.step_runner.PRECISIONS`)."""
     device: str = "cpu"
     _steps: StepRunner | None = field(default=None, init=False, repr=False, compare=False)
 
@@ -76,7 +78,7 @@ class HMD2:
 
     @property
     def advance(self) -> int:
-        """Frames by which windows advance. Raises WearcapError when the windows would not touch."""
+        """Frames by which windows advance. Raises WearcapError when successive windows would leave a gap."""
         window = self.net.window
         advance = (3 * window // 4 if self.inpaint else window // 2) if self.stride is None else self.stride
         if not 0 < advance <= window:
@@ -86,7 +88,7 @@ class HMD2:
 
     @property
     def lookahead_frames(self) -> int:
-        """Frames at a window's end that are said again. Raises WearcapError where windows do not share as many."""
+        """Frames at a window's end that the next one re-denoises. Raises WearcapError when the overlap is shorter."""
         shared = self.net.window - self.advance
         lookahead_frames = (0 if self.inpaint else shared // 2) if self.lookahead is None else self.lookahead
         if not 0 <= lookahead_frames <= shared:
@@ -98,9 +100,9 @@ class HMD2:
         return self.capture([recording], [seed])[0]
 
     def prepare(self) -> None:
-        """Bring the network to its device and its steps into the form they run in, as every capture does first.
+        """Move the network to its device and set up its runtime, as every capture does first.
 
-        What is compiled or exported is made once, from the weights as they are then.
+        Compilation or export happens once, with the weights of that moment.
         """
         self.net.to(self.device).eval()
         if self._steps is None or self.runtime == "eager":
@@ -108,31 +110,31 @@ class HMD2:
             self._steps = StepRunner(self.net, levels, self.runtime, self.precision)
 
     def undisturbed(self) -> AbstractContextManager[None]:
-        """For windows of few lanes, after `prepare`: nothing else takes the cores from the steps."""
+        """A context for small batches, after `prepare`, in which other threads leave the cores to the steps."""
         assert self._steps is not None
         return self._steps.undisturbed()
 
     @torch.inference_mode()
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per (recording, seed); recordings share batches, which changes nothing but the time."""
+        """One motion per (recording, seed); recordings share batches, which does not change the results."""
         self.prepare()
-        # 1. head path and floor; 2. points around the body as codes; 3. pictures as embeddings; once for all seeds
+        # 1. head path and floor; 2. codes of the points around the body; 3. image embeddings; once for all seeds
         once = {id(recording): recording for recording in recordings}
         path_of = {key: head_path(recording, self.skeleton, self.fps) for key, recording in once.items()}
         sensed = {key: self.sense(recording, path_of[key]) for key, recording in once.items()}
         paths, frames = zip(*((path_of[id(recording)], sensed[id(recording)]) for recording in recordings))
-        # 4. windows of the diffusion model, each stretch of a path by itself
+        # 4. windows of the diffusion model, every stretch of a path separately
         poses = self._windows(paths, frames, seeds)
-        # 5. the body hangs from the measured head
+        # 5. anchor the body to the measured head
         return [
             self.motion(path.timestamps, path.skeleton, path.T_world_head, predicted)
             for path, predicted in zip(paths, poses)
         ]
 
     def sense(self, recording: Recording, path: HeadPath) -> Frames:
-        """Everything that the network is told of a recording, as one lane.
+        """Steps 2 and 3: the conditioning of a whole recording, as a batch of one.
 
-        Raises WearcapError for embeddings that the network does not know.
+        Raises WearcapError for embeddings of an encoder that the network was not trained on.
         """
         count = len(path.timestamps)
         points, points_valid = self._points(recording, path)
@@ -155,21 +157,21 @@ class HMD2:
             image = camera.embedding[number].float()
             image_valid &= image.isfinite().all(-1)
             image = image.nan_to_num(0.0, 0.0, 0.0)
-        item = Frames(
+        frames = Frames(
             path.T_world_head.R, path.T_world_head.t, self._floor(recording, path), points, points_valid,
             image, image_valid, torch.ones(count, dtype=torch.bool),
         )  # fmt: skip
-        return Frames(*(part[None] for part in item))
+        return Frames(*(part[None] for part in frames))
 
-    def _listens_to_points(self, recording: Recording) -> bool:
+    def _uses_points(self, recording: Recording) -> bool:
         return bool(self.net.points_size) and "points" in self.use and recording.points is not None
 
     def _points(
         self, recording: Recording, path: HeadPath
     ) -> tuple[Float[Tensor, "time feature"], Bool[Tensor, "time"]]:
-        """Codes of the points around the body at every frame, of those that had been seen by then."""
+        """Codes of the points around the body that had been seen by each frame, and which frames have them."""
         count, cloud = len(path.timestamps), recording.points
-        if not self._listens_to_points(recording) or self.place_encoder is None or cloud is None:
+        if not self._uses_points(recording) or self.place_encoder is None or cloud is None:
             return torch.zeros(count, self.net.points_size), torch.zeros(count, dtype=torch.bool)
         grid = voxelize(
             cloud.points_world,
@@ -182,31 +184,28 @@ class HMD2:
         return code, torch.ones(count, dtype=torch.bool)
 
     def _floor(self, recording: Recording, path: HeadPath) -> Float[Tensor, "time"]:
-        """Floor beneath the head: from points that are listened to, else from the head's path."""
-        cloud = recording.points if self._listens_to_points(recording) else None
+        """Floor height (m) below the head: from the points where they are used, else from the head's path."""
+        cloud = recording.points if self._uses_points(recording) else None
         if self.live:
             return tracked_floor(cloud, path.timestamps, path.T_world_head.t, path.stature, self.fps)
         floor = floor_from_points(cloud, path.T_world_head.t, path.stature)
         return path.floor_height if floor is None else floor
 
     def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Denoise:
-        """x̂0 of a window as a function of x_t and its level, asked for at the levels of the steps, one after the other.
-
-        What the conditions say, and what the levels do, is computed once.
-        """
+        """x̂0 as a function of x_t, to be called once per sampling step in order; conditions are encoded once."""
         encoded = self.net.encode(conditions, valid)
-        blind = None
+        unguided = None
         if self.guidance != 1.0:
-            nothing = torch.zeros_like(valid)
-            blind = self.net.encode(conditions._replace(points_valid=nothing, image_valid=nothing), valid)
+            none = torch.zeros_like(valid)
+            unguided = self.net.encode(conditions._replace(points_valid=none, image_valid=none), valid)
         steps, number, last = self._steps, 0, None
         assert steps is not None
 
         def denoise(x_t: Tensor, level: Tensor) -> Tensor:
             nonlocal last, number
             x0_hat = steps(number, x_t, encoded, valid, last)
-            if blind is not None:
-                plain = steps(number, x_t, blind, valid, last)
+            if unguided is not None:
+                plain = steps(number, x_t, unguided, valid, last)
                 x0_hat = plain + self.guidance * (x0_hat - plain)
             last, number = x0_hat if self.net.self_conditioning else None, number + 1
             return x0_hat
@@ -216,9 +215,9 @@ class HMD2:
     def _windows(
         self, paths: Sequence[HeadPath], frames: Sequence[Frames], seeds: Sequence[int]
     ) -> list[Poses]:
-        """Poses of every path: its stretches side by side, window after window."""
+        """Step 4: poses of every path, window after window; all stretches of all paths share batches."""
         stride, lookahead_frames, passed = self.advance, self.lookahead_frames, 0
-        done = [no_poses(self, len(path.timestamps)) for path in paths]
+        whole = [no_poses(self, len(path.timestamps)) for path in paths]
         items = [
             (i, start, stop, self.sampler(path.skeleton, seeds[i], start))
             for i, path in enumerate(paths)
@@ -233,22 +232,22 @@ class HMD2:
             for i, start, stop, sampler in items:
                 ended = start + passed >= stop
                 left = 0 if ended else lookahead_frames
-                given, behind = sampler.give(left), min(start + passed, stop) - left
-                for whole, part in zip(done[i], given.poses):
-                    whole[0, behind - part.shape[1] : behind] = part[0]
+                final, end = sampler.finalize(left), min(start + passed, stop) - left
+                for target, part in zip(whole[i], final.poses):
+                    target[0, end - part.shape[1] : end] = part[0]
             items = [item for item in items if item[1] + passed < item[2]]
         return [
-            _bridged(Poses(*(part[0] for part in poses)), path.stretches) for poses, path in zip(done, paths)
+            _bridged(Poses(*(part[0] for part in poses)), path.stretches) for poses, path in zip(whole, paths)
         ]
 
     def sampler(self, skeleton: Skeleton, seed: int, start: int) -> WindowSampler:
-        """Windows of a stretch that begins at frame `start`; stretches of one recording have noise of their own."""
+        """A sampler for the stretch that begins at frame `start`; every stretch of a recording has its own noise."""
         return WindowSampler(self, body_size(skeleton), seed + 1_000_003 * start)
 
     def motion(
         self, timestamps: Float64[Tensor, "time"], skeleton: Skeleton, T_world_head: Rigid, poses: Poses
     ) -> Motion:
-        """Step 5: poses without the lane axis as a motion that hangs from the measured head."""
+        """Step 5: poses (without the batch axis) as a motion that is anchored to the measured head."""
         settings = {
             "pipeline": "hmd2",
             "steps": str(self.steps),
@@ -269,7 +268,7 @@ class HMD2:
 
 
 def _cut(frames: Frames, start: int, stop: int, length: int) -> Frames:
-    """`length` frames from `start`; behind `stop` the last one is repeated as not valid."""
+    """`length` frames from `start`; from `stop` on the last frame is repeated and marked as not valid."""
     take = torch.arange(start, start + length)
     there = take < stop
     cut = Frames(*(part[:, take.clamp_max(stop - 1)] for part in frames))
@@ -277,7 +276,7 @@ def _cut(frames: Frames, start: int, stop: int, length: int) -> Frames:
 
 
 def _bridged(poses: Poses, stretches: tuple[tuple[int, int], ...]) -> Poses:
-    """Frames between stretches turn from the pose before to the pose behind."""
+    """Poses with the frames between stretches interpolated (slerp) from the last pose before to the first one after."""
     for (_, before), (after, _) in pairwise(stretches):
         if after > before:
             R = poses.R_parent_joint

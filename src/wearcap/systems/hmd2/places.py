@@ -1,4 +1,4 @@
-"""What a stream remembers of the places around its wearer, and what it tells of them."""
+"""A stream's map of the points around its wearer: voxel grids for the model, and the floor below the head."""
 
 from dataclasses import dataclass
 
@@ -12,17 +12,17 @@ from wearcap.scene.voxels import VoxelGrid, VoxelMap
 from wearcap.tracking.floor import LOOK_FRAMES, FloorTracker
 
 MANY = 4
-"""So many times the points that a stream may keep are too many, even while the head is not tracked."""
+"""Factor of `Memory.max_points` above which old points are dropped even while the head is not tracked."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """How much of the points a stream keeps. Whoever comes back to a place that was forgotten must be shown it again."""
+    """Limits on the points that a stream keeps. Points that were dropped do not return when the wearer does."""
 
     radius_m: float = 20.0
-    """Points so far away (horizontally) are forgotten, at the latest when the wearer has walked half of it; inf: none."""
+    """Horizontal distance (m) beyond which points are dropped, at the latest after walking half of it; inf: never."""
     max_points: int = 1_000_000
-    """Of more, the newer half is kept (about 100 bytes each)."""
+    """Number of points (about 100 bytes each) above which only the newest are kept, half as many."""
 
     def __post_init__(self):
         if not self.radius_m >= 5.0 or self.max_points < 1000:
@@ -31,42 +31,42 @@ class Memory:
 
 
 class Places:
-    """Points around one wearer and the floor beneath, as seen so far."""
+    """Points around one wearer and the floor below, as seen so far."""
 
     def __init__(self, grid: VoxelGrid, stature: float, fps: float, memory: Memory):
         """`stature` is the head joint's height in the rest pose (m)."""
         self.grid, self.memory = grid, memory
         self.mapped = False
-        """Whether points ever came, be it none of them."""
+        """Whether any packet of points arrived, even an empty one."""
         self._about = stature, fps
         self._map, self._floor = VoxelMap(grid), FloorTracker(stature, fps)
-        self._known: list[tuple[Tensor, Tensor]] = []
-        """Points, and when they were seen, that the floor's tracker knows …"""
+        self._tracked: list[tuple[Tensor, Tensor]] = []
+        """Points and the times they were first seen, as far as the floor tracker has them."""
         self._new: list[tuple[Tensor, Tensor]] = []
-        """… and those of frames to come."""
+        """Points and times that the floor tracker does not have yet, since no frame has reached those times."""
         self._center: Tensor | None = None
-        """Where points were forgotten last."""
+        """Head position at which distant points were dropped last (m)."""
 
     def state(self) -> dict[str, Tensor]:
-        points, seen = _joined(self._known + self._new)
-        observed = torch.tensor([len(_joined(self._known)[0]), self.mapped])
+        points, seen = _joined(self._tracked + self._new)
+        counts = torch.tensor([len(_joined(self._tracked)[0]), self.mapped])
         center = torch.zeros(0) if self._center is None else self._center
-        here = {"points": points, "seen": seen, "known": observed, "center": center}
+        here = {"points": points, "seen": seen, "known": counts, "center": center}
         return here | {f"floor.{name}": part for name, part in self._floor.state().items()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        observed, mapped = state["known"].tolist()
+        tracked, mapped = state["known"].tolist()
         self.mapped, points, seen = bool(mapped), state["points"], state["seen"]
         self._center = state["center"] if len(state["center"]) else None
-        self._new = [(points[observed:], seen[observed:])]
+        self._new = [(points[tracked:], seen[tracked:])]
         self._map.add(*self._new[0])
         floor = {
             name.removeprefix("floor."): part for name, part in state.items() if name.startswith("floor.")
         }
-        self._begin([(points[:observed], seen[:observed])], floor)
+        self._begin([(points[:tracked], seen[:tracked])], floor)
 
     def add(self, points_world: Float[Tensor, "point 3"], first_seen: float) -> None:
-        """Take in points (m) that were seen first at a time (s); those that are not finite are left out."""
+        """Add points (m) that were first seen at a time (s); points that are not finite are left out."""
         points = points_world.detach().float().cpu()
         points = points[points.isfinite().all(-1)]
         seen = torch.full((len(points),), first_seen, dtype=torch.float64)
@@ -77,27 +77,27 @@ class Places:
             self._drop_oldest()
 
     def _drop_oldest(self) -> None:
-        """While no frame comes that would forget points, the newest packets of them stay."""
+        """Keep only the newest packets of new points, for when no frame arrives that would drop distant ones."""
         kept, count = [], 0
         while self._new and (not kept or count + len(self._new[-1][0]) <= self.memory.max_points):
             kept.append(self._new.pop())
             count += len(kept[-1][0])
-        observed = [_joined(self._known)]
+        tracked = [_joined(self._tracked)]
         self._map, self._new = VoxelMap(self.grid), kept[::-1]
         for part in self._new:
             self._map.add(*part)
-        self._begin(observed, self._floor.state())
+        self._begin(tracked, self._floor.state())
 
     def grids(
         self, T_world_device: Rigid, timestamps: Float64[Tensor, "time"]
     ) -> Float[Tensor, "time x y z"]:
-        """Grids of the points seen by each frame's time."""
+        """Voxel grids (m) around the device at each frame, of the points seen by then."""
         return self._map.voxelize(T_world_device, timestamps)
 
     def floor(
         self, timestamps: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]
     ) -> Float[Tensor, "time"]:
-        """Floor height (m) beneath the next frames of the head; looks as `tracking.floor.tracked_floor` does."""
+        """Floor height (m) below the head at the next frames, updated as in `tracking.floor.tracked_floor`."""
         parts, done = [], 0
         while done < len(timestamps):
             if self._floor.frames % LOOK_FRAMES == 0:
@@ -109,23 +109,23 @@ class Places:
         return torch.cat(parts)
 
     def _show(self, until: float) -> None:
-        """Show the floor's tracker what was seen by then."""
+        """Give the floor tracker the points that were seen by the time `until` (s)."""
         shown = [part for part in self._new if len(part[1]) and part[1][0] <= until]
         if shown:
             self._new = [part for part in self._new if len(part[1]) and part[1][0] > until]
-            self._known.append(_joined(shown))
-            self._floor.see(self._known[-1][0])
-        if len(self._known) > 1000:
-            self._known = [_joined(self._known)]
+            self._tracked.append(_joined(shown))
+            self._floor.see(self._tracked[-1][0])
+        if len(self._tracked) > 1000:
+            self._tracked = [_joined(self._tracked)]
 
     def _forget(self, t_world_head: Float[Tensor, "3"]) -> None:
-        """Once the wearer has gone far, or points are many, leave out what is far and old."""
+        """Drop distant and old points once the wearer has walked far or there are too many points."""
         center = t_world_head if self._center is None else self._center
         self._center, moved = center, float((t_world_head - center)[:2].norm())
         if moved < 0.5 * self.memory.radius_m and len(self._map) <= self.memory.max_points:
             return
         self._center = t_world_head
-        points, seen = _joined(self._known)
+        points, seen = _joined(self._tracked)
         near = (points - t_world_head)[:, :2].norm(dim=-1) <= self.memory.radius_m
         points, seen = points[near], seen[near]
         if len(points) > self.memory.max_points // 2:
@@ -135,11 +135,11 @@ class Places:
             self._map.add(*part)
         self._begin([(points, seen)], self._floor.state())
 
-    def _begin(self, observed: list[tuple[Tensor, Tensor]], floor: dict[str, Tensor]) -> None:
-        """Go on with these known points alone."""
-        self._known, self._floor = observed, FloorTracker(*self._about)
+    def _begin(self, tracked: list[tuple[Tensor, Tensor]], floor: dict[str, Tensor]) -> None:
+        """Restart the floor tracker from its state with these points, and add them to the map."""
+        self._tracked, self._floor = tracked, FloorTracker(*self._about)
         self._floor.restore(floor)
-        for points, seen in observed:
+        for points, seen in tracked:
             self._map.add(points, seen)
             self._floor.see(points)
 

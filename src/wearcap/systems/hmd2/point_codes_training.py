@@ -13,7 +13,7 @@ from wearcap.training.base import GivenOptimizer
 
 
 class VoxelReconstruction(GivenOptimizer):
-    """Grids are encoded and rebuilt; the loss is the network's own."""
+    """Trains an autoencoder of voxel grids by the network's own reconstruction loss."""
 
     def __init__(
         self,
@@ -26,7 +26,7 @@ class VoxelReconstruction(GivenOptimizer):
         self._optimizer, self._scheduler = optimizer, scheduler
 
     def set_statistics(self, dataset: PlaceDataset, limit: int = 1500) -> None:
-        """Take first weights from a training split; a resumed run brings its own."""
+        """Initialise the weights from a training split; a resumed run loads its own."""
         random = torch.Generator().manual_seed(0)
         drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
         self.net.start_from(collate([dataset[item] for item in zip(drawn, range(limit))]).grids.flatten(0, 1))

@@ -1,4 +1,4 @@
-"""Grids of the points around the body, drawn from recordings; content and order are functions of seed and step."""
+"""Voxel grids of the points around the body, sampled from recordings as a function of seed and step."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,14 +21,14 @@ _MAPS_AT_ONCE = 512
 
 
 class Places(NamedTuple):
-    """Grids (m) of some frames, or a batch of such (a leading "batch" axis)."""
+    """Voxel grids (truncated distances, m) of some frames, or a batch of them (a leading "batch" axis)."""
 
     grids: Float[Tensor, "*batch time x y z"]
 
 
 @dataclass(frozen=True)
 class Surveyed:
-    """The head's path through a recording's points."""
+    """A recording's map of points, and the device's path through it."""
 
     map: VoxelMap
     T_world_device: Rigid
@@ -36,9 +36,9 @@ class Surveyed:
 
 
 class PlaceDataset(Dataset):
-    """A few frames' grids out of each window of a split, of recordings that have points.
+    """Voxel grids of random frames of each window of a split, of recordings that have points.
 
-    An item is asked for by (window, seed), or by its window alone.
+    Items are indexed by (window, seed), or by window alone.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class PlaceDataset(Dataset):
     ):  # fmt: skip
         """`frames` are drawn from every window of `window` frames; `balance`: see `WindowDataset`.
 
-        Raises WearcapError where no recording has points, and what `share_out` raises.
+        Raises WearcapError when no recording has points, and as `share_out` does.
         """
         self.grid, self.window, self.frames, self.mirror = grid, window, frames, mirror
         self.recordings, starts, weights = share_out(
@@ -89,7 +89,7 @@ def _survey(path: Path, grid: VoxelGrid) -> Surveyed:
 
 
 class PlaceWindows(SeededWindows):
-    """Grids of the points around the body, for their autoencoder."""
+    """Lightning data of the voxel autoencoder's training."""
 
     def __init__(
         self,

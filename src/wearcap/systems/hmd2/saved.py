@@ -1,4 +1,4 @@
-"""A stream of HMD² on disk: written whole, and read back from a file that anybody may have made."""
+"""Saving and loading an HMD² session; files are untrusted and checked completely."""
 
 import json
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from wearcap.systems.hmd2.wearer import Wearer, WearerState
 
 _KEY = "wearcap_stream"
 _DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError)
-"""What reading a damaged file raises somewhere below."""
+"""Exceptions that reading a damaged file may raise."""
 _DOUBLE, _FLOAT, _BOOL = torch.float64, torch.float32, torch.bool
 _ALWAYS = {
     "track.numbers": (_DOUBLE, "6"), "track.times": (_DOUBLE, "pose"), "track.R": (_FLOAT, "pose 3 3"),
@@ -47,7 +47,7 @@ _WAITING = {
 
 
 class Saved(NamedTuple):
-    """What a file says of a session."""
+    """The contents of a session file."""
 
     wearers: list[WearerState]
     memory: Memory
@@ -55,7 +55,7 @@ class Saved(NamedTuple):
 
 
 def write(path: str | Path, pipeline: HMD2, wearers: Sequence[WearerState], embedded: bool) -> None:
-    """Write everything that the poses to come depend on, but the pipeline."""
+    """Write everything that future poses depend on, except the pipeline."""
     tensors, about = {}, []
     for i, wearer in enumerate(wearers):
         tree, own = flatten(wearer.wearer, f"{i}.wearer")
@@ -72,9 +72,9 @@ def write(path: str | Path, pipeline: HMD2, wearers: Sequence[WearerState], embe
 
 
 def read(path: str | Path, pipeline: HMD2) -> Saved:
-    """What was written, for the pipeline that it ran with.
+    """Read a session for the pipeline that it ran with.
 
-    Raises WearcapError for a file that is no session's or is damaged, and for a pipeline with other settings.
+    Raises WearcapError for a file that is no session or is damaged, and for a pipeline with other settings.
     """
     try:
         with safetensors.safe_open(str(path), framework="pt") as file:
@@ -99,7 +99,7 @@ def read(path: str | Path, pipeline: HMD2) -> Saved:
 def _restored(
     number: int, about: Any, tensors: dict[str, Tensor], pipeline: HMD2, memory: Memory
 ) -> WearerState:
-    """One wearer; raises one of `_DAMAGE` where something is missing or of another shape."""
+    """Restore one wearer; raises one of `_DAMAGE` when something is missing or has another shape."""
     wearer = unflatten(about["wearer"], tensors.__getitem__, KNOWN | {"Wearer": Wearer})
     _require(isinstance(wearer, Wearer) and isinstance(wearer.skeleton, Skeleton), "no wearer")
     _require_shapes(
@@ -119,7 +119,7 @@ def _restored(
 
 
 def _require_state(state: dict[str, Tensor], pipeline: HMD2) -> None:
-    """Raise ValueError unless these are the tensors of `WearerState.state`."""
+    """Raise ValueError unless these are valid tensors of `WearerState.state`."""
     net = pipeline.net
     sizes = {
         "joints": pipeline.features.joints, "steps": pipeline.steps, "motion_size": net.motion_size,
@@ -132,7 +132,9 @@ def _require_state(state: dict[str, Tensor], pipeline: HMD2) -> None:
         expected |= {n: kind for name, kind in _WAITING.items() if (n := f"door.{k}.{name}") in state}
     _require(state.keys() == expected.keys(), "missing or foreign tensors")
     _require_shapes(state, expected, sizes)
-    _require(0 <= state["places.known"][0] <= len(state["places.points"]), "more points known than there are")
+    _require(
+        0 <= state["places.known"][0] <= len(state["places.points"]), "more tracked points than there are"
+    )
     _require(len(state["places.center"]) in (0, 3), "no place")
     _require(len(state["door.numbers"]) in (4, 7), "no place")
     _require(state.get("sampler.noise", torch.zeros(1, 0)).shape[1] <= net.window, "a longer window")
@@ -141,7 +143,7 @@ def _require_state(state: dict[str, Tensor], pipeline: HMD2) -> None:
 def _require_shapes(
     tensors: dict[str, Tensor], kinds: dict[str, tuple[torch.dtype, str]], sizes: dict[str, int]
 ) -> None:
-    """Raise ValueError unless tensors are of these types and shapes; axes of one name are equally long."""
+    """Raise ValueError unless tensors have these types and shapes; axes with the same name have equal lengths."""
     sizes = dict(sizes)
     for name, (dtype, axes) in kinds.items():
         shape, tensor = axes.split(), tensors[name]
@@ -157,7 +159,7 @@ def _require(fine: bool | Tensor, what: str) -> None:
 
 
 def _settings(pipeline: HMD2) -> dict[str, float | str]:
-    """What of a pipeline the state depends on."""
+    """The settings of a pipeline that the state depends on."""
     net = pipeline.net
     return {
         "window": net.window, "stride": pipeline.advance, "steps": pipeline.steps, "fps": pipeline.fps,

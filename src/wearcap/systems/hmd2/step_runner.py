@@ -1,4 +1,4 @@
-"""The steps of a sampler by the fastest means at hand: the levels' part ready-made, the rest by PyTorch or ONNX Runtime."""
+"""Runs denoising steps with precomputed level plans, in PyTorch (eager or compiled) or ONNX Runtime."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -12,16 +12,17 @@ from wearcap.runtime.onnx import missing_libraries, onnx_runner, undisturbed
 from wearcap.systems.hmd2.model import LevelPlan, MotionDenoiser
 
 RUNTIMES = ("auto", "eager", "compile", "onnx")
-"""auto: on a GPU compiled (CUDA graphs), elsewhere ONNX Runtime where it is installed, else eager."""
+"""Backends; auto: compiled (CUDA graphs) on a GPU, else ONNX Runtime where it is installed, else eager."""
 PRECISIONS = ("auto", "narrowest", "float32", "bfloat16", "int8")
-"""auto: bfloat16 on a GPU, else float32. narrowest: int8 with ONNX Runtime, too. int8 (weights, and activations as they come) with ONNX Runtime alone."""
+"""Number formats; auto: bfloat16 on a GPU, else float32; narrowest: as auto, but int8 with ONNX Runtime.
+int8 (weights, and dynamically quantised activations) needs ONNX Runtime."""
 
 Step = Callable[[Tensor, LevelPlan, Tensor, Tensor, Tensor | None], Tensor]
-"""x̂0 from x_t, its level's plan, what `encode` said, `valid`, and the last x̂0 (with self-conditioning)."""
+"""x̂0 from x_t, its level's plan, the encoded conditions, `valid`, and the last x̂0 (with self-conditioning)."""
 
 
 class StepGraph(nn.Module):
-    """One step of a denoiser with its level's plan as tensors of one level: what is compiled or exported."""
+    """One denoising step with its level's plan as plain tensors: the graph that is compiled or exported."""
 
     def __init__(self, net: MotionDenoiser):
         super().__init__()
@@ -40,7 +41,7 @@ class StepGraph(nn.Module):
 
 
 class StepRunner:
-    """x̂0 at a fixed row of levels, for any number of windows. The network's weights must not change while it is used."""
+    """x̂0 at a fixed sequence of levels, for any batch size. The network's weights must not change while it is used."""
 
     def __init__(
         self,
@@ -54,7 +55,7 @@ class StepRunner:
         device = net.motion_normalizer.mean.device
         runtime, precision = _chosen(runtime, precision, device)
         self.runtime = runtime
-        """What was chosen."""
+        """The chosen backend, never "auto"."""
         with torch.inference_mode():
             self._plans = [net.plan(level.reshape(1, 1)) for level in levels.to(device)]
         self._step = _step_of(net, runtime, precision)
@@ -67,21 +68,21 @@ class StepRunner:
         valid: Bool[Tensor, "batch time"],
         last: Float[Tensor, "batch time motion"] | None = None,
     ) -> Float[Tensor, "batch time motion"]:
-        """x̂0 at level `number` of the row."""
+        """x̂0 at level `number` of the sequence."""
         if self.net.self_conditioning and last is None:
             last = torch.zeros_like(x_t)
         return self._step(x_t, self._plans[number], encoded, valid, last)
 
     def undisturbed(self) -> AbstractContextManager[None]:
-        """For few small windows: nothing else takes the cores from the steps."""
+        """A context for small batches in which PyTorch's threads leave the cores to ONNX Runtime's."""
         return undisturbed(self.runtime == "onnx")
 
 
 def _chosen(runtime: str, precision: str, device: torch.device) -> tuple[str, str]:
-    for what, value, observed in (("runtime", runtime, RUNTIMES), ("precision", precision, PRECISIONS)):
-        if value not in observed:
+    for what, value, allowed in (("runtime", runtime, RUNTIMES), ("precision", precision, PRECISIONS)):
+        if value not in allowed:
             raise WearcapError(
-                f"no {what} {value!r}", expected=f"one of {', '.join(observed)}", fix=nearest(value, observed)
+                f"no {what} {value!r}", expected=f"one of {', '.join(allowed)}", fix=nearest(value, allowed)
             )
     missing = missing_libraries()
     if runtime == "auto":
@@ -112,22 +113,22 @@ def _step_of(net: MotionDenoiser, runtime: str, precision: str) -> Step:
         )
 
         def step(x_t: Tensor, plan: LevelPlan, encoded: Tensor, valid: Tensor, last: Tensor | None) -> Tensor:
-            # What a CUDA graph gives out is overwritten when it is replayed.
+            # Outputs of a CUDA graph are overwritten when it is replayed.
             return compiled(x_t, plan.worth, torch.stack(plan.blocks), encoded, valid, last).clone()
 
     if precision == "float32":
         return step
 
-    def narrow(x_t: Tensor, *conditions) -> Tensor:
-        # Norms stay in float32 under autocast, and so does the sampler, which sees what comes out.
+    def narrow(x_t: Tensor, *others) -> Tensor:
+        # Norms stay in float32 under autocast; the sampler gets float32 outputs.
         with torch.autocast(x_t.device.type, torch.bfloat16):
-            return step(x_t, *conditions).float()
+            return step(x_t, *others).float()
 
     return narrow
 
 
 def _onnx_step(net: MotionDenoiser, precision: str) -> Step:
-    """The step in ONNX Runtime."""
+    """The denoising step in ONNX Runtime."""
     batch, tokens, width = 2, net.window // net.frames_per_token, net.motion_encoder.linear.out_features
     x_t = torch.zeros(batch, net.window, net.motion_size)
     inputs = {

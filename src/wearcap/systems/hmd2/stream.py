@@ -1,7 +1,7 @@
-"""HMD² while things happen: moments go in as they come, poses come out every `stride` frames (thesis eq. 6.5).
+"""Streaming HMD²: sensor packets go in as they arrive, poses come out every `stride` frames (thesis eq. 6.5).
 
-Windows, noise and hanging are those of `HMD2.capture`: with the same seed, and a pipeline that is `live` (its floor is
-what had been seen by then), the poses are the same. Memory is that of a window and of the points that are kept.
+Windows, noise and anchoring are those of `HMD2.capture`: with the same seed, and a pipeline that is `live` (its floor
+uses earlier data only), the poses are the same. Memory is bounded by a window and the points that are kept.
 """
 
 from collections.abc import Sequence
@@ -26,21 +26,21 @@ __all__ = ["Sensed", "Session", "Wearer", "joined"]
 
 
 class Session:
-    """A streaming capture of one or several wearers with one pipeline; each has a clock of their own.
+    """A streaming capture of one or several wearers with one pipeline; every wearer has their own clock.
 
-    Poses wait until `stride` frames, and the `lookahead_frames` ones behind them, have come; what waits at a gap is given with what
-    comes behind it. Moments may come late or out of order within those frames; later ones
-    count as `dropped` (their points and pictures still serve). A pose that is missing or refused is interpolated;
-    at a chunk's end, where no newer one is known yet, the last is held, and put right for the windows that follow.
-    After a gap or jump (`hmd2.MAX_GAP_S`, `MAX_SPEED_M_S`) the capture begins anew, and nothing is said of the gap.
-    What cannot be true (`sensors.packets`) is `refused`, and concerns nobody else. Where a wearer's clock goes back
-    for good, that wearer's capture begins anew as a new session would.
+    Poses are output once `stride` frames, and `lookahead_frames` after them, have arrived; poses pending at a gap are
+    output with the next ones. Packets may be late or out of order within those frames; poses that are later still count
+    as `dropped` (their points and embeddings are used). A missing or refused head pose is interpolated; at a chunk's
+    end, before a newer one has arrived, the last pose is repeated, and corrected for the windows that follow.
+    After a gap or jump (`tracking.head_path.MAX_GAP_S`, `MAX_SPEED_M_S`) the capture restarts; gaps get no poses.
+    Implausible values (`sensors.packets`) are `refused` without affecting other wearers. When a wearer's clock is
+    reset, that wearer's capture restarts as in a new session.
     """
 
     def __init__(
         self, pipeline: HMD2, wearers: Sequence[Wearer], seeds: Sequence[int], memory: Memory | None = None
     ):
-        """Raises WearcapError when there is not one seed per wearer, or for a stride or lookahead that the windows cannot have."""
+        """Raises WearcapError when there is not one seed per wearer, or for a stride or lookahead that does not fit."""
         if len(wearers) != len(seeds) or not wearers:
             raise WearcapError(
                 f"{len(seeds)} seeds for {len(wearers)} wearers", expected="one for each wearer"
@@ -51,65 +51,65 @@ class Session:
             memory or Memory(),
             pipeline.lookahead_frames,
         )
-        self._items = [
+        self._wearers = [
             WearerState(pipeline, wearer, seed, self.memory) for wearer, seed in zip(wearers, seeds)
         ]
         self._embedded = False
-        """Whether an embedding of the right length has come."""
+        """Whether an embedding of the right length has arrived."""
 
     @property
     def dropped(self) -> list[int]:
-        """Poses of each wearer that came too late, twice, or were refused."""
-        return [item.dropped for item in self._items]
+        """Number of each wearer's poses that were late, duplicated or refused."""
+        return [state.dropped for state in self._wearers]
 
     @property
     def refused(self) -> list[dict[str, int]]:
-        """How many packets, or parts of them, of each wearer were refused, by reason: "head: not a rotation"."""
-        return [dict(item.door.refused) for item in self._items]
+        """Number of each wearer's refused packets, or parts of packets, by reason ("head: not a rotation")."""
+        return [dict(state.door.refused) for state in self._wearers]
 
     def push(self, sensed: Sequence[Sequence[Sensed]]) -> list[Motion | None]:
-        """Take in each wearer's new moments (any number, also none); poses of each whose next frames are complete.
+        """Process each wearer's new packets (any number, also none); returns each wearer's newly final poses or None.
 
-        Where a clock has gone back these are the poses before; those with the new times come with the next push.
-        Raises WearcapError, and takes nothing in, for embeddings of another length than the network knows where none
-        of the right length has come yet; later ones are refused.
+        When a clock was reset, these are the poses before the reset; poses at the new times follow with the next push.
+        Raises WearcapError, without processing anything, for an embedding of another length than the network's as long
+        as none of the right length has arrived; later ones are refused.
         """
-        if len(sensed) != len(self._items):
-            raise WearcapError(f"moments of {len(sensed)} wearers", expected=f"of {len(self._items)}, as the session has")  # fmt: skip
+        if len(sensed) != len(self._wearers):
+            raise WearcapError(f"packets of {len(sensed)} wearers", expected=f"of {len(self._wearers)}, as the session has")  # fmt: skip
         if not self._embedded:
             self._require_embeddings(sensed)
         before: dict[int, list[Motion]] = {}
         for i, moments in enumerate(sensed):
             for moment in moments:
-                before.setdefault(i, []).extend(self._take(i, self._items[i].admit(moment)))
+                before.setdefault(i, []).extend(self._take(i, self._wearers[i].admit(moment)))
         begun = {i for i, parts in before.items() if parts}
-        predicted = self._run([i for i in range(len(self._items)) if i not in begun], ended=False)
+        predicted = self._run([i for i in range(len(self._wearers)) if i not in begun], ended=False)
         return [joined(before[i]) if i in begun else motion for i, motion in enumerate(predicted)]
 
     def flush(self) -> list[Motion | None]:
-        """Poses of the frames that still wait, when nothing more will come."""
-        for item in self._items:
-            for _, moment in item.door.end():
-                item.take(moment)
-        return self._run(range(len(self._items)), ended=True)
+        """Poses of all remaining frames, at the end of the stream."""
+        for state in self._wearers:
+            for _, moment in state.door.end():
+                state.take(moment)
+        return self._run(range(len(self._wearers)), ended=True)
 
     def _take(self, number: int, admitted: Admitted) -> list[Motion]:
-        """Take in one wearer's moments; the poses left from before, where the clock begins anew with them."""
-        item, left = self._items[number], []
+        """Process one wearer's accepted packets; returns the poses that remained before a reset of the clock."""
+        state, left = self._wearers[number], []
         if admitted.begins:
             last = self._run([number], ended=True)[number] if admitted.again else None
             left = [] if last is None else [last]
-            item.begin()
+            state.begin()
         for _, moment in admitted.packets:
-            item.take(moment)
+            state.take(moment)
         return left
 
     def _require_embeddings(self, sensed: Sequence[Sequence[Sensed]]) -> None:
         size = self.pipeline.net.image_size
-        for item, moments in zip(self._items, sensed):
+        for state, moments in zip(self._wearers, sensed):
             for moment in moments:
                 embedding = getattr(moment, "embedding", None)
-                if not item.shows_pictures or not isinstance(embedding, Tensor) or embedding.ndim != 1:
+                if not state.shows_pictures or not isinstance(embedding, Tensor) or embedding.ndim != 1:
                     continue
                 if embedding.shape == (size,):
                     self._embedded = True
@@ -119,49 +119,49 @@ class Session:
 
     def _run(self, wearers: Sequence[int], ended: bool) -> list[Motion | None]:
         """The next poses of some wearers; None for the others."""
-        predicted: list[list[Motion]] = [[] for _ in self._items]
-        while chunks := {i: chunk for i in wearers if (chunk := self._items[i].track.next(ended))}:
+        predicted: list[list[Motion]] = [[] for _ in self._wearers]
+        while chunks := {i: chunk for i in wearers if (chunk := self._wearers[i].track.next(ended))}:
             for i, chunk in chunks.items():
                 if chunk.begins:
-                    predicted[i] += self._items[i].give(0)
+                    predicted[i] += self._wearers[i].finalize(0)
             with self.pipeline.undisturbed():
                 self._advance(chunks)
             for i in chunks:
-                predicted[i] += self._items[i].give(self._lookahead_frames)
+                predicted[i] += self._wearers[i].finalize(self._lookahead_frames)
         for i in wearers if ended else ():
-            predicted[i] += self._items[i].give(0)
+            predicted[i] += self._wearers[i].finalize(0)
         return [joined(parts) for parts in predicted]
 
     @torch.inference_mode()
     def _advance(self, chunks: dict[int, Chunk]) -> None:
-        """Say one chunk of some wearers, in one batch."""
+        """Sample the next chunk of some wearers, in one batch."""
         samplers, fresh = [], []
         for i, chunk in chunks.items():
-            item = self._items[i]
-            T_device_head = Rigid(item.wearer.R_head_device, item.wearer.t_head_device).inverse()
-            fresh.append(item.frames(chunk, chunk.T_world_device @ T_device_head))
-            item.times = torch.cat([item.times, chunk.timestamps])
-            if chunk.begins or item.sampler is None:
-                item.sampler = self.pipeline.sampler(item.wearer.skeleton, item.seed, chunk.first)
+            state = self._wearers[i]
+            T_device_head = Rigid(state.wearer.R_head_device, state.wearer.t_head_device).inverse()
+            fresh.append(state.frames(chunk, chunk.T_world_device @ T_device_head))
+            state.times = torch.cat([state.times, chunk.timestamps])
+            if chunk.begins or state.sampler is None:
+                state.sampler = self.pipeline.sampler(state.wearer.skeleton, state.seed, chunk.first)
             elif len(chunk.corrected.t):
-                item.sampler.correct(chunk.corrected @ T_device_head)
-            samplers.append(item.sampler)
+                state.sampler.correct(chunk.corrected @ T_device_head)
+            samplers.append(state.sampler)
         advance(samplers, fresh)
 
     def save(self, path: str | Path) -> None:
-        """Write everything that the poses to come depend on, but the pipeline (.safetensors)."""
-        write(path, self.pipeline, self._items, self._embedded)
+        """Write everything that future poses depend on, except the pipeline (.safetensors)."""
+        write(path, self.pipeline, self._wearers, self._embedded)
 
     @classmethod
     def load(cls, path: str | Path, pipeline: HMD2) -> "Session":
-        """The session that was saved, with the pipeline that it ran with.
+        """Restore a saved session with the pipeline that it ran with.
 
-        Raises WearcapError for a file that is no session's or is damaged, and for a pipeline with other settings.
+        Raises WearcapError for a file that is no session or is damaged, and for a pipeline with other settings.
         """
         saved = read(path, pipeline)
         wearers, seeds = zip(*((state.wearer, state.seed) for state in saved.wearers))
         session = cls(pipeline, wearers, seeds, saved.memory)
-        session._items, session._embedded = saved.wearers, saved.embedded
+        session._wearers, session._embedded = saved.wearers, saved.embedded
         return session
 
 

@@ -21,17 +21,17 @@ from wearcap.training import losses
 from wearcap.training.base import SeededSteps, WeighedTerms
 
 _TAIL_FRAMES = 20
-"""Within which the weight of a window's last frames falls off."""
+"""Decay length, in frames, of the extra loss weight of a window's last frames."""
 
 
 class MotionDiffusion(SeededSteps, WeighedTerms):
     """x0-prediction under one noise level per window; loss terms are weighed by `loss_weights`.
 
-    "motion" is the document's plain MSE; "joints", "velocity" and "skate" are ours (0 leaves them out). Levels are drawn
-    with a density that grows with the level to the power of `level_tilt`: 0 draws them uniformly, as the document does;
-    more (ours) trains what sampling in few steps depends on, the way from noise to a first guess. Points and images are
-    each replaced by their null token in a share `drop` of the windows, so that one checkpoint runs with any of them.
-    A window's last frames weigh up to 1 + `tail` in the loss (ours): in small strides they are what is said.
+    "motion" is the thesis's plain MSE; "joints", "velocity" and "skate" are ours (0 leaves them out). Levels are drawn
+    with a density proportional to the level to the power of `level_tilt`: 0 draws them uniformly, as the thesis does;
+    more (ours) favours high noise levels, on which sampling in few steps depends. Points and images are each replaced
+    by their null vector with probability `drop` per window, so that one checkpoint runs with any subset of them.
+    A window's last frames weigh up to 1 + `tail` in the loss (ours): with small strides they are the output.
     """
 
     def __init__(
@@ -53,8 +53,8 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
         seed: int = 0,
         compile: bool = False,
     ):
-        """`place_encoder` (frozen, thesis §6.2) makes the points' codes, the encoder of the name `image_encoder` the
-        embeddings of `image_size`; None leaves that modality out."""
+        """`place_encoder` (frozen, thesis §6.2) encodes the points; `image_encoder` names the encoder of the image
+        embeddings, `image_size` features each. None leaves that modality out."""
         super().__init__()
         self.net = net(
             motion_size=features.motion_size, condition_size=features.condition_size,
@@ -68,12 +68,12 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
         self._feet = [
             skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")
         ]
-        # Methods, not modules, which would put every weight into checkpoints a second time.
+        # Methods, since compiled modules would put every weight into checkpoints a second time.
         self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
         self._encode = torch.compile(self.net.encode) if compile else self.net.encode
 
     def set_statistics(self, dataset: WindowDataset) -> None:
-        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        """Compute normalisation from a training split; a resumed run loads it with the weights."""
         _require_same_inputs(self, dataset)
         statistics = feature_statistics(dataset, self.features)
         self.net.motion_normalizer.set(*statistics["motion"])
@@ -86,30 +86,30 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
             self.place_encoder.load_state_dict(dataset.surroundings.places.encoder.state_dict())
 
     def pipeline_parts(self) -> dict[str, Any]:
-        """What `HMD2` is built around."""
+        """Constructor arguments of `HMD2` that belong to the trained model."""
         return {
             "net": self.net, "features": self.features, "schedule": self.schedule, "skeleton": self.skeleton,
             "fps": self.fps, "place_encoder": self.place_encoder, "image_encoder": self.image_encoder,
         }  # fmt: skip
 
     def train(self, mode: bool = True) -> "MotionDiffusion":
-        """The encoder of places stays as it is."""
+        """Set the training mode; the frozen place encoder stays in evaluation mode."""
         super().train(mode)
         if self.place_encoder is not None:
             self.place_encoder.eval()
         return self
 
     def conditions(self, batch: Window) -> Conditions:
-        """What the network is told of a batch, modalities dropped by the windows' chances."""
+        """Conditioning of a batch, with modalities dropped by the windows' random numbers."""
         kept = batch.chance[:, None] >= self.drop
         points_valid, image_valid = batch.points_valid & kept[..., 0], batch.image_valid & kept[..., 1]
-        # Points tell where the floor is, too.
+        # The floor height comes from the points, so it is dropped with them.
         floor = torch.where(points_valid, batch.floor_height, batch.floor_from_head)
         head = self.features.condition(batch.R_world_head, batch.t_world_head, floor, batch.size, self.fps)
         return Conditions(head, batch.points, points_valid, batch.image, image_valid)
 
     def _predicted(self, batch: Window, x0: Tensor) -> Tensor:
-        """x̂0 of a batch in normalised motion space; with self-conditioning, after a first guess in half the windows."""
+        """x̂0 of a batch in normalised motion space; half the windows are self-conditioned on a first estimate."""
         encoded = self._encode(self.conditions(batch), batch.valid)
         level = batch.level ** (1 / (1 + self.level_tilt))
         x_t = add_noise(x0, batch.noise[..., : x0.shape[-1]], level, self.schedule)
@@ -121,7 +121,7 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
         return self._denoise(x_t, level, encoded, batch.valid, last)
 
     def _weight(self, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch time"]:
-        """Of each frame in the loss; none for padding."""
+        """Loss weight of each frame; 0 on padding."""
         left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
         return valid * (1 + self.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
 
@@ -143,14 +143,14 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
         return terms
 
     def _from_head(self, R_parent_joint: Tensor, batch: Window) -> Tensor:
-        """Joint positions seen from the head joint: where hanging the body from the true head puts them."""
+        """Joint positions relative to the head joint (m), as anchoring the body to the true head gives them."""
         origin = torch.zeros_like(batch.t_world_head)
         joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
         return joints - joints[:, :, self.skeleton.index("head"), None]
 
 
 def _require_same_inputs(system: MotionDiffusion, dataset: WindowDataset) -> None:
-    """Raise WearcapError unless the windows carry what the model takes in."""
+    """Raise WearcapError unless the windows contain the inputs of the model."""
     net, places = system.net, dataset.surroundings.places
     points_size = 0 if places is None else places.size
     if (net.points_size, net.image_size) != (points_size, dataset.image_size):

@@ -1,4 +1,4 @@
-"""One wearer of an HMD² stream: what the device gave and is not used yet, and the windows so far."""
+"""One wearer of an HMD² stream: its input buffers and its window sampler."""
 
 from bisect import insort
 from dataclasses import dataclass, field
@@ -30,27 +30,27 @@ from wearcap.systems.hmd2.windows import Frames, Poses, WindowSampler
 from wearcap.tracking.head_track import Chunk, HeadTrack
 
 MAX_WAITING = 1000
-"""Pictures, and floor heights, that wait for a pose; the oldest make room."""
+"""Most image embeddings, and most floor heights, that are buffered for coming head poses; the oldest are dropped."""
 
 
 class Sensed(NamedTuple):
-    """What one wearer's device gave at one moment; None where it gave nothing."""
+    """One packet of a wearer's device; a field is None where the device measured nothing."""
 
     timestamp: float
     """Seconds, on the wearer's own clock."""
     T_world_device: Rigid | None = None
-    """R "3 3", t "3" (m); the device frame has the head's axes."""
+    """R "3 3", t "3" (m); the device's axes are the head's."""
     points_world: Float[Tensor, "point 3"] | None = None
-    """Points of the surroundings that are new, in the world of the poses. No row: there is a map, and nothing new."""
+    """New points of the surroundings (m), in the world of the poses; zero rows: there is a map, but nothing new."""
     embedding: Float[Tensor, "feature"] | None = None
-    """Of the picture that the head camera took at this moment."""
+    """Embedding of the head camera's image at this timestamp."""
     floor_height: float | None = None
-    """Where it is known from elsewhere (m); else the points tell it, or the head's path."""
+    """Floor height (m) from another source; without it, it is estimated from the points or the head's path."""
 
 
 @dataclass(frozen=True)
 class Wearer:
-    """Who wears a device, and how it sits on the head joint."""
+    """The wearer's skeleton, and the device's pose on the head joint."""
 
     skeleton: Skeleton
     R_head_device: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
@@ -58,7 +58,7 @@ class Wearer:
 
 
 class WearerState:
-    """One wearer of a session: what came and is not used yet, and the windows so far."""
+    """State of one wearer in a session: checked packets that are not used yet, map, and windows."""
 
     def __init__(self, pipeline: HMD2, wearer: Wearer, seed: int, memory: Memory):
         self.pipeline, self.wearer, self.seed, self.memory = pipeline, wearer, seed, memory
@@ -67,7 +67,7 @@ class WearerState:
         self.begin()
 
     def begin(self) -> None:
-        """Begin anew: of what came before, the counts alone stay."""
+        """Restart the capture; only the counts of dropped and refused packets are kept."""
         pipeline, dropped = self.pipeline, self.track.dropped
         self.track = HeadTrack(pipeline.fps, pipeline.advance)
         self.track.dropped = dropped
@@ -76,18 +76,19 @@ class WearerState:
         self.places = Places(grid, stature, pipeline.fps, self.memory)
         self.sampler: WindowSampler | None = None
         self.times = torch.zeros(0, dtype=torch.float64)
-        """Of the frames that are said and not given yet."""
+        """Timestamps of the frames that were sampled but not output yet."""
         self.pictures: list[tuple[float, Tensor]] = []
-        """Time and embedding (NaN where it was not usable) of the newest that was used, and of those to come."""
+        """Time and embedding (NaN if it was refused) of the last image used, and of those not used yet."""
         self.floors: list[tuple[float, float]] = []
+        """Time and floor height (m) of the last measurement used, and of those not used yet."""
 
     @property
     def dropped(self) -> int:
-        """Poses that came too late, twice, or were refused."""
+        """Number of poses that were late, duplicated or refused."""
         return self.track.dropped + self.door.dropped
 
     def admit(self, sensed: object) -> Admitted:
-        """Check a moment; the moments that are to be taken now."""
+        """Check a packet; returns the packets that are accepted now."""
         door = self.door
         if not isinstance(sensed, Sensed):
             door.refuse("head", WRONG_TYPE)
@@ -102,11 +103,11 @@ class WearerState:
 
     @property
     def shows_pictures(self) -> bool:
-        """Whether embeddings are used."""
+        """Whether image embeddings condition the model."""
         return bool(self.pipeline.net.image_size) and "images" in self.pipeline.use
 
     def _embedding(self, embedding: object) -> Float[Tensor, "feature"] | None:
-        """A copy; NaN where the picture cannot be used, so that none is believed until the next one."""
+        """A copy of the embedding; NaN if it is faulty, so that no image is used until the next valid one."""
         size = self.pipeline.net.image_size
         if embedding is None or not self.shows_pictures:
             return None
@@ -127,7 +128,7 @@ class WearerState:
         return float(height)
 
     def take(self, sensed: Sensed) -> None:
-        """Take in a moment that was checked."""
+        """Add a checked packet to the buffers."""
         self.track.take(sensed.timestamp, sensed.T_world_device)
         if sensed.points_world is not None:
             self.places.add(sensed.points_world, sensed.timestamp)
@@ -139,7 +140,7 @@ class WearerState:
             del self.floors[:-MAX_WAITING]
 
     def frames(self, chunk: Chunk, T_world_head: Rigid) -> Frames:
-        """What the network is told of a chunk, filled up to the stride with its last frame as not valid."""
+        """Conditioning of a chunk, padded to the stride by its last frame, marked as not valid."""
         net, times, count = self.pipeline.net, chunk.timestamps, len(chunk.timestamps)
         floor = self._floor(times, T_world_head.t)
         points, points_valid = torch.zeros(count, net.points_size), torch.zeros(count, dtype=torch.bool)
@@ -155,9 +156,9 @@ class WearerState:
             image = image.nan_to_num(0.0, 0.0, 0.0)
             self.pictures = self.pictures[_newest(shown, times[-1].item()) :]
         valid = torch.ones(count, dtype=torch.bool)
-        conditions = (T_world_head.R, T_world_head.t, floor, points, points_valid, image, image_valid, valid)
+        fields = (T_world_head.R, T_world_head.t, floor, points, points_valid, image, image_valid, valid)
         number = torch.arange(self.pipeline.advance)
-        frames = Frames(*(part[number.clamp_max(count - 1)][None] for part in conditions))
+        frames = Frames(*(part[number.clamp_max(count - 1)][None] for part in fields))
         return frames._replace(valid=frames.valid & (number < count))
 
     def _floor(
@@ -166,15 +167,15 @@ class WearerState:
         tracked = self.places.floor(times, t_world_head)
         if not self.floors:
             return tracked
-        observed, height = (torch.tensor(part, dtype=torch.float64) for part in zip(*self.floors))
-        self.floors = self.floors[_newest(observed, times[-1].item()) :]
-        return interpolate_clamped(observed, height.float(), times)
+        measured, height = (torch.tensor(part, dtype=torch.float64) for part in zip(*self.floors))
+        self.floors = self.floors[_newest(measured, times[-1].item()) :]
+        return interpolate_clamped(measured, height.float(), times)
 
-    def give(self, lookahead_frames: int) -> list[Motion]:
-        """The poses that wait, but for the last `lookahead_frames` frames; none or one motion."""
+    def finalize(self, lookahead_frames: int) -> list[Motion]:
+        """Newly final poses, all but the last `lookahead_frames`, as a list of at most one motion."""
         if self.sampler is None or len(self.times) <= lookahead_frames:
             return []
-        poses, T_world_head = self.sampler.give(lookahead_frames)
+        poses, T_world_head = self.sampler.finalize(lookahead_frames)
         times, self.times = self.times.tensor_split([len(T_world_head.t)])
         poses = Poses(*(part[0] for part in poses))
         return [self.pipeline.motion(times, self.wearer.skeleton, T_world_head, poses)]
@@ -242,6 +243,6 @@ class WearerState:
         self.floors = [(time, height) for time, height in parts["floors"]["known"].tolist()]
 
 
-def _newest(observed: Float64[Tensor, "known"], time: float) -> int:
-    """Number of the newest that is known at a time, or 0."""
-    return max(0, int(torch.searchsorted(observed, time + 1e-4, right=True)) - 1)
+def _newest(times: Float64[Tensor, "sample"], time: float) -> int:
+    """Index of the newest sample at or before a time, or 0."""
+    return max(0, int(torch.searchsorted(times, time + 1e-4, right=True)) - 1)

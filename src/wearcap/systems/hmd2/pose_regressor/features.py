@@ -1,4 +1,4 @@
-"""What a pose regressor sees: a head, and hands where they are tracked too, as AvatarPoser describes them."""
+"""Input features of the pose regressor: tracked head, and hands where tracked, as in AvatarPoser."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,16 +16,15 @@ from wearcap.geometry.rigid import Rigid
 
 @dataclass(frozen=True)
 class TrackedPoints:
-    """Per point: rotation (6D), its change, position and velocity (Jiang et al. 2022: 18 numbers).
+    """Features per point: rotation (6D), its change, position and velocity (Jiang et al. 2022: 18 numbers).
 
-    Each frame is told in its own head's heading, with no place in the world (ours; AvatarPoser's world frame would
-    make a stride depend on where it is taken): horizontal positions are seen from the head. height "stature": heights
-    over the floor, and positions, as shares of the head's height in the rest pose; "floor": over the floor (m);
-    "world": AvatarPoser's own, heights in the world (m).
+    Each frame is expressed in its own head-centred, yaw-aligned coordinates (ours; in AvatarPoser's world frame the
+    features depend on where the wearer is). height "stature": heights above the floor, and positions, as shares of the
+    head's height in the rest pose; "floor": above the floor (m); "world": AvatarPoser's, heights in the world (m).
     """
 
     points: Sequence[str] = ("head",)
-    """Joints, the head first."""
+    """Names of the tracked joints, the head first."""
     height: str = "stature"
 
     def __post_init__(self):
@@ -46,19 +45,19 @@ class TrackedPoints:
         R_parent_joint: Float[Tensor, "*batch joint 3 3"] | None = None,
         t_parent_joint: Float[Tensor, "*#batch joint 3"] | None = None,
     ) -> Rigid:
-        """Poses "*batch point" of the points: the measured head's, and those of a true body hung from it.
+        """World poses "*batch point" of the points: the measured head, and a true body's joints anchored to it.
 
-        The true pose is needed where more than the head is tracked.
+        `R_parent_joint` is required when more than the head is tracked.
         """
         if len(self.points) == 1:
             return Rigid(T_world_head.R[..., None, :, :], T_world_head.t[..., None, :])
         assert R_parent_joint is not None
         body = forward_kinematics(skeleton, R_parent_joint, torch.zeros_like(T_world_head.t), t_parent_joint)
-        rest = list(skeleton.indices(*self.points[1:]))
-        t_head_point = body.t[..., rest, :] - body.t[..., [skeleton.index("head")], :]
+        others = list(skeleton.indices(*self.points[1:]))
+        t_head_point = body.t[..., others, :] - body.t[..., [skeleton.index("head")], :]
         t_head = T_world_head.t[..., None, :]
         return Rigid(
-            torch.cat([T_world_head.R[..., None, :, :], body.R[..., rest, :, :]], -3),
+            torch.cat([T_world_head.R[..., None, :, :], body.R[..., others, :, :]], -3),
             torch.cat([t_head, t_head + t_head_point], -2),
         )
 
@@ -70,7 +69,7 @@ class TrackedPoints:
         stature: Float[Tensor, "batch"],
         fps: float,
     ) -> Float[Tensor, "batch time feature"]:
-        """Features of the points' paths. Changes are against the frame before (per second), the first frame's zero."""
+        """Features of the points' paths. Changes are from the previous frame (per second), 0 in the first frame."""
         R_heading_world = _heading(R_world_point[:, :, 0]).mT[:, :, None]
         R_heading_point = R_heading_world @ R_world_point
         step = R_world_point[:, :-1].mT @ R_world_point[:, 1:] - torch.eye(3).to(R_world_point)
@@ -91,7 +90,7 @@ class TrackedPoints:
 def encode_pose(
     R_parent_joint: Float[Tensor, "*batch joint 3 3"], R_world_head: Float[Tensor, "*batch 3 3"]
 ) -> Float[Tensor, "*batch motion"]:
-    """Local rotations as 6D, the root's seen from where the head points."""
+    """Local rotations as 6D, the root's relative to the head's heading."""
     R_root = _heading(R_world_head).mT @ R_parent_joint[..., 0, :, :]
     R = torch.cat([R_root[..., None, :, :], R_parent_joint[..., 1:, :, :]], -3)
     return rotation.rot6d_from_matrix(R).flatten(-2)
@@ -117,7 +116,7 @@ def _after_first(change: Float[Tensor, "batch step point value"]) -> Float[Tenso
 def pasts(
     features: Float[Tensor, "batch time feature"], ends: Int64[Tensor, "batch end"], window: int
 ) -> tuple[Float[Tensor, "batch end window feature"], Bool[Tensor, "batch end window"]]:
-    """The `window` frames up to and with each end, and which of them exist (not before the first frame)."""
+    """The `window` frames up to and including each end, and which of them exist (not before the first frame)."""
     frames = ends[..., None] + torch.arange(1 - window, 1, device=ends.device)
     rows = torch.arange(len(features), device=ends.device)[:, None, None]
     return features[rows, frames.clamp_min(0)], frames >= 0

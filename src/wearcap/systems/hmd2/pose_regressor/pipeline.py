@@ -1,4 +1,4 @@
-"""AvatarPoser-style capture (Jiang et al. 2022): every frame's pose from its own past, hung from the measured head."""
+"""AvatarPoser-style capture (Jiang et al. 2022): each pose from the past frames, anchored to the measured head."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ from wearcap.tracking.head_path import HeadPath, head_path
 
 @dataclass
 class PoseRegressorCapture:
-    """Captures whole recordings frame by frame: no frame waits for a later one, and nothing is drawn."""
+    """Captures whole recordings frame by frame, deterministically and without lookahead."""
 
     net: PoseRegressor
     points: TrackedPoints
     skeleton: Skeleton
-    """For recordings that do not say whose body it is."""
+    """Skeleton for recordings without one of their own."""
     fps: float
     reach: bool = True
-    """Whether arms are bent until tracked wrists are where they were measured, AvatarPoser's last step."""
+    """Whether arms are adjusted by inverse kinematics to reach tracked wrists, AvatarPoser's last step."""
     frames_per_pass: int = 4096
     device: str = "cpu"
 
@@ -38,9 +38,9 @@ class PoseRegressorCapture:
 
     @torch.inference_mode()
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per recording; seeds change nothing.
+        """One motion per recording; seeds have no effect.
 
-        Raises WearcapError for a recording without head poses, or without a true motion where hands are tracked.
+        Raises WearcapError for a recording without head poses, or without true motion when hands are tracked.
         """
         self.net.to(self.device).eval()
         return [self._captured(recording) for recording in recordings]
@@ -49,7 +49,7 @@ class PoseRegressorCapture:
         path = head_path(recording, self.skeleton, self.fps)
         tracked = self._tracked(recording, path)
         stature = torch.tensor([path.stature])
-        # Behind a gap or a jump of the tracking a new past begins.
+        # After a gap or a jump of the tracking the past starts empty.
         count = len(path.timestamps)
         begins = [0, *(start for start, _ in path.stretches[1:]), count]
         features = (
@@ -64,12 +64,12 @@ class PoseRegressorCapture:
         return self._reaching(anchored, tracked) if self.reach else anchored
 
     def _tracked(self, recording: Recording, path: HeadPath) -> Rigid:
-        """Poses "time point" of the tracked points; those of the hands are the truth's."""
+        """World poses "time point" of the tracked points; those of the hands come from the true motion."""
         truth = recording.motion
         if len(self.points.points) == 1:
             return self.points.poses(path.skeleton, path.T_world_head)
         if truth is None:
-            raise WearcapError("hands are tracked by nothing in this recording", where=recording.name,
+            raise WearcapError("no tracked hands in this recording", where=recording.name,
                                expected="a recording with `motion`, or a checkpoint of the head alone")  # fmt: skip
         if len(truth) != len(path.timestamps) or (truth.timestamps - path.timestamps).abs().max() > 1e-6:
             truth = at_times(truth, path.timestamps)
@@ -82,7 +82,7 @@ class PoseRegressorCapture:
         return torch.cat(predicted).float().cpu()
 
     def _reaching(self, motion: Motion, tracked: Rigid) -> Motion:
-        """The motion with its tracked wrists where they were measured, as far as the arms reach."""
+        """The motion with its tracked wrists moved to their measured positions, as far as the arms reach."""
         for index, name in enumerate(self.points.points):
             side, _, joint = name.partition("_")
             if joint == "wrist":

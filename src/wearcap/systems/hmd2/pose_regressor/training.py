@@ -1,4 +1,4 @@
-"""Training of the pose regressor: AvatarPoser's losses (Jiang et al. 2022) on the windows that HMD² learns from."""
+"""Training of the pose regressor: AvatarPoser's losses (Jiang et al. 2022) on HMD²'s training windows."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,11 +19,11 @@ from wearcap.training.losses import joint_velocity, masked_mean
 
 
 class PoseRegression(SeededSteps, WeighedTerms):
-    """Regression of single frames from their pasts: `pairs` of neighbouring frames of every window are asked for.
+    """Regression of single frames from past frames; `pairs` of neighbouring frames are predicted per window.
 
-    Loss terms, weighed by `loss_weights`, are mean absolute errors: "root" and "rotation" of 6D rotations, "joints" of
-    positions with both bodies hung from the same head (m). "velocity" is HMD²'s: without it (as AvatarPoser is) single
-    frames answer to every tremor of the head, with a jitter of ten times people's.
+    Loss terms, weighted by `loss_weights`, are mean absolute errors: "root" and "rotation" of 6D rotations, "joints" of
+    positions with both bodies anchored to the same head (m). "velocity" is that of our HMD²: without it (as in
+    AvatarPoser) predictions follow every tremor of the head, with ten times the jitter of real motion.
     """
 
     def __init__(
@@ -45,11 +45,11 @@ class PoseRegression(SeededSteps, WeighedTerms):
         self._optimizer, self._scheduler = optimizer, scheduler
 
     def pipeline_parts(self) -> dict[str, Any]:
-        """What a `PoseRegressorCapture` takes from here."""
+        """Constructor arguments of `PoseRegressorCapture` that belong to the trained model."""
         return {"net": self.net, "points": self.points, "skeleton": self.skeleton, "fps": self.fps}
 
     def set_statistics(self, dataset: WindowDataset, limit: int = 500) -> None:
-        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        """Compute normalisation from a training split; a resumed run loads it with the weights."""
         random = torch.Generator().manual_seed(0)
         drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
         windows = [dataset[item] for item in zip(drawn, range(limit))]
@@ -71,8 +71,8 @@ class PoseRegression(SeededSteps, WeighedTerms):
         )
         return self.points.encode(poses.R, poses.t, batch.floor_from_head, batch.stature, self.fps)
 
-    def _asked(self, batch: Window) -> Int64[Tensor, "batch end"]:
-        """Pairs of neighbouring frames, spread evenly over each window and in training shifted by chance."""
+    def _frame_pairs(self, batch: Window) -> Int64[Tensor, "batch end"]:
+        """Indices of pairs of neighbouring frames, spread evenly over each window, in training with a random shift."""
         count, time = batch.valid.shape
         places = torch.arange(self.pairs, device=batch.valid.device)
         shift = torch.rand(count, self.pairs) if self.training else torch.full((count, 1), 0.5)
@@ -81,7 +81,7 @@ class PoseRegression(SeededSteps, WeighedTerms):
 
     def terms(self, batch: Window) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
-        ends = self._asked(batch)
+        ends = self._frame_pairs(batch)
         rows = torch.arange(len(ends), device=ends.device)[:, None]
         features, exists = pasts(self._features(batch), ends, self.net.window)
         motion = self.net(features.flatten(0, 1), exists.flatten(0, 1)).unflatten(0, ends.shape).float()
@@ -101,7 +101,7 @@ class PoseRegression(SeededSteps, WeighedTerms):
     def _from_head(
         self, R_parent_joint: Float[Tensor, "batch end joint 3 3"], batch: Window
     ) -> Float[Tensor, "batch end joint 3"]:
-        """Joint positions seen from the head joint."""
+        """Joint positions relative to the head joint (m)."""
         origin = torch.zeros_like(R_parent_joint[:, :, 0, 0])
         joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
         return joints - joints[:, :, self.skeleton.index("head"), None]
