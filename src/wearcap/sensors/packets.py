@@ -1,6 +1,6 @@
 """Packets of live devices, checked before a streaming session takes them in: nothing in them can end or poison it.
 
-The checks say what is wrong with a value, or None; `Clock` says which times are believed; `HeadDoor` puts both
+The checks say what is wrong with a value, or None; `Clock` says which times are believed; `HeadInput` puts both
 together for the head device, whose clock is the session's.
 """
 
@@ -222,7 +222,7 @@ class Clock:
 
 
 @dataclass
-class HeadDoor:
+class HeadInput:
     """Where one wearer's head packets come in. What is refused is counted by reason, such as "head: not a rotation"."""
 
     refused: Counter[str] = field(default_factory=Counter)
