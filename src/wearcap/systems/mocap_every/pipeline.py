@@ -129,7 +129,7 @@ class MocapEvery:
         return Estimate(*(part if part is None else part.cpu() for part in output))
 
     def _sensed(self, recording: Recording, path: HeadPath) -> Sensed:
-        """Sensor inputs at the path's times; a recording with true motion but no watches gets synthetic ones (eq. 8)."""
+        """Sensor inputs at the path's times; a recording with true motion but no watches gets synthetic IMUs."""
         R, t = path.T_world_head.R.float(), path.T_world_head.t.float()
         truth = recording.motion
         if self.features.wrists == "positions" or (not recording.imu and truth is not None):

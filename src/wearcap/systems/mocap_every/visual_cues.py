@@ -86,7 +86,7 @@ class VisualCues:
         return anchored_to_head(edited.motion(), T_world_head), solutions
 
     def _starts(self, observed: Tensor) -> Int64[Tensor, "window"]:
-        """First frames of windows with observations, on a grid of half windows; the outer ones extend past the motion."""
+        """First frames of the windows with observations, on a grid of half windows that extends past the motion."""
         half = self.window // 2
         grid = torch.arange(-half, len(observed), half)
         counted = torch.cat([torch.zeros(1, dtype=torch.int64), observed.long().cumsum(0)])
