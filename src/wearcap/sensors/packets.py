@@ -1,6 +1,6 @@
 """Validation of live device packets before a streaming session uses them, so that bad input cannot break a session.
 
-The `…_fault` functions return the reason why a value is invalid, or None; `Clock` decides which timestamps are accepted;
+The `…_fault` functions return why a value is invalid, or None; `Clock` decides which timestamps are accepted;
 `HeadInput` combines both for the head device, whose clock is the session's.
 """
 
