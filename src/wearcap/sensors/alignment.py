@@ -19,7 +19,7 @@ MAX_SPEED = 3.0
 def align_suit(
     suit: Motion, localization: Localization, mount: Rigid, first_s: float = 10.0
 ) -> tuple[Motion, Float[Tensor, ""]]:
-    """Transform a suit's motion to the scene by a rotation about gravity and a translation: (motion, angle in rad).
+    """Move a suit's motion into the scene by a rotation about gravity and a translation: (motion, angle in rad).
 
     The angle is that of eq. 4.14, estimated robustly over the first `first_s` seconds of localised frames instead of
     frame 0, which may be an outlier; it turns root orientation and path of all frames (eq. 4.15). The translation moves

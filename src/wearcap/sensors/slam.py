@@ -66,10 +66,10 @@ def semidense_points(
     ray = points - eyes
     distance = np.linalg.norm(ray, axis=1)
     deviation = settings.noise_at_2m * (distance / 2) ** 2
-    depth_error = deviation * rng.standard_normal(len(points)) / np.maximum(distance, 1e-6)
+    relative_error = deviation * rng.standard_normal(len(points)) / np.maximum(distance, 1e-6)
     wrong = rng.random(len(points)) < settings.outliers
-    depth_error[wrong] = np.exp(rng.normal(0.0, 0.5, wrong.sum())) - 1
-    noisy = points + ray * depth_error[:, None]
+    relative_error[wrong] = np.exp(rng.normal(0.0, 0.5, wrong.sum())) - 1
+    noisy = points + ray * relative_error[:, None]
     order = np.argsort(first, kind="stable")
     return PointCloud(
         torch.from_numpy(noisy[order]).float(),
