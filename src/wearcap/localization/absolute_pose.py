@@ -125,7 +125,7 @@ def pose_covariance(
     fit: Fit,
     min_sigma_px: float = 0.5,
 ) -> Float64[np.ndarray, "6 6"]:
-    """Covariance of rotation (rad) and position (m) in the world: σ² (JᵀJ)⁻¹ at the inliers, σ² from their residuals.
+    """Covariance of rotation (rad) and position (m) in the world: σ² (JᵀJ)⁻¹ of the inliers, σ² from residuals.
 
     σ is at least `min_sigma_px`, so that few matches that fit by chance do not look certain.
     """

@@ -23,7 +23,7 @@ def align_suit(
 
     The angle is that of eq. 4.14, estimated robustly over the first `first_s` seconds of localised frames instead of
     frame 0, which may be an outlier; it turns root orientation and path of all frames (eq. 4.15). The translation moves
-    the worn camera to its localised positions. `mount` is the nominal pose of the camera in head axes, T_head_cam. Clocks
+    the worn camera to its localised positions. `mount` is the camera's nominal pose in head axes, T_head_cam. Clocks
     must agree already. Raises WearcapError when no localised frame lies within the suit's time.
     """
     seen = inliers(localization)

@@ -164,7 +164,7 @@ def align_by_walks(
 ) -> tuple[float, Rigid]:
     """Scale (m per unit) and T_world_slam of a camera that was carried along the board's x and y edge.
 
-    p_world = T_world_slam @ (scale · p_slam). Inputs are the end points of both walks, the lengths of the edges (m), and
+    p_world = T_world_slam @ (scale · p_slam). Inputs are the end points of both walks, the lengths of the edges (m) and
     the camera's height above the floor at the start of the walk along y (m).
 
     The scale is the mean of both edges' (appendix C.2). The rotation aligns the walks with the world's x and y, equally

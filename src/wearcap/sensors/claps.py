@@ -33,7 +33,7 @@ class ClapSettings:
     min_contrast: float = 6.0
     """Smallest ratio to the median of the surrounding second: no claps are detected during shaking."""
     max_alike: float = 0.5
-    """Largest cosine between the wrists' accelerations: in a clap the hands stop each other, a landing pushes both up."""
+    """Largest cosine between the wrists' accelerations: clapping hands stop each other, a landing pushes both up."""
 
 
 CLAPS = ClapSettings()
