@@ -63,10 +63,10 @@ class MediaPipeHands:
         image = self._mediapipe.Image(
             image_format=self._mediapipe.ImageFormat.SRGB, data=np.ascontiguousarray(picture)
         )
-        said = self._landmarker.detect_for_video(image, round(1000 * time_s))
+        result = self._landmarker.detect_for_video(image, round(1000 * time_s))
         hands = [
             Hand(marks[WRIST].x, marks[WRIST].y, _left(side[0].category_name, side[0].score))
-            for marks, side in zip(said.hand_landmarks, said.handedness)
+            for marks, side in zip(result.hand_landmarks, result.handedness)
         ]
         height, width = picture.shape[:2]
         return {

@@ -1,6 +1,6 @@
 """Structure from motion over an ordered row of pictures, through COLMAP (needs the extra: `pip install "wearcap[track]"`).
 
-Everything it works out lies in one folder: `database.db` (features and matches), `sparse/` (what was mapped) and, once
+All results are in one folder: `database.db` (features and matches), `sparse/` (what was mapped) and, once
 that is finished, `model/`. A run that was stopped goes on where it was.
 """
 

@@ -174,7 +174,7 @@ def align_by_walks(
     displacements = torch.stack([end[1] - end[0] for end in (x_slam, y_slam)]).double()
     length = displacements.norm(dim=1)
     if not (length > 0).all() or abs((displacements[0] @ displacements[1] / length.prod()).item()) > 0.5:
-        raise WearcapError("the camera's ways along the board's edges are no right angle", where="camera on the board",
+        raise WearcapError("the camera's paths along the board's edges are not at a right angle", where="camera on the board",
                            expected="about 90°", fix="Check the times of the walks along x and y.")  # fmt: skip
     scale = (torch.tensor(length_m, dtype=torch.float64) / length).mean().item()
     axes = torch.eye(3, dtype=torch.float64)[:2]
@@ -246,5 +246,5 @@ def mount_checks(found: HeadMount, limits: AlignmentLimits = AlignmentLimits()) 
         StepCheck("standing", "not still", found.still_deg, limits.stand_still_deg, "°",
                   "Stand upright and look ahead for 10 s, or give a calmer stretch."),
         StepCheck("standing", "optical axis away from straight ahead", found.view_deg, limits.view_deg, "°",
-                  "Face the board's y while standing, or say where you faced (facing_deg)."),
+                  "Face the board's y while standing, or give the direction that you faced (facing_deg)."),
     ]  # fmt: skip
