@@ -74,7 +74,9 @@ def test_bad_poses_are_counted_and_good_ones_copied(name):
 def test_a_lone_pose_far_away_is_refused_and_several_are_believed():
     head_input = HeadInput()
     here, there = Rigid.identity(), Rigid(torch.eye(3), torch.tensor([500.0, 0.0, 0.0]))
-    found = [head_input.pose(pose) is not None for pose in (here, there, here, *[there] * (AGREEING + 1), here)]
+    found = [
+        head_input.pose(pose) is not None for pose in (here, there, here, *[there] * (AGREEING + 1), here)
+    ]
     assert found == [True, False, True, *[False] * (AGREEING - 1), True, True, False]
 
 
