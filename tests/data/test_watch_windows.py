@@ -15,7 +15,7 @@ from wearcap.systems.mocap_every.training_windows import (
     Variation,
     WatchDataset,
     WatchWindow,
-    mirror_window,
+    mirrored_window,
     scaled,
     turned,
     watched,
@@ -82,14 +82,14 @@ def test_motion_comes_back_as_it_went_in(root, frame, where):
 
 def test_a_mirror_seen_twice_shows_what_was_there(root):
     window = dataset(root)[0]
-    for part, back in zip(window, mirror_window(mirror_window(window, SKELETON), SKELETON)):
+    for part, back in zip(window, mirrored_window(mirrored_window(window, SKELETON), SKELETON)):
         torch.testing.assert_close(part, back, atol=1e-6, rtol=0)
 
 
 def test_in_a_mirror_the_wrists_are_still_those_of_the_body(root):
     for window in (
         dataset(root)[0],
-        mirror_window(dataset(root)[0], SKELETON),
+        mirrored_window(dataset(root)[0], SKELETON),
         turned(dataset(root)[0], 2.0),
         scaled(dataset(root)[0], 1.2),
     ):

@@ -155,7 +155,7 @@ def test_quaternions_with_the_scalar_first_are_refused(tmp_path):
 def test_a_board_without_a_right_angle_is_refused(tmp_path):
     write_capture(tmp_path)
     board = read_mocap_every_folder(tmp_path).board
-    with pytest.raises(WearcapError, match="no right angle"):
+    with pytest.raises(WearcapError, match="not at a right angle"):
         aligned(replace(board, y_slam=board.x_slam))
 
 

@@ -119,7 +119,7 @@ def test_three_tracked_points_need_a_truth(recording):
     pipeline = drawn_pipeline()
     pipeline.features = WatchFeatures(body=True, wrists="positions")
     assert pipeline(recording).R_parent_joint.isfinite().all()
-    with pytest.raises(WearcapError, match="hands are tracked by nothing"):
+    with pytest.raises(WearcapError, match="no hand positions"):
         pipeline(replace(recording, motion=None))
 
 

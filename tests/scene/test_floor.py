@@ -115,7 +115,7 @@ def test_it_moves_with_the_world():
 
 
 def test_refusals():
-    with pytest.raises(WearcapError, match="no points beneath"):
+    with pytest.raises(WearcapError, match="no points below"):
         estimate_floor(torch.tensor([[0.0, 0.0, 5.0]]), torch.zeros(10, 3))
     with pytest.raises(WearcapError, match="no head path"):
         estimate_floor(torch.zeros(4, 3), torch.zeros(0, 3))

@@ -103,7 +103,7 @@ def test_what_tells_no_scale_is_refused(exact):
 
 
 def test_no_floor_is_said(exact):
-    with pytest.raises(WearcapError, match="0 of 0 points beneath the path.*Look at the floor"):
+    with pytest.raises(WearcapError, match="0 of 0 points below the path.*Look at the floor"):
         by_floor(exact.slam, exact.points_slam[:0], STANDING, 1.6)
     cloud = 10 * torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
     with pytest.raises(WearcapError, match="lie on one plane"):

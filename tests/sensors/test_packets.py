@@ -12,7 +12,7 @@ from bad_packets import ROTATIONS, VECTORS, bad_poses, broken
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.sensors import packets
-from wearcap.sensors.packets import AGREEING, Clock, HeadDoor
+from wearcap.sensors.packets import AGREEING, Clock, HeadInput
 
 
 @pytest.mark.parametrize("name", VECTORS)
@@ -63,18 +63,20 @@ def test_points_that_can_be_used_are_kept():
 
 @pytest.mark.parametrize("name", bad_poses(Rigid.identity()))
 def test_bad_poses_are_counted_and_good_ones_copied(name):
-    door, good = HeadDoor(), Rigid.identity()
-    assert door.pose(bad_poses(good)[name]) is None
-    assert door.dropped == sum(door.refused.values()) == 1
-    copy = door.pose(broken(good, t=torch.zeros(3)))
+    head_input, good = HeadInput(), Rigid.identity()
+    assert head_input.pose(bad_poses(good)[name]) is None
+    assert head_input.dropped == sum(head_input.refused.values()) == 1
+    copy = head_input.pose(broken(good, t=torch.zeros(3)))
     assert copy is not None
     assert copy.t.tolist() == [0.0, 0.0, 0.0]
 
 
 def test_a_lone_pose_far_away_is_refused_and_several_are_believed():
-    door = HeadDoor()
+    head_input = HeadInput()
     here, there = Rigid.identity(), Rigid(torch.eye(3), torch.tensor([500.0, 0.0, 0.0]))
-    found = [door.pose(pose) is not None for pose in (here, there, here, *[there] * (AGREEING + 1), here)]
+    found = [
+        head_input.pose(pose) is not None for pose in (here, there, here, *[there] * (AGREEING + 1), here)
+    ]
     assert found == [True, False, True, *[False] * (AGREEING - 1), True, True, False]
 
 

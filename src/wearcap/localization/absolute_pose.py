@@ -14,15 +14,15 @@ from wearcap.geometry.camera import Camera
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Where a camera stood, and how sure that is."""
+    """Estimated camera pose with its uncertainty."""
 
     R_world_cam: Float[Tensor, "3 3"]
     t_world_cam: Float[Tensor, "3"]
     inliers: int
     confidence: float
-    """0…1, from the number of inliers and how they spread over the picture."""
+    """0…1, from the number of inliers and their spread over the image."""
     covariance: Float[Tensor, "6 6"]
-    """Of the pose's error in the world: rotation vector ω (rad) with R_true = exp(ω) R, then position (m)."""
+    """Covariance of the pose error in the world: rotation vector ω (rad) with R_true = exp(ω) R, then position (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Fit:
 
 
 def lens_of(camera: Camera) -> dict:
-    """The camera as PoseLib takes it. Raises WearcapError for fisheyes: undistort their pictures first."""
+    """The camera in PoseLib's format. Raises WearcapError for fisheyes: undistort their images first."""
     size = {"width": camera.width, "height": camera.height}
     principal = [camera.fx, camera.fy, camera.cx, camera.cy]
     if camera.model == "pinhole":
@@ -55,7 +55,7 @@ def ransac_pose(
     max_iterations: int = 20_000,
     seed: int = 0,
 ) -> Fit | None:
-    """P3P in LO-RANSAC over matches of which many may be wrong; None without a pose."""
+    """P3P in LO-RANSAC over matches with outliers; None where no pose is found."""
     if len(pixels) < 4:
         return None
     options = {"max_reproj_error": max_error_px, "max_iterations": max_iterations, "min_iterations": 50,
@@ -76,7 +76,7 @@ def refined_pose(
     start: Fit,
     max_error_px: float,
 ) -> Fit:
-    """Robust least squares of the reprojection error from a pose (`start.inlier` is not looked at)."""
+    """Robust least squares of the reprojection error from an initial pose (`start.inlier` is not used)."""
     initial = poselib.CameraPose()
     initial.R = start.R_world_cam.T
     initial.t = -start.R_world_cam.T @ start.t_world_cam
@@ -101,7 +101,7 @@ def _fit(pose: poselib.CameraPose, inlier: np.ndarray) -> Fit:
 
 
 def project(points_world: np.ndarray, camera: Camera, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of world points as the camera at a pose sees them, and where they are valid."""
+    """Project world points into the camera at a pose: pixels, and where they are valid."""
     points_cam = (points_world.astype(np.float64) - fit.t_world_cam) @ fit.R_world_cam
     pixels, valid = camera.project(torch.from_numpy(points_cam))
     return pixels.numpy(), valid.numpy()
@@ -113,7 +113,7 @@ def reprojection_errors(
     camera: Camera,
     fit: Fit,
 ) -> Float64[np.ndarray, "match"]:
-    """Pixels between each keypoint and its point's projection; infinite where that is not in view."""
+    """Distance (px) between each keypoint and its point's projection; infinite where that is not in view."""
     seen, valid = project(points_world, camera, fit)
     return np.where(valid, np.linalg.norm(seen - pixels, axis=1), np.inf)
 
@@ -125,9 +125,9 @@ def pose_covariance(
     fit: Fit,
     min_sigma_px: float = 0.5,
 ) -> Float64[np.ndarray, "6 6"]:
-    """Of rotation (rad) and position (m) in the world: σ² (JᵀJ)⁻¹ at the inliers, σ² from their own residuals.
+    """Covariance of rotation (rad) and position (m) in the world: σ² (JᵀJ)⁻¹ of the inliers, σ² from residuals.
 
-    σ is at least `min_sigma_px`, so that few matches that happen to fit do not look certain.
+    σ is at least `min_sigma_px`, so that few matches that fit by chance do not look certain.
     """
     pixels, offset = pixels[fit.inlier], points_world[fit.inlier].astype(np.float64) - fit.t_world_cam
     points_cam = offset @ fit.R_world_cam

@@ -1,6 +1,6 @@
-"""Camera calibration from pictures of a checkerboard: OpenCV's model with two radial and two tangential coefficients.
+"""Camera calibration from images of a checkerboard: OpenCV's model with two radial and two tangential coefficients.
 
-The documents calibrate so (thesis §4.3.3) and say no more; how views are chosen and judged is ours.
+The thesis uses this model (§4.3.3) without details; the selection and rejection of views is ours.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,7 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 
 _SEARCH_WIDTH = 960
-"""Boards are looked for in pictures of at most this width (pixels); corners are then refined in the full picture."""
+"""Width (pixels) to which images are reduced for the board search; corners are refined in the full image."""
 _CELLS = (8, 6)
 """Columns and rows of the picture's cells in which corners are counted for the coverage."""
 _HINT_FRAMES = 12
@@ -45,21 +45,21 @@ class Board:
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """How many views are wanted, and when one is bad."""
+    """Number of views, and limits of their quality."""
 
     max_views: int = 40
-    """The most varied of the sharp views up to this many are used."""
+    """Largest number of views: the most varied of the sharp ones are used."""
     min_views: int = 8
     max_blur_px: float | int = 4.0
     """Edges of squares that rise over more pixels than this are blurred, unless hardly any are sharper."""
     outlier_ratio: float | int = 2.5
-    """A view whose residual is so many times the median is rejected …"""
+    """Multiple of the median residual above which a view is rejected, if it also exceeds `outlier_px`."""
     outlier_px: float | int = 0.3
-    """… when it also exceeds this (RMS, pixels)."""
+    """Smallest residual (RMS, pixels) of a rejected view."""
     max_focal_spread: float | int = 0.02
     """Largest standard deviation of a focal length, as a share of it."""
     min_tilt_deg: float | int = 8.0
-    """Boards must be turned out of their mean direction by so much; else that deviation means nothing."""
+    """Smallest tilt of the boards from their mean direction; with less the focal length is not observable."""
 
 
 SETTINGS = CalibrationSettings()
@@ -67,7 +67,7 @@ SETTINGS = CalibrationSettings()
 
 @dataclass(frozen=True)
 class View:
-    """The board as one picture shows it."""
+    """Detection of the board in one image."""
 
     name: str
     corners: Float32[np.ndarray, "point 2"]
@@ -80,11 +80,11 @@ class View:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera and how far it is to be believed."""
+    """A calibrated camera with quality measures."""
 
     camera: Camera
     rms_px: float
-    """Over all corners of the views used."""
+    """Root mean square residual over all corners of the used views."""
     focal_std_px: float
     """The larger standard deviation of the two focal lengths."""
     coverage: float
@@ -93,7 +93,7 @@ class Calibration:
     rejected: tuple[View, ...] = ()
     """Views whose residual was too large."""
     seen: int = 0
-    """Pictures in which the board was found, before the varied ones were chosen."""
+    """Number of images in which the board was found, before the selection."""
     examined: int = 0
 
 
@@ -159,13 +159,13 @@ def _sharp(views: list[View], settings: CalibrationSettings) -> list[View]:
 
 
 def varied(views: Sequence[View], size: tuple[int, int], count: int) -> list[View]:
-    """Up to `count` views that differ most in place, size and tilt: the sharpest, then ever the one furthest from those."""
-    what = np.array([_appearance(view.corners, size) for view in views])
+    """Up to `count` views that differ most in position, size and tilt, by farthest-point sampling from the sharpest."""
+    appearance = np.array([_appearance(view.corners, size) for view in views])
     chosen = [int(np.argmin([view.blur_px for view in views]))]
-    distance = np.linalg.norm(what - what[chosen[0]], axis=1)
+    distance = np.linalg.norm(appearance - appearance[chosen[0]], axis=1)
     while len(chosen) < min(count, len(views)):
         chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(what - what[chosen[-1]], axis=1))
+        distance = np.minimum(distance, np.linalg.norm(appearance - appearance[chosen[-1]], axis=1))
     return [views[k] for k in sorted(chosen)]
 
 
@@ -229,7 +229,7 @@ def coverage(views: Sequence[View], size: tuple[int, int]) -> float:
 
 
 def _not_found(board: Board, size: tuple[int, int], examined: int, missed: list[np.ndarray]) -> WearcapError:
-    """What was tried, and whether another count of corners would have been right."""
+    """Error for a missing board; its fix suggests another count of corners if that one is found."""
     others = [(board.columns - 1, board.rows - 1), (board.columns + 1, board.rows + 1),
               (board.columns - 1, board.rows), (board.columns, board.rows - 1)]  # fmt: skip
     fix = (

@@ -1,4 +1,4 @@
-"""Local features of a picture: keypoints, descriptors, and what extracts, pairs and summarises them."""
+"""Local features of an image: keypoints and descriptors; interfaces of extractors, matchers and global descriptors."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -31,7 +31,7 @@ class Features:
 
 @runtime_checkable
 class Extractor(Protocol):
-    """Finds and describes keypoints. Two extractors of one name give descriptors that can be compared."""
+    """Detects and describes keypoints. Extractors with the same name give comparable descriptors."""
 
     @property
     def name(self) -> str: ...
@@ -48,7 +48,7 @@ class Matcher(Protocol):
 
 @runtime_checkable
 class GlobalDescriptor(Protocol):
-    """Summarises a picture in one vector of unit length; similar places have a large dot product."""
+    """Describes an image by one vector of unit length; similar places have a large dot product."""
 
     @property
     def name(self) -> str: ...
@@ -110,7 +110,7 @@ def root(descriptors: Float32[np.ndarray, "keypoint feature"]) -> Float32[np.nda
 
 
 def _strongest(scores: np.ndarray, count: int) -> np.ndarray:
-    """Numbers of the strongest keypoints (SIFT gives more than asked for where one has two orientations)."""
+    """Indices of the strongest keypoints (SIFT returns more than requested where one has two orientations)."""
     return np.argsort(-scores, kind="stable")[:count].astype(np.int64)
 
 

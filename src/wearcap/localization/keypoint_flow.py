@@ -1,7 +1,7 @@
-"""Keypoints that a detector missed, followed by optical flow from the detections before and behind (MocapEvery §3.4).
+"""Keypoints that a detector missed, tracked by optical flow from earlier and later detections (MocapEvery §3.4).
 
-Each missing keypoint is tracked forwards from its last detection and backwards from its next; what both say is blended,
-the nearer detection counting more. A video passes through a buffer of as many frames as a keypoint is followed.
+Each missing keypoint is tracked forwards from its last detection and backwards from its next; both tracks are blended,
+weighted towards the nearer detection. Video frames pass through a buffer as long as the longest track.
 """
 
 from collections import deque
@@ -21,22 +21,22 @@ from wearcap.localization.keypoints import Detector, Keypoint
 from wearcap.recording.recording import Cue
 
 APART_AT_MOST = 4.0
-"""Times `apart_px`, beyond which two tracks do not follow the same thing."""
+"""Multiple of `apart_px` beyond which two tracks do not follow the same point."""
 
 
 @dataclass(frozen=True)
 class FlowSettings:
-    """How far keypoints are followed, and when one is lost."""
+    """Settings of the tracking, and when a track ends."""
 
     reach: int = 15
-    """Frames from a detection at most; 0: detections alone."""
+    """Largest number of frames from a detection; 0: detections only."""
     window_px: int = 21
     levels: int = 3
-    """Halvings of the picture in which large steps are sought."""
+    """Pyramid levels, for large displacements."""
     return_px: float = 1.0
-    """A step is false that does not lead back to where it began so closely."""
+    """Largest forward-backward error of a step."""
     likeness: float = 0.6
-    """Least correlation of what a track shows with what was around the detection."""
+    """Smallest correlation of the patch around a track with the patch around its detection."""
     apart_px: float = 3.0
     """Distance of the two tracks that halves the confidence."""
 
@@ -55,7 +55,7 @@ class Spotted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """Where each keypoint was followed to (NaN where it is not), and the detection that it comes from."""
+    """Tracked position of each keypoint (NaN where lost), and the detection that it started from."""
 
     pixels: Float32[np.ndarray, "keypoint 2"]
     age: Float32[np.ndarray, "keypoint"]
@@ -63,7 +63,7 @@ class _Track:
     trust: Float32[np.ndarray, "keypoint"]
     """The detection's confidence."""
     look: Float32[np.ndarray, "keypoint row column"]
-    """What was around it."""
+    """Image patch around the detection."""
 
     @property
     def there(self) -> Bool[np.ndarray, "keypoint"]:
@@ -86,7 +86,7 @@ class _Frame:
 
 
 class KeypointFlow:
-    """Takes a video's frames one by one, and gives each back, in order, once nothing behind can add to it."""
+    """Consumes a video's frames one by one and returns each, in order, once later frames cannot change it."""
 
     def __init__(self, joints: Sequence[str], settings: FlowSettings = FlowSettings()):
         self.joints, self.settings = tuple(joints), settings
@@ -117,10 +117,10 @@ class KeypointFlow:
         return [_blended(self._frames.popleft(), self.settings)] if ready else []
 
     def finish(self) -> list[Spotted]:
-        """The frames that are left."""
-        rest = [_blended(frame, self.settings) for frame in self._frames]
+        """Return the remaining frames."""
+        remaining = [_blended(frame, self.settings) for frame in self._frames]
         self._frames.clear()
-        return rest
+        return remaining
 
     def _detected(self, grey: np.ndarray, found: Mapping[str, Keypoint]) -> _Track:
         rows = [found.get(joint, Keypoint(np.nan, np.nan, 0.0)) for joint in self.joints]
@@ -133,7 +133,7 @@ class KeypointFlow:
         return _Track(pixels, np.where(there, 0, np.nan).astype(np.float32), trust, look)
 
     def _look_back(self, detected: _Track) -> None:
-        """From detections backwards through the frames that lack them."""
+        """Track detections backwards through the frames that lack them."""
         track = detected
         for later, earlier in pairwise(reversed(self._frames)):
             track = _without(track, earlier.found)
@@ -149,8 +149,8 @@ def tracked_cues(
     detector: Detector,
     settings: FlowSettings = FlowSettings(),
 ) -> dict[str, Cue]:
-    """Cues of all joints that a detector finds in a video or that are followed from there; each holds only the frames
-    at which its joint was seen.
+    """Cues of all joints that are detected in a video or tracked from detections; each holds only the frames at which
+    its joint was observed.
 
     Raises WearcapError when there are not as many pictures as timestamps.
     """
@@ -179,7 +179,7 @@ def _without(track: _Track, ended: Bool[np.ndarray, "keypoint"]) -> _Track:
 
 
 def _followed(track: _Track, before: np.ndarray, after: np.ndarray, settings: FlowSettings) -> _Track:
-    """Tracks one frame on; those that are lost, or come from too far, end."""
+    """Advance tracks by one frame; lost and too old ones end."""
     rows = np.flatnonzero(track.there & (track.age < settings.reach))
     pixels = np.full_like(track.pixels, np.nan)
     if len(rows):
@@ -227,15 +227,17 @@ def _likeness(
 
 
 def _blended(frame: _Frame, settings: FlowSettings) -> Spotted:
-    """What both directions say: each weighed by how near the other's detection is not, both less sure the further away
-    their detections and they themselves are from each other."""
-    ways = (frame.forward, frame.backward)
-    there = np.stack([way.there for way in ways])
-    age = np.where(there, np.stack([way.age for way in ways]), 1.0)
+    """Blend both directions, weighted towards the nearer detection; confidence decreases with the distance (frames) to
+    the detections and with the distance (px) between the tracks."""
+    tracks = (frame.forward, frame.backward)
+    there = np.stack([track.there for track in tracks])
+    age = np.where(there, np.stack([track.age for track in tracks]), 1.0)
     share = there / np.maximum(age, 1e-6)
     share = share / np.maximum(share.sum(0), 1e-9)
-    where = np.where(there[..., None], np.stack([way.pixels for way in ways]), 0.0)
-    sure = np.where(there, np.stack([way.trust for way in ways]) * (1 - age / (settings.reach + 1)), 0.0)
+    where = np.where(there[..., None], np.stack([track.pixels for track in tracks]), 0.0)
+    sure = np.where(
+        there, np.stack([track.trust for track in tracks]) * (1 - age / (settings.reach + 1)), 0.0
+    )
     apart = np.where(there.all(0), np.linalg.norm(where[0] - where[1], axis=-1), 0.0)
     confidence = (share * sure).sum(0) / (1 + (apart / settings.apart_px) ** 2)
     confidence[apart > APART_AT_MOST * settings.apart_px] = 0.0

@@ -1,4 +1,4 @@
-"""What finds a body's joints in the pictures of a video, and detections that another program wrote down."""
+"""Interface of detectors of body joints in videos, and a detector that replays recorded detections."""
 
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -21,23 +21,23 @@ class Keypoint(NamedTuple):
 
 @runtime_checkable
 class Detector(Protocol):
-    """Finds joints in the pictures of one video, which it is shown in their order."""
+    """Detects joints in the images of one video, called in their order."""
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """All that it may find, by the skeleton's names."""
+        """Names of all detectable joints, as in the skeleton."""
         ...
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"], time_s: float) -> dict[str, Keypoint]:
-        """The joints that are seen; those that are not are absent."""
+        """The detected joints; others are absent."""
         ...
 
 
 class RecordedDetections:
-    """A detector that repeats what was found before: for each picture the detections nearest in time."""
+    """Replays recorded detections: for each image those nearest in time."""
 
     def __init__(self, cues: Mapping[str, Cue], within_s: float):
-        """`within_s`: detections further than this from a picture's time are not its own.
+        """`within_s`: largest time difference between a detection and its image.
 
         Raises WearcapError for cues that are no pixels.
         """

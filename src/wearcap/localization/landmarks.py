@@ -1,4 +1,4 @@
-"""Landmarks: keypoints of several pictures that show one place of the scene become one point with one descriptor."""
+"""Landmarks: keypoints of several images at one place of the scene, merged to one point with one descriptor."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float32, Int8, Int32
 
 STEPS = 254.0
-"""Descriptors of unit length are kept as bytes: round(254 d), so numbers beyond ±0.5 are cut there."""
+"""Quantisation of unit-length descriptors to bytes: round(254 d), so components beyond ±0.5 are clipped."""
 
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Points of the scene that keypoints were found on."""
+    """Scene points at which keypoints were detected."""
 
     points_world: Float32[np.ndarray, "landmark 3"]
     descriptors: Int8[np.ndarray, "landmark feature"]
@@ -55,8 +55,8 @@ def merge(
 
 
 def _leaders(cell: np.ndarray, descriptors: np.ndarray, min_cosine: float, rounds: int = 12) -> np.ndarray:
-    """For each observation the one that leads its group: again and again the first one left of each cell takes
-    along those of the cell that look like it."""
+    """For each observation the leader of its group: repeatedly, the first remaining one of each cell collects the
+    similar ones of that cell."""
     leader = np.full(len(cell), -1)
     left = np.arange(len(cell))
     for _ in range(rounds):

@@ -50,7 +50,7 @@ def _read(weights: str | Path | None, absent: tuple[str, str]) -> dict[str, Tens
 
 
 def _place(network: nn.Module, device: str) -> None:
-    """On its device, for inference alone."""
+    """Move a network to its device, for inference only."""
     try:
         network.to(device).eval().requires_grad_(False)
     except (RuntimeError, AssertionError) as error:
@@ -60,7 +60,7 @@ def _place(network: nn.Module, device: str) -> None:
 
 
 def _identity(network: str, weights: str | Path | None) -> str:
-    """Name of what a network with these weights computes: other weights, other name."""
+    """Name of a network with these weights; other weights give another name."""
     return f"{network}-{sha256_of(Path(str(weights)).expanduser())[:12]}"
 
 

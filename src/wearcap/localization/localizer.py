@@ -1,7 +1,7 @@
-"""Camera self-localisation (thesis 4.2.2): retrieval, 2D-3D matches, LO-RANSAC, and a second look with the pose known.
+"""Camera self-localisation (thesis 4.2.2): retrieval, 2D-3D matches, LO-RANSAC, and guided matching with the pose.
 
-The second look matches keypoints again, this time only with landmarks that project beside them: more and better
-spread matches, so a more exact pose. It is ours, as are confidence and covariance.
+Guided matching (`second_look_px`) matches keypoints again, only with landmarks that project nearby: more and better
+spread matches, so a more accurate pose. It is ours, as are confidence and covariance.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -40,38 +40,38 @@ from wearcap.recording.recording import Localization
 
 @dataclass(frozen=True)
 class LocalizerSettings:
-    """How pictures are localised."""
+    """Settings of the localisation."""
 
     retrieved: int = 40
-    """Database pictures whose landmarks are matched (K_loc of the document)."""
+    """Number of retrieved database images whose landmarks are matched (K_loc of the thesis)."""
     retrieved_with_prior: int = 8
-    """The same where a prior pose is given: so many similar pictures and as many near the prior."""
+    """Number with a prior pose: this many similar images and as many near the prior."""
     max_landmarks: int = 8_000
-    """Landmarks that are matched: those that most of the chosen pictures observe."""
+    """Largest number of matched landmarks: those observed by most of the retrieved images."""
     max_landmarks_with_prior: int = 4_000
     max_ratio: float = 0.85
     """Ratio test on the distances of descriptors."""
     min_cosine: float = 0.75
-    """Smallest similarity of descriptors in the second look."""
+    """Smallest similarity of descriptors in guided matching."""
     max_error_px: float = 5.0
     """Reprojection error up to which a match is an inlier, at a picture 1000 pixels wide; grows with the width."""
     second_look_px: float = 12.0
-    """Distance up to which the second look seeks, at the same width."""
+    """Search radius of guided matching, at the same width."""
     min_inliers: int = 10
-    """With fewer matches of the first look that agree with the pose there is none."""
+    """Fewest initial matches that agree with the pose; with fewer there is no pose."""
     horizontal_fov_deg: float = 100.0
     """Field of view of the perspective camera that a fisheye's pictures are undistorted to."""
 
 
 @dataclass(frozen=True, eq=False)
 class Described:
-    """A picture as the map is asked about it."""
+    """An image described for queries to the map."""
 
     camera: Camera
-    """Of the picture, or the perspective one that it was undistorted to."""
+    """Camera of the image, or the perspective camera that it was undistorted to."""
     features: Features
     summary: Float32[np.ndarray, "global"]
-    """Its global descriptor."""
+    """Global descriptor of the image."""
 
 
 class Localizer:
@@ -108,8 +108,8 @@ class Localizer:
     ) -> CameraPose | None:
         """Pose of the picture's camera, or None where none is found.
 
-        `prior`: where the camera may stand; it only chooses database pictures, and where that leads to a weak pose
-        or none the search is done again without it. Raises WearcapError as `describe`.
+        `prior`: approximate camera pose; it only selects database images, and where that leads to a weak pose or
+        none the search is repeated without it. Raises WearcapError as `describe`.
         """
         return self.locate(self.describe(image, camera), prior)
 
@@ -191,7 +191,7 @@ class Localizer:
     ) -> tuple[Float32[np.ndarray, "match 2"], Float32[np.ndarray, "match 3"]]:
         """Pixels and world positions from picture-to-picture matches with each database picture.
 
-        A keypoint and a landmark that several pictures pair are one match: repeated, it would pass for many witnesses.
+        A keypoint and a landmark paired by several images are one match: repeated, it would count as many.
         """
         assert self.matcher is not None
         found = [np.zeros((0, 2), np.int64)]
@@ -258,7 +258,7 @@ def localize_video(
     prior_age_s: float = 1.0,
     progress: bool = False,
 ) -> Localization:
-    """Localise every frame. Where no pose is found confidence is 0 and the last pose is held (at first: the first found).
+    """Localise every frame. Where no pose is found confidence is 0 and the last pose is repeated (at first: the first).
 
     `use_prior`: the previous frame's pose, if not older than `prior_age_s`, helps to choose database pictures.
     Raises WearcapError for more or fewer frames than timestamps, and as `Localizer.__call__`.
@@ -283,16 +283,16 @@ def localize_video(
 
 
 def _one_ahead(describe: Callable[[np.ndarray], Described], frames: Iterable[np.ndarray]) -> Iterator[Described]:  # fmt: skip
-    """Describe frames in a second thread, one ahead of what is asked for."""
+    """Describe frames in a second thread, one frame ahead of the consumer."""
     with ThreadPoolExecutor(1) as pool:
-        waiting: Future[Described] | None = None
+        pending: Future[Described] | None = None
         for frame in frames:
             following = pool.submit(describe, frame)
-            if waiting is not None:
-                yield waiting.result()
-            waiting = following
-        if waiting is not None:
-            yield waiting.result()
+            if pending is not None:
+                yield pending.result()
+            pending = following
+        if pending is not None:
+            yield pending.result()
 
 
 def _as_localization(timestamps: Float64[Tensor, "time"], poses: list[CameraPose | None]) -> Localization:
@@ -301,10 +301,10 @@ def _as_localization(timestamps: Float64[Tensor, "time"], poses: list[CameraPose
         count = len(poses)
         return Localization(timestamps, torch.eye(3).repeat(count, 1, 1), torch.zeros(count, 3),
                             torch.zeros(count), torch.eye(6).repeat(count, 1, 1) * _UNKNOWN)  # fmt: skip
-    held, filled = found[0], []
+    last, filled = found[0], []
     for pose in poses:
-        held = pose or held
-        filled.append(held)
+        last = pose or last
+        filled.append(last)
     sure = torch.tensor([0.0 if pose is None else pose.confidence for pose in poses])
     covariance = torch.stack([torch.eye(6) * _UNKNOWN if pose is None else pose.covariance for pose in poses])
     return Localization(

@@ -27,7 +27,7 @@ from wearcap.scene.scan import Scan
 
 @dataclass(frozen=True)
 class MapSettings:
-    """How a map is built; lengths in the scene's unit (m)."""
+    """Settings of the map building; lengths in the scene's unit (m)."""
 
     splat_m: float = 0.015
     """Radius of a scan point's disc."""
@@ -45,7 +45,7 @@ class MapSettings:
 
 @dataclass(frozen=True, eq=False)
 class _Picture:
-    """What one photo gives: all descriptors for retrieval, and the keypoints that have a position."""
+    """Features of one photo: all descriptors for retrieval, and keypoints with world positions."""
 
     camera: Camera
     descriptors: Int8[np.ndarray, "keypoint feature"]
@@ -70,7 +70,7 @@ def build_map(
 ) -> VisualMap:
     """A map of the photos, their keypoints lifted by a scan or by tracks (whose photo numbers are the photos').
 
-    `descriptor`: what finds similar pictures; None: VLAD over a vocabulary trained on these photos.
+    `descriptor`: global descriptor for retrieval; None: VLAD over a vocabulary trained on these photos.
     Raises WearcapError for no photos, photos whose size is not their camera's, unreadable ones, and an empty map.
     """
     pictures = _pictures(photos, source, extractor, descriptor, settings, progress)
@@ -126,7 +126,7 @@ def require_same_features(
 
 
 def _pictures(photos, source, extractor, descriptor, settings: MapSettings, progress: bool) -> list[_Picture]:
-    """What each photo gives. Raises WearcapError without photos, and when none of them shows the scene."""
+    """Features of each photo. Raises WearcapError without photos, and when none of them shows the scene."""
     if not photos:
         raise WearcapError("no photos to build a map from", expected="database photos with cameras and poses")
     if isinstance(source, Scan):
@@ -191,7 +191,7 @@ def _lift_by_tracks(tracks: Tracks, settings: MapSettings) -> Lift:
 
 
 def _vocabulary(pictures: list[_Picture], words: int, sample: int = 60_000) -> np.ndarray:
-    """Trained on descriptors from all pictures."""
+    """VLAD vocabulary trained on descriptors from all images."""
     share = max(1, sample // len(pictures))
     random = np.random.default_rng(0)
     chosen = [p.descriptors[random.permutation(len(p.descriptors))[:share]] for p in pictures]
@@ -216,7 +216,7 @@ def _assemble(photos, pictures: list[_Picture], extractor: str, descriptor, vlad
 
 
 def _why_empty(photos: Sequence[Photo], source: Scan | Tracks) -> str:
-    """The likeliest reason: poses and scene in different units or worlds."""
+    """Most likely cause of an empty map: poses and scene in different units or worlds."""
     points = source.points if isinstance(source, Scan) else source.points_world
     if not len(points):
         return "The scene has no points."

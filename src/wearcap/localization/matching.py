@@ -1,4 +1,4 @@
-"""Query keypoints against landmarks: nearest descriptors with a ratio test that knows where landmarks are."""
+"""Matching of query keypoints to landmarks: nearest descriptors, with a ratio test that ignores the same place."""
 
 import numpy as np
 import torch
@@ -7,7 +7,7 @@ from jaxtyping import Float32, Int64
 from wearcap.geometry.compiled import compiled
 
 _KEPT = 4
-"""So many best landmarks per keypoint are remembered for the ratio test."""
+"""Number of best landmarks per keypoint that are kept for the ratio test."""
 
 
 def match_landmarks(
@@ -37,7 +37,7 @@ def match_landmarks(
     apart = np.linalg.norm(positions[number] - positions[nearest][:, None], axis=-1) > same_m
     apart &= number >= 0
     rival = np.where(apart, best, -np.inf).max(1)
-    rival = np.where(np.isfinite(rival), rival, best[:, -1])  # at least as far as the last one remembered
+    rival = np.where(np.isfinite(rival), rival, best[:, -1])  # at least as far as the last one kept
     distance, rival_distance = (np.sqrt(np.maximum(2 - 2 * s, 0)) for s in (best[:, 0], rival))
     keep = (reverse[nearest] == np.arange(len(query))) & (distance < max_ratio * rival_distance)
     chosen = np.flatnonzero(keep)
@@ -50,7 +50,7 @@ def match_nearby(
     near: Int64[np.ndarray, "pair 2"],
     min_cosine: float,
 ) -> Int64[np.ndarray, "match 2"]:
-    """Of (keypoint, landmark) pairs that may belong together each keypoint's most similar one, if similar enough."""
+    """Most similar landmark of each keypoint among candidate (keypoint, landmark) pairs, if similar enough."""
     cosine = np.einsum("pf,pf->p", query[near[:, 0]], descriptors[near[:, 1]])
     near, cosine = near[cosine >= min_cosine], cosine[cosine >= min_cosine]
     near = near[np.argsort(-cosine, kind="stable")]

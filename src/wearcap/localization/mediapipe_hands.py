@@ -1,4 +1,4 @@
-"""A wearer's wrists in the head camera's pictures by MediaPipe's hand landmarker, an optional package.
+"""Detection of the wearer's wrists in head camera images by MediaPipe's hand landmarker, an optional package.
 
 Nothing is downloaded: the model is a file that the user has.
 """
@@ -20,23 +20,24 @@ from wearcap.localization.keypoints import Keypoint
 MODEL_VARIABLE = "WEARCAP_HANDS_MODEL"
 """Environment variable with the path of `hand_landmarker.task`."""
 WRIST = 0
-"""Of MediaPipe's 21 landmarks."""
+"""Index of the wrist among MediaPipe's 21 landmarks."""
 SIDE_PULL = 2.0
-"""How much the side of the picture speaks for a hand: logit of being the left one at the picture's left border."""
+"""Prior from the image side: logit of being the left hand at the image's left border."""
 
 
 class Hand(NamedTuple):
-    """One hand that was found."""
+    """One detected hand."""
 
     x: float
-    """Of the wrist, as a share of the picture's width."""
+    """Horizontal wrist position, as a share of the image's width."""
     y: float
+    """Vertical wrist position, as a share of the image's height."""
     left: float
     """Probability that it is a left hand."""
 
 
 class MediaPipeHands:
-    """Wrists of up to two hands, followed by MediaPipe from picture to picture: one object per video."""
+    """Wrists of up to two hands, tracked by MediaPipe from image to image: one object per video."""
 
     joints = ("left_wrist", "right_wrist")
 
@@ -62,10 +63,10 @@ class MediaPipeHands:
         image = self._mediapipe.Image(
             image_format=self._mediapipe.ImageFormat.SRGB, data=np.ascontiguousarray(picture)
         )
-        said = self._landmarker.detect_for_video(image, round(1000 * time_s))
+        result = self._landmarker.detect_for_video(image, round(1000 * time_s))
         hands = [
             Hand(marks[WRIST].x, marks[WRIST].y, _left(side[0].category_name, side[0].score))
-            for marks, side in zip(said.hand_landmarks, said.handedness)
+            for marks, side in zip(result.hand_landmarks, result.handedness)
         ]
         height, width = picture.shape[:2]
         return {

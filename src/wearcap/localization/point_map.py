@@ -1,4 +1,4 @@
-"""Point maps: which scan point is seen in each pixel of a photo (thesis 4.2.1), and keypoints lifted to 3D by them."""
+"""Point maps: the visible scan point of each pixel of a photo (thesis 4.2.1), for lifting keypoints to 3D."""
 
 import math
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from wearcap.scene.scan import Scan
 
 @dataclass(frozen=True, eq=False)
 class PointMap:
-    """What a camera sees of a scan."""
+    """Visible scan points and depths of a camera."""
 
     camera: Camera
     T_world_cam: Rigid
     index: Int32[np.ndarray, "height width"]
-    """Number of the visible scan point, -1 where none is."""
+    """Index of the visible scan point; -1 where there is none."""
     depth: Float32[np.ndarray, "height width"]
-    """Along the optical axis (m), for fisheyes along the ray; infinite where nothing is."""
+    """Depth along the optical axis (m), for fisheyes along the ray; infinite where there is no point."""
 
     def lift(
         self,
@@ -103,14 +103,14 @@ class Undistortion:
     """A remap of pictures and point maps of one camera onto a fixed pinhole camera with the same optical axis."""
 
     camera: Camera
-    """The perspective camera that the outcome belongs to."""
+    """The perspective camera of the remapped image."""
     x: Float32[np.ndarray, "height width"]
-    """Where each pixel of the outcome lies in the original; -1 where the original does not reach."""
+    """Position of each remapped pixel in the original; -1 outside the original."""
     y: Float32[np.ndarray, "height width"]
 
     @property
     def valid(self) -> Bool[np.ndarray, "height width"]:
-        """Pixels that the original reaches."""
+        """Pixels that are inside the original."""
         return self.x >= 0
 
     def image(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:

@@ -1,4 +1,4 @@
-"""Which database pictures show the same place: VLAD over a vocabulary trained on the map (thesis eq. 2.1)."""
+"""Image retrieval: VLAD over a vocabulary trained on the map (thesis eq. 2.1)."""
 
 import numpy as np
 import torch
@@ -59,7 +59,7 @@ class Vlad:
     def __call__(
         self, image: UInt8[np.ndarray, "height width 3"], features: Features
     ) -> Float32[np.ndarray, "feature"]:
-        """`image` is not looked at; zeros for a picture without features."""
+        """Global descriptor; `image` is not used. Zeros for an image without features."""
         return self.aggregate(features.descriptors)
 
     def aggregate(
@@ -78,7 +78,7 @@ class Vlad:
 def most_similar(
     query: Float32[np.ndarray, "feature"], database: Float32[np.ndarray, "image feature"], count: int = 40
 ) -> Int64[np.ndarray, "image_rank"]:
-    """Numbers of the `count` pictures with the largest cosine to the query, best first (descriptors of unit length)."""
+    """Indices of the `count` images with the largest cosine to the query, best first (descriptors of unit length)."""
     similarity = database @ query
     count = min(count, len(database))
     best = np.argpartition(-similarity, count - 1)[:count] if count else np.zeros(0, np.int64)

@@ -1,6 +1,6 @@
 """Structure from motion over an ordered row of pictures, through COLMAP (needs the extra: `pip install "wearcap[track]"`).
 
-Everything it works out lies in one folder: `database.db` (features and matches), `sparse/` (what was mapped) and, once
+All results are in one folder: `database.db` (features and matches), `sparse/` (what was mapped) and, once
 that is finished, `model/`. A run that was stopped goes on where it was.
 """
 
@@ -15,22 +15,22 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 
 Advance = Callable[[str, int, int], None]
-"""Told of progress: the step's name, how much of it is done, and how much there is."""
+"""Progress callback: the step's name, the amount done, and the total."""
 MODEL = "model"
 _CHUNK = 8
 _LENSES = {("pinhole", 0): "PINHOLE", ("opencv", 4): "OPENCV", ("fisheye", 4): "OPENCV_FISHEYE"}
-"""COLMAP's model for ours, by the number of coefficients."""
+"""COLMAP's camera model for each of ours, by the number of coefficients."""
 
 
 @dataclass(frozen=True)
 class MappingSettings:
-    """How pictures are matched and mapped."""
+    """Settings of matching and mapping."""
 
     overlap: int = 10
-    """Each picture is matched with so many that follow, and with some further ones at growing distances."""
+    """Number of following images that each image is matched with, besides some at growing distances."""
     max_keypoints: int = 4096
     max_size: int = 1600
-    """Larger pictures are shrunk to this side (px) for features."""
+    """Images with a longer side (px) are shrunk for feature extraction."""
     lens: str = "SIMPLE_RADIAL"
     """COLMAP's model where no camera is given and it calibrates itself; OPENCV_FISHEYE for very wide lenses."""
     threads: int = -1
@@ -75,7 +75,7 @@ def _pycolmap() -> Any:
     except ImportError as error:
         raise WearcapError("structure from motion needs the package pycolmap",
                            fix='Run: pip install "wearcap[track]", or give a finished COLMAP model: from_model=DIR.') from error  # fmt: skip
-    colmap.logging.minloglevel = 2  # its errors come as exceptions, its progress is told by ours
+    colmap.logging.minloglevel = 2  # its errors come as exceptions, we report its progress
     return colmap
 
 
@@ -83,7 +83,7 @@ def _extract(
     colmap: Any, names: Sequence[str], images: Path, database: Path, lens: tuple[str, str] | None,
     settings: MappingSettings, advance: Advance,
 ) -> None:  # fmt: skip
-    """Features of all pictures, a few at a time; those in the database stay, and all share its one camera."""
+    """Extract the features of all images, a few at a time; existing ones stay, and all share the database's camera."""
     reader, options = colmap.ImageReaderOptions(), colmap.FeatureExtractionOptions()
     reader.camera_model, reader.camera_params = lens or (settings.lens, "")
     options.num_threads, options.max_image_size = settings.threads, settings.max_size
@@ -98,7 +98,7 @@ def _extract(
         first = _CHUNK if start or reader.existing_camera_id >= 0 else 1
         for part in (names[start : start + first], names[start + first : start + _CHUNK]):
             if part:
-                _told(colmap.extract_features, database, images, image_names=list(part), reader_options=reader,
+                _run_step(colmap.extract_features, database, images, image_names=list(part), reader_options=reader,
                       camera_mode=colmap.CameraMode.SINGLE, extraction_options=options)  # fmt: skip
                 with colmap.Database.open(database) as opened:
                     reader.existing_camera_id = opened.read_all_cameras()[0].camera_id
@@ -109,13 +109,13 @@ def _match(colmap: Any, database: Path, settings: MappingSettings) -> None:
     """Match each picture with those that follow; pairs that are in the database are not matched again."""
     pairing, matching = colmap.SequentialPairingOptions(), colmap.FeatureMatchingOptions()
     pairing.overlap, pairing.num_threads, matching.num_threads = settings.overlap, settings.threads, settings.threads  # fmt: skip
-    _told(colmap.match_sequential, database, matching_options=matching, pairing_options=pairing)
+    _run_step(colmap.match_sequential, database, matching_options=matching, pairing_options=pairing)
 
 
 def _map(
     colmap: Any, count: int, images: Path, folder: Path, calibrated: bool, settings: MappingSettings, advance: Advance
 ) -> Path:  # fmt: skip
-    """Incremental mapping; the model with most pictures is put in place when it is whole."""
+    """Incremental mapping; the model with most images is moved into place when it is complete."""
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.min_model_size = settings.threads, settings.seed, 3
     if calibrated:
@@ -131,7 +131,7 @@ def _map(
     advance("mapping", 0, count)
     shutil.rmtree(folder / "sparse", ignore_errors=True)
     (folder / "sparse").mkdir()
-    models = _told(colmap.incremental_mapping, folder / "database.db", images, folder / "sparse", options=options,
+    models = _run_step(colmap.incremental_mapping, folder / "database.db", images, folder / "sparse", options=options,
                    next_image_callback=one_more)  # fmt: skip
     advance("mapping", count, count)
     if not models:
@@ -143,14 +143,14 @@ def _map(
     written.mkdir()
     best.write(written)
     (folder / MODEL).mkdir(exist_ok=True)
-    # images.bin says that the model is whole: it comes last.
+    # images.bin marks a complete model, so it is moved last.
     for path in sorted(written.iterdir(), key=lambda path: path.name == "images.bin"):
         path.replace(folder / MODEL / path.name)
     return folder / MODEL
 
 
-def _told(step: Callable, database: Path, *arguments: Any, **options: Any) -> Any:
-    """COLMAP's own exceptions, as errors a user can mend."""
+def _run_step(step: Callable, database: Path, *arguments: Any, **options: Any) -> Any:
+    """Run a COLMAP step; its exceptions become WearcapErrors with a fix."""
     try:
         return step(database, *arguments, **options)
     except (RuntimeError, ValueError) as error:

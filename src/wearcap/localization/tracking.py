@@ -1,4 +1,4 @@
-"""From a plain video, or a folder of pictures, to the camera's path and points of its surroundings.
+"""Camera path and scene points from a plain video or a folder of images.
 
 A single camera knows no metres and no gravity: scale and axes of the result are arbitrary.
 """
@@ -34,18 +34,18 @@ FRAMES, STATE = "frames", "settings.json"
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """Which pictures are taken, and what becomes of those that find no place."""
+    """Image sampling, and interpolation of images that could not be placed."""
 
     fps: float | int
-    """Pictures a second that are taken of a video; of a folder's pictures, how many belong to a second."""
+    """Images per second that are sampled from a video; frame rate of a folder's images."""
     max_gap_s: float | int
-    """Shorter gaps between placed pictures are interpolated."""
+    """Longest gap between placed images that is interpolated."""
     mapping: MappingSettings
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """An ordered row of picture files."""
+    """An ordered sequence of image files."""
 
     folder: Path
     names: tuple[str, ...]
@@ -54,25 +54,25 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Track:
-    """A camera's path in a world of arbitrary unit and axes."""
+    """A camera path in a world with arbitrary unit and axes."""
 
     T_world_cam: Trajectory
-    """Of placed pictures, and of those in short gaps between them."""
+    """Poses of placed images, and of those in short gaps between them."""
     camera: Camera
     points_world: Float64[np.ndarray, "point 3"]
     colors: UInt8[np.ndarray, "point 3"]
     pictures: int
     placed: int
     gaps_s: tuple[tuple[float, float, bool], ...]
-    """Start and end of each stretch without placed pictures, and whether it was bridged."""
+    """Start and end (s) of each stretch without placed images, and whether it was interpolated."""
     reprojection_px: float
-    """Mean distance of points from where they were seen; NaN without tracks."""
+    """Mean reprojection error of the points; NaN without tracks."""
 
 
 def track_pictures(
     source: str | Path, output: str | Path, settings: TrackSettings, camera: Camera | None, advance: Advance
 ) -> Track:  # fmt: skip
-    """Track the camera of a video or of a folder of pictures; `output` keeps what is worked out on the way.
+    """Track the camera of a video or of a folder of pictures; `output` keeps intermediate results.
 
     A run that was stopped goes on, a finished reconstruction is taken as it is. Raises WearcapError when `output`
     belongs to another source or other settings, without pictures, and as `map_pictures` does.
@@ -93,7 +93,7 @@ def track_pictures(
 
 
 def picture_row(folder: str | Path, fps: float) -> Pictures:
-    """A folder's pictures in order of name, `fps` of them a second."""
+    """A folder's images sorted by name, at `fps` per second."""
     folder = Path(folder)
     names = tuple(sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES))
     if not names:
@@ -102,7 +102,7 @@ def picture_row(folder: str | Path, fps: float) -> Pictures:
 
 
 def model_row(model: ColmapModel, fps: float) -> Pictures:
-    """The pictures that a model holds, in order of name, as if none was missing."""
+    """The images of a model sorted by name, assuming that none is missing."""
     names = tuple(photo.file.name for photo in model.photos)
     folder = model.photos[0].file.parent if model.photos else Path()
     return Pictures(folder, names, torch.arange(len(names), dtype=torch.float64) / fps)
@@ -136,7 +136,7 @@ def track_of_model(model: ColmapModel, pictures: Pictures, max_gap_s: float, whe
 
 
 def reprojection_error(model: ColmapModel) -> float:
-    """Mean distance (px) of a model's points from where its photos saw them; NaN without observations."""
+    """Mean reprojection error (px) of a model's points; NaN without observations."""
     tracks, distances = model.tracks, [np.zeros(0)]
     for index, photo in enumerate(model.photos):
         mine = tracks.photo == index
@@ -184,7 +184,7 @@ def _gaps(
 
 
 def _claim(source: Path, output: Path, settings: TrackSettings, camera: Camera | None) -> None:
-    """Write down whose folder this is. Raises WearcapError when it is another's."""
+    """Record source and settings in the folder. Raises WearcapError when it holds another track."""
     about = source.stat()
     mine = {
         "source": str(source.resolve()), "bytes": about.st_size if source.is_file() else len(_listed(source)),
@@ -204,7 +204,7 @@ def _listed(folder: Path) -> Sequence[Path]:
 
 
 def _frames(video: Path, output: Path, fps: float, advance: Advance) -> Pictures:
-    """Frames of a video nearest to an even clock, as JPEGs in `output`/frames, with the times that the video says."""
+    """Frames of a video nearest to an even clock, as JPEGs in `output`/frames, with the video's timestamps."""
     folder, listed = output / FRAMES, output / FRAMES / "times.json"
     if listed.is_file():
         rows = read_json(listed)

@@ -1,4 +1,4 @@
-"""The visual map of a scene: pictures with known poses, their keypoints lifted to 3D, and what finds them again."""
+"""The visual map of a scene: images with known poses, keypoints lifted to 3D, and global descriptors for retrieval."""
 
 import dataclasses
 import json
@@ -36,25 +36,25 @@ class VisualMap:
     descriptor: str
     """Name of the global descriptor."""
     names: tuple[str, ...]
-    """File name of each picture."""
+    """File name of each image."""
     cameras: tuple[Camera, ...]
-    """Of each picture; the perspective one where a fisheye was undistorted."""
+    """Camera of each image; the perspective camera where a fisheye was undistorted."""
     R_world_cam: Float64[np.ndarray, "image 3 3"]
     t_world_cam: Float64[np.ndarray, "image 3"]
     keypoints: Float32[np.ndarray, "observation 2"]
     descriptors: Int8[np.ndarray, "observation feature"]
     positions: Float32[np.ndarray, "observation 3"]
-    """In the world (m), as lifted from the observation's own picture."""
+    """World position (m), lifted in the observation's own image."""
     first: Int64[np.ndarray, "edge"]
-    """Picture i holds observations first[i] … first[i + 1] - 1."""
+    """Image i has the observations first[i] … first[i + 1] - 1."""
     landmark: Int32[np.ndarray, "observation"]
-    """Number of the landmark that the observation shows."""
+    """Index of the observed landmark."""
     landmarks: Landmarks
     global_descriptors: Float32[np.ndarray, "image global"]
     vocabulary: Float32[np.ndarray, "word feature"]
-    """Of VLAD; no words where another global descriptor is used."""
+    """VLAD's vocabulary; empty where another global descriptor is used."""
     cell_m: float
-    """Size of the cells within which observations are merged into landmarks; 0: those of equal position are."""
+    """Size of the cells (m) within which observations are merged into landmarks; 0: merged at equal positions."""
 
     def __len__(self) -> int:
         return len(self.names)

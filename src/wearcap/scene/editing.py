@@ -1,4 +1,4 @@
-"""Making an interactive environment out of a scan: select points, cut objects out, say how they move, undo."""
+"""Editing a scan into an interactive environment: select points, cut out objects, set their freedom, undo."""
 
 import re
 from dataclasses import dataclass, replace
@@ -20,13 +20,13 @@ USUAL_KIND = {
     "door": "hinge", "window": "hinge", "drawer": "axis", "sofa": "plane", "table": "plane", "chair": "plane",
     "cupboard": "plane", "box": "free", "other": "plane",
 }  # fmt: skip
-"""Categories that are offered, and how such things mostly move."""
+"""Default kind of freedom of each offered category."""
 FEWEST_POINTS = 20
-"""An object of fewer points would be a speck."""
+"""Fewest points of an object."""
 _SAME_M = 0.0005
-"""A point of an object that was cut out of this scan lies no further from the scan's."""
+"""Distance within which an object's point and a scan point are the same point."""
 _SURFACE_M = 0.02
-"""Points of the scan so near to an object's triangles are seen as its."""
+"""Distance to an object's triangles within which scan points belong to the object."""
 _OUTSIDE_M = 0.5
 _HISTORY = 200
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -36,7 +36,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 class _Cut:
     item: SceneObject
     points: Int64[np.ndarray, "taken"]
-    """Numbers of the scan's points that it took, ascending."""
+    """Indices of the object's points in the scan, ascending."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +46,14 @@ class _State:
 
 
 class ObjectEditing:
-    """The objects cut out of a scan so far, the points that are selected for the next, and all steps back.
+    """Editing session: the objects cut out of a scan, the selected points, and the undo history.
 
-    Every verb is one step of `undo`; consecutive ones with the same `stroke` (a brush's way, a slider that is
-    dragged) are one step together. The scan itself never changes.
+    Every method call is one `undo` step; consecutive calls with the same `stroke` (a brush stroke, a dragged slider)
+    form one step together. The scan itself never changes.
     """
 
     def __init__(self, scan: Scan, environment: Environment | None = None):
-        """Raises WearcapError for objects that do not stand in this scan."""
+        """Raises WearcapError for objects outside this scan."""
         self.scan = scan
         self._cloud = SlicedCloud(scan.points)
         objects = environment.objects if environment is not None else ()
@@ -66,7 +66,7 @@ class ObjectEditing:
 
     @property
     def selected(self) -> Int64[np.ndarray, "point"]:
-        """Numbers of the selected points, ascending."""
+        """Indices of the selected points, ascending."""
         return self._state.selected
 
     @property
@@ -76,7 +76,7 @@ class ObjectEditing:
 
     @property
     def revision(self) -> object:
-        """Another object whenever the environment has changed (and not when only the selection has)."""
+        """Token that changes identity whenever the environment changes (not when only the selection does)."""
         return self._state.cuts
 
     def left(self) -> Bool[np.ndarray, "point"]:
@@ -87,13 +87,13 @@ class ObjectEditing:
         return left
 
     def select_box(self, box: Box, add: bool = True) -> None:
-        """Add the points in a box to the selection, or take them away."""
+        """Add the points in a box to the selection, or remove them."""
         self._select(self._cloud.in_box(box), add)
 
     def select_ball(
         self, center: Float[np.ndarray, "3"], radius_m: float, add: bool = True, stroke: object = None
     ) -> None:
-        """Add the points around a place to the selection, or take them away: a dab of the brush."""
+        """Add the points around a position to the selection, or remove them (brush)."""
         self._select(self._cloud.in_ball(center, radius_m), add, stroke)
 
     def clear_selection(self) -> None:
@@ -111,19 +111,19 @@ class ObjectEditing:
             self._step(replace(self._state, selected=points), stroke)
 
     def cut(self, name: str, category: str, kind: str | None = None) -> SceneObject:
-        """Make the selected points an object, with the freedom that is usual for its category or for the kind.
+        """Make the selected points an object, with the default freedom of its category or of the kind.
 
         Its origin is the middle of its footprint on the floor, its axes are the world's. Raises WearcapError for
-        too few points or a name that cannot be.
+        too few points or an invalid name.
         """
         self._check_name(name)
         if len(self.selected) < FEWEST_POINTS:
             raise WearcapError(f"{len(self.selected)} points are selected", expected=f"{FEWEST_POINTS} or more",
                                fix="Select the object's points with the box or the brush first.")  # fmt: skip
         points = self.scan.points[self.selected]
-        rest = self.left()
-        rest[self.selected] = False
-        floor = floor_below(points, self.scan.points[rest])
+        remaining = self.left()
+        remaining[self.selected] = False
+        floor = floor_below(points, self.scan.points[remaining])
         origin = np.array([*footprint(points).center, floor])
         colors = np.full(3, 0.6, np.float32)
         if self.scan.colors is not None:
@@ -141,7 +141,7 @@ class ObjectEditing:
         return next(name for k in range(1, len(names) + 2) if (name := f"{category}_{k}") not in names)
 
     def rename(self, name: str, new: str) -> None:
-        """Raises WearcapError for a name that cannot be."""
+        """Rename an object. Raises WearcapError for an invalid name."""
         if new != name:
             self._check_name(new)
             self._change(replace(self._find(name).item, name=new), name)
@@ -150,7 +150,7 @@ class ObjectEditing:
         self._change(replace(self._find(name).item, freedom=freedom), name, stroke)
 
     def set_kind(self, name: str, kind: str) -> None:
-        """Another kind of freedom, with what is usual for it."""
+        """Set the kind of freedom, with its default parameters."""
         item = self._find(name).item
         if kind != item.freedom.kind:
             points, floor = points_world(item), float(item.t_world_object[2])
@@ -162,7 +162,7 @@ class ObjectEditing:
         self._step(replace(self._state, cuts=tuple(cut for cut in self._state.cuts if cut is not gone)))
 
     def undo(self) -> bool:
-        """Back by one step; whether there was one."""
+        """Undo one step; returns whether there was one."""
         self._stroke = None
         if not self._past:
             return False
@@ -204,7 +204,7 @@ class ObjectEditing:
 
 
 def points_world(item: SceneObject) -> Float[np.ndarray, "vertex 3"]:
-    """An object's vertices where it stands at the beginning (float64)."""
+    """An object's vertices in the world (m, float64) at its initial pose."""
     R, t = item.R_world_object.double().numpy(), item.t_world_object.double().numpy()
     return item.mesh.vertices.astype(np.float64) @ R.T + t
 

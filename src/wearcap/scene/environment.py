@@ -1,4 +1,4 @@
-"""An interactive environment: objects that can be moved, and which of them is nearest to a hand (thesis §5.2, §5.3)."""
+"""An interactive environment: movable objects, and the object nearest to a hand (thesis §5.2, §5.3)."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -21,23 +21,23 @@ class Nearest:
     """The object nearest to each of some points of the world."""
 
     object_index: Int64[Tensor, "query"]
-    """Number in `Environment.objects`; -1 where none is within reach."""
+    """Index in `Environment.objects`; -1 where none is within reach."""
     distance: Float[Tensor, "query"]
-    """From the point to the object's surface (m), infinity where none is within reach."""
+    """Distance (m) from the point to the object's surface; infinity where none is within reach."""
     point_world: Float[Tensor, "query 3"]
     """The object's closest point (m), NaN where none is within reach."""
 
 
 @dataclass(frozen=True, eq=False)
 class Environment:
-    """Objects by unique names. Raises WearcapError for a name that two objects bear."""
+    """Objects with unique names. Raises WearcapError for repeated names."""
 
     objects: tuple[SceneObject, ...]
 
     def __post_init__(self):
-        twice = [name for name, count in Counter(item.name for item in self.objects).items() if count > 1]
-        if twice:
-            raise WearcapError(f"several objects are named {twice[0]!r}", expected="unique names")
+        repeated = [name for name, count in Counter(item.name for item in self.objects).items() if count > 1]
+        if repeated:
+            raise WearcapError(f"several objects are named {repeated[0]!r}", expected="unique names")
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -47,7 +47,7 @@ class Environment:
         return self.objects[self.index(name)]
 
     def index(self, name: str) -> int:
-        """Number of the object of that name. Raises WearcapError where there is none."""
+        """Index of the object of that name. Raises WearcapError where there is none."""
         if name not in self._index:
             raise WearcapError(f"no object {name!r}", expected=f"one of {', '.join(self._index) or 'none'}")
         return self._index[name]
@@ -87,8 +87,8 @@ class Environment:
     ) -> Nearest:
         """The nearest object to each point, by exact distance to triangles (to points, in a cloud).
 
-        Objects stand at `T_world_object` where it names them, else where they stood at the beginning; with a
-        `contact_class` only objects of that class count. A point with NaN has no nearest object.
+        Objects are at `T_world_object` where it names them, else at their initial pose; with a `contact_class` only
+        objects of that class count. A point with NaN has no nearest object.
         """
         if contact_class not in (None, *CONTACT_CLASSES):
             raise WearcapError(
@@ -133,7 +133,7 @@ def surface_index(mesh: Mesh) -> TriangleIndex:
 
 
 def box_in_world(item: SceneObject) -> Float64[np.ndarray, "2 3"]:
-    """Least and greatest corner (m) of the box around an object where it stands at the beginning."""
+    """Minimum and maximum corner (m) of the bounding box of an object at its initial pose, in the world."""
     points = (
         item.mesh.vertices @ item.R_world_object.double().numpy().T + item.t_world_object.double().numpy()
     )
@@ -141,7 +141,7 @@ def box_in_world(item: SceneObject) -> Float64[np.ndarray, "2 3"]:
 
 
 def hinge_gap_m(item: SceneObject) -> float:
-    """How far an object's hinge is, seen from above, from the box around it; 0 for objects without a hinge."""
+    """Horizontal distance of an object's hinge from its bounding box; 0 for objects without a hinge."""
     if item.freedom.pivot is None:
         return 0.0
     low, high = box_in_world(item)[:, :2]

@@ -1,4 +1,4 @@
-"""Height of the floor beneath the wearer, from points of the surroundings or from the head alone."""
+"""Height of the floor below the wearer, from points of the surroundings or from the head path alone."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ _BIN_M = 0.02
 
 @dataclass(frozen=True)
 class _Reach:
-    """Points within `radius_m` of the head, seen from above, speak about the floor beneath it, near ones most."""
+    """Points within a horizontal radius of the head vote for the floor height, with Gaussian weights."""
 
     cell_m: float
     radius_m: float
@@ -27,29 +27,29 @@ class _Reach:
 
 
 _NEAR = _Reach(0.2, 0.8, 0.25)
-"""On stairs the nearest step counts …"""
+"""Narrow support, which resolves single stairs."""
 _WIDE = _Reach(0.4, 2.4, 1.0)
-"""… where hardly any points are near, those further off."""
+"""Wide support, for places with few points nearby."""
 _ENOUGH = 30.0
-"""Weighted number of near points that makes those further off unnecessary."""
+"""Weighted number of near points above which the wide support hardly counts."""
 _KEY_STEP_M = 0.15
-"""The head's path is examined once in so many metres."""
+"""Length of the path segments (m) that get one floor height each."""
 _FAINT = 0.1
-"""Layers of fewer (weighted) points per bin than this say little."""
+"""Weighted points per bin below which a layer is weak evidence."""
 _CLEARANCE_M = (0.3, 2.3)
-"""The head is never nearer to the floor, nor further from it."""
+"""Smallest and largest height of the head above the floor."""
 _CHANGE_COST = 20.0
 """Cost of a metre up or down, in the units of `_evidence` (ours, as all weights here)."""
 
 
 @dataclass(frozen=True)
 class FloorEstimate:
-    """Floor height beneath each head position."""
+    """Floor height below each head position."""
 
     height: Float[Tensor, "time"]
-    """Metres, in the world's z."""
+    """Floor height (m), along the world's z."""
     confidence: Float[Tensor, "time"]
-    """0 (nothing seen there: carried over from elsewhere) … 1 (hundreds of points lie on it)."""
+    """0 (no points there, taken over from neighbours) … 1 (hundreds of points on the floor)."""
 
 
 def estimate_floor(
@@ -57,7 +57,7 @@ def estimate_floor(
     t_world_head: Float[Tensor, "time 3"],
     standing_m: float | None = None,
 ) -> FloorEstimate:
-    """Floor beneath a moving head: at each place the lowest strong horizontal layer, changing no more than it must.
+    """Floor below a moving head: everywhere the lowest strong horizontal layer, with as little change as possible.
 
     The path is cut into steps of 0.15 m; each step votes for heights with the points within 0.8 m (2.4 m
     where they are few), and dynamic programming picks the sequence of heights with the best votes and the least
@@ -75,14 +75,14 @@ def estimate_floor(
     near, wide = (_votes(points, keys, bottom, bins, reach) for reach in (_NEAR, _WIDE))
     votes = near + wide * (1 - near.sum(1, keepdims=True) / _ENOUGH).clip(0.02, 1)
     if not votes.any():
-        raise WearcapError("no points beneath the head's path", expected="a cloud in the head's world, z up",
+        raise WearcapError("no points below the head's path", expected="a cloud in the head's world, z up",
                            fix="Give the wearer's stature instead: floor_from_head.")  # fmt: skip
     heights = bottom + (np.arange(bins) + 0.5) * _BIN_M
     clearance, evidence = keys[:, 2:] - heights, _evidence(votes)
     if standing_m is None:
         first = _cheapest_path(evidence + _posture_cost(clearance, 1.9, 20.0), _CHANGE_COST * _BIN_M)
         standing_m = _usual_clearance(np.take_along_axis(clearance, first[:, None], 1)[:, 0])
-    # Once the wearer's height is known, a ceiling below an upper floor is no longer taken for that floor.
+    # With the wearer's height, a ceiling below an upper floor is no longer mistaken for that floor.
     chosen = _cheapest_path(
         evidence + _posture_cost(clearance, standing_m + 0.03, 40.0), _CHANGE_COST * _BIN_M
     )
@@ -95,10 +95,10 @@ def estimate_floor(
 
 
 def floor_from_head(t_world_eyes: Float[Tensor, "time 3"], stature_m: float) -> FloorEstimate:
-    """One floor for the whole path, from the height of the eyes while upright (their 90th percentile).
+    """One floor height for the whole path, from the eye height while upright (its 90th percentile).
 
-    Right where the wearer stands or walks for a tenth of the time and stays on one storey; confidence 0.2.
-    Raises WearcapError for a stature that no person has.
+    Valid if the wearer stands or walks for a tenth of the time and stays on one storey; confidence 0.2.
+    Raises WearcapError for an implausible stature.
     """
     if not 0.5 < stature_m < 2.6:
         raise WearcapError(f"stature {stature_m} m", expected="metres, between 0.5 and 2.6")
@@ -108,14 +108,14 @@ def floor_from_head(t_world_eyes: Float[Tensor, "time 3"], stature_m: float) -> 
 
 
 def _key_positions(head: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One position per `_KEY_STEP_M` of path, and for each frame the key it belongs to."""
+    """One key position per `_KEY_STEP_M` of path, and the key of each frame."""
     arc = np.concatenate([[0.0], np.linalg.norm(np.diff(head, axis=0), axis=1).cumsum()])
     _, first, key_of_frame = np.unique(np.floor(arc / _KEY_STEP_M), return_index=True, return_inverse=True)
     return head[first], key_of_frame
 
 
 def _votes(points: np.ndarray, keys: np.ndarray, bottom: float, bins: int, reach: _Reach) -> np.ndarray:
-    """Points near each key by height: (key, bin) weighted counts. Points are put into columns of the floor once."""
+    """Weighted point counts (key, bin) by height near each key, from a precomputed histogram of floor cells."""
     cells = int(np.ceil(reach.radius_m / reach.cell_m))
     grid = np.stack(np.meshgrid(*[np.arange(-cells, cells + 1)] * 2, indexing="ij"), -1).reshape(-1, 2)
     distance = np.linalg.norm(grid * reach.cell_m, axis=1)
@@ -140,12 +140,12 @@ def _cell_key(cell: np.ndarray) -> np.ndarray:
 
 
 def _evidence(votes: np.ndarray) -> np.ndarray:
-    """Cost of each height: how weak its layer is beside the strongest there, and how much lies beneath it."""
+    """Cost of each height: how weak its layer is beside the strongest there, and the share of points below it."""
     layer = gaussian_filter1d(votes, 1.5, axis=1)
     strength = (layer + _FAINT) / (layer.max(1, keepdims=True) + _FAINT)
     margin = int(0.08 / _BIN_M)
     below = np.pad(votes.cumsum(1), ((0, 0), (margin, 0)))[:, : votes.shape[1]]
-    share = below / np.maximum(votes.sum(1, keepdims=True), 1)  # a lone point beneath is no evidence
+    share = below / np.maximum(votes.sum(1, keepdims=True), 1)  # a single point below is no evidence
     return -np.log(strength) + 6.0 * share.clip(max=0.4)
 
 

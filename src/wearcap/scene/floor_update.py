@@ -1,4 +1,4 @@
-"""The floor that the wearer stands on, followed by where the feet touch it (MocapEvery, appendix D.2)."""
+"""Floor height below the wearer, updated from foot contacts and points (MocapEvery, appendix D.2)."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -12,26 +12,26 @@ from torch import Tensor
 
 @runtime_checkable
 class FloorFollower(Protocol):
-    """Follows the floor through a capture, some frames after the other: where they are likely to be, then what their
-    feet say."""
+    """Estimates the floor height during a capture. For each block of frames `ahead` predicts the height from the head,
+    then `follow` corrects it from the estimated feet."""
 
     def see(self, points_world: Float[Tensor, "point 3"]) -> None:
         """Take in points of the surroundings (m)."""
         ...
 
     def ahead(self, t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
-        """Height (m) of the floor beneath the next frames, before their feet are known."""
+        """Predicted floor height (m) of the next frames, before their feet are estimated."""
         ...
 
     def follow(
         self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]
     ) -> None:
-        """Take in the same frames' probability of contact, and where their foot joints are (m)."""
+        """Take in the same frames' contact probabilities and foot joint positions (m)."""
         ...
 
 
 class _Cloud:
-    """Points to be asked for by place; more may come."""
+    """Incremental spatial index of points."""
 
     def __init__(self):
         self._trees: list[KDTree] = []
@@ -39,7 +39,7 @@ class _Cloud:
     def add(self, points_world: Float[Tensor, "point 3"]) -> None:
         points = points_world.detach().cpu().double().numpy()
         points = points[np.isfinite(points).all(1)]
-        # Few trees of rising size: each is built anew only when as many points have come as it holds.
+        # Few trees of increasing size: each is rebuilt only after as many new points as it holds.
         while self._trees and self._trees[-1].n <= len(points):
             points = np.concatenate([self._trees.pop().data, points])
         if len(points):
@@ -49,36 +49,42 @@ class _Cloud:
     def empty(self) -> bool:
         return not self._trees
 
-    def within(self, place: np.ndarray, radius_m: float) -> np.ndarray:
-        """Heights (m) of all points that near to a place."""
-        found = [tree.data[tree.query_ball_point(place, radius_m), 2] for tree in self._trees]
+    def within(self, position: np.ndarray, radius_m: float) -> np.ndarray:
+        """Heights (m) of all points within a radius of a position."""
+        found = [tree.data[tree.query_ball_point(position, radius_m), 2] for tree in self._trees]
         return np.concatenate(found) if found else np.zeros(0)
 
-    def nearest(self, places: np.ndarray, radius_m: float, count: int) -> np.ndarray:
-        """Heights (m) of the nearest points to each place, NaN for fewer than `count` of each tree within the radius."""
+    def nearest(self, positions: np.ndarray, radius_m: float, count: int) -> np.ndarray:
+        """Heights (m) of the `count` nearest points of each tree to each position; NaN beyond the radius."""
         columns = []
         for tree in self._trees:
-            number = tree.query(places, count, distance_upper_bound=radius_m)[1].reshape(len(places), -1)
+            number = tree.query(positions, count, distance_upper_bound=radius_m)[1].reshape(
+                len(positions), -1
+            )
             columns.append(np.append(tree.data[:, 2], np.nan)[number])
-        return np.concatenate(columns, 1) if columns else np.full((len(places), 1), np.nan)
+        return np.concatenate(columns, 1) if columns else np.full((len(positions), 1), np.nan)
 
 
 @dataclass(frozen=True)
 class UpdateSettings:
-    """The document's numbers; times in frames of 30 in a second."""
+    """Parameters of D.2 with the paper's values; durations in frames at 30 Hz."""
 
     contact: float = 0.5
+    """Contact probability above which a foot is in contact."""
     radius_m: float = 0.15
+    """Radius around the foot within which points are averaged."""
     min_points: int = 10
+    """Fewest points for an average; with fewer the foot's own height is used."""
     min_change_m: float = 0.1
+    """Smallest change of the floor height."""
     settled: int = 5
-    """Both feet in contact for so many frames before and after a frame: nothing changes there."""
+    """No update at frames where both feet are in contact for this many frames before and after."""
     min_frames: int = 25
-    """Between updates."""
+    """Fewest frames between updates."""
 
 
 class FloorUpdate:
-    """D.2 as it stands. The second rule looks `settled` frames ahead, so a stream's floor lags by as many."""
+    """Floor update of D.2. The `settled` rule looks that many frames ahead, so the floor height lags by as many."""
 
     def __init__(self, initial_m: float, settings: UpdateSettings | None = None):
         self._settings, self._height = settings or UpdateSettings(), initial_m
@@ -88,7 +94,7 @@ class FloorUpdate:
         self._contact = np.zeros((keep, 2), bool)
         self._feet = np.full((keep, 2, 3), np.nan)
         self._latest: np.ndarray | None = None
-        """Foot of the latest contact."""
+        """Position (m) of the foot that was in contact last."""
 
     def see(self, points_world: Float[Tensor, "point 3"]) -> None:
         self._cloud.add(points_world)
@@ -125,33 +131,35 @@ class FloorUpdate:
 
 @dataclass(frozen=True)
 class FollowSettings:
-    """Ours; times in frames of 30 in a second."""
+    """Parameters of `FloorFollow` (ours), for 30 Hz."""
 
     contact: float = 0.5
+    """Contact probability above which a foot corrects the floor."""
     radius_m: float = 0.15
-    """Points so near a standing foot, seen from above …"""
+    """Horizontal distance to a foot within which points belong to the floor."""
     reach_m: float = 0.12
-    """… and no further above or below its sole are the floor's."""
+    """Vertical distance to its sole within which they do."""
     points: int = 12
-    """The nearest so many are looked at."""
+    """Number of nearest points that are used."""
     min_points: int = 4
+    """Fewest points within both distances; with fewer the sole's height is used."""
     gain: float = 0.05
-    """Share of what the floor is off that each frame of full contact takes away, by the soles' word …"""
+    """Share of the floor's error that a frame of full contact corrects, measured by the sole's height."""
     gain_points: float = 0.1
-    """… and by that of points beneath them."""
+    """The same, measured by points below the sole."""
     walking_m_s: tuple[float, float] = (0.1, 0.3)
-    """From the first speed of the head on, and wholly from the second, its rising and falling is the floor's."""
+    """Head speeds between which the head's rise starts to move the floor, and moves it fully."""
     level: float = 0.15
+    """Smoothing factor of the head's height (Holt's method), against the ups and downs of steps and nods."""
     trend: float = 0.01
-    """Shares of a frame's surprise that go into the head's smoothed height, and into how fast it rises: steps and nods
-    are no floors."""
+    """Smoothing factor of the head's rate of rise."""
 
 
 class FloorFollow:
-    """The floor goes up and down with the head of one who walks, and is drawn to where feet stand (ours, after D.2).
+    """Floor that rises and falls with the walking wearer's head and is corrected by standing feet (ours, after D.2).
 
-    Without a threshold slopes are followed, too; and on stairs, where D.2 waits for the next foot, the head already
-    says how far up one is. Feet, or the points beneath them, correct what the head gets wrong.
+    There is no threshold, so it also follows slopes; on stairs the head moves the floor before the next foot is down,
+    for which D.2 waits. Feet, or the points below them, correct the error of the head's estimate.
     """
 
     def __init__(self, initial_m: float, sole_m: float, fps: float, settings: FollowSettings | None = None):
@@ -159,7 +167,7 @@ class FloorFollow:
         self._settings, self._sole, self._fps = settings or FollowSettings(), sole_m, fps
         self._cloud = _Cloud()
         self._floors = np.array([initial_m])
-        """Of the frames that were looked ahead at last."""
+        """Floor heights (m) of the latest block of frames."""
         self._head: np.ndarray | None = None
         self._velocity, self._level, self._trend = np.zeros(2), 0.0, 0.0
 
@@ -167,55 +175,56 @@ class FloorFollow:
         self._cloud.add(points_world)
 
     def ahead(self, t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
-        risen = [self._risen(head) for head in t_world_head.detach().cpu().double().numpy()]
-        self._floors = self._floors[-1] + np.cumsum(risen)
+        rise = [self._rise(head) for head in t_world_head.detach().cpu().double().numpy()]
+        self._floors = self._floors[-1] + np.cumsum(rise)
         return torch.from_numpy(self._floors).float()
 
     def follow(
         self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]
     ) -> None:
-        settings, wrong = self._settings, 0.0
+        settings, correction = self._settings, 0.0
         weight = (contact_prob.detach().cpu().numpy() - settings.contact).clip(0) / (1 - settings.contact)
-        reported, seen = self._below(t_world_foot.detach().cpu().double().numpy())
-        weight = weight * np.where(seen, settings.gain_points, settings.gain)
+        height, from_points = self._floor_at(t_world_foot.detach().cpu().double().numpy())
+        weight = weight * np.where(from_points, settings.gain_points, settings.gain)
         total = weight.sum(1)
-        target = (weight * reported).sum(1) / np.where(total > 0, total, 1)
+        target = (weight * height).sum(1) / np.where(total > 0, total, 1)
         share = weight.max(1)
         for frame in np.flatnonzero(total):
-            wrong += share[frame] * (target[frame] - self._floors[frame] - wrong)
-        self._floors = self._floors + wrong
+            correction += share[frame] * (target[frame] - self._floors[frame] - correction)
+        self._floors = self._floors + correction
 
-    def _risen(self, head: np.ndarray) -> float:
-        """By how much the floor rises within a frame, as the head's smoothed path says (Holt's linear trend)."""
+    def _rise(self, head: np.ndarray) -> float:
+        """Rise of the floor (m) within a frame, from the head's smoothed height (Holt's linear trend)."""
         settings = self._settings
         if self._head is None:
             self._head, self._level = head, float(head[2])
         velocity = (head[:2] - self._head[:2]) * self._fps
         self._velocity += settings.level * (velocity - self._velocity)
         self._head = head
-        before, surprise = self._level, float(head[2]) - self._level - self._trend
-        self._level += self._trend + settings.level * surprise
-        self._trend += settings.trend * surprise
+        before, innovation = self._level, float(head[2]) - self._level - self._trend
+        self._level += self._trend + settings.level * innovation
+        self._trend += settings.trend * innovation
         low, high = settings.walking_m_s
         walking = float(np.clip((np.hypot(*self._velocity) - low) / (high - low), 0, 1))
         return walking * (self._level - before)
 
-    def _below(self, feet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Height (m) of the floor beneath feet "time foot 3", of the points there, else of the soles; and which it is."""
+    def _floor_at(self, feet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Floor height (m) at feet "time foot 3", from points where there are enough, else from the soles; and whether
+        it is from points."""
         settings, soles = self._settings, feet[..., 2] - self._sole
         if self._cloud.empty:
             return soles, np.zeros(soles.shape, bool)
-        places = np.concatenate([feet[..., :2], soles[..., None]], -1).reshape(-1, 3)
+        positions = np.concatenate([feet[..., :2], soles[..., None]], -1).reshape(-1, 3)
         reach = float(np.hypot(settings.radius_m, settings.reach_m))
-        heights = self._cloud.nearest(places, reach, settings.points)
-        heights[np.abs(heights - places[:, 2:]) > settings.reach_m] = np.nan
+        heights = self._cloud.nearest(positions, reach, settings.points)
+        heights[np.abs(heights - positions[:, 2:]) > settings.reach_m] = np.nan
         few = np.isfinite(heights).sum(1, keepdims=True) < settings.min_points
-        heights = np.where(few, places[:, 2:], heights)
+        heights = np.where(few, positions[:, 2:], heights)
         return np.nanmedian(heights, 1).reshape(soles.shape), ~few.reshape(soles.shape)
 
 
 class FloorFixed:
-    """The floor where it was (the document's ablation), or where it is given."""
+    """Constant floor height (the paper's ablation), or one that the caller sets."""
 
     def __init__(self, initial_m: float):
         self.height = initial_m

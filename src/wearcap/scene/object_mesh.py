@@ -1,4 +1,4 @@
-"""Meshes of objects that are handled: centred in axes of their own, and the checks of what strangers' files hold."""
+"""Meshes of handled objects: centring in their own axes, and validation of meshes from files."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,8 +28,8 @@ def centered(mesh: Mesh) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
 
 
 def check_object(item: SceneObject, where: str | Path) -> None:
-    """`check_object_mesh` of an environment's object; what turns on a hinge or slides along an axis is in the axes of
-    its mount, wherever that is."""
+    """`check_object_mesh` of an environment's object. Objects on a hinge or axis may be in the axes of their mount,
+    with the origin anywhere."""
     check_object_mesh(item.mesh, where, item.freedom.kind not in ("hinge", "axis"))
 
 

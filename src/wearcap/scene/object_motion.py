@@ -1,4 +1,4 @@
-"""How an object follows the hands that hold it, within its degrees of freedom (thesis §5.3.3, eq. 5.3–5.7)."""
+"""Object motion from the hands that hold the object, within its degrees of freedom (thesis §5.3.3, eq. 5.3–5.7)."""
 
 from dataclasses import dataclass
 
@@ -11,68 +11,68 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import SceneObject
 
 ANCHORS = ("right", "middle")
-"""What carries an object held by two hands: the right hand (document), or the middle of both (ours)."""
+"""Reference point of an object held by two hands: the right hand (thesis), or the middle of both (ours)."""
 LEAST_APART_M = 0.05
-"""Hands nearer to each other than this tell no direction: the last angle stays."""
+"""Smallest distance between the hands that defines a direction; below it the last angle is kept."""
 
 
 @dataclass(frozen=True)
 class ObjectState:
-    """Where an object stands, and how far it has been turned or pulled."""
+    """Pose of an object, and its hinge angle or displacement."""
 
     T_world_object: Rigid
     value: float = 0.0
-    """Angle of a hinge (rad) or way along an axis (m) since the initial pose; 0 for the others."""
+    """Hinge angle (rad) or displacement along the axis (m) from the initial pose; 0 for other kinds."""
 
 
 def follow_hands(
-    thing: SceneObject,
+    item: SceneObject,
     state: ObjectState,
     palms_world: Float[Tensor, "time hand 3"],
     holds: Bool[Tensor, "hand"],
     anchor: str = "middle",
 ) -> tuple[Rigid, Float[Tensor, "time"]]:
-    """Poses of an object from the frame at which it is taken (in `state`) on, and its angle or way (0 for others).
+    """Poses of an object from the frame of the grasp (in `state`) on, and its angle or displacement (0 for others).
 
-    `palms_world` are the keypoints in the middle of the left and the right hand (m); `holds` says which of them hold.
-    A hinge or axis stays within its limits; what slides in the plane keeps its height.
+    `palms_world` holds the palm centres of the left and the right hand (m); `holds` marks the hands that hold the
+    object. A hinge or axis stays within its limits; an object that slides in the plane keeps its height.
     """
-    held = palms_world[:, holds].double()
-    kind = thing.freedom.kind
+    palms = palms_world[:, holds].double()
+    kind = item.freedom.kind
     if kind in ("hinge", "axis"):
-        change = hinge_angle(thing, held) if kind == "hinge" else axis_way(thing, held)
-        value = thing.freedom.clamped(state.value + change)
-        return thing.freedom.moved(thing.T_world_object, value), value
-    T = carried(state.T_world_object, held, anchor)
+        change = hinge_angle(item, palms) if kind == "hinge" else axis_displacement(item, palms)
+        value = item.freedom.clamped(state.value + change)
+        return item.freedom.moved(item.T_world_object, value), value
+    T = carried(state.T_world_object, palms, anchor)
     if kind == "plane":
         T.t[:, 2] = state.T_world_object.t[2].to(T.t)
-    return T, torch.zeros(len(held), dtype=torch.float64)
+    return T, torch.zeros(len(palms), dtype=torch.float64)
 
 
-def hinge_angle(thing: SceneObject, held: Float[Tensor, "time held 3"]) -> Float[Tensor, "time"]:
-    """Signed angle (rad, continuous through ±π) of the contact point about the hinge (eq. 5.6, 5.4); hands' mean."""
-    arm = held[..., :2] - torch.tensor(thing.freedom.pivot, dtype=held.dtype)[:2]
+def hinge_angle(item: SceneObject, palms: Float[Tensor, "time hand 3"]) -> Float[Tensor, "time"]:
+    """Signed angle (rad, unwrapped) of the holding palms about the hinge (eq. 5.6, 5.4), averaged over hands."""
+    arm = palms[..., :2] - torch.tensor(item.freedom.pivot, dtype=palms.dtype)[:2]
     return turned(arm.transpose(0, 1)).mean(0)
 
 
-def axis_way(thing: SceneObject, held: Float[Tensor, "time held 3"]) -> Float[Tensor, "time"]:
-    """Way (m) of the hands along an object's axis; hands' mean."""
-    axis = torch.tensor(thing.freedom.axis, dtype=held.dtype)
-    return ((held - held[:1]) @ axis).mean(1)
+def axis_displacement(item: SceneObject, palms: Float[Tensor, "time hand 3"]) -> Float[Tensor, "time"]:
+    """Displacement (m) of the holding palms along an object's axis, averaged over hands."""
+    axis = torch.tensor(item.freedom.axis, dtype=palms.dtype)
+    return ((palms - palms[:1]) @ axis).mean(1)
 
 
-def carried(start: Rigid, held: Float[Tensor, "time held 3"], anchor: str) -> Rigid:
+def carried(start: Rigid, palms: Float[Tensor, "time hand 3"], anchor: str) -> Rigid:
     """O* = R^α (O − h) + h + t, α the turn of the vector from the right hand to the left (eq. 5.3–5.5, 5.7).
 
-    h is the right hand or the hands' middle, t its translation; one hand alone gives a translation only. The height
-    follows the hands too.
+    h is the right hand or the middle of both, t its translation; a single hand gives a translation only. The height
+    follows the hands, too.
     """
-    alone = held.shape[1] == 1
-    point = held[:, -1] if alone or anchor == "right" else held.mean(1)
-    angle = held.new_zeros(len(held)) if alone else turned((held[:, 0] - held[:, -1])[None, :, :2])[0]
+    alone = palms.shape[1] == 1
+    point = palms[:, -1] if alone or anchor == "right" else palms.mean(1)
+    angle = palms.new_zeros(len(palms)) if alone else turned((palms[:, 0] - palms[:, -1])[None, :, :2])[0]
     R = rotation.about_axis("z", angle)
-    lever = start.t.to(held) - point[0]
-    return Rigid(R @ start.R.to(held), point + (R @ lever[:, None])[..., 0])
+    lever = start.t.to(palms) - point[0]
+    return Rigid(R @ start.R.to(palms), point + (R @ lever[:, None])[..., 0])
 
 
 def turned(vectors: Float[Tensor, "hand time 2"]) -> Float[Tensor, "hand time"]:

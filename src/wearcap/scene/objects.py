@@ -1,4 +1,4 @@
-"""Objects of an interactive environment: their shape, where they stand at first, and how they may move (thesis §5.2)."""
+"""Objects of an interactive environment: shape, initial pose and degrees of freedom (thesis §5.2)."""
 
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ class Freedom:
     axis: tuple[float, float, float] | None = None
     """Direction of sliding, a unit vector."""
     limits: tuple[float, float] | None = None
-    """Least and greatest angle (rad, counter-clockwise from above) or way along the axis (m); initially 0."""
+    """Least and greatest angle (rad, counter-clockwise from above) or displacement along the axis (m); initially 0."""
 
     def __post_init__(self):
         if self.kind not in FREEDOMS:
@@ -53,15 +53,15 @@ class Freedom:
 
     @property
     def contact_class(self) -> str:
-        """Whose network tells contacts with it: "hinged" or "sliding"."""
+        """Contact network responsible for the object: "hinged" or "sliding"."""
         return "hinged" if self.kind == "hinge" else "sliding"
 
     def clamped(self, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Angle or way, kept within the limits."""
+        """Angle or displacement, clamped to the limits."""
         return value if self.limits is None else value.clamp(*self.limits)
 
     def moved(self, T_world_object: Rigid, value: Float[Tensor, "*batch"]) -> Rigid:
-        """The pose of an object that stood at `T_world_object`, after a hinge's angle (rad) or an axis' way (m)."""
+        """Pose of an object with initial pose `T_world_object` at a hinge angle (rad) or axis displacement (m)."""
         if self.kind == "hinge":
             R = rotation.about_axis("z", value)
             pivot = torch.tensor(self.pivot, dtype=value.dtype)
@@ -76,7 +76,7 @@ class Freedom:
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """A thing that can be moved: a mesh (or a cloud: no faces) in its own axes, and its pose at the beginning."""
+    """A movable object: a mesh (or a cloud: no faces) in its own axes, and its initial pose."""
 
     name: str
     category: str

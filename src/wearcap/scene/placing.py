@@ -1,4 +1,4 @@
-"""Where an object that is cut out of a scan stands, and where its hinge or slide axis probably is."""
+"""Footprint and floor height of an object cut out of a scan, and likely places of its hinge or slide axis."""
 
 from dataclasses import dataclass
 
@@ -16,17 +16,17 @@ _PULLED_M = (0.0, 0.4)
 
 @dataclass(frozen=True)
 class Footprint:
-    """The smallest rectangle around something seen from above (world axes, m)."""
+    """The smallest rectangle around an object seen from above (world axes, m)."""
 
     center: Float[np.ndarray, "2"]
     long: Float[np.ndarray, "2"]
-    """Unit vector along the longer side …"""
+    """Unit vector along the longer side."""
     half_length: float
     half_width: float
 
     @property
     def short(self) -> Float[np.ndarray, "2"]:
-        """… and, to its left, along the shorter."""
+        """Unit vector along the shorter side, to the left of `long`."""
         return np.array([-self.long[1], self.long[0]])
 
 
@@ -53,9 +53,9 @@ def footprint(points: Float[np.ndarray, "point 3"]) -> Footprint:
 
 
 def floor_below(points: Float[np.ndarray, "point 3"], scene: Float[np.ndarray, "other 3"]) -> float:
-    """Height (m) of the floor that something stands on: the lowest strong layer of the scene's points around it.
+    """Height (m) of the floor that an object stands on: the lowest strong layer of the scene's points around it.
 
-    Its own lowest point where the scene has none beneath.
+    Without scene points below it, the object's own lowest point.
     """
     low, high, bottom = points[:, :2].min(0), points[:, :2].max(0), float(points[:, 2].min())
     around = ((scene[:, :2] > low - _AROUND_M) & (scene[:, :2] < high + _AROUND_M)).all(1)
@@ -82,7 +82,7 @@ def hinge_places(points: Float[np.ndarray, "point 3"], floor: float) -> Float[np
 def snapped(
     place: Float[np.ndarray, "3"], places: Float[np.ndarray, "place 3"], reach_m: float
 ) -> Float[np.ndarray, "3"]:
-    """The nearest of some places seen from above if it is within reach; else the place itself, at their height."""
+    """The horizontally nearest of some places if it is within reach; else the place itself, at their height."""
     distance = np.linalg.norm(places[:, :2] - place[:2], axis=1)
     if distance.min() <= reach_m:
         return places[distance.argmin()]
@@ -90,7 +90,7 @@ def snapped(
 
 
 def usual_freedom(kind: str, points: Float[np.ndarray, "point 3"], floor: float) -> Freedom:
-    """A freedom to start from: a hinge at one end, opening to 90°; a slide across the longer side, 40 cm far."""
+    """Default freedom: a hinge at one end, opening to 90°; a slide of 40 cm across the longer side."""
     if kind == "hinge":
         x, y, z = hinge_places(points, floor)[0].tolist()
         return Freedom("hinge", pivot=(x, y, z), limits=_OPEN)

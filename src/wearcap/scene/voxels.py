@@ -1,4 +1,4 @@
-"""Surroundings of the wearer as grids of truncated distances, one per frame (thesis §6.2.1)."""
+"""Voxel grids of truncated distances to the wearer's surroundings, one per frame (thesis §6.2.1)."""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ _TILE_M = 0.3
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """A cube of cells below the device that turns with its yaw alone: axes x forward, y left, z up."""
+    """A cube of cells below the device, aligned to its yaw: axes x forward, y left, z up."""
 
     cells: int = 10
     """Cells along each edge."""
@@ -26,7 +26,7 @@ class VoxelGrid:
     below_m: float = 1.0
     """The cube's centre lies this far below the device."""
     clip_m: float = 0.1
-    """Greatest distance that is told; at most half a cell's edge, so that a point concerns its own cell alone."""
+    """Truncation distance (m); at most half a cell's edge, so that a point affects only its own cell."""
 
     def __post_init__(self):
         if self.cells < 1 or not 0 < self.clip_m <= 0.5 * self.cell_m * (1 + 1e-9):
@@ -48,9 +48,8 @@ def voxelize(
 ) -> Float[Tensor, "time x y z"]:
     """Distance (m) from each cell's centre to the nearest point, clipped to `clip_m` (thesis §6.2.1), of every frame.
 
-    With `first_seen` and `timestamps` (s) a point counts from the moment at which it was seen; without one of them
-    all points count in all frames. Points that are not finite are left out, and frames whose pose is not finite
-    see none.
+    With `first_seen` and `timestamps` (s) a point counts from the time at which it was first seen; without either, all
+    points count in all frames. Points that are not finite are ignored; frames whose pose is not finite see none.
     """
     everything = VoxelMap(grid)
     everything.add(points_world, first_seen)
@@ -128,11 +127,11 @@ class VoxelMap:
 
 
 def _free_blocks(size: int) -> tuple[np.ndarray, ...]:
-    """Room for points, for when they were seen (NaN, which is never, where there is none), and for the block before."""
+    """Empty blocks: points, first-seen times (NaN: unused), and the index of the preceding block."""
     points = np.zeros((size, 3, BLOCK), np.float32)
     return points, np.full((size, BLOCK), np.nan), np.empty(size, np.int32)
 
 
 def mirrored(grids: Float[Tensor, "*batch x y z"]) -> Float[Tensor, "*batch x y z"]:
-    """Grids of the same surroundings seen in a mirror that swaps left and right."""
+    """The grids mirrored, left and right swapped."""
     return grids.flip(-2)

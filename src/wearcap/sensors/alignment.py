@@ -1,4 +1,4 @@
-"""The suit's world turned and moved into the scene's: thesis eq. 4.14 and 4.15, and the camera's mount (eq. 4.3)."""
+"""Alignment of the suit's world to the scene's (thesis eq. 4.14, 4.15), and the camera's mount (eq. 4.3)."""
 
 import roma
 import torch
@@ -19,11 +19,11 @@ MAX_SPEED = 3.0
 def align_suit(
     suit: Motion, localization: Localization, mount: Rigid, first_s: float = 10.0
 ) -> tuple[Motion, Float[Tensor, ""]]:
-    """Bring a suit's motion into the scene by one rotation about gravity and one translation: (motion, angle in rad).
+    """Move a suit's motion into the scene by a rotation about gravity and a translation: (motion, angle in rad).
 
-    The angle is that of eq. 4.14, robustly over the first `first_s` seconds of localised frames instead of frame 0,
-    which may be wrong; it turns root orientation and path of all frames (eq. 4.15). The translation puts the worn
-    camera where those frames saw it. `mount` is the nominal pose of the camera in head axes, T_head_cam. Clocks
+    The angle is that of eq. 4.14, estimated robustly over the first `first_s` seconds of localised frames instead of
+    frame 0, which may be an outlier; it turns root orientation and path of all frames (eq. 4.15). The translation moves
+    the worn camera to its localised positions. `mount` is the camera's nominal pose in head axes, T_head_cam. Clocks
     must agree already. Raises WearcapError when no localised frame lies within the suit's time.
     """
     seen = inliers(localization)
@@ -48,14 +48,14 @@ def align_suit(
 
 
 def inliers(localization: Localization) -> Bool[Tensor, "time"]:
-    """Localised frames (confidence above 0) whose position no inlier neighbour contradicts at 3 m/s."""
+    """Localised frames (confidence above 0) within 3 m/s of their inlier neighbours."""
     found = (localization.confidence > 0) & localization.R_world_cam.isfinite().all(-1).all(-1)
     position = torch.where(found[:, None], localization.t_world_cam, torch.nan)
     return outlier_mask(Trajectory(localization.timestamps, localization.R_world_cam, position), MAX_SPEED)
 
 
 def _first(seen: Tensor, localization: Localization, first_s: float) -> Tensor:
-    """Of the frames seen, as many from the start as make up `first_s` seconds."""
+    """The first localised frames, as many as make up `first_s` seconds."""
     step = localization.timestamps.diff().median().item() if len(seen) > 1 else first_s
     return seen & (seen.cumsum(0) <= max(round(first_s / step), 1))
 
@@ -78,7 +78,7 @@ def robust_angle(
 ) -> Float[Tensor, ""]:
     """Centre (rad) of angles on the circle: the sample with the least weighted sum of distances to all others, then
     reweighted means in which an angle `scale_rad` away counts a quarter, and far ones hardly."""
-    # So many candidates are enough for a start
+    # A subset of candidates suffices for the initial estimate.
     candidates = angle[:: max(len(angle) // 300, 1)]
     distance = rotation.wrap_angle(candidates[:, None] - angle).abs()
     centre = candidates[(distance @ weight).argmin()]
@@ -109,7 +109,7 @@ def estimate_head_camera(
     good = (confidence > 0) & R_world_cam.isfinite().all(-1).all(-1)
     if not good.any():
         raise WearcapError(
-            "no localised frame", expected="one at least, to tell how the camera sits on the head"
+            "no localised frame", expected="at least one, to estimate the camera's mount on the head"
         )
     R, weight = R_world_head[good].mT @ R_world_cam[good], confidence[good]
     median = torch.stack([_weighted_median(R[:, :, column], weight) for column in range(3)], -1)
@@ -122,5 +122,5 @@ def estimate_head_camera(
 
 
 def body_camera(motion: Motion, t_head_cam: Float[Tensor, "3"]) -> Float[Tensor, "time 3"]:
-    """Where a motion carries the camera of its head (m, world)."""
+    """Positions (m, world) of a camera mounted on a motion's head."""
     return motion.joint("head") @ t_head_cam  # pyright: ignore[reportReturnType]

@@ -1,6 +1,6 @@
-"""Two clocks brought together by arm swings: when the forearm is highest, and when the camera has the hands nearest.
+"""Clock synchronisation by arm swings: times of the highest forearm against times of the hands nearest to the camera.
 
-MocapEvery, appendix C.2: swings are surer than claps, whose blow a wrist's sensor does not always survive unharmed.
+MocapEvery, appendix C.2: swings are more reliable than claps, whose impact may disturb a wrist sensor.
 """
 
 from dataclasses import dataclass, replace
@@ -19,28 +19,28 @@ from wearcap.sensors.clock import TOLERANCE_S, Clock, fit_clock
 from wearcap.sensors.stillness import StepCheck, Stretch
 
 _STEP_S = 0.01
-"""Elevations are examined at 100 Hz."""
+"""Time step of the resampled elevations (100 Hz)."""
 _TREMOR_S = 0.03
-"""Deviation of the Gaussian that smooths them."""
+"""Standard deviation of the Gaussian that smooths the elevations."""
 _TOP_S = 0.1
-"""A parabola is fitted so far to both sides of a top."""
+"""Half width of the parabola fit around a peak."""
 _PEAK_S = 0.002
-"""Deviation of a watch's top against the arm's (simulated watches: below 1 ms), with room for the arm's own unevenness."""
+"""Standard deviation of a watch's peak time (simulated watches: below 1 ms), with a margin for uneven swings."""
 
 
 @dataclass(frozen=True)
 class SwingSettings:
-    """What makes a top of the forearm's elevation a swing."""
+    """Thresholds for a peak of the forearm's elevation to count as a swing."""
 
     min_rise_deg: float = 50.0
-    """Above the dips to both sides."""
+    """Prominence of the peak."""
     min_height_deg: float = -10.0
     min_apart_s: float = 0.5
 
 
 @dataclass(frozen=True)
 class SwingClock:
-    """The clock by swings, and its deviation (s) where the swings are."""
+    """Clock estimated from swings, and the standard deviation (s) of its offset at the swings."""
 
     clock: Clock
     std_s: float
@@ -101,11 +101,11 @@ def fit_swing_clock(
     frame_s: float,
     max_offset_s: float = 600.0,
 ) -> SwingClock:
-    """The clock on which the camera's swings, each a frame's time and so good to half a frame, are the watch's.
+    """Fit the clock that maps the watch's swings to the camera's, whose times are accurate to half a frame.
 
-    `fit_clock` finds which belong together and the drift. The offset is then the mean of its posterior: a camera's time
-    is off evenly by up to half a frame, a watch's normally by some milliseconds, so that many swings bound the offset
-    more tightly than their mean does (for 10 at 30 Hz 2 ms, not 3 ms). Raises WearcapError as `fit_clock` does.
+    `fit_clock` finds the correspondences and the drift. The offset is then its posterior mean: camera times have a
+    uniform error of up to half a frame, watch times a normal one of some milliseconds, so that many swings bound the
+    offset more tightly than their mean does (for 10 at 30 Hz 2 ms, not 3 ms). Raises WearcapError as `fit_clock` does.
     """
     try:
         clock = fit_clock(camera_s, watch_s, max_offset_s)
@@ -121,7 +121,7 @@ def fit_swing_clock(
     spread = max(_PEAK_S, float(np.sqrt(max(np.mean(late**2) - half**2 / 3, 0.0))))
     offset = np.linspace(-frame_s, frame_s, 801) + np.median(late)
     off = late[:, None] - offset
-    # A thousandth for frames that were picked wrongly
+    # A likelihood floor of 0.001 for wrongly picked frames.
     likelihood = ndtr((off + half) / spread) - ndtr((off - half) / spread) + 1e-3
     posterior = np.exp(np.log(likelihood).sum(0) - np.log(likelihood).sum(0).max())
     posterior /= posterior.sum()
@@ -133,7 +133,7 @@ def fit_swing_clock(
 def swing_checks(
     found: SwingClock, joint: str, min_swings: int = 5, max_std_s: float = 0.005
 ) -> list[StepCheck]:
-    """What tells whether the swings went well."""
+    """Quality checks of the swings."""
     more = "Swing ten times, and give the frames in which the hands are nearest to the camera."
     return [
         StepCheck(f"arm swings, {joint}", "seen by both clocks", found.clock.claps, min_swings, "", more, at_least=True),

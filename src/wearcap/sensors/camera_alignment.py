@@ -1,7 +1,7 @@
-"""From a monocular SLAM's world to ours by a board, and from the camera to the head (MocapEvery appendix C.2).
+"""Alignment of a monocular SLAM's world by a board, and calibration of the head camera's mount (MocapEvery C.2).
 
-The camera is put on four positions (`align_by_marks`): C1 and C2 on the board's y axis, C3 and C4 on its x axis, as
-far apart as measured; the origin is where the axes meet. Or it is carried along the board's edges, as for MocapEvery's
+The camera is put on four positions (`align_by_marks`): C1 and C2 on the board's y axis, C3 and C4 on its x axis, at
+measured distances; the origin is where the axes meet. Or it is carried along the board's edges, as in MocapEvery's
 own capture folders (`align_by_walks`). p_world = scale · R_world_slam p_slam + t_world_slam. Cameras are OpenCV's.
 """
 
@@ -26,12 +26,12 @@ from wearcap.sensors.stillness import StepCheck, Stretch, during, unstillness_de
 
 MARKS = ("C1", "C2", "C3", "C4")
 T_HEAD_CAM_M = (0.09, 0.0, 0.09)
-"""A camera on the forehead, from the head joint: a nominal value, which is measured on nobody."""
+"""Nominal position of a camera on the forehead, relative to the head joint."""
 
 
 @dataclass(frozen=True)
 class AlignmentLimits:
-    """What is accepted of the board positions and of standing."""
+    """Limits of the quality checks of the board positions and of standing."""
 
     residual_m: float = 0.01
     scale_spread: float = 0.03
@@ -44,18 +44,18 @@ class AlignmentLimits:
 
 @dataclass(frozen=True)
 class SlamAlignment:
-    """The similarity that turns a SLAM's world into ours, and how well the four positions obey it."""
+    """Similarity transform from a SLAM's world to the metric world, and how well the four positions fit."""
 
     scale: float
     """Metres per unit of the SLAM."""
     R_world_slam: Float64[Tensor, "3 3"]
     t_world_slam: Float64[Tensor, "3"]
     residual_m: float
-    """Root mean square of what the refinement minimises: off-axis coordinates, heights, distances."""
+    """Root mean square residual of the refinement: off-axis coordinates, heights, distances."""
     scale_spread: float
-    """Between the scales by either distance, as a share."""
+    """Relative difference between the scales from the two distances."""
     corner_deg: float
-    """By which the two lines miss a right angle."""
+    """Deviation of the two lines from a right angle."""
 
     def points(self, points_slam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Positions in the world (m)."""
@@ -70,7 +70,7 @@ class SlamAlignment:
 
 @dataclass(frozen=True)
 class HeadMount:
-    """How a camera sits on the head."""
+    """Mounting of a camera on the head."""
 
     R_head_cam: Float[Tensor, "3 3"]
     t_head_cam: Float[Tensor, "3"]
@@ -79,11 +79,11 @@ class HeadMount:
 
     @property
     def view_deg(self) -> float:
-        """Between the optical axis and straight ahead."""
+        """Angle between the optical axis and straight ahead."""
         return math.degrees(math.acos(min(max(self.R_head_cam[0, 2].item(), -1.0), 1.0)))
 
     def apply(self, T_world_cam: Trajectory) -> HeadStream:
-        """The camera's path as that of a device whose axes are the head's."""
+        """The camera's path as a head stream, with the device axes rotated to the head's."""
         R = T_world_cam.R_world_body
         return HeadStream(
             T_world_cam.timestamps, R @ self.R_head_cam.mT.to(R), T_world_cam.t_world_body, torch.eye(3), self.t_head_cam
@@ -93,8 +93,8 @@ class HeadMount:
 def mark_positions(
     slam: Trajectory, stretches: Sequence[Stretch]
 ) -> tuple[Float64[Tensor, "mark 3"], Float64[Tensor, "mark"], list[float]]:
-    """Mean camera centres during the four stretches, how far samples lie from them (root mean square; units of the
-    SLAM), and by how much the camera turns meanwhile (degrees)."""
+    """Mean camera centres during the four stretches, the root mean square deviation of samples from them (SLAM units),
+    and the camera's rotation meanwhile (degrees)."""
     if len(stretches) != len(MARKS):
         raise WearcapError(f"{len(stretches)} stretches on the board", where="camera on the board",
                            expected="four: C1 and C2 on the y axis, C3 and C4 on the x axis")  # fmt: skip
@@ -150,7 +150,7 @@ def _closed_form(C: np.ndarray, distances: np.ndarray, height: float) -> np.ndar
 
 
 def _residuals(x: np.ndarray, C: np.ndarray, distances: tuple[float, float], height: float) -> np.ndarray:
-    """What the axes, the height and the distances say of the placed positions (m)."""
+    """Residuals (m) of the transformed positions against the axes, the height and the distances."""
     P = np.exp(x[3]) * Rotation.from_rotvec(x[:3]).apply(C) + x[4:]
     apart = [P[1, 1] - P[0, 1] - distances[0], P[3, 0] - P[2, 0] - distances[1]]
     return np.concatenate([P[:2, 0], P[2:, 1], P[:, 2] - height, apart])
@@ -164,27 +164,27 @@ def align_by_walks(
 ) -> tuple[float, Rigid]:
     """Scale (m per unit) and T_world_slam of a camera that was carried along the board's x and y edge.
 
-    p_world = T_world_slam @ (scale · p_slam). Told are where each walk began and ended, how long the edges are, and how
-    high the camera was above the floor where the walk along y began.
+    p_world = T_world_slam @ (scale · p_slam). Inputs are the end points of both walks, the lengths of the edges (m) and
+    the camera's height above the floor at the start of the walk along y (m).
 
-    The scale is the mean of both edges' (appendix C.2). The rotation brings the walks nearest to the world's x and y,
-    both alike, in closed form where the document optimises; the origin lies on the floor under the start of y.
-    Raises WearcapError for walks that are no right angle.
+    The scale is the mean of both edges' (appendix C.2). The rotation aligns the walks with the world's x and y, equally
+    weighted, in closed form where the paper optimises; the origin is on the floor below the start of y.
+    Raises WearcapError for walks that are far from a right angle.
     """
-    ways = torch.stack([end[1] - end[0] for end in (x_slam, y_slam)]).double()
-    length = ways.norm(dim=1)
-    if not (length > 0).all() or abs((ways[0] @ ways[1] / length.prod()).item()) > 0.5:
-        raise WearcapError("the camera's ways along the board's edges are no right angle", where="camera on the board",
+    displacements = torch.stack([end[1] - end[0] for end in (x_slam, y_slam)]).double()
+    length = displacements.norm(dim=1)
+    if not (length > 0).all() or abs((displacements[0] @ displacements[1] / length.prod()).item()) > 0.5:
+        raise WearcapError("the camera's paths along the board's edges are not at a right angle", where="camera on the board",
                            expected="about 90°", fix="Check the times of the walks along x and y.")  # fmt: skip
     scale = (torch.tensor(length_m, dtype=torch.float64) / length).mean().item()
     axes = torch.eye(3, dtype=torch.float64)[:2]
-    R: Tensor = roma.special_procrustes(axes.T @ (ways / length[:, None]))  # pyright: ignore[reportAssignmentType]
+    R: Tensor = roma.special_procrustes(axes.T @ (displacements / length[:, None]))  # pyright: ignore[reportAssignmentType]
     start = torch.tensor([0.0, 0.0, height_m], dtype=torch.float64)
     return scale, Rigid(R, start - R @ (scale * y_slam[0].double())).to(torch.float32)
 
 
 def scale_by_walks(slam: Trajectory, walks: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
-    """Metres per unit of the SLAM from walked distances, and the spread of the scales by each of them, as a share.
+    """Metres per SLAM unit from walked distances, and the relative spread of their individual scales.
 
     A walk is (start s, stop s, metres between the two places). Raises WearcapError for walks that lead nowhere.
     """
@@ -207,7 +207,7 @@ def mount_by_standing(
     facing_deg: float = 90.0,
     t_head_cam: tuple[float, float, float] = T_HEAD_CAM_M,
 ) -> HeadMount:
-    """How the camera sits on the head of someone who stands upright and looks ahead, in a direction that is known.
+    """Mounting of the camera on the head of a wearer who stands upright and looks ahead in a given direction.
 
     R_head_cam = R_world_headᵀ mean(R_world_cam); the translation (m) is given.
     """
@@ -223,7 +223,7 @@ def mark_checks(
     turned_deg: Sequence[float],
     limits: AlignmentLimits = AlignmentLimits(),
 ) -> list[StepCheck]:
-    """What tells whether the camera's four positions went well; `moved_m` and `turned_deg` as `mark_positions` has it."""
+    """Quality checks of the camera's four positions; `moved_m` and `turned_deg` as from `mark_positions`."""
     still = "Let go of the camera, or give a stretch in which it rests."
     ruler = "Measure |C1 C2| and |C3 C4| again, and check which position is which."
     rows = []
@@ -241,10 +241,10 @@ def mark_checks(
 
 
 def mount_checks(found: HeadMount, limits: AlignmentLimits = AlignmentLimits()) -> list[StepCheck]:
-    """What tells whether standing went well."""
+    """Quality checks of standing."""
     return [
         StepCheck("standing", "not still", found.still_deg, limits.stand_still_deg, "°",
                   "Stand upright and look ahead for 10 s, or give a calmer stretch."),
         StepCheck("standing", "optical axis away from straight ahead", found.view_deg, limits.view_deg, "°",
-                  "Face the board's y while standing, or say where you faced (facing_deg)."),
+                  "Face the board's y while standing, or give the direction that you faced (facing_deg)."),
     ]  # fmt: skip

@@ -1,6 +1,6 @@
-"""Claps that two clocks share: in the acceleration of the wrists, and in a camera's sound track (thesis §4.3.4).
+"""Clap detection in the acceleration of the wrists and in a camera's sound track (thesis §4.3.4).
 
-The documents say only that claps are "detected in both modalities"; how is ours.
+The thesis only states that claps are "detected in both modalities"; the detectors are ours.
 """
 
 from collections.abc import Sequence
@@ -22,25 +22,25 @@ from wearcap.sensors.imu import GRAVITY
 
 @dataclass(frozen=True)
 class ClapSettings:
-    """What makes a spike of the wrists' acceleration a clap."""
+    """Thresholds for a spike of the wrists' acceleration to count as a clap."""
 
     min_acc: float = 15.0
     """m/s² above its surroundings; palms stop with 20 to 60, of which a sensor's filter takes some."""
     max_width_s: float = 0.05
-    """At half its height: a swinging arm takes longer."""
+    """Largest width at half height: a swinging arm takes longer."""
     together_s: float = 0.05
-    """Between the spikes of the two wrists."""
+    """Largest delay between the spikes of the two wrists."""
     min_contrast: float = 6.0
-    """Times the median of the second around: in the midst of shaking nothing is a clap."""
+    """Smallest ratio to the median of the surrounding second: no claps are detected during shaking."""
     max_alike: float = 0.5
-    """Cosine between the two wrists' accelerations: hands stop each other, a landing pushes both upwards."""
+    """Largest cosine between the wrists' accelerations: clapping hands stop each other, a landing pushes both up."""
 
 
 CLAPS = ClapSettings()
 
 
 def detect_claps(*wrists: ImuStream, settings: ClapSettings = CLAPS) -> Float64[Tensor, "clap"]:
-    """Times (s, on the sensors' clock) of claps in one or, surer, both wrists' acceleration; below a sample's step.
+    """Times (s, sensor clock, sub-sample precision) of claps in one or, more reliably, both wrists' acceleration.
 
     Streams come raw or in world axes, at 60 Hz or more; a suit's own pose gives them by `synthesize_imu(suit,
     joint, n=1)`. Raises WearcapError when there is no clap, and for streams without acceleration.
@@ -134,7 +134,7 @@ def _alike(times: np.ndarray, clocks: list[np.ndarray], jerks: list[np.ndarray])
 
 
 SOUND_BANDS_HZ = ((1000.0, 2000.0), (2000.0, 4000.0), (4000.0, 7500.0))
-"""A clap is loud in all of them at once; a knock is below, a whistle in one."""
+"""A clap is loud in all bands at once; a knock has lower frequencies, a whistle is in one band."""
 
 
 def detect_claps_audio(
@@ -173,7 +173,7 @@ def detect_claps_audio(
 
 
 def _level_db(sound: np.ndarray, rate: float, band: tuple[float, float], hop: int) -> np.ndarray:
-    """Energy (dB) of each millisecond in a band; causal, so that nothing is heard before it sounds."""
+    """Energy (dB) of each millisecond in a band, from a causal filter so that onsets are not smeared backwards."""
     design = scipy.signal.butter(2, band, "bandpass", fs=rate, output="sos")
     filtered = np.asarray(scipy.signal.sosfilt(design, sound))
     count = len(sound) // hop
@@ -182,7 +182,7 @@ def _level_db(sound: np.ndarray, rate: float, band: tuple[float, float], hop: in
 
 
 def _start(sound: np.ndarray, rate: float, sample: int, hop: int) -> float:
-    """Where, near `sample`, the sound first reaches a quarter of its height (s)."""
+    """Time (s) at which the sound near `sample` first reaches a quarter of its peak."""
     first = max(sample - 5 * hop, 0)
     piece = np.abs(np.diff(sound[first : sample + 4 * hop]))
     return (first + int((piece > 0.25 * piece.max()).argmax())) / rate
@@ -220,7 +220,7 @@ def _start_s(stream) -> float:
 def camera_claps(
     camera: CameraStream, folder: str | Path, given_s: Sequence[float] | None = None
 ) -> Float64[Tensor, "clap"]:
-    """Times of claps on a camera's clock: from its video's sound, or as the user saw them.
+    """Times of claps on a camera's clock: from its video's sound, or as given by the user.
 
     `given_s` counts seconds from the video's first picture, for silent videos; `folder` is the data set's.
     """

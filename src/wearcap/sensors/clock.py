@@ -1,4 +1,4 @@
-"""Two clocks brought together by claps that both saw (thesis §4.3.4: one clap, and about 87 ms of drift an hour)."""
+"""Clock synchronisation by common claps (thesis §4.3.4: one clap; clock drift of about 87 ms per hour)."""
 
 from dataclasses import dataclass, replace
 
@@ -11,16 +11,16 @@ from wearcap.errors import WearcapError
 from wearcap.recording.recording import Recording
 
 TOLERANCE_S = 0.03
-"""Between a clap and where the clock puts it."""
+"""Largest error of a clap under the fitted clock."""
 MAX_DRIFT = 0.2 / 3600
-"""Seconds per second."""
+"""Largest clock drift (seconds per second)."""
 GROUP_S = 5.0
-"""Claps that follow each other sooner make one knot."""
+"""Claps closer together than this share one knot."""
 PRIOR_SPREAD_S = 110.0
-"""Claps that are spread by less say little of drift: 3 ms of a clap's noise against 100 ms/h of usual drift."""
+"""Prior on the drift, as an equivalent spread of claps: 3 ms of clap noise against a usual drift of 100 ms/h."""
 
 TOGETHER_S = 60.0
-"""Recorders are started about together: of offsets that fit alike, one that is smaller by this is taken."""
+"""Among equally good offsets, one smaller than all others by this is chosen: recorders start at about the same time."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,15 @@ class Clock:
     camera_s: Float64[Tensor, "knot"]
     suit_s: Float64[Tensor, "knot"]
     drift_s_per_hour: float
-    """By which the camera's clock gains on the suit's, over all knots."""
+    """Drift of the camera's clock relative to the suit's, over all knots."""
     residual_s: float
-    """Root mean square of the claps against the map; one clap at every knot: none."""
+    """Root mean square error of the claps under the map; 0 with one clap per knot."""
     claps: int
-    """That both clocks saw."""
+    """Number of common claps."""
 
     @property
     def offset_s(self) -> float:
-        """Camera's time less suit's at the first knot."""
+        """Camera time minus suit time at the first knot."""
         return (self.camera_s[0] - self.suit_s[0]).item()
 
     def to_camera(self, suit_s: Float64[Tensor, "*time"]) -> Float64[Tensor, "*time"]:
@@ -65,9 +65,9 @@ def fit_clock(
     claps_suit: Float64[Tensor, "clap_suit"],
     max_offset_s: float = 600.0,
 ) -> Clock:
-    """The clock on which most claps of the two lists (s, any order) coincide; some may be missing in either.
+    """The clock under which most claps of the two lists (s, any order) coincide; either list may miss some.
 
-    One common clap gives the offset, claps at several times the drift too. Raises WearcapError when a list is
+    One common clap gives the offset, claps at several times also the drift. Raises WearcapError when a list is
     empty, when no pair is less than `max_offset_s` apart, and when two offsets fit equally
     well, neither of them smaller by a minute.
     """
@@ -100,7 +100,7 @@ def retime(recording: Recording, clock: Clock) -> Recording:
 
 
 def _drift(suit: np.ndarray, camera: np.ndarray) -> float:
-    """Slope of camera less suit over suit, drawn to zero where the claps lie close together."""
+    """Slope of camera minus suit time over suit time, shrunk to zero where the claps are close together."""
     time, gained = suit - suit.mean(), (camera - camera.mean()) - (suit - suit.mean())
     return float((time * gained).sum() / ((time**2).sum() + PRIOR_SPREAD_S**2))
 
@@ -152,7 +152,7 @@ def _gap(times: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def _refined(camera: np.ndarray, suit: np.ndarray, start: float, offset: float) -> tuple[float, float, tuple]:
-    """Fit offset and drift to the claps that coincide and look again: score, offset midway, pairs."""
+    """Refit offset and drift to the coinciding claps iteratively: score, offset at the middle, pairs."""
     predicted, reach = suit + offset, TOLERANCE_S + MAX_DRIFT * np.abs(suit - start)
     for _ in range(8):
         gap = np.abs(predicted[:, None] - camera)

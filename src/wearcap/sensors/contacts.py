@@ -1,5 +1,5 @@
-"""Foot contacts for suits that report none: from the feet's speed or their sensors (thesis §4.2.4: "a peak in the
-acceleration of the leg"). The documents give no thresholds: these are ours."""
+"""Foot contacts for suits that report none, from the feet's speed or sensors (thesis §4.2.4: "a peak in the
+acceleration of the leg"). The papers give no thresholds: these are ours."""
 
 from dataclasses import dataclass
 
@@ -22,17 +22,17 @@ class ContactSettings:
     """Thresholds, in pairs: contact begins below the first and ends above the second."""
 
     speed: tuple[float, float] = (0.1, 0.15)
-    """Of a patch (m/s)."""
+    """Speed of a patch (m/s)."""
     max_height_m: float = 0.35
-    """Above the lowest patch: two stairs; higher feet hang."""
+    """Largest height above the lowest patch (two stairs); higher feet are in the air."""
     gyro: tuple[float, float] = (0.35, 0.7)
-    """Of a foot that lies flat (rad/s)."""
+    """Angular speed of a flat foot (rad/s)."""
     acc: tuple[float, float] = (3.0, 6.0)
-    """Free acceleration of a foot that lies flat (m/s²)."""
+    """Free acceleration of a flat foot (m/s²)."""
     reach_s: tuple[float, float] = (0.15, 0.35)
-    """How far before it lies flat the peak of heel strike is looked for, and after it that of push-off."""
+    """Search ranges for the peak of heel strike before the foot is flat, and of push-off after it."""
     shortest_s: float = 0.07
-    """Shorter contacts, and shorter pauses between two, are none."""
+    """Shorter contacts, and shorter gaps between contacts, are removed."""
 
 
 CONTACTS = ContactSettings()
@@ -104,8 +104,8 @@ def _hysteresis(
 
 
 def _without_short(state: Bool[Tensor, "time column"], frames: float) -> Bool[Tensor, "time column"]:
-    """Pauses shorter than so many frames closed, then contacts shorter than that dropped."""
+    """Close gaps shorter than a number of frames, then drop contacts shorter than that."""
     window = np.ones((max(int(np.ceil(frames)), 1), 1), bool)
-    held = np.pad(state.numpy(), ((len(window), len(window)), (0, 0)), mode="edge")
-    held = scipy.ndimage.binary_opening(scipy.ndimage.binary_closing(held, window), window)
-    return torch.from_numpy(held[len(window) : -len(window)])
+    padded = np.pad(state.numpy(), ((len(window), len(window)), (0, 0)), mode="edge")
+    padded = scipy.ndimage.binary_opening(scipy.ndimage.binary_closing(padded, window), window)
+    return torch.from_numpy(padded[len(window) : -len(window)])

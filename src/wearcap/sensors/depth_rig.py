@@ -1,6 +1,6 @@
-"""From three depth cameras to a cloud of the person alone, in the scene (thesis §4.5.1).
+"""Point cloud of the person from several depth cameras, in the scene (thesis §4.5.1).
 
-Depth images are uint16 millimetres along the optical axis, 0 where nothing came back, as Kinects give them.
+Depth images are uint16 millimetres along the optical axis, 0 for missing measurements, as Kinects give them.
 """
 
 from collections.abc import Sequence
@@ -23,13 +23,13 @@ from wearcap.sensors.registration import STAGES, Registration, register
 CLUSTER_EPS_M = 0.12
 """DBSCAN's distance (thesis §4.5.1)."""
 _CLUSTER_POINTS = 10
-"""Points that make a DBSCAN core (ours: the document gives none)."""
+"""DBSCAN's minimum number of points of a core (ours: the thesis gives none)."""
 _CLUSTER_VOXEL_M = 0.02
 """Points are clustered by voxel, each weighing as many as it holds: a sixth of eps, and a hundred times fewer."""
 _SEEN_SHARE = 0.5
-"""A background pixel counts where at least so many of the empty frames saw it."""
+"""Smallest share of empty frames with a measurement for a background pixel to be valid."""
 _FLICKER = 2.5
-"""Times the camera's usual relative deviation that a steady pixel may have."""
+"""Largest relative deviation of a steady pixel, as a multiple of the camera's median one."""
 _SPLAT_M = 0.02
 """Radius at which a scan's points hide what is behind them: its spacing, and some more."""
 _BESIDE_M = 0.04
@@ -38,19 +38,19 @@ _BESIDE_M = 0.04
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """What a fixed camera sees of the empty scene."""
+    """Depth of the empty scene as seen by a fixed camera."""
 
     depth_m: Float[np.ndarray, "height width"]
-    """Mean; infinite where nothing came back."""
+    """Mean depth; infinite where nothing was measured."""
     deviation_m: Float[np.ndarray, "height width"]
     """Standard deviation over time."""
 
     @property
     def steady(self) -> Bool[np.ndarray, "height width"]:
         """Measured pixels that flicker no more than others at their depth: means along edges lie in mid-air."""
-        known = np.isfinite(self.depth_m) & ~_flying(self.depth_m, Subtraction().edge_m)
-        relative = np.where(known, self.deviation_m / self.depth_m, np.inf)
-        return known & (relative <= _FLICKER * np.median(relative[known])) if known.any() else known
+        valid = np.isfinite(self.depth_m) & ~_flying(self.depth_m, Subtraction().edge_m)
+        relative = np.where(valid, self.deviation_m / self.depth_m, np.inf)
+        return valid & (relative <= _FLICKER * np.median(relative[valid])) if valid.any() else valid
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +64,12 @@ class DepthView:
 
 @dataclass(frozen=True)
 class Subtraction:
-    """How far before the background something must be to count as the person (ours: the document has no margin)."""
+    """Margins of the background subtraction (ours: the thesis has no margin)."""
 
     margin_m: float = 0.01
+    """Smallest distance in front of the background."""
     deviations: float = 4.0
-    """And so many standard deviations of that background pixel: more at edges, less on a near floor."""
+    """Additional margin in standard deviations of the background pixel: more at edges, less on a near floor."""
     edge_m: float = 0.06
     """Pixels without two neighbours in this depth are flying pixels, dropped before unprojection."""
 
@@ -83,8 +84,8 @@ def empty_scene(frames_mm: UInt16[np.ndarray, "time height width"]) -> Backgroun
     depth = frames_mm.astype(np.float32) / 1000
     mean = depth.sum(0) / np.maximum(count, 1)
     variance = (seen * (depth - mean) ** 2).sum(0) / np.maximum(count - 1, 1)
-    known = count >= _SEEN_SHARE * len(frames_mm)
-    return Background(np.where(known, mean, np.inf).astype(np.float32), np.sqrt(variance, dtype=np.float32))
+    valid = count >= _SEEN_SHARE * len(frames_mm)
+    return Background(np.where(valid, mean, np.inf).astype(np.float32), np.sqrt(variance, dtype=np.float32))
 
 
 def foreground(
@@ -135,7 +136,7 @@ def register_view(
 
     `view.T_world_cam` is the approximate pose, as visual localisation gives it. Where the result is wrong, a person
     gives it back with a `correction` in scene axes (new = correction @ old), and ICP starts from there: the
-    document's localisation, ICP, manual correction, ICP. ICP runs twice, each time to the points that the camera
+    thesis's localisation, ICP, manual correction, ICP. ICP runs twice, each time to the points that the camera
     would see from where it is thought to be: scans show walls from both sides, 10 cm apart.
     Raises WearcapError as `register` does.
     """

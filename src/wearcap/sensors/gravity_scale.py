@@ -1,4 +1,4 @@
-"""A monocular SLAM's scale and vertical where no board was used: from an inertial sensor on the head, or from the floor.
+"""Scale and vertical of a monocular SLAM without a board: from an inertial sensor on the head, or from the floor.
 
 Inertial: with s metres per unit, s a_slam - g_slam = R_slam_imu f for the specific force f (m/s²), so that gravity and scale
 are linear unknowns. Nearly all error lies in a_slam, a second difference of jittery positions; solved for s, that
@@ -24,13 +24,13 @@ from wearcap.sensors.imu import GRAVITY, acceleration
 from wearcap.sensors.stillness import Stretch, during
 
 _HALF_S = 0.25
-"""Second differences reach so far to both sides: longer ones have less of the jitter, shorter ones more of the gait."""
+"""Half span of the second differences: longer ones reduce jitter, shorter ones keep more of the gait."""
 _BLOCK_S = 1.0
-"""Errors further apart in time are taken as independent."""
+"""Errors further apart in time are assumed independent."""
 _BIAS = 0.05
-"""Deviation (m/s²) that an accelerometer's bias is expected to have."""
+"""Expected standard deviation (m/s²) of an accelerometer's bias."""
 _GRAVITY_SHARE = 0.05
-"""By which the length of the gravity found may differ from 9.81 m/s²."""
+"""Largest relative difference of the estimated gravity's magnitude from 9.81 m/s²."""
 _ROUNDS = 20
 
 
@@ -43,7 +43,7 @@ class GravityScale:
     """Metres per unit of the SLAM."""
     scale_std: float
     gravity_std_deg: float
-    """Deviation of the vertical's direction."""
+    """Standard deviation of the vertical's direction."""
 
     @property
     def scale_std_percent(self) -> float:
@@ -58,13 +58,13 @@ def by_head_imu(
 ) -> GravityScale:
     """Scale and vertical from a sensor (acc_imu, the camera's clock) fixed to the camera at a known place (m).
 
-    Huber's robust least squares in (1/s, g/s, bias/s); its covariance lets errors within a second hang together.
-    Raises WearcapError where the two share less than 10 s, do not move enough to tell the scale, or contradict each
-    other: gravity not 9.81 m/s² long, or a negative scale.
+    Huber's robust least squares in (1/s, g/s, bias/s); its covariance allows for correlated errors within a second.
+    Raises WearcapError where the two overlap by less than 10 s, do not move enough to observe the scale, or contradict
+    each other: gravity not 9.81 m/s² long, or a negative scale.
     """
-    a_slam, felt, R, fps = _alike(slam, imu, R_cam_imu, t_cam_imu)
+    a_slam, force_slam, R, fps = _alike(slam, imu, R_cam_imu, t_cam_imu)
     # a_slam = k R f - h - R b with h = -g/s (up), b = k bias
-    rows = np.concatenate([felt[:, :, None], np.broadcast_to(-np.eye(3), R.shape), -R], 2)
+    rows = np.concatenate([force_slam[:, :, None], np.broadcast_to(-np.eye(3), R.shape), -R], 2)
     x, covariance = _robust(rows, a_slam, round(_BLOCK_S * fps), _BIAS)
     k, up = x[0], x[1:4]
     length = np.linalg.norm(up) / k if abs(k) > 1e-12 else math.inf
@@ -85,7 +85,7 @@ def by_head_imu(
 def _alike(
     slam: Trajectory, imu: ImuStream, R_cam_imu: Tensor | None, t_cam_imu: Tensor | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Second differences of the camera's path, what the sensor felt through the same filter, R_slam_imu; frames a second.
+    """Second differences of the camera's path, the specific force through the same filter, R_slam_imu, and frame rate.
 
     (p(t-h) + p(t+h) - 2p(t)) / h² is the acceleration under a triangle of half-width h; so the forces go under one, too.
     """
@@ -111,26 +111,26 @@ def _alike(
     )
     R = poses.R_world_body @ R_cam_imu.double()
     force = interpolate(imu.timestamps, imu.acc_imu.double(), dense)
-    felt = (R @ force[..., None])[..., 0].numpy()
+    force_slam = (R @ force[..., None])[..., 0].numpy()
     triangle = np.bartlett(2 * n * fine + 1)
-    felt, turned = (
+    force_slam, turned = (
         scipy.ndimage.convolve1d(value, triangle / triangle.sum(), axis=0)[::fine]
-        for value in (felt, R.numpy().reshape(-1, 9))
+        for value in (force_slam, R.numpy().reshape(-1, 9))
     )
     arm = torch.zeros(3) if t_cam_imu is None else t_cam_imu
     swung = acceleration((poses.R_world_body @ arm.double())[::fine], 1 / step, n).numpy()
     a_slam = acceleration(poses.t_world_body[::fine], 1 / step, n).numpy()
     inner = slice(n, len(a_slam) - n)
-    return a_slam[inner], (felt - swung)[inner], turned.reshape(-1, 3, 3)[inner], 1 / step
+    return a_slam[inner], (force_slam - swung)[inner], turned.reshape(-1, 3, 3)[inner], 1 / step
 
 
 def _robust(rows: np.ndarray, y: np.ndarray, block: int, bias: float) -> tuple[np.ndarray, np.ndarray]:
-    """Huber's estimate of x in rows (time, 3, unknown) x = y (time, 3), and its covariance with errors that hang
-    together within blocks. The last three unknowns, k times a bias, are drawn to zero."""
+    """Huber's estimate of x in rows (time, 3, unknown) x = y (time, 3), and its covariance with errors that are
+    correlated within blocks. The last three unknowns, k times a bias, have a zero-mean prior."""
     weight, prior = np.ones(len(y)), np.zeros(rows.shape[2])
     sigma2, k = y.var(), 0.0
     for _ in range(_ROUNDS):
-        # Errors hang together over a block: a block counts as one observation against the prior.
+        # Errors are correlated over a block: a block counts as one observation against the prior.
         prior[-3:] = block * sigma2 / max(k * bias, 1e-6) ** 2 if k else 1e6 * len(y)
         normal = np.einsum("t,tij,tik->jk", weight, rows, rows) + np.diag(prior)
         x = np.linalg.solve(normal, np.einsum("t,tij,ti->j", weight, rows, y))
@@ -157,11 +157,11 @@ def by_floor(
     height_std_m: float = 0.005,
     seed: int = 0,
 ) -> GravityScale:
-    """Scale and vertical from the floor beneath the path, and the camera's height above it while standing (m).
+    """Scale and vertical from the floor below the path, and the camera's height above it while standing (m).
 
-    The floor is the plane with most points beneath the path (RANSAC, then total least squares), not more than 35° from
-    what the camera takes for level. Deviations by a bootstrap over patches of the floor, with `height_std_m` of the
-    measured height. Raises WearcapError when too few points lie on a plane, or the height is none of a head.
+    The floor is the plane with most points below the path (RANSAC, then total least squares), at most 35° from the
+    camera's mean level. Standard deviations by a bootstrap over patches of the floor, with `height_std_m` of the
+    measured height. Raises WearcapError when too few points lie on a plane, or for an implausible height.
     """
     if not 0.5 < height_m < 2.5:
         raise WearcapError(
@@ -188,7 +188,7 @@ def by_floor(
 
 
 def _below(points: np.ndarray, path: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Points within 50° of straight below some place of the path, down to twice the usual drop."""
+    """Points within 50° of vertically below the path."""
     across = np.eye(3) - np.outer(up, up)
     distance, nearest = KDTree(path @ across).query(points @ across)
     drop = (path[nearest] - points) @ up
@@ -213,7 +213,7 @@ def _floor_points(
         best = near if near.sum() > best.sum() else best
     for _ in range(3):
         if best.sum() < 30:
-            raise WearcapError(f"{int(best.sum())} of {len(points)} points beneath the path lie on one plane", where="scale from the floor",
+            raise WearcapError(f"{int(best.sum())} of {len(points)} points below the path lie on one plane", where="scale from the floor",
                                expected="30 or more", fix="Look at the floor while walking, or use the board.")  # fmt: skip
         up, height = _plane(points[best], eyes)
         best = np.abs((points - eyes) @ up + height) < 0.02 * height

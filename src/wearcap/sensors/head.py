@@ -22,7 +22,7 @@ class SlamNoise:
     jitter_deg: float = 0.12
     jitter_period_s: float = 0.4
     drift_share: float = 0.0
-    """Deviation of position after travelling one metre, as a share (closed loops: none)."""
+    """Standard deviation of the position error after travelling one metre, as a share (0 with loop closure)."""
     yaw_drift_deg_per_sqrt_min: float = 0.0
 
 

@@ -29,9 +29,9 @@ class ImuNoise:
     acc_bias: float = 0.02
     gyro_noise_deg_s: float = 0.3
     strap_deg: float = 3.0
-    """Constant error of the mounting."""
+    """Constant mounting error."""
     clock_offset_s: float = 0.0
-    """Largest offset of the sensor's clock, drawn evenly."""
+    """Largest offset of the sensor's clock, drawn uniformly."""
     clock_ppm: float = 0.0
 
 
@@ -48,7 +48,7 @@ def acceleration(position: Float[Tensor, "time axis"], fps: float, n: int = 4) -
 
 
 def mean_filter(value: Float[Tensor, "time feature"], window: int = 7) -> Float[Tensor, "time feature"]:
-    """Centred mean over an odd number of frames, the ends held (MocapEvery: 7, on real and synthetic alike)."""
+    """Centred mean over an odd number of frames, edges repeated (MocapEvery: 7, on real and synthetic data)."""
     half = window // 2
     padded = torch.cat([value[:1].expand(half, -1), value, value[-1:].expand(half, -1)])
     return padded.unfold(0, window, 1).mean(-1)
@@ -106,7 +106,7 @@ def _normal(rng: np.random.Generator, *shape: int) -> Tensor:
 
 
 def _off_clock(path: Trajectory, noise: ImuNoise, rng: np.random.Generator) -> tuple[Trajectory, Tensor]:
-    """The path at the moments when the sensor's clock shows the recording's timestamps."""
+    """The path sampled when the sensor's clock shows the recording's timestamps."""
     offset = float(rng.uniform(-1, 1)) * noise.clock_offset_s
     rate = 1 + 1e-6 * noise.clock_ppm * float(rng.standard_normal())
     start = path.timestamps[0]
@@ -116,7 +116,7 @@ def _off_clock(path: Trajectory, noise: ImuNoise, rng: np.random.Generator) -> t
 
 
 def _estimated(R: Tensor, noise: ImuNoise, rng: np.random.Generator, fps: float) -> Tensor:
-    """The sensor's own idea of its orientation: slowly varying attitude error and a heading that walks off."""
+    """The sensor's estimated orientation: a slowly varying attitude error and a drifting heading."""
     attitude = (
         np.deg2rad(noise.attitude_deg)
         * smooth_noise(rng, len(R), 3, noise.attitude_period_s, fps)

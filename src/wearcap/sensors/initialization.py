@@ -1,4 +1,4 @@
-"""Where HPS's optimisation starts: the suit's pose carried along the camera's path (thesis §4.2.5, eq. 4.13)."""
+"""Initialisation of HPS's optimisation: the suit's pose moved to the camera's path (thesis §4.2.5, eq. 4.13)."""
 
 from dataclasses import dataclass, replace
 
@@ -17,29 +17,29 @@ from wearcap.sensors.alignment import body_camera, inliers, robust_angle, yaw_be
 
 YAWS, BRIDGES = ("tangent", "orientation"), ("line", "suit")
 ANGLE_SCALE, DISTANCE_SCALE = 0.1, 0.15
-"""Rad and m from which on a sample is doubted."""
+"""Robust scales (rad, m) of the smoothing residuals."""
 PATH_SPAN_S = 1.0
-"""A metre or more of way: 5 cm of noise turn it by 4°, a hundred such by 0.4°."""
+"""Duration (s) of the displacements, a metre or more: 5 cm of noise turn one by 4°, a hundred by 0.4°."""
 
 
 @dataclass(frozen=True)
 class InitializationSettings:
-    """How the start is made; the values of the documents are named as such."""
+    """Settings of the initialisation; the thesis's values are marked."""
 
     yaw: str = "orientation"
     """"tangent": each frame's own direction of travel (thesis eq. 4.13). "orientation" (ours): the camera's
-    orientation against the suit's head, smoothed, which tells the heading of who stands too."""
+    orientation against the suit's head, smoothed, which also gives the heading of a standing wearer."""
     bridge: str = "suit"
-    """Where no camera is localised: "line" straight to the next (the document's) or (ours) "suit": as the suit
-    moved, with the error that shows at the far end spread over the gap."""
+    """Gaps without localisation: "line", straight to the next position (the thesis), or (ours) "suit": the suit's
+    displacement, with the error at the far end spread over the gap."""
     tangent_s: float = 1 / 3
-    """Document: 10 frames at 30 Hz."""
+    """Time span of a tangent (thesis: 10 frames at 30 Hz)."""
     min_speed: float = 0.3
     """m/s over a tangent; slower frames are stationary."""
     yaw_smoothing_s: float = 10.0
     path_smoothing_s: float = 1.0
-    """Standard deviation (as for yaw) of the smoothing of the camera's path less the suit's, for bridge="suit" alone;
-    0: none (document)."""
+    """Standard deviation (as for yaw) of the smoothing of the difference between camera and suit path, for
+    bridge="suit" only; 0: none (thesis)."""
 
     def __post_init__(self):
         for name, value, choices in (("yaw", self.yaw, YAWS), ("bridge", self.bridge, BRIDGES)):
@@ -47,12 +47,12 @@ class InitializationSettings:
                 raise WearcapError(f"{name}={value!r}", expected=f"one of {', '.join(choices)}")
         if self.bridge == "line" and self.path_smoothing_s:
             raise WearcapError(f"bridge='line' with path_smoothing_s={self.path_smoothing_s:g}",
-                               expected="path_smoothing_s=0: what is smoothed is the way beside the suit's")  # fmt: skip
+                               expected="path_smoothing_s=0: smoothing applies to the difference from the suit's path")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Initialization:
-    """The start: a motion in the scene, and how it came about."""
+    """Initial motion in the scene."""
 
     motion: Motion
     valid: Bool[Tensor, "time"]
@@ -68,10 +68,10 @@ def initialize(
     t_head_cam: Float[Tensor, "3"],
     settings: InitializationSettings | None = None,
 ) -> Initialization:
-    """Turn the aligned suit's root to the camera's heading and place it so that its camera sits at the camera's.
+    """Turn the aligned suit's root to the camera's heading and translate it so that its worn camera is at the camera's.
 
-    "orientation" takes R_head_cam's yaw as relative: what remains of it shows on the way and is corrected, so that
-    `estimate_head_camera` with the head of the motion returned gives the better R_head_cam.
+    With "orientation" a yaw error of R_head_cam is estimated from the paths and corrected, so that
+    `estimate_head_camera` with the returned motion's head gives a better R_head_cam.
     Outliers at 3 m/s are removed to convergence. Raises WearcapError when no frame is localised in the suit's time.
     """
     settings, suit, seen = settings or InitializationSettings(), suit_aligned, inliers(localization)
@@ -99,7 +99,7 @@ def initialize(
 
 @dataclass(frozen=True)
 class _Paths:
-    """The head camera's way by the suit and by localisation, at the suit's timestamps."""
+    """Paths of the head camera by the suit and by localisation, at the suit's timestamps."""
 
     timestamps: Float64[Tensor, "time"]
     body: Float64[Tensor, "time 3"]
@@ -107,8 +107,8 @@ class _Paths:
     valid: Bool[Tensor, "time"]
 
     def steps(self, span_s: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Horizontal ways during the next `span_s` by suit and camera (complex, m), and where they are whole: valid
-        from one end to the other."""
+        """Horizontal displacements during the next `span_s` by suit and camera (complex, m), and where they are valid
+        from start to end."""
         ahead = torch.searchsorted(self.timestamps, self.timestamps + span_s - 1e-6).clamp(
             max=len(self.timestamps) - 1
         )
@@ -141,7 +141,7 @@ def _orientation_yaw(
     R_head_cam: Tensor,
     settings: InitializationSettings,
 ) -> Float64[Tensor, "time"]:
-    """Angle about gravity from the suit's head to the one that the camera's orientation tells, smoothed robustly."""
+    """Angle about gravity from the suit's head to the head implied by the camera's orientation, robustly smoothed."""
     head, times = suit.joint("head"), localization.timestamps[seen]
     R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), times).R_world_body
     angle, certainty = yaw_between(
@@ -155,9 +155,9 @@ def _orientation_yaw(
 
 
 def _path_turn(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Float64[Tensor, ""]:
-    """The constant angle by which the suit's way, turned by `yaw`, still differs from the camera's.
+    """The constant angle by which the suit's path, turned by `yaw`, still differs from the camera's.
 
-    Alignment by a nominal mount is wrong by that mount's error in yaw; who walks shows it.
+    Alignment with a nominal mount inherits the mount's yaw error; walking reveals it.
     """
     body, camera, whole = paths.steps(PATH_SPAN_S)
     turned = body * torch.polar(torch.ones_like(yaw), yaw)
@@ -170,15 +170,15 @@ def _path_turn(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> 
 
 
 def _bridged(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Float64[Tensor, "time 3"]:
-    """The suit's way, turned step by step, plus what the camera's differs from it: interpolated where it is lost."""
+    """The suit's path, turned step by step, plus the camera's difference from it, interpolated over gaps."""
     turn = rotation.about_axis("z", (yaw[1:] + yaw[:-1]) / 2)
-    way = (turn @ paths.body.diff(dim=0)[..., None])[..., 0].cumsum(0)
-    way = torch.cat([torch.zeros(1, 3, dtype=way.dtype), way])
-    times, apart = paths.timestamps[paths.valid], (paths.camera - way)[paths.valid]
+    suit_path = (turn @ paths.body.diff(dim=0)[..., None])[..., 0].cumsum(0)
+    suit_path = torch.cat([torch.zeros(1, 3, dtype=suit_path.dtype), suit_path])
+    times, apart = paths.timestamps[paths.valid], (paths.camera - suit_path)[paths.valid]
     if settings.path_smoothing_s:
         ones = torch.ones(len(times), dtype=torch.float64)
         apart = _robust_smooth(times, apart, ones, settings.path_smoothing_s, DISTANCE_SCALE)
-    return way + _interpolated(paths.timestamps, times, apart)
+    return suit_path + _interpolated(paths.timestamps, times, apart)
 
 
 def _covered(suit: Motion, localization: Localization, seen: Tensor) -> Bool[Tensor, "time"]:
@@ -194,7 +194,7 @@ def _covered(suit: Motion, localization: Localization, seen: Tensor) -> Bool[Ten
 def _interpolated(
     at: Float64[Tensor, "time"], times: Float64[Tensor, "sample"], value: Float[Tensor, "sample axis"]
 ) -> Float64[Tensor, "time axis"]:
-    """Linear between samples, held beyond them."""
+    """Linear interpolation; the end samples are repeated outside."""
     columns = [np.interp(at.numpy(), times.numpy(), column) for column in value.double().numpy().T]
     return torch.from_numpy(np.stack(columns, -1))
 

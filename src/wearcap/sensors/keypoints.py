@@ -1,6 +1,6 @@
-"""What detectors on a head camera would report of a true motion: the wearer's own joints, and another person's pose.
+"""Simulated detections of a head camera from a true motion: the wearer's own joints, and another person's pose.
 
-Only the picture's borders hide anything here: walls, furniture and the body itself do not.
+Only the image borders limit visibility; occlusion by walls, furniture and the body itself is not simulated.
 """
 
 from collections.abc import Sequence
@@ -23,21 +23,21 @@ from wearcap.sensors.noise import smooth_noise
 from wearcap.sensors.slam import R_DEVICE_CAM
 
 ACTION_CAMERA = Camera("pinhole", 1920, 1080, 895.2, 785.7, 959.5, 539.5)
-"""94° x 69°, what the wide lens of an action camera shows."""
+"""Field of view of an action camera's wide lens, 94° x 69°."""
 DOWN_DEG, T_HEAD_CAM = 22.5, (0.09, 0.0, 0.09)
-"""How far the camera looks down, and its place in the head's frame (m)."""
+"""Downward tilt of the camera, and its position in the head's frame (m)."""
 BURST_S = 0.2
-"""How long a detector goes on missing a joint, about."""
+"""Typical duration (s) of a burst of missed detections."""
 NEAR_M = 0.05
-"""Nothing is seen that is closer to the lens."""
+"""Smallest visible distance from the lens (m)."""
 TRUNK = ("head", "left_shoulder", "right_shoulder", "left_hip", "right_hip")
-"""Joints that a pose estimator has to see."""
+"""Joints that must be visible for a pose estimate."""
 DEPTH_SHARE = 0.05
-"""Deviation of a person's distance, as a share of it: one picture does not tell size from distance."""
+"""Relative standard deviation of a person's estimated distance: a single image does not determine scale."""
 
 
 def action_camera(timestamps: Float64[Tensor, "time"]) -> CameraStream:
-    """`ACTION_CAMERA` on a head, taking pictures at these times."""
+    """`ACTION_CAMERA` on a head, with images at these times."""
     down = rotation.about_axis("y", torch.tensor(DOWN_DEG).deg2rad())
     return CameraStream(timestamps, ACTION_CAMERA, down @ R_DEVICE_CAM, torch.tensor(T_HEAD_CAM))
 
@@ -59,11 +59,11 @@ def seen_joints(
     motion: Motion, T_world_cam: Trajectory, camera: Camera, joints: Sequence[str], noise_px: float, drop: float,
     rng: np.random.Generator,
 ) -> dict[str, Cue]:  # fmt: skip
-    """Pixels of joints in a camera's frames (OpenCV axes, within the motion's time), as a detector would find them.
+    """Simulated 2D detections of joints in a camera's frames (OpenCV axes, within the motion's time).
 
-    A share `drop` of what is in the picture is missed, in short bursts. Half of the noise's variance lasts for about a
-    second; how noisy a frame is (`noise_px` in the middle) varies as much, and confidence falls with it. Cues hold the
-    frames that show their joint; joints that are never seen are left out.
+    A share `drop` of the visible joints is missed, in short bursts. Half of the noise variance is correlated over about
+    a second; the noise level (median `noise_px`) varies over the same time, and confidence decreases with it. Cues hold
+    the frames in which their joint is detected; joints that are never detected are left out.
     """
     count, fps = len(T_world_cam), _rate(T_world_cam)
     cues = {}
@@ -85,11 +85,11 @@ def seen_wearer(
     motion: Motion, T_world_cam: Trajectory, camera: Camera, noise_deg: float, rng: np.random.Generator,
     period_s: float = 1.0, range_m: float = 8.0,
 ) -> tuple[Motion, Float[Tensor, "time joint"]]:  # fmt: skip
-    """A person's motion as a monocular pose estimator finds it in another wearer's camera, and its confidence.
+    """Simulated monocular pose estimate of a person in another wearer's camera, and its confidence.
 
-    Local rotations are off by `noise_deg` (root mean square), changing over about `period_s`; the root's place by its
-    distance. Frames count in which trunk and head are in the picture and nearer than `range_m`, and of these the joints
-    that are in the picture with their children; all else has confidence 0. Both need one clock and one world.
+    Local rotations have errors of `noise_deg` (root mean square) that vary over about `period_s`; the root has an error
+    in distance. Confidence is above 0 for frames with trunk and head in the image and nearer than `range_m`, and for
+    joints that are in the image with their children. Both recordings need one clock and one world.
     """
     times = T_world_cam.timestamps
     joints = interpolate(motion.timestamps, motion.T_world_joint.t, times)

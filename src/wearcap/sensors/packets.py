@@ -1,7 +1,7 @@
-"""Packets of live devices, checked before a streaming session takes them in: nothing in them can end or poison it.
+"""Validation of live device packets before a streaming session uses them, so that bad input cannot break a session.
 
-The checks say what is wrong with a value, or None; `Clock` says which times are believed; `HeadDoor` puts both
-together for the head device, whose clock is the session's.
+The `…_fault` functions return why a value is invalid, or None; `Clock` decides which timestamps are accepted;
+`HeadInput` combines both for the head device, whose clock is the session's.
 """
 
 import math
@@ -19,28 +19,30 @@ from torch import Tensor
 from wearcap.geometry.rigid import Rigid
 
 MAX_TIME_S = 1e10
-"""Beyond it a double no longer resolves a millionth of a second; Unix times are 1.7e9 s (1.7e12 are milliseconds)."""
+"""Largest valid time (s): beyond it a double no longer resolves a microsecond; Unix times are 1.7e9 s."""
 MAX_POSITION_M = 10_000.0
-"""From the world's origin, along each axis: there a float32 still resolves a millimetre."""
+"""Largest valid coordinate (m) along each axis: there a float32 still resolves a millimetre."""
 MAX_JUMP_M = 100.0
-"""From one head pose to the next; `AGREEING` poses in a row that are further away are where the head is now."""
+"""Largest valid distance (m) between consecutive head poses; after `AGREEING` farther poses in a row the new position
+is accepted."""
 MAX_ACC_M_S2 = 2_000.0
-"""Wearables' accelerometers saturate at 16 g (157 m/s²), those for impacts at 200 g."""
+"""Largest valid acceleration. Accelerometers of wearables saturate at 16 g (157 m/s²), those for impacts at 200 g."""
 MAX_FEATURE = 10_000.0
-"""Of an embedding; those of image encoders are around 1, or 10."""
+"""Largest valid component of an embedding; those of image encoders are around 1 to 10."""
 ROTATION_TOLERANCE = 0.02
-"""Of each entry of R Rᵀ - 1: matrices that were rounded to two digits pass, scales and shears do not."""
+"""Tolerance of each entry of R Rᵀ - 1: matrices rounded to two digits pass, scales and shears do not."""
 AHEAD_S = 0.5
-"""A packet that is further ahead of its stream is alone until others agree; captures begin anew behind such gaps."""
+"""Packets further ahead (s) of their stream are accepted only when others confirm them; captures restart after such
+gaps."""
 BEHIND_S = 1.0
-"""One that is further behind is so, too; poses are final by then."""
+"""Packets further behind (s) are accepted only when others confirm them; by then poses are final."""
 AGREEING = 5
-"""Packets in a row, each later than the one before by `AGREEING_STEP_S` at most, that move a clock."""
+"""Number of consecutive packets, at most `AGREEING_STEP_S` apart, that confirm a clock jump."""
 AGREEING_STEP_S = 1.0
 CONNECTED_S = 10.0
-"""Packets that came before the head's clock was known belong to it if no longer pause lies between."""
+"""Longest pause (s) within the samples that arrived before the head's clock started and are kept for it."""
 MAX_WAITING = 100_000
-"""Packets of one stream that wait for others; a quarter of an hour at 100 Hz. The oldest make room."""
+"""Capacity of one stream's buffer: a quarter of an hour at 100 Hz. The oldest packets are dropped."""
 
 WRONG_TYPE = "wrong type or shape"
 NOT_FINITE = "not finite"
@@ -50,7 +52,7 @@ OFF_THE_CLOCK = "off the clock"
 
 
 def number_fault(value: object, limit: float) -> str | None:
-    """What is wrong with a number of magnitude up to `limit`."""
+    """Why a number is invalid (magnitude above `limit`, not finite, wrong type), or None."""
     if not isinstance(value, float | int | np.floating | np.integer):
         return WRONG_TYPE
     if abs(value) <= limit:
@@ -59,19 +61,19 @@ def number_fault(value: object, limit: float) -> str | None:
 
 
 def time_fault(timestamp: object) -> str | None:
-    """What is wrong with a time (s)."""
+    """Why a time (s) is invalid, or None."""
     return number_fault(timestamp, MAX_TIME_S)
 
 
 def vector_fault(value: object, limit: float) -> str | None:
-    """What is wrong with a vector "3" of components up to `limit`."""
+    """Why a vector "3" with components up to `limit` is invalid, or None."""
     if not _is_float(value, (3,)):
         return WRONG_TYPE
     return _values_fault(value.tolist(), limit)
 
 
 def rotation_fault(R: object) -> str | None:
-    """What is wrong with a rotation matrix "3 3"."""
+    """Why a rotation matrix "3 3" is invalid, or None."""
     if not _is_float(R, (3, 3)):
         return WRONG_TYPE
     rows = (ax, ay, az), (bx, by, bz), (cx, cy, cz) = R.tolist()
@@ -87,14 +89,14 @@ def rotation_fault(R: object) -> str | None:
 
 
 def pose_fault(pose: object) -> str | None:
-    """What is wrong with one pose in the world (R "3 3", t "3" in m)."""
+    """Why a pose in the world (R "3 3", t "3" in m) is invalid, or None."""
     if not isinstance(pose, Rigid):
         return WRONG_TYPE
     return rotation_fault(pose.R) or vector_fault(pose.t, MAX_POSITION_M)
 
 
 def embedding_fault(embedding: object, size: int) -> str | None:
-    """What is wrong with an embedding of `size` features."""
+    """Why an embedding of `size` features is invalid, or None."""
     if not _is_float(embedding, (size,)):
         return WRONG_TYPE
     largest = embedding.detach().abs().max().item() if size else 0.0
@@ -102,7 +104,7 @@ def embedding_fault(embedding: object, size: int) -> str | None:
 
 
 def rotations_fault(R: object, shape: Sequence[int]) -> str | None:
-    """What is wrong with many rotation matrices "*batch 3 3", all together."""
+    """Why a batch of rotation matrices "*batch 3 3" is invalid, or None."""
     if not _is_float(R, tuple(shape)):
         return WRONG_TYPE
     R = R.detach().double()
@@ -114,7 +116,7 @@ def rotations_fault(R: object, shape: Sequence[int]) -> str | None:
 
 
 def values_fault(values: object, shape: Sequence[int], limit: float) -> str | None:
-    """What is wrong with many values of magnitude up to `limit`, all together."""
+    """Why an array of values with magnitudes up to `limit` is invalid, or None."""
     if not _is_float(values, tuple(shape)):
         return WRONG_TYPE
     if (values.detach().abs() <= limit).all():
@@ -123,7 +125,7 @@ def values_fault(values: object, shape: Sequence[int], limit: float) -> str | No
 
 
 def usable_points(points: object) -> tuple[Float[Tensor, "point 3"] | None, str | None]:
-    """A copy of those points of the world (m) that are finite and within range, and what is wrong with the others."""
+    """A copy of the world points (m) that are finite and within range, and why the others are invalid."""
     if not isinstance(points, Tensor) or points.ndim != 2 or not _is_float(points, (len(points), 3)):
         return None, WRONG_TYPE
     points = owned(points)
@@ -134,7 +136,7 @@ def usable_points(points: object) -> tuple[Float[Tensor, "point 3"] | None, str 
 
 
 def owned(value: Tensor) -> Tensor:
-    """A copy (float32, CPU): the device may write its next packet into the same memory."""
+    """A copy (float32, CPU), since the device may reuse the memory for its next packet."""
     return value.detach().to("cpu", torch.float32, copy=True)
 
 
@@ -144,7 +146,7 @@ def owned_pose(pose: Rigid) -> Rigid:
 
 
 def connected(times: Sequence[float], at: float) -> slice:
-    """Of rising times (s) those around `at` without a pause of more than `CONNECTED_S`."""
+    """Slice of increasing times (s) that are connected to `at` without a pause longer than `CONNECTED_S`."""
     first = stop = bisect_left(times, at)
     while first > 0 and (times[first] if first < stop else at) - times[first - 1] <= CONNECTED_S:
         first -= 1
@@ -155,35 +157,35 @@ def connected(times: Sequence[float], at: float) -> slice:
 
 
 class Admitted(NamedTuple):
-    """What a clock says to a packet: those that are believed now, some of which may have waited for it."""
+    """Packets that a clock accepts at once, which may include earlier ones that were waiting for confirmation."""
 
     packets: list[tuple[float, Any]]
-    """Times (s) and packets, to be taken in this order."""
+    """Times (s) and packets, in the order in which to process them."""
     refused: int = 0
-    """How many had a wrong time: they were ahead, and alone."""
+    """Number of packets refused for an unconfirmed time."""
     begins: bool = False
-    """Whether the clock begins with these packets, for the first time or anew."""
+    """Whether the clock starts or restarts with these packets."""
     again: bool = False
-    """Whether what came before is believed, too: else it was a few packets at a wrong time."""
+    """Whether the packets before a restart were valid; otherwise they were a few packets with a wrong time."""
 
 
 class Clock:
-    """The time of one stream. A lone packet far from the others is refused; several that agree have moved the clock.
+    """Clock of one stream. A single packet far from the others is refused; several consistent ones move the clock.
 
-    `leads`: it is the session's; else it goes back only to where the session's is.
+    `leads`: this is the session's clock; other clocks jump back only to the session's time.
     """
 
     def __init__(self, leads: bool = True):
         self.leads = leads
         self.newest = -math.inf
-        """Time (s) of the newest packet that is believed."""
+        """Time (s) of the newest accepted packet."""
         self.taken = 0
-        """Packets that were believed since the clock began; no more than `AGREEING` are counted."""
+        """Number of packets accepted since the clock started, counted up to `AGREEING`."""
         self.waiting: list[tuple[float, Any]] = []
-        """Packets in a row that agree with each other alone, fewer than `AGREEING`."""
+        """Consecutive packets that await confirmation, fewer than `AGREEING`."""
 
     def admit(self, time: float, packet: Any, leader: float = -math.inf) -> Admitted:
-        """What is to be done with a packet at a time (s), and those that waited; `leader`: the session's newest time."""
+        """Decide on a packet at a time (s) and on the waiting ones; `leader`: the session's newest time."""
         newest = self.newest
         begins = not self.taken
         if begins or newest - BEHIND_S <= time <= max(newest, leader) + AHEAD_S:
@@ -202,6 +204,7 @@ class Clock:
         return self._moved()
 
     def _moved(self) -> Admitted:
+        """Accept a confirmed jump of the clock."""
         packets, self.waiting = self.waiting, []
         again = self.taken >= AGREEING
         begins, refused = packets[0][0] < self.newest or not again, 0 if again else self.taken
@@ -209,33 +212,34 @@ class Clock:
         return Admitted(packets, refused, begins, begins and again)
 
     def dismiss(self) -> tuple[list[tuple[float, Any]], int]:
-        """Wait no longer: the packets that were merely late, and how many others are refused."""
+        """Clear the waiting packets: those that were merely late, and the number of the others, which are refused."""
         waiting, self.waiting = self.waiting, []
         late = [(time, packet) for time, packet in waiting if time < self.newest]
         return late, len(waiting) - len(late)
 
     def set(self, newest: float | None) -> int:
-        """Go on from a newest time, or begin with the next packet; returns how many waiting packets are refused."""
+        """Continue from a newest time (None: restart with the next packet); returns the number of refused packets."""
         refused, self.waiting = len(self.waiting), []
         self.newest, self.taken = (-math.inf, 0) if newest is None else (newest, AGREEING)
         return refused
 
 
 @dataclass
-class HeadDoor:
-    """Where one wearer's head packets come in. What is refused is counted by reason, such as "head: not a rotation"."""
+class HeadInput:
+    """Validates the packets of one wearer's head device and counts the refused ones."""
 
     refused: Counter[str] = field(default_factory=Counter)
+    """Number of refused packets by reason, such as "head: not a rotation"."""
     dropped: int = 0
-    """Head poses among them."""
+    """Number of refused head poses."""
     clock: Clock = field(default_factory=Clock)
     place: tuple[float, float, float] | None = None
-    """Of the last pose that was believed (m)."""
+    """Position (m) of the last accepted pose."""
     far: int = 0
-    """Poses since then that were too far from it."""
+    """Number of poses since then that were too far from it."""
 
     def pose(self, T_world_device: object) -> Rigid | None:
-        """A copy of the device's pose, or None where there is none that can be used."""
+        """A copy of the device's pose; None for a missing or invalid one."""
         if T_world_device is None:
             return None
         fault = pose_fault(T_world_device)
@@ -255,7 +259,7 @@ class HeadDoor:
         return None
 
     def points(self, points_world: object) -> Float[Tensor, "point 3"] | None:
-        """A copy of those points (m) that can be used, or None where there are none."""
+        """A copy of the valid points (m); None where there are none."""
         if points_world is None:
             return None
         points, fault = usable_points(points_world)
@@ -264,20 +268,20 @@ class HeadDoor:
         return points
 
     def timely(self, timestamp: object) -> bool:
-        """Whether a packet has a time at all."""
+        """Whether a packet has a valid time."""
         if fault := time_fault(timestamp):
             self.refuse("head", fault)
             self.dropped += 1
         return fault is None
 
     def admit(self, time: float, packet: Any) -> Admitted:
-        """The packets to be taken now that this one has come."""
+        """The packets to process now, given a new one."""
         admitted = self.clock.admit(time, packet)
         self._count(admitted.refused)
         return admitted
 
     def end(self) -> list[tuple[float, Any]]:
-        """Nothing more will come: the packets that were merely late."""
+        """End of input: the waiting packets that were merely late."""
         late, refused = self.clock.dismiss()
         self._count(refused)
         return late
@@ -304,7 +308,7 @@ def _is_float(value: object, shape: tuple[int, ...]) -> TypeGuard[Tensor]:
 
 
 def _values_fault(values: list[float], limit: float) -> str | None:
-    # Comparisons with NaN are false; min and max may pass over it.
+    # Comparisons with NaN are false, whereas min and max may ignore it.
     if all(-limit <= value <= limit for value in values):
         return None
     return OUT_OF_RANGE if all(map(math.isfinite, values)) else NOT_FINITE

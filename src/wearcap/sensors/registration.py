@@ -1,4 +1,4 @@
-"""Registering a cloud to the scanned scene by iterative closest points, coarse to fine, with a report."""
+"""Registration of a point cloud to the scanned scene by coarse-to-fine ICP, with a quality report."""
 
 from dataclasses import dataclass
 
@@ -12,13 +12,13 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 
 _FEWEST = 100
-"""Points below which nothing can be registered."""
+"""Fewest points for a registration."""
 _SHARE = 0.05
 """Share of the cloud that must lie near the scene in every stage."""
 _INSIDE_M = 0.05
 """The report counts points of the cloud within this of the scene's."""
 _ROOM_M = 1.5
-"""The scene is searched so far around the cloud."""
+"""Margin around the cloud within which the scene is used."""
 _NORMAL_NEIGHBORS = 12
 
 
@@ -36,10 +36,10 @@ STAGES = (Stage(0.1, 0.6), Stage(0.06, 0.25), Stage(0.03, 0.06))
 
 @dataclass(frozen=True)
 class Registration:
-    """Where ICP put a cloud, and how well it lies there."""
+    """Pose of a cloud found by ICP, with its quality."""
 
     T_scene_cloud: Rigid
-    """float64."""
+    """Pose of the cloud in the scene (float64)."""
     fitness: float
     """Share of the cloud (in voxels of the last stage) within 5 cm of a scene point."""
     rmse_m: float
@@ -85,7 +85,7 @@ def register(
 
 
 def _near(scene: np.ndarray, points: np.ndarray, pose: np.ndarray, voxel_m: float) -> np.ndarray:
-    """The scene around where the cloud is thought to be, thinned to the finest voxels."""
+    """The scene around the cloud's approximate pose, thinned to the finest voxels."""
     placed = _moved(points, pose)
     inside = ((scene > placed.min(0) - _ROOM_M) & (scene < placed.max(0) + _ROOM_M)).all(1)
     if inside.sum() < _FEWEST:

@@ -1,4 +1,4 @@
-"""Semi-dense SLAM points: on texture, only where the device really looked, with the noise of triangulation."""
+"""Simulated semi-dense SLAM points: on textured surfaces that the device saw, with triangulation noise."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording.recording import HeadStream, PointCloud
 
 CAMERA = Camera("pinhole", 160, 120, 66.0, 66.0, 79.5, 59.5)
-"""Wide view (100° × 85°) at a resolution that tells walls from what is behind them."""
+"""Visibility camera, 100° × 85°, at a resolution that resolves occlusion by walls."""
 
 R_DEVICE_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """OpenCV camera axes (right, down, forward) in the device's (forward, left, up)."""
@@ -22,7 +22,7 @@ R_DEVICE_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]
 
 @dataclass(frozen=True)
 class SlamPoints:
-    """How the point cloud comes about."""
+    """Parameters of the simulated point cloud."""
 
     density: float = 40.0
     """Times as many points as the textures' features: semi-dense maps follow edges, not corners. Real ones of Aria have
@@ -35,7 +35,7 @@ class SlamPoints:
     keyframe_deg: float = 25.0
     range_m: float = 10.0
     noise_at_2m: float = 0.01
-    """Deviation of depth at 2 m (m); it grows with distance squared."""
+    """Standard deviation of depth at 2 m (m); it grows with distance squared."""
     outliers: float = 0.03
 
 
@@ -66,10 +66,10 @@ def semidense_points(
     ray = points - eyes
     distance = np.linalg.norm(ray, axis=1)
     deviation = settings.noise_at_2m * (distance / 2) ** 2
-    stretch = deviation * rng.standard_normal(len(points)) / np.maximum(distance, 1e-6)
+    relative_error = deviation * rng.standard_normal(len(points)) / np.maximum(distance, 1e-6)
     wrong = rng.random(len(points)) < settings.outliers
-    stretch[wrong] = np.exp(rng.normal(0.0, 0.5, wrong.sum())) - 1
-    noisy = points + ray * stretch[:, None]
+    relative_error[wrong] = np.exp(rng.normal(0.0, 0.5, wrong.sum())) - 1
+    noisy = points + ray * relative_error[:, None]
     order = np.argsort(first, kind="stable")
     return PointCloud(
         torch.from_numpy(noisy[order]).float(),
@@ -95,7 +95,7 @@ def textured_points(
 
 
 def keyframes(head: HeadStream, settings: SlamPoints) -> list[int]:
-    """Frames after every so much of moving and turning together, thinned to at most the limit."""
+    """Keyframes after each `keyframe_m` or `keyframe_deg` of combined motion, thinned to the limit."""
     moved = head.t_world_device.diff(dim=0).norm(dim=-1) / settings.keyframe_m
     turned = rotation.geodesic(head.R_world_device[:-1], head.R_world_device[1:])
     effort = torch.cumsum(moved + turned / np.deg2rad(settings.keyframe_deg), 0)
@@ -110,7 +110,7 @@ def _visible(
     T_world_cam: Rigid,
     range_m: float,
 ) -> Bool[np.ndarray, "point"]:
-    """Which points the camera sees: inside the picture, in range, from the front, and not behind what is nearer."""
+    """Points visible to the camera: inside the image, in range, facing it, and not occluded."""
     in_cam = T_world_cam.inverse()[None] @ torch.from_numpy(points).float()
     pixels, valid = CAMERA.project(in_cam)
     depth = render(CAMERA, T_world_cam, [mesh]).depth

@@ -1,4 +1,4 @@
-"""Clean-up of a monocular SLAM trajectory: what accelerates as no head can is an outlier (MocapEvery §3.2)."""
+"""Outlier removal of a monocular SLAM trajectory by implausible accelerations (MocapEvery §3.2)."""
 
 from dataclasses import dataclass
 
@@ -10,22 +10,22 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory, filled, require_rising
 
 MAX_ACCELERATION = 40.0
-"""m/s² at the usual 30 Hz: a jump of 4.5 cm between two frames. A running head stays below 30 (ours: the document names
+"""m/s² at the usual 30 Hz: a jump of 4.5 cm between two frames. A running head stays below 30 (ours: the paper gives
 no number)."""
 MAX_BURST_S = 1.0
-"""Longer stretches of deviating positions are no burst of outliers: SLAM has found another place, and stays there."""
+"""Longest burst of outliers; longer deviating segments are jumps of the SLAM system to another place."""
 
 
 @dataclass(frozen=True)
 class CleanTrack:
-    """A trajectory without outliers, and what was done to it."""
+    """A trajectory without outliers, with the replaced frames and remaining jumps."""
 
     trajectory: Trajectory
     """On the same timestamps; outliers are interpolated."""
     valid: Bool[Tensor, "time"]
     """False where a pose was replaced."""
     jumps_s: Float64[Tensor, "jump"]
-    """Times before jumps that no short burst explains: on either side lies a path of its own."""
+    """Times before jumps that are not short bursts; the path before and after is inconsistent."""
 
 
 def clean_track(
@@ -48,7 +48,7 @@ def acceleration_outliers(
 
     A jump between two frames accelerates both of them, there and back; a hard step or a turn only one. Where both
     exceed `max_acceleration` (m/s²) the track is cut, a piece not longer than those beside it nor than `max_burst_s` is
-    dropped, its neighbours are joined, and so on. A burst of any shape thus falls as a whole, and
+    dropped, its neighbours are joined, and so on. A burst of any shape is thus dropped as a whole, and
     longer good pieces beside it stay. Frames that are not finite are never valid.
     """
     require_rising(trajectory.timestamps)

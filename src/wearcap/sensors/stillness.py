@@ -1,4 +1,4 @@
-"""Steps of a calibration during which a sensor is held still: where a log has them, how still it was, what is enough."""
+"""Calibration steps in which a sensor is held still: finding them in a log, measuring stillness, quality checks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, resample
 
 Stretch = tuple[float, float]
-"""From when to when (s, on the log's clock)."""
+"""Start and stop time (s, on the log's clock)."""
 _LOOK_S = 0.5
-"""Turns are looked for over so much time: a gyroscope's noise averages out, a hand's tremor does not."""
+"""Interval over which rotation is measured: it averages out gyroscope noise, but not a hand's tremor."""
 
 
 @dataclass(frozen=True)
 class StepCheck:
-    """One number that tells whether a step went well."""
+    """Quality check of a calibration step: one measured number with its limit."""
 
     step: str
     what: str
@@ -29,7 +29,7 @@ class StepCheck:
     unit: str
     fix: str
     at_least: bool = False
-    """Whether the limit is the least allowed, not the most."""
+    """Whether the limit is a minimum instead of a maximum."""
 
     @property
     def ok(self) -> bool:
@@ -88,7 +88,7 @@ def still_intervals(
     edges = np.flatnonzero(np.diff(np.concatenate([[0], calm.astype(np.int8), [0]])))
     found = []
     for first, last in edges.reshape(-1, 2):
-        # The half second looked at after the last calm moment is calm, too; a tenth is left out at each end.
+        # The half second after the last calm time is calm, too; 0.1 s is trimmed at each end.
         start, stop = at[first].item() + 0.1, at[last - 1].item() + _LOOK_S - 0.1
         if stop - start >= min_s:
             found.append((start, stop))
@@ -96,6 +96,6 @@ def still_intervals(
 
 
 def common(a: Sequence[Stretch], b: Sequence[Stretch], min_s: float = 2.0) -> list[Stretch]:
-    """Stretches that lie in both lists."""
+    """Overlaps of the stretches of two lists."""
     both = [(max(x[0], y[0]), min(x[1], y[1])) for x in a for y in b]
     return sorted(stretch for stretch in both if stretch[1] - stretch[0] >= min_s)

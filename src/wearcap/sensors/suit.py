@@ -1,4 +1,4 @@
-"""What a suit of inertial sensors (Xsens-like) makes of a motion: pose, drifting translation, foot contacts."""
+"""Simulated output of an inertial suit (Xsens-like): pose, drifting translation, foot contacts."""
 
 from dataclasses import dataclass, replace
 
@@ -16,18 +16,18 @@ from wearcap.sensors.noise import random_walk, smooth_noise
 
 @dataclass(frozen=True)
 class SuitNoise:
-    """Errors of a suit; zeros make it perfect. The walked way ends about 0.5 m off after 70 m, 1 m after 380 m."""
+    """Errors of a suit; zeros make it perfect. The path drifts by about 0.5 m over 70 m, 1 m over 380 m."""
 
     fixed_deg: float = 1.0
-    """Calibration of each segment's orientation: constant in a recording."""
+    """Calibration error of each segment's orientation, constant in a recording."""
     slow_deg: float = 1.3
-    """What varies of it, over `slow_period_s`."""
+    """Orientation error that varies over `slow_period_s`."""
     slow_period_s: float = 6.0
     heading_walk_deg_per_sqrt_min: float = 0.06
     scale: float = 0.0008
-    """Deviation of the walked distance, constant in a recording, as a share."""
+    """Standard deviation of the scale error of walked distances, constant in a recording."""
     step_scale: float = 0.036
-    """Deviation of the walked distance from step to step, as a share."""
+    """Standard deviation of the scale error of walked distances from step to step."""
     step_period_s: float = 2.0
     height_m: float = 0.01
     contact_delay_s: tuple[float, float] = (0.010, 0.040)
@@ -38,9 +38,9 @@ class SuitNoise:
 def suit_motion(
     motion: Motion, contact: Bool[Tensor, "time patch"], noise: SuitNoise, rng: np.random.Generator
 ) -> Motion:
-    """The suit's own idea of `motion`, on its clock and in a world that starts with the true one and drifts off.
+    """The suit's estimate of `motion`, in a world that starts at the true one and drifts.
 
-    `contact` is the truth about `FOOT_PATCHES`; the flags that the suit reports come as `contact_prob` of 0 or 1.
+    `contact` is the ground truth of `FOOT_PATCHES`; the reported flags become a `contact_prob` of 0 or 1.
     """
     length, joints, fps = len(motion), len(motion.skeleton), motion.fps
     per_axis = np.deg2rad(1.0) / np.sqrt(3)
@@ -67,7 +67,7 @@ def _drifted(
     rng: np.random.Generator,
     fps: float,
 ) -> Float[Tensor, "time 3"]:
-    """Steps of the path, each turned and stretched by the errors of its moment, added up again; height is held."""
+    """Integrate the path's steps with their heading and scale errors; the height keeps the true one plus noise."""
     stretch = 1 + noise.scale * float(rng.standard_normal())
     stretch = stretch + noise.step_scale * smooth_noise(rng, len(t_world_root), 1, noise.step_period_s, fps)
     wander = noise.height_m * smooth_noise(rng, len(t_world_root), 1, 20.0, fps)[:, 0]

@@ -1,10 +1,10 @@
-"""From a watch's own reference frame and its place on the arm to the world and the wrist (MocapEvery appendix C.2).
+"""Calibration of watches: from their reference frame to the world, and their mounting on the wrist (MocapEvery C.2).
 
 Both watches lie on a board whose axes are the world's (z up, y where the wearer will face), then are worn in a T-pose
 that faces y. With our names eq. 6 and 7 read R_world_joint = R_world_ref R_ref_imu R_imu_joint,
 acc_world = R_world_ref acc_ref, and R_imu_joint = R_world_imu(T)ᵀ R_world_joint(T). A skeleton's rest pose is a T-pose that
-faces x, so that facing y R_world_joint(T) = Rz(90°) for both wrists. A pose that is held wrongly by a constant angle
-cannot be told from a watch that sits otherwise.
+faces x, so that facing y R_world_joint(T) = Rz(90°) for both wrists. A constant error of the pose
+cannot be distinguished from another mounting of the watch.
 """
 
 import math
@@ -35,22 +35,22 @@ FACING_DEG = 90.0
 
 @dataclass(frozen=True)
 class CalibrationLimits:
-    """What is accepted of the board and the T-pose."""
+    """Limits of the quality checks of the board and the T-pose."""
 
     board_still_deg: float = 1.0
     board_tilt_deg: float = 3.0
     pose_still_deg: float = 4.0
     face_up_deg: float = 40.0
-    """Between the T-pose's vertical and the watch's face: palms down, the watch on the back of the wrist."""
+    """Angle between the vertical and the watch's face in the T-pose: palms down, watch on the back of the wrist."""
     arm_level_deg: float = 20.0
     arm_facing_deg: float = 25.0
     arms_apart_deg: float = 15.0
-    """Between the lines of the two forearms."""
+    """Angle between the lines of the two forearms."""
 
 
 @dataclass(frozen=True)
 class WatchCalibration:
-    """How one watch's reference frame lies in the world and the watch on its wrist; how well that is known (degrees)."""
+    """Orientation of a watch's reference frame in the world and its mounting on the wrist, with quality measures."""
 
     joint: str
     R_world_ref: Float[Tensor, "3 3"]
@@ -58,12 +58,12 @@ class WatchCalibration:
     board_still_deg: float
     """Root mean square angle to the mean while on the board."""
     board_tilt_deg: float
-    """Of the board's z against the vertical that the watch feels."""
+    """Angle of the board's z to the vertical measured by the watch."""
     pose_still_deg: float
 
     @property
     def face_up_deg(self) -> float:
-        """By which the watch's face (its z axis) looks away from straight up in the T-pose."""
+        """Angle of the watch's face (its z axis) to the vertical in the T-pose."""
         return _angle_deg(self.R_joint_imu[2, 2])
 
     @property
@@ -73,12 +73,12 @@ class WatchCalibration:
 
     @property
     def arm_facing_deg(self) -> float:
-        """By which the forearm points away from the side of someone who faces the board's y."""
+        """Horizontal angle of the forearm to the side direction of a wearer who faces the board's y."""
         x = self.R_joint_imu[:, 0]
         return math.degrees(math.atan2(abs(x[0].item()), abs(x[1].item())))
 
     def apply(self, stream: ImuStream) -> ImuStream:
-        """The stream in the world: orientation and free acceleration (eq. 6), and where the watch sits on the wrist."""
+        """The stream in the world: orientation and free acceleration (eq. 6), with the mounting on the wrist."""
         R_ref_imu = _orientation(stream)
         R = self.R_world_ref.to(R_ref_imu)
         acc = None if stream.acc_world is None else stream.acc_world @ R.mT
@@ -88,7 +88,7 @@ class WatchCalibration:
 
 
 def measure_watch(stream: ImuStream, board: Stretch, t_pose: Stretch) -> WatchCalibration:
-    """Calibrate one watch (log in its own reference frame, z up) without judging how well the steps went.
+    """Calibrate one watch (log in its own reference frame, z up) without quality checks.
 
     Raises WearcapError for a stretch that is shorter than 2 s or not in the log.
     """
@@ -119,7 +119,7 @@ def measure_watches(
 def watch_checks(
     found: Mapping[str, WatchCalibration], limits: CalibrationLimits = CalibrationLimits()
 ) -> list[StepCheck]:
-    """What tells whether the board and the T-pose went well, in the order of the steps."""
+    """Quality checks of the board and the T-pose, in the order of the steps."""
     still = "Let go of the watches, and give a stretch in which nothing touches them."
     steady = "Hold the pose for 3 s without moving, or give a calmer stretch."
     flat = "Put the board on a level table, the watches' backs flat on it."
@@ -150,9 +150,9 @@ def require_watches(
     t_pose: Stretch,
     limits: CalibrationLimits = CalibrationLimits(),
 ) -> None:
-    """Raise WearcapError for the first step that went wrong, and for logs of the wrong arms.
+    """Raise WearcapError for the first failed step, and for swapped logs.
 
-    Which arm is which shows only once the arms hang, in the half minute after the T-pose.
+    Left and right are checked when the arms hang, in the half minute after the T-pose.
     """
     require(watch_checks(found, limits))
     after = []
@@ -183,9 +183,9 @@ def calibrate_watches(
 
 
 def propose_steps(streams: Mapping[str, ImuStream]) -> tuple[Stretch | None, Stretch | None]:
-    """Where two uncalibrated logs seem to have the board and the T-pose: stretches (s) still in both, or None.
+    """Propose the board and T-pose stretches (s) of two uncalibrated logs; None where not found.
 
-    On the board both watches lie level and as still as no arm is; in the T-pose, later, faces still look up and the
+    On the board both watches are level and stiller than any arm; in the later T-pose the faces still look up and the
     forearms are level.
     """
     still = [still_intervals(stream.timestamps, _orientation(stream)) for stream in streams.values()]
@@ -217,6 +217,6 @@ def _angle_deg(cos: Tensor) -> float:
 
 
 def _apart_deg(found: Mapping[str, WatchCalibration]) -> float:
-    """Between the lines of the watches' x axes in the T-pose; crowns may point to the hand or to the elbow."""
+    """Angle between the lines of the watches' x axes in the T-pose; crowns may point to the hand or to the elbow."""
     left, right = (found[joint].R_joint_imu[:, 0] for joint in WRISTS)
     return _angle_deg((left @ right).abs())

@@ -1,4 +1,4 @@
-"""Two watches as MocapEvery's estimator wants them: on the camera's clock, filtered, as joints (§4.1, appendix C.1)."""
+"""Preprocessing of two watches for MocapEvery: resampled to the camera's clock and filtered (§4.1, appendix C.1)."""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,21 +13,21 @@ from wearcap.recording import ImuStream
 
 WRISTS = ("left_wrist", "right_wrist")
 MAX_GAP_S = 0.5
-"""Longer silence of a watch is not bridged."""
+"""Longest gap (s) between a watch's samples that is interpolated."""
 FILTER = 7
-"""Frames of the mean filter."""
+"""Width of the mean filter, in frames."""
 _HANGING = 0.25
-"""Mean share of the vertical along the forearms from which one can tell left from right."""
+"""Smallest mean vertical component of the forearm axes that tells left from right."""
 
 
 def watches_at(
     streams: Mapping[str, ImuStream], timestamps: Float64[Tensor, "time"], where: str
 ) -> tuple[Float[Tensor, "time wrist 3 3"], Float[Tensor, "time wrist 3"]]:
-    """Orientation of the wrist joints and their filtered free acceleration (m/s²) at an even clock's times.
+    """Orientation and filtered free acceleration (m/s²) of the wrist joints at evenly spaced times.
 
-    Orientations turn evenly between samples (slerp); accelerations are averaged over each frame, then over 7 frames.
-    Raises WearcapError for a watch that is missing, silent at some of the times, or says neither orientation nor
-    acceleration, and for watches that are worn on the wrong arms.
+    Orientations are interpolated by slerp; accelerations are averaged over each frame, then over 7 frames. Raises
+    WearcapError for a watch that is missing, has gaps, or lacks orientation or acceleration, and for watches that are
+    worn on the wrong arms.
     """
     worn = []
     for joint in WRISTS:
@@ -37,7 +37,7 @@ def watches_at(
         stream = streams[joint]
         if stream.R_world_imu is None or stream.acc_world is None:
             raise WearcapError("a watch without orientation or free acceleration", where=f"{where}, {joint}", expected="both")  # fmt: skip
-        _require_awake(stream.timestamps, timestamps, f"{where}, {joint}")
+        _require_no_gaps(stream.timestamps, timestamps, f"{where}, {joint}")
         worn.append(stream)
     step = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
     frames = torch.arange(-(FILTER // 2), len(timestamps) + FILTER // 2).clamp(0, len(timestamps) - 1)
@@ -52,8 +52,8 @@ def filtered(
     around: Float64[Tensor, "more"],
     step_s: float,
 ) -> tuple[Float[Tensor, "time wrist 3 3"], Float[Tensor, "time wrist 3"]]:
-    """The same of watches that are known to be awake. `around` has the frames that the filter sees: the times with
-    `FILTER` // 2 more on either side. Beyond a watch's time its first or last word stands."""
+    """`watches_at` without checks. `around` holds the frames of the filter: the times with `FILTER` // 2 more on either
+    side. Outside a watch's log its first or last sample is repeated."""
     before, turn, accelerations = [], [], []
     for stream in streams:
         times, R, acc = stream.timestamps, stream.R_world_imu, stream.acc_world
@@ -72,7 +72,7 @@ def filtered(
 
 
 def require_sides(R_world_wrist: Float[Tensor, "time wrist 3 3"], where: str) -> None:
-    """Raise WearcapError when the watches are worn the wrong way round.
+    """Raise WearcapError when left and right watch are swapped.
 
     Arms hang most of the time: the left forearm's axis (+y of a T-pose) then points down, the right one's up.
     """
@@ -82,20 +82,20 @@ def require_sides(R_world_wrist: Float[Tensor, "time wrist 3 3"], where: str) ->
                            fix="Exchange the logs of the left and the right watch, or calibrate them again.")  # fmt: skip
 
 
-def _require_awake(times: Tensor, asked: Tensor, where: str) -> None:
-    """Raise WearcapError when the watch is silent at some of the times."""
+def _require_no_gaps(times: Tensor, requested: Tensor, where: str) -> None:
+    """Raise WearcapError when the watch has no samples at some of the requested times."""
     step = times.diff()
     if len(times) < 2 or (step <= 0).any():
         raise WearcapError("times of a watch that do not grow", where=where,
                            fix="Sort its samples by time and leave repeated ones out.")  # fmt: skip
-    early, late = (times[0] - asked[0]).item(), (asked[-1] - times[-1]).item()
+    early, late = (times[0] - requested[0]).item(), (requested[-1] - times[-1]).item()
     if early > MAX_GAP_S or late > MAX_GAP_S:
         raise WearcapError(
             f"the watch logged from {times[0].item():.2f} s to {times[-1].item():.2f} s", where=where,
-            expected=f"{asked[0].item():.2f} s to {asked[-1].item():.2f} s, as the camera did",
+            expected=f"{requested[0].item():.2f} s to {requested[-1].item():.2f} s, as the camera did",
             fix="Put both on one clock (wearcap calibrate), or cut the recording to what they share.")  # fmt: skip
     gaps = find_gaps(times, MAX_GAP_S)
-    inside = [g for g in gaps.tolist() if times[g + 1] > asked[0] and times[g] < asked[-1]]
+    inside = [g for g in gaps.tolist() if times[g + 1] > requested[0] and times[g] < requested[-1]]
     if inside:
         first = inside[0]
         raise WearcapError(
@@ -110,7 +110,7 @@ def _averaged(
     at: Float64[Tensor, "time"],
     step_s: float,
 ) -> Float[Tensor, "time 3"]:
-    """Mean over the frame around each time, of what is taken as linear between samples: whatever the watch's rate."""
+    """Mean over the frame around each time, with linear interpolation between samples at any sample rate."""
     step = times.diff()[:, None]
     area = torch.cat(
         [value.new_zeros(1, 3).double(), ((value[1:] + value[:-1]).double() / 2 * step).cumsum(0)]
@@ -123,6 +123,6 @@ def _averaged(
     upto = area[before] + share * (value[before].double() + slope * share / 2)
     span = (edges[1] - edges[0])[:, None]
     inside = (upto[1] - upto[0]) / span.clamp_min(1e-9)
-    # Beyond the watch's time its first or last word stands.
+    # Outside the watch's log its first or last sample is repeated.
     outside = value[torch.where(at < times[0], 0, len(times) - 1)].double()
     return torch.where(span > 1e-6, inside, outside).to(value.dtype)

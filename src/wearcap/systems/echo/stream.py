@@ -30,7 +30,7 @@ from wearcap.sensors.packets import (
     OFF_THE_CLOCK,
     Admitted,
     Clock,
-    HeadDoor,
+    HeadInput,
     connected,
     owned_pose,
     pose_fault,
@@ -87,7 +87,7 @@ class EchoSession:
         self._environment, self._reader = environment, pipeline.reader()
         self._shapes: dict[str, ObjectShape] = {}
         """Objects that were named so far, in order of their first use."""
-        self._entry, self._track = HeadDoor(), HeadTrack(pipeline.fps, 1)
+        self._entry, self._track = HeadInput(), HeadTrack(pipeline.fps, 1)
         self._wrists: dict[str, list[tuple[float, Tensor, Tensor]]] = {joint: [] for joint in WRISTS}
         self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
         self._acts: list[tuple[float, str | None]] = []

@@ -19,7 +19,7 @@ from wearcap.sensors.packets import (
     MAX_POSITION_M,
     WRONG_TYPE,
     Admitted,
-    HeadDoor,
+    HeadInput,
     embedding_fault,
     number_fault,
     owned,
@@ -62,7 +62,7 @@ class WearerState:
 
     def __init__(self, pipeline: HMD2, wearer: Wearer, seed: int, memory: Memory):
         self.pipeline, self.wearer, self.seed, self.memory = pipeline, wearer, seed, memory
-        self.door = HeadDoor()
+        self.door = HeadInput()
         self.track = HeadTrack(pipeline.fps, pipeline.advance)
         self.begin()
 

@@ -1,6 +1,6 @@
-"""Editing captured motion within a manifold until it agrees with what was seen (MocapEvery §3.4, eq. 5).
+"""Energy of MocapEvery's motion editing: the latent of a motion manifold is optimised to fit visual cues (§3.4, eq. 5).
 
-Each term is a pure function of the edited body; the unknown is the latent z of windows of motion, all of them at once.
+Each term is a pure function of the edited body. The unknown is the latent z of a batch of motion windows.
 """
 
 from collections.abc import Callable
@@ -17,26 +17,26 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.tracking.anchor import anchor
 
-ROUND = 1e-5
-"""Squared radians, or m², below which a cue is met: within the noise of detectors a distance counts as if it were
-squared, so that nothing is a kink."""
-REST_M2_S2 = 1e-4
-"""Squared speed up to which a foot counts as at rest: feet that do not move at all would else be a kink that second-order
-solvers do not get away from."""
+CUE_SMOOTHING = 1e-5
+"""Smoothing constant of the cue distances √(d² + ε), in rad² or m²: distances within the detectors' noise act
+quadratically, so that the energy is differentiable at zero."""
+SPEED_SMOOTHING_M2_S2 = 1e-4
+"""Smoothing constant of foot speeds (m²/s²): without it the energy has a kink at zero speed, where second-order solvers
+get stuck."""
 SOLVERS = ("lbfgs", "adam")
 
 
 class PixelCue(NamedTuple):
-    """One joint in the egocentric picture (φ_E)."""
+    """2D observations of one joint in the egocentric image (φ_E)."""
 
     joint: int
     pixels: Float[Tensor, "batch time 2"]
     confidence: Float[Tensor, "batch time"]
-    """0 where it was not seen."""
+    """Confidence of each observation; 0 where the joint was not observed."""
 
 
 class PlaceCue(NamedTuple):
-    """One joint's place in the world (m), from whatever saw it."""
+    """3D observations of one joint's position in the world (m), from any source."""
 
     joint: int
     t_world: Float[Tensor, "batch time 3"]
@@ -44,14 +44,14 @@ class PlaceCue(NamedTuple):
 
 
 class PoseCue(NamedTuple):
-    """Local joint rotations without the root, as another wearer's camera saw them (φ_T)."""
+    """Local joint rotations observed by another wearer's camera (φ_T); the root is ignored."""
 
     R_parent_joint: Float[Tensor, "batch time joint 3 3"]
     confidence: Float[Tensor, "batch time joint"]
 
 
 class Seen(NamedTuple):
-    """Everything that was seen in a batch of windows, and how the wearer's head and camera moved."""
+    """All observations of a batch of windows, with the poses of the wearer's head and camera."""
 
     T_world_head: Rigid
     camera: Camera | None
@@ -62,7 +62,7 @@ class Seen(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A batch of windows of motion that hang from the measured heads."""
+    """A batch of motion windows, anchored to the measured head poses."""
 
     R_parent_joint: Float[Tensor, "batch time joint 3 3"]
     T_world_joint: Rigid
@@ -71,28 +71,29 @@ class Body(NamedTuple):
 
 @dataclass(frozen=True)
 class LatentWeights:
-    """Of the terms; all are means over the frames that they are about."""
+    """Weights of the energy terms; each term is a mean over the frames that it applies to."""
 
     pixel: float = 1.0
-    """Per radian of view angle."""
+    """Weight of `pixel_error`, per radian of view angle."""
     place: float = 1.0
-    """Per metre."""
+    """Weight of `place_error`, per metre."""
     pose: float = 0.3
-    """Per unit of rotation matrices' distance."""
+    """Weight of `pose_error`, per unit of distance between rotation matrices."""
     stay: float = 1.0
-    """Of the mean square by which latents move (L_reg, which the document does not spell out)."""
+    """Weight of the latents' mean squared change from their start (L_reg, which the paper does not define)."""
     contact: float = 0.1
-    """Per m/s of feet in contact (L_contact)."""
+    """Weight of `contact_slip` (L_contact), per m/s."""
 
 
 @dataclass(frozen=True)
 class LatentSolver:
-    """ "lbfgs" (ours) or "adam" (the document: 500 steps at 7e-4 for pixels, 1e-3 for poses)."""
+    """Optimiser of the latents."""
 
     kind: str = "lbfgs"
+    """"lbfgs" (ours) or "adam" (the paper: 500 steps, learning rate 7e-4 for pixels and 1e-3 for poses)."""
     steps: int = 35
     learning_rate: float = 7e-4
-    """Of Adam."""
+    """Learning rate of Adam."""
 
     def __post_init__(self):
         if self.kind not in SOLVERS:
@@ -101,22 +102,22 @@ class LatentSolver:
 
 @dataclass(frozen=True, eq=False)
 class LatentSolution:
-    """Where the latents ended, and the energy by term after every step."""
+    """Optimised latents, and the energy by term at every evaluation."""
 
     latent: Float[Tensor, "batch channel short"]
     history: list[dict[str, float]] = field(default_factory=list)
     evaluations: int = 0
-    """Of the energy and its gradient."""
+    """Number of evaluations of the energy and its gradient."""
 
 
 def anchored_body(skeleton: Skeleton, R_parent_joint: Tensor, contact: Tensor, T_world_head: Rigid) -> Body:
-    """A motion whose head is where it was measured."""
+    """The body of a motion, moved so that its head coincides with the measured head."""
     R, T_world_joint = anchor(skeleton, R_parent_joint, T_world_head)
     return Body(R, T_world_joint, contact)
 
 
 def pixel_error(body: Body, seen: Seen, cue: PixelCue) -> Float[Tensor, "batch time"]:
-    """‖μ − π(C, p)‖ over the focal length, so in radians near the axis (eq. 5, φ_E); 0 behind the camera."""
+    """Reprojection error ‖μ − π(C, p)‖ over the focal length (rad near the axis; eq. 5, φ_E); 0 behind the camera."""
     assert seen.camera is not None
     assert seen.T_head_cam is not None
     T_world_cam = seen.T_world_head @ seen.T_head_cam
@@ -128,20 +129,20 @@ def pixel_error(body: Body, seen: Seen, cue: PixelCue) -> Float[Tensor, "batch t
 
 
 def place_error(body: Body, cue: PlaceCue) -> Float[Tensor, "batch time"]:
-    """Distance (m) of a joint from where it was seen."""
+    """Distance (m) between a joint and its observed position."""
     return _norm(body.T_world_joint.t[:, :, cue.joint] - cue.t_world) * cue.confidence
 
 
 def pose_error(body: Body, cue: PoseCue) -> Float[Tensor, "batch time"]:
-    """Σ_j w_j ‖τ_j − q_j‖ over joints but the root (eq. 5, φ_T), on rotation matrices."""
-    wrong = (body.R_parent_joint[:, :, 1:] - cue.R_parent_joint[:, :, 1:]).flatten(-2)
-    return (_norm(wrong) * cue.confidence[:, :, 1:]).mean(-1)
+    """Σ_j w_j ‖τ_j − q_j‖ over all joints but the root (eq. 5, φ_T), on rotation matrices."""
+    difference = (body.R_parent_joint[:, :, 1:] - cue.R_parent_joint[:, :, 1:]).flatten(-2)
+    return (_norm(difference) * cue.confidence[:, :, 1:]).mean(-1)
 
 
 def contact_slip(body: Body, feet: list[int], fps: float) -> Float[Tensor, "batch time"]:
-    """c · ‖ṗ‖ of the feet (m/s), L_contact."""
+    """L_contact = c · ‖ṗ‖, the speed (m/s) of feet in contact."""
     velocity = body.T_world_joint.t[:, :, feet].diff(dim=1) * fps
-    speed = _norm(velocity, REST_M2_S2) - REST_M2_S2**0.5
+    speed = _norm(velocity, SPEED_SMOOTHING_M2_S2) - SPEED_SMOOTHING_M2_S2**0.5
     return (speed * body.contact[:, 1:].clamp(0, 1)).mean(-1)
 
 
@@ -153,7 +154,10 @@ def energy_terms(
     fps: float,
     weights: LatentWeights,
 ) -> dict[str, Float[Tensor, ""]]:
-    """L = L_vis + L_reg + L_contact, by term and weighted: means per window, added over windows."""
+    """Weighted terms of L = L_vis + L_reg + L_contact: means per window, summed over windows.
+
+    `moved` is the latents' change from their start.
+    """
     terms = {
         "stay": weights.stay * moved.square().mean((1, 2)).sum(),
         "contact": weights.contact * contact_slip(body, feet, fps).mean(1).sum(),
@@ -164,9 +168,9 @@ def energy_terms(
         ("pose", weights.pose, [(pose_error(body, cue), cue.confidence.amax(-1)) for cue in seen.poses]),
     ):
         if errors:
-            shown = torch.stack([(confidence > 0).sum(1).clamp_min(1) for _, confidence in errors])
+            observed = torch.stack([(confidence > 0).sum(1).clamp_min(1) for _, confidence in errors])
             terms[name] = weight * sum(
-                ((e.sum(1) / n).sum() for (e, _), n in zip(errors, shown)), torch.zeros(())
+                ((e.sum(1) / n).sum() for (e, _), n in zip(errors, observed)), torch.zeros(())
             )
     return terms
 
@@ -176,19 +180,19 @@ def solve_latent(
     energy: Callable[[Float[Tensor, "batch channel short"]], dict[str, Float[Tensor, ""]]],
     solver: LatentSolver = LatentSolver(),
 ) -> LatentSolution:
-    """Latents that minimise the sum of the energy's terms, from `start` on."""
+    """Minimise the sum of the energy's terms over the latents, starting at `start`."""
     latent = start.detach().clone(memory_format=torch.contiguous_format).requires_grad_()
     history: list[dict[str, float]] = []
     evaluations = 0
     if solver.kind == "adam":
         optimizer: torch.optim.Optimizer = torch.optim.Adam([latent], lr=solver.learning_rate)
-        rounds = solver.steps
+        iterations = solver.steps
     else:
         optimizer = torch.optim.LBFGS(
             [latent], lr=1.0, max_iter=solver.steps, history_size=20, line_search_fn="strong_wolfe",
             tolerance_grad=1e-7, tolerance_change=1e-7,
         )  # fmt: skip
-        rounds = 1
+        iterations = 1
 
     def closure() -> Tensor:
         nonlocal evaluations
@@ -201,10 +205,11 @@ def solve_latent(
         return total
 
     with torch.enable_grad():
-        for _ in range(rounds):
+        for _ in range(iterations):
             optimizer.step(closure)
     return LatentSolution(latent.detach(), history, evaluations)
 
 
-def _norm(value: Float[Tensor, "*batch axis"], epsilon: float = ROUND) -> Float[Tensor, "*batch"]:
+def _norm(value: Float[Tensor, "*batch axis"], epsilon: float = CUE_SMOOTHING) -> Float[Tensor, "*batch"]:
+    """Norm over the last axis, smoothed at zero."""
     return (value.square().sum(-1) + epsilon).sqrt()

@@ -1,4 +1,4 @@
-"""What MocapEvery's estimator is told and says: a head's path and two wrists in, a moving body out."""
+"""Input and output encoding of MocapEvery's estimator: head path and two wrists in, body motion out (§3.2)."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,16 +16,16 @@ from wearcap.sensors.imu import acceleration
 
 WRISTS = ("left_wrist", "right_wrist")
 ENDS = ("left_wrist", "right_wrist", "left_toe", "right_toe")
-"""End-effectors whose positions stand between the two stages: hands and feet."""
+"""End-effectors whose positions the first stage predicts: hands and feet."""
 FRAMES = ("own", "heading", "head", "world")
 TRACKED = ("watches", "positions")
 ROOTS = ("head", "window")
 ACCELERATION_FRAMES = 4
-"""n of eq. 8."""
+"""Half span n of the finite difference in eq. 8, in frames."""
 
 
 class Sensed(NamedTuple):
-    """What is worn, frame by frame at the estimator's rate."""
+    """Sensor inputs, frame by frame at the estimator's rate."""
 
     R_world_head: Float[Tensor, "*batch time 3 3"]
     t_world_head: Float[Tensor, "*batch time 3"]
@@ -33,11 +33,11 @@ class Sensed(NamedTuple):
     acc_world_wrist: Float[Tensor, "*batch time wrist 3"]
     """Free acceleration (m/s²), filtered."""
     t_world_wrist: Float[Tensor, "*batch time wrist 3"]
-    """Where the hands are tracked (AvatarPoser's protocol 1); zeros otherwise."""
+    """Positions (m) of tracked hands (AvatarPoser's protocol 1); zeros for watches."""
 
 
 def mirrored(sensed: Sensed) -> Sensed:
-    """The same seen in a mirror that swaps left and right."""
+    """The inputs mirrored, left and right swapped."""
     flip = sensed.t_world_head.new_tensor(MIRROR)
     turn = torch.outer(flip, flip)
     return Sensed(
@@ -47,13 +47,13 @@ def mirrored(sensed: Sensed) -> Sensed:
 
 
 class Canonical(NamedTuple):
-    """Poses in the world of the frames that a window is told in: one for all, or one per frame."""
+    """Pose in the world of each window's canonical frame: one for the whole window, or one per time step."""
 
     R: Float[Tensor, "batch #time 3 3"]
     t: Float[Tensor, "batch #time 3"]
 
     def last(self, count: int) -> "Canonical":
-        """Those of the last frames."""
+        """The poses of the last `count` time steps."""
         return Canonical(self.R[:, -count:], self.t[:, -count:])
 
 
@@ -66,7 +66,7 @@ def synthetic_wrists(
 ) -> tuple[Float[Tensor, "time wrist 3 3"], Float[Tensor, "time wrist 3"], Float[Tensor, "time wrist 3"]]:
     """Orientation, filtered acceleration (m/s²) and position (m) of both wrists of a motion (MocapEvery eq. 8).
 
-    The acceleration is that of the estimator's rate, `fps` / `every`: n = 4 and a mean over 7 of its frames.
+    Acceleration is computed at the estimator's rate, `fps` / `every`: n = 4 and a mean filter over 7 of its frames.
     """
     body = forward_kinematics(skeleton, R_parent_joint, t_world_root)
     wrists = skeleton.indices(*WRISTS)
@@ -79,25 +79,23 @@ def synthetic_wrists(
 
 @dataclass(frozen=True)
 class WatchFeatures:
-    """Encodes windows of what is sensed, and body motions, in one frame per window.
-
-    frame "head": the pose of the window's first head (the document's). "heading": the same without its tilt, so that
-    z stays up (ours). "own" (ours): each frame in its own head's heading and place, with velocities instead of a path,
-    so that nothing depends on where in the window it happens. "world": as sensed over the first frame's floor, as
-    AvatarPoser has it.
-    """
+    """Encodes sensor windows and body motions in canonical, head-based coordinates."""
 
     frame: str = "heading"
+    """Canonical frame. "head": the pose of the window's first head (the paper). "heading": the same without its tilt,
+    so that z stays up (ours). "own" (ours): head-centred, yaw-aligned coordinates of each frame's own head, with
+    velocities instead of a path, so that the features do not depend on the position in the window. "world": world
+    axes above the first frame's floor, as in AvatarPoser."""
     root: str = "head"
-    """Where root and end-effectors are said from: "head", of the same frame (ours: a stride is then no matter of where
-    in the window it happens), or "window", its frame's origin (the document)."""
+    """Origin of the predicted root and end-effectors: "head", the head of the same frame (ours: the values do not
+    depend on the position in the window), or "window", the canonical frame's origin (the paper)."""
     absolute: bool = True
-    """Whether the head's height over the floor and its up-vector are told, too, this in the world (the document), or
-    seen from the window's heading, so that north makes no difference."""
+    """Whether the head's height above the floor and its up-vector are inputs. The up-vector is in world axes (the
+    paper); with frame "heading" it is in the window's axes, which makes it independent of the world's heading."""
     wrists: str = "watches"
-    """watches: orientation and acceleration. positions: orientation and position (three tracked points)."""
+    """watches: orientation and acceleration. positions: orientation and position (three-point tracking)."""
     body: bool = False
-    """Whether the wearer's size is told (ours; the document knows a mean body alone)."""
+    """Whether the wearer's body size is an input (ours; the paper uses a mean body)."""
     joints: int = 23
     fps: float = 30.0
 
@@ -109,20 +107,20 @@ class WatchFeatures:
 
     @property
     def size(self) -> int:
-        """27 and, where told, 4 of height and up-vector (the document's 31) and the body's size.
+        """Number of input features: 27, 4 more for height and up-vector (the paper's 31), and the body size.
 
-        In its own frame a head has velocities for a place (3 more), and its tilt is its up-vector (3 fewer).
+        With frame "own", velocities replace the position (3 more) and the tilt replaces the up-vector (3 fewer).
         """
         path, absolute = (30, 1) if self.frame == "own" else (27, 4)
         return path + (absolute if self.absolute else 0) + (len(LIMBS) if self.body else 0)
 
     @property
     def motion_size(self) -> int:
-        """Root translation, and 6D rotations of all joints."""
+        """Number of output features: root translation, and 6D rotations of all joints."""
         return 3 + 6 * self.joints
 
     def canonical(self, sensed: Sensed, floor_height: Float[Tensor, "batch time"]) -> Canonical:
-        """Poses in the world of the windows' frames."""
+        """The windows' canonical frames."""
         if self.frame == "own":
             heading = rotation.about_axis("z", rotation.yaw_of(sensed.R_world_head))
             return Canonical(heading, sensed.t_world_head)
@@ -141,16 +139,16 @@ class WatchFeatures:
         size: Float[Tensor, "batch limb"],
         canonical: Canonical,
     ) -> Float[Tensor, "batch time feature"]:
-        """Features of windows in their frames; `size` holds the wearers' `body_size` (m)."""
+        """Input features of windows in their canonical frames; `size` holds the wearers' `body_size` (m)."""
         R, t = canonical
         R_canonical_world = R.mT
         R_canonical_head = R_canonical_world @ sensed.R_world_head
-        turned = R_canonical_world[:, :, None] @ sensed.R_world_wrist
-        places = sensed.acc_world_wrist if self.wrists == "watches" else sensed.t_world_wrist - t[:, :, None]
-        places = (R_canonical_world[:, :, None] @ places[..., None])[..., 0]
+        R_canonical_wrist = R_canonical_world[:, :, None] @ sensed.R_world_wrist
+        vectors = sensed.acc_world_wrist if self.wrists == "watches" else sensed.t_world_wrist - t[:, :, None]
+        vectors = (R_canonical_world[:, :, None] @ vectors[..., None])[..., 0]
         parts = [
             rotation.rot6d_from_matrix(R_canonical_head), self._path(sensed, canonical),
-            rotation.rot6d_from_matrix(turned).flatten(-2), places.flatten(-2),
+            rotation.rot6d_from_matrix(R_canonical_wrist).flatten(-2), vectors.flatten(-2),
         ]  # fmt: skip
         if self.absolute:
             height = (sensed.t_world_head[..., 2] - floor_height)[..., None]
@@ -161,13 +159,13 @@ class WatchFeatures:
         return torch.cat(parts, -1)
 
     def _path(self, sensed: Sensed, canonical: Canonical) -> Float[Tensor, "batch time value"]:
-        """Where the head is, or how it moves (m/s) and turns (rad/s, seen from itself)."""
+        """Head position (m); with frame "own" its velocity (m/s) and angular velocity (rad/s, in head axes)."""
         R, t = canonical
         if self.frame != "own":
             return (R.mT @ (sensed.t_world_head - t)[..., None])[..., 0]
         velocity = first_repeated(sensed.t_world_head.diff(dim=1)) * self.fps
-        turn = rotation.log(sensed.R_world_head[:, :-1].mT @ sensed.R_world_head[:, 1:])
-        return torch.cat([(R.mT @ velocity[..., None])[..., 0], first_repeated(turn) * self.fps], -1)
+        angle = rotation.log(sensed.R_world_head[:, :-1].mT @ sensed.R_world_head[:, 1:])
+        return torch.cat([(R.mT @ velocity[..., None])[..., 0], first_repeated(angle) * self.fps], -1)
 
     def encode_motion(
         self,
@@ -176,7 +174,7 @@ class WatchFeatures:
         sensed: Sensed,
         canonical: Canonical,
     ) -> Float[Tensor, "batch time motion"]:
-        """Root and local rotations, the root's pose in the window's frame."""
+        """Target features: root translation and local rotations, with the root's pose in the canonical frame."""
         R, t = canonical
         root = (R.mT @ (t_world_root - t)[..., None])[..., 0] - self.origin(sensed, canonical)
         turned = torch.cat([(R.mT @ R_parent_joint[:, :, 0])[:, :, None], R_parent_joint[:, :, 1:]], 2)
@@ -185,12 +183,12 @@ class WatchFeatures:
     def decode_motion(
         self, motion: Float[Tensor, "batch predicted motion"], sensed: Sensed, canonical: Canonical
     ) -> tuple[Float[Tensor, "batch predicted joint 3 3"], Float[Tensor, "batch predicted 3"]]:
-        """R_parent_joint and root (m) of the window's last frames, still in the window's frame."""
+        """Rotations and root translation (m) of the window's last frames, still in the canonical frame."""
         R = rotation.matrix_from_rot6d(motion[..., 3:].unflatten(-1, (-1, 6)))
         return R, motion[..., :3] + self.origin(sensed, canonical)[:, -motion.shape[1] :]
 
     def origin(self, sensed: Sensed, canonical: Canonical) -> Float[Tensor, "batch time 3"]:
-        """Where translations are said from, in the window's frame."""
+        """Origin of the predicted translations, in the canonical frame (m)."""
         if self.root == "window":
             return torch.zeros_like(sensed.t_world_head)
         return (canonical.R.mT @ (sensed.t_world_head - canonical.t)[..., None])[..., 0]
@@ -201,7 +199,7 @@ def to_world(
     t_root: Float[Tensor, "batch predicted 3"],
     canonical: Canonical,
 ) -> tuple[Float[Tensor, "batch predicted joint 3 3"], Float[Tensor, "batch predicted 3"]]:
-    """A motion of the last frames out of its windows' frames."""
+    """Transform a motion of the windows' last frames from their canonical frames to the world."""
     R, t = canonical.last(t_root.shape[1])
     turned = torch.cat([(R @ R_parent_joint[:, :, 0])[:, :, None], R_parent_joint[:, :, 1:]], 2)
     return turned, t + (R @ t_root[..., None])[..., 0]

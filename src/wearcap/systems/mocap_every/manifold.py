@@ -7,10 +7,10 @@ from wearcap.models.layers import Normalizer
 
 
 class MotionManifold(nn.Module):
-    """Three strided convolutions over time and their mirror (document: width 25, stride 2, 256 channels).
+    """Strided convolutions over time and a transposed decoder (the paper: 3 layers, width 25, stride 2, 256 channels).
 
-    Frames have `size` features: contact of both feet, root translation, 6D rotations (137 with 22 joints). Any number of
-    frames that `halvings` halve evenly may be encoded.
+    Frames have `size` features: contact of both feet, root translation, 6D rotations (137 with 22 joints). A window's
+    number of frames must be a multiple of `multiple`.
     """
 
     def __init__(self, size: int, channels: int = 256, width: int = 25, layers: int = 3):
@@ -30,7 +30,7 @@ class MotionManifold(nn.Module):
 
     @property
     def multiple(self) -> int:
-        """A window has a multiple of so many frames."""
+        """Factor that a window's number of frames must be divisible by."""
         return 2**self.halvings
 
     def encode(self, motion: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch channel short"]:

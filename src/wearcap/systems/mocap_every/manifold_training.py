@@ -1,4 +1,4 @@
-"""Training of MocapEvery's motion manifold: what it rebuilds is compared as in the document's eq. 9."""
+"""Training of MocapEvery's motion manifold: the reconstruction losses of eq. 9."""
 
 from collections.abc import Callable
 
@@ -16,10 +16,10 @@ from wearcap.training.base import WeighedTerms
 
 
 class ManifoldTraining(WeighedTerms):
-    """Windows of true motion are compressed and rebuilt.
+    """Trains the autoencoder to reconstruct windows of ground-truth motion.
 
-    Loss terms (eq. 9), weighed by `loss_weights`, are L1: "contact", "root" (translation and rotation), "rotation" of
-    the joints, "position" (m); "velocity" (m/s) is ours.
+    L1 loss terms (eq. 9), weighted by `loss_weights`: "contact", "root" (translation and rotation), "rotation" of the
+    joints, "position" (m); "velocity" (m/s) is ours.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class ManifoldTraining(WeighedTerms):
         self._optimizer, self._scheduler = optimizer, scheduler
 
     def set_statistics(self, dataset: WatchDataset, limit: int = 1000) -> None:
-        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        """Compute the normalisation from a training split; a resumed run restores it with the weights."""
         random = torch.Generator().manual_seed(0)
         drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
         window = _posed(collate([dataset[item] for item in zip(drawn, range(limit))]))
@@ -45,20 +45,20 @@ class ManifoldTraining(WeighedTerms):
         self.net.normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
-        """Every loss term of a batch, unweighted, and the error of joints (cm)."""
+        """Unweighted loss terms of a batch, and the mean joint error (cm)."""
         window = _posed(batch)
         origin = origin_of(window)
         X = encode_window(window, origin)
-        rebuilt = self.net(X)
-        error = (rebuilt - X).abs()
-        joints, joints_true = (self._joints(decode_window(x, origin), batch) for x in (rebuilt, X))
-        wrong = joints - joints_true
+        reconstructed = self.net(X)
+        error = (reconstructed - X).abs()
+        joints, joints_true = (self._joints(decode_window(x, origin), batch) for x in (reconstructed, X))
+        error_m = joints - joints_true
         return {
             "contact": error[..., :FEET].mean(),
             "root": error[..., FEET : FEET + 9].mean(),
             "rotation": error[..., FEET + 9 :].mean(),
-            "position": wrong.abs().mean(),
-            "velocity": (wrong.diff(dim=1) * self.fps).abs().mean(),
+            "position": error_m.abs().mean(),
+            "velocity": (error_m.diff(dim=1) * self.fps).abs().mean(),
             "joints_cm": mpjpe_cm(joints.detach(), joints_true),
         }
 

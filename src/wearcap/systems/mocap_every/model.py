@@ -10,35 +10,36 @@ from wearcap.models.layers import Normalizer, TemporalBlend
 from wearcap.models.pose_regressor import PoseRegressor
 
 ENDS_SIZE = 12
-"""Positions of two hands and two feet."""
+"""Size of the positions of two hands and two feet."""
 FEET = 2
 
 
 class Estimate(NamedTuple):
-    """What is said of the last frames of a window (all of them, or the last one alone)."""
+    """Predictions for the last frames of a window (all of them, or the last one only)."""
 
     motion: Float[Tensor, "batch predicted motion"]
-    """Root translation and 6D rotations in the window's frame."""
+    """Root translation and 6D rotations in the window's canonical frame."""
     contact_logit: Float[Tensor, "batch predicted foot"]
     ends: Float[Tensor, "batch predicted 12"] | None
-    """Positions of hands and feet from the first stage (m); None where there is no such stage."""
+    """Positions of hands and feet predicted by the first stage (m); None for a single-stage network."""
 
 
 class WatchEstimator(nn.Module):
-    """What says bodies from windows of so many frames."""
+    """Interface of the networks that predict body motion from windows of sensor features."""
 
     window: int
+    """Number of frames of an input window."""
 
     def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
-        """What is said of raw features."""
+        """Predict from raw (not normalised) features."""
         raise NotImplementedError
 
 
 class TwoStageEstimator(WatchEstimator):
-    """Two transformer encoders in a row (document: width 1280, 4 layers, 10 heads, MLP heads of 256).
+    """Two transformer encoders in sequence (the paper: width 1280, 4 layers, 10 heads, MLP heads of 256).
 
-    With one stage (`multi_stage` False, the document's ablation) the second encoder alone speaks. Positions of
-    tokens are learned. `frames_per_token` > 1 (ours, for CPUs) lets neighbouring frames share a token.
+    `multi_stage=False` (the paper's ablation) leaves out the first encoder. Position embeddings are learned.
+    `frames_per_token` > 1 (ours, for CPUs) packs neighbouring frames into one token.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class TwoStageEstimator(WatchEstimator):
         frames_per_token: int = 1,
         blend: int = 0,
     ):
-        """`blend` (odd; 0: none) frames of what is said are blended by learned weights (ours, against tremor)."""
+        """`blend` (odd; 0: none): output frames that are blended with learned weights (ours, against jitter)."""
         super().__init__()
         if window % frames_per_token:
             raise ValueError(f"a window of {window} frames does not split into tokens of {frames_per_token}")
@@ -89,7 +90,7 @@ class TwoStageEstimator(WatchEstimator):
         self.blend = TemporalBlend(blend) if blend else None
 
     def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
-        """What is said of every frame of raw features."""
+        """Predict every frame of the window from raw features."""
         x = self._tokens(self.feature_normalizer(features))
         ends, embedded = None, self.embed(x)
         if self.first is not None:
@@ -112,7 +113,7 @@ class TwoStageEstimator(WatchEstimator):
 
 
 class LastPoseEstimator(WatchEstimator):
-    """AvatarPoser's way (Jiang et al. 2022), for comparison: the pose of a window's last frame, from one encoder."""
+    """Baseline after AvatarPoser (Jiang et al. 2022): one encoder predicts the pose of the window's last frame."""
 
     def __init__(
         self, feature_size: int, motion_size: int, window: int = 40, width: int = 256, layers: int = 3, heads: int = 8,
@@ -138,9 +139,9 @@ class LastPoseEstimator(WatchEstimator):
         return self.regressor.feature_normalizer
 
     def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
-        """What is said of the last frame of raw features."""
-        exist = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
-        output = self.regressor(features, exist)[:, None]
+        """Predict the window's last frame from raw features."""
+        valid = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
+        output = self.regressor(features, valid)[:, None]
         return Estimate(self.motion_normalizer.inverse(output[..., :-FEET]), output[..., -FEET:], None)
 
 

@@ -30,40 +30,41 @@ FLOORS = ("follow", "update", "points", "fixed")
 
 @dataclass(frozen=True, eq=False)
 class Captured:
-    """What came out."""
+    """Result of capturing one recording."""
 
     motion: Motion
     floor: FloorTrack
-    """As the estimator was told it."""
+    """Floor height that conditioned the estimator."""
     edits: list[LatentSolution]
-    """How the editing by cues went, batch by batch."""
+    """Solutions of the editing by visual cues, one per batch of windows."""
 
 
 @dataclass
 class MocapEvery:
-    """Captures whole recordings: estimator in overlapping windows, floor followed window by window."""
+    """Captures recordings: the estimator runs on overlapping windows, the floor is updated from window to window."""
 
     net: WatchEstimator
     features: WatchFeatures
     skeleton: Skeleton
-    """For recordings that do not say whose body it is."""
+    """Skeleton for recordings without their own."""
     fps: float
+    """Frame rate of the estimator (Hz)."""
     stride: int = 20
-    """Frames by which windows advance; 1 in a stream."""
+    """Frames by which windows advance; 1: frame by frame."""
     lookahead: int = 20
-    """Frames that must follow a pose before it is final."""
+    """Frames that must follow a pose before it is final (latency)."""
     floor: str = "follow"
-    """follow: ours. update: the document's D.2. points: beneath the head, from points alone. fixed: where it was."""
+    """follow: ours. update: the paper's D.2. points: below the head, from points only. fixed: constant height."""
     anchor: bool = True
-    """Whether the body hangs from the measured head (ours) or stands where the estimator puts it (the document)."""
+    """Whether the body is anchored to the measured head (ours) or keeps the estimator's translation (the paper)."""
     mirror_average: bool = False
-    """Whether each window is asked in a mirror, too (ours)."""
+    """Mirror test-time augmentation: the prediction for the mirrored window is averaged in (ours)."""
     cues: VisualCues | None = None
-    """Edits the motion by the recording's keypoints (§3.4); None: it stays as estimated."""
+    """Motion editing by the recording's keypoints (§3.4); None: no editing."""
     runtime: str = "eager"
-    """onnx: ONNX Runtime on the CPU; it takes some seconds to begin."""
+    """eager: PyTorch. onnx: ONNX Runtime on the CPU, which takes some seconds to start."""
     int8: bool = False
-    """Whether ONNX Runtime multiplies int8."""
+    """Whether ONNX Runtime uses int8 weights and products."""
     device: str = "cpu"
     _runner: Runner | None = field(default=None, init=False, repr=False, compare=False)
 
@@ -76,13 +77,13 @@ class MocapEvery:
             raise WearcapError(f"no floor {self.floor!r}", expected=f"one of {', '.join(FLOORS)}")
         if not 0 < self.stride <= self.net.window or not 0 <= self.lookahead <= self.net.window - self.stride:
             raise WearcapError(f"windows of {self.net.window} frames with stride {self.stride} and lookahead {self.lookahead}",
-                               expected="a stride from 1 to the window, and a lookahead of no more than what windows share")  # fmt: skip
+                               expected="a stride from 1 to the window, and a lookahead of at most the overlap of two windows")  # fmt: skip
 
     def __call__(self, recording: Recording, seed: int = 0) -> Motion:
         return self.capture([recording], [seed])[0]
 
     def prepare(self) -> None:
-        """Bring the network to its device and into the form it runs in; what is exported is made once."""
+        """Move the network to its device and build the ONNX runner if needed (once)."""
         self.net.to(self.device).eval()
         if self.runtime == "onnx" and self._runner is None:
             size, window = self.features.size, self.net.window
@@ -90,7 +91,7 @@ class MocapEvery:
 
     @torch.inference_mode()
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per recording; seeds change nothing.
+        """One motion per recording; the seeds have no effect.
 
         Raises WearcapError for a recording without head poses, or whose watches are missing, silent or swapped.
         """
@@ -98,27 +99,29 @@ class MocapEvery:
 
     @torch.inference_mode()
     def run(self, recording: Recording) -> Captured:
-        """One recording, with all that is found on the way. Raises as `capture` does."""
+        """Capture one recording, with floor and editing results. Raises as `capture` does."""
         self.prepare()
-        # 1. the head's path and the watches, on one clock
+        # 1. head path and watches on a common clock
         path = head_path(recording, self.skeleton, self.fps)
         sensed = self._sensed(recording, path)
-        # 2. end-effectors, contacts and poses, window after window; 3. the floor by where the feet touch it
-        output = [self._stretch(recording, path, sensed, start, stop) for start, stop in path.stretches]
+        # 2. end-effectors, contacts and poses, window by window; 3. floor height from the feet in contact
+        output = [
+            self._capture_stretch(recording, path, sensed, start, stop) for start, stop in path.stretches
+        ]
         whole = _bridged(output, path)
         motion = Motion(path.timestamps, path.skeleton, whole.R_parent_joint, whole.t_world_root,
                         whole.contact_prob.repeat_interleave(2, -1), provenance=self.settings())  # fmt: skip
-        # 4. the head is where it was measured
+        # 4. anchor the body to the measured head
         if self.anchor:
             motion = anchored_to_head(motion, path.T_world_head)
-        # 5. the motion agrees with what was seen, as far as the manifold of motions allows
+        # 5. edit the motion within the manifold to fit the visual cues
         edits: list[LatentSolution] = []
         if self.cues is not None:
             motion, edits = self.cues.edit(motion, recording, path.T_world_head)
         return Captured(motion, FloorTrack(path.timestamps, whole.floor_height), edits)
 
     def estimate(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
-        """The network's answer, on the CPU."""
+        """Run the network; the prediction is on the CPU."""
         if self._runner is not None:
             motion, contact, *ends = self._runner(features)
             return Estimate(motion, contact, ends[0] if ends else None)
@@ -126,13 +129,13 @@ class MocapEvery:
         return Estimate(*(part if part is None else part.cpu() for part in output))
 
     def _sensed(self, recording: Recording, path: HeadPath) -> Sensed:
-        """What is worn, at the path's times; a recording of a true motion without watches has synthetic ones (eq. 8)."""
+        """Sensor inputs at the path's times; a recording with true motion but no watches gets synthetic IMUs."""
         R, t = path.T_world_head.R.float(), path.T_world_head.t.float()
         truth = recording.motion
         if self.features.wrists == "positions" or (not recording.imu and truth is not None):
             if truth is None:
-                raise WearcapError("hands are tracked by nothing in this recording", where=recording.name,
-                                   expected="a recording with `motion`, or a checkpoint of watches")  # fmt: skip
+                raise WearcapError("no hand positions in this recording", where=recording.name,
+                                   expected="a recording with `motion`, or a checkpoint for watches")  # fmt: skip
             truth = at_times(truth, path.timestamps)
             return Sensed(
                 R, t, *synthetic_wrists(truth.skeleton, truth.R_parent_joint, truth.t_world_root, self.fps)
@@ -141,27 +144,28 @@ class MocapEvery:
             R, t, *watches_at(recording.imu, path.timestamps, recording.name), torch.zeros(len(t), 2, 3)
         )
 
-    def _stretch(
+    def _capture_stretch(
         self, recording: Recording, path: HeadPath, sensed: Sensed, start: int, stop: int
     ) -> FinalPoses:
+        """Run the sliding windows over the path's frames from `start` to `stop`."""
         times = path.timestamps[start:stop]
         floor = self._follower(recording, path, times[0].item())
         windows, parts = EstimatorWindows(self, path.skeleton, floor), []
-        below = self._below(recording, path) if self.floor == "points" else None
-        seen = -torch.inf
+        floor_height = self._floor_from_points(recording, path) if self.floor == "points" else None
+        seen_until = -torch.inf
         for first in range(start, stop, self.stride):
             last = min(first + self.stride, stop)
-            seen = self._show(recording, floor, seen, path.timestamps[last - 1].item())
-            if below is not None:
+            seen_until = self._add_points(recording, floor, seen_until, path.timestamps[last - 1].item())
+            if floor_height is not None:
                 assert isinstance(floor, FloorFixed)
-                floor.height = below[first].item()
+                floor.height = floor_height[first].item()
             parts.append(windows.advance(Sensed(*(part[first:last] for part in sensed))))
         parts.append(windows.finish())
         return FinalPoses(*(torch.cat(part) for part in zip(*parts)))
 
     def _follower(self, recording: Recording, path: HeadPath, time_s: float) -> FloorFollower:
-        """Begins with the measured height of the floor (the document's h_0) where there is one, else with what the
-        head's path says."""
+        """Floor follower of a stretch, started at the measured floor height (the paper's h_0) or, without one, at the
+        height estimated from the head path."""
         track = recording.floor
         if track is not None:
             initial = interpolate_clamped(
@@ -172,32 +176,35 @@ class MocapEvery:
         return self.follower(path.skeleton, initial)
 
     def follower(self, skeleton: Skeleton, initial_m: float) -> FloorFollower:
-        """What follows the floor from a height (m) on."""
+        """Floor follower of the configured kind, with an initial height (m)."""
         if self.floor == "update":
             return FloorUpdate(initial_m)
         if self.floor == "follow":
             return FloorFollow(initial_m, skeleton.height_of("left_toe"), self.fps)
         return FloorFixed(initial_m)
 
-    def _below(self, recording: Recording, path: HeadPath) -> Float[Tensor, "time"]:
-        found = floor_from_points(recording.points, path.T_world_head.t, path.stature)
-        return path.floor_height if found is None else found
+    def _floor_from_points(self, recording: Recording, path: HeadPath) -> Float[Tensor, "time"]:
+        """Floor height (m) below the head from points, or from the head path where there are too few."""
+        height = floor_from_points(recording.points, path.T_world_head.t, path.stature)
+        return path.floor_height if height is None else height
 
-    def _show(self, recording: Recording, floor: FloorFollower, seen: float, until: float) -> float:
-        """Show the follower the points that have been seen by a time."""
+    def _add_points(
+        self, recording: Recording, floor: FloorFollower, seen_until: float, until: float
+    ) -> float:
+        """Pass the points first seen between two times (s) to the follower; returns `until`."""
         cloud = recording.points
         if cloud is None or self.floor not in ("follow", "update"):
             return until
         when = cloud.first_seen
         if when is None:
-            if seen == -torch.inf:
+            if seen_until == -torch.inf:
                 floor.see(cloud.points_world)
-        elif ((when > seen) & (when <= until)).any():
-            floor.see(cloud.points_world[(when > seen) & (when <= until)])
+        elif ((when > seen_until) & (when <= until)).any():
+            floor.see(cloud.points_world[(when > seen_until) & (when <= until)])
         return until
 
     def settings(self) -> dict[str, str]:
-        """What the motion depends on, beside the network."""
+        """Settings that the motion depends on, for its provenance."""
         return {
             "pipeline": "mocap_every", "stride": str(self.stride), "lookahead": str(self.lookahead), "floor": self.floor,
             "anchor": str(self.anchor), "mirror_average": str(self.mirror_average),
@@ -205,6 +212,6 @@ class MocapEvery:
 
 
 def _bridged(output: list[FinalPoses], path: HeadPath) -> FinalPoses:
-    """Stretches as one; frames in the gaps between them hold the pose before, at the interpolated head."""
-    whole, held = FinalPoses(*(torch.cat(part) for part in zip(*output))), path.held_frames
-    return FinalPoses(*(part[held] for part in whole))
+    """Concatenated stretches; frames in the gaps between them repeat the previous pose at the interpolated head."""
+    whole, repeated = FinalPoses(*(torch.cat(part) for part in zip(*output))), path.held_frames
+    return FinalPoses(*(part[repeated] for part in whole))

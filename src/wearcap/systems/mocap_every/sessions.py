@@ -1,6 +1,6 @@
-"""Several people who wear devices in one place: each is captured alone, then edited by what the others' cameras saw.
+"""Capture of several wearers in one place: each alone, then edited to fit the views of the others' cameras.
 
-Their recordings share a session's name, a clock and a world (MocapEvery §3.4, φ_T).
+Their recordings share a session name, a clock and a world (MocapEvery §3.4, φ_T).
 """
 
 from collections import Counter
@@ -20,7 +20,7 @@ from wearcap.sensors.keypoints import camera_path, seen_wearer
 from wearcap.systems.mocap_every.visual_cues import View, VisualCues
 
 CONFIDENCE = ".confidence.npz"
-"""Ending of the file with a view's confidence, beside the motion's .npz."""
+"""Suffix of the file with a view's confidence, next to the motion's .npz."""
 
 
 def capture_session(
@@ -29,10 +29,10 @@ def capture_session(
     cues: VisualCues,
     views: Mapping[str, Sequence[View]],
 ) -> dict[str, Motion]:
-    """A motion for each recording of a session, by name; `views` are those of a recording's wearer by the others.
+    """Motion of each recording of a session, by name; `views` holds the views of a recording's wearer by the others.
 
-    A captured head has to be where it was measured, as the pipelines leave it. Raises WearcapError for recordings that
-    share no session or no time, and for views of nobody among them or of another skeleton.
+    `capture` must return motions anchored to the measured head, as the pipelines do. Raises WearcapError for recordings
+    that share no session or no time, for views of an unknown recording, and for views with another skeleton.
     """
     _require_one_session(recordings)
     if unknown := set(views) - {recording.name for recording in recordings}:
@@ -41,19 +41,19 @@ def capture_session(
         )
     motions = {}
     for recording in recordings:
-        motion, seen = capture(recording), views.get(recording.name, ())
-        for view in seen:
+        motion, own_views = capture(recording), views.get(recording.name, ())
+        for view in own_views:
             if view.motion.skeleton.joint_names != motion.skeleton.joint_names:
                 raise WearcapError(f"a view with the joints of {view.motion.skeleton.name}", where=recording.name,
                                    expected=f"those of {motion.skeleton.name}, as captured")  # fmt: skip
-        motions[recording.name], _ = cues.edit(motion, recording, motion.joint("head"), seen)
+        motions[recording.name], _ = cues.edit(motion, recording, motion.joint("head"), own_views)
     return motions
 
 
 def simulated_views(
     recordings: Sequence[Recording], rng: np.random.Generator, noise_deg: float = 5.0
 ) -> dict[str, list[View]]:
-    """What pose estimators on everyone's cameras would say of everyone else, of the true motions (`seen_wearer`).
+    """Simulated pose estimates of each wearer from the others' cameras, made from the true motions (`seen_wearer`).
 
     Raises WearcapError for recordings that share no session or no time, or lack a camera or a true motion.
     """
@@ -64,39 +64,39 @@ def simulated_views(
                 "no true motion or no camera", where=recording.name, expected="both, as simulated"
             )
     views: dict[str, list[View]] = {recording.name: [] for recording in recordings}
-    for seen, seer in permutations(recordings, 2):
+    for seen, observer in permutations(recordings, 2):
         assert seen.motion is not None
-        assert seer.motion is not None
-        assert seer.camera is not None
-        path = camera_path(seer.motion, seer.camera)
+        assert observer.motion is not None
+        assert observer.camera is not None
+        path = camera_path(observer.motion, observer.camera)
         start, stop = seen.motion.timestamps[0], seen.motion.timestamps[-1]
         path = path[(path.timestamps >= start) & (path.timestamps <= stop)]
-        views[seen.name].append(View(*seen_wearer(seen.motion, path, seer.camera.camera, noise_deg, rng)))
+        views[seen.name].append(View(*seen_wearer(seen.motion, path, observer.camera.camera, noise_deg, rng)))
     return views
 
 
 def write_view(view: View, path: str | Path) -> None:
-    """A view as a motion .npz and its confidence beside it (`CONFIDENCE`)."""
+    """Write a view as a motion .npz, with its confidence in a file next to it (`CONFIDENCE`)."""
     write_motion(view.motion, path)
-    with atomic_path(_beside(path)) as temporary, open(temporary, "wb") as file:
+    with atomic_path(_confidence_path(path)) as temporary, open(temporary, "wb") as file:
         np.savez(file, confidence=view.confidence.numpy())
 
 
 def read_view(path: str | Path) -> View:
-    """Read what `write_view` wrote, or another program as it does.
+    """Read a view in the format of `write_view`.
 
-    Raises WearcapError when a file is missing or damaged, or the confidence (0…1) is none of this motion's.
+    Raises WearcapError when a file is missing or damaged, or when the confidence (0…1) does not match the motion.
     """
-    motion, beside = read_motion(path), _beside(path)
-    arrays = read_npz(beside, ["confidence"])
-    require(arrays, beside, confidence=(len(motion), len(motion.skeleton)))
+    motion, confidence_file = read_motion(path), _confidence_path(path)
+    arrays = read_npz(confidence_file, ["confidence"])
+    require(arrays, confidence_file, confidence=(len(motion), len(motion.skeleton)))
     confidence = torch.from_numpy(arrays["confidence"]).float()
     if ((confidence < 0) | (confidence > 1)).any():
-        raise WearcapError("confidence beyond its range", where=beside, expected="0 to 1")
+        raise WearcapError("confidence beyond its range", where=confidence_file, expected="0 to 1")
     return View(motion, confidence)
 
 
-def _beside(path: str | Path) -> Path:
+def _confidence_path(path: str | Path) -> Path:
     path = Path(path)
     return path.with_name(path.name.removesuffix(".npz") + CONFIDENCE)
 
@@ -106,14 +106,14 @@ def _require_one_session(recordings: Sequence[Recording]) -> None:
         if recording.session is None or recording.session != recordings[0].session:
             raise WearcapError(f"session {recording.session!r}", where=recording.name,
                                expected=f"that of {recordings[0].name}, {recordings[0].session!r}")  # fmt: skip
-    if twice := [name for name, count in Counter(r.name for r in recordings).items() if count > 1]:
-        raise WearcapError(f"two recordings are called {twice[0]!r}", expected="unique names")
+    if repeated := [name for name, count in Counter(r.name for r in recordings).items() if count > 1]:
+        raise WearcapError(f"two recordings are called {repeated[0]!r}", expected="unique names")
     spans = []
     for recording in recordings:
         stream = recording.head or recording.motion
         if stream is None or not len(stream.timestamps):
             raise WearcapError(
-                "neither head poses nor a motion", where=recording.name, expected="one of both"
+                "neither head poses nor a motion", where=recording.name, expected="at least one of the two"
             )
         spans.append((stream.timestamps[0].item(), stream.timestamps[-1].item()))
     if spans and max(start for start, _ in spans) > min(stop for _, stop in spans):

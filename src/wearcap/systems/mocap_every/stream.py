@@ -1,7 +1,7 @@
-"""MocapEvery while things happen: head poses and watch samples go in as they come, poses come out frame by frame.
+"""Streaming MocapEvery: head poses and watch samples go in as they arrive, final poses come out.
 
-Windows, floor and hanging are those of `MocapEvery.run`: with the same stride, lookahead and first floor the motion
-is the same. What a stream waits for beside its lookahead are the three frames that the mean filter sees ahead.
+Windows, floor and anchoring are those of `MocapEvery.run`: with equal stride, lookahead and initial floor the motion is
+the same. Beyond the lookahead, a stream's latency includes the three future frames of the mean filter.
 """
 
 import math
@@ -26,7 +26,7 @@ from wearcap.sensors.packets import (
     WRONG_TYPE,
     Admitted,
     Clock,
-    HeadDoor,
+    HeadInput,
     connected,
     owned,
     rotation_fault,
@@ -41,11 +41,11 @@ from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_track import Chunk, HeadTrack
 
 MAX_POINTS = 1_000_000
-"""Points that wait for the head's pose; the oldest make room."""
+"""Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""
 
 
 class WatchSample(NamedTuple):
-    """What a watch said at one moment."""
+    """One sample of a watch."""
 
     timestamp: float
     """Seconds, on the camera's clock."""
@@ -56,41 +56,41 @@ class WatchSample(NamedTuple):
 
 @dataclass(frozen=True)
 class Wearing:
-    """Who wears the kit, and how it sits."""
+    """The wearer's skeleton and the mounting of the devices."""
 
     skeleton: Skeleton
     R_head_device: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
     t_head_device: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
     R_wrist_imu: Mapping[str, Float[Tensor, "3 3"]] = field(default_factory=dict)
-    """Mounting of each watch on its wrist joint, where it is not the joint's own."""
+    """Mounting of each watch on its wrist joint; identity where missing."""
     floor_m: float | None = None
-    """Height of the floor at the beginning (the document's h_0); None: the first head's, less that of one who stands."""
+    """Initial floor height (the paper's h_0); None: the first head height minus the standing head height."""
 
 
 class MocapEverySession:
     """A streaming capture of one wearer.
 
-    Frames wait until both watches have said what they are told from; a watch that is silent for longer than
-    `watches.MAX_GAP_S` is taken to rest as it was, without acceleration, and counted in `silent`.
-    What cannot be true (`sensors.packets`) is `refused`. Where the camera's clock goes back for good, the capture begins
-    anew as a new session would; the watches are on that clock.
+    Frames are processed once both watches have delivered the samples that they need. A watch without samples for longer
+    than `watches.MAX_GAP_S` is assumed static (last orientation, no acceleration) and counted in `silent`. Invalid
+    packets (`sensors.packets`) are counted in `refused`. When the camera's clock jumps back for good, the capture
+    restarts as in a new session; the watches share that clock.
     """
 
     def __init__(self, pipeline: MocapEvery, wearing: Wearing):
         pipeline.prepare()
         self.pipeline, self.wearing = pipeline, wearing
         self.silent = 0
-        """Frames for which a watch had nothing to say."""
-        self._door = HeadDoor()
+        """Number of frames without samples of a watch (counted per watch)."""
+        self._head_input = HeadInput()
         self._track = HeadTrack(pipeline.fps, pipeline.stride)
         self._samples: dict[str, list[WatchSample]] = {joint: [] for joint in WRISTS}
         self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
         self._finished: list[Motion] = []
-        """Of before the clock went back, not given yet."""
-        self._begin()
+        """Motions from before the clock jumped back that were not returned yet."""
+        self._restart()
 
-    def _begin(self) -> None:
-        """Begin anew: what the watches said stays, and the counts."""
+    def _restart(self) -> None:
+        """Restart the capture; watch samples and counters are kept."""
         dropped = self._track.dropped
         self._track = HeadTrack(self.pipeline.fps, self.pipeline.stride)
         self._track.dropped = dropped
@@ -100,17 +100,17 @@ class MocapEverySession:
         self._points: list[Tensor] = []
         self._times = torch.zeros(0, dtype=torch.float64)
         self._heads = Rigid(torch.zeros(0, 3, 3), torch.zeros(0, 3))
-        """Of the frames that are taken and not given yet."""
+        """Head poses of frames that were consumed but not returned yet."""
 
     @property
     def dropped(self) -> int:
-        """Head poses that came too late, twice, or were refused."""
-        return self._track.dropped + self._door.dropped
+        """Number of head poses that came too late, twice, or were refused."""
+        return self._track.dropped + self._head_input.dropped
 
     @property
     def refused(self) -> dict[str, int]:
-        """How many packets, or parts of them, were refused, by reason: "left_wrist: out of range"."""
-        return dict(self._door.refused)
+        """Number of refused packets, or parts of packets, by reason such as "left_wrist: out of range"."""
+        return dict(self._head_input.refused)
 
     def head(
         self,
@@ -118,16 +118,16 @@ class MocapEverySession:
         T_world_device: Rigid | None,
         points_world: Float[Tensor, "point 3"] | None = None,
     ) -> None:
-        """Take in a moment of the camera: its pose, if tracking has one, and points that are new."""
-        if self._door.timely(timestamp):
-            packet = self._door.pose(T_world_device), self._door.points(points_world)
-            self._take(self._door.admit(float(timestamp), packet))
+        """Take in one time step of the camera: its pose (None while tracking is lost) and new points."""
+        if self._head_input.timely(timestamp):
+            packet = self._head_input.pose(T_world_device), self._head_input.points(points_world)
+            self._take(self._head_input.admit(float(timestamp), packet))
 
     def _take(self, admitted: Admitted) -> None:
         if admitted.begins:
             if admitted.again and (motion := self._final(ended=True)) is not None:
                 self._finished.append(motion)
-            self._begin()
+            self._restart()
             for joint in self._samples:
                 self._rejoin(joint, None if admitted.again else admitted.packets[0][0])
         for time, (pose, points) in admitted.packets:
@@ -138,7 +138,7 @@ class MocapEverySession:
             self._points = [torch.cat(self._points)[-MAX_POINTS:]]
 
     def _rejoin(self, joint: str, time: float | None) -> None:
-        """Keep of a watch what belongs to the clock that begins at a time; None: nothing does."""
+        """Keep the samples of a watch that belong to the clock starting at a time (s); None: drop all of them."""
         samples = self._samples[joint]
         kept = [] if time is None else samples[connected([sample.timestamp for sample in samples], time)]
         refused = self._clocks[joint].set(kept[-1].timestamp if kept else None)
@@ -147,53 +147,54 @@ class MocapEverySession:
 
     def _refuse(self, joint: str, count: int) -> None:
         if count:
-            self._door.refuse(joint, OFF_THE_CLOCK, count)
+            self._head_input.refuse(joint, OFF_THE_CLOCK, count)
 
     def watch(self, joint: str, samples: Sequence[WatchSample]) -> None:
-        """Take in what a watch said; samples that come twice are left out.
+        """Take in samples of a watch; repeated samples are ignored.
 
-        Raises WearcapError for another joint than the wrists.
+        Raises WearcapError for joints other than the wrists.
         """
         if joint not in self._samples:
             raise WearcapError(f"no watch on {joint!r}", expected=" or ".join(WRISTS))
         clock = self._clocks[joint]
         for sample in samples:
             if fault := _fault(sample):
-                self._door.refuse(joint, fault)
+                self._head_input.refuse(joint, fault)
                 continue
             sample = WatchSample(float(sample.timestamp), owned(sample.R_world_imu), owned(sample.acc_world))
-            admitted = clock.admit(sample.timestamp, sample, self._door.clock.newest)
+            admitted = clock.admit(sample.timestamp, sample, self._head_input.clock.newest)
             self._refuse(joint, admitted.refused)
             if admitted.begins:
                 first = bisect_left(self._samples[joint], admitted.packets[0][0], key=_time)
                 self._samples[joint] = self._samples[joint][: first if admitted.again else 0]
-            for _, believed in admitted.packets:
-                _insert(self._samples[joint], believed)
+            for _, accepted in admitted.packets:
+                _insert(self._samples[joint], accepted)
 
     def poses(self, ended: bool = False) -> Motion | None:
-        """The frames that are final since the last time; `ended`: nothing more will come.
+        """Frames that became final since the last call; `ended`: no more input will come.
 
-        Where the camera's clock has gone back these are the frames before; call again for those with the new times.
+        After the camera's clock jumped back, the first call returns the frames before the jump and the next call those
+        after it.
         """
         if ended:
-            for time, (pose, _) in self._door.end():
+            for time, (pose, _) in self._head_input.end():
                 self._track.take(time, pose)
         return self._finished.pop(0) if self._finished else self._final(ended)
 
     def _final(self, ended: bool) -> Motion | None:
         while (chunk := self._track.next(ended)) is not None:
             self._chunks.append(chunk)
-        given: list[Motion] = []
+        motions: list[Motion] = []
         end_s = self._chunks[-1].timestamps[-1].item() if ended and self._chunks else math.inf
         while self._chunks and (ended or self._complete(self._chunks[0])):
-            given += self._advance(self._chunks.pop(0), end_s)
+            motions += self._advance(self._chunks.pop(0), end_s)
         if ended and self._windows is not None:
-            given += self._give(self._windows.finish())
+            motions += self._to_motion(self._windows.finish())
             self._windows = None
-        return joined(given)
+        return joined(motions)
 
     def _complete(self, chunk: Chunk) -> bool:
-        """Whether both watches have said all that a chunk is told from, or are silent."""
+        """Whether both watches have delivered all samples that a chunk needs, or are silent."""
         last = chunk.timestamps[-1].item()
         needed = last + (FILTER // 2 + 0.5) / self.pipeline.fps
         newest = [samples[-1].timestamp if samples else -math.inf for samples in self._samples.values()]
@@ -202,12 +203,13 @@ class MocapEverySession:
 
     @torch.inference_mode()
     def _advance(self, chunk: Chunk, end_s: float) -> list[Motion]:
-        given: list[Motion] = []
+        """Run the windows over one chunk of frames; `end_s`: time of the last frame (s), once known."""
+        motions: list[Motion] = []
         mount = Rigid(self.wearing.R_head_device, self.wearing.t_head_device).inverse()
         T_world_head = chunk.T_world_device @ mount
         if chunk.begins or self._windows is None:
             if self._windows is not None:
-                given += self._give(self._windows.finish())
+                motions += self._to_motion(self._windows.finish())
             self._begin_s = chunk.timestamps[0].item()
             floor_m = self.wearing.floor_m if self._windows is None else self._windows.floor_m
             if floor_m is None:
@@ -228,12 +230,12 @@ class MocapEverySession:
                 for part in zip((self._heads.R, self._heads.t), (T_world_head.R, T_world_head.t))
             )
         )
-        return given + self._give(self._windows.advance(sensed))
+        return motions + self._to_motion(self._windows.advance(sensed))
 
     def _watches(
         self, chunk: Chunk, end_s: float
     ) -> tuple[Float[Tensor, "time wrist 3 3"], Float[Tensor, "time wrist 3"]]:
-        """What the watches say of a chunk's frames; the filter sees nothing before the stretch and behind `end_s`."""
+        """Wrist orientations and filtered accelerations of a chunk; the filter ignores times outside the stretch."""
         step = 1 / self.pipeline.fps
         frames = torch.arange(-(FILTER // 2), len(chunk.timestamps) + FILTER // 2, dtype=torch.float64)
         around = chunk.timestamps[0] + step * frames
@@ -242,7 +244,7 @@ class MocapEverySession:
         for joint, samples in self._samples.items():
             if not samples or samples[-1].timestamp < chunk.timestamps[-1].item() - MAX_GAP_S:
                 self.silent += len(chunk.timestamps)
-                samples = self._at_rest(samples, chunk)
+                samples = self._static(samples, chunk)
             elif len(samples) == 1:
                 samples = [samples[0]._replace(timestamp=samples[0].timestamp - step), *samples]
             streams.append(ImuStream(
@@ -250,20 +252,21 @@ class MocapEverySession:
                 torch.stack([s.R_world_imu for s in samples]), torch.stack([s.acc_world for s in samples]),
                 R_joint_imu=self.wearing.R_wrist_imu.get(joint),
             ))  # fmt: skip
-            forget = around[-FILTER].item() - 2 * step
+            oldest_s = around[-FILTER].item() - 2 * step
             kept = self._samples[joint]
-            self._samples[joint] = [s for s in kept if s.timestamp >= forget] or kept[-1:]
+            self._samples[joint] = [s for s in kept if s.timestamp >= oldest_s] or kept[-1:]
         return filtered(streams, chunk.timestamps, around, step)
 
-    def _at_rest(self, samples: list[WatchSample], chunk: Chunk) -> list[WatchSample]:
-        """A watch as it was last, at rest."""
+    def _static(self, samples: list[WatchSample], chunk: Chunk) -> list[WatchSample]:
+        """Samples of a static watch with its last orientation, around a chunk."""
         R = samples[-1].R_world_imu if samples else torch.eye(3)
         return [
             WatchSample(time, R, torch.zeros(3))
             for time in (chunk.timestamps[0].item() - 1.0, chunk.timestamps[-1].item() + 1.0)
         ]
 
-    def _give(self, output: FinalPoses) -> list[Motion]:
+    def _to_motion(self, output: FinalPoses) -> list[Motion]:
+        """Final frames as a motion with their times, anchored to the head; an empty list for no frames."""
         count = len(output.t_world_root)
         if not count:
             return []
@@ -279,7 +282,7 @@ def _time(sample: WatchSample) -> float:
 
 
 def _fault(sample: object) -> str | None:
-    """What is wrong with a watch's sample."""
+    """Why a watch's sample is invalid; None for a valid one."""
     if not isinstance(sample, WatchSample):
         return WRONG_TYPE
     return (
@@ -289,9 +292,9 @@ def _fault(sample: object) -> str | None:
     )
 
 
-def _insert(known: list[WatchSample], sample: WatchSample) -> None:
-    """Put a sample where it belongs in time, unless there is one already."""
-    place = bisect_left(known, sample.timestamp, key=_time)
-    if place == len(known) or known[place].timestamp != sample.timestamp:
-        known.insert(place, sample)
-        del known[:-MAX_WAITING]
+def _insert(samples: list[WatchSample], sample: WatchSample) -> None:
+    """Insert a sample in order of time, unless there is one with the same timestamp."""
+    index = bisect_left(samples, sample.timestamp, key=_time)
+    if index == len(samples) or samples[index].timestamp != sample.timestamp:
+        samples.insert(index, sample)
+        del samples[:-MAX_WAITING]

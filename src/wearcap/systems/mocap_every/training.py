@@ -1,4 +1,4 @@
-"""Training of MocapEvery's estimator: the losses of §3.3 (eq. 2–4), forward kinematics inside."""
+"""Training of MocapEvery's estimator with the losses of §3.3 (eq. 2–4)."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,9 +19,9 @@ from wearcap.training.losses import EPSILON_M2
 
 
 class WatchRegression(SeededSteps, WeighedTerms):
-    """Regression of bodies from a head and two wrists.
+    """Regression of body motion from the head and two wrists.
 
-    Loss terms, weighed by `loss_weights`, are means over frames and joints: "root" and "rotation" (eq. 2), "position"
+    Loss terms, weighted by `loss_weights`, are means over frames and joints: "root" and "rotation" (eq. 2), "position"
     with `joint_weights` for hands and feet (eq. 3), "mid" and "consistency" of the first stage (eq. 4), "contact"
     (cross entropy), "foot_velocity"; "velocity" of all joints is ours.
     """
@@ -40,7 +40,7 @@ class WatchRegression(SeededSteps, WeighedTerms):
         end_weight: float = 1.0,
         seed: int = 0,
     ):
-        """`end_weight`: of hands and feet among the joints of "position"."""
+        """`end_weight`: weight of hands and feet relative to the other joints in "position"."""
         super().__init__()
         self.net = net(feature_size=features.size, motion_size=features.motion_size)
         self.features, self.skeleton, self.fps = features, skeleton, fps
@@ -52,18 +52,18 @@ class WatchRegression(SeededSteps, WeighedTerms):
         self._optimizer, self._scheduler = optimizer, scheduler
 
     def pipeline_parts(self) -> dict[str, Any]:
-        """What a `MocapEvery` pipeline takes from here."""
+        """Constructor arguments of a `MocapEvery` pipeline that come from the checkpoint."""
         return {"net": self.net, "features": self.features, "skeleton": self.skeleton, "fps": self.fps}
 
     def set_statistics(self, dataset: WatchDataset, limit: int = 1500) -> None:
-        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        """Compute the normalisation from a training split; a resumed run restores it with the weights."""
         random = torch.Generator().manual_seed(0)
         drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
         batch = collate([dataset[item] for item in zip(drawn, range(limit))])
         features, motion, canonical = self._inputs(batch)
-        ends = self._seen(self._joints(motion, batch, canonical)[:, :, self._ends], batch, canonical).flatten(
-            -2
-        )
+        ends = self._ends_from_world(
+            self._joints(motion, batch, canonical)[:, :, self._ends], batch, canonical
+        ).flatten(-2)
         for normalizer, rows in (
             (self.net.feature_normalizer, features), (self.net.motion_normalizer, motion), (self.net.ends_normalizer, ends),
         ):  # fmt: skip
@@ -73,7 +73,7 @@ class WatchRegression(SeededSteps, WeighedTerms):
     def _inputs(
         self, batch: WatchWindow
     ) -> tuple[Float[Tensor, "batch time feature"], Float[Tensor, "batch time motion"], Canonical]:
-        """Features, true motion, and the windows' frames."""
+        """Input features, ground-truth motion features, and the windows' canonical frames."""
         canonical = self.features.canonical(batch.sensed, batch.floor_height)
         features = self.features.encode(batch.sensed, batch.floor_height, batch.size, canonical)
         true = self.features.encode_motion(batch.R_parent_joint, batch.t_world_root, batch.sensed, canonical)
@@ -82,41 +82,41 @@ class WatchRegression(SeededSteps, WeighedTerms):
     def _joints(
         self, motion: Float[Tensor, "batch predicted motion"], batch: WatchWindow, canonical: Canonical
     ) -> Float[Tensor, "batch predicted joint 3"]:
-        """Joints (m) in the world."""
+        """Joint positions (m) in the world, from motion features."""
         R, t = to_world(*self.features.decode_motion(motion, batch.sensed, canonical), canonical)
         return forward_kinematics(self.skeleton, R, t, batch.t_parent_joint[:, None]).t
 
-    def _placed(
+    def _ends_to_world(
         self, ends: Float[Tensor, "batch time end 3"], batch: WatchWindow, canonical: Canonical
     ) -> Float[Tensor, "batch time end 3"]:
-        """End-effectors in the world, from where they are said."""
+        """Predicted end-effectors (m), transformed to the world."""
         origin = self.features.origin(batch.sensed, canonical)
         return (
             canonical.t[:, :, None]
             + (canonical.R[:, :, None] @ (ends + origin[:, :, None])[..., None])[..., 0]
         )
 
-    def _seen(
+    def _ends_from_world(
         self, ends: Float[Tensor, "batch time end 3"], batch: WatchWindow, canonical: Canonical
     ) -> Float[Tensor, "batch time end 3"]:
-        """The inverse of `_placed`."""
+        """The inverse of `_ends_to_world`."""
         origin = self.features.origin(batch.sensed, canonical)
         return (canonical.R.mT[:, :, None] @ (ends - canonical.t[:, :, None])[..., None])[..., 0] - origin[
             :, :, None
         ]
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
-        """Every loss term of a batch, unweighted."""
+        """Unweighted loss terms of a batch."""
         features, true, canonical = self._inputs(batch)
         output = self.net(features)
         last = output.motion.shape[1]
         motion, true = output.motion.float(), true[:, -last:]
         joints, joints_true = (self._joints(each, batch, canonical) for each in (motion, true))
         error = motion - true
-        turns, distance = _norm(error[..., 3:].unflatten(-1, (-1, 6))), _norm(joints - joints_true)
+        rotation_error, distance = _norm(error[..., 3:].unflatten(-1, (-1, 6))), _norm(joints - joints_true)
         terms = {
-            "root": (_norm(error[..., :3]) + turns[..., 0]).mean(),
-            "rotation": turns[..., 1:].mean(),
+            "root": (_norm(error[..., :3]) + rotation_error[..., 0]).mean(),
+            "rotation": rotation_error[..., 1:].mean(),
             "position": (distance * self._joint_weights).mean(),
             "contact": F.binary_cross_entropy_with_logits(
                 output.contact_logit.float(), batch.foot_contact[:, -last:]
@@ -126,11 +126,12 @@ class WatchRegression(SeededSteps, WeighedTerms):
             velocity = _norm((joints - joints_true).diff(dim=1) * self.fps)
             terms |= {"foot_velocity": velocity[:, :, self._ends[2:]].mean(), "velocity": velocity.mean()}
         if output.ends is not None:
-            ends = self._placed(output.ends.float().unflatten(-1, (-1, 3)), batch, canonical)
+            ends = self._ends_to_world(output.ends.float().unflatten(-1, (-1, 3)), batch, canonical)
             terms["mid"] = _norm(ends - joints_true[:, :, self._ends]).mean()
             terms["consistency"] = _norm(joints[:, :, self._ends] - ends).mean()
         return terms
 
 
 def _norm(value: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch"]:
+    """Norm over the last axis, smoothed at zero."""
     return (value.square().sum(-1) + EPSILON_M2).sqrt()

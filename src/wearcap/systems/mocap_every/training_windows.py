@@ -1,4 +1,4 @@
-"""Windows of a head and two wrists, with the motion behind them, for MocapEvery's estimator."""
+"""Training windows of MocapEvery's estimator: head and wrist inputs with the ground-truth motion."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -50,37 +50,38 @@ class WatchWindow(NamedTuple):
 
 @dataclass(frozen=True)
 class Variation:
-    """What makes more windows out of few, and what real watches and real tracking get wrong: errors that are constant
-    within a window (1.3 s is too short for more), and white noise of acceleration. By default nothing varies."""
+    """Data augmentation by time and size, and simulated sensor errors: errors that are constant within a window (of
+    1.3 s), and white noise of the acceleration. The defaults change nothing."""
 
     stretch: float = 1.0
-    """Greatest factor by which everything happens faster or slower; accelerations go with its square."""
+    """Largest factor by which a motion is sped up or slowed down; accelerations scale with its square."""
     scale: float = 1.0
-    """Greatest factor by which wearer and world are larger or smaller."""
+    """Largest factor by which wearer and world are enlarged or shrunk."""
     wrist_deg: float = 0.0
-    """Deviation of a wrist's orientation about each axis: strap, attitude, heading."""
+    """Standard deviation of a wrist's orientation error about each axis: strap, attitude, heading."""
     acc_m_s2: float = 0.0
+    """Standard deviation of the acceleration's white noise (m/s²)."""
     head_deg: float = 0.0
-    """Tilt of the head, about each axis."""
+    """Standard deviation of the head's orientation error about each axis."""
     floor_m: float = 0.0
-    """Of the floor's height."""
+    """Standard deviation of the floor height's error."""
 
 
 class WatchDataset(Dataset):
-    """Windows of one split of one or more data sets. An item is asked for by (window, seed), or by its window alone.
+    """Windows of one split of one or more data sets, indexed by (window, seed) or by the window only.
 
-    What is sensed is found when a recording is first touched, and kept: 0.8 GB for four hours at 60 Hz.
+    Sensor inputs are computed on the first access to a recording and cached: 0.8 GB for four hours at 60 Hz.
     """
 
     def __init__(
         self, sources: list[Source], split: str, *, window: int, stride: int, fps: float, every: int,
         augment: bool = False, balance: float = 1.0, variation: Variation | None = None, beginnings: float = 0.0,
     ):  # fmt: skip
-        """Recordings of `fps` frames a second, of which every `every`-th is taken; `window` and `stride` count those.
+        """Of recordings at `fps` frames per second every `every`-th frame is used; `window` and `stride` count those.
 
-        `augment` shifts windows by up to a stride, mirrors half of them, turns them about the vertical, and varies
-        them; `balance`: see `WindowDataset`; `beginnings` is the share of windows whose first frames are all the same,
-        as when a capture has just begun.
+        `augment` shifts windows by up to a stride, mirrors half of them, turns them about the vertical, and applies
+        `variation`. `balance`: see `WindowDataset`. `beginnings` is the share of windows whose first frames repeat one
+        frame, as at the beginning of a capture.
         """
         self.window, self.stride, self.fps, self.every = window, stride, fps / every, every
         self.augment, self.variation, self.beginnings = augment, variation or Variation(), beginnings
@@ -94,7 +95,7 @@ class WatchDataset(Dataset):
 
     def __getitem__(self, item: tuple[int, int] | int) -> WatchWindow:
         index, random = asked_for(item)
-        shift, mirrored, turn, begins, held, faster, larger = torch.rand(7, generator=random).tolist()
+        shift, mirror, turn, begins, padding, faster, larger = torch.rand(7, generator=random).tolist()
         recording, start, _ = self.starts[index].tolist()
         store, name = self.recordings[recording]
         whole = watched(store.path_of(name), self.every)
@@ -104,30 +105,31 @@ class WatchDataset(Dataset):
         first = min(first, max(len(whole.floor_height) - 1 - span, 0.0))
         frames = first + self.every * speed * torch.arange(self.window)
         if begins < self.beginnings:
-            frames = frames.clamp_min(frames[int(held * (self.window - 2))].item())
+            frames = frames.clamp_min(frames[int(padding * (self.window - 2))].item())
         window = whole.window(frames.clamp_max(len(whole.floor_height) - 1), speed)
         if not self.augment:
             return window
         window = scaled(window, self.variation.scale ** (2 * larger - 1))
-        window = self._disturbed(turned(window, 2 * torch.pi * turn), random)
-        return mirror_window(window, whole.skeleton) if mirrored < 0.5 else window
+        window = self._with_sensor_errors(turned(window, 2 * torch.pi * turn), random)
+        return mirrored_window(window, whole.skeleton) if mirror < 0.5 else window
 
-    def _disturbed(self, window: WatchWindow, random: torch.Generator) -> WatchWindow:
-        wrong = self.variation
+    def _with_sensor_errors(self, window: WatchWindow, random: torch.Generator) -> WatchWindow:
+        """A window with random errors of watches, head tracking and floor height."""
+        errors = self.variation
         angle = torch.randn(3, 3, generator=random).deg2rad()
-        turn = rotation.exp(angle * torch.tensor([[wrong.wrist_deg], [wrong.wrist_deg], [wrong.head_deg]]))
+        turn = rotation.exp(angle * torch.tensor([[errors.wrist_deg], [errors.wrist_deg], [errors.head_deg]]))
         return window._replace(
             R_world_wrist=window.R_world_wrist @ turn[:2],
             acc_world_wrist=(turn[:2] @ window.acc_world_wrist[..., None])[..., 0]
-            + wrong.acc_m_s2 * torch.randn(window.acc_world_wrist.shape, generator=random),
+            + errors.acc_m_s2 * torch.randn(window.acc_world_wrist.shape, generator=random),
             R_world_head=window.R_world_head @ turn[2],
-            floor_height=window.floor_height + wrong.floor_m * torch.randn(1, generator=random),
+            floor_height=window.floor_height + errors.floor_m * torch.randn(1, generator=random),
         )
 
 
 @dataclass(frozen=True)
 class Watched:
-    """A whole recording at its own rate."""
+    """Inputs and ground truth of a whole recording, at its own frame rate."""
 
     sensed: Sensed
     floor_height: Float[Tensor, "time"]
@@ -138,7 +140,7 @@ class Watched:
     size: Float[Tensor, "limb"]
 
     def window(self, frames: Float[Tensor, "frame"], speed: float = 1.0) -> WatchWindow:
-        """Some of its frames, which may lie between those that there are, as it is when it happens at that speed."""
+        """Window at fractional frame numbers, interpolated; accelerations are scaled to the playback speed."""
         low = frames.long()
         share, high = frames - low, (low + 1).clamp_max(len(self.floor_height) - 1)
 
@@ -160,7 +162,7 @@ class Watched:
 
 @cache
 def watched(path: Path, every: int) -> Watched:
-    """What watches on a recording's true body measure beside its head stream (the document's protocol: eq. 8)."""
+    """Load a recording's head stream and synthesise watches on its true motion (the paper's protocol, eq. 8)."""
     file = RecordingFile(path)
     recording = file.load()
     motion, head = recording.motion, recording.head
@@ -175,7 +177,7 @@ def watched(path: Path, every: int) -> Watched:
 
 
 def turned(window: WatchWindow, angle: float) -> WatchWindow:
-    """The same happening, turned about the world's vertical (rad)."""
+    """The window turned about the world's vertical by an angle (rad)."""
     R = rotation.about_axis("z", torch.tensor(angle))
     root = torch.cat([(R @ window.R_parent_joint[:, 0])[:, None], window.R_parent_joint[:, 1:]], 1)
     return window._replace(
@@ -186,7 +188,7 @@ def turned(window: WatchWindow, angle: float) -> WatchWindow:
 
 
 def scaled(window: WatchWindow, factor: float) -> WatchWindow:
-    """The same happening to a larger or smaller wearer in a larger or smaller world."""
+    """The window with wearer and world scaled by a factor."""
     return window._replace(
         t_world_head=window.t_world_head * factor, acc_world_wrist=window.acc_world_wrist * factor,
         t_world_wrist=window.t_world_wrist * factor, floor_height=window.floor_height * factor,
@@ -195,8 +197,8 @@ def scaled(window: WatchWindow, factor: float) -> WatchWindow:
     )  # fmt: skip
 
 
-def mirror_window(window: WatchWindow, skeleton: Skeleton) -> WatchWindow:
-    """The same happening seen in a mirror that swaps left and right."""
+def mirrored_window(window: WatchWindow, skeleton: Skeleton) -> WatchWindow:
+    """The window mirrored, left and right swapped."""
     flip = torch.tensor(MIRROR)
     twins = joint_twins(skeleton)
     return window._replace(
@@ -207,7 +209,7 @@ def mirror_window(window: WatchWindow, skeleton: Skeleton) -> WatchWindow:
 
 
 class WatchWindows(SeededWindows):
-    """Windows of heads and wrists for Lightning."""
+    """Lightning data module of `WatchDataset`."""
 
     def __init__(
         self, sources: dict[str, dict | None], window: int, stride: int, fps: float, every: int, batch_size: int,
@@ -215,7 +217,7 @@ class WatchWindows(SeededWindows):
         augment: bool = True, balance: float = 1.0, variation: Variation | None = None, beginnings: float = 0.0,
         val_sources: dict[str, dict | None] | None = None,
     ):  # fmt: skip
-        """See `SeededWindows` and `WatchDataset`; what varies windows is for training alone."""
+        """See `SeededWindows` and `WatchDataset`; augmentation applies to training only."""
         super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
         self.window, self.stride, self.fps, self.every = window, stride, fps, every
         self.augment, self.balance, self.variation, self.beginnings = augment, balance, variation, beginnings

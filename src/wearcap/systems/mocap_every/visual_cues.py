@@ -1,4 +1,4 @@
-"""MocapEvery's second half (§3.4): a captured motion is edited within the manifold until it agrees with what was seen."""
+"""Editing of a captured motion within the motion manifold to fit visual cues (MocapEvery §3.4)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -35,87 +35,89 @@ FOOT_JOINTS = ("left_toe", "right_toe")
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A wearer's pose as another wearer's camera saw it: frames with a confidence per joint; 0 says nothing."""
+    """A wearer's pose as observed by another wearer's camera."""
 
     motion: Motion
     confidence: Float[Tensor, "time joint"]
+    """Confidence of each joint, 0…1; 0: not observed."""
 
 
 @dataclass
 class VisualCues:
-    """Edits windows in which anything was seen; what was not seen stays as it was captured."""
+    """Edits the windows of a motion that have observations; other frames stay as captured."""
 
     manifold: MotionManifold
     weights: LatentWeights = field(default_factory=LatentWeights)
     solver: LatentSolver = field(default_factory=LatentSolver)
     window: int = 80
-    """Frames, edited at once; windows advance by half of it and are blended."""
+    """Window length in frames; windows advance by half of it and are blended."""
     residual: bool = True
-    """Whether what the manifold changes is added to the capture (ours), or the manifold's own motion taken (the
-    document), with what its autoencoder loses."""
+    """True: only the change of the decoded motion is added to the capture (ours). False: the decoded motion is the
+    result (the paper), which includes the autoencoder's reconstruction error."""
     smooth: float = 2.0
-    """Frames (deviation of a Gaussian) over which a change is spread, so that a detector's errors do not shake the arm;
-    with `residual` alone (ours)."""
+    """Standard deviation (frames) of the Gaussian that smooths the change over time, against jitter from detector
+    errors; only with `residual` (ours)."""
     batch: int = 16
-    """Windows that are edited at once."""
+    """Number of windows that are optimised together."""
 
     def edit(
         self, motion: Motion, recording: Recording, T_world_head: Rigid, views: Sequence[View] = ()
     ) -> tuple[Motion, list[LatentSolution]]:
-        """The motion, edited by the recording's cues and by other wearers' views, and how each batch went.
+        """Edit a motion by the recording's cues and by other wearers' views; also returns the solution of each batch.
 
-        `T_world_head` holds the head's measured poses at the motion's frames.
+        `T_world_head` holds the measured head poses at the motion's frames.
         """
         cues = [
             at_frames(cue, motion.timestamps)
             for cue in recording.cues.values()
             if cue.joint in motion.skeleton
         ]
-        seen = [view_at_frames(view, motion.timestamps) for view in views]
-        output = [cue.confidence for cue in cues] + [view.confidence.amax(-1) for view in seen]
-        if not output or not torch.stack(output).any():
+        views = [view_at_frames(view, motion.timestamps) for view in views]
+        confidence = [cue.confidence for cue in cues] + [view.confidence.amax(-1) for view in views]
+        if not confidence or not torch.stack(confidence).any():
             return motion, []
-        starts = self._starts(torch.stack(output).amax(0) > 0)
+        starts = self._starts(torch.stack(confidence).amax(0) > 0)
         edited, solutions = _Blend(motion, self.window), []
-        for some in starts.split(self.batch):
-            frames = some[:, None] + torch.arange(self.window)
-            R, root, solution = self._edit_windows(motion, recording, T_world_head, frames, cues, seen)
+        for first in starts.split(self.batch):
+            frames = first[:, None] + torch.arange(self.window)
+            R, root, solution = self._edit_windows(motion, recording, T_world_head, frames, cues, views)
             edited.add(frames, R, root)
             solutions.append(solution)
         return anchored_to_head(edited.motion(), T_world_head), solutions
 
-    def _starts(self, shown: Tensor) -> Int64[Tensor, "window"]:
-        """First frames of the windows, on a grid of half windows, that show anything; the outer ones reach beyond."""
+    def _starts(self, observed: Tensor) -> Int64[Tensor, "window"]:
+        """First frames of the windows with observations, on a grid of half windows that extends past the motion."""
         half = self.window // 2
-        grid = torch.arange(-half, len(shown), half)
-        counted = torch.cat([torch.zeros(1, dtype=torch.int64), shown.long().cumsum(0)])
-        within = (grid + self.window).clamp_max(len(shown))
-        return grid[counted[within] > counted[grid.clamp_min(0)]]
+        grid = torch.arange(-half, len(observed), half)
+        counted = torch.cat([torch.zeros(1, dtype=torch.int64), observed.long().cumsum(0)])
+        stop = (grid + self.window).clamp_max(len(observed))
+        return grid[counted[stop] > counted[grid.clamp_min(0)]]
 
     def _edit_windows(
         self, motion: Motion, recording: Recording, T_world_head: Rigid, frames: Int64[Tensor, "window time"],
         cues: list[Cue], views: list[View],
     ) -> tuple[Tensor, Tensor, LatentSolution]:  # fmt: skip
+        """Optimise the latents of a batch of windows; returns local rotations, root translation and the solution."""
         skeleton = motion.skeleton
-        there = (frames >= 0) & (frames < len(motion))
+        exists = (frames >= 0) & (frames < len(motion))
         frames = frames.clamp(0, len(motion) - 1)
         window = Posed(
             motion.R_parent_joint[frames], motion.t_world_root[frames], _foot_contact(motion)[frames]
         )
         head = Rigid(T_world_head.R[frames], T_world_head.t[frames])
-        seen = _seen(recording, skeleton, head, frames, there, cues, views)
+        seen = _observations(recording, skeleton, head, frames, exists, cues, views)
         origin = origin_of(window)
         X0 = encode_window(window, origin)
         feet = skeleton.indices(*FOOT_JOINTS)
         with torch.no_grad():
             start = self.manifold.encode(X0)
-            rebuilt = self.manifold.decode(start)
+            reconstructed = self.manifold.decode(start)
 
-        spread = _spread(self.window, self.smooth)
+        smoothing = _gaussian_filter(self.window, self.smooth)
 
         def edited(latent: Tensor) -> Tensor:
-            output = self.manifold.decode(latent)
-            return X0 + spread @ (output - rebuilt) if self.residual else output
+            decoded = self.manifold.decode(latent)
+            return X0 + smoothing @ (decoded - reconstructed) if self.residual else decoded
 
         def body(latent: Tensor) -> Body:
             posed = decode_window(edited(latent), origin)
@@ -131,15 +133,15 @@ class VisualCues:
         return posed.R_parent_joint, posed.t_world_root, solution
 
 
-def _spread(window: int, frames: float) -> Float[Tensor, "time time"]:
-    """Averages over time with the weights of a Gaussian; 0 frames: nothing is averaged."""
+def _gaussian_filter(window: int, frames: float) -> Float[Tensor, "time time"]:
+    """Matrix of a Gaussian filter over time, with a standard deviation in frames; 0: identity."""
     time = torch.arange(window, dtype=torch.float32)
     weight = torch.exp(-0.5 * ((time[:, None] - time) / max(frames, 1e-3)) ** 2)
     return weight / weight.sum(1, keepdim=True)
 
 
 class _Blend:
-    """Frames of overlapping windows, each weighed by how far it is from its window's ends; elsewhere as captured."""
+    """Blends overlapping windows with Hann weights; frames without windows stay as captured."""
 
     def __init__(self, motion: Motion, window: int):
         self._motion = motion
@@ -148,8 +150,9 @@ class _Blend:
         self._roots, self._shares = torch.zeros(len(motion), 3), torch.zeros(len(motion))
 
     def add(self, frames: Tensor, R: Tensor, root: Tensor) -> None:
-        there = (frames >= 0) & (frames < len(self._shares))
-        weight = (self._weight * there).flatten()
+        """Add windows "window time" at frame numbers, which may extend past the motion."""
+        exists = (frames >= 0) & (frames < len(self._shares))
+        weight = (self._weight * exists).flatten()
         at = frames.flatten().clamp(0, len(self._shares) - 1)
         self._rotations.index_add_(
             0, at, weight[:, None] * rotation.rot6d_from_matrix(R).flatten(-2).flatten(0, 1)
@@ -158,6 +161,7 @@ class _Blend:
         self._shares.index_add_(0, at, weight)
 
     def motion(self) -> Motion:
+        """The blended motion."""
         motion = self._motion
         left = (1 - self._shares).clamp_min(0)[:, None]
         whole = self._shares[:, None] + left
@@ -169,7 +173,7 @@ class _Blend:
 
 
 def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
-    """A cue at a motion's frames: the nearest observation within half a frame; no confidence where there is none."""
+    """Resample a cue to a motion's frames: the nearest observation within half a frame, else confidence 0."""
     if not len(cue.timestamps):
         empty = torch.zeros(len(timestamps), cue.points.shape[-1])
         return replace(cue, timestamps=timestamps, points=empty, confidence=torch.zeros(len(timestamps)))
@@ -183,7 +187,7 @@ def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
 
 
 def view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> View:
-    """A view at a motion's frames, likewise."""
+    """Resample a view to a motion's frames, as `at_frames` does."""
     nearest = nearest_frames(view.motion.timestamps, timestamps)
     step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
     near = (view.motion.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6
@@ -194,29 +198,32 @@ def view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> View:
     return View(motion, view.confidence[nearest] * near[:, None])
 
 
-def _seen(
-    recording: Recording, skeleton: Skeleton, head: Rigid, frames: Tensor, there: Tensor, cues: list[Cue], views: list[View],
+def _observations(
+    recording: Recording, skeleton: Skeleton, head: Rigid, frames: Tensor, exists: Tensor, cues: list[Cue], views: list[View],
 ) -> Seen:  # fmt: skip
-    """What of it falls into windows; frames beyond the capture show nothing."""
+    """Observations of a batch of windows; frames outside the capture have confidence 0."""
     camera = recording.camera
-    flat, deep = ([cue for cue in cues if cue.points.shape[-1] == axes] for axes in (2, 3))
+    cues_2d, cues_3d = ([cue for cue in cues if cue.points.shape[-1] == axes] for axes in (2, 3))
     pixels = (
-        tuple(PixelCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * there) for c in flat)
+        tuple(
+            PixelCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * exists)
+            for c in cues_2d
+        )
         if camera
         else ()
     )
     places = tuple(
-        PlaceCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * there) for c in deep
+        PlaceCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * exists) for c in cues_3d
     )
     poses = tuple(
-        PoseCue(v.motion.R_parent_joint[frames], v.confidence[frames] * there[..., None]) for v in views
+        PoseCue(v.motion.R_parent_joint[frames], v.confidence[frames] * exists[..., None]) for v in views
     )
     mount = None if camera is None else Rigid(camera.R_head_cam, camera.t_head_cam)
     return Seen(head, None if camera is None else camera.camera, mount, pixels, places, poses)
 
 
 def _foot_contact(motion: Motion) -> Float[Tensor, "time foot"]:
-    """Probability that each foot touches the floor, from those of its patches."""
+    """Contact probability of each foot, the maximum over its patches."""
     if motion.contact_prob is None:
         return torch.zeros(len(motion), FEET)
     return motion.contact_prob.unflatten(-1, (FEET, -1)).amax(-1)

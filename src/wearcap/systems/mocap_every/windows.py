@@ -1,7 +1,7 @@
-"""MocapEvery's windows: frames of what is worn go in, frames of motion come out, the floor is followed in between.
+"""Sliding-window inference of MocapEvery's estimator: sensor frames in, poses and floor height out.
 
-The same for whole recordings and for streams; they differ in `stride` and `lookahead` alone. What overlapping windows
-say of a frame is averaged with weights that fade towards the windows' ends.
+Whole recordings and streams share this code and differ only in `stride` and `lookahead`. Predictions of overlapping
+windows for the same frame are averaged, with weights that decrease towards the windows' ends.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -23,25 +23,25 @@ if TYPE_CHECKING:
     from wearcap.systems.mocap_every.pipeline import MocapEvery
 
 FEET = ("left_toe", "right_toe")
-"""Joints whose contact is said, and that the floor is followed by."""
+"""Foot joints whose contact is predicted and whose positions update the floor."""
 
 
 class FinalPoses(NamedTuple):
-    """Frames that are final."""
+    """Poses of frames that later windows no longer change."""
 
     R_parent_joint: Float[Tensor, "time joint 3 3"]
     t_world_root: Float[Tensor, "time 3"]
     contact_prob: Float[Tensor, "time foot"]
     floor_height: Float[Tensor, "time"]
-    """As it was told to the estimator (m)."""
+    """Floor height (m) that conditioned the estimator."""
 
 
 class EstimatorWindows:
-    """Windows over one stretch of one recording.
+    """Sliding windows over one uninterrupted stretch of a recording.
 
-    The floor of new frames is what the follower expects when they come in, with all frames of earlier windows seen: what
-    their own feet say counts from the next window on. So the floor's state is carried from window to window, and what
-    D.2 decides by frame comes up to `stride` frames later.
+    The floor height of new frames is predicted by the floor follower from all earlier windows; the feet of the new
+    frames take effect from the next window on. The floor state thus carries over between windows, and the per-frame
+    decisions of D.2 are delayed by up to `stride` frames.
     """
 
     def __init__(self, pipeline: "MocapEvery", skeleton: Skeleton, floor: FloorFollower):
@@ -49,35 +49,36 @@ class EstimatorWindows:
         self._size = body_size(skeleton)[None]
         self._feet = skeleton.indices(*FEET)
         window = pipeline.net.window
-        place = torch.arange(1, window + 1, dtype=torch.float32)
-        self._weight = torch.minimum(place, window + 1 - place).square()[:, None]
+        position = torch.arange(1, window + 1, dtype=torch.float32)
+        self._weight = torch.minimum(position, window + 1 - position).square()[:, None]
         self._sensed: Sensed | None = None
         self._floors = torch.zeros(0)
         self._sum = torch.zeros(window, 0)
-        """Weighted sums of what was said of the window's frames: root, rotations, contact, and of the weights."""
-        self._given, self._taken = 0, 0
+        """Weighted sums of the predictions for the window's frames (root, rotations, contact), and sums of weights."""
+        self._returned, self._consumed = 0, 0
+        """Numbers of frames that were returned as final, and that were taken in."""
 
     def advance(self, new: Sensed) -> FinalPoses:
-        """Take in up to `stride` new frames; the frames that are final now."""
+        """Take in up to `stride` new frames and return the frames that are now final."""
         window, count = self._pipeline.net.window, len(new.t_world_head)
         if self._sensed is None:
-            # Before a capture begins its first frame stands still.
+            # The window before the capture is padded with its first frame.
             self._sensed = Sensed(*(part[:1].expand(window, *part.shape[1:]) for part in new))
             self._floors = self.floor.ahead(new.t_world_head[:1]).expand(window)
             self._sum = torch.zeros(window, 3 + 6 * len(self._skeleton) + 3)
         self._sensed = Sensed(*(torch.cat([a[count:], b]) for a, b in zip(self._sensed, new)))
         self._floors = torch.cat([self._floors[count:], self.floor.ahead(new.t_world_head)])
         self._sum = torch.cat([self._sum[count:], self._sum.new_zeros(count, self._sum.shape[1])])
-        self._taken += count
+        self._consumed += count
         output = self._estimate()
         last = len(output)
         self._sum[-last:] += self._weight[-last:] * torch.cat([output, torch.ones(last, 1)], -1)
         R, t, contact = _parts(output[-count:])
         self.floor.follow(contact, forward_kinematics(self._skeleton, R, t).t[:, self._feet])
-        return self._give(self._pipeline.lookahead)
+        return self._return_final(self._pipeline.lookahead)
 
     def correct(self, T_world_head: Rigid) -> None:
-        """Put the latest head poses right, which had been held."""
+        """Replace the latest head poses, which repeated an earlier pose while tracking was lost."""
         assert self._sensed is not None
         count = len(T_world_head.t)
         R, t = self._sensed.R_world_head[:-count], self._sensed.t_world_head[:-count]
@@ -91,22 +92,22 @@ class EstimatorWindows:
         return self._floors[-1].item()
 
     def finish(self) -> FinalPoses:
-        """The frames that are left."""
-        return self._give(0)
+        """Return the remaining frames."""
+        return self._return_final(0)
 
-    def _give(self, waiting: int) -> FinalPoses:
-        """Frames that have not been given yet, but for the last ones."""
-        window, count = len(self._sum), self._taken - waiting - self._given
-        stop = window - waiting
+    def _return_final(self, lookahead: int) -> FinalPoses:
+        """Frames that were not returned yet, except for the last `lookahead` ones."""
+        window, count = len(self._sum), self._consumed - lookahead - self._returned
+        stop = window - lookahead
         rows = self._sum[stop - max(count, 0) : stop]
-        self._given += max(count, 0)
+        self._returned += max(count, 0)
         return FinalPoses(*_parts(rows[:, :-1] / rows[:, -1:]), self._floors[stop - len(rows) : stop])
 
     def _estimate(self) -> Float[Tensor, "predicted value"]:
-        """Root, 6D rotations and contact in the world of the window's last frames.
+        """Root, 6D rotations and contact of the window's last frames, in the world.
 
-        With `mirror_average` the window seen in a mirror is asked, too, and the mean of both taken: none of what a network
-        believes of left hands and right ones stays.
+        With `mirror_average` the prediction for the mirrored window is mirrored back and averaged in, which removes
+        the network's left-right bias.
         """
         pipeline, skeleton = self._pipeline, self._skeleton
         assert self._sensed is not None
@@ -130,5 +131,5 @@ class EstimatorWindows:
 def _parts(
     output: Float[Tensor, "time value"],
 ) -> tuple[Float[Tensor, "time joint 3 3"], Float[Tensor, "time 3"], Float[Tensor, "time foot"]]:
-    """Rotations, root and contact."""
+    """Split a prediction into rotations, root and contact."""
     return rotation.matrix_from_rot6d(output[:, 3:-2].unflatten(-1, (-1, 6))), output[:, :3], output[:, -2:]
