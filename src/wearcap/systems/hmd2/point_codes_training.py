@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from wearcap.data.statistics import collate
-from wearcap.metrics.occupancy import distance_mae_cm, occupied_distance_mae_cm, occupancy_iou
+from wearcap.metrics.occupancy import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.systems.hmd2.point_codes_windows import PlaceDataset, Places
 from wearcap.training.base import GivenOptimizer
