@@ -54,7 +54,8 @@ def voxel_downsample(
 def statistical_outliers(
     points: Float[Tensor, "point 3"], neighbor_count: int = 16, max_deviation: float = 2.0
 ) -> Bool[Tensor, "point"]:
-    """Mask of valid points, whose mean distance to their neighbours is at most `max_deviation` σ above the cloud's mean."""
+    """Mask of valid points, whose mean distance to their neighbours is at most `max_deviation` σ above the cloud's
+    mean."""
     if len(points) < 3:
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
     distance, _ = PointIndex(points).neighbors(points, neighbor_count + 1)

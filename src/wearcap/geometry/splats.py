@@ -56,7 +56,8 @@ class SplatCloud:
     def draw(
         self, camera: Camera, T_world_cam: Rigid, radius_m: float
     ) -> tuple[Int32[np.ndarray, "height width"], Float32[np.ndarray, "height width"]]:
-        """Index (in the original cloud) and depth (m) of the point visible in each pixel; -1 and infinity where none is.
+        """Index (in the original cloud) and depth (m) of the point visible in each pixel; -1 and infinity where none
+        is.
 
         Depth is the point's own, along the optical axis, for fisheyes along the ray.
         """

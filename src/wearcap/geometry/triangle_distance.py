@@ -45,7 +45,8 @@ class TriangleIndex:
     def nearest(
         self, queries: Float64[np.ndarray, "query 3"]
     ) -> tuple[Float64[np.ndarray, "query"], Int64[np.ndarray, "query"]]:
-        """Distance (m) from each point to the surface, and the index of the nearest face (NaN and 0 for points with NaN)."""
+        """Distance (m) from each point to the surface, and the index of the nearest face (NaN and 0 for points with
+        NaN)."""
         distance, face, _ = self._search(queries)
         return distance, face
 

@@ -41,7 +41,8 @@ def mean_detection_scores(
 
 
 def average_precision(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"]) -> float:
-    """Average precision Σ (R_n - R_(n-1)) P_n over falling thresholds, with ties grouped (scikit-learn's definition)."""
+    """Average precision Σ (R_n - R_(n-1)) P_n over falling thresholds, with ties grouped (scikit-learn's
+    definition)."""
     order = prob.argsort(descending=True, stable=True)
     hits = truth[order].double().cumsum(0)
     if not len(hits) or not hits[-1]:

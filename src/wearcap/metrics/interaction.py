@@ -1,4 +1,5 @@
-"""Errors of moved objects and contacting hands (thesis Tables 5.1, 5.2). Inputs in metres, results in cm and degrees."""
+"""Errors of moved objects and contacting hands (thesis Tables 5.1, 5.2). Inputs in metres, results in cm and
+degrees."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -14,7 +14,8 @@ from wearcap.geometry.rigid import Rigid
 
 SIDES = ("left", "right")
 FLOOR_WINDOW_S = 10.0
-"""Time to either side of a frame in which the lowest true joint defines the local floor (thesis §6.4: 20 s in total)."""
+"""Time to either side of a frame in which the lowest true joint defines the local floor (thesis §6.4: 20 s in
+total)."""
 CONTACT_HEIGHT_M = 0.05
 CONTACT_SPEED_M_S = 0.3
 """Speed below which EDGE takes a foot joint to be in contact: 0.01 m per frame at 30 Hz."""

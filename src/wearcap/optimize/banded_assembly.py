@@ -82,7 +82,8 @@ class Weights(NamedTuple):
 
 
 class Kinematics(NamedTuple):
-    """Kinematics of all frames at the current state: joint rotations R and origins c, perturbation axes, patch vertices."""
+    """Kinematics of all frames at the current state: joint rotations R and origins c, perturbation axes, patch
+    vertices."""
 
     R: np.ndarray
     c: np.ndarray
@@ -93,7 +94,8 @@ class Kinematics(NamedTuple):
 
 
 class Forms(NamedTuple):
-    """Quadratic forms in the variables that the terms act on; `small`: translation, root and head, whose forms are w I."""
+    """Quadratic forms in the variables that the terms act on; `small`: translation, root and head, whose forms are w
+    I."""
 
     small: np.ndarray
     """(time, 3) weights w of translation, root and head."""

@@ -1,4 +1,5 @@
-"""Maps the terms' quadratic forms to the block tridiagonal system in the frames' unknowns, and its solution to a state."""
+"""Maps the terms' quadratic forms to the block tridiagonal system in the frames' unknowns, and its solution to a
+state."""
 
 import numpy as np
 
@@ -21,7 +22,8 @@ def fill_system(theta, body, frames, kin, forms, diagonal, below, gradient):
 
 @compiled
 def _fill_trunk(j, theta, body, frames, kin, forms, diagonal, gradient):
-    """Add translation, root and head; eliminating the spine turns its pose prior into the form w (J Jᵀ)⁻¹ of the head."""
+    """Add translation, root and head; eliminating the spine turns its pose prior into the form w (J Jᵀ)⁻¹ of the
+    head."""
     D, g, R = diagonal[j], gradient[j], kin.R[j, 0]
     inverse, turn = spine_form(theta, body, frames, kin, j)
     pull = inverse @ turn
@@ -40,7 +42,8 @@ def _fill_trunk(j, theta, body, frames, kin, forms, diagonal, gradient):
 
 @compiled
 def spine_form(theta, body, frames, kin, j):
-    """((J Jᵀ)⁻¹, J d): J is the head rotation's Jacobian (world axes) in the spine's axis-angles, d their deviation from
+    """((J Jᵀ)⁻¹, J d): J is the head rotation's Jacobian (world axes) in the spine's axis-angles, d their deviation
+    from
     the suit's."""
     gram, turn = np.zeros((3, 3)), np.zeros(3)
     for joint in body.head_chain:

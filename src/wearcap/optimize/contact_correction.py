@@ -1,4 +1,5 @@
-"""Contact-based correction of the root's path, as a smooth offset that brings hands onto touched objects (thesis §5.3.1).
+"""Contact-based correction of the root's path, as a smooth offset that brings hands onto touched objects (thesis
+§5.3.1).
 
 The thesis bends the path again, with the touched point as the only control point (`bend_contacts`). Bending keeps step
 lengths, so it cannot move a wearer who walks straight at an object towards it. Ours (`offset_for`) adds an offset that
@@ -23,7 +24,8 @@ from wearcap.optimize.trajectory import BentPath
 SETTLED = 2.0717
 """x with exp(−x) (cos x + sin x) = 0.05: decay of the offset after a contact, as a function of rate · time."""
 KEEP = 10.0
-"""Weight of a bent window's end, relative to the contact's (1), so that a point out of reach does not move what follows."""
+"""Weight of a bent window's end, relative to the contact's (1), so that a point out of reach does not move what
+follows."""
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,8 @@ def foot_plane(
     origin: Float[Tensor, "time vertex 3"],
     normal: Float[Tensor, "time vertex 3"],
 ) -> Float[Tensor, "time vertex 1"]:
-    """Signed distance (m) of patch vertices from the scan's local plane (ours): eq. 4.6, insensitive to point spacing."""
+    """Signed distance (m) of patch vertices from the scan's local plane (ours): eq. 4.6, insensitive to point
+    spacing."""
     return ((points - origin) * normal).sum(-1, keepdim=True)
 
 
@@ -84,7 +85,8 @@ def translation_step(
 def rotation_step(
     R_world_body: Float[Tensor, "time 3 3"], expected: Float[Tensor, "pair 3 3"]
 ) -> Float[Tensor, "pair 3"]:
-    """Rotation (rad) from frame to frame relative to the expected one: identity (thesis eq. 4.10, 4.11) or the suit's (ours).
+    """Rotation (rad) from frame to frame relative to the expected one: identity (thesis eq. 4.10, 4.11) or the
+    suit's (ours).
 
     An expected rotation has the form R_world_body[j + 1] R_world_body[j]ᵀ.
     """

@@ -17,7 +17,8 @@ PATCH_VERTICES = 10
 
 @dataclass(frozen=True, eq=False)
 class FootPatches:
-    """Vertices of the patches (B_k of thesis eq. 4.6), skinned without the rest of the body: 40 instead of thousands."""
+    """Vertices of the patches (B_k of thesis eq. 4.6), skinned without the rest of the body: 40 instead of
+    thousands."""
 
     body: BodyModel
     vertex: Int64[Tensor, "vertex"]
@@ -42,7 +43,8 @@ class FootPatches:
         return self._only.vertices(T_world_joint)
 
     def share(self, contact: Float[Tensor, "*batch patch"]) -> Float[Tensor, "*batch vertex"]:
-        """Contact of each vertex's patch, divided by its number of vertices, so that sums over vertices are patch means."""
+        """Contact of each vertex's patch, divided by its number of vertices, so that sums over vertices are patch
+        means."""
         size = torch.bincount(self.patch, minlength=len(FOOT_REGIONS)).to(contact)
         return (contact / size)[..., self.patch]
 

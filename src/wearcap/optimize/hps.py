@@ -24,7 +24,8 @@ TERMS = (
 SURFACE_REACH_M = 0.5
 """Distance (m) to the nearest scanned point above which a foot has no scene below it."""
 LEAST_UPRIGHT = 0.7
-"""Least vertical component of a plane's normal that a foot may stand on (45°): excludes walls beside gaps in the floor."""
+"""Least vertical component of a plane's normal that a foot may stand on (45°): excludes walls beside gaps in the
+floor."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,8 @@ class HpsData:
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Nearest scene point v(n) of each patch vertex (eq. 4.6), and the local plane; `found` is 1 where both exist, else 0."""
+    """Nearest scene point v(n) of each patch vertex (eq. 4.6), and the local plane; `found` is 1 where both exist,
+    else 0."""
 
     point: Float[Tensor, "time vertex 3"]
     origin: Float[Tensor, "time vertex 3"]

@@ -1,4 +1,5 @@
-"""Trajectory correction (thesis eq. 5.1, 5.2): bends a path in the ground plane to control points; problem, energy, Adam.
+"""Trajectory correction (thesis eq. 5.1, 5.2): bends a path in the ground plane to control points; problem, energy,
+Adam.
 
 A suit measures distances well and headings badly: step lengths are kept, headings are unknown. A step is the
 displacement from one frame to the next. The unknowns are the turns φ = α̂ − α of the steps, so l̂ = l(0) + Σ R(φ) step,
@@ -159,7 +160,8 @@ def bending_problem(
 
 
 def headings(path: Float64[Tensor, "time 2"]) -> Float64[Tensor, "step"]:
-    """Heading α of each step (rad, within ±π; atan2 of eq. 5.1); a step of zero length takes that of the last moving step."""
+    """Heading α of each step (rad, within ±π; atan2 of eq. 5.1); a step of zero length takes that of the last moving
+    step."""
     step = path.diff(dim=0)[_leaders(path)]
     return torch.atan2(step[:, 1], step[:, 0])
 
@@ -228,7 +230,8 @@ def bent_path(
 
 
 def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: float = 1e-2) -> BentPath:
-    """The thesis's solver (§5.4.2), Adam with a learning rate in rad and m. Returns the best state of all iterations."""
+    """The thesis's solver (§5.4.2), Adam with a learning rate in rad and m. Returns the best state of all
+    iterations."""
     turn = torch.zeros(len(problem.leader), dtype=torch.float64, requires_grad=True)
     shift = torch.zeros(2, dtype=torch.float64, requires_grad=problem.settings.free_start)
     unknowns = [value for value in (turn, shift) if value.requires_grad]

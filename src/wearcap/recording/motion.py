@@ -16,7 +16,8 @@ from wearcap.recording.interactions import Interactions
 
 @dataclass(frozen=True)
 class Motion:
-    """A body's motion: timestamps (s), rotation of each joint relative to its parent (root: world), root position (m)."""
+    """A body's motion: timestamps (s), rotation of each joint relative to its parent (root: world), root position
+    (m)."""
 
     timestamps: Float64[Tensor, "time"]
     skeleton: Skeleton

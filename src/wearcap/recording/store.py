@@ -56,7 +56,8 @@ class RecordingFile:
     """
 
     def __init__(self, path: str | Path, *, verify: bool = True):
-        """Open a file. Raises WearcapError when it is missing, damaged, no recording, or differs from the manifest's."""
+        """Open a file. Raises WearcapError when it is missing, damaged, no recording, or differs from the
+        manifest's."""
         self.path = Path(path)
         if verify:
             _verify(self.path)

@@ -17,7 +17,8 @@ PROBABILITIES = ("contact_prob", "hand_contact_prob", "body_contact_prob")
 
 
 def resampled(motion: Motion, fps: float | int) -> Motion:
-    """Resample a motion to `fps`: every n-th frame if the rates divide, else slerp (rotations) and lerp (root, contacts).
+    """Resample a motion to `fps`: every n-th frame if the rates divide, else slerp (rotations) and lerp (root,
+    contacts).
 
     Object trajectories keep their own timestamps.
     """

@@ -135,7 +135,8 @@ class MapLocalization:
         return own
 
     def reads(self, recording: Recording, folder: Path) -> list[Any]:
-        """Inputs that determine the result, for its cache key. Raises WearcapError without localisation and map, or images."""
+        """Inputs that determine the result, for its cache key. Raises WearcapError without localisation and map, or
+        images."""
         file, stream = self.map_file(recording, folder), recording.camera
         if file is None or stream is None:
             return [recording.localization]

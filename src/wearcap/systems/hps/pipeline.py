@@ -51,7 +51,8 @@ class Evidence:
     """Largest speed (m/s, in the suit's own motion) at which a foot patch's contact flag is used; None: all flags are
     used (thesis)."""
     confident: bool = True
-    """Whether frames are weighted by the localisation's confidence (0 where it failed); False: all frames alike (thesis)."""
+    """Whether frames are weighted by the localisation's confidence (0 where it failed); False: all frames alike
+    (thesis)."""
 
 
 @dataclass(eq=False)
@@ -68,7 +69,8 @@ class HPS:
     localization: Localize = field(default_factory=MapLocalization)
 
     def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
-        """Return the wearer's motion in the scene at `fps`; `folder` is the data set's. Raises WearcapError as `stages`."""
+        """Return the wearer's motion in the scene at `fps`; `folder` is the data set's. Raises WearcapError as
+        `stages`."""
         source = Source(recording, folder, scan)
         results, _ = run_stages(self.stages(source))
         return self.motion(results["initialize"], results["optimize"])
@@ -138,12 +140,14 @@ class HPS:
         return self.localization(recording, folder)
 
     def align(self, recording: Recording) -> Motion:
-        """Resample the suit's motion to `fps`, rotate it about gravity and move it into the scene (thesis eq. 4.14, 4.15)."""
+        """Resample the suit's motion to `fps`, rotate it about gravity and move it into the scene (thesis eq. 4.14,
+        4.15)."""
         suit, localization, T_head_cam = required(recording)
         return align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
 
     def initialize(self, recording: Recording, aligned: Motion) -> Initialization:
-        """Initial state of the optimisation: the suit's pose moved along the camera's path (thesis §4.2.5, eq. 4.13)."""
+        """Initial state of the optimisation: the suit's pose moved along the camera's path (thesis §4.2.5, eq.
+        4.13)."""
         _, localization, T_head_cam = required(recording)
         return initialize(aligned, localization, T_head_cam.R, T_head_cam.t, self.initialization)
 

@@ -19,7 +19,8 @@ from wearcap.systems.hps.pipeline import HPS
 
 
 class HpsValidation(Callback):
-    """Captures recordings with HPS every n-th validation epoch; logs root error, foot-to-scan distance, localised share.
+    """Captures recordings with HPS every n-th validation epoch; logs root error, foot-to-scan distance, localised
+    share.
 
     HPS has no network of its own: `localizer` builds its localisation step from the module in training, such as
     `MapLocalization` with that module as extractor and a map built with the same weights.

@@ -37,7 +37,8 @@ class AttachmentSettings:
     """Longest approach and retreat (s) at an interval's beginning and end, cut off where the hands are slowest; 0: none
     is cut off (thesis)."""
     keep_object: bool = True
-    """Whether the object stays the same when hands join or leave without a pause; False: it is searched again (thesis)."""
+    """Whether the object stays the same when hands join or leave without a pause; False: it is searched again
+    (thesis)."""
 
     def __post_init__(self):
         if self.anchor not in ANCHORS or not self.reach_m > 0:

@@ -96,7 +96,8 @@ class ContactStream:
         return done + self._closed(self._count)
 
     def _decided(self, now_s: float) -> list[ContactInterval]:
-        """Process frames that no later contact can change: every hand is in contact, or was released longer than the gap ago."""
+        """Process frames that no later contact can change: every hand is in contact, or was released longer than the
+        gap ago."""
         done = []
         while self._undecided:
             number, time, contact = self._undecided[0]

@@ -35,7 +35,8 @@ class PoseFeatures(Protocol):
 
 @dataclass(frozen=True)
 class SmplAngles:
-    """The thesis's input: axis-angle vectors of SMPL's 23 body joints (69), in SMPL's own axes (x left, y up, z forward).
+    """The thesis's input: axis-angle vectors of SMPL's 23 body joints (69), in SMPL's own axes (x left, y up, z
+    forward).
 
     With `fingers`, SMPL+H's 21 body joints, six zeros in place of SMPL's two hand joints, and 30 finger joints (159).
     """
@@ -83,7 +84,8 @@ class HandViews:
         return self.encode(torch.eye(3).expand(len(self.skeleton), 3, 3)).shape[-1]
 
     def encode(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch feature"]:
-        """Encode poses of `skeleton`: the left hand's view (its side, the other side, the middle), then the right hand's."""
+        """Encode poses of `skeleton`: the left hand's view (its side, the other side, the middle), then the right
+        hand's."""
         sides, middle = self._seen(R_parent_joint)
         mirror = lambda x, signs: x * x.new_tensor(signs)  # noqa: E731
         own, other = sides.unbind(-2)
@@ -119,7 +121,8 @@ FEATURES = {cls.__name__: cls for cls in (SmplAngles, HandViews)}
 
 
 def worn(source: Skeleton, target: Skeleton) -> Skeleton:
-    """Skeleton into which `in_skeleton` retargets a source's poses: `target` in the wearer's size, or `target` itself if
+    """Skeleton into which `in_skeleton` retargets a source's poses: `target` in the wearer's size, or `target`
+    itself if
     the joints are the same."""
     return target if source.joint_names == target.joint_names else fit_offsets(source, target)
 

@@ -65,7 +65,8 @@ class ObjectTracker:
     """Correction of the arms (ours); None: only the whole body is moved."""
 
     def __call__(self, registered: Motion, contacts: dict[str, Tensor], environment: Environment) -> Motion:
-        """Return the corrected motion with `object_motion`, `interactions` and `hand_contact_prob`, at the contacts' frames.
+        """Return the corrected motion with `object_motion`, `interactions` and `hand_contact_prob`, at the contacts'
+        frames.
 
         `contacts` has probabilities "time hand" by class, and their "timestamps".
         """

@@ -39,12 +39,14 @@ class IReplica:
     name: str = "ireplica"
 
     def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
-        """Return the wearer's motion with `object_motion` and `interactions` at `fps`. Raises WearcapError as `stages`."""
+        """Return the wearer's motion with `object_motion` and `interactions` at `fps`. Raises WearcapError as
+        `stages`."""
         results, _ = run_stages(self.stages(Source(recording, folder, scan)))
         return results["interact"]
 
     def stages(self, source: Source) -> list[Stage]:
-        """The registration's stages, then `contacts` and `interact`. Raises WearcapError as those, and without environment."""
+        """The registration's stages, then `contacts` and `interact`. Raises WearcapError as those, and without
+        environment."""
         environment = read_environment(self.environment_file(source))
         suit = source.recording.suit
         before = self.registration.stages(source)

@@ -1,4 +1,5 @@
-"""Baselines of iReplica (thesis §5.4.3): static objects, objects interpolated between true poses, contact by proximity."""
+"""Baselines of iReplica (thesis §5.4.3): static objects, objects interpolated between true poses, contact by
+proximity."""
 
 from dataclasses import replace
 

@@ -1,4 +1,5 @@
-"""Refinement of contact intervals (ours): cuts off approach and retreat, as a hand is at rest when it takes and releases.
+"""Refinement of contact intervals (ours): cuts off approach and retreat, as a hand is at rest when it takes and
+releases.
 
 The networks report contact during the approach to an object and the retreat from it too: some tenths of a second in
 which the object would follow hands that do not hold it.
