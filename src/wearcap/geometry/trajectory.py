@@ -182,8 +182,7 @@ def outlier_mask(trajectory: Trajectory, max_speed: float) -> Bool[Tensor, "time
 
 def _agreeing(position: Tensor, time: Tensor, valid: Tensor, candidate: Tensor, max_speed: float) -> Tensor:
     """Candidates, from first to last, that are near enough to the next valid frame and to the previous one, which
-    may be
-    a candidate that was just accepted."""
+    may be a candidate that was just accepted."""
     kept, frame = valid.nonzero()[:, 0], candidate.nonzero()[:, 0]
     if not len(kept):
         return frame[:0]

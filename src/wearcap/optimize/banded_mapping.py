@@ -43,8 +43,7 @@ def _fill_trunk(j, theta, body, frames, kin, forms, diagonal, gradient):
 @compiled
 def spine_form(theta, body, frames, kin, j):
     """((J Jᵀ)⁻¹, J d): J is the head rotation's Jacobian (world axes) in the spine's axis-angles, d their deviation
-    from
-    the suit's."""
+    from the suit's."""
     gram, turn = np.zeros((3, 3)), np.zeros(3)
     for joint in body.head_chain:
         J = kin.axes[j, joint]

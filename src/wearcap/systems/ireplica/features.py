@@ -122,8 +122,7 @@ FEATURES = {cls.__name__: cls for cls in (SmplAngles, HandViews)}
 
 def worn(source: Skeleton, target: Skeleton) -> Skeleton:
     """Skeleton into which `in_skeleton` retargets a source's poses: `target` in the wearer's size, or `target`
-    itself if
-    the joints are the same."""
+    itself if the joints are the same."""
     return target if source.joint_names == target.joint_names else fit_offsets(source, target)
 
 
