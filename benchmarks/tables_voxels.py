@@ -22,7 +22,7 @@ from torch import Tensor
 from wearcap.data.place_codes import PlaceCodes
 from wearcap.data.windows import Source
 from wearcap.files import write_text
-from wearcap.metrics.occupancy import distance_mae_cm, held_distance_mae_cm, occupancy_iou
+from wearcap.metrics.occupancy import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.systems.hmd2.point_codes_windows import PlaceDataset
 from wearcap.viewer.picture import save_png
@@ -76,7 +76,7 @@ def scored(rebuild: Rebuild, val: Tensor, test: Tensor, clip_m: float) -> dict[s
     rebuilt = rebuild(test).clamp(0, clip_m)
     return {
         "distance_cm": distance_mae_cm(rebuilt, test).item(),
-        "held_distance_cm": held_distance_mae_cm(rebuilt, test, clip_m).item(),
+        "held_distance_cm": occupied_distance_mae_cm(rebuilt, test, clip_m).item(),
         "occupancy_iou": occupancy_iou(rebuilt, test, clip_m, border).item(),
     }
 

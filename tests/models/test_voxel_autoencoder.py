@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.metrics.occupancy import distance_mae_cm, held_distance_mae_cm, occupancy_iou
+from wearcap.metrics.occupancy import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.scene.voxels import VoxelGrid
 
@@ -79,7 +79,7 @@ def test_it_learns(layers, steps, share):
     if layers == "sparse":
         rebuilt = net.decode(net.encode(grids)).detach()
         assert occupancy_iou(rebuilt, grids, 0.1) > 0.5
-        assert held_distance_mae_cm(rebuilt, grids, 0.1) < 3
+        assert occupied_distance_mae_cm(rebuilt, grids, 0.1) < 3
 
 
 def test_other_grids():
@@ -105,5 +105,5 @@ def test_scores_of_grids():
     assert occupancy_iou(rebuilt, true, 0.1) == pytest.approx(1 / 3)
     assert occupancy_iou(rebuilt, true, 0.1, border_m=0.04) == 0
     assert distance_mae_cm(rebuilt, true) == pytest.approx((8 + 3 + 5) / 54)
-    assert held_distance_mae_cm(rebuilt, true, 0.1) == pytest.approx((8 + 3) / 2)
+    assert occupied_distance_mae_cm(rebuilt, true, 0.1) == pytest.approx((8 + 3) / 2)
     assert occupancy_iou(rebuilt.half().float(), rebuilt, 0.1) == 1

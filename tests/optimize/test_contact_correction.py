@@ -16,7 +16,7 @@ from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
 
 FPS = 60
-BEND = functools.partial(bend, settings=Bending(0.003, held_headings=True), solver=bend_banded)
+BEND = functools.partial(bend, settings=Bending(0.003, clamped_ends=True), solver=bend_banded)
 
 
 def times(count: int) -> torch.Tensor:

@@ -34,7 +34,7 @@ VARIANTS = {
     "huber": Bending(30.0, loss=Loss("huber", 0.1)),
     "cauchy": Bending(30.0, loss=Loss("cauchy", 0.1)),
     "squares": Bending(30.0, loss=Loss("square")),
-    "held": Bending(30.0, held_headings=True, free_start=True),
+    "held": Bending(30.0, clamped_ends=True, free_start=True),
 }
 
 
@@ -254,7 +254,7 @@ def test_the_closed_form_is_the_limit_of_the_solver():
     for size in (1e-4, 0.03):
         points = ends + size * torch.tensor([[0.6, -0.8], [0.0, 0.0]]).double()
         problem = bending_problem(
-            path, timestamps, times, points, None, Bending(1e-8, held_headings=True, loss=Loss("square"))
+            path, timestamps, times, points, None, Bending(1e-8, clamped_ends=True, loss=Loss("square"))
         )
         ours = bend_banded(problem, iterations=100, tolerance=0.0)
         closed = bend_closed(problem)
@@ -268,11 +268,11 @@ def test_the_closed_form_is_the_limit_of_the_solver():
 def test_the_closed_form_says_what_it_cannot_do():
     timestamps = torch.arange(50).double() / 30
     path = torch.stack([timestamps, torch.zeros(50)], -1).double()
-    held = Bending(held_headings=True)
+    held = Bending(clamped_ends=True)
     problem = bending_problem(path, timestamps, timestamps[[20, -1]], path[[25, -1]], None, held)
     with pytest.raises(WearcapError, match="out of reach"):
         bend_closed(problem)
-    with pytest.raises(WearcapError, match="held_headings"):
+    with pytest.raises(WearcapError, match="clamped_ends"):
         bend_closed(bending_problem(path, timestamps, timestamps[[20]], path[[25]], None, Bending()))
 
 
@@ -281,7 +281,7 @@ def test_degenerate_paths(solver):
     timestamps = torch.arange(5).double()
     still, walk = torch.ones(5, 2), torch.arange(10.0).reshape(5, 2)
     for free in (False, True):
-        settings = Bending(free_start=free, held_headings=free)
+        settings = Bending(free_start=free, clamped_ends=free)
         unheld = bend(walk, timestamps, timestamps[:0], walk[:0], settings=settings, solver=solver)
         torch.testing.assert_close(unheld.path, walk.double(), rtol=0.0, atol=1e-6)
         stands = bend(still, timestamps, timestamps[1:2], still[:1] + 3, settings=settings, solver=solver)

@@ -56,7 +56,7 @@ def test_frame_by_frame_gives_the_same_as_all_at_once(seed, gap_s):
     stream, found = ContactStream(settings), []
     for row, time in zip(prob, stamps.tolist()):
         found += stream.push(row, time)
-        assert len(stream._waiting) <= 2 + (gap_s + 0.05) * 60
+        assert len(stream._undecided) <= 2 + (gap_s + 0.05) * 60
     assert found + stream.flush() == contact_intervals(active(prob, stamps, settings))
 
 

@@ -314,7 +314,7 @@ def test_the_documents_correction_runs_on_the_same_contacts(scene):
     off = replace(motion, t_world_root=motion.t_world_root + torch.tensor([0.0, -0.25, 0.0]))
     contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
     correction = BendCorrection(
-        partial(bend, settings=Bending(rigidity=1.0, held_headings=True), solver=bend_banded)
+        partial(bend, settings=Bending(rigidity=1.0, clamped_ends=True), solver=bend_banded)
     )
     captured = replace(tracker(), correction=correction)(off, contacts, environment)
     assert held_of(captured).objects == ("near",)

@@ -1,5 +1,5 @@
 """Rotations, rigid transforms, cameras, trajectories, distances and the software renderer.
 
-Open `rotation.py`, `rigid.py` and `trajectory.py` first: everything else is said in them. `render.py` is the
-renderer, `raster.py` its loops.
+Open `rotation.py`, `rigid.py` and `trajectory.py` first: the rest builds on them. `render.py` is the renderer,
+`raster.py` its compiled loops.
 """

@@ -1,6 +1,6 @@
-"""Camera models: points in the camera's axes (OpenCV: x right, y down, z forward) to pixels and back.
+"""Camera models: projection of points in camera axes (OpenCV: x right, y down, z forward) to pixels, and its inverse.
 
-Every model draws a point as `focal * lens(m) + centre`. The plane coordinates m are (x/z, y/z) for "pinhole" and
+Every model projects a point to `focal * lens(m) + centre`. The plane coordinates m are (x/z, y/z) for "pinhole" and
 "opencv", and the direction's angle θ from the optical axis along (x, y) for the fisheyes.
 """
 
@@ -58,11 +58,11 @@ class Camera:
 
     @property
     def is_fisheye(self) -> bool:
-        """True where the model draws angles, so that points beside and behind the lens may be seen."""
+        """Whether the model projects angles, so that points beside and behind the lens may be visible."""
         return self.model == "ocam" or self.model.startswith("fisheye")
 
     def scaled(self, width: int, height: int) -> "Camera":
-        """The same camera after its image was resized to width x height pixels."""
+        """The camera for images resized to width x height pixels."""
         x, y = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y,
@@ -72,9 +72,9 @@ class Camera:
     def project(
         self, points_cam: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
-        """Pixels (x, y) of points, and where they are valid: before the lens, within its monotone range, in the image.
+        """Pixels (x, y) of points, and a mask of valid ones: in front of the lens, in its monotone range, in the image.
 
-        Differentiable in the points. Pixels that are not valid are finite, and mean nothing.
+        Differentiable in the points. Invalid pixels are finite but meaningless.
         """
         plane, seen = self._to_plane(points_cam)
         distorted, _ = self._lens(plane)
@@ -84,9 +84,9 @@ class Camera:
         return pixels, seen & inside
 
     def unproject(self, pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
-        """Unit rays of pixels in the camera's axes; NaN where the lens maps no direction there.
+        """Unit rays of pixels in camera axes; NaN where the lens maps no direction to a pixel.
 
-        Newton's method on the lens; differentiable in the pixels (the derivative is the inverse lens's own).
+        Newton's method on the lens; differentiable in the pixels (with the exact derivative of the inverse).
         """
         target = (pixels - pixels.new_tensor([self.cx, self.cy])) / pixels.new_tensor([self.fx, self.fy])
         plane = target
@@ -100,7 +100,7 @@ class Camera:
         return self._from_plane(plane)
 
     def _to_plane(self, points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
-        """Plane coordinates and which points the lens can see at all."""
+        """Plane coordinates of points, and a mask of those within the lens's field of view."""
         xy, z = points[..., :2], points[..., 2]
         if not self.is_fisheye:
             ahead = z > 1e-6
@@ -155,7 +155,7 @@ class Camera:
 
     @cached_property
     def _fold(self) -> float:
-        """Square of the largest undistorted radius (or angle) up to which the radial polynomial still rises."""
+        """Square of the largest undistorted radius (or angle) up to which the radial polynomial is increasing."""
         if self.model == "ocam":
             slope = [1.0, *((i + 2) * k for i, k in enumerate(self.distortion[3:]))]
         else:
@@ -167,7 +167,7 @@ class Camera:
         return min([math.pi**2 if self.is_fisheye else math.inf, *rising])
 
     def _invert_lens(self, target: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
-        """Plane coordinates that the lens maps onto `target`, and where they were found."""
+        """Plane coordinates that the lens maps to `target`, and a mask of convergence."""
         limit = min(0.999 * math.sqrt(self._fold), 1e3)
         plane = target
         for _ in range(25):

@@ -7,10 +7,10 @@ import numba
 
 
 def compiled(function: Callable) -> Callable:
-    """Compile a function of arrays and numbers; it releases the GIL, and is kept on disk where a cache can be.
+    """Compile a function of arrays and numbers; it releases the GIL and is cached on disk where possible.
 
-    Kernels that call one another belong in one file: numba renews its cache when that file changes. Their
-    arguments are not annotated: a shape checker's wrapper cannot be compiled and is taken off here.
+    Kernels that call one another belong in one file: numba invalidates its cache when that file changes. Their
+    arguments are not annotated: a shape checker's wrapper cannot be compiled and is removed here.
     """
     plain = inspect.unwrap(function)
     try:

@@ -1,4 +1,4 @@
-"""Triangle meshes as plain arrays, and the few solids that pictures and simulated rooms are made of."""
+"""Triangle meshes as plain arrays, and primitives for pictures and simulated rooms."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -82,14 +82,14 @@ def draw_projected(pixels, vertex_nearness, valid, faces, nearness, index):
 
 
 _BULGE = 4.0
-"""Depth of a splat's rim behind its centre in radii: at a slant of 45° a point's image then shifts by 1/8 radius."""
+"""Depth of a splat's rim behind its centre, in radii; at a slant of 45° a point's image then shifts by 1/8 radius."""
 
 
 @compiled
 def project_point(x, y, z, lens):
-    """Pixel of a point in the camera's axes, and its nearness: 1/z, for angle-drawing lenses 1/distance; 0 if unseen.
+    """Pixel of a point in camera axes, and its nearness: 1/z, for fisheyes 1/distance; 0 if not visible.
 
-    `lens` is laid out as `geometry.splats.lens_numbers` says. Pixels may lie outside the picture.
+    `lens` is laid out as in `geometry.splats.lens_numbers`. Pixels may be outside the image.
     """
     square = x * x + y * y
     if lens[0] == 0.0:  # plane coordinates x/z, y/z
@@ -239,9 +239,9 @@ def _key_visibility(x, y, z, axes, scale, shadow, shadow_high, shadow_low):
 
 @compiled
 def _contact_shade(x, y, z, axes, scale, contact, fade):
-    """Part (0…1) of the sky that a thing close above an upward surface hides: darkest where they touch.
+    """Fraction (0…1) of the sky occluded by geometry close above an upward surface: largest where they touch.
 
-    `contact` holds exp(height / fade) of the surfaces seen from beneath, blurred; rows 3-5 of `axes` place it.
+    `contact` holds exp(height / fade) of the surfaces seen from below, blurred; rows 3-5 of `axes` place it.
     """
     u = (axes[3, 0] * x + axes[3, 1] * y + axes[3, 2] * z + axes[3, 3]) * scale
     v = (axes[4, 0] * x + axes[4, 1] * y + axes[4, 2] * z + axes[4, 3]) * scale

@@ -1,6 +1,6 @@
-"""The one software renderer: triangles and splats through a z-buffer to colour, depth and index pictures.
+"""The software renderer: triangles and splats through a z-buffer to colour, depth and index images.
 
-Pictures, simulated cameras, visibility tests and point maps share it. Triangles are exact through a pinhole
+Pictures, simulated cameras, visibility tests and point maps use it. Triangles are exact through a pinhole
 camera; through other lenses their edges are straight between projected corners, so large ones want subdividing.
 """
 
@@ -27,7 +27,7 @@ class Splats:
     points: Float32[np.ndarray, "point 3"]
     color: Float32[np.ndarray, "point 3"] | Float32[np.ndarray, "3"]
     radius: float = 1.0
-    """In pixels, or in metres where `metric`. A disc always covers the pixel nearest to its centre."""
+    """Radius in pixels, or in metres if `metric`. A disc always covers the pixel nearest to its centre."""
     metric: bool = False
 
 
@@ -50,14 +50,14 @@ class Frame:
 
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float32[np.ndarray, "height width"]
-    """Along the optical axis (m), for fisheyes along the ray; infinite where nothing is."""
+    """Depth along the optical axis (m), for fisheyes along the ray; infinite where nothing is visible."""
     index: Int32[np.ndarray, "height width"]
-    """What is seen: faces of all meshes in their order, then points of all splats; -1 where nothing is."""
+    """Index of the visible primitive: faces of all meshes in order, then points of all splats; -1 where none is."""
     face_count: int
 
     @property
     def point_index(self) -> Int32[np.ndarray, "height width"]:
-        """Number of the splat point seen in each pixel; -1 elsewhere."""
+        """Index of the splat point visible in each pixel; -1 elsewhere."""
         return np.where(self.index >= self.face_count, self.index - self.face_count, -1).astype(np.int32)
 
 
@@ -71,7 +71,7 @@ def render(
     background: Float32[np.ndarray, "height 3"] | tuple[float, float, float] = (1.0, 1.0, 1.0),
     supersample: int = 1,
 ) -> Frame:
-    """Draw meshes and splats as the camera at T_world_cam (no batch axes) sees them.
+    """Render meshes and splats for a camera at T_world_cam (no batch axes).
 
     `background`: RGB 0…1, one or per row. `supersample` n averages n x n samples per pixel; depth and index are
     then those of the nearest sample.
@@ -173,7 +173,7 @@ def _point_colors(splats: Sequence[Splats]) -> np.ndarray:
 
 
 def _project(camera: Camera, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels, nearness and which points may be drawn, some way outside the picture too."""
+    """Pixels and nearness of points, and a mask of drawable ones, including a margin outside the image."""
     wide = Camera(
         camera.model, 3 * camera.width, 3 * camera.height, camera.fx, camera.fy,
         camera.cx + camera.width, camera.cy + camera.height, camera.distortion,
@@ -224,7 +224,7 @@ def _shadow_maps(scene: _Scene, light: Light) -> tuple:
 def _resolve(
     camera, fine, R, t, vertices_cam, scene, point_colors, light, background, nearness, index
 ) -> Frame:
-    """Shade what the z-buffer holds, at the picture's own size."""
+    """Shade the z-buffer's samples at the image's own size."""
     to_light = np.asarray(light.to_light, float) / np.linalg.norm(light.to_light)
     shine = np.array([*to_light, light.key, light.ambient_below, light.ambient_above])
     axes, scale, *maps = _shadow_maps(scene, light)

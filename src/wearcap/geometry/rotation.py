@@ -1,4 +1,4 @@
-"""Rotations: matrices in computation, 6D into networks, quaternions and axis-angle only at the doors.
+"""Rotations: matrices in computation, 6D into networks, quaternions and axis-angle only at interfaces.
 
 Every function is batched over leading axes and differentiable, at the identity and near π too (RoMa).
 """
@@ -41,15 +41,15 @@ def matrix_from_quat_wxyz(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor,
 
 
 def quat_wxyz_from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternion, scalar first and not negative."""
+    """Unit quaternion with a non-negative scalar part, scalar first."""
     wxyz = roma.rotmat_to_unitquat(R).roll(1, dims=-1)
     return torch.where(wxyz[..., :1] < 0, -wxyz, wxyz)
 
 
 def geodesic(R_a: Float[Tensor, "*batch 3 3"], R_b: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-    """Angle between two rotations (rad, 0…π): precise, and its gradient finite, where they agree and at π too."""
+    """Angle between two rotations (rad, 0…π), accurate and with finite gradient at 0 and π too."""
     turn = R_a.transpose(-1, -2) @ R_b
-    # sin and cos of the angle; acos or asin of one alone loses half the digits at one end
+    # atan2 of sine and cosine; acos or asin alone loses half the digits at one end
     axis = torch.stack([turn[..., i, j] - turn[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
     return torch.atan2(axis.norm(dim=-1), turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
 
@@ -67,8 +67,8 @@ def about_axis(axis: str, angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*bat
 def yaw_of(R_world_body: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
     """Heading (rad) about the vertical: direction in which the body's x axis points.
 
-    Where x is nearly vertical (|x_z| > 0.9: looking straight up or down) the body's z axis, which then
-    points along or against the heading, decides; so a head that bends down keeps its heading.
+    Where x is nearly vertical (|x_z| > 0.9: looking straight up or down) the body's z axis is used, which then points
+    along or against the heading; so a head that bends down keeps its heading.
     """
     forward, up = R_world_body[..., 0], R_world_body[..., 2]
     steep = forward[..., 2:].abs() > 0.9

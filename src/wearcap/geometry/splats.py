@@ -1,6 +1,6 @@
-"""Clouds drawn as discs of one size: what maps, simulated cameras and pictures see of a scan.
+"""Point clouds rendered as discs of one size, for maps, simulated cameras and pictures of a scan.
 
-A cloud is cut once into blocks of neighbouring points, so that a camera passes over what it cannot see.
+A cloud is cut once into blocks of neighbouring points, so that blocks outside a camera's view are culled.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class SplatCloud:
     points: Float32[np.ndarray, "point 3"]
     """Ordered by block."""
     order: Int32[np.ndarray, "point"]
-    """Number in the original cloud of each of `points`."""
+    """Index of each of `points` in the original cloud."""
     first: Int64[np.ndarray, "edge"]
     """Block b holds points first[b] … first[b + 1] - 1."""
     centers: Float64[np.ndarray, "block 3"]
@@ -56,7 +56,8 @@ class SplatCloud:
     def draw(
         self, camera: Camera, T_world_cam: Rigid, radius_m: float
     ) -> tuple[Int32[np.ndarray, "height width"], Float32[np.ndarray, "height width"]]:
-        """Number (in the original cloud) and depth (m) of the point seen in each pixel; -1 and infinity where none.
+        """Index (in the original cloud) and depth (m) of the point visible in each pixel; -1 and infinity where none
+        is.
 
         Depth is the point's own, along the optical axis, for fisheyes along the ray.
         """
@@ -150,7 +151,7 @@ def _spread(value):
 
 @compiled
 def _curve(points, low, cell):
-    """Place of each point along a Z-order curve."""
+    """Position of each point along a Z-order curve."""
     code = np.empty(len(points), np.int64)
     for number in range(len(points)):
         total = np.int64(0)

@@ -1,7 +1,7 @@
 """Nearest points and local planes of a large point cloud: a hashed grid, searched by compiled loops.
 
-A cloud of a scene has tens of millions of points and is asked about feet millions of times: cells of a few
-points make that less than a microsecond each, where a KD-tree takes some ten.
+A scene's cloud has tens of millions of points and is queried millions of times for feet: with cells of a few points a
+query takes less than a microsecond, against about ten with a KD-tree.
 """
 
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ _EMPTY = np.int64(-1)
 
 @dataclass(frozen=True, eq=False)
 class SurfaceIndex:
-    """A cloud in cells. Build it with `SurfaceIndex.build`."""
+    """A point cloud sorted into grid cells. Build it with `SurfaceIndex.build`."""
 
     points: Float32[np.ndarray, "point 3"]
     """Ordered by cell."""
     order: Int64[np.ndarray, "point"]
-    """Number in the original cloud of each of `points`."""
+    """Index of each of `points` in the original cloud."""
     cell_m: float
     origin: Float64[np.ndarray, "3"]
     keys: Int64[np.ndarray, "slot"]
@@ -56,7 +56,7 @@ class SurfaceIndex:
     def nearest(
         self, queries: Float64[np.ndarray, "query 3"], reach_m: float = 0.5
     ) -> tuple[Float64[np.ndarray, "query"], Int64[np.ndarray, "query"]]:
-        """Distance (m) to the nearest point and its number in the cloud; infinity and -1 beyond `reach_m`."""
+        """Distance (m) to the nearest point and its index in the cloud; infinity and -1 beyond `reach_m`."""
         distance, index = np.empty(len(queries)), np.empty(len(queries), np.int64)
         _nearest_all(queries, reach_m, *self._grid, distance, index)
         return distance, np.where(index >= 0, self.order[index], -1)
@@ -64,7 +64,7 @@ class SurfaceIndex:
     def nearest_points(
         self, queries: Float64[np.ndarray, "query 3"], reach_m: float = 0.5
     ) -> Float64[np.ndarray, "query 3"]:
-        """The nearest point itself (m); NaN beyond `reach_m`."""
+        """Position of the nearest point (m); NaN beyond `reach_m`."""
         distance, index = np.empty(len(queries)), np.empty(len(queries), np.int64)
         _nearest_all(queries, reach_m, *self._grid, distance, index)
         return np.where(index[:, None] >= 0, self.points[index], np.nan).astype(np.float64)
@@ -72,10 +72,10 @@ class SurfaceIndex:
     def plane(
         self, queries: Float64[np.ndarray, "query 3"], radius_m: float = 0.06, reach_m: float = 0.5
     ) -> tuple[Float64[np.ndarray, "query 3"], Float64[np.ndarray, "query 3"]]:
-        """Local plane of the surface beside each query: a point on it, and its normal, which looks upwards.
+        """Local plane of the surface near each query: a point on it, and its upward normal.
 
-        The plane of least squares through the points within `radius_m` of the nearest one, each weighing less
-        the further it is; NaN where the nearest is beyond `reach_m` or fewer than six are there.
+        Weighted least squares over the points within `radius_m` of the nearest one, with weights falling with distance;
+        NaN where the nearest point is beyond `reach_m` or fewer than six points are found.
         """
         origin, normal = np.empty_like(queries), np.empty_like(queries)
         _plane_all(queries, radius_m, reach_m, *self._grid, origin, normal)
@@ -97,7 +97,7 @@ def _pack(points: np.ndarray, origin: np.ndarray, cell_m: float) -> Int64[np.nda
 
 @compiled
 def _slot(key, slots):
-    """Where a key's search begins: its bits mixed (multiplicative hashing)."""
+    """First slot of a key's search (multiplicative hashing)."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64((mixed ^ (mixed >> np.uint64(29))) & np.uint64(slots - 1))
 
@@ -127,7 +127,7 @@ def _find(x, y, z, keys):
 
 @compiled
 def nearest_point(px, py, pz, reach, points, cell_m, origin, keys, first, count):
-    """(squared distance, row) of the nearest point within reach, (inf, -1) where none is: shell after shell."""
+    """(squared distance, row) of the nearest point within reach, else (inf, -1); searches shells of cells outwards."""
     ux, uy, uz = (px - origin[0]) / cell_m, (py - origin[1]) / cell_m, (pz - origin[2]) / cell_m
     cx, cy, cz = int(np.floor(ux)), int(np.floor(uy)), int(np.floor(uz))
     inner = min(ux - cx, cx + 1 - ux, uy - cy, cy + 1 - uy, uz - cz, cz + 1 - uz) * cell_m

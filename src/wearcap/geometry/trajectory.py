@@ -65,7 +65,7 @@ def interpolate(
     value: Float[Tensor, "time *rest"],
     at: Float64[Tensor, "new_time"],
 ) -> Float[Tensor, "new_time *rest"]:
-    """Values at other times, linearly between frames. Times outside are refused as in `resample`."""
+    """Values at other times, by linear interpolation. Raises WearcapError for times outside, as `resample`."""
     before, after, blend = _brackets(timestamps, at)
     blend = blend.to(value.dtype).reshape(-1, *[1] * (value.ndim - 1))
     return torch.lerp(value[before], value[after], blend)
@@ -74,7 +74,7 @@ def interpolate(
 def interpolate_clamped(
     timestamps: Float64[Tensor, "time"], value: Float[Tensor, "time"], at: Float64[Tensor, "new_time"]
 ) -> Float[Tensor, "new_time"]:
-    """Values at any times, linearly between frames; beyond the ends they are those of the ends."""
+    """Values at any times, by linear interpolation; beyond the ends they are constant."""
     if len(timestamps) == 1:
         return value.expand(len(at)).clone()
     right = torch.searchsorted(timestamps, at).clamp(1, len(timestamps) - 1)
@@ -85,14 +85,14 @@ def interpolate_clamped(
 def nearest_frames(
     timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "new_time"]
 ) -> Int64[Tensor, "new_time"]:
-    """The frame that is nearest to each of some times, however far away it is."""
+    """Index of the frame nearest to each time, at any distance."""
     return torch.searchsorted((timestamps[1:] + timestamps[:-1]) / 2, at.contiguous())
 
 
 def resample(trajectory: Trajectory, timestamps: Float64[Tensor, "new_time"]) -> Trajectory:
     """Poses at other times: linear in translation, slerp in rotation.
 
-    The end poses are held for up to one median frame step outside the trajectory; times further outside, and
+    The end poses are extended by up to one median frame step outside the trajectory; times further outside, and
     timestamps that do not rise, raise WearcapError.
     """
     return _resampled(trajectory, timestamps, _brackets(trajectory.timestamps, timestamps))
@@ -153,12 +153,12 @@ def _central(trajectory: Trajectory) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def outlier_mask(trajectory: Trajectory, max_speed: float) -> Bool[Tensor, "time"]:
-    """Valid frames: no two neighbouring valid frames are further apart than `max_speed` (m/s) allows.
+    """Mask of valid frames: neighbouring valid frames are at most as far apart as `max_speed` (m/s) allows.
 
-    Where the speed is exceeded the track is cut; a piece not longer than the pieces beside it is dropped, its
-    neighbours are joined, and so on until no cut is left; then dropped frames that agree with their valid
-    neighbours come back (thesis §4, initialisation, 3 m/s). A block of wrong positions thus falls as a whole
-    and takes no good neighbour along. Frames with positions that are not finite are never valid.
+    The track is cut where the speed is exceeded. Pieces not longer than their neighbouring pieces are dropped, the
+    neighbours are joined, and this repeats until no cut is left; then dropped frames that agree with their valid
+    neighbours are restored (thesis §4, initialisation, 3 m/s). A block of wrong positions is thus dropped as a whole
+    without good neighbours. Frames with positions that are not finite are never valid.
     """
     require_rising(trajectory.timestamps)
     position, time = trajectory.t_world_body.double(), trajectory.timestamps
@@ -181,15 +181,15 @@ def outlier_mask(trajectory: Trajectory, max_speed: float) -> Bool[Tensor, "time
 
 
 def _agreeing(position: Tensor, time: Tensor, valid: Tensor, candidate: Tensor, max_speed: float) -> Tensor:
-    """Candidates, from first to last, that are near enough to the next valid frame and to the one before, which may
-    be a candidate that was just taken."""
+    """Candidates, from first to last, that are near enough to the next valid frame and to the previous one, which
+    may be a candidate that was just accepted."""
     kept, frame = valid.nonzero()[:, 0], candidate.nonzero()[:, 0]
     if not len(kept):
         return frame[:0]
     stretch = torch.searchsorted(kept, frame)
     following = kept[stretch.clamp(max=len(kept) - 1)]
-    way = (position[frame] - position[following]).norm(dim=-1)
-    near = (stretch == len(kept)) | (way <= max_speed * (time[following] - time[frame]))
+    distance = (position[frame] - position[following]).norm(dim=-1)
+    near = (stretch == len(kept)) | (distance <= max_speed * (time[following] - time[frame]))
     frame, stretch = frame[near], stretch[near]
     before = torch.where(stretch > 0, kept[(stretch - 1).clamp(min=0)], -1).tolist()
     p, t, taken, last = position.tolist(), time.tolist(), [], -1
@@ -203,7 +203,7 @@ def _agreeing(position: Tensor, time: Tensor, valid: Tensor, candidate: Tensor, 
 
 
 def filled(trajectory: Trajectory, valid: Bool[Tensor, "time"]) -> Trajectory:
-    """The same timestamps with invalid frames interpolated from valid ones (held at the ends)."""
+    """The same timestamps with invalid frames interpolated from valid ones (constant beyond the ends)."""
     if not valid.any():
         raise WearcapError("no valid pose to interpolate from", expected="at least one valid frame")
     good = trajectory[valid]

@@ -20,7 +20,7 @@ class TriangleIndex:
     corners: Float64[np.ndarray, "face 3 3"]
     """Ordered by leaf."""
     order: Int64[np.ndarray, "face"]
-    """Number in the mesh of each of `corners`."""
+    """Index in the mesh of each of `corners`."""
     low: Float64[np.ndarray, "node 3"]
     high: Float64[np.ndarray, "node 3"]
     span: Int64[np.ndarray, "node 3"]
@@ -45,14 +45,15 @@ class TriangleIndex:
     def nearest(
         self, queries: Float64[np.ndarray, "query 3"]
     ) -> tuple[Float64[np.ndarray, "query"], Int64[np.ndarray, "query"]]:
-        """Distance (m) from each point to the surface, and the face that is nearest (NaN and 0 for points with NaN)."""
+        """Distance (m) from each point to the surface, and the index of the nearest face (NaN and 0 for points with
+        NaN)."""
         distance, face, _ = self._search(queries)
         return distance, face
 
     def nearest_points(
         self, queries: Float64[np.ndarray, "query 3"]
     ) -> tuple[Float64[np.ndarray, "query"], Float64[np.ndarray, "query 3"]]:
-        """Distance (m) from each point to the surface, and the nearest point of it (NaN for points with NaN)."""
+        """Distance (m) from each point to the surface, and the nearest surface point (NaN for points with NaN)."""
         distance, _, point = self._search(queries)
         return distance, point
 
@@ -68,7 +69,7 @@ class TriangleIndex:
 
 @dataclass(frozen=True, eq=False)
 class BodiesIndex:
-    """Several meshes, each to be moved rigidly, ready for queries of the nearest one. Build it with `BodiesIndex.build`."""
+    """Index of several rigidly moving meshes for nearest-body queries. Build it with `BodiesIndex.build`."""
 
     corners: Float64[np.ndarray, "face 3 3"]
     low: Float64[np.ndarray, "node 3"]

@@ -1,4 +1,4 @@
-"""Metrics: pure functions, each defined once, and the tables made of them."""
+"""Metrics as pure functions, each defined once, and tables of them."""
 
 from wearcap.metrics.table import Row, Summary, aggregate, evaluate_motion
 

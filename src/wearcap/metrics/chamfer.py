@@ -1,7 +1,7 @@
-"""Chamfer distance between a captured body and the cloud that depth cameras saw (thesis §4.5.1, Tables 4.1, 4.2).
+"""Chamfer distance between a captured body and a depth-camera point cloud (thesis §4.5.1, Tables 4.1, 4.2).
 
 "Bidirectional Chamfer distance between the SMPL model and the ground truth point cloud, without Procrustes
-alignment". The document spells out no formula. Ours: the mean of the two directions' mean (not squared) distances.
+alignment". The thesis gives no formula. Ours: the mean of the two directions' mean (not squared) distances.
 Inputs in metres, results in centimetres, as in the tables.
 """
 
@@ -41,12 +41,12 @@ def chamfer(
     faces: Int64[Tensor, "face 3"] | None = None,
     seen: Bool[Tensor, "vertex"] | None = None,
 ) -> Chamfer:
-    """Bidirectional Chamfer distance of one frame; nothing is aligned first.
+    """Bidirectional Chamfer distance of one frame, without alignment.
 
-    Without `faces` the literal form, vertices to points both ways, which adds what lies between vertices. With
-    `faces` (ours, the better default) points are measured to the surface itself. The other direction takes the
-    vertices that are `seen`, by default all, though soles and armpits, which no camera sees, then add a constant.
-    Raises WearcapError for an empty cloud, none seen, or NaN.
+    Without `faces`: the literal form, vertices to points both ways, biased by the spacing of vertices. With `faces`
+    (ours, the better default): points are measured to the surface. The other direction uses the `seen` vertices,
+    by default all; soles and armpits, which no camera sees, then add a constant. Raises WearcapError for an empty
+    cloud, no seen vertex, or NaN.
     """
     body, points = vertices.detach().cpu().double().numpy(), cloud.detach().cpu().double().numpy()
     checked = body if seen is None else body[seen.cpu().numpy()]
@@ -70,7 +70,7 @@ def seen_vertices(
     cameras: list[Camera],
     T_world_cam: Rigid,
 ) -> Bool[Tensor, "vertex"]:
-    """Vertices of the faces that any of the cameras (poses "camera") sees, hidden by the body alone (ours)."""
+    """Vertices of faces visible to any of the cameras (poses "camera"), with occlusion by the body only (ours)."""
     mesh = Mesh(
         vertices.detach().cpu().numpy().astype(np.float32), faces.cpu().numpy().astype(np.int32),
         np.ones(3, np.float32),

@@ -1,4 +1,4 @@
-"""A captured motion beside keypoints that another system tracked (Aria Digital Twin's body joints)."""
+"""Comparison of a captured motion with keypoints tracked by another system (Aria Digital Twin's body joints)."""
 
 from collections.abc import Mapping
 
@@ -13,10 +13,10 @@ from wearcap.recording.recording import Cue
 
 
 def cue_errors_cm(motion: Motion, cues: Mapping[str, Cue]) -> dict[str, Float[Tensor, "_"]]:
-    """Distance (cm) of the motion's joints from 3D keypoints of the same name, at the keypoints' own times.
+    """Distance (cm) of the motion's joints from 3D keypoints of the same name, at the keypoints' times.
 
-    Clock and world have to be shared. Keypoints with a confidence of 0, outside the motion's time, or of joints that the
-    skeleton lacks are left out. Raises WearcapError where nothing is left to compare.
+    Both must share clock and world. Keypoints of confidence 0, outside the motion's time span, or of joints that the
+    skeleton lacks are ignored. Raises WearcapError if none is left.
     """
     errors = {}
     joints = motion.T_world_joint.t

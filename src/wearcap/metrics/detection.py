@@ -1,4 +1,4 @@
-"""How well probabilities tell yes from no: average precision, precision, recall, accuracy, calibration (thesis Table 5.3)."""
+"""Scores of binary detection: average precision, precision, recall, accuracy, calibration error (thesis Table 5.3)."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class DetectionScores(NamedTuple):
-    """Shares (0…1); NaN where they are not defined, such as recall without a positive."""
+    """Scores in 0…1; NaN where undefined, such as recall without a positive sample."""
 
     average_precision: float
     precision: float
@@ -20,7 +20,7 @@ class DetectionScores(NamedTuple):
 def detection_scores(
     prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"], threshold: float = 0.5
 ) -> DetectionScores:
-    """Scores of one detector; precision, recall and accuracy with probabilities above `threshold` as yes."""
+    """Scores of one detector; precision, recall and accuracy at `threshold`."""
     found = prob > threshold
     hits = float((found & truth).sum())
     return DetectionScores(
@@ -35,18 +35,19 @@ def detection_scores(
 def mean_detection_scores(
     prob: Float[Tensor, "sample hand"], truth: Bool[Tensor, "sample hand"], threshold: float = 0.5
 ) -> DetectionScores:
-    """Means of each hand's scores, as the document reports them; hands without a score are left out of its mean."""
+    """Mean of the hands' scores, as in the thesis; undefined scores of a hand are ignored."""
     hands = torch.tensor([detection_scores(prob[:, h], truth[:, h], threshold) for h in range(prob.shape[1])])
     return DetectionScores(*hands.nanmean(0).tolist())
 
 
 def average_precision(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"]) -> float:
-    """Σ (R_n - R_(n-1)) P_n over falling thresholds, samples of equal probability together (as scikit-learn defines it)."""
+    """Average precision Σ (R_n - R_(n-1)) P_n over falling thresholds, with ties grouped (scikit-learn's
+    definition)."""
     order = prob.argsort(descending=True, stable=True)
     hits = truth[order].double().cumsum(0)
     if not len(hits) or not hits[-1]:
         return float("nan")
-    # A threshold lies behind the last of equal probabilities.
+    # Thresholds follow the last of equal probabilities.
     ends = torch.cat([prob[order].diff() != 0, torch.ones(1, dtype=torch.bool, device=prob.device)])
     hits, count = hits[ends], torch.arange(1, len(order) + 1, device=prob.device)[ends]
     gained = hits.diff(prepend=hits.new_zeros(1))
@@ -54,7 +55,7 @@ def average_precision(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample
 
 
 def calibration_error(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"], bins: int = 10) -> float:
-    """Mean distance between probability and frequency over equal bins, weighted by their samples (Guo et al. 2017)."""
+    """Expected calibration error over bins of equal width (Guo et al. 2017)."""
     if not len(prob):
         return float("nan")
     place = (prob * bins).long().clamp(0, bins - 1)

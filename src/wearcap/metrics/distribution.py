@@ -1,4 +1,4 @@
-"""How a set of motions is distributed, beside another: in the latent space of a motion autoencoder (Guo et al. 2020)."""
+"""Distribution metrics of motion sets in the latent space of a motion autoencoder (Guo et al. 2020): FID, diversity."""
 
 import torch
 from jaxtyping import Float
@@ -15,9 +15,9 @@ def frechet_distance(
 ) -> Float[Tensor, ""]:
     """FID: Fréchet distance between Gaussians fitted to both sets, ‖μ−μ'‖² + tr(C + C' − 2(CC')^½), in float64.
 
-    The trace of the last root is the sum of the singular values of C^½ C'^½: no root of a matrix that is not
-    symmetric has to be found, and sets that fill only part of the space do no harm. Raises WearcapError for sets of
-    fewer than two samples and for values that are not finite.
+    The trace of the last root is the sum of the singular values of C^½ C'^½, which avoids roots of non-symmetric
+    matrices and is valid for rank-deficient covariances. Raises WearcapError for sets of fewer than two samples and for
+    values that are not finite.
     """
     (mean, root), (mean_true, root_true) = (_gaussian(value) for value in (latent, latent_true))
     cross = torch.linalg.svdvals(root @ root_true).sum()
@@ -28,7 +28,7 @@ def frechet_distance(
 def _gaussian(
     latent: Float[Tensor, "sample feature"],
 ) -> tuple[Float[Tensor, "feature"], Float[Tensor, "feature feature"]]:
-    """Mean, and the symmetric root of the (unbiased) covariance."""
+    """Mean and symmetric square root of the (unbiased) covariance."""
     if len(latent) < 2 or not latent.isfinite().all():
         raise WearcapError(f"no distribution in {len(latent)} samples", expected="two at least, all finite")
     values, vectors = torch.linalg.eigh(torch.cov(latent.double().T).reshape(latent.shape[1], -1))
@@ -38,10 +38,10 @@ def _gaussian(
 def diversity(
     latent: Float[Tensor, "sample feature"], size: int = DIVERSITY_SAMPLES, seed: int = 0
 ) -> Float[Tensor, ""]:
-    """Mean distance between two random subsets of `size` samples each, none in both, pair by pair.
+    """Mean distance between paired samples of two disjoint random subsets of `size` samples each.
 
-    The subsets follow from seed and number of samples, so that two sets of equal number are compared at the same
-    places. Raises WearcapError for fewer than twice as many samples.
+    The subsets depend on seed and number of samples only, so sets of equal size use the same indices. Raises
+    WearcapError for fewer than 2 · `size` samples.
     """
     if len(latent) < 2 * size:
         raise WearcapError(

@@ -1,4 +1,4 @@
-"""Whether a floor that is followed is the one that is stood on."""
+"""Error of an estimated floor height against the ground below standing feet."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,8 +10,9 @@ def stood_on(
 ) -> tuple[Float[Tensor, "time"], Float[Tensor, "time"]]:
     """Lowest and highest ground (m) that the feet stand on, or stood on last.
 
-    `sole_height` is that of each foot's lowest point. On the level and on slopes both are nearly one; on stairs they
-    are a step apart. A foot that has not stood yet counts from where it first stands; one that never does, not at all.
+    `sole_height` is the height of each foot's lowest point. On level ground and slopes both are nearly equal; on stairs
+    they differ by a step. Before its first contact a foot uses the ground of that contact; a foot without contact is
+    ignored.
     """
     ground = []
     frames = torch.arange(len(contact))
@@ -31,5 +32,5 @@ def stood_on(
 def floor_error_m(
     height: Float[Tensor, "time"], low: Float[Tensor, "time"], high: Float[Tensor, "time"]
 ) -> Float[Tensor, "time"]:
-    """How far (m) a floor's height is from what lies between the lowest and the highest ground that is stood on."""
+    """Distance (m) of a floor's height from the interval between the lowest and the highest ground stood on."""
     return torch.maximum(low - height, height - high).clamp_min(0)

@@ -1,6 +1,6 @@
-"""How well an object's motion and a wearer's feet were captured, as ECHO's tables have it (ECHO eq. 14–17, §9).
+"""Errors of object motion, joint velocity and foot contact as in ECHO's tables (ECHO eq. 14–17, §9).
 
-Metres in; cm, mm and degrees out.
+Inputs in metres; results in cm, mm and degrees.
 """
 
 import torch
@@ -12,13 +12,13 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import geodesic, quat_wxyz_from_matrix
 
 ANKLE_M, TOE_M = 0.10, 0.05
-"""Below which an ankle and a foot joint touch the floor (ECHO §9)."""
+"""Heights (m) above the floor below which an ankle and a toe joint are in contact (ECHO §9)."""
 
 
 def vertex_error_cm(
     T_found: Rigid, T_true: Rigid, vertices: Float[Tensor, "vertex 3"]
 ) -> Float[Tensor, "*batch"]:
-    """E_v2v (eq. 16): mean distance (cm) of an object's vertices, given in its own axes, from their true places."""
+    """E_v2v (eq. 16): mean position error (cm) of an object's vertices, which are given in its own axes."""
     turn, shift = T_found.R - T_true.R, T_found.t - T_true.t
     return 100 * (vertices @ turn.mT + shift[..., None, :]).norm(dim=-1).mean(-1)
 
@@ -26,7 +26,7 @@ def vertex_error_cm(
 def center_error_cm(
     T_found: Rigid, T_true: Rigid, vertices: Float[Tensor, "vertex 3"]
 ) -> Float[Tensor, "*batch"]:
-    """E_c (eq. 17): distance (cm) of the mean of the vertices from its true place."""
+    """E_c (eq. 17): position error (cm) of the vertices' mean."""
     center = vertices.mean(0)
     return 100 * (T_found @ center - T_true @ center).norm(dim=-1)  # pyright: ignore[reportOperatorIssue]
 
@@ -37,7 +37,7 @@ def rotation_difference_deg(T_found: Rigid, T_true: Rigid) -> Float[Tensor, "*ba
 
 
 def quaternion_difference(T_found: Rigid, T_true: Rigid) -> Float[Tensor, "*batch"]:
-    """L1 distance of unit quaternions whose scalar is not negative (the document does not say which of ±q it takes)."""
+    """L1 distance of unit quaternions with non-negative scalar part (ECHO does not define the sign)."""
     found, true = (quat_wxyz_from_matrix(T.R) for T in (T_found, T_true))
     return (found - true).abs().sum(-1)
 
@@ -45,21 +45,21 @@ def quaternion_difference(T_found: Rigid, T_true: Rigid) -> Float[Tensor, "*batc
 def joint_step_error_mm(
     joints: Float[Tensor, "time joint 3"], joints_true: Float[Tensor, "time joint 3"]
 ) -> Float[Tensor, ""]:
-    """MPJVE (eq. 15): mean difference (mm per frame) of the ways that joints go from frame to frame."""
+    """MPJVE (eq. 15): mean error (mm per frame) of the joints' displacements from frame to frame."""
     return 1000 * (joints - joints_true).diff(dim=0).norm(dim=-1).mean()
 
 
 def foot_contact_share(
     skeleton: Skeleton, joints: Float[Tensor, "time joint 3"], floor_height: Float[Tensor, "time"]
 ) -> Float[Tensor, ""]:
-    """FC: share of the frames in which an ankle is below 10 cm or a foot joint below 5 cm over the floor (m)."""
+    """FC: share of frames in which an ankle is less than 10 cm, or a toe joint less than 5 cm, above the floor."""
     return feet_down(skeleton, joints, floor_height).float().mean()
 
 
 def feet_down(
     skeleton: Skeleton, joints: Float[Tensor, "time joint 3"], floor_height: Float[Tensor, "time"]
 ) -> Bool[Tensor, "time"]:
-    """Whether any of the four joints of the feet is that low."""
+    """Whether any of the four foot joints is below its contact height."""
     low = []
     for name, limit in (("ankle", ANKLE_M), ("toe", TOE_M)):
         at = skeleton.indices(f"left_{name}", f"right_{name}")

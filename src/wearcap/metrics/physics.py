@@ -1,6 +1,6 @@
-"""How plausible a motion is by itself: smoothness, feet that stay, nothing below the floor.
+"""Physical plausibility of a motion: jitter, foot skate, foot contact, floor penetration.
 
-World z is up. Accelerations and third differences are taken in float64: they amplify rounding by fps² and fps³.
+World z is up. Accelerations and third differences are computed in float64: they amplify rounding by fps² and fps³.
 """
 
 import torch
@@ -14,10 +14,11 @@ from wearcap.geometry.rigid import Rigid
 
 SIDES = ("left", "right")
 FLOOR_WINDOW_S = 10.0
-"""The local floor is the lowest true joint within this time to either side (thesis §6.4: 20 s in all)."""
+"""Time to either side of a frame in which the lowest true joint defines the local floor (thesis §6.4: 20 s in
+total)."""
 CONTACT_HEIGHT_M = 0.05
 CONTACT_SPEED_M_S = 0.3
-"""EDGE's contact: a foot joint that moves less than 0.01 m per frame at 30 Hz."""
+"""Speed below which EDGE takes a foot joint to be in contact: 0.01 m per frame at 30 Hz."""
 
 
 def jitter_m_s3(joints: Float[Tensor, "time joint 3"], fps: float) -> Float[Tensor, ""]:
@@ -43,15 +44,15 @@ def foot_joints(skeleton: Skeleton, T_world_joint: Rigid) -> Float[Tensor, "time
 
 
 def foot_contact(contact: Bool[Tensor, "time patch"]) -> Bool[Tensor, "time foot"]:
-    """Whether heel or toe tip of each foot touches; patches in the order of `FOOT_PATCHES`."""
+    """Whether heel or toe tip of each foot is in contact; patches in the order of `FOOT_PATCHES`."""
     return contact.unflatten(-1, (2, 2)).any(-1)
 
 
 def contact_from_motion(
     points: Float[Tensor, "time foot point 3"], floor: Float[Tensor, "time"], fps: float
 ) -> Bool[Tensor, "time foot"]:
-    """Contact by height and speed, where none was recorded: a point of the foot is less than 5 cm above the
-    local floor and moves less than 0.3 m/s (EDGE's 0.01 m per frame at 30 Hz)."""
+    """Contact from height and speed, where none was recorded: a point of the foot is less than 5 cm above the
+    local floor and moves slower than 0.3 m/s (EDGE's 0.01 m per frame at 30 Hz)."""
     speed = points.diff(dim=0, prepend=points[:1]).norm(dim=-1) * fps
     low = points[..., 2] - floor[:, None, None] < CONTACT_HEIGHT_M
     return (low & (speed < CONTACT_SPEED_M_S)).any(-1)
@@ -60,10 +61,9 @@ def contact_from_motion(
 def foot_skate_cm_s(
     points: Float[Tensor, "time foot point 3"], contact: Bool[Tensor, "time foot"], fps: float
 ) -> Float[Tensor, ""]:
-    """Foot skate (cm/s): mean horizontal speed of the lowest point of a foot while the truth says contact.
+    """Foot skate (cm/s): mean horizontal speed of the lowest point of a foot during true contact.
 
-    A step from one frame to the next counts where both are in contact; the point is the one that is lowest
-    at the later frame. NaN where no foot touches.
+    Pairs of frames count if both are in contact; the point is the lowest one of the later frame. NaN without contact.
     """
     lowest = points[1:, :, :, 2].argmin(-1)[..., None]
     speed = points[..., :2].diff(dim=0).norm(dim=-1).gather(-1, lowest)[..., 0] * (fps * 100.0)
@@ -76,11 +76,11 @@ def physicality(
     """EDGE's physical foot contact score (m²/s²): mean over frames of ‖root acceleration‖ (its downward part
     clipped to 0) × ‖left foot velocity‖ × ‖right foot velocity‖, over the sequence's largest acceleration.
 
-    A foot's velocity is that of the slower of its ankle and toe. A body that accelerates must push on a
-    foot that stands, so lower is more plausible; report the truth's own value beside it. EDGE's code
-    takes the feet's horizontal speed alone (its paper, and this, their speed) and multiplies displacements per
-    frame at 30 Hz by 10⁴, which makes its figures for level steps 11.1 times these. NaN for
-    fewer than three frames, 0 for a root that never accelerates.
+    A foot's velocity is that of the slower of its ankle and toe. An accelerating body must push on a standing foot, so
+    lower is more plausible; report the ground truth's value for comparison. EDGE's code uses the feet's horizontal
+    speed only (its paper, and this function, the full speed) and multiplies displacements per frame at 30 Hz by 10⁴,
+    which makes its figures for level steps 11.1 times larger. NaN for fewer than three frames, 0 for a root that never
+    accelerates.
     """
     acceleration = t_world_root.double().diff(n=2, dim=0) * fps**2
     acceleration = torch.cat([acceleration[:, :2], acceleration[:, 2:].clamp(min=0)], -1).norm(dim=-1)
@@ -94,7 +94,7 @@ def physicality(
 def local_floor(
     joints_true: Float[Tensor, "time joint 3"], fps: float, window_s: float = FLOOR_WINDOW_S
 ) -> Float[Tensor, "time"]:
-    """Height (m) of the lowest true joint within ±`window_s` of each frame: a floor that follows stairs."""
+    """Height (m) of the lowest true joint within ±`window_s` of each frame, a floor estimate that follows stairs."""
     radius = round(window_s * fps)
     lowest = joints_true[..., 2].amin(-1)
     return -max_pool1d(-lowest[None, None], 2 * radius + 1, stride=1, padding=radius)[0, 0]
@@ -103,5 +103,5 @@ def local_floor(
 def floor_penetration_cm(
     joints: Float[Tensor, "time joint 3"], floor: Float[Tensor, "time"]
 ) -> Float[Tensor, ""]:
-    """Mean over frames of how deep (cm) the lowest joint lies below the local floor; 0 where it does not."""
+    """Mean over frames of the depth (cm) of the lowest joint below the local floor, 0 where it is above."""
     return (floor - joints[..., 2].amin(-1)).clamp(min=0).mean() * 100.0

@@ -1,4 +1,4 @@
-"""How far captured joints and rotations are from the true ones. Pure functions on tensors."""
+"""Position, velocity and rotation errors of captured joints. Pure functions on tensors."""
 
 import torch
 from jaxtyping import Float
@@ -22,14 +22,14 @@ def mpjpe_cm(
 ) -> Float[Tensor, ""]:
     """Mean per joint position error (cm): the mean over frames and joints of the joint errors.
 
-    Systems driven by the head are compared with the body hung from the true head (thesis §6.4); whoever
-    calls does that first.
+    Systems driven by the head are compared with the body anchored to the true head (thesis §6.4); the caller does that
+    first.
     """
     return joint_error_cm(joints, joints_true).mean()
 
 
 def body_parts(skeleton: Skeleton) -> dict[str, list[int]]:
-    """Joints of the parts whose errors the tables name.
+    """Joint indices of the body parts in the papers' tables.
 
     hand: both wrists. lower: hips, knees, ankles, toes. upper: every joint above the pelvis, so all but the
     pelvis and the lower ones. Raises WearcapError when the skeleton lacks one of the named joints.
@@ -54,8 +54,8 @@ def error_percentile_cm(
 ) -> Float[Tensor, ""]:
     """Percentile over one sequence's frames of the frame's mean joint error (cm).
 
-    Thesis §6.4.4 takes it within each sequence and averages over sequences, so that hard sequences do not
-    alone decide the tail. Linear interpolation between frames.
+    Thesis §6.4.4 computes it within each sequence and averages over sequences, so that hard sequences alone do not
+    determine the tail. Linear interpolation between frames.
     """
     return torch.quantile(joint_error_cm(joints, joints_true).mean(-1), percent / 100.0)
 

@@ -1,4 +1,4 @@
-"""Scores of one capture against its recording's truth."""
+"""Scores of one capture against its recording's ground truth."""
 
 from collections.abc import Callable
 
@@ -16,14 +16,14 @@ from wearcap.recording.timing import at_times
 from wearcap.tracking.anchor import anchored_to_head
 
 Measure = Callable[[Motion, Recording, str, int], Row]
-"""Scores of a motion that was captured from a recording, by the recording's name and a seed."""
+"""Function that scores a captured motion against its recording, given the recording's name and the seed."""
 
 
 def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
-    """All metrics of one capture at its own frames against its recording's truth.
+    """All metrics of one capture at its own frames against its recording's ground truth.
 
-    Both are hung from the true head, but for `world_root_cm` and `world_mpjpe_cm`: these are measured where the capture
-    put the body in the world.
+    The capture is anchored to the true head, except for `world_root_cm` and `world_mpjpe_cm`, which are measured in the
+    world without alignment.
     """
     anchored, truth, contact = comparable(motion, recording, name)
     scores = evaluate_motion(anchored, truth, contact)
@@ -34,9 +34,9 @@ def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
 
 
 def score_in_world(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
-    """All metrics of one capture where it put the body in the world, nothing hung or aligned (MocapEvery §4.1).
+    """All metrics of one capture in the world, without anchoring or alignment (MocapEvery §4.1).
 
-    Beside them `r_mpjpe_cm`, both bodies moved to one root (r.MPJPE), and `right_hand_pe_cm`.
+    Adds `r_mpjpe_cm` (root-relative, r.MPJPE) and `right_hand_pe_cm`.
     """
     truth, contact = truth_at(motion, recording, name)
     scores = evaluate_motion(motion, truth, contact)
@@ -50,7 +50,7 @@ def score_in_world(motion: Motion, recording: Recording, name: str, seed: int) -
 def comparable(
     motion: Motion, recording: Recording, name: str
 ) -> tuple[Motion, Motion, Bool[Tensor, "time patch"] | None]:
-    """A capture hung from the true head, the truth at the capture's frames, and the true contact of its feet.
+    """The capture anchored to the true head, the true motion at its frames, and true foot contact.
 
     Raises WearcapError when the recording has no true motion.
     """
@@ -61,7 +61,7 @@ def comparable(
 def truth_at(
     motion: Motion, recording: Recording, name: str
 ) -> tuple[Motion, Bool[Tensor, "time patch"] | None]:
-    """The truth at the capture's frames, and the true contact of its feet.
+    """The true motion at the capture's frames, and true foot contact.
 
     Raises WearcapError when the recording has no true motion.
     """
@@ -75,7 +75,7 @@ def truth_at(
 
 
 def _within(motion: Motion, truth: Motion) -> bool:
-    """Whether a motion has another rate than the truth, and no frame outside its time."""
+    """Whether a motion has other timestamps than the truth, all of them within its time span."""
     same = len(motion) == len(truth) and torch.allclose(
         motion.timestamps, truth.timestamps, rtol=0, atol=1e-6
     )
@@ -88,7 +88,7 @@ def _within(motion: Motion, truth: Motion) -> bool:
 
 
 def _foot_contact(recording: Recording) -> Bool[Tensor, "time patch"] | None:
-    """True contact of the foot patches among the parts that a recording tracks (hands may be others)."""
+    """True contact of the foot patches, None if the recording does not track all of them."""
     track = recording.contacts
     if track is None or not set(FOOT_PATCHES) <= set(track.parts):
         return None

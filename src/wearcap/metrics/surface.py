@@ -1,4 +1,4 @@
-"""How feet meet the scanned surface: distance to it and sliding along it during contact (thesis Table 4.3)."""
+"""Distance of the feet to the scanned surface, and sliding along it, during contact (thesis Table 4.3)."""
 
 from dataclasses import dataclass
 
@@ -16,18 +16,18 @@ from wearcap.geometry.surface import SurfaceIndex
 
 @dataclass(frozen=True)
 class FootSurface:
-    """Feet in contact against the scan; NaN where nothing was in contact near it."""
+    """Scores of contacting feet against the scan; NaN without contact near it."""
 
     distance_cm: float
     """Mean signed point-to-plane distance, positive above the surface (the table's distance to surface)."""
     absolute_distance_cm: float
-    """Mean of its absolute value: sinking here and floating there do not cancel."""
+    """Mean absolute point-to-plane distance: penetration and floating do not cancel."""
     sliding_cm: float
-    """Mean way along the surface plane from one frame to the next, per frame."""
+    """Mean displacement along the surface plane per frame."""
     contacts: int
-    """Pairs of frame and vertex in contact."""
+    """Number of pairs of frame and vertex in contact."""
     off_scan: int
-    """Those of them with no surface within the index's reach: left out."""
+    """Number of these pairs without a surface within the index's reach, which are not scored."""
 
 
 def foot_surface(
@@ -35,8 +35,8 @@ def foot_surface(
 ) -> FootSurface:
     """Signed distance to the local scan plane and foot sliding, over vertices in contact (world, m).
 
-    A step from one frame to the next counts where a vertex is in contact in both; it is projected onto the plane
-    beneath its start. Far from the scan (a drifted tracker) there is no plane: such contacts count as `off_scan`.
+    Sliding counts pairs of frames with contact in both; the displacement is projected onto the plane below its start.
+    Contacts far from the scan (a drifted tracker) have no plane and count as `off_scan`.
     """
     points = points.detach().cpu().double()
     contact = contact.cpu()
@@ -45,23 +45,23 @@ def foot_surface(
     planes = surface.plane(touching.numpy())
     origin[contact], normal[contact] = (torch.from_numpy(part) for part in planes)
     distance = ((points - origin) * normal).sum(-1)[contact]
-    known = distance.isfinite()
+    on_scan = distance.isfinite()
     step = points.diff(dim=0)
     along = step - (step * normal[:-1]).sum(-1, keepdim=True) * normal[:-1]
     slide = along.norm(dim=-1)[contact[1:] & contact[:-1]]
     return FootSurface(
-        100 * float(distance[known].mean()),
-        100 * float(distance[known].abs().mean()),
+        100 * float(distance[on_scan].mean()),
+        100 * float(distance[on_scan].abs().mean()),
         100 * float(slide[slide.isfinite()].mean()),
         int(contact.sum()),
-        int((~known).sum()),
+        int((~on_scan).sum()),
     )
 
 
 def foot_vertices(
     body: BodyModel, T_world_joint: Rigid, contact: Bool[Tensor, "time patch"]
 ) -> tuple[Float[Tensor, "time vertex 3"], Bool[Tensor, "time vertex"]]:
-    """The foot patches' vertices (m) and which of them touch; patches in the order of `FOOT_PATCHES`.
+    """Vertices of the foot patches (m) and their contacts; patches in the order of `FOOT_PATCHES`.
 
     Raises WearcapError when contacts and poses differ in length.
     """

@@ -1,4 +1,4 @@
-"""Scores of one motion, their mean over recordings and spread over seeds, and the tables that show them."""
+"""Scores of a motion, their mean over recordings and spread over seeds, and tables of them."""
 
 import json
 import math
@@ -19,7 +19,7 @@ from wearcap.metrics import physics, position
 from wearcap.recording.motion import Motion
 
 PER_SEQUENCE = ("p95_cm",)
-"""Metrics that the thesis averages over sequences; all others over frames."""
+"""Metrics that the thesis averages over sequences; all others are averaged over frames."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Summary:
 def evaluate_motion(
     prediction: Motion, truth: Motion, contact: Bool[Tensor, "time patch"] | None = None
 ) -> dict[str, float]:
-    """All metrics of one captured motion against the truth, by name with unit.
+    """All metrics of one captured motion against ground truth, by name with unit.
 
-    contact: true contact of `FOOT_PATCHES` at the truth's frames; without it, it is judged from the true
-    motion (`contact_from_motion`). Raises WearcapError unless both motions have the same joints and
-    timestamps and finite values.
+    contact: true contact of `FOOT_PATCHES` at the truth's frames; None: estimated from the true motion
+    (`contact_from_motion`). Raises WearcapError unless both motions have the same joints and timestamps and finite
+    values.
     """
     _require_comparable(prediction, truth)
     if contact is not None and len(contact) != len(truth):
@@ -92,7 +92,7 @@ def evaluate_motion(
 
 
 def _double_pose(motion: Motion) -> Rigid:
-    """Joint poses in float64: in float32, metres away from the origin, rounding alone is jitter of 1 m/s³."""
+    """Joint poses in float64: in float32, metres from the origin, rounding alone causes a jitter of 1 m/s³."""
     return forward_kinematics(motion.skeleton, motion.R_parent_joint.double(), motion.t_world_root.double())
 
 
@@ -129,9 +129,9 @@ def _span(motion: Motion) -> str:
 
 def aggregate(rows: list[Row]) -> dict[str, Summary]:
     """Mean over recordings within each seed, weighted by frames (`PER_SEQUENCE`: equally), then mean and
-    spread over seeds. A score that is NaN (no contact, too few frames) is left out of its mean.
+    spread over seeds. Scores that are NaN (no contact, too few frames) are ignored.
 
-    Raises WearcapError when the seeds did not see the same recordings, once each.
+    Raises WearcapError unless every seed was scored on the same recordings, once each.
     """
     by_seed: dict[int, dict[str, Row]] = defaultdict(dict)
     for row in rows:
@@ -152,14 +152,14 @@ def aggregate(rows: list[Row]) -> dict[str, Summary]:
 
 
 def _weighted_mean(name: str, rows: list[Row]) -> float:
-    known = [(row.scores[name], 1 if name in PER_SEQUENCE else row.frames) for row in rows]
-    known = [(score, weight) for score, weight in known if not math.isnan(score)]
-    total = sum(weight for _, weight in known)
-    return sum(score * weight for score, weight in known) / total if total else math.nan
+    weighted = [(row.scores[name], 1 if name in PER_SEQUENCE else row.frames) for row in rows]
+    weighted = [(score, weight) for score, weight in weighted if not math.isnan(score)]
+    total = sum(weight for _, weight in weighted)
+    return sum(score * weight for score, weight in weighted) / total if total else math.nan
 
 
 def summarize(values: list[float]) -> Summary:
-    """Mean and spread of one score over seeds."""
+    """Mean and sample standard deviation of one score over seeds."""
     mean = sum(values) / len(values)
     if len(values) == 1:
         return Summary(mean, None, 1)
@@ -172,7 +172,7 @@ Scores = dict[str, dict[str, Summary]]
 
 
 def _cells(methods: Scores, metrics: tuple[str, ...] | None) -> list[list[str]]:
-    """One line per method: its name, then its metrics (by default all that the first method has)."""
+    """One line per method: its name, then its metrics (default: all metrics of the first method)."""
     columns = list(metrics or next(iter(methods.values())))
     lines = [
         [method, *(str(scores[metric]) if metric in scores else "–" for metric in columns)]
@@ -189,7 +189,7 @@ def markdown_table(methods: Scores, metrics: tuple[str, ...] | None = None) -> s
 
 
 def rich_table(title: str, methods: Scores, metrics: tuple[str, ...] | None = None) -> Table:
-    """A table for a terminal, where many metrics need lines: one line per metric, one column per method."""
+    """A table for a terminal: one line per metric, one column per method."""
     table = Table(title=title)
     header, *lines = _cells(methods, metrics)
     table.add_column("", no_wrap=True)
@@ -203,8 +203,8 @@ def rich_table(title: str, methods: Scores, metrics: tuple[str, ...] | None = No
 def write_scores(
     path: str | Path, methods: Scores, about: dict[str, str | int | float] | None = None
 ) -> None:
-    """Write a table as JSON, atomically: {"about", "methods": {method: {metric: {mean, std, seeds}}}}; what is
-    not finite becomes null."""
+    """Write a table as JSON, atomically: {"about", "methods": {method: {metric: {mean, std, seeds}}}}; values that
+    are not finite become null."""
     tree = {
         method: {
             metric: {key: None if _undefined(value) else value for key, value in asdict(summary).items()}

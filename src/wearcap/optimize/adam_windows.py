@@ -1,4 +1,4 @@
-"""The document's solver (thesis §4.3.1): Adam over windows of 100 frames that share one frame."""
+"""The thesis's solver (§4.3.1): Adam over windows of 100 frames, neighbours sharing one frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,14 +15,15 @@ from wearcap.optimize.solution import Solution
 
 @dataclass(frozen=True)
 class AdamSettings:
-    """The document's window and step, the released code's rate and number of steps."""
+    """Settings of Adam: window and step of the thesis, learning rate and number of steps of the released code."""
 
     window: int = 100
     advance: int = 99
     steps: int = 500
     learning_rate: float = 1e-3
     full_mesh: bool = True
-    """Skin the whole body at each step, as the document does; False: the patches alone, with the same result."""
+    """Whether the whole body is skinned at each step, as in the thesis; False: only the patches, with the same
+    result."""
     dtype: torch.dtype = torch.float32
 
     def __post_init__(self):
@@ -37,9 +38,9 @@ def solve_adam_windows(
     settings: AdamSettings = AdamSettings(),
     progress: Callable[[int], None] = lambda frames: None,
 ) -> Solution:
-    """Minimise window after window; a window's first frame keeps the previous window's last (all but the first).
+    """Minimise window after window; a window's first frame is fixed to the previous window's last.
 
-    `progress` is told the number of frames after each window.
+    `progress` is called with the number of solved frames after each window.
     """
     data = data.to(settings.dtype)
     state = data.start
@@ -48,8 +49,8 @@ def solve_adam_windows(
     while True:
         stop = min(begin + settings.window, len(data))
         window = slice(begin, stop)
-        known = HpsState(theta[window], R[window], t[window])
-        solved, history = _solve_window(energy, data[window], known, begin > 0, settings)
+        start = HpsState(theta[window], R[window], t[window])
+        solved, history = _solve_window(energy, data[window], start, begin > 0, settings)
         theta[window], R[window], t[window] = solved.theta, solved.R_world_root, solved.t_world_root
         histories.append(history)
         progress(stop)

@@ -1,8 +1,9 @@
-"""Our solver of HPS: second order, over time at once.
+"""Banded Gauss-Newton solver of HPS (ours): all frames at once, in time linear in the recording's length.
 
-Only the head, the root and the feet's patches enter the energy, so the arms stay as the suit says and some fifteen
-joints are left; neighbouring frames alone share terms, so the normal equations are block tridiagonal and solved in
-time linear in the recording's length. Norms are met by iterative reweighting, their tips rounded ever less.
+The energy depends on the root, the head and the foot patches only, so the arms keep the suit's pose and about fifteen
+joints are optimised. Terms couple neighbouring frames only, so the normal equations are block tridiagonal. Norms are
+minimised by iteratively reweighted least squares with a smoothing of their tips that decreases over the iterations.
+`systems/hps/README.md` derives the system.
 """
 
 from dataclasses import dataclass
@@ -42,18 +43,19 @@ _PAIRS = {
 
 @dataclass(frozen=True)
 class BandedSettings:
-    """How long and how finely to iterate."""
+    """Iterations and tolerances of the solver."""
 
     iterations: int = 20
     smooth_start: float = 1e-2
-    """Rounding of norms (m, rad) in the first iteration …"""
+    """Smoothing of norms (m, rad) in the first iteration."""
     smooth_end: float = 3e-4
-    """… falling geometrically to this in the last."""
+    """Smoothing of norms (m, rad) in the last iteration; between both it decreases geometrically."""
     tolerance: float = 1e-4
-    """Stop when the energy falls by less than this share, the rounding having reached its end."""
+    """Relative decrease of the energy below which the solver stops, once the smoothing has reached its end."""
     damping: float = 1e-6
+    """Relative increase of the system's diagonal (Levenberg-Marquardt)."""
     relaxation: float = 1.5
-    """Share of each step that is gone after the first two: above 1 the reweighting of norms converges sooner."""
+    """Step length after the first two iterations; above 1, the reweighting of norms converges sooner."""
 
 
 DEFAULTS = BandedSettings()
@@ -61,15 +63,16 @@ DEFAULTS = BandedSettings()
 
 @dataclass(frozen=True, eq=False)
 class ActiveBody:
-    """The joints that the energy sees, and their arrays for the kernels."""
+    """The optimised joints, and their arrays for the kernels."""
 
     joints: tuple[int, ...]
-    """Numbers in the skeleton, parents first, the root left out."""
+    """Indices in the skeleton, parents first, without the root."""
     arrays: Body
 
     @classmethod
     def of(cls, patches: FootPatches) -> "ActiveBody":
-        """Raises WearcapError when a patch is held by other joints than its foot's last two."""
+        """Select the chains to the head and the feet. Raises WearcapError when a patch is skinned to joints other than
+        the last two of its leg."""
         skeleton = patches.body.skeleton
         head, legs = chain_to(skeleton, skeleton.index("head")), patches.legs
         joints = tuple(sorted({*head, *legs[0], *legs[1]}))
@@ -78,31 +81,33 @@ class ActiveBody:
         offsets = skeleton.t_parent_joint[list(joints)].double().numpy()
         head_chain = np.array([number[joint] for joint in head])
         leg_chains = np.array([[number[joint] for joint in leg] for leg in legs])
-        arrays = Body(parents, offsets, head_chain, leg_chains, *_held(patches, legs), patches.patch.numpy())
+        arrays = Body(
+            parents, offsets, head_chain, leg_chains, *_patch_skinning(patches, legs), patches.patch.numpy()
+        )
         return cls(joints, arrays)
 
     @property
     def unknowns(self) -> int:
-        """Of a frame."""
+        """Number of unknowns of a frame."""
         return LEGS + 3 * self.arrays.leg_chains.size
 
 
-def _held(patches: FootPatches, legs: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Patch vertices in the axes of their leg's last two joints (vertex, 2, 3; m), and these joints' shares."""
+def _patch_skinning(patches: FootPatches, legs: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Patch vertices in the axes of their leg's last two joints (vertex, 2, 3; m), and their weights (vertex, 2)."""
     body, rows = patches.body, patches.vertex
     if body.pose_blend is not None:
         raise WearcapError(
-            "this body's feet change shape with the pose", fix="Take the solver adam_windows for it."
+            "this body's feet change shape with the pose", fix="Use the solver adam_windows for it."
         )
     rest, joints = body.rest_vertices[rows].double(), body.skeleton.rest_joints.double()
     weights = torch.zeros(len(rows), len(body.skeleton), dtype=torch.float64)
     weights.scatter_add_(1, body.skin_joints[rows], body.skin_weights[rows].double())
-    holders = torch.tensor([legs[int(patch) // 2][-2:] for patch in patches.patch])
-    shares = weights.gather(1, holders)
+    last_two = torch.tensor([legs[int(patch) // 2][-2:] for patch in patches.patch])
+    shares = weights.gather(1, last_two)
     if (shares.sum(1) < 0.99).any():
-        raise WearcapError("vertices of the feet's patches are held by joints other than ankle and toe",
+        raise WearcapError("vertices of the foot patches are skinned to joints other than ankle and toe",
                            expected="a body whose soles follow the feet")  # fmt: skip
-    arms = rest[:, None] - joints[holders]
+    arms = rest[:, None] - joints[last_two]
     return arms.numpy(), (shares / shares.sum(1, keepdim=True)).numpy()
 
 
@@ -114,8 +119,8 @@ def solve_banded(
 ) -> Solution:
     """Minimise an energy over all frames of `data` at once.
 
-    `start` is where to begin (the initialisation when None). Returns the best state met, and the energy by term of
-    each. Raises WearcapError when the energy leaves something open (a weight of `pose` or `hold` that is zero).
+    `start` is the initial state (None: `data.start`). Returns the best state, and the energy by term after each
+    iteration. Raises WearcapError when the energy does not determine all unknowns (a zero weight of `pose` or `hold`).
     """
     problem = Stretch(energy, data, data.start if start is None else start)
     best, history, reason = problem.state(), [], "all iterations done"
@@ -135,7 +140,7 @@ def solve_banded(
 
 
 class Stretch:
-    """The arrays of one stretch: its data, the current state, and the system there."""
+    """Arrays of one stretch of frames: data, current state, and the linear system at it."""
 
     def __init__(self, energy: HpsEnergy, data: HpsData, start: HpsState):
         self.energy, self.data, self.start = energy, data, start
@@ -155,7 +160,7 @@ class Stretch:
         self.system = np.empty((length, n, n)), np.empty((pairs, n, n)), np.empty((length, n))
 
     def evaluate(self, smooth: float, look_up: bool) -> dict[str, float]:
-        """Energy by term at the current state; with `look_up` the scene beneath the feet is sought anew."""
+        """Energy by term at the current state; with `look_up` the scene below the feet is queried again."""
         update_kinematics(self.theta, self.R_root, self.t, self.active.arrays, self.kin)
         if look_up:
             self._look_up_ground()
@@ -179,6 +184,7 @@ class Stretch:
         apply_step(self.system[2], relaxation, self.theta, self.R_root, self.t, body, self.frames, self.kin)
 
     def state(self) -> HpsState:
+        """The current state, with the suit's angles of all joints that are not optimised."""
         whole = self.start.theta.clone()
         whole[:, self.columns] = torch.from_numpy(self.theta)
         return HpsState(whole, torch.from_numpy(self.R_root.copy()), torch.from_numpy(self.t.copy()))

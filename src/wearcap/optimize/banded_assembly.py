@@ -1,10 +1,10 @@
-"""The normal equations of HPS over a stretch of frames, in two compiled passes.
+"""Assembly of the normal equations of HPS over a stretch of frames, in two compiled passes.
 
-First each term adds its quadratic form where it acts: on the translation, the turns of root and head (world
-axes), the twists of each foot. These forms are small, and none mixes two of the five. Then they are mapped to
-the unknowns of a frame: translation (3), root rotation (3, right perturbation), turn of the head beyond the
-root's (3), axis-angles of the two legs. The spine's joints are eliminated: of all that turn the head alike, the
-one nearest to the suit's pose costs least.
+First each term adds its quadratic form in the variables it acts on: translation, rotations of root and head (world
+axes), twist of each foot. These forms are small, and none couples two of the five. `banded_mapping` then maps them to
+the unknowns of a frame: translation (3), root rotation (3, right perturbation), head rotation relative to the root's
+(3), axis-angles of the two legs. The spine's joints are eliminated: of all spine poses with the same head rotation,
+the one nearest to the suit's pose has the least energy.
 """
 
 from typing import NamedTuple
@@ -25,41 +25,43 @@ from wearcap.optimize.banded_kernels import (
     SELF, CONTACT, CONTACT_PLANE, SLIDE, TRANSLATION_SMOOTH, ROOT_SMOOTH, HEAD_SMOOTH, POSE, HOLD,
     TRANSLATION_STEP, ROOT_STEP, HEAD_STEP, POSE_STEP,
 ) = range(13)  # fmt: skip
-"""Places of `hps.TERMS`."""
+"""Indices into `hps.TERMS`."""
 
 HEAD = 6
-"""First of the head's unknowns in a frame; translation and root come before, the legs behind."""
+"""Index of the head's first unknown in a frame, after translation and root."""
 LEGS = 9
+"""Index of the legs' first unknown in a frame."""
 
 
 class Body(NamedTuple):
-    """The active part of a skeleton: joints above the head and the feet; number 0 is the root."""
+    """The optimised part of a skeleton: root (index 0) and the joints from it to head and toes."""
 
     parents: np.ndarray
     offsets: np.ndarray
     head_chain: np.ndarray
-    """Active joints from the spine to the head."""
+    """Indices of the joints from the spine to the head."""
     leg_chains: np.ndarray
-    """(2, joints) from hip to toe."""
+    """(2, joints) indices of the joints from hip to toe."""
     arms: np.ndarray
     """(vertex, 2, 3) patch vertices in the axes of their leg's last two joints (m)."""
     shares: np.ndarray
+    """(vertex, 2) skinning weights of these two joints."""
     patch: np.ndarray
 
 
 class Frames(NamedTuple):
-    """Data of the stretch, as in `hps.HpsData`."""
+    """Data of the stretch's frames, as in `hps.HpsData`."""
 
     theta_imu: np.ndarray
     R_cam: np.ndarray
-    """Localised orientation of the head, R^C R_HCᵀ."""
+    """(time, 3, 3) localised orientation of the head, R^C R_HCᵀ."""
     cam_confidence: np.ndarray
     t_hold: np.ndarray
     hold_confidence: np.ndarray
     contact: np.ndarray
-    """(time, patch), divided by the patch's number of vertices and by four."""
+    """(time, patch) contact, divided by the patch's number of vertices and by four."""
     stay: np.ndarray
-    """(pair, patch), the same for both frames in contact."""
+    """(pair, patch) contact in both frames of a pair, divided likewise."""
     t_step: np.ndarray
     R_root_step: np.ndarray
     R_head_step: np.ndarray
@@ -71,7 +73,7 @@ class Frames(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """By term: weight over count, kind of loss, its delta; and how far the tips of norms are rounded."""
+    """Weight over number of residuals, kind of loss and its delta by term; and the smoothing of norms (m, rad)."""
 
     weight: np.ndarray
     kind: np.ndarray
@@ -80,37 +82,39 @@ class Weights(NamedTuple):
 
 
 class Kinematics(NamedTuple):
-    """Of all frames at the current state: poses of the active joints, perturbation axes, patch vertices, maps."""
+    """Kinematics of all frames at the current state: joint rotations R and origins c, perturbation axes, patch
+    vertices."""
 
     R: np.ndarray
     c: np.ndarray
     axes: np.ndarray
     points: np.ndarray
     foot_maps: np.ndarray
-    """(time, 2, 12, 6 + leg) twists of each foot's holders."""
+    """(time, 2, 12, 6 + leg) Jacobians of the twists of each leg's last two joints."""
 
 
 class Forms(NamedTuple):
-    """Quadratic forms where the terms act; `small` is translation, root, head, whose diagonal forms are w I."""
+    """Quadratic forms in the variables that the terms act on; `small`: translation, root and head, whose forms are w
+    I."""
 
     small: np.ndarray
-    """(time, 3)."""
+    """(time, 3) weights w of translation, root and head."""
     small_step: np.ndarray
-    """(pair, 3, 3, 3), rows of the next frame."""
+    """(pair, 3, 3, 3) couplings with the next frame, whose variables are the rows."""
     small_gradient: np.ndarray
     foot: np.ndarray
-    """(time, 2, 12, 12), lower triangles."""
+    """(time, 2, 12, 12) forms of the foot twists, lower triangles."""
     foot_step: np.ndarray
     foot_gradient: np.ndarray
     pose: np.ndarray
-    """(time) weight of the pose prior."""
+    """(time) weights of the pose prior."""
     pose_step: np.ndarray
-    """(pair) weight of the legs' pose steps."""
+    """(pair) weights of the legs' pose steps."""
 
 
 @compiled
 def update_kinematics(theta, R_root, t, body, kin):
-    """Poses, patch vertices and derivatives of a state."""
+    """Compute joint poses, patch vertices and derivatives of a state."""
     pose_all(theta, R_root, t, body.parents, body.offsets, kin.R, kin.c, kin.axes)
     patch_points(kin.R, kin.c, body.leg_chains, body.arms, body.shares, body.patch, kin.points)
     for j in range(len(t)):
@@ -120,7 +124,7 @@ def update_kinematics(theta, R_root, t, body, kin):
 
 @compiled
 def gather(theta, t, body, frames, weights, kin, forms, energy):
-    """Add the forms of all terms at this state, reweighted, to `forms` and their energy to `energy`."""
+    """Add the reweighted forms of all terms at this state to `forms`, and their energies to `energy`."""
     for j in range(len(t)):
         _gather_frame(j, theta, t, body, frames, weights, kin, forms, energy)
         _gather_contact(j, body, frames, weights, kin, forms, energy)
@@ -132,7 +136,7 @@ def gather(theta, t, body, frames, weights, kin, forms, energy):
 
 @compiled
 def _rho(term, square, share, weights, energy):
-    """Add an element's energy; returns its weight in the least squares."""
+    """Add a residual's energy; returns its weight in the least-squares problem."""
     value, weight = reweight(square, weights.kind[term], weights.delta[term], weights.smooth)
     energy[term] += weights.weight[term] * share * value
     return weights.weight[term] * share * weight
@@ -140,7 +144,7 @@ def _rho(term, square, share, weights, energy):
 
 @compiled
 def _gather_frame(j, theta, t, body, frames, weights, kin, forms, energy):
-    """Thesis eq. 4.2 and 4.12, and the hold on the translation."""
+    """Add the terms of single frames: `self` (thesis eq. 4.2), `pose` (eq. 4.12), `hold`."""
     if weights.weight[SELF] > 0 and frames.cam_confidence[j] > 0:
         r = np.empty(3)
         turn_between(frames.R_cam[j], kin.R[j, body.head_chain[-1]], r)
@@ -162,7 +166,7 @@ def _gather_frame(j, theta, t, body, frames, weights, kin, forms, energy):
 
 @compiled
 def _gather_steps(j, t, body, frames, weights, kin, forms, energy):
-    """Thesis eq. 4.9–4.11, and the same against the suit's steps."""
+    """Add the smoothness terms (thesis eq. 4.9–4.11) and their counterparts relative to the suit's steps."""
     for term in (TRANSLATION_SMOOTH, TRANSLATION_STEP):
         if weights.weight[term] > 0:
             r = t[j + 1] - t[j]
@@ -198,14 +202,14 @@ def _gather_pose_step(j, theta, body, frames, weights, forms, energy):
 
 @compiled
 def pose_change(j, joint, i, theta, frames):
-    """How much more a joint's axis-angle is off the suit's at frame j + 1 than at j."""
+    """Change of a joint's deviation from the suit's axis-angle from frame j to j + 1 (rad)."""
     here = theta[j, joint - 1, i] - frames.theta_imu[j, joint - 1, i]
     return theta[j + 1, joint - 1, i] - frames.theta_imu[j + 1, joint - 1, i] - here
 
 
 @compiled
 def _add_step(j, group, w, step, r, forms):
-    """The element ½ w |r + next - step here|²."""
+    """Add the form ½ w |r + next - step here|²."""
     forms.small[j, group] += w
     forms.small[j + 1, group] += w
     forms.small_step[j, group] -= w * step
@@ -215,7 +219,7 @@ def _add_step(j, group, w, step, r, forms):
 
 @compiled
 def _gather_contact(j, body, frames, weights, kin, forms, energy):
-    """Thesis eq. 4.6, to nearest points and to planes."""
+    """Add the contact terms (thesis eq. 4.6), to nearest points and to planes."""
     if weights.weight[CONTACT] == 0 and weights.weight[CONTACT_PLANE] == 0:
         return
     A, along, r = np.empty((12, 3)), np.empty(12), np.empty(3)
@@ -245,7 +249,7 @@ def _gather_contact(j, body, frames, weights, kin, forms, energy):
 
 @compiled
 def _gather_slide(j, body, frames, weights, kin, forms, energy):
-    """Thesis eq. 4.7."""
+    """Add the slide term (thesis eq. 4.7)."""
     if weights.weight[SLIDE] == 0:
         return
     A, B, r = np.empty((12, 3)), np.empty((12, 3)), np.empty(3)

@@ -1,7 +1,8 @@
-"""Compiled pieces of the banded solver: rotations, forward kinematics of the active joints, block elimination.
+"""Compiled kernels of the banded solver: rotations, forward kinematics of the optimised joints, block elimination.
 
-Derivatives go through world axes: a perturbation of joint i turns all below it about the columns of `axes[i]`.
-The two joints that hold a foot's vertices move as twists (v, ω), so that its twenty vertices cost one 12 x 12 form.
+Derivatives are taken in world axes: a perturbation of joint i rotates all its descendants about the columns of
+`axes[i]`. The two joints that a foot's vertices are skinned to move as twists (v, ω), so that twenty vertices need one
+12 x 12 form.
 """
 
 import numpy as np
@@ -13,8 +14,8 @@ NORM, SQUARE, HUBER, CAUCHY = 0, 1, 2, 3
 
 @compiled
 def reweight(square, kind, delta, smooth):
-    """(ρ, w = ρ'(s) / s) of iteratively reweighted least squares, in which ½ w s² meets ρ, of an element whose squared norm is given; the weight of a norm is that of its
-    tip rounded by `smooth`."""
+    """(ρ, w = ρ'(s) / s) of a residual with squared norm `square`: its loss and its weight in iteratively reweighted
+    least squares, where ½ w s² has the slope of ρ. The weight of a norm is smoothed at its tip by `smooth`."""
     if kind == SQUARE:
         return square, 2.0
     if kind == CAUCHY:
@@ -74,7 +75,7 @@ def log_of(R, v):
 
 @compiled
 def turn_between(A, B, v):
-    """Rotation vector (world axes) that turns A into B: log(B Aᵀ)."""
+    """Rotation vector (world axes, rad) that rotates A into B: log(B Aᵀ)."""
     M = np.zeros((3, 3))
     for i in range(3):
         for k in range(3):
@@ -85,7 +86,7 @@ def turn_between(A, B, v):
 
 @compiled
 def pose_all(theta, R_root, t, parents, offsets, R, c, axes):
-    """Forward kinematics of the active joints, entry 0 the root: rotations, origins, perturbation axes (world)."""
+    """Forward kinematics of the optimised joints (index 0: root): rotations, origins, perturbation axes (world)."""
     R_local, J = np.empty((3, 3)), np.empty((3, 3))
     for j in range(len(t)):
         R[j, 0], c[j, 0], axes[j, 0] = R_root[j], t[j], R_root[j]
@@ -108,7 +109,7 @@ def pose_all(theta, R_root, t, parents, offsets, R, c, axes):
 
 @compiled
 def patch_points(R, c, leg_chains, arms, shares, patch, points):
-    """Positions of patch vertices, each held by the last two joints of its leg."""
+    """Positions of patch vertices, each skinned to the last two joints of its leg."""
     for j in range(len(R)):
         for n in range(len(patch)):
             chain = leg_chains[patch[n] // 2]
@@ -124,9 +125,9 @@ def patch_points(R, c, leg_chains, arms, shares, patch, points):
 
 @compiled
 def vertex_twist(R, chain, arms, shares, A):
-    """Motion of a patch vertex by the twists (v, ω) of its leg's last two joints, transposed: (12, 3).
+    """Transposed Jacobian (12, 3) of a patch vertex in the twists (v, ω) of its leg's last two joints.
 
-    Returns how many rows count: six where the second joint has no share.
+    Returns the number of rows used: six if the second joint has no weight.
     """
     for h in range(2):
         share, joint = shares[h], chain[len(chain) - 2 + h]
@@ -146,7 +147,7 @@ def vertex_twist(R, chain, arms, shares, A):
 
 @compiled
 def foot_map(c, axes, chain, T):
-    """Twists of a leg's last two joints by translation, root and the leg's joints: a 12 x (6 + 3 joints) matrix."""
+    """Jacobian, 12 x (6 + 3 joints), of the twists of a leg's last two joints in translation, root and leg joints."""
     T[:] = 0.0
     for h in range(2):
         holder = chain[len(chain) - 2 + h]
@@ -170,11 +171,11 @@ def foot_map(c, axes, chain, T):
 
 @compiled
 def factor_and_solve(diagonal, below, right, damping):
-    """Solve the block tridiagonal system in place: Cholesky forwards, substitution forwards and backwards.
+    """Solve a block tridiagonal system in place: block Cholesky, then forward and backward substitution.
 
     diagonal (time, n, n) and below (time - 1, n, n; rows of the next frame) are overwritten by the factors, right
-    (time, n) by the solution. Diagonals are raised by their share `damping`. Raises LinAlgError where the matrix
-    is not positive definite.
+    (time, n) by the solution. Diagonal entries are multiplied by 1 + `damping`. Raises LinAlgError where the matrix is
+    not positive definite.
     """
     count, n = right.shape
     for j in range(count):

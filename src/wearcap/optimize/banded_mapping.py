@@ -1,4 +1,5 @@
-"""From the forms of the terms to the block tridiagonal system in a frame's unknowns, and from its solution back."""
+"""Maps the terms' quadratic forms to the block tridiagonal system in the frames' unknowns, and its solution to a
+state."""
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from wearcap.optimize.banded_kernels import exp_and_jacobian
 
 @compiled
 def fill_system(theta, body, frames, kin, forms, diagonal, below, gradient):
-    """Blocks (time, n, n), couplings (pair, n, n; rows of the next frame) and right-hand side (time, n)."""
+    """Fill diagonal blocks (time, n, n), couplings (pair, n, n; rows of the next frame) and gradient (time, n)."""
     diagonal[:], below[:], gradient[:] = 0.0, 0.0, 0.0
     for j in range(len(diagonal)):
         _fill_trunk(j, theta, body, frames, kin, forms, diagonal, gradient)
@@ -21,7 +22,8 @@ def fill_system(theta, body, frames, kin, forms, diagonal, below, gradient):
 
 @compiled
 def _fill_trunk(j, theta, body, frames, kin, forms, diagonal, gradient):
-    """Translation, root, head; the pose prior of the eliminated spine weighs the head's turn by w (J Jᵀ)⁻¹."""
+    """Add translation, root and head; eliminating the spine turns its pose prior into the form w (J Jᵀ)⁻¹ of the
+    head."""
     D, g, R = diagonal[j], gradient[j], kin.R[j, 0]
     inverse, turn = spine_form(theta, body, frames, kin, j)
     pull = inverse @ turn
@@ -40,7 +42,8 @@ def _fill_trunk(j, theta, body, frames, kin, forms, diagonal, gradient):
 
 @compiled
 def spine_form(theta, body, frames, kin, j):
-    """((J Jᵀ)⁻¹, J d): J turns the head (world axes) by the spine's axis-angles, d is their way off the suit's."""
+    """((J Jᵀ)⁻¹, J d): J is the head rotation's Jacobian (world axes) in the spine's axis-angles, d their deviation
+    from the suit's."""
     gram, turn = np.zeros((3, 3)), np.zeros(3)
     for joint in body.head_chain:
         J = kin.axes[j, joint]
@@ -54,7 +57,7 @@ def spine_form(theta, body, frames, kin, j):
 
 @compiled
 def _fill_trunk_step(j, kin, forms, below):
-    """Couplings of translation, root and head with the next frame's."""
+    """Add the couplings of translation, root and head with the next frame's."""
     B, here, after = below[j], kin.R[j, 0], kin.R[j + 1, 0]
     head = forms.small_step[j, 2]
     for i in range(3):
@@ -71,7 +74,7 @@ def _fill_trunk_step(j, kin, forms, below):
 
 @compiled
 def _fill_foot(j, f, theta, body, frames, kin, forms, diagonal, below, gradient):
-    """A foot's twists and the leg's pose prior."""
+    """Add a foot's twist forms and the leg's pose terms."""
     chain, T = body.leg_chains[f], kin.foot_maps[j, f]
     first = LEGS + 3 * len(chain) * f
     for k in range(len(chain)):
@@ -113,7 +116,7 @@ def _scatter(target, first, block):
 
 @compiled
 def apply_step(step, scale, theta, R_root, t, body, frames, kin):
-    """Move a state by `scale` times minus the system's solution; the spine follows the head's turn."""
+    """Update a state by -`scale` times the system's solution; the spine follows the head's rotation."""
     R_turn, J = np.empty((3, 3)), np.empty((3, 3))
     for j in range(len(t)):
         inverse, turn = spine_form(theta, body, frames, kin, j)

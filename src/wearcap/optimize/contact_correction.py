@@ -1,9 +1,10 @@
-"""Moving a wearer onto what the hands touch, smoothly in and out (thesis §5.3.1), as an offset of the root's path.
+"""Contact-based correction of the root's path, as a smooth offset that brings hands onto touched objects (thesis
+§5.3.1).
 
-The document bends the path once more, with the touched point as the only control point (`bend_contacts`). Bending
-keeps lengths of steps: who walks straight at a thing cannot be moved towards it. Ours (`offset_for`) adds an offset
-that the contacts prescribe and that is as smooth and small as it can be elsewhere: one linear system with five
-diagonals for a whole recording.
+The thesis bends the path again, with the touched point as the only control point (`bend_contacts`). Bending keeps step
+lengths, so it cannot move a wearer who walks straight at an object towards it. Ours (`offset_for`) adds an offset that
+the contacts prescribe and that is otherwise as smooth and small as possible: one pentadiagonal linear system per
+recording.
 """
 
 from collections.abc import Callable
@@ -21,21 +22,22 @@ from wearcap.geometry.trajectory import require_rising
 from wearcap.optimize.trajectory import BentPath
 
 SETTLED = 2.0717
-"""x with exp(−x) (cos x + sin x) = 0.05: how an offset that its contact lets go of fades, over rate · time."""
+"""x with exp(−x) (cos x + sin x) = 0.05: decay of the offset after a contact, as a function of rate · time."""
 KEEP = 10.0
-"""Weight of a bent window's end; the contact has one. A point out of reach shall not move what follows."""
+"""Weight of a bent window's end, relative to the contact's (1), so that a point out of reach does not move what
+follows."""
 
 
 @dataclass(frozen=True)
 class OffsetSettings:
-    """a and b of min Σ hold · weight ‖δ − target‖² + ∫ a ‖δ''‖² + b ‖δ‖² dt (b outside of contacts, and one)."""
+    """Parameters of min Σ hold · weight ‖δ − target‖² + ∫ a ‖δ''‖² + b ‖δ‖² dt (b = 1 outside of contacts, else 0)."""
 
     transition_s: float = 1.5
-    """Before and after a contact the offset is within 5 % of its size (it swings 4 % beyond zero); a follows from
-    it. An offset of D m adds a speed of up to 1.34 D / transition_s to the root, and so to feet that stand."""
+    """Time (s) before and after a contact at which the offset has decayed to 5 % (it overshoots zero by 4 %); it
+    determines a. An offset of D m adds a speed of up to 1.34 D / transition_s to the root, and so to standing feet."""
     hold: float = 1e3
-    """Of a contact's frame of weight one. A single one is met to 0.2 % (for transitions of 1 to 2 s); every frame,
-    changes faster than about 50 ms are smoothed."""
+    """Weight of a contact frame's target. A single target frame is met to 0.2 % (for transitions of 1 to 2 s); with
+    targets in all frames, changes faster than about 50 ms are smoothed."""
 
     def __post_init__(self):
         if not (self.transition_s > 0 and self.hold > 0):
@@ -43,7 +45,7 @@ class OffsetSettings:
 
     @property
     def stiffness(self) -> float:
-        """a (s⁴)."""
+        """Weight a of the second derivative (s⁴)."""
         return (self.transition_s / SETTLED) ** 4 / 4
 
 
@@ -53,11 +55,11 @@ def offset_for(
     timestamps: Float64[Tensor, "time"],
     settings: OffsetSettings = OffsetSettings(),
 ) -> Float64[Tensor, "time axis"]:
-    """The offset (m) of the whole recording: near the targets where they weigh, smooth, and fading elsewhere.
+    """Offset (m) of the whole recording: close to weighted targets, smooth, and decaying to zero elsewhere.
 
-    Weights are 0 outside of contacts and about 1 within: in the first frame alone (the document's p_c), or in all
-    frames (a hand on a hinge's arc). Solved exactly, in time linear in the recording's length. Raises WearcapError
-    for negative weights, targets that are not finite where they weigh, timestamps that do not rise.
+    Weights are 0 outside of contacts and about 1 within: in the first frame alone (the thesis's p_c), or in all frames
+    (a hand on a hinge's arc). Solved exactly, in time linear in the recording's length. Raises WearcapError for
+    negative weights, targets of positive weight that are not finite, timestamps that do not rise.
     """
     require_rising(timestamps)
     if not (weights >= 0).all():
@@ -76,7 +78,7 @@ def offset_for(
 
 
 def _form(times: np.ndarray, pull: np.ndarray, stiffness: float) -> np.ndarray:
-    """Upper bands of the system: two above the diagonal, for solveh_banded."""
+    """Upper bands of the pentadiagonal system, for solveh_banded."""
     before, after = np.diff(times)[:-1], np.diff(times)[1:]
     around = (before + after) / 2
     # second differences of neighbours at uneven times: left · δ₋ + middle · δ + right · δ₊
@@ -101,11 +103,11 @@ def bend_contacts(
     bend: Callable[..., BentPath],
     transition_s: float = 3.0,
 ) -> Float64[Tensor, "time 2"]:
-    """The document's correction as an offset (m): for each contact the path is bent to its first frame's target.
+    """The thesis's correction as an offset (m): for each contact the path is bent to its first frame's target.
 
-    `bend` is `trajectory.bend` with its settings (held headings) and solver. A contact is a run of frames that
-    weigh. From `transition_s` before it to `transition_s` after it, or to the neighbouring contact's start, the
-    path is bent; the rest stays, also where the bent piece, out of reach, does not quite come back to it.
+    `bend` is `trajectory.bend` with its settings (`clamped_ends`) and solver. A contact is a run of frames of positive
+    weight. The path is bent from `transition_s` before it to `transition_s` after it, or to the neighbouring contact's
+    start. The rest is unchanged, even if the bent piece does not quite end on it because the target is out of reach.
     """
     require_rising(timestamps)
     touches = torch.cat([weights.new_zeros(1), (weights > 0).to(weights), weights.new_zeros(1)]).diff()

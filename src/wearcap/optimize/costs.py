@@ -1,7 +1,7 @@
-"""The terms of HPS as pure functions of what they see; each returns residuals, and `Loss` turns those into energy.
+"""The terms of HPS as pure functions that return residuals; `Loss` maps residuals to energy.
 
-A residual is a vector per element: per frame, pair of frames, or patch vertex. The documents' energies are means
-of its norms (`Loss("norm")`); other losses are ours. Frames at 30 Hz, rotations as matrices, metres, radians.
+A residual is one vector per frame, pair of frames or patch vertex. The thesis's energies are means of residual norms
+(`Loss("norm")`); other losses are ours. Frames at 30 Hz, rotations as matrices, metres, radians.
 """
 
 from dataclasses import dataclass
@@ -18,11 +18,12 @@ LOSSES = ("norm", "square", "huber", "cauchy")
 
 @dataclass(frozen=True)
 class Loss:
-    """ρ of a residual's norm s: s, s², s²/2δ up to δ and s − δ/2 beyond, or δ/2 · log(1 + (s/δ)²)."""
+    """Loss ρ of a residual's norm s: s; s²; s²/2δ up to δ and s − δ/2 beyond; or δ/2 · log(1 + (s/δ)²)."""
 
     kind: str = "norm"
+    """One of `LOSSES`, in the order of the formulas above."""
     delta: float = 1.0
-    """Where "huber" and "cauchy" turn from square to robust, in the residual's unit."""
+    """Norm δ at which "huber" and "cauchy" change from quadratic to robust, in the residual's unit."""
 
     def __post_init__(self):
         if self.kind not in LOSSES:
@@ -31,7 +32,7 @@ class Loss:
             raise WearcapError(f"a loss with delta {self.delta}", expected="a positive number")
 
     def __call__(self, residual: Float[Tensor, "*batch component"]) -> Float[Tensor, "*batch"]:
-        """ρ of each element; the gradient is finite at zero."""
+        """ρ of each residual; the gradient is finite at zero."""
         square = (residual**2).sum(-1)
         if self.kind == "square":
             return square
@@ -48,7 +49,7 @@ def head_orientation(
     R_head_cam: Float[Tensor, "3 3"],
     R_world_cam: Float[Tensor, "time 3 3"],
 ) -> Float[Tensor, "time 3"]:
-    """Turn (rad) from the body's camera R^H(θ) R_HC to the localised one (thesis eq. 4.2–4.4), in the world."""
+    """Rotation (rad, world axes) from the body's camera R^H(θ) R_HC to the localised one (thesis eq. 4.2–4.4)."""
     return _turn(R_world_head @ R_head_cam, R_world_cam)
 
 
@@ -64,28 +65,30 @@ def foot_plane(
     origin: Float[Tensor, "time vertex 3"],
     normal: Float[Tensor, "time vertex 3"],
 ) -> Float[Tensor, "time vertex 1"]:
-    """Signed distance (m) of patch vertices from the scan's local plane: eq. 4.6 without the cloud's grain (ours)."""
+    """Signed distance (m) of patch vertices from the scan's local plane (ours): eq. 4.6, insensitive to point
+    spacing."""
     return ((points - origin) * normal).sum(-1, keepdim=True)
 
 
 def foot_slide(points: Float[Tensor, "time vertex 3"]) -> Float[Tensor, "pair vertex 3"]:
-    """Way (m) of patch vertices from frame to frame (thesis eq. 4.7)."""
+    """Displacement (m) of patch vertices from frame to frame (thesis eq. 4.7)."""
     return points.diff(dim=0)
 
 
 def translation_step(
     t_world_root: Float[Tensor, "time 3"], expected: Float[Tensor, "pair 3"]
 ) -> Float[Tensor, "pair 3"]:
-    """Step of the root (m) beyond what is expected: nothing (thesis eq. 4.9) or the suit's step (released code)."""
+    """Root displacement (m) minus the expected one: zero (thesis eq. 4.9) or the suit's (released code)."""
     return t_world_root.diff(dim=0) - expected
 
 
 def rotation_step(
     R_world_body: Float[Tensor, "time 3 3"], expected: Float[Tensor, "pair 3 3"]
 ) -> Float[Tensor, "pair 3"]:
-    """Turn (rad) from frame to frame beyond the expected one: none (thesis eq. 4.10, 4.11) or the suit's (ours).
+    """Rotation (rad) from frame to frame relative to the expected one: identity (thesis eq. 4.10, 4.11) or the
+    suit's (ours).
 
-    The expected turn is R_world_body[j + 1] R_world_body[j]ᵀ.
+    An expected rotation has the form R_world_body[j + 1] R_world_body[j]ᵀ.
     """
     return _turn(expected @ R_world_body[:-1], R_world_body[1:])
 
@@ -93,24 +96,24 @@ def rotation_step(
 def pose_prior(
     theta: Float[Tensor, "time joint 3"], theta_imu: Float[Tensor, "time joint 3"]
 ) -> Float[Tensor, "time component"]:
-    """All joints' axis-angles but the root's against the suit's, one vector per frame (thesis eq. 4.12)."""
+    """Deviation of all joints' axis-angles but the root's from the suit's, one vector per frame (thesis eq. 4.12)."""
     return (theta - theta_imu).flatten(1)
 
 
 def pose_step(
     theta: Float[Tensor, "time joint 3"], theta_imu: Float[Tensor, "time joint 3"]
 ) -> Float[Tensor, "pair component"]:
-    """Change from frame to frame of the way off the suit's pose, whose errors are slow (ours)."""
+    """Change of the deviation from the suit's pose from frame to frame; the suit's errors vary slowly (ours)."""
     return pose_prior(theta, theta_imu).diff(dim=0)
 
 
 def translation_hold(
-    t_world_root: Float[Tensor, "time 3"], held: Float[Tensor, "time 3"]
+    t_world_root: Float[Tensor, "time 3"], target: Float[Tensor, "time 3"]
 ) -> Float[Tensor, "time 3"]:
-    """Offset (m) of the root from where the camera's localisation puts it (released code; no equation)."""
-    return t_world_root - held
+    """Offset (m) of the root from its camera-based initial position (released code; no equation)."""
+    return t_world_root - target
 
 
 def _turn(R_a: Float[Tensor, "*batch 3 3"], R_b: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Rotation vector (world axes, rad) that turns a into b."""
+    """Rotation vector (world axes, rad) that rotates a into b."""
     return rotation.log(R_b @ R_a.transpose(-1, -2))

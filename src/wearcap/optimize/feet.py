@@ -1,4 +1,4 @@
-"""The four patches of the feet that meet the floor: a few vertices of the body's surface each."""
+"""The four contact patches of the feet (left/right heel and toe): a few vertices of the body's surface each."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,32 +17,34 @@ PATCH_VERTICES = 10
 
 @dataclass(frozen=True, eq=False)
 class FootPatches:
-    """Vertices of the patches (B_k of thesis eq. 4.6), skinned alone: 40 instead of some thousand."""
+    """Vertices of the patches (B_k of thesis eq. 4.6), skinned without the rest of the body: 40 instead of
+    thousands."""
 
     body: BodyModel
     vertex: Int64[Tensor, "vertex"]
     patch: Int64[Tensor, "vertex"]
-    """Number in `FOOT_PATCHES` of each vertex."""
+    """Index in `FOOT_PATCHES` of each vertex's patch."""
 
     @classmethod
     def of(cls, body: BodyModel, count: int = PATCH_VERTICES) -> "FootPatches":
-        """`count` vertices of each region, spread out (all of them where a region has fewer)."""
+        """Choose `count` evenly spread vertices of each region (all vertices of a smaller region)."""
         chosen = [_spread(body, body.regions[name], count) for name in FOOT_REGIONS.values()]
         patch = torch.cat([torch.full((len(v),), k) for k, v in enumerate(chosen)])
         return cls(body, torch.cat(chosen), patch)
 
     @property
     def legs(self) -> list[list[int]]:
-        """Joints of the left and the right leg, from hip to toes; the last two hold the patches."""
+        """Joints of the left and the right leg, from hip to toe; the patches are skinned to the last two."""
         skeleton = self.body.skeleton
         return [chain_to(skeleton, skeleton.index(f"{side}_toe")) for side in ("left", "right")]
 
     def points(self, T_world_joint: Rigid) -> Float[Tensor, "time vertex 3"]:
-        """Positions (m) in the world, given the poses of all joints."""
+        """World positions (m) of the vertices, given the poses of all joints."""
         return self._only.vertices(T_world_joint)
 
     def share(self, contact: Float[Tensor, "*batch patch"]) -> Float[Tensor, "*batch vertex"]:
-        """Contact of each vertex's patch, divided by the patch's number of vertices: sums over vertices are means."""
+        """Contact of each vertex's patch, divided by its number of vertices, so that sums over vertices are patch
+        means."""
         size = torch.bincount(self.patch, minlength=len(FOOT_REGIONS)).to(contact)
         return (contact / size)[..., self.patch]
 
@@ -53,7 +55,7 @@ class FootPatches:
 
     @cached_property
     def _only(self) -> BodyModel:
-        """The patches as a body of their own."""
+        """Body model that consists of the patches only."""
         whole = self.body
         blend = None if whole.pose_blend is None else whole.pose_blend[:, self.vertex]
         return BodyModel(
@@ -63,7 +65,7 @@ class FootPatches:
 
 
 def chain_to(skeleton: Skeleton, joint: int) -> list[int]:
-    """Joints from just below the root to `joint`."""
+    """Joints on the chain from the root (excluded) to `joint`."""
     chain = []
     while joint > 0:
         chain.append(joint)
@@ -72,7 +74,7 @@ def chain_to(skeleton: Skeleton, joint: int) -> list[int]:
 
 
 def _spread(body: BodyModel, region: Int64[Tensor, "all"], count: int) -> Int64[Tensor, "chosen"]:
-    """Vertices of a region chosen one by one, each the furthest from those before."""
+    """Farthest-point sampling of a region's vertices."""
     points = body.rest_vertices[region]
     chosen = [int((points - points.mean(0)).norm(dim=1).argmax())]
     while len(chosen) < min(count, len(region)):

@@ -1,4 +1,4 @@
-"""HPS as an energy (thesis eq. 4.1–4.12): what is known of a recording, the unknowns, and the terms between them."""
+"""The energy of HPS (thesis eq. 4.1–4.12): data of a recording, unknowns, and the terms that relate them."""
 
 from dataclasses import dataclass, field, replace
 
@@ -19,12 +19,13 @@ TERMS = (
     "self", "contact", "contact_plane", "slide", "translation_smooth", "root_smooth", "head_smooth", "pose",
     "hold", "translation_step", "root_step", "head_step", "pose_step",
 )  # fmt: skip
-"""`costs` by the names under which a config weighs them."""
+"""Names of the terms, as configs weight them; each is a function of `costs`."""
 
 SURFACE_REACH_M = 0.5
-"""A foot further than this from every scanned point has no scene beneath it."""
+"""Distance (m) to the nearest scanned point above which a foot has no scene below it."""
 LEAST_UPRIGHT = 0.7
-"""What leans more than 45° carries no foot: a wall beside a gap in the scanned floor."""
+"""Least vertical component of a plane's normal that a foot may stand on (45°): excludes walls beside gaps in the
+floor."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class HpsEnergy:
 
     weights: dict[str, float]
     losses: dict[str, Loss] = field(default_factory=dict)
-    """The document's norms where a term is not named."""
+    """Loss by term; terms without an entry use the thesis's norm."""
 
     def __post_init__(self):
         for name in (*self.weights, *self.losses):
@@ -54,7 +55,7 @@ class HpsEnergy:
 
 @dataclass(frozen=True, eq=False)
 class HpsState:
-    """The unknowns: axis-angles of all joints but the root, and the root's pose in the world (float64)."""
+    """The unknowns: axis-angles of all joints but the root (rad), and the root's pose in the world (float64, m)."""
 
     theta: Float[Tensor, "time joint 3"]
     R_world_root: Float[Tensor, "time 3 3"]
@@ -73,25 +74,27 @@ class HpsState:
 
 @dataclass(frozen=True, eq=False)
 class HpsData:
-    """What sensors and initialisation say, frame by frame at one rate (float64; m, rad)."""
+    """Sensor data and initialisation, frame by frame at one rate (float64; m, rad)."""
 
     patches: FootPatches
     start: HpsState
-    """Initialisation (thesis §4.2.5); its theta is the suit's, θ^I."""
+    """Initial state (thesis §4.2.5); its theta is the suit's pose θ^I."""
     R_head_cam: Float[Tensor, "3 3"]
     R_world_cam: Float[Tensor, "time 3 3"]
-    """Localised orientations."""
+    """Localised camera orientations."""
     cam_confidence: Float[Tensor, "time"]
-    """Weighs each frame's `self` term: 0 where the camera was not localised."""
+    """Weight of each frame's `self` term: 0 where the camera was not localised."""
     hold_confidence: Float[Tensor, "time"]
-    """Weighs each frame's `hold` on the initial translation."""
+    """Weight of each frame's `hold` term, which attracts the root to its initial translation."""
     contact: Float[Tensor, "time patch"]
     t_step: Float[Tensor, "pair 3"]
-    """Steps of the root by the suit, turned into the scene (m)."""
+    """Root displacements per frame measured by the suit, rotated into the scene (m)."""
     R_root_step: Float[Tensor, "pair 3 3"]
+    """Root rotations per frame measured by the suit, in world axes."""
     R_head_step: Float[Tensor, "pair 3 3"]
+    """Head rotations per frame measured by the suit, in world axes."""
     surface: SurfaceIndex | None = None
-    """None: without scene."""
+    """Surface of the scan; None: without scene."""
 
     def __len__(self) -> int:
         return len(self.start)
@@ -108,20 +111,21 @@ class HpsData:
         )  # fmt: skip
 
     def to(self, dtype: torch.dtype) -> "HpsData":
-        """All numbers in another precision (the surface stays)."""
+        """All tensors in another precision; the surface is unchanged."""
         tensors = {name: value.to(dtype) for name, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(
             self, start=HpsState(*(part.to(dtype) for part in vars(self.start).values())), **tensors
         )
 
     def pose(self, state: HpsState) -> Rigid:
-        """Poses of all joints."""
+        """World poses of all joints in a state."""
         return forward_kinematics(self.patches.body.skeleton, state.R_parent_joint, state.t_world_root)
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Nearest scene point v(n) of each patch vertex (eq. 4.6), and the plane there; `found` where there is one."""
+    """Nearest scene point v(n) of each patch vertex (eq. 4.6), and the local plane; `found` is 1 where both exist,
+    else 0."""
 
     point: Float[Tensor, "time vertex 3"]
     origin: Float[Tensor, "time vertex 3"]
@@ -130,9 +134,9 @@ class Ground:
 
 
 def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: HpsEnergy) -> Ground:
-    """Look up the scene beneath patch vertices (m, world) in contact, as far as the energy asks for it.
+    """Query the scene below patch vertices in contact (m, world), as far as the energy needs it.
 
-    A patch has one plane: that beneath its middle. Nothing is found without a scene.
+    Each patch has one plane, that below its centroid. `found` is 0 everywhere without a scene.
     """
     if data.surface is None or not (energy.weight("contact") or energy.weight("contact_plane")):
         none = torch.zeros_like(points.detach())
@@ -152,7 +156,7 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
             torch.from_numpy, data.surface.plane(queries, reach_m=SURFACE_REACH_M)
         )
         origin, normal = where[:, patch], up[:, patch]
-        found *= normal[..., 2] > LEAST_UPRIGHT  # not where there is none: NaN is no greater
+        found *= normal[..., 2] > LEAST_UPRIGHT  # False where no plane was found (NaN)
     parts = (point.nan_to_num(), origin.nan_to_num(), normal.nan_to_num(), found)
     return Ground(*(part.to(dtype) for part in parts))
 
@@ -160,10 +164,10 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
 def energy_terms(
     energy: HpsEnergy, data: HpsData, state: HpsState, ground: Ground | None = None, full_mesh: bool = False
 ) -> dict[str, Float[Tensor, ""]]:
-    """Each weighed term of eq. 4.1, differentiable in the state.
+    """Weighted terms of eq. 4.1, differentiable in the state.
 
-    `ground` None: looked up for this state. `full_mesh` skins the whole body and takes the patches from it, as
-    the document does; the result is the same.
+    `ground` None: queried for this state. `full_mesh` skins the whole body and takes the patches from it, as the
+    thesis does, with the same result.
     """
     T_world_joint = data.pose(state)
     head = data.patches.body.skeleton.index("head")

@@ -1,4 +1,4 @@
-"""What a solver returns: where it ended, why, and every step on the way."""
+"""The result of an HPS solver."""
 
 from dataclasses import dataclass, field
 
@@ -7,10 +7,10 @@ from wearcap.optimize.hps import HpsState
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The state, and the energy by term after every iteration."""
+    """Final state, energy history and stopping reason."""
 
     state: HpsState
     history: list[dict[str, float]] = field(default_factory=list)
-    """One entry per iteration (over windows: their mean), with "total"."""
+    """Energy by term and in "total", one entry per iteration (mean over windows or stretches)."""
     reason: str = ""
-    """Why it stopped."""
+    """Why the solver stopped."""

@@ -1,7 +1,7 @@
-"""Long recordings in stretches that overlap: bounded memory, and one stretch per core.
+"""Solves long recordings in overlapping stretches: bounded memory, and one stretch per core.
 
-What a frame says fades along time within seconds where the camera is localised. A stretch therefore takes frames
-beyond its ends along, as many as hold the motion firmly, and leaves them to its neighbours.
+Where the camera is localised, the influence of a frame decays within seconds. A stretch is therefore solved together
+with `overlap` localised frames beyond each of its ends, whose solution is discarded.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -22,10 +22,10 @@ def solve_in_stretches(
     overlap: int = 150,
     jobs: int = 2,
 ) -> Solution:
-    """`solve_banded` over stretches of about `stretch` frames, `jobs` at a time.
+    """Run `solve_banded` on stretches of about `stretch` frames, `jobs` at a time.
 
-    No border lies in an outage of localisation, and `overlap` counts frames that were localised. The history is the
-    stretches' mean, by their share of the frames.
+    Borders are never within a localisation outage, and `overlap` counts localised frames. The history is the mean over
+    stretches, weighted by their numbers of frames.
     """
     spans = list(_spans(data, stretch, overlap))
     with ThreadPoolExecutor(max_workers=max(jobs, 1)) as pool:
@@ -45,17 +45,17 @@ def solve_in_stretches(
 
 
 def _spans(data: HpsData, stretch: int, overlap: int):
-    """(first, keep from, keep to, last) of each stretch."""
-    firm = (data.hold_confidence > 0).long()
-    held = torch.cat([firm.new_zeros(1), firm.cumsum(0)])
+    """Frames (first, keep from, keep to, last) of each stretch."""
+    localized = (data.hold_confidence > 0).long()
+    localized_before = torch.cat([localized.new_zeros(1), localized.cumsum(0)])
     borders = [0]
     while len(data) - borders[-1] > 1.5 * stretch:
         border = borders[-1] + stretch
-        while border < len(data) and not firm[border]:
+        while border < len(data) and not localized[border]:
             border += 1
         borders.append(border)
     borders = [b for b in borders if b < len(data)] + [len(data)]
     for keep, stop in pairwise(borders):
-        first = int(torch.searchsorted(held, held[keep] - overlap, right=True)) - 1
-        last = int(torch.searchsorted(held, held[stop] + overlap))
+        first = int(torch.searchsorted(localized_before, localized_before[keep] - overlap, right=True)) - 1
+        last = int(torch.searchsorted(localized_before, localized_before[stop] + overlap))
         yield max(min(first, keep), 0), keep, stop, min(max(last, stop), len(data))

@@ -1,9 +1,10 @@
-"""Bending a path in the ground plane through control points (thesis eq. 5.1, 5.2): the problem, its energy, Adam.
+"""Trajectory correction (thesis eq. 5.1, 5.2): bends a path in the ground plane to control points; problem, energy,
+Adam.
 
-A suit measures well how far its wearer goes and badly where to: lengths of steps are kept, headings are unknown. A
-step is the way from one frame to the next. Whatever the sampling, what is unknown is the turn φ = α̂ − α of each
-step, l̂ = l(0) + Σ R(φ) step, and E_tr counts how φ changes. A step of zero length has no heading and keeps the
-turn of the last step that has one (at the path's beginning: that of the first).
+A suit measures distances well and headings badly: step lengths are kept, headings are unknown. A step is the
+displacement from one frame to the next. The unknowns are the turns φ = α̂ − α of the steps, so l̂ = l(0) + Σ R(φ) step,
+and E_tr penalises changes of φ. A step of zero length has no heading and takes the turn of the last step that has one
+(at the path's beginning: that of the first).
 """
 
 import math
@@ -25,18 +26,18 @@ STILL_M = 1e-6
 
 @dataclass(frozen=True)
 class Bending:
-    """What eq. 5.2 leaves to choose. Raises WearcapError for a rigidity that is not positive or an unknown norm."""
+    """Parameters of eq. 5.2. Raises WearcapError for a rigidity that is not positive or an unknown norm."""
 
     rigidity: float = 10.0
     """λ: metres of the control term per unit of E_tr (rad²/s, or rad for "absolute")."""
     norm: str = "square"
-    """Of the difference of heading rates, where eq. 5.1 prints none: ∫ (dα̂/dτ − dα/dτ)² dτ, or ∫ |…| dτ."""
+    """Penalty on the difference of heading rates, which eq. 5.1 does not print: ∫ (dα̂/dτ − dα/dτ)² dτ, or ∫ |…| dτ."""
     loss: Loss = field(default_factory=Loss)
-    """Of a control point's distance: the document's norm; "huber", and "cauchy" for bursts of wrong points (ours)."""
+    """Loss of a control point's distance: the thesis's norm; "huber", or "cauchy" for bursts of wrong points (ours)."""
     free_start: bool = False
-    """The first point is unknown too: the path may be shifted (a control point at its time pulls it)."""
-    held_headings: bool = False
-    """The path comes from and goes on to steps that do not turn: for a window within a longer path."""
+    """Whether the first point is an unknown too, so that the whole path may shift."""
+    clamped_ends: bool = False
+    """Whether the steps before and after the path are fixed (φ = 0 there): for a window within a longer path."""
 
     def __post_init__(self):
         if not (self.rigidity > 0 and math.isfinite(self.rigidity)):
@@ -49,17 +50,17 @@ class Bending:
 
 @dataclass(frozen=True, eq=False)
 class BendingProblem:
-    """A path and its control points, checked and taken apart into steps (float64; m, s, rad)."""
+    """A validated path as steps, and its control points (float64; m, s, rad)."""
 
     settings: Bending
     path: Float64[Tensor, "time 2"]
     timestamps: Float64[Tensor, "time"]
     leader: Int64[Tensor, "step"]
-    """The step whose turn each step has: itself where it has a heading."""
+    """Index of the step whose turn each step takes: its own where it has a heading."""
     control_step: Int64[Tensor, "control"]
-    """The step within which each control point lies, rising …"""
+    """Index of the step that contains each control point's time, ascending."""
     control_share: Float64[Tensor, "control"]
-    """… and how far along it (0…1)."""
+    """Position of each control point's time within its step (0…1)."""
     control_points: Float64[Tensor, "control 2"]
     control_weights: Float64[Tensor, "control"]
 
@@ -69,14 +70,14 @@ class BendingProblem:
 
     @property
     def link_s(self) -> Float64[Tensor, "link"]:
-        """Time (s) from each step's middle to the next one's; before and after them the end steps' own."""
+        """Time (s) from each step's middle to the next one's; the first and last entry are the end steps' durations."""
         steps = self.timestamps.diff()
         return torch.cat([steps[:1], (steps[:-1] + steps[1:]) / 2, steps[-1:]])
 
 
 @dataclass(frozen=True, eq=False)
 class BentPath:
-    """Where a solver ended: the path in the plane, and the energy by term ("control", "bending", "total")."""
+    """Result of a solver: the path in the plane (m), and the energy by term ("control", "bending", "total")."""
 
     path: Float64[Tensor, "time 2"]
     turn: Float64[Tensor, "step"]
@@ -90,7 +91,7 @@ class BentPath:
 
     @property
     def frame_turn(self) -> Float64[Tensor, "time"]:
-        """By how much (rad, about the vertical) whoever walks the path turns with it, at each frame."""
+        """Turn of the body at each frame (rad, about the vertical): mean of the turns of the adjacent steps."""
         before, after = torch.cat([self.turn[:1], self.turn]), torch.cat([self.turn, self.turn[-1:]])
         return (before + after) / 2
 
@@ -108,10 +109,10 @@ def bend(
     settings: Bending,
     solver: Solver,
 ) -> BentPath:
-    """The path (m, in the ground plane) that keeps its lengths of steps and its shape, and nears the control points.
+    """Bend a path (m, ground plane) towards control points, keeping its step lengths and, softly, its shape.
 
-    `control_times` lie between frames or on them, and rise (several points may share a time). `weights` are ones
-    when None. Raises WearcapError for what is not finite, times out of order or outside the path, negative weights.
+    `control_times` may lie between frames and must not descend (several points may share a time). `weights` default to
+    one. Raises WearcapError for values that are not finite, times out of order or outside the path, negative weights.
     """
     return solver(bending_problem(path, timestamps, control_times, control_points, weights, settings))
 
@@ -124,7 +125,7 @@ def bending_problem(
     weights: Float[Tensor, "control"] | None,
     settings: Bending,
 ) -> BendingProblem:
-    """What `bend` hands to its solver; raises what it raises."""
+    """The problem that `bend` solves. Raises WearcapError as `bend`."""
     require_rising(timestamps)
     weights = torch.ones_like(control_times) if weights is None else weights
     if len(path) < 2:
@@ -159,7 +160,8 @@ def bending_problem(
 
 
 def headings(path: Float64[Tensor, "time 2"]) -> Float64[Tensor, "step"]:
-    """α of each step (rad, within ±π): atan2 of eq. 5.1; where nothing moves, that of the last step that did."""
+    """Heading α of each step (rad, within ±π; atan2 of eq. 5.1); a step of zero length takes that of the last moving
+    step."""
     step = path.diff(dim=0)[_leaders(path)]
     return torch.atan2(step[:, 1], step[:, 0])
 
@@ -172,7 +174,7 @@ def wrapped(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 def bent(
     problem: BendingProblem, turn: Float64[Tensor, "step"], shift: Float64[Tensor, "2"]
 ) -> Float64[Tensor, "time 2"]:
-    """l̂: the steps turned by φ one after the other, from the first point moved by `shift` (m)."""
+    """The bent path l̂: steps rotated by φ and accumulated from the first point, which moves by `shift` (m)."""
     turn, step = turn[problem.leader], problem.step
     cosine, sine = turn.cos(), turn.sin()
     x, y = step.unbind(-1)
@@ -182,17 +184,17 @@ def bent(
 
 
 def control_offset(path: Float64[Tensor, "time 2"], problem: BendingProblem) -> Float64[Tensor, "control 2"]:
-    """l̂(τ_i) − p_i (m; eq. 5.2), linear within steps."""
+    """Offsets l̂(τ_i) − p_i (m; eq. 5.2), the path being linear within steps."""
     at, share = problem.control_step, problem.control_share[:, None]
     return torch.lerp(path[at], path[at + 1], share) - problem.control_points
 
 
 def heading_change(
-    heading: Float64[Tensor, "step"], original: Float64[Tensor, "step"], held: bool = False
+    heading: Float64[Tensor, "step"], original: Float64[Tensor, "step"], clamped: bool = False
 ) -> Float64[Tensor, "link"]:
-    """dα̂ − dα from step to step (rad, wrapped; eq. 5.1); `held`: before and after them nothing turns."""
+    """Change dα̂ − dα from step to step (rad, wrapped; eq. 5.1); `clamped`: with fixed steps before and after them."""
     off = heading - original
-    if not held:
+    if not clamped:
         return wrapped(off.diff())
     return wrapped(torch.cat([off[:1], off.diff(), -off[-1:]]))
 
@@ -200,12 +202,12 @@ def heading_change(
 def energy_terms(
     problem: BendingProblem, turn: Float64[Tensor, "step"], shift: Float64[Tensor, "2"]
 ) -> dict[str, Float64[Tensor, ""]]:
-    """The terms of eq. 5.2, differentiable in φ (rad) and in the shift of the first point (m)."""
+    """Terms of eq. 5.2, differentiable in φ (rad) and in the shift of the first point (m)."""
     settings = problem.settings
     offset = control_offset(bent(problem, turn, shift), problem)
     off = turn[problem.leader]
-    change = heading_change(off, torch.zeros_like(off), settings.held_headings)
-    seconds = problem.link_s if settings.held_headings else problem.link_s[1:-1]
+    change = heading_change(off, torch.zeros_like(off), settings.clamped_ends)
+    seconds = problem.link_s if settings.clamped_ends else problem.link_s[1:-1]
     tension = change**2 / seconds if settings.norm == "square" else change.abs()
     return {
         "control": (problem.control_weights * settings.loss(offset)).sum(),
@@ -220,7 +222,7 @@ def bent_path(
     history: list[dict[str, float]],
     reason: str,
 ) -> BentPath:
-    """What a solver returns for its unknowns."""
+    """Build a solver's result from its unknowns."""
     turn = turn[problem.leader]
     turn = torch.cat([wrapped(turn[:1]), wrapped(turn.diff())]).cumsum(0)
     heading = wrapped(headings(problem.path) + turn)
@@ -228,7 +230,8 @@ def bent_path(
 
 
 def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: float = 1e-2) -> BentPath:
-    """The document's solver (thesis §5.4.2); the rate (rad, m) is its hyperparameter. Returns the best state met."""
+    """The thesis's solver (§5.4.2), Adam with a learning rate in rad and m. Returns the best state of all
+    iterations."""
     turn = torch.zeros(len(problem.leader), dtype=torch.float64, requires_grad=True)
     shift = torch.zeros(2, dtype=torch.float64, requires_grad=problem.settings.free_start)
     unknowns = [value for value in (turn, shift) if value.requires_grad]

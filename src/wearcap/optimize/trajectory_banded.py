@@ -1,8 +1,8 @@
-"""Our solver of the bending energy: second order, over all of a path in time linear in its length.
+"""Second-order solver of the bending energy (ours), in time linear in the path's length.
 
-The path begins where the convex relaxation (steps may stretch) has its one minimum, which needs no first guess, then
-Gauss-Newton steps go from there: each is one pass backwards and one forwards (`trajectory_kernels`), and since the
-forward pass steers by where it is, a path of kilometres follows its control points instead of running away.
+The initial path is the unique minimum of a convex relaxation in which steps may also stretch, so no initial guess is
+needed. Gauss-Newton steps follow, each one backward and one forward pass (`trajectory_kernels`). The forward pass
+feeds the current position back into the turns, so errors do not accumulate over paths of kilometres.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from wearcap.optimize.trajectory_kernels import control_weights, energy, stretch
 
 RELAXED_PASSES = 3
 RELAXED_M, RELAXED_TURN = 0.3, 0.02
-"""Rounding of distances (m) and turns from step to step (rad) in the relaxation."""
+"""Smoothing of distances (m) and of turns from step to step (rad) in the relaxation."""
 
 
 def bend_banded(
@@ -24,9 +24,9 @@ def bend_banded(
     smooth_end: float = 1e-5,
     tolerance: float = 1e-6,
 ) -> BentPath:
-    """Minimise eq. 5.2; norms are met by reweighting, their tips rounded ever less (m, rad).
+    """Minimise eq. 5.2 by iteratively reweighted least squares with a decreasing smoothing of norms (m, rad).
 
-    Stops when the energy falls by less than a share of `tolerance`, the rounding having reached its end.
+    Stops when the relative decrease of the energy is below `tolerance` and the smoothing has reached its end.
     """
     path = _Path(problem)
     path.begin()
@@ -49,14 +49,14 @@ def bend_banded(
 
 
 class _Path:
-    """Arrays of a path as it is being bent, its first point at the origin."""
+    """Arrays of a path during the optimisation, relative to its first point."""
 
     def __init__(self, problem: BendingProblem):
         settings, steps = problem.settings, len(problem.leader)
         self.free = settings.free_start
         self.step = np.ascontiguousarray(problem.step.numpy())
         seconds = problem.link_s.numpy() if settings.norm == "square" else np.ones(steps + 1)
-        ends = settings.rigidity * settings.held_headings / seconds[[0, -1]]
+        ends = settings.rigidity * settings.clamped_ends / seconds[[0, -1]]
         leads = problem.leader.numpy() == np.arange(steps)
         self.link = np.where(leads, settings.rigidity / seconds[:-1], np.inf)
         self.link[1 : problem.leader[0].item() + 1] = np.inf
@@ -72,17 +72,17 @@ class _Path:
         self.gains = np.empty((steps, 4))
 
     def state(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """φ, and the shift of the first point."""
+        """The turns φ (rad) and the shift of the first point (m)."""
         return torch.from_numpy(self.turn.copy()), torch.from_numpy(self.place[0].copy())
 
     def terms(self, smooth: float, turn: np.ndarray | None = None, place: np.ndarray | None = None) -> dict:
-        """Energy by term, of the path at hand when no other is given; `smooth` rounds norms."""
+        """Energy by term of a path (default: the current one), with norms smoothed by `smooth`."""
         turn, place = self.turn if turn is None else turn, self.place if place is None else place
         control, bending = energy(turn, place, self.link, self.last_link, *self.controls, self.kinds, smooth)
         return {"control": control, "bending": bending, "total": control + bending}
 
     def begin(self) -> None:
-        """Start from the relaxation, reweighted from its own distances, unless the path lies better as it is."""
+        """Start from the reweighted relaxation, unless the original path has less energy."""
         first, share, target, weight = self.controls
         complex_target = target[:, 0] + 1j * target[:, 1]
         step = self.step[:, 0] + 1j * self.step[:, 1]
@@ -104,7 +104,7 @@ class _Path:
             self._take()
 
     def improve(self, smooth: float, damping: float, before: float) -> tuple[float, float]:
-        """One Gauss-Newton step: by how much the rounded energy fell, and the damping for the next."""
+        """One Gauss-Newton step; returns the decrease of the smoothed energy, and the damping for the next step."""
         for _ in range(8):
             xx, xy, yy, x, y = value_pass(
                 self.turn, self.place, self.link, self.last_link, *self.controls, self.kinds, smooth, damping, self.gains

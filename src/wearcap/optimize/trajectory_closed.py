@@ -1,8 +1,7 @@
-"""Bending through few points exactly: the limit of no rigidity, in closed form for small turns.
+"""Bending exactly through a few points: the limit of zero rigidity, in closed form for small turns.
 
-While turns are small, a point of the path moves by a linear form of them, and the least bending that puts it where
-it shall be is a linear problem: one tridiagonal system, with as many right sides as the control points have
-coordinates.
+For small turns, points of the path are linear in them, and the least bending that meets the control points is a linear
+problem: one tridiagonal system with a right-hand side per coordinate of the control points.
 """
 
 import numpy as np
@@ -21,16 +20,16 @@ from wearcap.optimize.trajectory import (
 
 
 def bend_closed(problem: BendingProblem, tolerance_m: float = 1e-6, rounds: int = 20) -> BentPath:
-    """Least ∫ (dα̂/dτ − dα/dτ)² dτ among all paths through the control points; weights and rigidity do not matter.
+    """Minimise ∫ (dα̂/dτ − dα/dτ)² dτ among all paths through the control points; weights and rigidity have no effect.
 
-    The first round is the closed form for small turns; further ones linearise anew until the points are met and the
-    path stays, both within `tolerance_m`. Needs `held_headings`, a fixed start and the norm "square". Raises WearcapError where these are
-    not given, or where turns would not be small.
+    The first round is the closed form for small turns; further rounds linearise again until the points are met and the
+    path no longer changes, both within `tolerance_m`. Raises WearcapError for settings other than `clamped_ends`, a
+    fixed start and the norm "square", and where the turns would not be small.
     """
     settings = problem.settings
-    if not settings.held_headings or settings.free_start or settings.norm != "square":
-        raise WearcapError("bending in closed form needs held ends",
-                           expected="held_headings, a start that is not free, the norm square")  # fmt: skip
+    if not settings.clamped_ends or settings.free_start or settings.norm != "square":
+        raise WearcapError("bending in closed form needs fixed ends",
+                           expected="clamped_ends=True, free_start=False, norm=square")  # fmt: skip
     leaders = torch.unique(problem.leader)
     stiffness = _stiffness(problem, leaders)
     turn, shift = torch.zeros(len(problem.leader), dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
@@ -49,8 +48,8 @@ def bend_closed(problem: BendingProblem, tolerance_m: float = 1e-6, rounds: int 
             reason = "points met"
             break
     if not reason:
-        raise WearcapError("the control points ask for large turns, or lie out of reach of steps of these lengths",
-                           expected="points near the path, beside it", fix="Take the solver bend_banded.")  # fmt: skip
+        raise WearcapError("the control points need large turns, or are out of reach of steps of these lengths",
+                           expected="points near the path, beside it", fix="Use the solver bend_banded.")  # fmt: skip
     return bent_path(problem, turn, shift, history, reason)
 
 
@@ -61,7 +60,7 @@ def _entry(problem: BendingProblem, turn: torch.Tensor) -> dict[str, float]:
 
 
 def _stiffness(problem: BendingProblem, leaders: torch.Tensor) -> np.ndarray:
-    """Second derivative of E_tr in the turns of steps that have one: upper band, for solveh_banded."""
+    """Hessian of E_tr in the turns of moving steps: upper band, for solveh_banded."""
     seconds = problem.link_s.numpy()
     inner = 1.0 / seconds[leaders.numpy()[1:]]
     before, after = np.r_[1.0 / seconds[0], inner], np.r_[inner, 1.0 / seconds[-1]]
@@ -69,7 +68,7 @@ def _stiffness(problem: BendingProblem, leaders: torch.Tensor) -> np.ndarray:
 
 
 def _point_forms(problem: BendingProblem, path: torch.Tensor) -> np.ndarray:
-    """How the path's points at the control times move with each leader's turn: (2 control, step), in its column."""
+    """Jacobian (2 control, step) of the path's points at the control times in the turn of each leading step."""
     step = path.diff(dim=0)
     sideways = torch.stack([-step[:, 1], step[:, 0]])
     number, at = torch.arange(len(step)), problem.control_step[:, None]

@@ -1,8 +1,8 @@
-"""Compiled passes over a path's steps: value function backwards, steps of the path forwards.
+"""Compiled passes over a path's steps: value function backwards, roll-out of the path forwards.
 
-A frame's position and its step's turn are all that the future sees of the past. So the least energy from a frame to
-the end is, to second order, a quadratic form of these three numbers, and one pass from the end to the beginning
-finds it for all frames (Riccati's recursion); it leaves, for each step, by how much to turn given where one is.
+Given a frame's position and its step's turn, the rest of the path does not depend on what came before. So the least
+energy from a frame to the end is, to second order, a quadratic form of these three numbers. One backward pass computes
+it for all frames (Riccati recursion), with feedback gains from position and previous turn to the next turn.
 """
 
 import numpy as np
@@ -16,10 +16,10 @@ TINY = 1e-12
 
 @compiled
 def stretch_freely(step, link, last_link, first, share, target, weight, free_start, place, z):
-    """The convex relaxation in which a step may also stretch: complex factors z instead of turns.
+    """Solve the convex relaxation in which a step may also stretch: complex factors z instead of turns.
 
-    Minimises Σ weight |place − target|² + Σ link |z − z before|² exactly, and fills z (step) and place (time), both
-    complex; place[0] is the given start. Controls of step s are first[s] … first[s + 1] − 1.
+    Minimises Σ weight |place − target|² + Σ link |z − previous z|² exactly, and fills z (step) and place (time), both
+    complex; place[0] is the start. Control points of step s are first[s] … first[s + 1] − 1.
     """
     count = len(step)
     # least energy beyond a step = a|p|² + 2 Re(p* b z) + c|z|² − 2 Re(g* p + h* z)
@@ -31,12 +31,12 @@ def stretch_freely(step, link, last_link, first, share, target, weight, free_sta
         b += a * d
         h += np.conj(d) * g
         for i in range(first[s], first[s + 1]):
-            w, way = weight[i], share[i] * d
+            w, part = weight[i], share[i] * d
             a += w
-            b += w * way
-            c += w * abs(way) ** 2
+            b += w * part
+            c += w * abs(part) ** 2
             g += w * target[i]
-            h += w * np.conj(way) * target[i]
+            h += w * np.conj(part) * target[i]
         k = link[s]
         if np.isinf(k):
             gains[s, 0], gains[s, 1], gains[s, 2] = 0.0, 1.0, 0.0
@@ -57,7 +57,7 @@ def stretch_freely(step, link, last_link, first, share, target, weight, free_sta
 
 @compiled
 def link_form(change, link, norm, smooth):
-    """(energy of a link, second derivative of the form that meets it, change wrapped to ±π)."""
+    """(energy of a link, curvature of its quadratic approximation, change wrapped to ±π)."""
     change -= 2 * np.pi * np.round(change / (2 * np.pi))
     if norm == SQUARE:
         return link * change * change, 2 * link, change
@@ -67,14 +67,14 @@ def link_form(change, link, norm, smooth):
 
 @compiled
 def control_form(square, loss, delta, smooth):
-    """(ρ of a squared distance, weight of reweighted squares); a norm's tip is rounded in both."""
+    """(ρ of a squared distance, its weight in reweighted least squares); a norm's tip is smoothed in both."""
     rho, weight = reweight(square, loss, delta, smooth)
     return (1.0 / weight if loss == NORM else rho), weight
 
 
 @compiled
 def control_weights(distance, loss, delta, smooth):
-    """Weights of reweighted squares for distances (m)."""
+    """Weights in reweighted least squares for distances (m)."""
     weights = np.empty_like(distance)
     for i in range(len(distance)):
         weights[i] = control_form(distance[i] ** 2, loss, delta, smooth)[1]
@@ -83,7 +83,7 @@ def control_weights(distance, loss, delta, smooth):
 
 @compiled
 def energy(turn, place, link, last_link, first, share, target, weight, kinds, smooth):
-    """(control, bending) of a path; `kinds`: norm of the links, loss and its delta, rounding in m and rad."""
+    """(control, bending) energy of a path; `kinds`: norm of the links, loss, its delta; `smooth` in m and rad."""
     norm, loss, delta = kinds
     control, bending, before = 0.0, 0.0, 0.0
     for s in range(len(turn)):
@@ -99,9 +99,9 @@ def energy(turn, place, link, last_link, first, share, target, weight, kinds, sm
 
 @compiled
 def value_pass(turn, place, link, last_link, first, share, target, weight, kinds, smooth, damping, gains):
-    """Fill gains (step, 4): the change of each turn by (x, y, turn before, 1), these being changes themselves.
+    """Fill gains (step, 4): each turn's change as a linear function of the changes (x, y, previous turn) and 1.
 
-    Returns the second-order form (xx, xy, yy, x, y) of the least energy in the first point's change.
+    Returns the quadratic form (xx, xy, yy, x, y) of the least energy in the change of the first point.
     """
     norm, loss, delta = kinds
     count = len(turn)
@@ -110,7 +110,7 @@ def value_pass(turn, place, link, last_link, first, share, target, weight, kinds
     gt = tt * off
     for s in range(count - 1, -1, -1):
         ahead_x, ahead_y = place[s + 1, 0] - place[s, 0], place[s + 1, 1] - place[s, 1]
-        jx, jy = -ahead_y, ahead_x  # where the step's end goes as it turns
+        jx, jy = -ahead_y, ahead_x  # derivative of the step's end in its turn
         tt += jx * (xx * jx + 2 * xy * jy + 2 * xt) + jy * (yy * jy + 2 * yt)
         xt += xx * jx + xy * jy
         yt += xy * jx + yy * jy
@@ -144,9 +144,9 @@ def value_pass(turn, place, link, last_link, first, share, target, weight, kinds
 
 @compiled
 def walk(turn, place, step, gains, share, shift, new_turn, new_place):
-    """Go the path anew: each step turns by its gains, given how far off the old path one is by then.
+    """Roll out a new path: each turn changes by the gains applied to the offset from the old path so far.
 
-    `share` of what is gained without being off, `shift` of the first point (2).
+    `share` scales the constant part of the gains (step length); `shift` (2) moves the first point.
     """
     new_place[0] = place[0] + shift
     change = 0.0

@@ -1,4 +1,4 @@
-"""The Recording (what was sensed, what is true), the Motion (what was captured), and their store."""
+"""The Recording (sensor data and ground truth), the Motion (a captured or true motion), and their store."""
 
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import (

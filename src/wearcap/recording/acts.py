@@ -1,4 +1,4 @@
-"""Which object a wearer is busy with at which time: what ECHO is told beside three tracked points."""
+"""The active object over time: a condition of ECHO besides three tracked points."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from wearcap.errors import WearcapError
 from wearcap.recording.recording import Recording
 
 MARGIN_S = 2.0
-"""Before the first touch and after the last one, in which an object is the active one already and still."""
+"""Time (s) before the first touch and after the last one in which an object counts as active."""
 NO_OBJECT = -1
 SAME_S = 1e-6
-"""Times nearer than this are one."""
+"""Times closer than this (s) are equal."""
 
 
 @dataclass(frozen=True)
 class Act:
-    """One object, active from one time to another (s)."""
+    """A time span (s) in which one object is active."""
 
     object: str
     start_s: float
@@ -28,30 +28,30 @@ class Act:
 
 
 def true_acts(recording: Recording, margin_s: float = MARGIN_S) -> list[Act]:
-    """Acts as the recording's interactions tell them; with objects but no interactions: the only object, throughout.
+    """Acts from the recording's interactions; without interactions, its only object is active throughout.
 
-    Each object is active from `margin_s` before it is touched until as long after it is let go, or until half way to
-    the next one. Raises WearcapError where there are several objects and nothing tells which is active.
+    Each object is active from `margin_s` before it is touched until `margin_s` after its release, or until half way to
+    the next act. Raises WearcapError for several objects without interactions.
     """
-    told = recording.interactions
-    if told is None:
+    interactions = recording.interactions
+    if interactions is None:
         objects = list(recording.object_motion)
         if not objects:
             return []
         if len(objects) > 1:
-            raise WearcapError(f"{len(objects)} objects and no interactions that tell which is active", where=recording.name,
+            raise WearcapError(f"{len(objects)} objects and no interactions to choose the active one", where=recording.name,
                                expected="interactions, or a single object")  # fmt: skip
         times = recording.object_motion[objects[0]].timestamps
         return [Act(objects[0], times[0].item(), times[-1].item() + 1.0)]
-    spans = sorted(zip(told.start_s.tolist(), told.stop_s.tolist(), told.objects))
+    spans = sorted(zip(interactions.start_s.tolist(), interactions.stop_s.tolist(), interactions.objects))
     return spread_acts([Act(name, start, stop) for start, stop, name in spans if name], margin_s)
 
 
 def spread_acts(held: Sequence[Act], margin_s: float = MARGIN_S) -> list[Act]:
-    """Acts that reach `margin_s` beyond the stretches in which objects are held, none into another.
+    """Extend acts by `margin_s` beyond the time spans in which objects are held, without overlap.
 
-    `held` is ordered by its start; stretches of one object that follow each other become one. Where one object is held
-    within the time of another, it is the active one, and the other one before and behind.
+    `held` is ordered by start; consecutive spans of one object are merged. An object held within the time span of
+    another is the active one there; the other object is active before and after.
     """
     merged: list[Act] = []
     for act in _side_by_side(held):
@@ -68,7 +68,7 @@ def spread_acts(held: Sequence[Act], margin_s: float = MARGIN_S) -> list[Act]:
 
 
 def _side_by_side(held: Sequence[Act]) -> list[Act]:
-    """Stretches of which none lies within another: the longer one is cut."""
+    """Time spans of which none is within another: longer ones are split."""
     left, done = list(held), []
     while left:
         act = left.pop(0)
@@ -88,7 +88,7 @@ def _side_by_side(held: Sequence[Act]) -> list[Act]:
 def active_at(
     acts: Iterable[Act], names: Sequence[str], timestamps: Float64[Tensor, "time"]
 ) -> Int64[Tensor, "time"]:
-    """Number in `names` of the object that is active at each time, `NO_OBJECT` where none is.
+    """Index in `names` of the active object at each time, `NO_OBJECT` where none is active.
 
     Raises WearcapError for an act of an object that is not among the names.
     """

@@ -1,7 +1,7 @@
-"""A recording that is still being made: a folder of pieces, each a recording of some seconds, in order.
+"""A live recording: a folder of consecutive pieces, each a recording of some seconds.
 
-`piece-000000.safetensors`, `piece-000001.safetensors`, … appear whole (written under another name and renamed); the
-file `end` says that there are no more. The first piece tells about the wearer and the camera.
+`piece-000000.safetensors`, `piece-000001.safetensors`, … appear complete (written under another name and renamed); the
+file `end` marks the end. The first piece describes the wearer and the camera.
 """
 
 import time
@@ -18,16 +18,17 @@ END = "end"
 
 
 def piece_path(folder: str | Path, number: int) -> Path:
+    """Path of the piece with this number."""
     return Path(folder) / f"piece-{number:06d}.safetensors"
 
 
 def write_piece(recording: Recording, folder: str | Path, number: int) -> None:
-    """Add the next piece."""
+    """Write a piece to the folder."""
     save_recording(recording, piece_path(folder, number))
 
 
 def close_pieces(folder: str | Path) -> None:
-    """Say that the recording has ended."""
+    """Mark the recording as ended."""
     write_text(Path(folder) / END, "")
 
 
@@ -37,13 +38,13 @@ def follow_pieces(
     poll_s: float = 0.1,
     refused: Counter[str] | None = None,
 ) -> Iterator[Recording]:
-    """Pieces as they appear, until `end`. A damaged file is counted in `refused`, and passed over.
+    """Yield pieces as they appear, until `end`. A damaged file is counted in `refused` and skipped.
 
-    Raises WearcapError when none comes for `patience_s`, and without `refused` for a damaged file.
+    Raises WearcapError when no piece appears for `patience_s`, and without `refused` for a damaged file.
     """
     folder, number, since = Path(folder), 0, time.monotonic()
     while True:
-        ended = (folder / END).exists()  # asked first: what was written before the end is still there
+        ended = (folder / END).exists()  # checked first, so that pieces written before the end are not missed
         if piece_path(folder, number).exists():
             piece = _read(piece_path(folder, number), refused)
             if piece is not None:

@@ -1,4 +1,4 @@
-"""Which hands held which object when."""
+"""Interactions: which hands hold which object at which time."""
 
 from dataclasses import dataclass
 
@@ -11,16 +11,16 @@ HANDS = ("left", "right")
 
 @dataclass(frozen=True)
 class Interactions:
-    """Stretches of time in which a fixed set of hands holds one object, ordered by their start."""
+    """Time intervals in which a fixed set of hands holds one object, ordered by start."""
 
     start_s: Float64[Tensor, "interval"]
     stop_s: Float64[Tensor, "interval"]
     hands: Bool[Tensor, "interval hand"]
-    """Of `HANDS`."""
+    """Whether each of `HANDS` holds the object."""
     objects: tuple[str, ...]
-    """Names in the environment; "" where it is not known."""
+    """Names of the objects in the environment; "" if unknown."""
     classes: tuple[str, ...]
-    """Each of `scene.objects.CONTACT_CLASSES`; "" where it is not known."""
+    """Contact class of each interval, of `scene.objects.CONTACT_CLASSES`; "" if unknown."""
 
     def __len__(self) -> int:
         return len(self.start_s)
@@ -28,7 +28,7 @@ class Interactions:
     def hand_contact(
         self, timestamps: Float64[Tensor, "time"], contact_class: str | None = None
     ) -> Bool[Tensor, "time hand"]:
-        """Whether each hand holds something (of a class, where one is given) at each time (start ≤ t < stop)."""
+        """Whether each hand holds an object (of `contact_class`, if given) at each time (start ≤ t < stop)."""
         times = timestamps[:, None]
         within = (self.start_s <= times) & (times < self.stop_s)
         if contact_class is not None:

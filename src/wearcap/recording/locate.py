@@ -1,4 +1,4 @@
-"""Recordings, and the folder of their data set, by what a user types."""
+"""Resolves a recording given by the user, and the folder of its data set."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def load_recording(where: str | Path) -> Recording:
 
 
 def dataset_folder(where: str | Path) -> Path:
-    """The data set's folder of what a user typed for a recording: files that the recording names lie relative to it."""
+    """Folder of the data set of a recording given by the user; file names in the recording are relative to it."""
     path = Path(where)
     for folder in (path, *path.parents):
         if (folder / "manifest.json").is_file():

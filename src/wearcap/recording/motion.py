@@ -1,4 +1,4 @@
-"""The Motion: what a pipeline returns and what truth holds."""
+"""The Motion: output of a pipeline, or ground truth."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,7 +16,8 @@ from wearcap.recording.interactions import Interactions
 
 @dataclass(frozen=True)
 class Motion:
-    """A body's motion: timestamps in s, rotations of each joint in its parent (the root in the world), m."""
+    """A body's motion: timestamps (s), rotation of each joint relative to its parent (root: world), root position
+    (m)."""
 
     timestamps: Float64[Tensor, "time"]
     skeleton: Skeleton
@@ -25,13 +26,14 @@ class Motion:
     contact_prob: Float[Tensor, "time patch"] | None = None
     """Probability of floor contact of `FOOT_PATCHES`."""
     hand_contact_prob: Float[Tensor, "time hand"] | None = None
-    """Probability that each of `HANDS` holds something."""
+    """Probability that each of `HANDS` holds an object."""
     body_contact_prob: Float[Tensor, "time point"] | None = None
     """Probability that each of the body's contact points (`body.contact_points`) touches the active object."""
     object_motion: dict[str, Trajectory] | None = None
+    """Poses of the objects by name, with their own timestamps."""
     interactions: Interactions | None = None
     provenance: dict[str, str] = field(default_factory=dict)
-    """Pipeline, checkpoint, config hash, or the source of a truth."""
+    """Pipeline, checkpoint and config hash, or the source of a ground truth."""
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -70,7 +72,7 @@ class Motion:
         )  # fmt: skip
 
     def moved(self, T_new_world: Rigid) -> "Motion":
-        """The same motion, and its objects', in other world axes."""
+        """The motion and its objects in the coordinates of another world frame."""
         R_new, t_new = T_new_world.R, T_new_world.t
         R = self.R_parent_joint.clone()
         R[:, 0] = R_new @ R[:, 0]

@@ -1,4 +1,4 @@
-"""A picture taken in the scene with a known camera: what a visual map is built from."""
+"""An image of the scene with known camera and pose, from which a visual map is built."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The Recording: what was sensed and what is true, with only the parts that exist."""
+"""The Recording: sensor data and ground truth; parts that do not exist are None or empty."""
 
 from dataclasses import dataclass, field
 
@@ -15,9 +15,9 @@ from wearcap.recording.motion import Motion
 
 @dataclass(frozen=True)
 class HeadStream:
-    """Poses of a head-mounted device, and how it sits on the head joint.
+    """Poses of a head-mounted device, and its mount on the head joint.
 
-    The device frame has the head's axes (x forward, y left, z up); readers turn foreign device axes into these.
+    The device frame has the head's axes (x forward, y left, z up); readers convert other device axes to these.
     """
 
     timestamps: Float64[Tensor, "time"]
@@ -38,7 +38,7 @@ class HeadStream:
 
 @dataclass(frozen=True)
 class ImuStream:
-    """One inertial sensor; only what the sensor gave is present."""
+    """Data of one inertial sensor; channels that the sensor lacks are None."""
 
     timestamps: Float64[Tensor, "time"]
     joint: str
@@ -51,7 +51,7 @@ class ImuStream:
     gyro_imu: Float[Tensor, "time 3"] | None = None
     """Angular velocity in the sensor's axes (rad/s)."""
     R_joint_imu: Float[Tensor, "3 3"] | None = None
-    """Mounting, where it is known."""
+    """Mounting orientation, if known."""
 
 
 @dataclass(frozen=True)
@@ -68,21 +68,21 @@ class CameraStream:
     """Video file, relative to the data set's directory, whose n-th frame belongs to the n-th timestamp."""
     embedding: Float[Tensor, "time feature"] | None = None
     embedding_mirrored: Float[Tensor, "time feature"] | None = None
-    """Of the pictures flipped left to right, for training on mirrored motions."""
+    """Embeddings of the horizontally flipped images, for training on mirrored motions."""
     embedding_name: str | None = None
-    """The encoder's."""
+    """Name of the image encoder."""
 
 
 @dataclass(frozen=True)
 class Localization:
-    """Camera poses found in a map, frame by frame, with their confidence (0…1; 0 where none was found)."""
+    """Camera poses localised in a map, frame by frame, with confidence (0…1; 0 where localisation failed)."""
 
     timestamps: Float64[Tensor, "time"]
     R_world_cam: Float[Tensor, "time 3 3"]
     t_world_cam: Float[Tensor, "time 3"]
     confidence: Float[Tensor, "time"]
     covariance: Float[Tensor, "time 6 6"] | None = None
-    """Of the pose's error in the world: rotation vector (rad), then position (m)."""
+    """Covariance of the pose error in the world: rotation vector (rad), then position (m)."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class ContactTrack:
 
 @dataclass(frozen=True)
 class FloorTrack:
-    """Height (m) of the floor beneath the wearer over time."""
+    """Height (m) of the floor below the wearer over time."""
 
     timestamps: Float64[Tensor, "time"]
     height: Float[Tensor, "time"]
@@ -124,19 +124,19 @@ class FloorTrack:
 
 @dataclass(frozen=True)
 class Intervals:
-    """Named stretches of a recording on the motion's clock, for evaluation: what was done where along the way."""
+    """Named time intervals of a recording on the motion's clock, for evaluation."""
 
     start_s: Float64[Tensor, "interval"]
     stop_s: Float64[Tensor, "interval"]
     distance_m: Float[Tensor, "interval"]
-    """Travelled since the recording's start when the interval begins."""
+    """Distance walked from the recording's start to the interval's start."""
     names: tuple[str, ...]
     """One per interval, such as "stand" and "move"."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Everything one wearer's sensors saw, and what is known to be true. Streams keep their own clocks' rates."""
+    """Sensor data and ground truth of one wearer. Streams keep their own frame rates."""
 
     name: str
     # sensed
@@ -148,7 +148,7 @@ class Recording:
     points: PointCloud | None = None
     cues: dict[str, Cue] = field(default_factory=dict)
     tracked: dict[str, Trajectory] = field(default_factory=dict)
-    """Poses of joints that are tracked in space, such as wrists by controllers, by the skeleton's names."""
+    """Poses of tracked joints, such as wrists by controllers, by the skeleton's joint names."""
     scene: str | None = None
     """File of the surroundings' geometry (.ply or .glb), relative to the data set's directory."""
     environment: str | None = None
@@ -186,4 +186,4 @@ class Recording:
 
 
 MIN_DURATION_S = 0.25
-"""Shorter recordings hold no motion worth a window."""
+"""Duration below which a recording is too short for a window."""

@@ -1,7 +1,7 @@
-"""Recordings to flat tensors plus JSON and back: the content of one `.safetensors` file.
+"""Converts recordings to flat tensors plus JSON and back: the content of one `.safetensors` file.
 
 A tree of known dataclasses becomes `{"head.R_world_device": tensor, …}` and a JSON skeleton in which every
-tensor is a reference. Only the classes in `KNOWN` can come back; nothing in a file is ever executed.
+tensor is a reference. Only the classes in `KNOWN` are restored; nothing in a file is ever executed.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ KNOWN: dict[str, type] = {
 
 
 def flatten(value: Any, key: str = "") -> tuple[Any, dict[str, Tensor]]:
-    """Return (JSON tree, tensors by dotted key). Parts that are None or empty are left out."""
+    """Return (JSON tree, tensors by dotted key). Parts that are None or empty are omitted."""
     if isinstance(value, Tensor):
         return {"$tensor": key}, {key: value.detach().cpu().contiguous().clone()}
     if dataclasses.is_dataclass(value):
@@ -54,7 +54,7 @@ def flatten(value: Any, key: str = "") -> tuple[Any, dict[str, Tensor]]:
 
 
 def unflatten(tree: Any, fetch, known: dict[str, type] = KNOWN) -> Any:
-    """Rebuild what `flatten` took apart; `fetch(key)` gives a tensor, only classes in `known` come back."""
+    """Inverse of `flatten`; `fetch(key)` returns a tensor, and only classes in `known` are restored."""
     if not isinstance(tree, dict):
         return tree
     if "$tensor" in tree:
@@ -74,7 +74,7 @@ def unflatten(tree: Any, fetch, known: dict[str, type] = KNOWN) -> Any:
 
 
 def require_part(kind: type, name: str, value: Any) -> None:
-    """Raise WearcapError unless a value is what a field of a dataclass is annotated with (tensors: type and shape)."""
+    """Raise WearcapError unless a value matches the annotation of a dataclass field (tensors: type and shape)."""
     hint = _hints(kind).get(name)
     if hint is not None and not _fits(value, hint):
         found = (
@@ -91,7 +91,7 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value that came out of a file has an annotated type, as far as containers' own items."""
+    """Whether a value read from a file has an annotated type, including the items of containers."""
     origin, inner = get_origin(hint), get_args(hint)
     if hint is Any:
         return True
@@ -108,7 +108,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _require_one_length(kind: type, items: dict[str, Any]) -> None:
-    """Raise WearcapError unless all tensors over time (by their annotations) are as long as the timestamps."""
+    """Raise WearcapError unless all tensors annotated with a time axis are as long as the timestamps."""
     times = items.get("timestamps")
     for name in _over_time(kind) if isinstance(times, Tensor) else ():
         if isinstance(items.get(name), Tensor) and len(items[name]) != len(times):
@@ -118,7 +118,7 @@ def _require_one_length(kind: type, items: dict[str, Any]) -> None:
 
 @functools.cache
 def _over_time(kind: type) -> tuple[str, ...]:
-    """Fields annotated with the axis "time" first."""
+    """Names of the fields whose first annotated axis is "time"."""
     hints = _hints(kind)
     shapes = {
         name: [getattr(part, "dim_str", "") for part in (get_args(hint) or (hint,))]

@@ -1,4 +1,4 @@
-"""A directory of recordings: one `manifest.json`, one memory-mapped `.safetensors` file per recording."""
+"""Data sets on disk: a `manifest.json`, and one memory-mapped `.safetensors` file per recording."""
 
 import dataclasses
 import json
@@ -23,12 +23,12 @@ SCHEMA_VERSION = 1
 SPLITS = ("train", "val", "test")
 MANIFEST, FOLDER = "manifest.json", "recordings"
 MAX_FRAMES, MAX_FPS = 10**9, 1e5
-"""Most that a manifest may say of a recording: a week at 1.6 kHz."""
+"""Largest values accepted from a manifest: a week at 1.6 kHz."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What the manifest knows about one recording."""
+    """Manifest entry of one recording."""
 
     file: str
     sha256: str
@@ -49,14 +49,15 @@ _MOST = {"frames": MAX_FRAMES, "fps": MAX_FPS, "duration_s": 1e11, "bytes": 1 <<
 
 
 class RecordingFile:
-    """One recording on disk, opened without reading its tensors; slices read nothing but themselves.
+    """One recording on disk, opened without reading its tensors; slices read only their own rows.
 
-    A file in a data set is verified against the manifest's checksum when it is opened, once as long as it stays the
-    same (`wearcap.checksums`).
+    A file in a data set is verified against the manifest's checksum when it is opened, once while it is unchanged
+    (`wearcap.checksums`).
     """
 
     def __init__(self, path: str | Path, *, verify: bool = True):
-        """Raises WearcapError when the file is missing, damaged or foreign, or not the one that the manifest names."""
+        """Open a file. Raises WearcapError when it is missing, damaged, no recording, or differs from the
+        manifest's."""
         self.path = Path(path)
         if verify:
             _verify(self.path)
@@ -101,7 +102,7 @@ class RecordingFile:
         return self._file.get_slice(key)[start:stop]
 
     def part(self, name: str):
-        """One top-level part ("skeleton", "head", "motion" …), or None where the recording lacks it."""
+        """One top-level part ("skeleton", "head", "motion" …), or None if the recording lacks it."""
         part = self._built(self._tree.get(name))
         try:
             require_part(Recording, name, part)
@@ -122,7 +123,7 @@ class RecordingFile:
             raise self._unreadable(error) from error
 
     def _missing(self, error: OSError) -> WearcapError:
-        """safetensors calls a file that may not be read a missing one."""
+        """Error for a missing file; safetensors also reports unreadable files as missing."""
         if self.path.exists():
             return WearcapError(f"cannot be read ({error.strerror or 'no permission'})", where=self.path)
         return WearcapError("no such recording", where=self.path)
@@ -138,7 +139,7 @@ class RecordingFile:
 
 
 def _verify(path: Path) -> None:
-    """Raise WearcapError when a file is not what the manifest of its data set says; other files have no checksum."""
+    """Raise WearcapError when a file differs from its data set's manifest; files outside a data set are not checked."""
     manifest = path.parent.parent / MANIFEST
     try:
         if path.parent.name != FOLDER or not manifest.is_file() or not path.is_file():
@@ -161,7 +162,7 @@ def _differs(path: Path) -> WearcapError:
 
 @lru_cache(maxsize=16)
 def _entries(manifest: Path, *stamp: int) -> Mapping[str, Entry]:
-    """Entries of a manifest by file name; `stamp` (size, time, inode) tells when it has to be read anew."""
+    """Entries of a manifest by file name; a new `stamp` (size, time, inode) causes it to be read again."""
     entries = RecordingStore(manifest.parent).entries
     return {recording_path(Path(), name).name: entry for name, entry in entries.items()}
 
@@ -176,7 +177,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
 
 
 class RecordingStore:
-    """A data set on disk. Writing is for one process; any number may read."""
+    """A data set on disk. One process may write; any number may read."""
 
     def __init__(self, root: str | Path):
         self.root = Path(root)
@@ -184,7 +185,7 @@ class RecordingStore:
 
     @classmethod
     def open(cls, root: str | Path) -> "RecordingStore":
-        """A store that must exist already."""
+        """Open an existing data set. Raises WearcapError if there is none."""
         if not (Path(root) / MANIFEST).is_file():
             raise WearcapError("no data set here", where=root, expected="a folder with a manifest.json",
                                fix="Make one with `wearcap prepare`.")  # fmt: skip
@@ -211,7 +212,7 @@ class RecordingStore:
                                fix="Delete it and prepare the data set again.") from error  # fmt: skip
 
     def _entry(self, name: str, row: dict[str, Any]) -> Entry:
-        """One row of the manifest. Raises ValueError or TypeError for values that no recording has."""
+        """Parse one row of the manifest. Raises ValueError or TypeError for invalid values."""
         for field in dataclasses.fields(Entry):
             value = row[field.name]
             if type(value) is not field.type and not (field.type is float and type(value) is int):
@@ -220,7 +221,7 @@ class RecordingStore:
                 raise ValueError(f"{field.name} of {name!r} is {value}")
         entry = Entry(**row)
         if self.root / entry.file != recording_path(self.root, name):
-            raise ValueError(f"{name!r} lies at {entry.file!r}, outside this data set")
+            raise ValueError(f"{name!r} is at {entry.file!r}, outside this data set")
         if entry.split not in SPLITS:
             raise ValueError(f"{name!r} is in split {entry.split[:40]!r}")
         if entry.frames * entry.fps and entry.bytes < entry.frames:
@@ -228,7 +229,7 @@ class RecordingStore:
         return entry
 
     def names(self, split: str | None = None) -> list[str]:
-        """Recordings of one split ("train", "val", "test"), or all, in order."""
+        """Sorted names of the recordings of one split ("train", "val", "test"), or of all."""
         if split is not None and split not in SPLITS:
             raise WearcapError(f"no split {split!r}", expected=f"one of {', '.join(SPLITS)}")
         return sorted(name for name, entry in self.entries.items() if split in (None, entry.split))
@@ -239,7 +240,7 @@ class RecordingStore:
         self.register({recording.name: entry_for(recording, self.root, split, config_hash)})
 
     def register(self, entries: dict[str, Entry]) -> None:
-        """Enter recordings by name whose files are already in place (written by workers)."""
+        """Add manifest entries of recordings whose files already exist (written by workers)."""
         self.entries |= entries
         recordings = {key: dataclasses.asdict(value) for key, value in sorted(self.entries.items())}
         text = json.dumps({"schema_version": SCHEMA_VERSION, "recordings": recordings}, indent=1)
@@ -263,7 +264,7 @@ class RecordingStore:
         return self.open_file(name).load()
 
     def verify(self) -> Iterator[tuple[str, WearcapError | None]]:
-        """Check every file against its checksum, whatever is remembered of it; yields (name, what is wrong or None)."""
+        """Check every file against its checksum, ignoring cached results; yields (name, error or None)."""
         for name in self.names():
             try:
                 self.verify_one(name)
@@ -279,7 +280,7 @@ class RecordingStore:
 
 
 def recording_path(root: Path, name: str) -> Path:
-    """Where a data set keeps a recording. Raises WearcapError when the name is no plain file name."""
+    """Path of a recording in a data set. Raises WearcapError when the name is no plain file name."""
     if not name or Path(name).name != name or name.startswith("."):
         raise WearcapError(f"{name!r} cannot name a recording", expected="a plain file name")
     return Path(root) / FOLDER / f"{name}.safetensors"

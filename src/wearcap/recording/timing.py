@@ -1,4 +1,4 @@
-"""Motions in time: the same motion at other times, and consecutive pieces as one."""
+"""Resampling of motions, and concatenation of consecutive pieces."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -13,13 +13,14 @@ from wearcap.recording.interactions import Interactions
 from wearcap.recording.motion import Motion
 
 PROBABILITIES = ("contact_prob", "hand_contact_prob", "body_contact_prob")
-"""Fields of a Motion that it has or lacks, with a row per frame."""
+"""Optional fields of a Motion with a row per frame."""
 
 
 def resampled(motion: Motion, fps: float | int) -> Motion:
-    """The motion at `fps`: every n-th frame where the rates divide, else slerp (rotations) and lerp (root, contacts).
+    """Resample a motion to `fps`: every n-th frame if the rates divide, else slerp (rotations) and lerp (root,
+    contacts).
 
-    Objects keep their own frames.
+    Object trajectories keep their own timestamps.
     """
     ratio = motion.fps / fps
     steps = motion.timestamps.diff()
@@ -36,7 +37,7 @@ def resampled(motion: Motion, fps: float | int) -> Motion:
 
 
 def at_times(motion: Motion, times: Float64[Tensor, "new_time"]) -> Motion:
-    """The motion at other times within its own: slerp (rotations), lerp (root, contacts)."""
+    """Resample a motion at times within its span: slerp (rotations), lerp (root, contacts)."""
     return replace(
         motion, timestamps=times, R_parent_joint=_slerp(motion.timestamps, motion.R_parent_joint, times),
         t_world_root=interpolate(motion.timestamps, motion.t_world_root, times),
@@ -45,9 +46,9 @@ def at_times(motion: Motion, times: Float64[Tensor, "new_time"]) -> Motion:
 
 
 def joined(parts: Sequence[Motion]) -> Motion | None:
-    """Consecutive pieces of a motion as one; None for no piece. The skeleton and provenance are the first piece's.
+    """Concatenate consecutive pieces of a motion; None for no piece. Skeleton and provenance are the first piece's.
 
-    A field that some pieces lack is left out: it would have no row for their frames.
+    A field that some pieces lack is dropped, as it would have no rows for their frames.
     """
     if len(parts) < 2:
         return parts[0] if parts else None
@@ -62,8 +63,8 @@ def joined(parts: Sequence[Motion]) -> Motion | None:
         for name, track in (part.object_motion or {}).items():
             tracks.setdefault(name, []).append(track)
     objects = {name: _end_to_end(each) for name, each in tracks.items()} or None
-    held = [part.interactions for part in parts if part.interactions is not None]
-    return replace(parts[0], **whole, object_motion=objects, interactions=_all_of(held) if held else None)
+    found = [part.interactions for part in parts if part.interactions is not None]
+    return replace(parts[0], **whole, object_motion=objects, interactions=_all_of(found) if found else None)
 
 
 def _end_to_end(tracks: list[Trajectory]) -> Trajectory:
@@ -71,12 +72,12 @@ def _end_to_end(tracks: list[Trajectory]) -> Trajectory:
     return Trajectory(torch.cat(times), torch.cat(R), torch.cat(t))
 
 
-def _all_of(held: list[Interactions]) -> Interactions:
+def _all_of(parts: list[Interactions]) -> Interactions:
     start, stop, hands = (
-        torch.cat([getattr(each, name) for each in held]) for name in ("start_s", "stop_s", "hands")
+        torch.cat([getattr(each, name) for each in parts]) for name in ("start_s", "stop_s", "hands")
     )
     objects, classes = (
-        tuple(name for each in held for name in getattr(each, key)) for key in ("objects", "classes")
+        tuple(name for each in parts for name in getattr(each, key)) for key in ("objects", "classes")
     )
     return Interactions(start, stop, hands, objects, classes)
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from wearcap.data.statistics import collate
-from wearcap.metrics.occupancy import distance_mae_cm, held_distance_mae_cm, occupancy_iou
+from wearcap.metrics.occupancy import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.systems.hmd2.point_codes_windows import PlaceDataset, Places
 from wearcap.training.base import GivenOptimizer
@@ -43,7 +43,7 @@ class VoxelReconstruction(GivenOptimizer):
         scores = {
             "val/loss": self.net.loss(grids),
             "val/distance_cm": distance_mae_cm(rebuilt, grids),
-            "val/held_distance_cm": held_distance_mae_cm(rebuilt, grids, clip_m),
+            "val/held_distance_cm": occupied_distance_mae_cm(rebuilt, grids, clip_m),
             "val/occupancy_iou": occupancy_iou(rebuilt, grids, clip_m),
         }
         self.log_dict(scores, batch_size=len(grids), sync_dist=True)

@@ -1,4 +1,4 @@
-"""HPS' first two steps: the head camera's clock against the suit's (thesis §4.3.4), and its poses in the scene (§4.2.3)."""
+"""The first two steps of HPS: synchronisation of head camera and suit (thesis §4.3.4), camera localisation (§4.2.3)."""
 
 import sys
 from collections.abc import Iterator
@@ -25,43 +25,44 @@ CLOCKS = ("shared", "claps", "auto")
 WRISTS = ("left_wrist", "right_wrist")
 MAP_NAME = "map.safetensors"
 USUAL_HZ = 6.0
-"""Frames localised per second where nothing else is said: the suit tells what lies between."""
+"""Default number of frames localised per second; the suit's motion bridges the frames between."""
 
 
 @runtime_checkable
 class Localize(Protocol):
-    """Finds the head camera's poses, on the camera's clock; recordings come with their data set's folder."""
+    """Estimates the head camera's poses, on the camera's clock; `folder` is the recording's data set folder."""
 
     def __call__(self, recording: Recording, folder: Path) -> Localization: ...
 
     def reads(self, recording: Recording, folder: Path) -> list[Any]:
-        """All that decides the result, for its digest. Raises WearcapError when that is not enough for one."""
+        """Inputs that determine the result, for its cache key. Raises WearcapError when they do not suffice for one."""
         ...
 
 
 @dataclass(frozen=True)
 class Synchronization:
-    """How camera and suit come onto one clock."""
+    """Synchronisation of camera and suit."""
 
     clock: str = "shared"
-    """"shared": they are on one already. "claps": by claps that both noticed. "auto": by claps where a wrist wears a
+    """"shared": both use the same clock. "claps": by claps detected in both. "auto": by claps where a wrist wears a
     sensor, else shared."""
     camera_claps_s: list[float] | None = None
-    """Times of the claps, s from the video's first picture; None: heard in its sound."""
+    """Times of the claps (s from the video's first image); None: detected in the video's sound."""
     max_offset_s: float | int = 600.0
+    """Largest offset (s) between the clocks that is searched."""
 
     def __post_init__(self):
         if self.clock not in CLOCKS:
             raise WearcapError(f"clock={self.clock!r}", expected=f"one of {', '.join(CLOCKS)}")
 
     def by_claps(self, recording: Recording) -> bool:
-        """Whether this recording's clocks are brought together by claps."""
+        """Whether this recording is synchronised by claps."""
         return self.clock == "claps" or (
             self.clock == "auto" and any(name in recording.imu for name in WRISTS)
         )
 
     def reads(self, recording: Recording, folder: Path) -> list[Any]:
-        """All that decides the result, for its digest."""
+        """Inputs that determine the result, for its cache key."""
         camera = recording.camera
         if not self.by_claps(recording) or camera is None:
             return []
@@ -70,10 +71,10 @@ class Synchronization:
         return [self, worn, camera.timestamps[:1], folder / (camera.video or "") if heard else None]
 
     def __call__(self, recording: Recording, folder: Path) -> Clock | None:
-        """The map between the clocks; None: they are one.
+        """Map from the camera's clock to the suit's; None where they share one clock.
 
-        Without sensors on the wrists the claps are sought in the suit's own motion. Raises WearcapError when either
-        side has no clap, and when they fit together in several ways.
+        Without wrist sensors the claps are detected in accelerations synthesised from the suit's motion. Raises
+        WearcapError when either side has no clap, and when the match is ambiguous.
         """
         if not self.by_claps(recording):
             return None
@@ -97,25 +98,26 @@ class Synchronization:
 
 @dataclass(frozen=True, eq=False)
 class MapLocalization:
-    """Localises a recording's pictures in a visual map."""
+    """Localises a recording's images in a visual map."""
 
     extractor: Extractor = field(default_factory=RootSift)
     matcher: Matcher | None = None
     descriptor: GlobalDescriptor | None = None
     settings: LocalizerSettings = field(default_factory=LocalizerSettings)
     map: str | None = None
-    """A map's file, or the folder of a scene that has one (map.safetensors); None: the recording's own poses are
-    taken, or where it has none the map in the folder of its scan."""
+    """A map's file, or a scene's folder that contains map.safetensors; None: the recording's own poses are used, or,
+    where it has none, the map in the folder of its scan."""
     every: int | None = None
-    """Each n-th frame is localised; None: as many as make up `USUAL_HZ`."""
+    """Step between localised frames; None: chosen for `USUAL_HZ`."""
     use_prior: bool = True
+    """Whether the pose of the previous frame guides the search in the next one."""
 
     def __post_init__(self):
         if self.every is not None and self.every < 1:
             raise WearcapError(f"every={self.every}", expected="1 (each frame) or more")
 
     def map_file(self, recording: Recording, folder: Path) -> Path | None:
-        """The map that is asked for; None: the recording's own localisation is taken. Raises WearcapError without either."""
+        """Path of the map; None: the recording's own localisation is used. Raises WearcapError without either."""
         if self.map is not None:
             given = Path(self.map)
             given = given / MAP_NAME if given.is_dir() else given
@@ -132,7 +134,8 @@ class MapLocalization:
         return own
 
     def reads(self, recording: Recording, folder: Path) -> list[Any]:
-        """All that decides the result, for its digest. Raises WearcapError without localisation and map, or pictures."""
+        """Inputs that determine the result, for its cache key. Raises WearcapError without localisation and map, or
+        images."""
         file, stream = self.map_file(recording, folder), recording.camera
         if file is None or stream is None:
             return [recording.localization]
@@ -143,9 +146,9 @@ class MapLocalization:
         ]  # fmt: skip
 
     def __call__(self, recording: Recording, folder: Path) -> Localization:
-        """Poses at each `every`-th frame, on the camera's clock.
+        """Localise every `every`-th frame; times are on the camera's clock.
 
-        Raises WearcapError without localisation and map, without pictures, and what the map's and video's readers refuse.
+        Raises WearcapError without localisation and map, without images, and for a map or video that cannot be read.
         """
         file = self.map_file(recording, folder)
         if file is None:
@@ -165,7 +168,7 @@ class MapLocalization:
 
 
 def camera_stages(source: Source, synchronization: Synchronization, localize: Localize) -> list[Stage]:
-    """The first two stages. Raises WearcapError when there can be no localisation."""
+    """Stages `synchronize` and `localize`. Raises WearcapError when localisation is impossible."""
     recording, folder = source.recording, source.folder
     localize.reads(recording, folder)
     return [
@@ -181,13 +184,13 @@ def camera_stages(source: Source, synchronization: Synchronization, localize: Lo
 
 
 def on_one_clock(recording: Recording, results: dict[str, Any]) -> Recording:
-    """The recording with what both stages found: camera and localisation on the suit's clock."""
+    """The recording with both stages' results: camera and localisation on the suit's clock."""
     sensed = replace(recording, localization=results["localize"])
     return sensed if results["synchronize"] is None else retime(sensed, results["synchronize"])
 
 
 def camera_report(results: dict[str, Any]) -> dict[str, Any]:
-    """The clock (None: shared), and how often the camera was found, as far as the stages went."""
+    """Report of the first stages: clock (None: shared), number of frames and share of them that were localised."""
     clock: Clock | None = results["synchronize"]
     about: dict[str, Any] = {"clock": None}
     if clock is not None:
@@ -220,7 +223,7 @@ def _pictures(recording: Recording, folder: Path) -> list[Path]:
 
 
 def _frames(stream: CameraStream, folder: Path, every: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Each `every`-th picture that has a timestamp."""
+    """Every `every`-th image that has a timestamp."""
     if stream.video is None:
         assert stream.image_files is not None
         for name in stream.image_files[::every]:

@@ -1,4 +1,4 @@
-"""Pieces of a recording that is being made: what is wrong with one, and putting them together."""
+"""Pieces of a live recording: validation and concatenation."""
 
 import math
 
@@ -17,15 +17,16 @@ from wearcap.sensors.packets import (
 )
 
 MAX_PAUSE_S = 10.0
-"""Behind a longer pause a piece is alone until the next one agrees; then a new stretch begins."""
+"""Longest gap (s) within a stretch. A piece after a longer one is kept aside until the next piece continues it; then a
+new stretch begins."""
 
 
 def suit_fault(suit: object, like: Motion | None) -> str | None:
-    """What is wrong with a piece of a suit's motion beside an earlier good one."""
+    """Reason to refuse a piece of a suit's motion, None for a good one; it must match an earlier good piece `like`."""
     if not isinstance(suit, Motion) or not isinstance(suit.timestamps, Tensor) or suit.timestamps.ndim != 1:
         return WRONG_TYPE
     times, count, joints = suit.timestamps, len(suit.timestamps), len(suit.skeleton)
-    contact, known = suit.contact_prob, None if like is None else like.contact_prob
+    contact, before = suit.contact_prob, None if like is None else like.contact_prob
     fault = (
         _times_fault(times, MAX_PAUSE_S)
         or rotations_fault(suit.R_parent_joint, (count, joints, 3, 3))
@@ -33,8 +34,10 @@ def suit_fault(suit: object, like: Motion | None) -> str | None:
         or (None if contact is None else _contact_fault(contact, count))
     )
     if fault is None and like is not None:
-        same = like.skeleton.joint_names == suit.skeleton.joint_names and (contact is None) == (known is None)
-        return None if same and (known is None or contact is None or known.shape[1:] == contact.shape[1:]) else WRONG_TYPE  # fmt: skip
+        same = like.skeleton.joint_names == suit.skeleton.joint_names and (contact is None) == (
+            before is None
+        )
+        return None if same and (before is None or contact is None or before.shape[1:] == contact.shape[1:]) else WRONG_TYPE  # fmt: skip
     return fault
 
 
@@ -44,7 +47,7 @@ def _contact_fault(contact: object, count: int) -> str | None:
 
 
 def localization_fault(seen: object, suit: Motion) -> str | None:
-    """What is wrong with the camera poses of a piece; rows that are not localised (confidence 0) may hold anything."""
+    """Reason to refuse a piece's camera poses, None for good ones; poses of confidence 0 are not checked."""
     if not isinstance(seen, Localization) or not isinstance(seen.timestamps, Tensor):
         return WRONG_TYPE
     count = seen.timestamps.numel()
@@ -68,16 +71,18 @@ def _times_fault(times: Tensor, max_pause_s: float) -> str | None:
 
 
 def follows(first: Motion, then: Motion) -> bool:
-    """Whether a piece continues another, without overlap or a long pause."""
+    """Whether a piece continues another, without overlap or a long gap."""
     return 0 < (then.timestamps[0] - first.timestamps[-1]).item() <= MAX_PAUSE_S
 
 
 def more(first: Localization, then: Localization) -> Localization:
+    """Concatenate two localisations."""
     names = ("timestamps", "R_world_cam", "t_world_cam", "confidence")
     return Localization(*(torch.cat([getattr(first, name), getattr(then, name)]) for name in names))
 
 
 def cut(seen: Localization, first: int) -> Localization:
+    """Drop the frames before `first`."""
     return Localization(
         seen.timestamps[first:], seen.R_world_cam[first:], seen.t_world_cam[first:], seen.confidence[first:]
     )

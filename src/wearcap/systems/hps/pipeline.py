@@ -1,7 +1,7 @@
-"""HPS (thesis ch. 4): a suit's pose registered in a scanned scene by a head camera, without drift.
+"""HPS (thesis ch. 4): registers a suit's motion in a scanned scene by a head camera, without drift.
 
-A recording goes through the document's steps in order; each is a method that can be called alone, and a stage whose
-result can be kept: synchronize → localize → align → initialize → optimize.
+The steps of the thesis in order: synchronize → localize → align → initialize → optimize. Each is a method that can be
+called alone, and a stage whose result can be cached.
 """
 
 from collections.abc import Callable
@@ -45,12 +45,14 @@ Solver = Callable[[HpsEnergy, HpsData], Solution]
 
 @dataclass(frozen=True)
 class Evidence:
-    """How the optimisation reads contacts and localisation."""
+    """How much the optimisation trusts the suit's contacts and the localisation."""
 
     max_contact_speed: float | None = 0.6
-    """Flags of a foot patch that moves faster by the suit itself (m/s) are not believed; None: all are (document)."""
+    """Largest speed (m/s, in the suit's own motion) at which a foot patch's contact flag is used; None: all flags are
+    used (thesis)."""
     confident: bool = True
-    """Weigh frames by the localisation's confidence, not at all where it was lost; False: all alike (document)."""
+    """Whether frames are weighted by the localisation's confidence (0 where it failed); False: all frames alike
+    (thesis)."""
 
 
 @dataclass(eq=False)
@@ -67,7 +69,8 @@ class HPS:
     localization: Localize = field(default_factory=MapLocalization)
 
     def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
-        """The wearer's motion in the scene at `fps`; `folder` is the data set's. Raises WearcapError as `stages`."""
+        """Return the wearer's motion in the scene at `fps`; `folder` is the data set's. Raises WearcapError as
+        `stages`."""
         source = Source(recording, folder, scan)
         results, _ = run_stages(self.stages(source))
         return self.motion(results["initialize"], results["optimize"])
@@ -93,14 +96,14 @@ class HPS:
                 lambda: (self.initialization, *mount(recording)), ("synchronize", "localize", "align"),
             ),
             Stage(
-                "optimize", lambda done: self.optimize(self._stated(source, done)),
+                "optimize", lambda done: self.optimize(self._problem_of(source, done)),
                 lambda: (self.energy, self.solver, self.evidence, source.scan, source.metres_per_unit, recording.shape),
                 ("synchronize", "localize", "align", "initialize"),
             ),
         ]  # fmt: skip
 
     def require_scan(self, scan: Path | Scan | None, where: str) -> None:
-        """Raise WearcapError when the energy asks for a scan and there is none."""
+        """Raise WearcapError when a term of the energy needs a scan and there is none."""
         terms = [name for name in ("contact", "contact_plane") if self.energy.weight(name)]
         if scan is None and terms:
             raise WearcapError(f"no scan of the scene, which the energy's term {' and '.join(terms)} needs",
@@ -108,13 +111,13 @@ class HPS:
                                fix="Without one: pipeline=hps_without_scene.")  # fmt: skip
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
-        """The motion after the last stage that was run: aligned, initial, or optimised."""
+        """Motion after the last stage that was run: aligned, initial or optimised."""
         if "optimize" in results:
             return self.motion(results["initialize"], results["optimize"])
         return results["initialize"].motion if "initialize" in results else results.get("align")
 
     def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
-        """Clock, share localised, angle of the alignment, energies by term and iteration, and why the solver stopped."""
+        """Clock, share of localised frames, alignment angle, energy by term and iteration, and the stopping reason."""
         about = camera_report(results)
         if "align" in results:
             assert source.recording.suit is not None
@@ -127,20 +130,22 @@ class HPS:
         return about
 
     def synchronize(self, recording: Recording, folder: Path) -> Clock | None:
-        """The camera's clock against the suit's by claps (thesis §4.3.4); None where they are one."""
+        """Map from the camera's clock to the suit's, by claps (thesis §4.3.4); None where they share one clock."""
         return self.synchronization(recording, folder)
 
     def localize(self, recording: Recording, folder: Path) -> Localization:
-        """The head camera's poses in the scene, on its own clock (thesis §4.2.3)."""
+        """Poses of the head camera in the scene, on its own clock (thesis §4.2.3)."""
         return self.localization(recording, folder)
 
     def align(self, recording: Recording) -> Motion:
-        """The suit's motion at `fps`, turned about gravity and moved into the scene (thesis eq. 4.14, 4.15)."""
+        """Resample the suit's motion to `fps`, rotate it about gravity and move it into the scene (thesis eq. 4.14,
+        4.15)."""
         suit, localization, T_head_cam = required(recording)
         return align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
 
     def initialize(self, recording: Recording, aligned: Motion) -> Initialization:
-        """The start of the optimisation: the suit carried along the camera's path (thesis §4.2.5, eq. 4.13)."""
+        """Initial state of the optimisation: the suit's pose moved along the camera's path (thesis §4.2.5, eq.
+        4.13)."""
         _, localization, T_head_cam = required(recording)
         return initialize(aligned, localization, T_head_cam.R, T_head_cam.t, self.initialization)
 
@@ -148,9 +153,9 @@ class HPS:
         self, recording: Recording, aligned: Motion, start: Initialization, scan: Scan | None,
         R_head_cam: Float[Tensor, "3 3"] | None = None,
     ) -> HpsData:  # fmt: skip
-        """What the energy is told: the start, localised cameras, contacts, and the suit's own steps.
+        """Data of the energy: initial state, localised cameras, contacts, and the suit's frame-to-frame motion.
 
-        `R_head_cam` is estimated from the frames that are localised (HPS paper eq. 4) where it is not given.
+        `R_head_cam` is estimated from the localised frames (HPS paper eq. 4) unless it is given.
         """
         motion, (_, localization, _) = start.motion, required(recording)
         R_cam, sure = at_frames(localization, motion)
@@ -171,7 +176,7 @@ class HPS:
             scan.surface if scan else None,
         )  # fmt: skip
 
-    def _stated(self, source: Source, results: dict[str, Any]) -> HpsData:
+    def _problem_of(self, source: Source, results: dict[str, Any]) -> HpsData:
         recording = on_one_clock(source.recording, results)
         return self.problem(recording, results["align"], results["initialize"], source.read_scan())
 
@@ -180,7 +185,7 @@ class HPS:
         return self.solver(self.energy, data)
 
     def motion(self, start: Initialization, solution: Solution) -> Motion:
-        """What was captured; contacts stay the suit's."""
+        """Captured motion of a solution; foot contacts are those of the suit."""
         state = solution.state
         return replace(
             start.motion, R_parent_joint=state.R_parent_joint.float(), t_world_root=state.t_world_root.float(),
@@ -189,7 +194,7 @@ class HPS:
 
 
 def required(recording: Recording) -> tuple[Motion, Localization, Rigid]:
-    """Suit, localisation and nominal mount T_head_cam of a recording. Raises WearcapError naming what it lacks."""
+    """Suit, localisation and nominal mount T_head_cam of a recording. Raises WearcapError that names missing parts."""
     require(recording, "suit", "localization", "camera")
     assert recording.suit is not None
     assert recording.localization is not None
@@ -197,7 +202,7 @@ def required(recording: Recording) -> tuple[Motion, Localization, Rigid]:
 
 
 def require(recording: Recording, *names: str) -> None:
-    """Raise WearcapError unless the recording has these parts."""
+    """Raise WearcapError unless the recording has all of these parts."""
     missing = [name for name in names if getattr(recording, name) is None]
     if missing:
         raise WearcapError(f"no {' and no '.join(missing)} in this recording", where=recording.name,
@@ -213,10 +218,10 @@ def mount(recording: Recording) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"
 def at_frames(
     localization: Localization, motion: Motion
 ) -> tuple[Float64[Tensor, "time 3 3"], Float64[Tensor, "time"]]:
-    """Orientation and confidence of the nearest localised frame, 0 beyond half a frame or where it is an outlier.
+    """Orientation and confidence of the nearest localised frame; confidence is 0 beyond half a frame and at outliers.
 
-    The orientation is carried from its own time to the motion's frame by the turn of the motion's head, which matters
-    where cameras are localised more seldom than frames are asked for.
+    The orientation is propagated from its own time to the motion's frame by the rotation of the motion's head, which
+    matters where localisation is sparser than the motion's frames.
     """
     times, timestamps = localization.timestamps.contiguous(), motion.timestamps.contiguous()
     after = torch.searchsorted(times, timestamps).clamp(1, len(times) - 1)
@@ -231,14 +236,14 @@ def at_frames(
 
 
 def turns(R_world_body: Float[Tensor, "time 3 3"]) -> Float[Tensor, "pair 3 3"]:
-    """Turn in the world's axes from each frame to the next."""
+    """Rotation in world axes from each frame to the next."""
     return R_world_body[1:] @ R_world_body[:-1].mT
 
 
 def believed_contact(suit: Motion, max_speed: float | None) -> Bool[Tensor, "time patch"]:
-    """The suit's contact flags, without those of patches that move faster than `max_speed` (m/s) by the suit itself.
+    """The suit's contact flags, without those of patches that move faster than `max_speed` (m/s) in the suit's motion.
 
-    Raises WearcapError when there are none, or fewer than frames.
+    Raises WearcapError when there are no flags, or not one per frame.
     """
     if suit.contact_prob is None or len(suit.contact_prob) != len(suit):
         count = "no" if suit.contact_prob is None else f"{len(suit.contact_prob)} frames of"

@@ -1,4 +1,4 @@
-"""What the documents compare HPS with (thesis §4.5.1): the suit alone, and the suit carried by the camera."""
+"""Baselines of HPS (thesis §4.5.1): the suit alone, and the suit translated by the camera."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
@@ -26,7 +26,7 @@ KINDS = ("imu", "imu_cam", "imu_cam_filtered")
 
 
 class PlacedSuit(ABC):
-    """A pipeline that puts the suit's motion into the scene in one step behind HPS' first two."""
+    """A pipeline that places the suit's motion in the scene in one step after the first two of HPS."""
 
     fps: float
     synchronization: Synchronization
@@ -35,18 +35,18 @@ class PlacedSuit(ABC):
     @property
     @abstractmethod
     def placing(self) -> Any:
-        """What decides the step, beside the recording and the rate."""
+        """Settings that determine the placement, besides the recording and the rate, for its cache key."""
 
     @abstractmethod
     def place(self, recording: Recording) -> Motion:
         """The suit's motion in the scene."""
 
     def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
-        """The placed motion. Raises WearcapError as `stages`."""
+        """Return the suit's motion in the scene. Raises WearcapError as `stages`."""
         return run_stages(self.stages(Source(recording, folder, scan)))[0]["place"]
 
     def stages(self, source: Source) -> list[Stage]:
-        """HPS' first two, then the suit is placed. Raises WearcapError as HPS does."""
+        """The first two stages of HPS, then `place`. Raises WearcapError as HPS does."""
         recording = source.recording
         require(recording, "suit", "camera")
         return [
@@ -58,17 +58,18 @@ class PlacedSuit(ABC):
         ]  # fmt: skip
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
-        """The motion, once it is placed."""
+        """The motion, once it has been placed."""
         return results.get("place")
 
     def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
-        """Clock and share localised."""
+        """Clock and share of localised frames."""
         return camera_report(results)
 
 
 @dataclass(frozen=True)
 class HpsBaseline(PlacedSuit):
-    """A row of the documents' tables: "imu", "imu_cam" or "imu_cam_filtered"; all are aligned at the start."""
+    """A baseline row of thesis Tables 4.1 to 4.3: "imu", "imu_cam" or "imu_cam_filtered"; all are aligned at the
+    start."""
 
     kind: str
     fps: float = 30.0

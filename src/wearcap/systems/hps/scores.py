@@ -1,6 +1,6 @@
-"""Scores of motions captured in a scene against the truth: thesis §4.5, Tables 4.1 to 4.3, drift and outages.
+"""Scores of captured motions against ground truth: thesis §4.5, Tables 4.1 to 4.3, drift, localisation outages.
 
-Nothing is aligned before it is measured. Lengths in m go in, errors in cm come out.
+No alignment is applied before measuring. Inputs are in m, errors in cm.
 """
 
 import math
@@ -27,41 +27,42 @@ from wearcap.recording.timing import resampled
 from wearcap.scene.scan import Scan
 
 FEET_S, FEET_EVERY_S = 2.0, 6.0
-"""Feet are examined for so long out of so much: in all about the document's three minutes, spread evenly."""
+"""Feet are scored in the first `FEET_S` of every `FEET_EVERY_S` (s): in total about the thesis's three minutes, spread
+evenly."""
 BIN_M = 20.0
-"""Stretches of way whose errors are averaged before a slope is fitted."""
+"""Length of path (m) over which errors are averaged before a slope is fitted."""
 MARGIN_S = 5.0
-"""Between a visit at the capture spot and a planted outage."""
+"""Least time (s) between a visit to the depth-camera rig and a planted outage."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigCloud:
-    """What the depth cameras saw of the wearer at one instant."""
+    """Point cloud of the wearer from the rig's depth cameras at one instant (m, world)."""
 
     time_s: float
-    """On the suit's clock."""
+    """Time on the suit's clock."""
     points: Float[Tensor, "point 3"]
 
 
 @dataclass(frozen=True, eq=False)
 class HpsTruth:
-    """What captures of one recording are measured against. Make it with `HpsTruth.of`."""
+    """Ground truth of one recording. Make it with `HpsTruth.of`."""
 
     motion: Motion
-    """At the captures' frames."""
+    """True motion at the captures' frames."""
     body: BodyModel
     surface: SurfaceIndex
     contact: Bool[Tensor, "time patch"]
-    """As the suit reports it: the document's "frames when foot contact is detected"."""
+    """Foot contact as the suit reports it: the thesis's "frames when foot contact is detected"."""
     true_contact: Bool[Tensor, "time patch"]
     visits: tuple[tuple[RigCloud, ...], ...]
-    """The clouds of every interval of the recording."""
+    """Clouds of each interval of the recording."""
 
     @classmethod
     def of(
         cls, recording: Recording, scan: Scan, visits: Sequence[Sequence[RigCloud]], fps: float = 30.0
     ) -> "HpsTruth":
-        """The truth of a recording at `fps`; suit and true motion share their timestamps, as simulated ones do.
+        """Ground truth of a recording at `fps`; suit and true motion share their timestamps, as simulated ones do.
 
         Raises WearcapError when the recording lacks a suit with contacts, a true motion or true contacts.
         """
@@ -83,32 +84,34 @@ class HpsTruth:
 
 @dataclass(frozen=True)
 class Drift:
-    """Root error along the way, and how fast it grows."""
+    """Root error as a function of the distance walked, and its slope."""
 
     distance_m: tuple[float, ...]
-    """Middles of the bins."""
+    """Centres of the distance bins."""
     error_cm: tuple[float, ...]
+    """Mean root error of each bin."""
     slope_cm_per_100m: float
 
 
 @dataclass(frozen=True)
 class HpsScores:
-    """One capture's scores; NaN where there was nothing to measure."""
+    """Scores of one capture; NaN where there was nothing to measure."""
 
     literal: tuple[Chamfer, ...]
-    """Of every interval of the recording: vertices to points both ways, as documented."""
+    """Chamfer distance of each interval between vertices and points, both ways, as in the thesis."""
     surface: tuple[Chamfer, ...]
-    """The same with points measured to the body's surface (ours)."""
+    """Chamfer distance of each interval with points measured to the body's surface (ours)."""
     feet: FootSurface
-    """During the suit's contacts (Table 4.3)."""
+    """Foot scores during the contacts that the suit reports (Table 4.3)."""
     feet_true_contact: FootSurface
+    """Foot scores during true contacts."""
     drift: Drift
     joints: dict[str, float]
-    """Of the whole recording: `metrics.table.evaluate_motion`."""
+    """Scores of `metrics.table.evaluate_motion` over the whole recording."""
 
 
 def score_hps(motion: Motion, truth: HpsTruth) -> HpsScores:
-    """All scores of one capture. Raises WearcapError unless it has the truth's joints, timestamps and finite poses."""
+    """Score one capture. Raises WearcapError unless it has the truth's joints and timestamps, and finite poses."""
     joints = evaluate_motion(motion, truth.motion, truth.true_contact)
     literal, surface = zip(*(interval_chamfer(motion, truth.body, clouds) for clouds in truth.visits))
     error = joint_errors_cm(motion, truth.motion)[:, 0]
@@ -119,15 +122,15 @@ def score_hps(motion: Motion, truth: HpsTruth) -> HpsScores:
 
 
 def visit_times(intervals: Intervals, count: int = 10) -> Float64[Tensor, "interval frame"]:
-    """Instants (s) spread evenly over each interval, off its ends: when the rig is looked at."""
+    """Instants (s) at which the rig's clouds are taken: evenly spread over each interval, without its ends."""
     share = (torch.arange(count, dtype=torch.float64) + 0.5) / count
     return intervals.start_s[:, None] + (intervals.stop_s - intervals.start_s)[:, None] * share
 
 
 def interval_chamfer(motion: Motion, body: BodyModel, clouds: Sequence[RigCloud]) -> tuple[Chamfer, Chamfer]:
-    """Mean over clouds of the Chamfer distance to the captured body: (literal, to the surface).
+    """Mean Chamfer distance between clouds and the captured body: (vertices to points, points to surface).
 
-    Raises WearcapError for a cloud further than half a frame from any frame of the motion.
+    Raises WearcapError for a cloud more than half a frame away from every frame of the motion.
     """
     times = torch.tensor([cloud.time_s for cloud in clouds], dtype=torch.float64)
     frames = nearest_frames(motion.timestamps, times)
@@ -138,7 +141,7 @@ def interval_chamfer(motion: Motion, body: BodyModel, clouds: Sequence[RigCloud]
 
 
 def nearest_frames(timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "instant"]) -> Tensor:
-    """Frame nearest to each instant (s). Raises WearcapError beyond half a frame."""
+    """Frame nearest to each instant (s). Raises WearcapError for an instant more than half a frame away from it."""
     frames = (timestamps[:, None] - at).abs().argmin(0)
     off = (timestamps[frames] - at).abs()
     if off.max() > 0.51 * timestamps.diff().median():
@@ -147,7 +150,7 @@ def nearest_frames(timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "ins
 
 
 def foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time patch"]) -> FootSurface:
-    """Distance to the scan and sliding of the captured feet during `contact` (Table 4.3)."""
+    """Foot-to-scan distance and foot sliding of a capture during `contact` (Table 4.3)."""
     times = truth.motion.timestamps
     examined = (times - times[0]) % FEET_EVERY_S < FEET_S
     touching = contact & examined[:, None]
@@ -155,20 +158,21 @@ def foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time pat
 
 
 def joint_errors_cm(motion: Motion, truth: Motion) -> Float[Tensor, "time joint"]:
-    """Distance of each joint from the true one in the world; the root comes first."""
+    """Position error of each joint in the world (cm); the root comes first."""
     return 100 * (motion.T_world_joint.t - truth.T_world_joint.t).norm(dim=-1)
 
 
 def travelled_m(motion: Motion) -> Float[Tensor, "time"]:
-    """Way of the root over the ground since the first frame."""
-    way = motion.t_world_root[:, :2].double().diff(dim=0).norm(dim=-1).cumsum(0)
-    return torch.cat([way.new_zeros(1), way])
+    """Horizontal path length of the root since the first frame (m)."""
+    length = motion.t_world_root[:, :2].double().diff(dim=0).norm(dim=-1).cumsum(0)
+    return torch.cat([length.new_zeros(1), length])
 
 
 def drift(distance_m: Float[Tensor, "time"], error_cm: Float[Tensor, "time"], bin_m: float = BIN_M) -> Drift:
-    """Mean error of every `bin_m` of the way, and the slope of a line through these means.
+    """Mean error of each bin of `bin_m` walked, and the slope of a line fitted to these means.
 
-    A bin counts once, however long the wearer stood in it; the last one only where at least half of it was walked.
+    Each bin has the same weight, however long the wearer stood in it; the last one counts only if at least half of it
+    was walked.
     """
     number = (distance_m / bin_m).floor().long().numpy()
     whole = number < round(distance_m[-1].item() / bin_m)
@@ -183,20 +187,20 @@ def drift(distance_m: Float[Tensor, "time"], error_cm: Float[Tensor, "time"], bi
 
 @dataclass(frozen=True)
 class Outage:
-    """A stretch of a recording in which localisation finds nothing (s, on the suit's clock)."""
+    """A time span without localisation (s, on the suit's clock)."""
 
     start_s: float
     length_s: float
 
     def frames(self, timestamps: Float64[Tensor, "time"]) -> Bool[Tensor, "time"]:
-        """Which frames fall into it."""
+        """Mask of the frames within the outage."""
         return (timestamps >= self.start_s) & (timestamps < self.start_s + self.length_s)
 
 
 def planted_outages(intervals: Intervals, end_s: float, lengths_s: Sequence[float]) -> list[Outage]:
-    """Outages in the middle of the walks between visits, the longest in the longest walk, one in each.
+    """Outages centred in the walks between visits: at most one per walk, the longest in the longest walk.
 
-    One that does not fit with some seconds before and after it is shortened. Raises WearcapError when there are more
+    An outage that does not leave `MARGIN_S` before and after it is shortened. Raises WearcapError when there are more
     outages than walks.
     """
     away = torch.cat([intervals.stop_s, torch.zeros(1, dtype=torch.float64)])
@@ -215,7 +219,7 @@ def planted_outages(intervals: Intervals, end_s: float, lengths_s: Sequence[floa
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Mean errors (cm) with and without outages of localisation, over the same frames."""
+    """Mean errors (cm) with and without localisation outages, over the same frames."""
 
     root_cm: float
     joint_cm: float
@@ -224,23 +228,23 @@ class Disturbance:
 
     @property
     def root_ratio(self) -> float:
-        """Disturbed over undisturbed."""
+        """Error with outages divided by the error without."""
         return self.root_cm / self.undisturbed_root_cm
 
     @property
     def joint_ratio(self) -> float:
-        """Disturbed over undisturbed."""
+        """Error with outages divided by the error without."""
         return self.joint_cm / self.undisturbed_joint_cm
 
 
 def disturbance(
     disturbed: Motion, undisturbed: Motion, truth: Motion, frames: Bool[Tensor, "time"]
 ) -> Disturbance:
-    """What outages do to a capture in the given frames."""
+    """Compare captures with and without outages over the given frames."""
     with_, without = (joint_errors_cm(motion, truth)[frames] for motion in (disturbed, undisturbed))
     return Disturbance(*(float(e) for e in (with_[:, 0].mean(), with_.mean(), without[:, 0].mean(), without.mean())))  # fmt: skip
 
 
 def in_order(errors: Sequence[float]) -> bool:
-    """Whether every error is larger than the next: the documents' order of baselines (Tables 4.1 and 4.2)."""
+    """Whether the errors strictly decrease, as those of the thesis's baselines do (Tables 4.1 and 4.2)."""
     return all(before > after for before, after in pairwise(errors))

@@ -1,7 +1,7 @@
-"""HPS while it is being recorded: frames go in as they come, finished motion comes out some time later.
+"""Streaming HPS: takes frames as they are recorded and returns final motion with a fixed latency.
 
-A window of the newest seconds is solved again and again; frames older than `lag_s` are final and hold those that
-follow. Memory is that of a window, however long the recording.
+A window of the newest seconds is re-solved as frames arrive; frames older than `lag_s` are final and constrain those
+that follow. Memory is bounded by the window, however long the recording.
 """
 
 from collections import Counter
@@ -28,38 +28,39 @@ from wearcap.systems.hps.pieces import cut, follows, localization_fault, more, s
 from wearcap.systems.hps.pipeline import HPS
 
 MAX_UNALIGNED_S = 600.0
-"""While nothing is localised, the newest so many seconds of the suit are kept."""
+"""Length (s) of suit motion that is kept until the first alignment."""
 
 
 @dataclass(frozen=True)
 class StreamSettings:
-    """Lengths in seconds."""
+    """Window and latency of a stream (s)."""
 
     start_s: float = 5.0
-    """Of localised frames before the suit is aligned and the first motion comes."""
+    """Localised time needed before the suit is aligned and the first motion is returned."""
     window_s: float = 20.0
-    """What heading and camera's mount are drawn from."""
+    """Length of the window from which heading and camera mount are estimated."""
     lag_s: float = 1.0
-    """Age at which a frame is final."""
+    """Latency: age at which a frame is final."""
     advance_s: float = 0.5
-    """A window is solved each time so much is new."""
+    """New motion after which the window is solved again."""
     behind_s: float = 1.5
-    """Of final frames that a window is tied to."""
+    """Length of final motion that a window is constrained to."""
     tie: float = 30.0
-    """Weight of a final frame's position among localised ones (1)."""
+    """Weight of a final frame's position, relative to a localised frame's (1)."""
 
 
 class HpsStream:
-    """Feed `push` with pieces of a recording, in order; finished pieces of motion are returned.
+    """Takes consecutive pieces of a recording by `push` and returns final pieces of motion.
 
-    A piece that cannot be true (`sensors.packets`), or that does not follow the one before, is `refused`. Where two
-    pieces in a row follow each other and not those before, the clock has moved: a new stretch begins, aligned anew.
+    A piece that is invalid (`sensors.packets`), or that does not follow the one before, is counted in `refused`. When
+    two consecutive pieces follow each other but not those before, the clock has jumped: a new stretch begins and is
+    aligned again.
     """
 
     def __init__(self, hps: HPS, about: Recording, scan: Scan | None, settings: StreamSettings | None = None):
-        """`about` gives the wearer's shape and the camera with its mount; its streams are not read.
+        """Start a stream. `about` provides the wearer's shape and the camera with its mount; its streams are not read.
 
-        Raises WearcapError without a camera, or a scan where the energy asks for one.
+        Raises WearcapError without a camera, or without a scan where the energy needs one.
         """
         if about.camera is None:
             raise WearcapError(
@@ -70,22 +71,22 @@ class HpsStream:
         self.settings = settings or StreamSettings()
         self.mount = Rigid(about.camera.R_head_cam, about.camera.t_head_cam)
         self.refused: Counter[str] = Counter()
-        """Pieces, or their localisation, that were refused, by reason: "suit: off the clock"."""
+        """Number of refused pieces, or localisations of pieces, by reason such as "suit: off the clock"."""
         self._alone: tuple[Motion, Localization | None] | None = None
-        """The last piece, where it did not follow those before."""
-        self._given = False
-        """Whether any motion was handed out."""
+        """The last piece, if it did not follow those before."""
+        self._any_returned = False
+        """Whether any motion was returned."""
         self._like: Motion | None = None
-        """The first good piece: those to come have its joints and contacts."""
+        """The first valid piece; later ones must have the same joints and contacts."""
         self._begin()
 
     def _begin(self) -> None:
-        """Begin a stretch."""
+        """Begin a new stretch."""
         self.suit: Motion | None = None
-        """What was pushed and is still needed, at the pipeline's rate."""
+        """Suit motion that later windows still need, at its own rate."""
         self.seen: Localization | None = None
         self.turn: tuple[Float[Tensor, ""], Float[Tensor, "3"]] | None = None
-        """Angle and translation of the alignment, once it is known."""
+        """Angle (rad) and translation (m) of the alignment, once it has been estimated."""
         self.R_head_cam = self.mount.R.double()
         self.yaw = torch.zeros((), dtype=torch.float64)
         self.done: Motion | None = None
@@ -93,9 +94,9 @@ class HpsStream:
         self._solved_to = -torch.inf
 
     def push(self, suit: Motion, localization: Localization | None = None) -> Motion | None:
-        """Take in what is new of suit and localisation; returns the frames that have become final, if any.
+        """Add new suit motion and localisation; returns the frames that have become final, if any.
 
-        Where a new stretch begins these are the last ones of the stretch before.
+        When a new stretch begins, the remaining frames of the previous one are returned.
         """
         fault = suit_fault(suit, self._like)
         if fault is not None:
@@ -126,7 +127,7 @@ class HpsStream:
             self._alone = None
 
     def _checked(self, localization: object, suit: Motion) -> Localization | None:
-        """The localisation of a piece, or None where it cannot be used."""
+        """The localisation of a piece, or None if it is unusable."""
         if localization is None:
             return None
         if fault := localization_fault(localization, suit):
@@ -147,7 +148,7 @@ class HpsStream:
             self.seen = localization if self.seen is None else more(self.seen, localization)
 
     def _solve(self) -> Motion | None:
-        """The frames that have become final."""
+        """Solve once enough is new; returns the frames that have become final."""
         assert self.suit is not None
         newest = self.suit.timestamps[-1].item()
         if self.turn is None and not self._align():
@@ -158,9 +159,9 @@ class HpsStream:
         return self._advance(newest - self.settings.lag_s)
 
     def finish(self) -> Motion | None:
-        """The frames that are left when the recording has ended.
+        """Return the remaining frames at the end of the recording.
 
-        Raises WearcapError when every piece was refused, and when none was ever localised.
+        Raises WearcapError when every piece was refused, and when no piece was ever localised.
         """
         self._refuse_alone()
         if self.suit is None and self.refused:
@@ -169,14 +170,14 @@ class HpsStream:
                 expected="finite poses of the suit at rising times",
             )  # fmt: skip
         motion = self._end()
-        if self.suit is not None and not self._given:
+        if self.suit is not None and not self._any_returned:
             raise WearcapError(
                 "the camera was never localised", expected="some localised frames", where=self.about.name
             )
         return motion
 
     def _end(self) -> Motion | None:
-        """The frames that are left of a stretch; none where it was never localised, which is counted."""
+        """Return the remaining frames of a stretch; None, and counted in `refused`, if it was never localised."""
         if self.suit is None:
             return None
         if self.turn is None and not self._align(enough=False):
@@ -185,7 +186,7 @@ class HpsStream:
         return self._advance(self.suit.timestamps[-1].item() + 1.0)
 
     def _align(self, enough: bool = True) -> bool:
-        """Align once `start_s` seconds are localised; whether that was possible."""
+        """Align the suit once `start_s` seconds are localised; returns whether it is aligned."""
         assert self.suit is not None
         if self.seen is None:
             return False
@@ -199,7 +200,7 @@ class HpsStream:
         return True
 
     def _advance(self, final_s: float) -> Motion | None:
-        """Solve the newest window and hand out its frames up to `final_s`."""
+        """Solve the newest window and return its frames up to `final_s`."""
         assert self.suit is not None
         fps, settings = self.hps.fps, self.settings
         aligned = self._window()
@@ -215,7 +216,7 @@ class HpsStream:
         new = (motion.timestamps > after + 0.5 / fps) & (motion.timestamps <= final_s)
         if not new.any():
             return None
-        self._given = True
+        self._any_returned = True
         begin, stop = int(new.nonzero()[0]), int(new.nonzero()[-1]) + 1
         keep = int((settings.behind_s + 1.0) * fps)
         self.done = motion.sliced(max(0, stop - keep), stop)
@@ -223,7 +224,7 @@ class HpsStream:
         return motion.sliced(begin, stop)
 
     def _window(self) -> Motion:
-        """The suit's frames at the pipeline's rate, aligned."""
+        """Aligned suit motion of the window at the pipeline's rate."""
         assert self.suit is not None
         assert self.turn is not None
         fps, (angle, move) = self.hps.fps, self.turn
@@ -234,7 +235,8 @@ class HpsStream:
         return motion.moved(Rigid(turn, move))
 
     def _start(self, aligned: Motion) -> Initialization:
-        """The window's initialisation; while nothing of it is localised, the suit carries on from the last frames."""
+        """The window's initialisation; without localised frames, the suit's motion continues from the last final
+        frame."""
         seen = self.seen
         if seen is not None and (_inside(seen, aligned) & inliers(seen)).any():
             start = initialize(aligned, seen, self.mount.R, self.mount.t, self.hps.initialization)
@@ -256,13 +258,13 @@ class HpsStream:
         return Initialization(carried, lost, self.yaw.expand(len(aligned)))
 
     def _tied(self, data: HpsData, times: Float64[Tensor, "time"]) -> HpsData:
-        """Final frames hold those that follow: their positions stand for the camera's."""
+        """Constrain the window to its final frames: their positions replace the camera's in the `hold` term."""
         if self.done is None:
             return data
-        known = int((times <= self.done.timestamps[-1] + 0.5 / self.hps.fps).sum())
-        final = self.done.sliced(len(self.done) - known, len(self.done))
+        count = int((times <= self.done.timestamps[-1] + 0.5 / self.hps.fps).sum())
+        final = self.done.sliced(len(self.done) - count, len(self.done))
         t, hold = data.start.t_world_root.clone(), data.hold_confidence.clone()
-        t[:known], hold[:known] = final.t_world_root.double(), self.settings.tie
+        t[:count], hold[:count] = final.t_world_root.double(), self.settings.tie
         return replace(
             data, start=HpsState(data.start.theta, data.start.R_world_root, t), hold_confidence=hold
         )
@@ -272,11 +274,11 @@ class HpsStream:
         return replace(self.about, suit=self.suit, localization=self.seen)
 
     def _forget(self, before_s: float) -> None:
-        """Drop what no later window needs."""
+        """Drop frames that no later window needs."""
         assert self.suit is not None
         first = int(torch.searchsorted(self.suit.timestamps, before_s))
         self.suit = self.suit.sliced(first, len(self.suit))
-        if self.seen is not None:  # two stay, which tell the rate where nothing new comes
+        if self.seen is not None:  # two are kept: they determine the frame rate
             first = int(torch.searchsorted(self.seen.timestamps, before_s))
             self.seen = cut(self.seen, max(min(first, len(self.seen.timestamps) - 2), 0))
 
@@ -289,12 +291,12 @@ def follow(
     settings: StreamSettings | None = None,
     refused: Counter[str] | None = None,
 ) -> Iterator[Motion]:
-    """Motion of a recording that is still being made, piece by piece; `folder` holds what pieces name.
+    """Capture a live recording piece by piece; file names in pieces are relative to `folder`.
 
-    A piece's camera is localised where it brings pictures and no poses. Camera and suit must share a clock: claps
-    are heard too late. `refused` counts what could not be used, by reason (`HpsStream.refused`).
-    Raises WearcapError when the clocks are not shared, the first piece has no suit or cannot be localised, or the
-    energy asks for a scan.
+    A piece's camera is localised if it has images and no poses. Camera and suit must share a clock, as claps would be
+    detected too late. `refused` counts unusable pieces by reason (`HpsStream.refused`).
+    Raises WearcapError when the clocks are not shared, the first piece has no suit or cannot be localised, or a term
+    of the energy needs a scan that is missing.
     """
     stream: HpsStream | None = None
     refused = Counter() if refused is None else refused
@@ -304,7 +306,7 @@ def follow(
                 "no suit in this piece", where=piece.name, expected="a suit's motion in each piece"
             )
         if hps.synchronization.by_claps(piece):
-            raise WearcapError("claps cannot bring a growing recording's clocks together", where=piece.name,
+            raise WearcapError("a live recording cannot be synchronised by claps", where=piece.name,
                                fix="Set the clocks before, and give pipeline.synchronization.clock=shared.")  # fmt: skip
         if piece.suit is None:
             refused[f"suit: {WRONG_TYPE}"] += 1
@@ -322,7 +324,7 @@ def follow(
 
 
 def _localized(hps: HPS, piece: Recording, folder: Path, refused: Counter[str] | None) -> Localization | None:
-    """Where the camera was; what cannot be localised is counted, but without a counter raised."""
+    """Camera poses of a piece; a failure is counted in `refused`, or raised if there is no counter."""
     if piece.camera is None:
         return piece.localization
     try:

@@ -1,4 +1,4 @@
-"""HPS with the current weights during validation: what a localiser in training is worth to the captured motion."""
+"""Validation of a localiser in training by the motion that HPS captures with its current weights."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,10 +19,11 @@ from wearcap.systems.hps.pipeline import HPS
 
 
 class HpsValidation(Callback):
-    """Every n-th validation epoch captures recordings by HPS and logs root error, feet on the scan, share localised.
+    """Captures recordings with HPS every n-th validation epoch; logs root error, foot-to-scan distance, localised
+    share.
 
-    HPS has no network of its own: `localizer` makes its localisation from the module in training, such as
-    `MapLocalization` with its extractor and a map that was built with the same weights.
+    HPS has no network of its own: `localizer` builds its localisation step from the module in training, such as
+    `MapLocalization` with that module as extractor and a map built with the same weights.
     """
 
     def __init__(
@@ -49,28 +50,28 @@ class HpsValidation(Callback):
             rows = [validated(pipeline, where) for where in self.recordings]
         pl_module.train(training)
         for name in rows[0]:
-            known = [row[name] for row in rows if row[name] == row[name]]
+            scored = [row[name] for row in rows if row[name] == row[name]]
             pl_module.log(
-                f"hps/{name}", sum(known) / len(known) if known else float("nan"), rank_zero_only=True
+                f"hps/{name}", sum(scored) / len(scored) if scored else float("nan"), rank_zero_only=True
             )
 
 
 def validated(pipeline: HPS, where: str) -> dict[str, float]:
-    """Scores of one recording by name with unit; those that need what it lacks (truth, scan) are NaN."""
+    """Scores of one recording by name with unit; NaN for those whose ground truth or scan is missing."""
     recording, folder = load_recording(where), dataset_folder(where)
     source = Source(recording, folder, folder / recording.scene if recording.scene else None)
     results, _ = run_stages(pipeline.stages(source))
     motion, nan = pipeline.motion(results["initialize"], results["optimize"]), float("nan")
     feet = surface_scores(motion, recording, source.read_scan())
-    known = score(motion, recording, where, 0).scores if recording.motion is not None else {}
+    scores = score(motion, recording, where, 0).scores if recording.motion is not None else {}
     return {
-        "world_root_cm": known.get("world_root_cm", nan), "world_mpjpe_cm": known.get("world_mpjpe_cm", nan), **feet,
+        "world_root_cm": scores.get("world_root_cm", nan), "world_mpjpe_cm": scores.get("world_mpjpe_cm", nan), **feet,
         "localized_share": (results["localize"].confidence > 0).double().mean().item(),
     }  # fmt: skip
 
 
 def surface_scores(motion: Motion, recording: Recording, scan: Scan | None) -> dict[str, float]:
-    """How feet that the suit reports in contact meet the scan (thesis Table 4.3)."""
+    """Distance to the scan and sliding of the feet that the suit reports in contact (thesis Table 4.3)."""
     if scan is None or motion.contact_prob is None:
         return {"surface_cm": float("nan"), "sliding_cm": float("nan")}
     body = anny_body(motion.skeleton, recording.shape or None)

@@ -1,4 +1,4 @@
-"""Contact intervals become interactions: which object is held, how it moves, where it is left (thesis §5.3.2, §5.3.3)."""
+"""Attachment of objects to hands: which object is held, how it moves, where it is left (thesis §5.3.2, §5.3.3)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -24,19 +24,21 @@ from wearcap.systems.ireplica.contact_intervals import (
 
 @dataclass(frozen=True)
 class AttachmentSettings:
-    """How objects are taken and carried. Raises WearcapError for an unknown anchor or a reach that is not positive."""
+    """Rules of attachment. Raises WearcapError for an unknown anchor or a reach that is not positive."""
 
     reach_m: float = 0.5
-    """A contact with no object of its class so near to the hand is a false positive (thesis §5.3.1)."""
+    """Largest distance (m) from a contacting hand to the object it takes; a contact farther from every object of its
+    class is a false positive (thesis §5.3.1)."""
     anchor: str = "middle"
-    """What carries an object held by two hands: "right" (document) or "middle" (ours)."""
+    """Point that carries an object held by two hands: the "right" hand (thesis) or the "middle" of both (ours)."""
     one_class: bool = True
-    """A hand holds by its more probable class alone; False: both networks work in parallel (document)."""
+    """Whether a hand can hold by its more probable class only; False: both networks work independently (thesis)."""
     settle_s: float = 0.4
-    """Up to so much of an interval's beginning and end is approach and retreat, and cut off where hands are slowest;
-    0: nothing is (document)."""
+    """Longest approach and retreat (s) at an interval's beginning and end, cut off where the hands are slowest; 0: none
+    is cut off (thesis)."""
     keep_object: bool = True
-    """When hands join or leave without a pause, the object stays the same; False: it is looked for anew (document)."""
+    """Whether the object stays the same when hands join or leave without a pause; False: it is searched again
+    (thesis)."""
 
     def __post_init__(self):
         if self.anchor not in ANCHORS or not self.reach_m > 0:
@@ -49,16 +51,18 @@ class Held:
     """An interval in which hands hold an object, with the object's poses at its frames."""
 
     interval: ContactInterval
-    thing: SceneObject
+    scene_object: SceneObject
     contact_class: str
     state: ObjectState
-    """In which the object was taken."""
+    """State of the object when it was taken."""
     points_world: Float[Tensor, "hand 3"]
-    """Where each hand touches it at the start: its nearest point (m); NaN for a hand that does not."""
+    """Touched point at the start: the object's point nearest to each hand (m); NaN for a hand without contact."""
     goes_on: bool
-    """Whether a hand has held the object already when the interval starts."""
+    """Whether a hand already held the object before the interval."""
     T_world_object: Rigid
+    """Poses of the object at the interval's frames."""
     value: Float[Tensor, "time"]
+    """Value of the object's degree of freedom at the interval's frames."""
 
     @property
     def hands(self) -> Bool[Tensor, "hand"]:
@@ -66,51 +70,54 @@ class Held:
 
     @property
     def left_state(self) -> ObjectState:
-        """In which the object is left."""
+        """State of the object at the end of the interval."""
         return ObjectState(self.T_world_object[-1], float(self.value[-1]))
 
 
 @dataclass(eq=False)
 class Room:
-    """Objects as they stand while interactions are gone through in order."""
+    """Current state of all objects while interactions are processed in order of time."""
 
     environment: Environment
     settings: AttachmentSettings
     states: dict[str, ObjectState] = field(init=False)
 
     def __post_init__(self):
-        self.states = {thing.name: ObjectState(thing.T_world_object) for thing in self.environment.objects}
+        self.states = {
+            scene_object.name: ObjectState(scene_object.T_world_object)
+            for scene_object in self.environment.objects
+        }
 
     def nearest(
         self, palms_world: Float[Tensor, "hand 3"], contact_class: str, contact: ContactInterval
     ) -> SceneObject | None:
-        """The object of the class that is nearest to a contacting hand, within reach; None where there is none."""
-        held = palms_world[torch.tensor(contact.hands)]
+        """The object of the class that is nearest to a contacting hand, within reach; None if there is none."""
+        contacting = palms_world[torch.tensor(contact.hands)]
         poses = {name: state.T_world_object for name, state in self.states.items()}
-        found = self.environment.nearest(held, poses, contact_class, self.settings.reach_m)
+        found = self.environment.nearest(contacting, poses, contact_class, self.settings.reach_m)
         if not bool((found.object_index >= 0).any()):
             return None
         return self.environment.objects[int(found.object_index[found.distance.argmin()])]
 
     def touched(
-        self, thing: SceneObject, palms_world: Float[Tensor, "hand 3"], contact: ContactInterval
+        self, scene_object: SceneObject, palms_world: Float[Tensor, "hand 3"], contact: ContactInterval
     ) -> Tensor:
-        """p_c: the object's point nearest to each contacting hand (m, NaN for the other)."""
-        pose = self.states[thing.name].T_world_object
-        _, points = self.environment.distance(thing.name, palms_world, pose)
+        """Contact points p_c: the object's point nearest to each contacting hand (m; NaN for the other hand)."""
+        pose = self.states[scene_object.name].T_world_object
+        _, points = self.environment.distance(scene_object.name, palms_world, pose)
         points[~torch.tensor(contact.hands)] = torch.nan
         return points
 
     def take(
-        self, contact: ContactInterval, contact_class: str, thing: SceneObject, points: Tensor, goes_on: bool,
+        self, contact: ContactInterval, contact_class: str, scene_object: SceneObject, points: Tensor, goes_on: bool,
         palms_world: Float[Tensor, "time hand 3"],
     ) -> Held:  # fmt: skip
-        """Let the object follow the hands (of the interval's frames) and stay where they leave it."""
-        state = self.states[thing.name]
+        """Move the object with the hands over the interval's frames, and leave it there."""
+        state = self.states[scene_object.name]
         hands = torch.tensor(contact.hands)
-        T, value = follow_hands(thing, state, palms_world, hands, self.settings.anchor)
-        held = Held(contact, thing, contact_class, state, points, goes_on, T, value)
-        self.states[thing.name] = held.left_state
+        T, value = follow_hands(scene_object, state, palms_world, hands, self.settings.anchor)
+        held = Held(contact, scene_object, contact_class, state, points, goes_on, T, value)
+        self.states[scene_object.name] = held.left_state
         return held
 
 
@@ -134,18 +141,20 @@ def class_intervals(
 def object_trajectories(
     environment: Environment, held: Sequence[Held], timestamps: Float64[Tensor, "time"]
 ) -> dict[str, Trajectory]:
-    """Every object's poses over time: at rest, except while it is held. What never moves has two frames alone."""
+    """Poses of every object over time: static except while held. Objects that never move have two frames only."""
     tracks = {}
-    for thing in environment.objects:
-        own = [row for row in held if row.thing.name == thing.name]
+    for scene_object in environment.objects:
+        own = [row for row in held if row.scene_object.name == scene_object.name]
         if not own:
             ends = timestamps[[0, -1]]
-            tracks[thing.name] = Trajectory(
-                ends, thing.R_world_object.float().expand(2, 3, 3), thing.t_world_object.float().expand(2, 3)
+            tracks[scene_object.name] = Trajectory(
+                ends,
+                scene_object.R_world_object.float().expand(2, 3, 3),
+                scene_object.t_world_object.float().expand(2, 3),
             )
             continue
-        R = thing.R_world_object.float().repeat(len(timestamps), 1, 1)
-        t = thing.t_world_object.float().repeat(len(timestamps), 1)
+        R = scene_object.R_world_object.float().repeat(len(timestamps), 1, 1)
+        t = scene_object.t_world_object.float().repeat(len(timestamps), 1)
         for row in own:
             frames = slice(row.interval.start, row.interval.stop)
             R[frames], t[frames] = row.T_world_object.R.float(), row.T_world_object.t.float()
@@ -153,12 +162,12 @@ def object_trajectories(
                 R[row.interval.stop - 1],
                 t[row.interval.stop - 1],
             )
-        tracks[thing.name] = Trajectory(timestamps, R, t)
+        tracks[scene_object.name] = Trajectory(timestamps, R, t)
     return tracks
 
 
 def interactions_of(held: Sequence[Held], timestamps: Float64[Tensor, "time"]) -> Interactions:
-    """What was held when, as a recording keeps it."""
+    """Interactions (object, hands, times) as a recording stores them."""
     edges = torch.cat(
         [timestamps, timestamps[-1:] + (timestamps.diff().median() if len(timestamps) > 1 else 0.0)]
     )
@@ -167,5 +176,5 @@ def interactions_of(held: Sequence[Held], timestamps: Float64[Tensor, "time"]) -
     hands = torch.tensor([row.interval.hands for row in held], dtype=torch.bool).reshape(-1, 2)
     return Interactions(
         torch.tensor(start, dtype=torch.float64), torch.tensor(stop, dtype=torch.float64), hands,
-        tuple(row.thing.name for row in held), tuple(row.contact_class for row in held),
+        tuple(row.scene_object.name for row in held), tuple(row.contact_class for row in held),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""iReplica's own registration as documented (thesis §5.3.1): the suit's path is bent to the camera's positions."""
+"""iReplica's own registration as in the thesis (§5.3.1): the suit's path is bent to the camera's positions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ from wearcap.systems.hps.published import PlacedSuit
 
 @dataclass(frozen=True)
 class BentSuit(PlacedSuit):
-    """The suit's motion along its own path, bent in the ground plane; pose and height stay the suit's."""
+    """Places the suit's motion by bending its path in the ground plane; pose and height are the suit's."""
 
     bend: Callable[..., BentPath]
     """`optimize.trajectory.bend` with its settings and solver."""
@@ -32,7 +32,7 @@ class BentSuit(PlacedSuit):
         return self.bend
 
     def place(self, recording: Recording) -> Motion:
-        """F_tr(l, p) of eq. 5.2, p the root beneath each localised camera, outliers left out."""
+        """Compute F_tr(l, p) of eq. 5.2; p are root positions from the localised camera positions, without outliers."""
         suit, localization, T_head_cam = required(recording)
         motion = align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
         first, last = motion.timestamps[0], motion.timestamps[-1]

@@ -8,9 +8,9 @@ from wearcap.systems.ireplica.training import ContactDetection
 
 
 class FitTemperature(Callback):
-    """After every validation epoch the network's temperatures are fitted to it, and go into the checkpoint with its weights.
+    """Fits the network's temperatures after every validation epoch; the checkpoint stores them with the weights.
 
-    Stands before the weight averaging in the list of callbacks: the temperatures belong to the averaged weights.
+    It must come before the weight averaging in the list of callbacks: the temperatures belong to the averaged weights.
     """
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: ContactDetection) -> None:

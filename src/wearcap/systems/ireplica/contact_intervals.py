@@ -1,4 +1,4 @@
-"""From contact probabilities to intervals in which a fixed set of hands holds on (thesis §5.3.2)."""
+"""Contact probabilities to intervals with a fixed set of contacting hands (thesis §5.3.2)."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -13,11 +13,12 @@ from wearcap.errors import WearcapError
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """How probabilities become contacts. Raises WearcapError for a threshold outside 0…1 or a negative gap."""
+    """Threshold and gap filling. Raises WearcapError for a threshold outside 0…1 or a negative gap."""
 
     threshold: float = 0.5
+    """Least probability of a contact."""
     gap_s: float = 0.5
-    """Gaps up to this long between two contacts of a hand are filled (thesis Table 5.4)."""
+    """Longest gap (s) between two contacts of a hand that is filled (thesis Table 5.4)."""
 
     def __post_init__(self):
         if not 0.0 < self.threshold < 1.0 or self.gap_s < 0:
@@ -27,7 +28,7 @@ class ContactSettings:
 
 @dataclass(frozen=True)
 class ContactInterval:
-    """Frames start … stop − 1 in which the same hands (left, right) hold on."""
+    """Frames start … stop − 1 in which the same hands (left, right) are in contact."""
 
     start: int
     stop: int
@@ -37,7 +38,7 @@ class ContactInterval:
 def active(
     contact_prob: Float[Tensor, "time hand"], timestamps: Float64[Tensor, "time"], settings: ContactSettings
 ) -> Bool[Tensor, "time hand"]:
-    """Contacts of each hand after threshold and gap filling."""
+    """Contacts of each hand after thresholding and gap filling."""
     above = contact_prob >= settings.threshold
     frames = torch.arange(len(above))[:, None].expand_as(above)
     last = torch.where(above, frames, -1).cummax(0).values
@@ -49,7 +50,7 @@ def active(
 
 
 def contact_intervals(contact: Bool[Tensor, "time hand"]) -> list[ContactInterval]:
-    """Runs of frames with the same, not empty set of hands, in order: split where the set changes."""
+    """Runs of frames with the same non-empty set of contacting hands, in order of time."""
     if not len(contact):
         return []
     change = (contact[1:] != contact[:-1]).any(1).nonzero()[:, 0] + 1
@@ -60,21 +61,21 @@ def contact_intervals(contact: Bool[Tensor, "time hand"]) -> list[ContactInterva
 
 @dataclass
 class ContactStream:
-    """The same frame by frame: an interval is given out as soon as it is known to be over.
+    """Streaming version of `active` and `contact_intervals`: returns an interval as soon as it is certain to be over.
 
-    A frame without contact is decided `gap_s` later, or when contact comes back before. Memory is bounded by the gap.
+    A frame without contact is decided after `gap_s`, or earlier if contact returns. Memory is bounded by the gap.
     """
 
     settings: ContactSettings = field(default_factory=ContactSettings)
-    _waiting: deque = field(default_factory=deque)
-    """Undecided frames from the oldest on: (number, time, above)."""
+    _undecided: deque = field(default_factory=deque)
+    """Undecided frames, oldest first: (index, time, above threshold per hand)."""
     _last: list[float] = field(default_factory=lambda: [-float("inf")] * 2)
     _now_s: float = -float("inf")
     _count: int = 0
     _open: tuple[int, tuple[bool, bool]] | None = None
 
     def push(self, contact_prob: Float[Tensor, "hand"], time_s: float) -> list[ContactInterval]:
-        """Take one frame's probabilities; intervals that are over by now. Raises WearcapError when time stands."""
+        """Add one frame's probabilities; returns intervals that are over. Raises WearcapError unless time rises."""
         if not time_s > self._now_s:
             raise WearcapError(f"a frame at {time_s} s after one at {self._now_s} s", expected="rising times")
         self._now_s = time_s
@@ -82,36 +83,37 @@ class ContactStream:
         for hand in range(2):
             if above[hand]:
                 if time_s - self._last[hand] <= self.settings.gap_s + 1e-9:
-                    for _, time, held in self._waiting:
-                        held[hand] |= time > self._last[hand]
+                    for _, time, contact in self._undecided:
+                        contact[hand] |= time > self._last[hand]
                 self._last[hand] = time_s
-        self._waiting.append((self._count, time_s, above))
+        self._undecided.append((self._count, time_s, above))
         self._count += 1
         return self._decided(time_s)
 
     def flush(self) -> list[ContactInterval]:
-        """What is left at the end."""
+        """Return the remaining intervals at the end of the recording."""
         done = self._decided(float("inf"))
         return done + self._closed(self._count)
 
     def _decided(self, now_s: float) -> list[ContactInterval]:
-        """Step over the frames that no later contact can change: each hand holds, or let go longer ago than the gap."""
+        """Process frames that no later contact can change: every hand is in contact, or was released longer than the
+        gap ago."""
         done = []
-        while self._waiting:
-            number, time, held = self._waiting[0]
+        while self._undecided:
+            number, time, contact = self._undecided[0]
             if any(not on and last < time and now_s - last < self.settings.gap_s
-                   for on, last in zip(held, self._last)):  # fmt: skip
+                   for on, last in zip(contact, self._last)):  # fmt: skip
                 break
-            self._waiting.popleft()
-            done += self._step(number, (held[0], held[1]))
+            self._undecided.popleft()
+            done += self._step(number, (contact[0], contact[1]))
         return done
 
-    def _step(self, number: int, held: tuple[bool, bool]) -> list[ContactInterval]:
-        if self._open is not None and self._open[1] == held:
+    def _step(self, number: int, contact: tuple[bool, bool]) -> list[ContactInterval]:
+        if self._open is not None and self._open[1] == contact:
             return []
         done = self._closed(number)
-        if any(held):
-            self._open = (number, held)
+        if any(contact):
+            self._open = (number, contact)
         return done
 
     def _closed(self, stop: int) -> list[ContactInterval]:

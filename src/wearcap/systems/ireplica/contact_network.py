@@ -1,4 +1,4 @@
-"""What the networks that tell hand contact from poses have in common (thesis §5.3.2)."""
+"""Base class of the networks that predict hand contact from poses (thesis §5.3.2)."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -6,19 +6,19 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 REACH = 30
-"""Frames (at 60 Hz) that a prediction looks back, and ahead."""
+"""Number of context frames (at 60 Hz) on each side of a predicted frame."""
 FRAMES = 2 * REACH + 1
 
 
 class ContactNetwork(nn.Module):
-    """Poses of consecutive frames to logits of contact, per hand (left, right) and class of interaction.
+    """Maps poses of consecutive frames to contact logits per hand (left, right) and class of interaction.
 
-    Of `time` frames those from `REACH` to `time - REACH - 1` have an answer: the others lack neighbours.
+    Of `time` frames, those from `REACH` to `time - REACH - 1` have a prediction; the others lack context.
     """
 
     temperature: Tensor
     frames_per_pass: int
-    """Answers that are best computed together."""
+    """Number of predicted frames that are best computed in one pass."""
 
     def __init__(self, classes: int):
         super().__init__()
@@ -29,11 +29,11 @@ class ContactNetwork(nn.Module):
         raise NotImplementedError
 
     def probability(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch out hand class"]:
-        """Calibrated probabilities: the logits are divided by a temperature that was fitted on validation data."""
+        """Calibrated probabilities: sigmoid of the logits divided by a temperature fitted on validation data."""
         return (self(pose) / self.temperature).sigmoid()
 
     def normalize_on(self, pose: Float[Tensor, "batch time feature"]) -> None:
-        """Take the statistics that inputs are normalised with; the document's network has none."""
+        """Set the statistics that normalise the inputs; the thesis's network has none."""
 
 
 def fit_temperature(

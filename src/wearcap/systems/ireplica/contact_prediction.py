@@ -1,4 +1,4 @@
-"""Which hands hold something, told from poses alone (thesis §5.3.2): whole recordings, and frame by frame."""
+"""Prediction of hand contact from poses alone (thesis §5.3.2), for whole recordings and frame by frame."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ NETWORKS = {cls.__name__: cls for cls in (ContactTransformer, ContactSequence)}
 
 @dataclass(frozen=True)
 class ContactDetector:
-    """A network with what it sees of poses, at its frame rate, and the classes of interaction that it tells."""
+    """A contact network with its input features, frame rate, and classes of interaction."""
 
     net: ContactNetwork
     features: PoseFeatures
@@ -32,7 +32,7 @@ class ContactDetector:
     fps: float = 60.0
 
     def probability(self, feature: Float[Tensor, "time feature"]) -> Float[Tensor, "out hand class"]:
-        """Probabilities of all frames but the first and last `REACH`, in passes of the network's own size."""
+        """Probabilities of all frames but the first and last `REACH`, in passes of `frames_per_pass` frames."""
         step, out = self.net.frames_per_pass, len(feature) - 2 * REACH
         device = self.net.temperature.device
         passes = [
@@ -45,9 +45,9 @@ class ContactDetector:
 
 
 class ContactPredictor:
-    """Probabilities of contact per class of interaction, hand and frame of a motion, by one or more detectors.
+    """Predicts contact probabilities per class of interaction, hand and frame of a motion, by one or more detectors.
 
-    Frames before the beginning and behind the end are taken to be like the first and the last.
+    The motion is padded at both ends with its first and last frame.
     """
 
     def __init__(self, *detectors: ContactDetector):
@@ -61,12 +61,12 @@ class ContactPredictor:
 
     @classmethod
     def load(cls, *checkpoints: str | Path) -> "ContactPredictor":
-        """From checkpoints of `wearcap train`, each with its classes. Raises WearcapError for any other file."""
+        """Load detectors from checkpoints of `wearcap train`. Raises WearcapError for any other file."""
         return cls(*(load_detector(path) for path in checkpoints))
 
     @torch.inference_mode()
     def __call__(self, motion: Motion) -> dict[str, Float[Tensor, "time hand"]]:
-        """One probability per frame of `motion`, whatever its rate and skeleton.
+        """Contact probabilities by class at the frames of `motion`, for any frame rate and skeleton.
 
         Raises WearcapError for poses that are not numbers.
         """
@@ -84,12 +84,12 @@ class ContactPredictor:
         return result
 
     def stream(self, skeleton: Skeleton) -> "ContactStream":
-        """The same for frames of a skeleton that come one by one, at the networks' rate."""
+        """Streaming prediction for poses of `skeleton` at the networks' frame rate."""
         return ContactStream(self.detectors, skeleton)
 
 
 class ContactStream:
-    """Takes poses one by one and answers `REACH` frames later; its state is the last 61 frames' features."""
+    """Predicts contact frame by frame with a latency of `REACH` frames; its state is the last 61 frames' features."""
 
     def __init__(self, detectors: tuple[ContactDetector, ...], skeleton: Skeleton):
         self._detectors, self._skeleton = detectors, skeleton
@@ -99,9 +99,9 @@ class ContactStream:
 
     @torch.inference_mode()
     def push(self, R_parent_joint: Float[Tensor, "joint 3 3"]) -> dict[str, Float[Tensor, "hand"]] | None:
-        """The answer for the frame `REACH` before this one; None as long as there is no such frame.
+        """Add a pose; returns the prediction for the frame `REACH` before it, None while there is no such frame.
 
-        Raises WearcapError for a pose that is not a number: the state stays as it was.
+        Raises WearcapError for a pose that is not a number; the state is then unchanged.
         """
         if not R_parent_joint.isfinite().all():
             raise WearcapError(f"the pose of frame {self._frames} is not a number",
@@ -114,10 +114,10 @@ class ContactStream:
 
     @torch.inference_mode()
     def finish(self) -> list[dict[str, Float[Tensor, "hand"]]]:
-        """The answers that are still missing, as if the last frame went on."""
+        """Return the remaining predictions, repeating the last frame."""
         last = [state[-1:] for state in self._state]
-        answers = [self._advance(last) for _ in range(REACH)]
-        return [answer for answer in answers if answer is not None]
+        predictions = [self._advance(last) for _ in range(REACH)]
+        return [prediction for prediction in predictions if prediction is not None]
 
     def _advance(self, features: list[Tensor]) -> dict[str, Float[Tensor, "hand"]] | None:
         if not self._state:
@@ -126,14 +126,14 @@ class ContactStream:
         self._frames += 1
         if self._frames <= REACH:
             return None
-        answer = {}
+        prediction = {}
         for detector, state in zip(self._detectors, self._state):
-            answer |= dict(zip(detector.classes, detector.probability(state)[0].unbind(-1)))
-        return answer
+            prediction |= dict(zip(detector.classes, detector.probability(state)[0].unbind(-1)))
+        return prediction
 
 
 def load_detector(path: str | Path) -> ContactDetector:
-    """The detector of a checkpoint of `wearcap train`. Raises WearcapError when it holds another model."""
+    """Load the detector of a checkpoint of `wearcap train`. Raises WearcapError when it holds another model."""
     config, state = read_checkpoint(path)
     model = config["model"]
     net, features, classes, fps = (model.get(key) for key in ("net", "features", "classes", "fps"))
@@ -152,5 +152,5 @@ def load_detector(path: str | Path) -> ContactDetector:
 
 
 def _class_name(part: Any) -> str:
-    """Name of the class that a part of a config is made of, "" where it is no part."""
+    """Class name in the `_target_` of a part of a config, "" if there is none."""
     return str(part.get("_target_", "")).rpartition(".")[2] if isinstance(part, dict) else ""

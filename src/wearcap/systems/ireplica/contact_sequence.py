@@ -1,4 +1,4 @@
-"""Ours: contact of all frames in one pass, by dilated temporal convolutions over both hands' views of the pose."""
+"""Contact network for whole sequences (ours): dilated temporal convolutions over both hands' views of the pose."""
 
 import torch
 from jaxtyping import Float
@@ -12,7 +12,7 @@ _HANDS = 2
 
 
 class GatedBlock(nn.Module):
-    """x + gated mixture of channels, after a convolution of each channel over dilated taps (no padding: time shrinks)."""
+    """Residual block: dilated depthwise convolution without padding (time shrinks), then a gated linear unit."""
 
     def __init__(self, width: int, taps: int, dilation: int, dropout: float):
         super().__init__()
@@ -37,11 +37,10 @@ class GatedBlock(nn.Module):
 
 
 class ContactSequence(ContactNetwork):
-    """Per hand: the pose as that hand sees it (`HandViews`) and how it changes, through gated dilated convolutions.
+    """Gated dilated convolutions over each hand's view of the pose (`HandViews`) and its temporal differences.
 
-    Both hands go through the same weights: the right one's view is the mirror image of what the left one would see.
-    Changes are differences over `strides` frames to both sides, so that one stride is quick and another one steady.
-    An answer depends on exactly the 61 frames around it, however many frames pass at once.
+    Both hands share weights: the right hand's view is mirrored. Differences are central, over `strides` frames to both
+    sides. A prediction depends on exactly the 61 frames around it, however many frames are computed in one pass.
     """
 
     frames_per_pass = 18000
@@ -64,7 +63,7 @@ class ContactSequence(ContactNetwork):
             raise ValueError(f"strides and dilations reach {reach} frames, not {REACH}")
 
     def _derived(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "view out derived"]:
-        """What the hands see, and its differences; batch and hand share the first axis."""
+        """Views of both hands and their differences; batch and hand share the first axis."""
         view = pose.unflatten(-1, (_HANDS, -1)).transpose(1, 2).flatten(0, 1)
         margin, last = max(self.strides), view.shape[1]
         parts = [view[:, margin : last - margin]]

@@ -1,6 +1,6 @@
-"""The contact network of iReplica as it was published (thesis §5.3.2): a small transformer over 61 poses.
+"""The published contact network of iReplica (thesis §5.3.2): a small transformer over windows of 61 poses.
 
-One window gives one answer, that of its middle frame. 21,944 parameters for 69 inputs, 24,824 for 159.
+A window yields one prediction, for its middle frame. 21,944 parameters for 69 inputs, 24,824 for 159.
 """
 
 import math
@@ -54,9 +54,9 @@ class EncoderLayer(nn.Module):
 class ContactTransformer(ContactNetwork):
     """Linear 69→32, sinusoidal positions, 3 post-norm layers of 8 heads, 32→2 and ReLU per frame, 61·2→2 in the end.
 
-    `batch_axis`: attend over the windows of a batch instead of over their frames, and tell positions along that
+    `batch_axis`: attend over the windows of a batch instead of over their frames, with positional encoding along that
     axis, as the released code does by mistake. Predictions then depend on which windows share a batch; the switch
-    is there to reproduce the released checkpoints' numbers.
+    exists to reproduce the released checkpoints' numbers.
     """
 
     frames_per_pass = 100
@@ -66,7 +66,7 @@ class ContactTransformer(ContactNetwork):
         if classes != 1:
             raise WearcapError(
                 f"the published contact network for {classes} classes of interaction", expected="one class",
-                fix="Train one network per class, as the document does, or model=contact_sequence.",
+                fix="Train one network per class, as the thesis does, or model=contact_sequence.",
             )  # fmt: skip
         self.inputs, self.batch_axis = inputs, batch_axis
         self.encoder = nn.Linear(inputs, _WIDTH)
@@ -89,16 +89,16 @@ class ContactTransformer(ContactNetwork):
 
 
 def sinusoids(length: int) -> Float[Tensor, "place width"]:
-    """Sines (even entries) and cosines (odd) of places, with wavelengths from 2π to 20,000π (Vaswani et al. 2017)."""
+    """Sinusoidal positional encoding, wavelengths from 2π to 20,000π (Vaswani et al. 2017): sines even, cosines odd."""
     frequency = 10000.0 ** (-torch.arange(0, _WIDTH, 2) / _WIDTH)
     angle = torch.arange(length)[:, None] * frequency
     return torch.stack([angle.sin(), angle.cos()], -1).flatten(1)
 
 
 def load_released(path: str | Path, batch_axis: bool = True) -> ContactTransformer:
-    """The published network with the weights of a checkpoint of the released code, in evaluation mode.
+    """Load the published network from a checkpoint of the released code, in evaluation mode.
 
-    Raises WearcapError that says which tensors are missing, unexpected or of another size.
+    Raises WearcapError that names missing or unexpected tensors and those of another size.
     """
     tensors = {}
     for name, value in _renamed(read_weights(path)).items():
@@ -114,17 +114,17 @@ def load_released(path: str | Path, batch_axis: bool = True) -> ContactTransform
 
 
 def _renamed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Released tensors under this module's names; those that are none of the network's keep theirs.
+    """Released tensors under this module's names; tensors that do not belong to the network keep their names.
 
-    Encoder layers are known by `layers.0…`, whatever stands before it; the linear layers around them by their shapes.
+    Encoder layers are recognised by `layers.0…` after any prefix, the linear layers around them by their shapes.
     """
     by_shape = {(_HANDS, _WIDTH): "decoder", (_HANDS, FRAMES * _HANDS): "aggregator"}
     module = {}
     for name, value in tensors.items():
         if name.endswith(".weight") and value.ndim == 2 and "layers." not in name:
-            known = "encoder" if value.shape[0] == _WIDTH else by_shape.get(tuple(value.shape))
-            if known is not None:
-                module[name.removesuffix(".weight")] = known
+            found = "encoder" if value.shape[0] == _WIDTH else by_shape.get(tuple(value.shape))
+            if found is not None:
+                module[name.removesuffix(".weight")] = found
     result = {}
     for name, value in tensors.items():
         owner, _, kind = name.rpartition(".")

@@ -1,4 +1,4 @@
-"""What the contact networks see of a pose: no place, no heading, nothing but the body and which way is down."""
+"""Input features of the contact networks: the body's pose and the gravity direction, without position and heading."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +20,7 @@ from wearcap.recording.timing import resampled
 
 @runtime_checkable
 class PoseFeatures(Protocol):
-    """Poses of a skeleton as vectors for a network, frame by frame."""
+    """Encodes poses of a skeleton as feature vectors, frame by frame."""
 
     @property
     def skeleton(self) -> Skeleton: ...
@@ -35,7 +35,8 @@ class PoseFeatures(Protocol):
 
 @dataclass(frozen=True)
 class SmplAngles:
-    """The document's input: axis-angle vectors of SMPL's 23 body joints (69), in SMPL's own axes (x left, y up, z forward).
+    """The thesis's input: axis-angle vectors of SMPL's 23 body joints (69), in SMPL's own axes (x left, y up, z
+    forward).
 
     With `fingers`, SMPL+H's 21 body joints, six zeros in place of SMPL's two hand joints, and 30 finger joints (159).
     """
@@ -51,7 +52,7 @@ class SmplAngles:
         return 159 if self.fingers else 69
 
     def encode(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch feature"]:
-        """Poses of `skeleton`."""
+        """Encode poses of `skeleton`."""
         angles = rotation.log(R_parent_joint[..., 1:, :, :]).roll(-1, -1).flatten(-2)
         if not self.fingers:
             return angles
@@ -62,16 +63,16 @@ class SmplAngles:
 _ROT6D = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
 _SIDE_SIGNS = (*MIRROR * 4, *_ROT6D, 1.0)
 _MIDDLE_SIGNS = (*MIRROR * 2, *_ROT6D, 1.0)
-"""What a mirror does to the entries: y changes sign, and the second column of a rotation once more."""
+"""Signs of the features under mirroring: y changes sign, and the second column of a rotation once more."""
 
 
 @dataclass(frozen=True)
 class HandViews:
-    """Ours: the pose as each hand sees it, the right hand's in a mirror, so that one network serves both.
+    """Pose from the view of each hand (ours); the right hand's view is mirrored, so that both share one network.
 
-    Positions are those of a standard body in this pose (m), in the pelvis' heading: hands and elbows from the chest,
-    ankles from the pelvis, heights above the lower foot; with the rotations of hands and chest, the direction of the
-    head and feet, and the pelvis' tilt.
+    Positions (m) are those of a standard body in this pose, in the pelvis' heading: hands and elbows relative to the
+    chest, ankles relative to the pelvis, heights above the lower foot. Further features are the rotations of hands and
+    chest, the directions of head and feet, and the pelvis' tilt.
     """
 
     @cached_property
@@ -83,7 +84,8 @@ class HandViews:
         return self.encode(torch.eye(3).expand(len(self.skeleton), 3, 3)).shape[-1]
 
     def encode(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch feature"]:
-        """Poses of `skeleton`; the left hand's view (its side, the other side, the middle), then the right hand's."""
+        """Encode poses of `skeleton`: the left hand's view (its side, the other side, the middle), then the right
+        hand's."""
         sides, middle = self._seen(R_parent_joint)
         mirror = lambda x, signs: x * x.new_tensor(signs)  # noqa: E731
         own, other = sides.unbind(-2)
@@ -93,7 +95,7 @@ class HandViews:
     def _seen(
         self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]
     ) -> tuple[Float[Tensor, "*batch side 19"], Float[Tensor, "*batch 13"]]:
-        """What is told of each side, left and right, and of the middle of the body."""
+        """Features of each side (left, right) and of the middle of the body."""
         body, root = self.skeleton, R_parent_joint[..., 0, :, :]
         R_root = rotation.about_axis("z", -rotation.yaw_of(root)) @ root
         R = torch.cat([R_root[..., None, :, :], R_parent_joint[..., 1:, :, :]], -3)
@@ -119,14 +121,15 @@ FEATURES = {cls.__name__: cls for cls in (SmplAngles, HandViews)}
 
 
 def worn(source: Skeleton, target: Skeleton) -> Skeleton:
-    """The skeleton that `in_skeleton` puts a source's pose into: of the wearer's size, unless the joints are the same."""
+    """Skeleton into which `in_skeleton` retargets a source's poses: `target` in the wearer's size, or `target`
+    itself if the joints are the same."""
     return target if source.joint_names == target.joint_names else fit_offsets(source, target)
 
 
 def in_skeleton(
     source: Skeleton, target: Skeleton, R_parent_joint: Float[Tensor, "time joint 3 3"]
 ) -> Float[Tensor, "time joint_t 3 3"]:
-    """Rotations of a source's pose in a `worn` target; as they are where both have the same joints."""
+    """Joint rotations of a source skeleton retargeted to a `worn` target; unchanged if both have the same joints."""
     if source.joint_names == target.joint_names:
         return R_parent_joint
     return retarget(source, target, R_parent_joint, torch.zeros_like(R_parent_joint[:, 0, 0]))[0]
@@ -135,7 +138,7 @@ def in_skeleton(
 def pose_frames(
     motion: Motion, skeleton: Skeleton, fps: float
 ) -> tuple[Float64[Tensor, "time_f"], Float[Tensor, "time_f joint 3 3"]]:
-    """Times and rotations of a motion at an even rate in a network's skeleton; untouched where they are so already.
+    """Timestamps and joint rotations of a motion, resampled to `fps` and retargeted to `skeleton` where necessary.
 
     Raises WearcapError for frames that are not finite.
     """
@@ -150,5 +153,5 @@ def pose_frames(
 
 
 def is_even(timestamps: Float64[Tensor, "time"], fps: float) -> bool:
-    """Whether no step differs from the rate's by more than a hundredth of it."""
+    """Whether every time step is within 1 % of 1/`fps`."""
     return len(timestamps) < 2 or bool((timestamps.diff() * fps - 1).abs().max() < 0.01)

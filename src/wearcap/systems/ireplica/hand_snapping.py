@@ -1,4 +1,4 @@
-"""Ours: hands that hold are put onto what they hold, by the arms alone, smoothly in and out."""
+"""Correction of the arms that keeps holding hands on the object, smoothly in and out (ours)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,16 +18,16 @@ from wearcap.tracking.anchor import with_hand_moved
 
 @dataclass(frozen=True)
 class HandSnapping:
-    """How hands are moved."""
+    """Moves holding hands onto the object by bending the arms."""
 
     offset_settings: OffsetSettings = field(default_factory=lambda: OffsetSettings(transition_s=0.4))
     most_m: float = 0.15
-    """A hand farther off is moved by no more."""
+    """Largest displacement (m) of a hand."""
 
     def __call__(self, motion: Motion, held: Sequence[Held], environment: Environment) -> Motion:
-        """The motion with arms bent so that each holding palm stays at the point of the object that it took.
+        """Bend the arms so that each holding palm stays at its point of the object.
 
-        That point is the nearest to the palm when its hold begins. Hands keep their orientation in the world.
+        That point is the object's point nearest to the palm when its hold begins. Hands keep their world orientation.
         """
         palms = site_positions(motion.skeleton, motion.T_world_joint, tuple(f"{side}_palm" for side in HANDS))
         for hand, side in enumerate(HANDS):
@@ -40,7 +40,7 @@ class HandSnapping:
     def _targets(
         self, palm: Float64[Tensor, "time 3"], hand: int, held: Sequence[Held], environment: Environment
     ) -> tuple[Float64[Tensor, "time 3"], Float64[Tensor, "time"]]:
-        """How far the palm is from its point of the object, at the frames at which it holds on."""
+        """Displacement (m) of a palm to its point of the object, and weight 1 at frames in which it holds."""
         targets, weights = torch.zeros_like(palm), torch.zeros_like(palm[:, 0])
         before: Held | None = None
         point = palm.new_zeros(3)
@@ -48,9 +48,15 @@ class HandSnapping:
             if not row.interval.hands[hand]:
                 continue
             start, frames = row.interval.start, slice(row.interval.start, row.interval.stop)
-            on = before is not None and before.interval.stop == start and before.thing is row.thing
+            on = (
+                before is not None
+                and before.interval.stop == start
+                and before.scene_object is row.scene_object
+            )
             if not on:
-                _, nearest = environment.distance(row.thing.name, palm[[start]], row.state.T_world_object)
+                _, nearest = environment.distance(
+                    row.scene_object.name, palm[[start]], row.state.T_world_object
+                )
                 start_pose = row.T_world_object[0].to(torch.float64)
                 point = start_pose.R.mT @ (nearest[0] - start_pose.t)
             T = row.T_world_object.to(torch.float64)

@@ -1,4 +1,4 @@
-"""Attach, correct, move and release: from a registered wearer's contacts to moving objects (thesis §5.3.1–5.3.3)."""
+"""Object tracking from contacts of a registered wearer: attach, correct, move, release (thesis §5.3.1–5.3.3)."""
 
 from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
@@ -27,12 +27,12 @@ from wearcap.systems.ireplica.hand_snapping import HandSnapping
 from wearcap.systems.ireplica.settling import settled
 
 PALMS = ("left_palm", "right_palm")
-"""The keypoints in the middle of each hand (thesis §5.3.3)."""
+"""Keypoints in the middle of each hand (thesis §5.3.3)."""
 
 
 @runtime_checkable
 class Correction(Protocol):
-    """Moves the wearer in the plane so that hands meet what they hold (thesis §5.3.1)."""
+    """Contact-based correction: moves the wearer in the ground plane so that hands meet the object (thesis §5.3.1)."""
 
     def start(self, palms_world: Float[Tensor, "time hand 3"], motion: Motion) -> None:
         """Begin a recording."""
@@ -41,33 +41,34 @@ class Correction(Protocol):
     def offset(
         self,
         contact: ContactInterval,
-        thing: SceneObject,
+        scene_object: SceneObject,
         points_world: Float[Tensor, "hand 3"],
         goes_on: bool,
     ) -> Float[Tensor, "frame 2"]:
-        """By how much to move the wearer (m) at an interval's frames; intervals come in order of time."""
+        """Offset of the wearer (m) at an interval's frames; intervals are passed in order of time."""
         ...
 
     def finish(self, held: list[Held]) -> Float[Tensor, "time 2"]:
-        """By how much at every frame of the recording, smooth into and out of interactions."""
+        """Offset of the wearer (m) at every frame of the recording, smooth into and out of interactions."""
         ...
 
 
 @dataclass(eq=False)
 class ObjectTracker:
-    """Lets objects follow the hands that hold them, one interval of contact after the other."""
+    """Moves objects with the hands that hold them, one contact interval after the other."""
 
     correction: Correction | None
-    """None: the row "w/o contact correction"."""
+    """Contact-based correction of the wearer; None: the thesis's row "w/o contact correction"."""
     contact: ContactSettings = field(default_factory=ContactSettings)
     attachment: AttachmentSettings = field(default_factory=AttachmentSettings)
     hands: HandSnapping | None = None
-    """Puts hands onto what they hold by the arms (ours); None: the wearer is moved as a whole alone."""
+    """Correction of the arms (ours); None: only the whole body is moved."""
 
     def __call__(self, registered: Motion, contacts: dict[str, Tensor], environment: Environment) -> Motion:
-        """The corrected motion with `object_motion`, `interactions` and `hand_contact_prob`, at the contacts' frames.
+        """Return the corrected motion with `object_motion`, `interactions` and `hand_contact_prob`, at the contacts'
+        frames.
 
-        `contacts` are probabilities "time hand" by class, beside their "timestamps".
+        `contacts` has probabilities "time hand" by class, and their "timestamps".
         """
         motion = within(registered, contacts["timestamps"])
         prob = {
@@ -100,37 +101,37 @@ class ObjectTracker:
             if contact.start >= contact.stop:
                 continue
             before = self._kept(held, contact, contact_class)
-            thing = before or room.nearest(palms[contact.start], contact_class, contact)
-            if thing is None:
+            scene_object = before or room.nearest(palms[contact.start], contact_class, contact)
+            if scene_object is None:
                 continue
-            points = room.touched(thing, palms[contact.start], contact)
+            points = room.touched(scene_object, palms[contact.start], contact)
             frames = palms[contact.start : contact.stop].clone()
             if self.correction is not None:
-                offset = self.correction.offset(contact, thing, points, before is not None)
+                offset = self.correction.offset(contact, scene_object, points, before is not None)
                 frames[..., :2] += offset[:, None]
-            held.append(room.take(contact, contact_class, thing, points, before is not None, frames))
+            held.append(room.take(contact, contact_class, scene_object, points, before is not None, frames))
             busy_until = [contact.stop if on else until for on, until in zip(contact.hands, busy_until)]
         return sorted(held, key=lambda row: row.interval.start)
 
     def _kept(self, held: list[Held], contact: ContactInterval, contact_class: str) -> SceneObject | None:
-        """What the hands hold already when only the set of hands changes."""
+        """The object that the hands already hold, if only the set of hands changes."""
         if not self.attachment.keep_object:
             return None
         for row in reversed(held[-4:]):
             shared = any(a and b for a, b in zip(row.interval.hands, contact.hands))
             if row.contact_class == contact_class and row.interval.stop == contact.start and shared:
-                return row.thing
+                return row.scene_object
         return None
 
 
 def once_free(contact: ContactInterval, busy_until: list[int]) -> ContactInterval:
-    """The interval from the frame on at which none of its hands holds anything else; it may be empty."""
+    """Cut the interval's beginning until none of its hands holds another object; the result may be empty."""
     busy = [until for on, until in zip(contact.hands, busy_until) if on]
     return replace(contact, start=max(contact.start, *busy))
 
 
 def within(registered: Motion, timestamps: Float64[Tensor, "time"]) -> Motion:
-    """The registered motion at the contacts' frames, as far as it reaches. Raises WearcapError where it reaches none."""
+    """The registered motion at the contacts' frames within its time span. Raises WearcapError if there are none."""
     first, last = registered.timestamps[0], registered.timestamps[-1]
     inside = (timestamps >= first) & (timestamps <= last)
     if not inside.any():

@@ -1,6 +1,6 @@
-"""iReplica (thesis ch. 5): the wearer of HPS moves doors, sofas and tables, told by contact from pose alone.
+"""iReplica (thesis ch. 5): on top of HPS, tracks objects that the wearer moves, from contact predicted by pose alone.
 
-The document's steps in order, each a stage: those of the registration (HPS) → contacts → interact.
+The steps of the thesis in order, each a stage: those of the registration (HPS) → contacts → interact.
 """
 
 from collections.abc import Callable
@@ -29,22 +29,24 @@ class IReplica:
     """Captures the wearer and the objects that the wearer moves."""
 
     registration: StagedPipeline
-    """HPS, or another that puts the wearer into the scene."""
+    """HPS, or another pipeline that registers the wearer in the scene."""
     predictor: Predictor
     tracker: ObjectTracker
     environment: str | Path | None = None
-    """File of the objects; None: the one that the recording names."""
+    """File of the objects; None: the recording's environment."""
     fps: float = 60.0
-    """Of contacts, objects and motion, whatever HPS runs at."""
+    """Frame rate of contacts, objects and output motion, independent of the registration's."""
     name: str = "ireplica"
 
     def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
-        """The wearer's motion with `object_motion` and `interactions` at `fps`. Raises WearcapError as `stages`."""
+        """Return the wearer's motion with `object_motion` and `interactions` at `fps`. Raises WearcapError as
+        `stages`."""
         results, _ = run_stages(self.stages(Source(recording, folder, scan)))
         return results["interact"]
 
     def stages(self, source: Source) -> list[Stage]:
-        """HPS' steps, then contacts and interactions. Raises WearcapError as those do, and without an environment."""
+        """The registration's stages, then `contacts` and `interact`. Raises WearcapError as those, and without
+        environment."""
         environment = read_environment(self.environment_file(source))
         suit = source.recording.suit
         before = self.registration.stages(source)
@@ -61,7 +63,7 @@ class IReplica:
         ]  # fmt: skip
 
     def environment_file(self, source: Source) -> Path:
-        """Where the objects are described. Raises WearcapError where neither pipeline nor recording says it."""
+        """Path of the environment file. Raises WearcapError if neither the pipeline nor the recording names one."""
         if self.environment is not None:
             path = Path(self.environment)
             return path / FILE_NAME if path.is_dir() else path
@@ -72,15 +74,15 @@ class IReplica:
         return source.folder / source.recording.environment
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
-        """With objects after the last stage; before it, the registration's."""
+        """Motion with objects after the last stage; before it, the registration's motion."""
         return results["interact"] if "interact" in results else self.registration.motion_of(results)
 
     def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
-        """The registration's report, and what was held when."""
+        """The registration's report, and the list of interactions."""
         about = self.registration.report(source, results)
         if "interact" in results:
-            held = results["interact"].interactions
-            rows = zip(held.start_s.tolist(), held.stop_s.tolist(), held.hands.tolist(), held.objects)
+            found = results["interact"].interactions
+            rows = zip(found.start_s.tolist(), found.stop_s.tolist(), found.hands.tolist(), found.objects)
             about["interactions"] = [
                 {"start_s": start, "stop_s": stop, "left": hands[0], "right": hands[1], "object": name}
                 for start, stop, hands, name in rows
@@ -88,7 +90,7 @@ class IReplica:
         return about
 
     def registered(self, source: Source) -> Motion:
-        """The wearer's motion in the scene, objects at rest. Raises WearcapError as the registration does."""
+        """The wearer's motion in the scene, without objects. Raises WearcapError as the registration does."""
         results, _ = run_stages(self.registration.stages(source))
         motion = self.registration.motion_of(results)
         assert motion is not None
@@ -100,6 +102,6 @@ class IReplica:
         return {"timestamps": motion.timestamps, **self.predictor(motion)}
 
     def interact(self, registered: Motion, contacts: dict[str, Tensor], environment: Environment) -> Motion:
-        """Attach, correct, move and release, one interval after the other (thesis §5.3.1–5.3.3)."""
+        """Attach, correct, move and release objects, one contact interval after the other (thesis §5.3.1–5.3.3)."""
         motion = self.tracker(registered, contacts, environment)
         return replace(motion, provenance=motion.provenance | {"pipeline": self.name})

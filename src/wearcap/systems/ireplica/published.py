@@ -1,4 +1,5 @@
-"""What iReplica is compared with (thesis §5.4.3): objects that stand still, that are interpolated, or taken when near."""
+"""Baselines of iReplica (thesis §5.4.3): static objects, objects interpolated between true poses, contact by
+proximity."""
 
 from dataclasses import replace
 
@@ -19,28 +20,29 @@ from wearcap.systems.ireplica.object_tracker import PALMS, ObjectTracker
 from wearcap.systems.ireplica.scores import poses_at
 
 NEAR_M = 0.08
-"""A palm so near to an object touches it, says the row without a contact network."""
+"""Distance (m) below which the row without a contact network takes a palm to touch an object."""
 ROUNDS = 3
+"""Number of alternations between contacts and object positions in `held_when_near`."""
 
 
 def static_objects(motion: Motion, environment: Environment) -> Motion:
-    """HPS: the wearer as registered, objects where they were at first."""
+    """Row "HPS": the registered wearer, objects at their initial poses."""
     return replace(motion, object_motion=object_trajectories(environment, [], motion.timestamps))
 
 
 def interpolated_objects(
     motion: Motion, environment: Environment, held: Interactions, true: dict[str, Trajectory]
 ) -> Motion:
-    """HPS w/ GT: an oracle tells when objects are handled and where they end; lines and slerp between.
+    """Row "HPS w/ GT": true times of handlings and true final poses of objects, interpolated in between.
 
-    Linear in the object's origin and in the angle of the turn, from each handling's start to its end.
+    Linear in the object's origin and in the rotation angle, from each handling's start to its end.
     """
     tracks = object_trajectories(environment, [], motion.timestamps)
     for name, start, stop in handlings(held.start_s, held.stop_s, held.objects):
-        thing, times = environment.by_name(name), motion.timestamps
-        old = poses_at(tracks[name], thing, times)
+        scene_object, times = environment.by_name(name), motion.timestamps
+        old = poses_at(tracks[name], scene_object, times)
         ends = torch.tensor([start, stop], dtype=torch.float64)
-        left = poses_at(true.get(name), thing, ends)[1].to(torch.float64)
+        left = poses_at(true.get(name), scene_object, ends)[1].to(torch.float64)
         frame = int(torch.searchsorted(times, start).clamp(max=len(times) - 1))
         begin = old[frame].to(torch.float64)
         share = ((times - start) / max(stop - start, 1e-6)).clamp(0.0, 1.0)
@@ -56,9 +58,9 @@ def interpolated_objects(
 
 
 def held_when_near(tracker: ObjectTracker, registered: Motion, environment: Environment) -> Motion:
-    """The whole method, but hands hold what is within `NEAR_M` of them: no network.
+    """The whole method without a contact network: hands hold objects within `NEAR_M`.
 
-    Where objects are depends on what was held; so it goes round a few times.
+    Contacts and object positions depend on each other, so both are computed alternately, `ROUNDS` times.
     """
     captured = static_objects(registered, environment)
     for _ in range(ROUNDS):
@@ -73,10 +75,10 @@ def nearness(
     """1 where a palm is within `NEAR_M` of an object of each class, else 0."""
     palms = site_positions(motion.skeleton, motion.T_world_joint, PALMS)
     found = {name: torch.zeros(len(motion), 2) for name in CONTACT_CLASSES}
-    for thing in environment.objects:
-        T = poses_at(objects.get(thing.name), thing, motion.timestamps)
+    for scene_object in environment.objects:
+        T = poses_at(objects.get(scene_object.name), scene_object, motion.timestamps)
         for hand in range(2):
-            distance, _ = environment.distance(thing.name, palms[:, hand], T)
-            near = found[thing.freedom.contact_class]
+            distance, _ = environment.distance(scene_object.name, palms[:, hand], T)
+            near = found[scene_object.freedom.contact_class]
             near[:, hand] = torch.maximum(near[:, hand], (distance <= NEAR_M).float())
     return found

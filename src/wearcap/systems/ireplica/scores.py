@@ -1,6 +1,6 @@
-"""Scores of captured interactions against the truth: thesis Tables 5.1, 5.2, 5.5, and hands and objects on their way.
+"""Scores of captured interactions against ground truth: thesis Tables 5.1, 5.2, 5.5, and errors during interactions.
 
-Nothing is aligned before it is measured.
+No alignment is applied before measuring.
 """
 
 from collections.abc import Sequence
@@ -32,26 +32,28 @@ from wearcap.systems.ireplica.object_tracker import PALMS
 from wearcap.systems.ireplica.pipeline import IReplica
 
 SETTLED_S = 0.6
-"""An object's end is looked at so long after it was released, or when it is taken again: releases are seen late."""
+"""Time (s) after an object's release at which its final pose is scored, or when it is taken again if that is earlier:
+releases are detected late."""
 CHAMFER_EVERY_S, CHAMFER_POINTS = 1.0, 1500
 
 
 @dataclass(frozen=True)
 class InteractionScores:
-    """One capture's scores."""
+    """Scores of one capture."""
 
     handlings: tuple[Handling, ...]
     mpjpe_cm: float
-    """Of the joints in the world, over the whole recording."""
+    """Mean per-joint position error in the world over the whole recording."""
     body_chamfer_cm: float
-    """Between the captured and the true body during interactions (Table 5.5)."""
+    """Chamfer distance between captured and true body during interactions (Table 5.5)."""
     object_chamfer_cm: float
+    """Chamfer distance between captured and true object during interactions (Table 5.5)."""
     false_moves_cm: float
-    """How far objects that nobody touched were moved, mean over those objects."""
+    """Mean displacement of objects that were never touched."""
 
 
 def score_interactions(motion: Motion, recording: Recording, environment: Environment) -> InteractionScores:
-    """All scores of one capture; its object motion may lack objects that never moved.
+    """Score one capture; its object motion may lack objects that never moved.
 
     Raises WearcapError when the recording lacks a true motion, interactions or object motion, or the capture objects.
     """
@@ -63,19 +65,24 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
         raise WearcapError("this capture has no objects", where=recording.name, expected="object_motion")
     true = at_times(truth, motion.timestamps)
     palms = [site_positions(m.skeleton, m.T_world_joint, PALMS) for m in (motion, true)]
-    found = {thing.name: poses_at(motion.object_motion.get(thing.name), thing, motion.timestamps) for thing in environment.objects}  # fmt: skip
+    found = {
+        scene_object.name: poses_at(
+            motion.object_motion.get(scene_object.name), scene_object, motion.timestamps
+        )
+        for scene_object in environment.objects
+    }
     real = {name: poses_at(recording.object_motion.get(name), environment.by_name(name), motion.timestamps) for name in found}  # fmt: skip
     rows = handlings(held.start_s, held.stop_s, held.objects)
     scored = [_handling(row, rows, environment, held, motion.timestamps, palms, found, real) for row in rows]
-    body, things = _chamfer(motion, true, recording, rows, environment, found, real)
+    body, objects = _chamfer(motion, true, recording, rows, environment, found, real)
     joints = mpjpe_cm(motion.T_world_joint.t, true.T_world_joint.t).item()
     return InteractionScores(
-        tuple(scored), joints, body, things, _false_moves(environment, held.objects, found)
+        tuple(scored), joints, body, objects, _false_moves(environment, held.objects, found)
     )
 
 
 def with_interactions(pipeline: IReplica, folder: Path) -> Measure:
-    """The common scores of a motion, and the means over its handlings where the recording's interactions are known."""
+    """Measure of the common scores, and of means over handlings for recordings with true interactions."""
 
     def measure(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
         row = score(motion, recording, name, seed)
@@ -88,28 +95,32 @@ def with_interactions(pipeline: IReplica, folder: Path) -> Measure:
     return measure
 
 
-def poses_at(track: Trajectory | None, thing: SceneObject, timestamps: Float64[Tensor, "time"]) -> Rigid:
-    """An object's poses at some times; before and after its track it rests, without one it never moved."""
+def poses_at(
+    track: Trajectory | None, scene_object: SceneObject, timestamps: Float64[Tensor, "time"]
+) -> Rigid:
+    """Poses of an object at given times; it is static before and after its track, and throughout without a track."""
     if track is None:
         count = len(timestamps)
-        return Rigid(thing.R_world_object.expand(count, 3, 3), thing.t_world_object.expand(count, 3))
+        return Rigid(
+            scene_object.R_world_object.expand(count, 3, 3), scene_object.t_world_object.expand(count, 3)
+        )
     inside = timestamps.clamp(track.timestamps[0], track.timestamps[-1])
     return resample(track, inside).T_world_body
 
 
-def middle_of(thing: SceneObject) -> Float[Tensor, "3"]:
-    """Middle of an object's box in its own axes (m)."""
-    vertices = thing.mesh.vertices
+def middle_of(scene_object: SceneObject) -> Float[Tensor, "3"]:
+    """Centre of an object's bounding box in its own axes (m)."""
+    vertices = scene_object.mesh.vertices
     return torch.from_numpy((vertices.min(0) + vertices.max(0)) / 2)
 
 
 def _handling(row, rows, environment, held, timestamps, palms, found, real) -> Handling:
     name, start, stop = row
-    thing = environment.by_name(name)
+    scene_object = environment.by_name(name)
     again = min((a for n, a, _ in rows if n == name and a > start), default=float("inf"))
     end = max(int(torch.searchsorted(timestamps, min(stop + SETTLED_S, again))) - 1, 0)
     begin = int(torch.searchsorted(timestamps, start).clamp(max=len(timestamps) - 1))
-    middle = middle_of(thing)
+    middle = middle_of(scene_object)
     left = object_error(found[name][end], real[name][end], middle)
     own = replace(held, **_only(held, [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())]))  # fmt: skip
     frames = slice(begin, max(int(torch.searchsorted(timestamps, stop)), begin + 1))
@@ -117,13 +128,13 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     apart = torch.stack(
         [environment.distance(name, palms[0][frames, hand], found[name][frames])[0] for hand in range(2)], 1
     )
-    way = object_error(found[name][frames], real[name][frames], middle)
+    during = object_error(found[name][frames], real[name][frames], middle)
     moved = object_error(real[name][[end]], real[name][[begin]], middle)
     return Handling(
-        name, thing.category, start, stop, float(left.distance_cm), float(left.angle_deg), float(moved.distance_cm[0]),
+        name, scene_object.category, start, stop, float(left.distance_cm), float(left.angle_deg), float(moved.distance_cm[0]),
         100 * float(contact_mean(apart, contact)),
         100 * float(contact_mean((palms[0] - palms[1])[frames].norm(dim=-1), contact)),
-        float(way.distance_cm.mean()), float(way.angle_deg.mean()),
+        float(during.distance_cm.mean()), float(during.angle_deg.mean()),
     )  # fmt: skip
 
 
@@ -135,9 +146,11 @@ def _only(held, chosen: Sequence[bool]) -> dict:
 
 
 def _false_moves(environment: Environment, touched: tuple[str, ...], found: dict[str, Rigid]) -> float:
-    """Mean over untouched objects of how far their centre ends from where it began (cm)."""
-    rest = [thing for thing in environment.objects if thing.name not in touched]
-    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], middle_of(t)).distance_cm[0] for t in rest]
+    """Mean displacement (cm) of the centres of untouched objects from the first to the last frame."""
+    untouched = [scene_object for scene_object in environment.objects if scene_object.name not in touched]
+    ends = [
+        object_error(found[t.name][[-1]], found[t.name][[0]], middle_of(t)).distance_cm[0] for t in untouched
+    ]
     return float(torch.stack(ends).mean()) if ends else 0.0
 
 
@@ -160,9 +173,9 @@ def _chamfer(
     return tuple(float(np.mean(part)) if part else float("nan") for part in errors)  # pyright: ignore[reportReturnType]
 
 
-def surface_points(thing: SceneObject, count: int = CHAMFER_POINTS) -> Float[Tensor, "point 3"]:
-    """Points spread over an object's surface by area (of a cloud: its own points), always the same."""
-    vertices, faces = thing.mesh.vertices, thing.mesh.faces
+def surface_points(scene_object: SceneObject, count: int = CHAMFER_POINTS) -> Float[Tensor, "point 3"]:
+    """Points sampled uniformly by area on an object's surface (without faces: from its vertices), with a fixed seed."""
+    vertices, faces = scene_object.mesh.vertices, scene_object.mesh.faces
     rng = np.random.default_rng(0)
     if not len(faces):
         return torch.from_numpy(vertices[rng.permutation(len(vertices))[:count]])

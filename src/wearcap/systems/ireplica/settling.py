@@ -1,7 +1,8 @@
-"""Ours: when hands truly hold on. A hand rests where it takes a thing and where it lets go of it.
+"""Refinement of contact intervals (ours): cuts off approach and retreat, as a hand is at rest when it takes and
+releases.
 
-A network sees the approach to a thing and the retreat from it before and after the contact itself: some tenths of a
-second in which the object would follow hands that do not hold it.
+The networks report contact during the approach to an object and the retreat from it too: some tenths of a second in
+which the object would follow hands that do not hold it.
 """
 
 from dataclasses import replace
@@ -21,10 +22,10 @@ def settled(
     timestamps: Float64[Tensor, "time"],
     settle_s: float,
 ) -> list[Span]:
-    """The intervals without the approach at their beginning and the retreat at their end, each up to `settle_s` long.
+    """Cut approach and retreat off the intervals, each up to `settle_s` long.
 
-    Intervals of a class that follow each other while a hand stays on are one hold: it begins and ends where the hands
-    that begin and end it are slowest. Intervals that lie in front of or behind that are left out.
+    Consecutive intervals of a class that share a hand form one hold; it begins and ends where the hands that begin and
+    end it are slowest. Intervals entirely before or after that are dropped.
     """
     if settle_s <= 0 or len(timestamps) < 3:
         return spans
@@ -49,7 +50,7 @@ def settled(
 
 
 def chains(spans: list[Span]) -> list[list[Span]]:
-    """Intervals of one class, each beginning where another ends and sharing a hand with it, together."""
+    """Group intervals into holds: intervals of one class that follow without a gap and share a hand."""
     found: list[list[Span]] = []
     for contact, contact_class in spans:
         for chain in reversed(found[-4:]):
@@ -64,13 +65,13 @@ def chains(spans: list[Span]) -> list[list[Span]]:
 
 
 def hands_of(chain: list[Span], start: int, frames: int) -> Tensor:
-    """Which hands are in contact within some frames of a hold: "hand"."""
+    """Mask "hand" of the hands in contact within `frames` frames of a hold from `start` on."""
     near = [contact.hands for contact, _ in chain if contact.start < start + frames and contact.stop > start]
     return torch.tensor([any(column) for column in zip(*near)] if near else chain[0][0].hands)
 
 
 def slowest(speed: Float[Tensor, "time hand"], hands: Tensor, start: int, stop: int) -> int:
-    """The frame in start … stop − 1 at which the hands' mean speed is least."""
+    """Frame in start … stop − 1 with the least mean speed of the hands."""
     if stop <= start:
         return start
     return start + int(speed[start:stop, hands].mean(1).argmin())

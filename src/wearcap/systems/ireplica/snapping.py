@@ -1,4 +1,4 @@
-"""Contact-based corrections of the wearer's path: as documented, and ours (thesis §5.3.1)."""
+"""Contact-based corrections of the wearer's path (thesis §5.3.1): the thesis's and ours."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,24 +15,24 @@ from wearcap.systems.ireplica.attachment import Held
 from wearcap.systems.ireplica.contact_intervals import ContactInterval
 
 FIT_FRAMES = 60
-"""Of an arc, evenly spread, are fitted: more tell no more."""
+"""Number of evenly spread frames of an arc that are fitted; more add no information."""
 
 
 @dataclass(frozen=True)
 class HingeFit:
-    """How far a hand's path about a hinge is trusted to tell where the wearer is (standard deviations)."""
+    """Standard deviations (m) with which a hand's arc about a hinge determines the wearer's position."""
 
     radius_m: float = 0.015
-    """Of the hand's distance from the hinge, from frame to frame."""
+    """Standard deviation of the hand's distance from the hinge, from frame to frame."""
     touch_m: float = 0.03
-    """Of the hand from the object's surface when it is taken, along the surface's normal."""
+    """Standard deviation of the hand's distance from the surface when the object is taken, along the surface normal."""
     place_m: float = 0.06
-    """Of the wearer's place."""
+    """Standard deviation of the wearer's position."""
     iterations: int = 6
 
 
 class _Targets:
-    """What both corrections gather: an offset (m) and a weight for each frame."""
+    """State shared by both corrections: target offset (m) and weight of each frame."""
 
     def start(self, palms_world: Float[Tensor, "time hand 3"], motion: Motion) -> None:
         self._palms, self._timestamps = palms_world, motion.timestamps
@@ -43,7 +43,7 @@ class _Targets:
 
 @dataclass(eq=False)
 class BendCorrection(_Targets):
-    """The document's: the path is bent once more, with the touched point as the only control point (eq. 5.2)."""
+    """The thesis's correction: the path is bent again, with the touched point as the only control point (eq. 5.2)."""
 
     bend: Callable[..., BentPath]
     """`optimize.trajectory.bend` with its settings and solver."""
@@ -52,7 +52,7 @@ class BendCorrection(_Targets):
     def offset(
         self,
         contact: ContactInterval,
-        thing: SceneObject,
+        scene_object: SceneObject,
         points_world: Float[Tensor, "hand 3"],
         goes_on: bool,
     ) -> Float[Tensor, "frame 2"]:
@@ -79,21 +79,21 @@ class BendCorrection(_Targets):
 
 @dataclass(eq=False)
 class SnapCorrection(_Targets):
-    """Ours: the wearer is moved as a whole by one offset per interaction, and smoothly from one to the next.
+    """Moves the whole wearer by one offset per interaction, with smooth transitions (ours).
 
-    While an object is held the offset stays, so that errors of a touch do not become motion of the object. About a
-    hinge it is fitted to the whole arc, as hands must stay at one distance from the axis.
+    The offset is constant while an object is held, so that errors of the touched point do not become object motion. For
+    a hinge it is fitted to the whole arc, as hands must keep their distance from the axis.
     """
 
     offset_settings: OffsetSettings = field(default_factory=OffsetSettings)
     hinge: HingeFit | None = field(default_factory=HingeFit)
     most_m: float = 0.3
-    """No interaction moves the wearer by more: farther off, it is not the wearer that errs."""
+    """Largest offset (m) of an interaction; larger ones are not due to an error of the wearer's position."""
 
     def offset(
         self,
         contact: ContactInterval,
-        thing: SceneObject,
+        scene_object: SceneObject,
         points_world: Float[Tensor, "hand 3"],
         goes_on: bool,
     ) -> Float[Tensor, "frame 2"]:
@@ -104,8 +104,8 @@ class SnapCorrection(_Targets):
         else:
             touch = points_world[hands][:, :2].double() - held[0]
             shift = touch.mean(0)
-            if thing.freedom.kind == "hinge" and self.hinge is not None:
-                pivot = torch.tensor(thing.freedom.pivot, dtype=torch.float64)[:2]
+            if scene_object.freedom.kind == "hinge" and self.hinge is not None:
+                pivot = torch.tensor(scene_object.freedom.pivot, dtype=torch.float64)[:2]
                 shift = fit_about_hinge(held.mean(1), pivot, shift, self.hinge)
             shift = shift * (self.most_m / shift.norm().clamp(min=1e-9)).clamp(max=1.0)
         self._targets[frames], self._weights[frames] = shift, 1.0
@@ -123,7 +123,7 @@ def fit_about_hinge(
     touch: Float64[Tensor, "2"],
     settings: HingeFit,
 ) -> Float64[Tensor, "2"]:
-    """The offset (m) under which a hand's path keeps its distance from a hinge, starting at the touched point.
+    """Fit the offset δ (m) under which a hand's path keeps its distance r from a hinge and starts at the touched point.
 
     Minimises Σ((|hand + δ − pivot| − r)/radius)²/frames·n + (n·(δ − touch)/touch_m)² + |δ|²/place_m² over δ and r by
     Gauss–Newton; n is the direction of `touch`.
@@ -131,7 +131,7 @@ def fit_about_hinge(
     picked = hand[torch.linspace(0, len(hand) - 1, min(FIT_FRAMES, len(hand))).long()] - pivot
     normal = touch / touch.norm().clamp(min=1e-9)
     radius = (picked[0] + touch).norm()
-    # frames are correlated: an arc weighs as ten independent looks, spread over its frames
+    # frames are correlated: an arc counts as ten independent measurements
     weight = (10.0 / len(picked)) ** 0.5 / settings.radius_m
     unknown = torch.cat([touch, radius[None]])
     for _ in range(settings.iterations):

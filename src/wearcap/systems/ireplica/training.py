@@ -17,7 +17,7 @@ from wearcap.training.base import GivenOptimizer, SeededSteps
 
 
 class ContactDetection(SeededSteps, GivenOptimizer):
-    """A contact network for some classes of interaction; what it is trained on and scored by are single frames."""
+    """Trains a contact network for some classes of interaction; loss and scores are per frame."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class ContactDetection(SeededSteps, GivenOptimizer):
         self._validated: list[tuple[Tensor, Tensor]] = []
 
     def set_statistics(self, dataset: ContactDataset, limit: int = 400) -> None:
-        """Take normalisation from a training split; a resumed run brings its own with the weights."""
+        """Set the input normalisation from a training split; a resumed run restores it with the weights."""
         random = torch.Generator().manual_seed(0)
         windows = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
         self.net.normalize_on(self._pose(collate([dataset[item] for item in zip(windows, range(limit))])))
@@ -44,20 +44,20 @@ class ContactDetection(SeededSteps, GivenOptimizer):
     def _pose(self, batch: ContactWindow) -> Float[Tensor, "batch time feature"]:
         return self.features.encode(batch.R_parent_joint @ rotation.exp(batch.error))
 
-    def _answers(
+    def _predictions(
         self, batch: ContactWindow
     ) -> tuple[Float[Tensor, "batch out hand class"], Bool[Tensor, "batch out hand class"]]:
-        """Logits, and the truth of the frames that they are about."""
+        """Logits, and ground truth of the predicted frames."""
         return self.net(self._pose(batch)), batch.contact[:, REACH:-REACH]
 
     def training_step(self, batch: ContactWindow, batch_idx: int) -> Tensor:
-        logits, truth = self._answers(batch)
+        logits, truth = self._predictions(batch)
         loss = F.binary_cross_entropy_with_logits(logits, truth.to(logits.dtype))
         self.log("train/loss", loss, batch_size=len(truth), prog_bar=True)
         return loss
 
     def validation_step(self, batch: ContactWindow, batch_idx: int) -> None:
-        logits, truth = self._answers(batch)
+        logits, truth = self._predictions(batch)
         loss = F.binary_cross_entropy_with_logits(logits, truth.to(logits.dtype))
         self.log("val/loss", loss, batch_size=len(truth), sync_dist=True)
         self._validated.append((logits.flatten(0, 1), truth.flatten(0, 1)))
@@ -65,13 +65,14 @@ class ContactDetection(SeededSteps, GivenOptimizer):
     def validated(
         self,
     ) -> tuple[Float[Tensor, "sample hand class"], Bool[Tensor, "sample hand class"]]:
-        """Logits and truth of the validation epoch so far, of all processes."""
+        """Logits and ground truth of the validation epoch so far, from all processes."""
         parts = [torch.cat(part) for part in zip(*self._validated)]
         every = [torch.as_tensor(self.all_gather(part)).reshape(-1, *part.shape[1:]) for part in parts]
         return every[0], every[1]
 
     def on_validation_epoch_end(self) -> None:
-        """Scores per class, hands' mean (thesis Table 5.3): of uncalibrated logits, whose order and sign are the same."""
+        """Log scores per class, means over hands (thesis Table 5.3); calibration does not change the logits' order
+        or sign."""
         logits, truth = self.validated()
         for index, name in enumerate(self.classes):
             scores = mean_detection_scores(logits[..., index].sigmoid(), truth[..., index])

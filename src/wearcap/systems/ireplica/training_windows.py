@@ -1,4 +1,4 @@
-"""Windows of poses with the truth about hand contact; content and order are functions of seed and step."""
+"""Training windows of poses with true hand contact; content and order are functions of seed and step."""
 
 import math
 from dataclasses import dataclass
@@ -33,33 +33,32 @@ class ContactWindow(NamedTuple):
 
     R_parent_joint: Float[Tensor, "*batch time joint 3 3"]
     error: Float[Tensor, "*batch time joint 3"]
-    """Rotation vectors (rad) to spoil the pose with, drawn here so that they depend on seed and step alone."""
+    """Pose noise as rotation vectors (rad), drawn with the window so that it depends on seed and step only."""
     contact: Bool[Tensor, "*batch time hand class"]
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How training windows are varied. Zeros (and a stretch of 1) leave them as they are."""
+    """Augmentation of training windows. Zeros (and a stretch of 1) disable it."""
 
     mirror: bool = True
-    """Half of the windows are seen in a mirror."""
+    """Whether half of the windows are mirrored."""
     noise_deg: float = 5.0
-    """Greatest error of joints' rotations: constant, slow and from frame to frame, in shares that vary."""
+    """Largest noise of joint rotations (°): a random mixture of constant, slow and per-frame noise."""
     stretch: float = 1.2
-    """Greatest factor by which time runs faster or slower; it also takes frames between those of the recording,
-    as resampling does."""
+    """Largest factor by which time is stretched or compressed; poses are then interpolated between frames."""
     drop: float = 0.2
-    """Greatest share of frames that are lost and interpolated."""
+    """Largest share of frames that are dropped and interpolated."""
 
 
 NONE = Augmentation(mirror=False, noise_deg=0.0, stretch=1.0, drop=0.0)
 
 
 class ContactDataset(Dataset):
-    """Windows of one split, in the skeleton of a network's input. An item is asked for by (window, seed), or by window.
+    """Windows of one split, in the skeleton of a network's input. An item is indexed by (window, seed), or by window.
 
-    `stream` is "suit" (what the sensors said) or "motion" (the truth). Recordings of the same skeleton and rate are
-    read from the memory map; others are converted when first touched and kept in memory.
+    `stream` is "suit" (sensed poses) or "motion" (ground truth). Recordings with the same skeleton and frame rate are
+    read from the memory map; others are converted on first use and kept in memory.
     """
 
     def __init__(
@@ -107,7 +106,7 @@ class ContactDataset(Dataset):
 def interpolated(
     R: Float[Tensor, "time joint 3 3"], kept: Bool[Tensor, "time"], place: Float[Tensor, "new_time"]
 ) -> Float[Tensor, "new_time joint 3 3"]:
-    """Rotations at places (in frames) between the frames that were kept: by chords, as neighbours differ little."""
+    """Rotations at fractional frames `place`, interpolated linearly (and orthogonalised) between the kept frames."""
     frames = kept.nonzero()[:, 0]
     after = torch.searchsorted(frames, place, right=True).clamp(1, len(frames) - 1)
     before = frames[after - 1]
@@ -119,7 +118,8 @@ def interpolated(
 def pose_errors(
     frames: int, joints: int, greatest_deg: float, random: torch.Generator
 ) -> Float[Tensor, "time joint 3"]:
-    """Rotation vectors (rad): constant, slow (a second) and from frame to frame in random shares, of random size."""
+    """Pose noise as rotation vectors (rad): a random mixture of constant, slow (1 s) and per-frame noise of random
+    size."""
     size, *shares = torch.rand(4, generator=random).tolist()
     scale = math.radians(greatest_deg * size) / math.sqrt(3 * sum(share**2 for share in shares))
     knots = torch.randn(2 + frames // 60, 3 * joints, generator=random)
@@ -134,7 +134,7 @@ def pose_errors(
 
 @dataclass(frozen=True, eq=False)
 class _Poses:
-    """An open recording: poses at the data set's rate, and what the hands held."""
+    """An open recording: poses at the data set's rate, and interactions."""
 
     file: RecordingFile
     stream: str
@@ -154,7 +154,7 @@ class _Poses:
     def contact(
         self, place: Float[Tensor, "place"], classes: tuple[str, ...]
     ) -> Bool[Tensor, "place hand class"]:
-        """The truth at places between frames."""
+        """True contact at fractional frames `place`."""
         below = place.long().clamp(max=self.length - 2)
         times = torch.lerp(self.timestamps[below], self.timestamps[below + 1], place.double() - below)
         return torch.stack([self.interactions.hand_contact(times, name) for name in classes], -1)
@@ -162,7 +162,7 @@ class _Poses:
 
 @cache
 def _poses(path: Path, stream: str, skeleton_name: str, fps: float) -> _Poses:
-    """Kept open per process."""
+    """Open a recording, once per process."""
     file, skeleton = RecordingFile(path), skeleton_by_name(skeleton_name)
     interactions = file.part("interactions")
     if f"{stream}.timestamps" not in file.keys or interactions is None:
@@ -178,7 +178,7 @@ def _poses(path: Path, stream: str, skeleton_name: str, fps: float) -> _Poses:
 
 
 class ContactWindows(SeededWindows):
-    """Windows of poses with the truth about hand contact, for contact detection."""
+    """Data module of windows of poses with true hand contact."""
 
     def __init__(
         self,
@@ -198,7 +198,7 @@ class ContactWindows(SeededWindows):
         balance: float = 1.0,
         val_sources: dict[str, dict | None] | None = None,
     ):
-        """See `SeededWindows` and `ContactDataset`; `augmentation` and `balance` are for training alone."""
+        """See `SeededWindows` and `ContactDataset`; `augmentation` and `balance` apply to training only."""
         super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
         self.features, self.classes = features, tuple(classes)
         self.window, self.stride, self.fps, self.stream = window, stride, fps, stream

@@ -1,4 +1,4 @@
-"""iReplica with the current weights during validation: what a contact network in training is worth to the objects."""
+"""Validation of a contact network in training by the object motion that iReplica captures with its current weights."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,15 +19,15 @@ from wearcap.training.callbacks import is_due
 
 
 class IReplicaValidation(Callback):
-    """Every n-th validation epoch tracks objects through recordings of the validation split; logs Tables 5.1 and 5.2.
+    """Tracks objects in recordings of the validation split every n-th validation epoch; logs Tables 5.1 and 5.2.
 
-    HPS has no part in the training: its motions are made once. Stands before the weight averaging in the list of
-    callbacks, so that it sees the averaged weights. Recordings that HPS cannot register, or whose objects and
-    interactions are not known, are left out; without any other nothing is logged.
+    HPS is not trained, so its motions are computed once. The callback must come before the weight averaging in the list
+    of callbacks, to see the averaged weights. Recordings without the inputs of HPS, or without true objects and
+    interactions, are skipped; if none remains, nothing is logged.
     """
 
     def __init__(self, pipeline: Callable[..., IReplica], recordings: int = 2, every_n_epochs: int = 10):
-        """`pipeline`: made for a `predictor`."""
+        """`pipeline` builds iReplica for a `predictor`."""
         self.pipeline, self.recordings, self.every_n_epochs = pipeline, recordings, every_n_epochs
         self._registered: list[tuple[Recording, Source, Motion]] | None = None
 
@@ -72,9 +72,9 @@ class IReplicaValidation(Callback):
 
 
 def fit(recording: Recording, folder: Path) -> bool:
-    """Whether a recording has what the tracker takes, and the truth that it is measured against."""
+    """Whether a recording has the tracker's inputs and the ground truth of its scores."""
     files = recording.environment, recording.scene
     sensed = recording.suit, recording.camera, recording.localization
     true = recording.motion, recording.interactions
-    known = None not in sensed and None not in true and bool(recording.object_motion)
-    return known and all(name is not None and (folder / name).is_file() for name in files)
+    complete = None not in sensed and None not in true and bool(recording.object_motion)
+    return complete and all(name is not None and (folder / name).is_file() for name in files)
