@@ -55,8 +55,8 @@ def run(config: DictConfig) -> Scores:
 
 def _learned(checkpoints: list[str], config: DictConfig, progress: Progress) -> tuple[RecordingStore, Scores]:
     """The data set, and the checkpoints' scores beside the baselines'."""
-    told = bool(config.dataset) and not config.baselines
-    sources, validated = ([], None) if told else trained_on(checkpoints[0])
+    own_data = bool(config.dataset) and not config.baselines
+    sources, validated = ([], None) if own_data else trained_on(checkpoints[0])
     store = RecordingStore.open(config.dataset or validated)
     realism = None if config.realism is None else load_realism(config.realism)
     rows: list[Row] = []

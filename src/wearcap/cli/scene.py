@@ -38,20 +38,20 @@ def run(config: DictConfig) -> VisualMap:
     )
     options = {"descriptor": descriptor, "settings": instantiate(config.settings), "progress": True}
     taken = np.arange(0, len(photos), config.every)
-    held = (
+    held_out = (
         taken[:: len(taken) // config.check][: config.check]
         if 0 < config.check <= len(taken) // 4
         else taken[:0]
     )
-    rest = np.setdiff1d(taken, held)
+    rest = np.setdiff1d(taken, held_out)
     if config.extend is None:
         made = build_map(*_part(photos, source, rest), extractor, **options)
     else:
         made = extended(VisualMap.load(config.extend), *_part(photos, source, rest), extractor, **options)
-    if len(held):
+    if len(held_out):
         localizer = Localizer(made, extractor, matcher, instantiate(config.localizer), descriptor=descriptor)
-        _check(localizer, [photos[number] for number in held])
-        made = extended(made, *_part(photos, source, held), extractor, **options)
+        _check(localizer, [photos[number] for number in held_out])
+        made = extended(made, *_part(photos, source, held_out), extractor, **options)
     _tell(made)
     made.save(config.output)
     show(f"map: {config.output}")

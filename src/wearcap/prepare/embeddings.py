@@ -38,7 +38,7 @@ def _embed_all(
     store: RecordingStore, encoder: ImageEncoder, cache: str | Path | None, overwrite: bool, progress: bool
 ) -> Report:
     name_of_all = embedding_name(encoder)
-    report, waiting, written_at = Report(), dict[str, Entry](), time.monotonic()
+    report, pending, written_at = Report(), dict[str, Entry](), time.monotonic()
     try:
         with progress_bar(len(store.entries), 0, progress) as advance:
             for name in store.names():
@@ -50,18 +50,18 @@ def _embed_all(
                     elif not overwrite and _is_current(store, name, camera, name_of_all):
                         report.current.append(name)
                     else:
-                        waiting[name] = _embed(
+                        pending[name] = _embed(
                             store, name, file, encoder, None if cache is None else Path(cache)
                         )
                         report.written.append(name)
                 except WearcapError as error:
                     report.failed[name] = str(error)
                 if time.monotonic() - written_at > REGISTER_EVERY_S:
-                    store.register(waiting)
-                    waiting, written_at = {}, time.monotonic()
+                    store.register(pending)
+                    pending, written_at = {}, time.monotonic()
                 advance()
     finally:
-        store.register(waiting)
+        store.register(pending)
     if len(report.notes) == len(store.entries):
         raise WearcapError("no recording has a head camera's pictures", where=store.root,
                            fix="Prepare it with them, as `wearcap prepare simulated camera=true` does.")  # fmt: skip

@@ -105,13 +105,13 @@ def _collect(
 ) -> Report:  # fmt: skip
     """Enter what workers have made in the manifest, and report."""
     report = Report(current=current)
-    waiting: dict[str, Entry] = {}
+    pending: dict[str, Entry] = {}
     written_at = time.monotonic()
     try:
         with progress_bar(total, len(current), progress) as advance:
             for name, outcome, note in outcomes:
                 if isinstance(outcome, Entry):
-                    waiting[name] = outcome
+                    pending[name] = outcome
                     report.written.append(name)
                 else:
                     report.failed[name] = outcome
@@ -119,14 +119,14 @@ def _collect(
                 if note:
                     report.notes[name] = note
                 if time.monotonic() - written_at > REGISTER_EVERY_S:
-                    store.register(waiting)
-                    waiting, written_at = {}, time.monotonic()
+                    store.register(pending)
+                    pending, written_at = {}, time.monotonic()
                 advance()
     except BrokenExecutor as error:
         raise WearcapError("a worker process was killed (out of memory?)", where=store.root,
                            fix="What is finished is kept: run again with fewer jobs.") from error  # fmt: skip
     finally:
-        store.register(waiting)
+        store.register(pending)
     report.written.sort()
     return report
 

@@ -156,18 +156,18 @@ def _camera(recording: Recording) -> CameraStream:
     return recording.camera
 
 
-def _from_elsewhere(recording: Recording, way: str) -> Recording:
-    """The recording with its files named from another folder, `way` from there."""
+def _from_elsewhere(recording: Recording, prefix: str) -> Recording:
+    """The recording with its files named from another folder, `prefix` from there."""
 
     def moved(name: str | None) -> str | None:
-        return name and Path(way, name).as_posix()
+        return name and Path(prefix, name).as_posix()
 
     camera = recording.camera
     if camera is not None:
         files = camera.image_files
         camera = replace(
             camera, video=moved(camera.video),
-            image_files=None if files is None else tuple(Path(way, name).as_posix() for name in files),
+            image_files=None if files is None else tuple(Path(prefix, name).as_posix() for name in files),
         )  # fmt: skip
     return replace(
         recording, camera=camera, scene=moved(recording.scene), environment=moved(recording.environment)

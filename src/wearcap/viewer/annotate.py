@@ -149,7 +149,7 @@ def _objects(recording: Recording, folder: Path) -> dict[str, str]:
         objects |= dict(zip(recording.interactions.objects, recording.interactions.classes))
     if recording.environment:
         environment = read_environment(folder / recording.environment)
-        objects |= {thing.name: thing.freedom.contact_class for thing in environment.objects}
+        objects |= {item.name: item.freedom.contact_class for item in environment.objects}
     objects.pop("", None)
     return dict(sorted(objects.items()))
 

@@ -194,9 +194,9 @@ class EditorView:
 def axis_toward(item: SceneObject, place: Float[np.ndarray, "3"]) -> tuple[float, float, float] | None:
     """Unit vector from the middle of an object to a place; None where they coincide."""
     points = points_world(item)
-    way = place - (points.min(0) + points.max(0)) / 2
-    length = float(np.linalg.norm(way))
-    return None if length < 1e-3 else tuple((way / length).tolist())
+    direction = place - (points.min(0) + points.max(0)) / 2
+    length = float(np.linalg.norm(direction))
+    return None if length < 1e-3 else tuple((direction / length).tolist())
 
 
 def by_height(points: Float[np.ndarray, "point 3"]) -> UInt8[np.ndarray, "point 3"]:

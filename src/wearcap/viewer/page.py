@@ -43,10 +43,10 @@ class Page:
         self.server = start_server(self.guard, port, "wearcap")
         self.server.scene.set_up_direction("+z")
         self.server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
-        things = moving_objects(list(motions.values()), environment)
-        self.bodies: dict[str, Placed] = placed_motions(self.server, recording, motions, things)
+        moving = moving_objects(list(motions.values()), environment)
+        self.bodies: dict[str, Placed] = placed_motions(self.server, recording, motions, moving)
         self.layers: list[Layer] = list(self.bodies.values())
-        self.aside_m = spacing_m(list(motions.values()), things) if len(motions) > 1 else 0.0
+        self.aside_m = spacing_m(list(motions.values()), moving) if len(motions) > 1 else 0.0
         if recording.head is not None and len(recording.head.timestamps):
             self.layers.append(HeadLayer(self.server, recording.head))
         self._surroundings = self.server.scene.add_frame("/surroundings", show_axes=False)
@@ -55,7 +55,7 @@ class Page:
         if scene is not None:
             self.server.scene.add_mesh_trimesh("/surroundings/scene", scene)
         if environment is not None:
-            still = [thing for thing in environment.objects if thing not in things]
+            still = [item for item in environment.objects if item not in moving]
             self.layers.append(ObjectsLayer(self.server, "surroundings", still, recording.object_motion))
         self.layout = BESIDE if len(self.bodies) - (TRUTH in self.bodies) > 1 else OVER
         self._followed = np.zeros(3)
@@ -154,12 +154,12 @@ class Page:
     def _point_camera(self) -> None:
         """From the front left; several that stand side by side are looked at from in front of the middle one."""
         self._followed = self._focus()
-        way = np.array([2.2, 2.0, 0.9])
+        direction = np.array([2.2, 2.0, 0.9])
         if self.layout == BESIDE:
-            way = np.array([1.0, 0.15, 0.3]) * max(3.0, 1.0 + 0.35 * self.aside_m * len(self.bodies))
+            direction = np.array([1.0, 0.15, 0.3]) * max(3.0, 1.0 + 0.35 * self.aside_m * len(self.bodies))
         camera = self.server.initial_camera
         camera.look_at = tuple(self._followed)
-        camera.position = tuple(self._followed + way)
+        camera.position = tuple(self._followed + direction)
 
     def _follow_camera(self) -> None:
         focus = self._focus()

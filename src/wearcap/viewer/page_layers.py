@@ -61,12 +61,12 @@ def stick_body(skeleton: Skeleton) -> BodyModel:
         start, end = (np.concatenate([points, rest[[head]] + [0.02, 0.0, 0.09]]) for points in (start, end))
         radius, bones = np.append(radius, 0.10), [*bones, head]
     mesh = capsules(start, end, radius, radius, np.zeros((len(bones), 3)), segments=12)
-    held = torch.tensor(bones).repeat_interleave(len(mesh.vertices) // len(bones))
-    weights = torch.zeros(len(held), 4)
+    bone_of_vertex = torch.tensor(bones).repeat_interleave(len(mesh.vertices) // len(bones))
+    weights = torch.zeros(len(bone_of_vertex), 4)
     weights[:, 0] = 1
     return BodyModel(
         skeleton, torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces).long(),
-        held[:, None].repeat(1, 4), weights,
+        bone_of_vertex[:, None].repeat(1, 4), weights,
     )  # fmt: skip
 
 

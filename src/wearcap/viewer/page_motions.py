@@ -51,15 +51,15 @@ def moving_objects(motions: Sequence[Motion], environment: Environment | None) -
     if environment is None:
         return []
     tracks = [motion.object_motion or {} for motion in motions]
-    return [thing for thing in environment.objects if any(_moves(of.get(thing.name), thing) for of in tracks)]
+    return [item for item in environment.objects if any(_moves(of.get(item.name), item) for of in tracks)]
 
 
-def _moves(track: Trajectory | None, thing: SceneObject) -> bool:
+def _moves(track: Trajectory | None, item: SceneObject) -> bool:
     if track is None or not len(track):
         return False
     R, t = track.R_world_body, track.t_world_body
-    turned = (R - thing.R_world_object.to(R)).flatten(1).norm(dim=1).max()
-    shifted = (t - thing.t_world_object.to(t)).norm(dim=1).max()
+    turned = (R - item.R_world_object.to(R)).flatten(1).norm(dim=1).max()
+    shifted = (t - item.t_world_object.to(t)).norm(dim=1).max()
     # A small angle is the matrices' distance divided by √2.
     return float(shifted) > STILL_M or float(turned) > 2**0.5 * STILL_RAD
 
@@ -68,7 +68,7 @@ def placed_motions(
     server: viser.ViserServer,
     recording: Recording,
     motions: dict[str, Motion],
-    things: Sequence[SceneObject],
+    items: Sequence[SceneObject],
 ) -> dict[str, Placed]:
     """All motions by name, each with its own of the objects that move, tinted like its body where there are several."""
     placed, captures = {}, 0
@@ -79,9 +79,9 @@ def placed_motions(
         several, points, objects = len(motions) > 1, None, None
         if motion.body_contact_prob is not None:
             points = BodyPointsLayer(server, f"{name}_points", motion, body)
-        if things and motion.object_motion:
+        if items and motion.object_motion:
             tint = color if several else None
-            objects = ObjectsLayer(server, f"{name}_objects", things, motion.object_motion, tint)
+            objects = ObjectsLayer(server, f"{name}_objects", items, motion.object_motion, tint)
         placed[name] = Placed(
             BodyLayer(server, name, motion, body, color), _feet(server, name, motion, recording), points, objects,
             LabelLayer(server, name, motion) if several else None,
@@ -102,7 +102,7 @@ def _feet(server: viser.ViserServer, name: str, motion: Motion, recording: Recor
     return FeetLayer(server, f"{name}_feet", motion, track.contact[:, columns], track.timestamps)
 
 
-def spacing_m(motions: Sequence[Motion], things: Sequence[SceneObject] = ()) -> float:
+def spacing_m(motions: Sequence[Motion], items: Sequence[SceneObject] = ()) -> float:
     """How far apart (m, along y) neighbours stand so that none covers the next one at any moment.
 
     The first has the greatest y. What a motion takes up: its body, and the objects that are near to it.
@@ -110,20 +110,20 @@ def spacing_m(motions: Sequence[Motion], things: Sequence[SceneObject] = ()) -> 
     start = min(motion.timestamps[0].item() for motion in motions)
     stop = max(motion.timestamps[-1].item() for motion in motions)
     times = torch.linspace(start, stop, 400, dtype=torch.float64)
-    spans = [_span(motion, things, times) for motion in motions]
+    spans = [_span(motion, items, times) for motion in motions]
     overlaps = [float((behind[1] - ahead[0]).max()) for ahead, behind in pairwise(spans)]
     return max(ASIDE_M, *overlaps)
 
 
 def _span(
-    motion: Motion, things: Sequence[SceneObject], times: Float64[Tensor, "time"]
+    motion: Motion, items: Sequence[SceneObject], times: Float64[Tensor, "time"]
 ) -> tuple[Float[Tensor, "time"], Float[Tensor, "time"]]:
     """Least and greatest y (m) of a motion and what is with it, at some times."""
     joints = motion.T_world_joint.t[nearest_frames(motion.timestamps, times)].double()
     low, high = joints[..., 1].amin(1) - FLESH_M, joints[..., 1].amax(1) + FLESH_M
-    for thing in things if motion.object_motion else ():
-        T = poses_at((motion.object_motion or {}).get(thing.name), thing, times)
-        corners = torch.from_numpy(_corners(thing)).to(T.t)
+    for item in items if motion.object_motion else ():
+        T = poses_at((motion.object_motion or {}).get(item.name), item, times)
+        corners = torch.from_numpy(_corners(item)).to(T.t)
         placed = (corners @ T.R.mT + T.t[:, None]).double()
         y, middle = placed[..., 1], placed.mean(1)
         radius = (corners - corners.mean(0)).norm(dim=1).max()
@@ -133,7 +133,7 @@ def _span(
     return low, high
 
 
-def _corners(thing: SceneObject) -> Float[np.ndarray, "8 3"]:
+def _corners(item: SceneObject) -> Float[np.ndarray, "8 3"]:
     """Of the box around an object in its own axes (m)."""
-    low, high = thing.mesh.vertices.min(0), thing.mesh.vertices.max(0)
+    low, high = item.mesh.vertices.min(0), item.mesh.vertices.max(0)
     return np.array(list(product(*zip(low, high, strict=True))))

@@ -137,6 +137,6 @@ def _object_poses(rows: dict[str, np.ndarray], where: Path) -> tuple[Rigid, Tens
     return turned, None if timeless else track.timestamps
 
 
-def _path(thing: AdtObject) -> Trajectory:
-    assert thing.timestamps is not None
-    return Trajectory(thing.timestamps, thing.T_world_obj.R, thing.T_world_obj.t)
+def _path(tracked: AdtObject) -> Trajectory:
+    assert tracked.timestamps is not None
+    return Trajectory(tracked.timestamps, tracked.T_world_obj.R, tracked.T_world_obj.t)

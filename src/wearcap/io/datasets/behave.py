@@ -81,17 +81,17 @@ def read_behave(root: str | Path, name: str) -> OneObject:
                            expected="a folder DATE_SUBJECT_OBJECT, such as Date01_Sub01_boxlarge_hand")  # fmt: skip
     folder = behave_folder(root) / name
     body = read_npz(folder / BODY_FILE, ("poses", "trans", "betas", "frame_times"))
-    thing = read_npz(folder / OBJECT_FILE, ("angles", "trans", "frame_times"))
+    fitted = read_npz(folder / OBJECT_FILE, ("angles", "trans", "frame_times"))
     frames = require(body, folder / BODY_FILE, poses=("time", 156), trans=("time", 3))["time"]
-    require(thing, folder / OBJECT_FILE, angles=("time", 3), trans=("time", 3))
-    times = _common_times(body, thing, folder, frames)
+    require(fitted, folder / OBJECT_FILE, angles=("time", 3), trans=("time", 3))
+    times = _common_times(body, fitted, folder, frames)
     object_name, gender = _about(read_json(folder / INFO_FILE), folder / INFO_FILE)
     provenance = {"source": name, "format": "behave", **({"gender": gender} if gender else {})}
     pelvis = body["trans"].astype(np.float64) + PELVIS_SMPLH
     rotvec = torch.from_numpy(body["poses"].astype(np.float64)).unflatten(1, (-1, 3))
     motion = smpl_motion(times, smplh52(), rotvec, torch.from_numpy(pelvis), provenance)
-    R = rotation.exp(torch.from_numpy(thing["angles"].astype(np.float64)))
-    path = Trajectory(times, R.float(), torch.from_numpy(thing["trans"].astype(np.float32)))
+    R = rotation.exp(torch.from_numpy(fitted["angles"].astype(np.float64)))
+    path = Trajectory(times, R.float(), torch.from_numpy(fitted["trans"].astype(np.float32)))
     take = OneObject(
         name, motion, object_name, path, read_behave_mesh(root, object_name), _shape(body, folder / BODY_FILE, frames),
         subject=parts[1], activity="_".join(parts[2:]), location=parts[0],
@@ -125,15 +125,15 @@ def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
 
 
 def _common_times(
-    body: dict[str, np.ndarray], thing: dict[str, np.ndarray], folder: Path, frames: int
+    body: dict[str, np.ndarray], fitted: dict[str, np.ndarray], folder: Path, frames: int
 ) -> torch.Tensor:
     """Times (s) of the object's frames, which must be the body's too."""
     if not frames:
         raise WearcapError("no frames", where=folder / BODY_FILE, expected="poses of at least one frame")
-    if len(thing["angles"]) != frames:
-        raise WearcapError(f"the object has {len(thing['angles'])} frames, the body {frames}", where=folder,
+    if len(fitted["angles"]) != frames:
+        raise WearcapError(f"the object has {len(fitted['angles'])} frames, the body {frames}", where=folder,
                            expected=f"as many in {OBJECT_FILE} as in {BODY_FILE}", fix="Fetch both files again.")  # fmt: skip
-    times = _times(thing, folder / OBJECT_FILE, frames)
+    times = _times(fitted, folder / OBJECT_FILE, frames)
     if "frame_times" in body:
         other = _times(body, folder / BODY_FILE, frames)
         apart = np.flatnonzero(other != times)
@@ -147,11 +147,11 @@ def _common_times(
 
 def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np.ndarray, "time"]:
     """Seconds of `frame_times` ("t0003.033"), brought to whole frames. Raises WearcapError for another rate than 30."""
-    told = arrays.get("frame_times")
-    if told is None or told.shape != (frames,) or told.dtype.kind not in "US":
-        raise WearcapError(f"frame_times is {'missing' if told is None else f'{told.dtype} {told.shape}'}", where=path,
+    stamps = arrays.get("frame_times")
+    if stamps is None or stamps.shape != (frames,) or stamps.dtype.kind not in "US":
+        raise WearcapError(f"frame_times is {'missing' if stamps is None else f'{stamps.dtype} {stamps.shape}'}", where=path,
                            expected=f'{frames} texts such as "t0003.033" (s)')  # fmt: skip
-    texts = [text.decode("latin-1") if isinstance(text, bytes) else str(text) for text in told]
+    texts = [text.decode("latin-1") if isinstance(text, bytes) else str(text) for text in stamps]
     try:
         seconds = np.array([float(text.removeprefix("t")) for text in texts])
     except ValueError as error:

@@ -86,16 +86,18 @@ def read_egohoi(
     body = read_smpl_json(packed if packed.is_file() else packed.with_suffix(""))
     clock = LabelClock.of(name, body.motion.timestamps)
     objects, paths, contacts = [], {}, []
-    for thing, (locations, labels) in _object_files(root, name, object_name).items():
+    for object_id, (locations, labels) in _object_files(root, name, object_name).items():
         annotated = read_object_locations(locations)
-        kind = _motion_type(thing, annotated, motion_types or {}, locations)
+        kind = _motion_type(object_id, annotated, motion_types or {}, locations)
         if kind == "absent":
             continue
-        item = scene_object(thing, annotated, root / "object_models" / f"{thing}.ply", kind, clock.start_s)
+        item = scene_object(
+            object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s
+        )
         objects.append(item)
-        paths[thing] = annotated.trajectory
+        paths[object_id] = annotated.trajectory
         if labels is not None:
-            contacts.append(read_egohoi_contacts(labels, clock, thing, item.freedom.contact_class))
+            contacts.append(read_egohoi_contacts(labels, clock, object_id, item.freedom.contact_class))
     interactions = _joined(contacts) if contacts else None
     if interactions is not None:
         labels_of(interactions, clock)  # refuses a hand that holds two things at once
@@ -119,9 +121,12 @@ def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, t
         raise WearcapError(
             "no object locations of this sequence", where=single, expected=f"this file, or a folder {several}"
         )
-    places = {thing: [root / folder / labels for folder in _CONTACTS] for thing, (_, labels) in found.items()}
-    return {thing: (path, next((place for place in places[thing] if place.is_file()), None))
-            for thing, (path, _) in found.items()}  # fmt: skip
+    places = {
+        object_id: [root / folder / labels for folder in _CONTACTS]
+        for object_id, (_, labels) in found.items()
+    }
+    return {object_id: (path, next((place for place in places[object_id] if place.is_file()), None))
+            for object_id, (path, _) in found.items()}  # fmt: skip
 
 
 def _only_object(root: Path, name: str) -> str:
@@ -135,13 +140,17 @@ def _only_object(root: Path, name: str) -> str:
     return fitting[0]
 
 
-def _motion_type(thing: str, annotated: AnnotatedObject, motion_types: Mapping[str, str], where: Path) -> str:
+def _motion_type(
+    object_id: str, annotated: AnnotatedObject, motion_types: Mapping[str, str], where: Path
+) -> str:
     default = "along_floor" if annotated.hinge is None else "hinge"
-    kind = next((kind for pattern, kind in motion_types.items() if fnmatchcase(thing, pattern)), default)
+    kind = next((kind for pattern, kind in motion_types.items() if fnmatchcase(object_id, pattern)), default)
     if kind not in MOTION_TYPES:
-        raise WearcapError(f"motion type {kind!r} of {thing}", expected=f"one of {', '.join(MOTION_TYPES)}")
+        raise WearcapError(
+            f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}"
+        )
     if kind == "hinge" and annotated.hinge is None:
-        raise WearcapError(f"{thing} is to turn about a hinge and has none", where=where, expected='"hinge": [x, y, z]',
+        raise WearcapError(f"{object_id} is to turn about a hinge and has none", where=where, expected='"hinge": [x, y, z]',
                            fix="Give it another motion type.")  # fmt: skip
     return kind
 

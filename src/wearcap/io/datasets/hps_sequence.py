@@ -181,13 +181,13 @@ def _video_times(path: Path) -> Float64[Tensor, "time"]:
 
 def _warn_if_apart(motion: Motion, localization: Localization, path: Path) -> None:
     frame = torch.searchsorted(motion.timestamps, localization.timestamps).clamp(max=len(motion) - 1)
-    known = (localization.confidence > 0) & (localization.timestamps >= 0) & (
+    localized = (localization.confidence > 0) & (localization.timestamps >= 0) & (
         localization.timestamps <= motion.timestamps[-1]
     )  # fmt: skip
-    if not known.any():
+    if not localized.any():
         warnings.warn(f"{path}: no localised frame while the motion lasts", stacklevel=3)
         return
-    apart = (motion.t_world_root[frame] - localization.t_world_cam)[known].norm(dim=-1).median().item()
+    apart = (motion.t_world_root[frame] - localization.t_world_cam)[localized].norm(dim=-1).median().item()
     if apart > FAR_M:
         warnings.warn(f"{path}: pelvis and localised camera are {apart:.1f} m apart (median): other clocks, or another scan",
                       stacklevel=3)  # fmt: skip

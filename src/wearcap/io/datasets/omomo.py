@@ -123,13 +123,13 @@ def omomo_take(sequence: OmomoSequence, root: str | Path, fps: float | int) -> O
     vectors = np.concatenate([arrays["root_orient"], arrays["pose_body"]], 1).astype(np.float64)
     rotvec = torch.from_numpy(vectors).unflatten(1, (-1, 3))
     motion = smpl_motion(times, smplx22(), rotvec, torch.from_numpy(_pelvis(arrays, where)), provenance)
-    known = arrays["obj_scale"] > _LEAST_SCALE
-    scale = _scale(arrays["obj_scale"][known], where)
+    posed = arrays["obj_scale"] > _LEAST_SCALE
+    scale = _scale(arrays["obj_scale"][posed], where)
     mesh, center = _mesh(root, sequence.object_name, scale)
-    path = _path(arrays, times, torch.from_numpy(center), torch.from_numpy(known), where)
+    path = _path(arrays, times, torch.from_numpy(center), torch.from_numpy(posed), where)
     take = OneObject(sequence.name, motion, sequence.object_name, path, mesh, shape_from_arrays(arrays, where), sequence.subject,
                      "_".join(sequence.name.split("_")[1:]))  # fmt: skip
-    return take.frames(torch.from_numpy(known))
+    return take.frames(torch.from_numpy(posed))
 
 
 def _flat(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -177,16 +177,16 @@ def _mesh(root: str | Path, object_name: str, scale: float) -> tuple[Mesh, Float
 
 
 def _path(
-    arrays: dict[str, np.ndarray], times: Tensor, center: Tensor, known: Tensor, where: str
+    arrays: dict[str, np.ndarray], times: Tensor, center: Tensor, posed: Tensor, where: str
 ) -> Trajectory:
     """Of the mesh's centre: scale · R · c + t."""
     R = torch.from_numpy(arrays["obj_rot"].astype(np.float64))
     away = (R.mT @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
-    bad = ((away > _ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)) & known
+    bad = ((away > _ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)) & posed
     if bad.any():
         raise WearcapError(f"obj_rot of frame {int(bad.nonzero()[0])} is no rotation ({int(bad.sum())} such frames)",
                            where=where, expected="orthogonal matrices of determinant +1")  # fmt: skip
-    U, _, Vh = torch.linalg.svd(torch.where(known[:, None, None], R, torch.eye(3, dtype=R.dtype)))
+    U, _, Vh = torch.linalg.svd(torch.where(posed[:, None, None], R, torch.eye(3, dtype=R.dtype)))
     R = U @ Vh
     scale = torch.from_numpy(arrays["obj_scale"].astype(np.float64))
     t = torch.from_numpy(arrays["obj_trans"].astype(np.float64)) + scale[:, None] * (R @ center)

@@ -116,7 +116,7 @@ def _read(path: str | Path, keys: dict[str, str], order: Sequence[str], motion: 
 
 
 def require_order(imu: Mapping[str, ImuStream], motion: Motion, where: str | Path) -> None:
-    """Raise WearcapError when the sensors turn as other joints do than those they are said to be worn on.
+    """Raise WearcapError when the sensors turn as other joints do than those they are assigned to be worn on.
 
     Compared are the turns over a quarter of a second in the world, which no mounting changes. Joints that turn alike
     may be confused without harm: an order is wrong only when another one fits far better.
@@ -125,12 +125,12 @@ def require_order(imu: Mapping[str, ImuStream], motion: Motion, where: str | Pat
     cost = _turn_differences(imu, motion)
     row, best = linear_sum_assignment(cost)
     moved = best != row
-    said, fits = np.rad2deg(np.diag(cost)), np.rad2deg(cost[row, best])
+    assigned, fits = np.rad2deg(np.diag(cost)), np.rad2deg(cost[row, best])
     if fits.mean() > _MAX_DEG:
         raise WearcapError(f"the sensors turn {fits.mean():.0f}° apart from the body, in whatever order", where=where,
                            expected="sensors and pose of the same recording")  # fmt: skip
     if moved.any():
-        now, other = said[moved].mean(), fits[moved].mean()
+        now, other = assigned[moved].mean(), fits[moved].mean()
         if now > _WORSE * other and now > other + _WORSE_DEG:
             order = ", ".join(joints[k] for k in best)
             raise WearcapError(f"the sensors are in another order: {now:.1f}° apart from their joints, {other:.1f}° in the order "

@@ -20,7 +20,7 @@ HEIGHT_M = (0.6, 2.6)
 
 def check_body(motion: Motion, path: Path, unit_m: float, R_world_file: Float[Tensor, "3 3"]) -> None:
     """Raise WearcapError, naming the setting that mends it, when the body is no person's size or lies on its side."""
-    height = longest_way(motion.skeleton) / REACH_PER_HEIGHT
+    height = longest_path(motion.skeleton) / REACH_PER_HEIGHT
     if not HEIGHT_M[0] < height < HEIGHT_M[1]:
         nearest = {name: abs(height / unit_m * unit - 1.7) for name, unit in UNITS_M.items()}
         name = min(nearest, key=lambda name: nearest[name])
@@ -49,7 +49,7 @@ def _mirror_error(skeleton: Skeleton, axis: int) -> float:
     return torch.cdist(skeleton.rest_joints * mirror, skeleton.rest_joints).amin(1).mean().item()
 
 
-def longest_way(skeleton: Skeleton) -> float:
+def longest_path(skeleton: Skeleton) -> float:
     """Length (m) of the longest way along the bones from one end of the tree to another."""
     bones = skeleton.t_parent_joint.double().norm(dim=-1).tolist()
     down = [0.0] * len(skeleton)
@@ -58,9 +58,9 @@ def longest_way(skeleton: Skeleton) -> float:
         down[joint] = max(down[joint], torch.tensor(site.t_joint_site).norm().item())
     longest = 0.0
     for joint in range(len(skeleton) - 1, 0, -1):
-        parent, way = skeleton.parents[joint], down[joint] + bones[joint]
-        longest = max(longest, down[parent] + way)
-        down[parent] = max(down[parent], way)
+        parent, length = skeleton.parents[joint], down[joint] + bones[joint]
+        longest = max(longest, down[parent] + length)
+        down[parent] = max(down[parent], length)
     return longest
 
 

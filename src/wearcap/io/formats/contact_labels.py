@@ -126,7 +126,7 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
             raise WearcapError(f"class {unknown.pop()!r} in {name}", where=where,
                                expected=f"one of {', '.join(CONTACT_CLASSES)}")  # fmt: skip
         spans = [_span(pair, clock, f"{name} label {place}", where) for place, pair in enumerate(pairs)]
-        found = [Label(*span, thing, kind) for span, thing, kind in zip(spans, objects, classes)]
+        found = [Label(*span, item, kind) for span, item, kind in zip(spans, objects, classes)]
         labels[hand] = tuple(sorted(found, key=lambda label: label.start_s))
         _refuse_overlap(labels[hand], clock, name, where)
     return labels
@@ -194,21 +194,20 @@ def _refuse_overlap(labels: Sequence[Label], clock: LabelClock, name: str, where
 def interactions_of(labels: Labels) -> Interactions:
     """Labels as interactions: hands that hold the same named object share one; where its hands change, a new begins."""
     found: list[tuple[float, float, tuple[bool, ...], str, str]] = []
-    for thing in {(label.object, label.contact_class) for hand in HANDS for label in labels[hand]}:
+    for item in {(label.object, label.contact_class) for hand in HANDS for label in labels[hand]}:
         held = [
-            [label for label in labels[hand] if (label.object, label.contact_class) == thing]
-            for hand in HANDS
+            [label for label in labels[hand] if (label.object, label.contact_class) == item] for hand in HANDS
         ]
-        if not thing[0]:  # two hands at unknown things need not be at the same
+        if not item[0]:  # two hands at unknown things need not be at the same
             for number, spans in enumerate(held):
                 one = tuple(other == number for other in range(len(HANDS)))
-                found += [(label.start_s, label.stop_s, one, *thing) for label in spans]
+                found += [(label.start_s, label.stop_s, one, *item) for label in spans]
             continue
         edges = sorted({edge for spans in held for label in spans for edge in (label.start_s, label.stop_s)})
         for start, stop in itertools.pairwise(edges):
             hands = tuple(any(s.start_s <= start < s.stop_s for s in spans) for spans in held)
             if any(hands):
-                found.append((start, stop, hands, *thing))
+                found.append((start, stop, hands, *item))
     found.sort(key=lambda row: row[0])
     column = lambda index: [row[index] for row in found]  # noqa: E731
     return Interactions(
@@ -227,13 +226,13 @@ def labels_of(interactions: Interactions, clock: LabelClock) -> Labels:
                     interactions.objects, interactions.classes))  # fmt: skip
     for number, hand in enumerate(HANDS):
         joined: list[Label] = []
-        for start, stop, hands, thing, kind in sorted(rows, key=lambda row: row[0]):
+        for start, stop, hands, item, kind in sorted(rows, key=lambda row: row[0]):
             if not hands[number]:
                 continue
             span = _span([start, stop], clock, f"{hand}_hand's interaction", clock.name)
-            label = Label(*span, thing, kind)
+            label = Label(*span, item, kind)
             last = joined[-1] if joined else None
-            if last and thing and (last.stop_s, last.object, last.contact_class) == (span[0], thing, kind):
+            if last and item and (last.stop_s, last.object, last.contact_class) == (span[0], item, kind):
                 joined[-1] = replace(last, stop_s=span[1])
             else:
                 joined.append(label)

@@ -58,7 +58,7 @@ def sticks(skeleton: Skeleton) -> SkinnedMesh:
     bones.append((0, torch.zeros(3)))
     owners = np.array([joint for joint, _ in bones])
     start = skeleton.rest_joints.double().numpy()[owners]
-    end = start + torch.stack([way for _, way in bones]).double().numpy()
+    end = start + torch.stack([offset for _, offset in bones]).double().numpy()
     mesh = capsules(
         start,
         end,

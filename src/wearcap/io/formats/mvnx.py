@@ -123,12 +123,12 @@ class _Chunks:
 def _elements(events: Iterator[tuple[str, Element]], chunks: _Chunks) -> Iterator[Element]:
     """Complete elements of interest; frames are forgotten once they are used, so that memory stays flat."""
     frames: Element | None = None
-    held = 0
+    kept = 0
     for event, element in events:
         chunks.restart()
         name = _name(element)
-        held += event == "start"
-        if held > _MAX_ELEMENTS:
+        kept += event == "start"
+        if kept > _MAX_ELEMENTS:
             raise ValueError(f"more than {_MAX_ELEMENTS} elements beside its frames")
         if event == "start" and name == "frames":
             frames = element
@@ -138,7 +138,7 @@ def _elements(events: Iterator[tuple[str, Element]], chunks: _Chunks) -> Iterato
             yield element
             if name == "frame" and frames is not None:
                 frames.clear()
-                held = 0
+                kept = 0
 
 
 def _name(element: Element) -> str:
@@ -204,8 +204,8 @@ def _require_segments(file: _File) -> None:
 
 def _field(file: _File, name: str, text: str) -> np.ndarray:
     """The numbers of one of a frame's fields."""
-    things, width = _FIELDS[name]
-    count = width * (len(getattr(file, things)) or len(FOOT_PATCHES) * (things == "contacts"))
+    listing, width = _FIELDS[name]
+    count = width * (len(getattr(file, listing)) or len(FOOT_PATCHES) * (listing == "contacts"))
     if len(text) > 1000 + _MAX_NUMBER * count:
         raise ValueError(f"{name} with {len(text)} characters where {count} numbers belong")
     found = finite_floats(text.split())
