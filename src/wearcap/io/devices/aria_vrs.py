@@ -36,7 +36,7 @@ class AriaDevice:
     """A recording's own calibration."""
 
     T_aria_cpf: Rigid
-    """Central pupil frame in the device frame; give it to `read_mps` or `head_stream` in place of the nominal one."""
+    """Central pupil frame in the device frame; pass it to `read_mps` or `head_stream` in place of the nominal one."""
     T_aria_sensor: dict[str, Rigid]
     """Poses of cameras (OpenCV axes) and IMUs by label: "camera-rgb", "camera-slam-left", "imu-right" …"""
     subtype: str
@@ -191,7 +191,7 @@ def timecode_offset_s(path: str | Path) -> float:
 
 
 def _open(path: str | Path):
-    """A data provider of projectaria-tools, or a WearcapError that says what is missing."""
+    """Data provider of projectaria-tools. Raises WearcapError that names what is missing."""
     if data_provider is None:
         raise WearcapError("reading VRS recordings needs projectaria-tools", where=path,
                            fix='Install it with `pip install "wearcap[aria]"` (about 1 GB).')  # fmt: skip
@@ -205,5 +205,5 @@ def _open(path: str | Path):
 
 
 def _rigid(pose) -> Rigid:
-    """A Sophus SE3 as ours."""
+    """A Sophus SE3 as a Rigid."""
     return Rigid.from_matrix(torch.tensor(pose.to_matrix(), dtype=torch.float32))
