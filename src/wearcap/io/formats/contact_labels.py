@@ -1,7 +1,7 @@
-"""When each hand holds something, as an annotator marked it: H-contact's JSON, and the same with what we know besides.
+"""Annotated hand contacts: H-contact's JSON, and wearcap's extension of it by objects, classes and the recording.
 
 H-contact: `{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}}` in seconds on the motion's clock; a
-label with end < start lasts until the recording ends. Our own files add `objects` and `classes` (one entry per label,
+label with end < start lasts until the recording ends. wearcap's own files add `objects` and `classes` (one entry per label,
 "" where unknown) and the `recording` that the labels were made for.
 """
 
@@ -25,7 +25,7 @@ from wearcap.scene.objects import CONTACT_CLASSES
 
 SCHEMA = 1
 SLACK_S = 0.05
-"""How far a label may stand outside the recording: a video's and a suit's clocks seldom end together."""
+"""Largest time (s) that a label may exceed the recording: a video's and a suit's clocks seldom end together."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def hcontact_of(labels: Labels, clock: LabelClock) -> dict[str, list[list[float]
 
 
 def annotation_of(labels: Labels, clock: LabelClock) -> dict[str, Any]:
-    """Our own file: H-contact's content, objects and classes beside it, and whose labels they are."""
+    """wearcap's own file: H-contact's content with objects, classes and the recording that the labels belong to."""
     return {
         "schema_version": SCHEMA,
         "recording": {
@@ -110,7 +110,7 @@ def annotation_of(labels: Labels, clock: LabelClock) -> dict[str, Any]:
 
 
 def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Labels:
-    """Check what a label file says; `where` is named in errors. Raises WearcapError as `read_contact_labels`."""
+    """Labels of a label file's content; errors name `where`. Raises WearcapError as `read_contact_labels`."""
     contacts = content.get("contacts") if isinstance(content, dict) else None
     names = [f"{hand}_hand" for hand in HANDS]
     if not isinstance(contacts, dict) or not all(isinstance(contacts.get(name), list) for name in names):
@@ -152,7 +152,7 @@ def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> Non
 
 
 def _texts(content: dict, key: str, name: str, count: int, where: str | Path) -> list[str]:
-    """One text per label of a hand; empty ones where the file has none."""
+    """One text per label of a hand; empty if the file has none."""
     texts = content.get(key, {})
     texts = texts.get(name, [""] * count) if isinstance(texts, dict) else None
     if not isinstance(texts, list) or len(texts) != count or not all(isinstance(text, str) for text in texts):
@@ -192,13 +192,13 @@ def _refuse_overlap(labels: Sequence[Label], clock: LabelClock, name: str, where
 
 
 def interactions_of(labels: Labels) -> Interactions:
-    """Labels as interactions: hands that hold the same named object share one; where its hands change, a new begins."""
+    """Labels as interactions: hands on the same named object share one; a new one starts when the hands change."""
     found: list[tuple[float, float, tuple[bool, ...], str, str]] = []
     for item in {(label.object, label.contact_class) for hand in HANDS for label in labels[hand]}:
         held = [
             [label for label in labels[hand] if (label.object, label.contact_class) == item] for hand in HANDS
         ]
-        if not item[0]:  # two hands at unknown things need not be at the same
+        if not item[0]:  # two hands on unknown objects need not hold the same one
             for number, spans in enumerate(held):
                 one = tuple(other == number for other in range(len(HANDS)))
                 found += [(label.start_s, label.stop_s, one, *item) for label in spans]
@@ -217,9 +217,9 @@ def interactions_of(labels: Labels) -> Interactions:
 
 
 def labels_of(interactions: Interactions, clock: LabelClock) -> Labels:
-    """Each hand's labels; stretches at the same named object that follow each other become one.
+    """Each hand's labels; adjacent intervals on the same named object become one.
 
-    Raises WearcapError where a hand would hold two things at once, or outside the recording.
+    Raises WearcapError where a hand would hold two objects at once, or outside the recording.
     """
     labels: Labels = {}
     rows = list(zip(interactions.start_s.tolist(), interactions.stop_s.tolist(), interactions.hands.tolist(),

@@ -1,6 +1,6 @@
 """Recorded keypoints as CSV: timestamp (s), joint, x, y (pixels) or x, y, z (m, in the world), confidence (0…1).
 
-A row is one joint at one time, in any order. A file holds pixels or places, not both.
+A row is one joint at one time, in any order. A file holds pixels or 3D positions, not both.
 """
 
 from collections.abc import Mapping
@@ -16,14 +16,14 @@ from wearcap.recording.recording import Cue
 
 AXES = "xyz"
 MAX_PLACE = 1e9
-"""Farthest place (m or pixels); larger numbers need not be finite as float32."""
+"""Largest coordinate (m or pixels); larger numbers need not be finite as float32."""
 
 
 def read_keypoints(path: str | Path) -> dict[str, Cue]:
-    """Cues by joint, their times rising. Rows with a confidence of 0 say nothing and are left out.
+    """Cues by joint, with rising times. Rows with a confidence of 0 carry no information and are dropped.
 
     Raises WearcapError for a missing column, a field that is no number, a time, place or confidence that cannot be one,
-    and a joint that is twice at one time. Whether a skeleton has the joints is not asked here.
+    and a joint that occurs twice at one time. Whether a skeleton has the joints is not checked here.
     """
     axes = list(AXES if "z" in read_header(path) else AXES[:2])
     table = read_columns(path, ["timestamp", *axes, "confidence"], text=["joint"])
@@ -50,7 +50,7 @@ def read_keypoints(path: str | Path) -> dict[str, Cue]:
 
 
 def write_keypoints(cues: Mapping[str, Cue], path: str | Path) -> None:
-    """Write cues atomically, row by row as time goes on; what has no confidence is left out.
+    """Write cues atomically, rows sorted by time; cues without confidence are left out.
 
     Raises WearcapError when nothing is left, for two cues of one joint, and for pixels beside places.
     """

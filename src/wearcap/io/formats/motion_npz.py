@@ -1,4 +1,4 @@
-"""Our own motion file: one .npz that holds a Motion exactly, readable with nothing but NumPy.
+"""wearcap's motion file: one .npz that holds a Motion exactly, readable with NumPy alone.
 
 Arrays by the Motion's field names (`timestamps`, `R_parent_joint`, `skeleton.t_parent_joint`, …), `wearcap` (JSON with
 everything that is no array), and for tools that know AMASS' keys `trans`, `poses` (axis-angle of each joint in its
@@ -69,7 +69,7 @@ def _damaged(error: Exception, path: str | Path) -> WearcapError:
 
 
 def _check(motion: Motion, path: str | Path) -> None:
-    """What the container's annotations promise, for a file that may say anything."""
+    """Check the shapes and types of the container's annotations, for a file with arbitrary content."""
     if not isinstance(motion, Motion):
         raise WearcapError("holds no motion", where=path)
     skeleton = motion.skeleton

@@ -23,7 +23,7 @@ _EXAMPLE = (
 
 
 def read_photos(folder: str | Path) -> list[Photo]:
-    """Photos of a scene's folder, their files as paths; that these exist is checked by who opens them.
+    """Photos of a scene's folder, with files as paths; whether these exist is checked when they are opened.
 
     Raises WearcapError when `photos.json` is missing or not as `write_photos` writes it, naming the photo.
     """
