@@ -1,6 +1,6 @@
 """`wearcap calibrate`: a video or pictures of a checkerboard go in; a camera's intrinsics come out.
 
-`wearcap calibrate steps=watches` calibrates what MocapEvery's wearer has on: watches and head camera.
+`wearcap calibrate steps=watches` calibrates MocapEvery's sensors: watches and head camera.
 """
 
 from dataclasses import asdict
@@ -21,7 +21,7 @@ HELP = (
     "watches: wearcap calibrate steps=watches left=LEFT.csv right=RIGHT.csv --guide"
 )
 ENOUGH = 0.6
-"""Coverage below which the user is told of it."""
+"""Coverage below which a hint is printed."""
 
 
 def run(config: DictConfig) -> Calibration:

@@ -16,7 +16,7 @@ HELP = "make a data set: wearcap prepare simulated, wearcap prepare cmu source=D
 
 
 def run(config: DictConfig) -> Report:
-    """Prepare what the config describes: recordings by `tasks`, or by `rework` a change to a data set that stands."""
+    """Run the config's preparation: recordings by `tasks`, or by `rework` a change of an existing data set."""
     if "rework" in config:
         report = instantiate(config.rework, _convert_="all")
         _tell(report, RecordingStore.open(config.output))
@@ -56,7 +56,7 @@ def sources() -> dict[str, Path]:
 
 
 def usage() -> str:
-    """What can be prepared."""
+    """Help text that lists the sources."""
     lines = ["usage: wearcap prepare SOURCE [key=value …]     wearcap prepare SOURCE --help", ""]
     for name, path in sources().items():
         about = next(line[2:] for line in path.read_text(encoding="utf-8").splitlines()
@@ -81,9 +81,7 @@ def main(arguments: list[str]) -> None:
         overrides = [f"prepare={source}", *(argument for argument in arguments if argument != source)]
         with explained("prepare", overrides):
             config = compose("prepare", overrides)
-            OmegaConf.to_container(
-                config, resolve=True, throw_on_missing=True
-            )  # what lacks a value is said here
+            OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # a missing value raises here
             report = run(config)
         if report.failed:
             sys.exit(1)

@@ -157,7 +157,7 @@ def check_knees(stream: str, motion: Motion, parts: Landmarks) -> list[Finding]:
         hip, knee, ankle = (position[:, joint] for joint in parts.limb[f"{side}_leg"])
         thigh, shank = (torch.nn.functional.normalize(v, dim=-1) for v in (knee - hip, ankle - knee))
         bent = (thigh * shank).sum(-1) < math.cos(math.radians(25))
-        # Flexion turns the shank about the axis to the left, so thigh × shank points to the right of the body.
+        # Flexion rotates the shank about the axis to the left, so thigh × shank points to the right of the body.
         wrong = (torch.linalg.cross(thigh, shank) * torch.nn.functional.normalize(across, dim=-1)).sum(
             -1
         ) < -0.2

@@ -20,7 +20,7 @@ from wearcap.simulation.surround import surround
 from wearcap.simulation.world import World
 
 TURNS, DOWN_DEG, VIEW_S = 12, (0.0, 38.0), 0.25
-"""Steps and duration (s) of each of the wearer's two turns before the recording, looking ahead and then down."""
+"""Steps per turn, pitch of each turn (°), duration of a step (s) of the wearer's turns on the spot before the recording."""
 
 
 @dataclass(frozen=True)
