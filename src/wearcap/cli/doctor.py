@@ -11,7 +11,7 @@ from rich.text import Text
 
 from wearcap.doctor import Report, examine
 
-HELP = "say what a recording holds, what looks wrong in it, and how to mend it"
+HELP = "report what a recording holds, what looks wrong in it, and how to fix it"
 _COLOR = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
 
 

@@ -27,8 +27,8 @@ class Finding:
 
 def refusal(error: WearcapError, check: str = "reading") -> Finding:
     """A reader's error as a finding."""
-    mend = " ".join(filter(None, [error.expected and f"Expected {error.expected}.", error.fix]))
-    return Finding("error", check, error.what, str(error.where or ""), mend)
+    fix = " ".join(filter(None, [error.expected and f"Expected {error.expected}.", error.fix]))
+    return Finding("error", check, error.what, str(error.where or ""), fix)
 
 
 @dataclass(frozen=True)

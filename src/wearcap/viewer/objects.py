@@ -1,4 +1,4 @@
-"""Objects of an interactive environment as they are shown: posed meshes, and a layer of the page."""
+"""Display of an interactive environment's objects: posed meshes, and a layer of the page."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,16 +24,16 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
 
 CLOUD_BALLS, CLOUD_BALL_M = 1500, 0.012
-"""A cloud without faces is shown as so many small balls."""
+"""Number and radius (m) of small balls that show a cloud without faces."""
 
 
 def pose_at(track: Trajectory | None, item: SceneObject, time_s: float) -> Rigid:
-    """Where an object is shown: its pose at the nearest frame of its track, or the initial one without a track."""
+    """Displayed pose of an object: at the nearest frame of its track, or the initial pose without a track."""
     return poses_at(track, item, torch.tensor([time_s], dtype=torch.float64))[0]
 
 
 def poses_at(track: Trajectory | None, item: SceneObject, times: Float64[Tensor, "time"]) -> Rigid:
-    """`pose_at` of many times (s)."""
+    """`pose_at` for many times (s)."""
     if track is None or not len(track):
         T = item.T_world_object
         return Rigid(T.R.expand(len(times), 3, 3), T.t.expand(len(times), 3))
@@ -51,20 +51,20 @@ def shown_mesh(item: SceneObject) -> Mesh:
 
 
 def posed_meshes(environment: Environment, tracks: dict[str, Trajectory], time_s: float) -> list[Mesh]:
-    """All objects at a time (s), in the world."""
+    """Meshes of all objects at a time (s), in the world."""
     return [
         moved(shown_mesh(item), pose_at(tracks.get(item.name), item, time_s)) for item in environment.objects
     ]
 
 
 def moved(mesh: Mesh, T_world_object: Rigid) -> Mesh:
-    """A mesh of an object's axes in the world."""
+    """A mesh transformed from an object's axes to the world."""
     R, t = T_world_object.R.double().numpy(), T_world_object.t.double().numpy()
     return replace(mesh, vertices=(mesh.vertices @ R.T + t).astype(np.float32))
 
 
 def with_objects(recording: Recording, environment: Environment | None = None) -> Motion | None:
-    """The true motion with the true objects, hands and contact points, for viewers that show one motion each."""
+    """The true motion with the true objects, hand contacts and contact points, for viewers of single motions."""
     truth = recording.motion
     if truth is None:
         return None
@@ -81,7 +81,7 @@ def true_body_contact(
 ) -> Float[Tensor, "time point"] | None:
     """1 where a contact point of the body is within `TOUCH_M` of the active object's surface, else 0.
 
-    None where nothing tells which object is active, and for bodies that are no human's.
+    None if the recording does not state which object is active, and for bodies that are not human.
     """
     if recording.interactions is None and len(recording.object_motion) != 1:
         return None
@@ -106,7 +106,7 @@ def true_body_contact(
 def _touches(
     environment: Environment, item: SceneObject, places: Float[Tensor, "time point 3"], T_world_object: Rigid
 ) -> Bool[Tensor, "time point"]:
-    """Whether points of the world (m) touch an object; only those inside the ball around it are measured."""
+    """Whether points of the world (m) touch an object; only those inside its bounding sphere are measured."""
     low, high = torch.from_numpy(np.stack([item.mesh.vertices.min(0), item.mesh.vertices.max(0)]))
     middle = T_world_object.R @ ((low + high) / 2).to(T_world_object.R) + T_world_object.t
     radius = (high - low).norm() / 2
@@ -125,7 +125,7 @@ class ObjectsLayer:
         self, server: viser.ViserServer, name: str, objects: Sequence[SceneObject], tracks: dict[str, Trajectory],
         tint: tuple[int, int, int] | None = None,
     ):  # fmt: skip
-        """`tint`: RGB (0…255) that the objects' own colours are mixed with half and half."""
+        """`tint` is the RGB colour (0…255) that the objects' own colours are mixed with equally."""
         self.objects, self.tracks, self.offset = tuple(objects), tracks, np.zeros(3)
         self.handles = []
         for item in self.objects:

@@ -115,7 +115,7 @@ def _check_gravity(gravity: np.ndarray, up: str, where: str | Path) -> None:
         sign = "-" if upward["xyz".index(axis)] < 0 else "+"
         raise WearcapError(
             f"gravity {mean.round(2).tolist()} says that {sign}{axis} is up", where=where, expected=f"+{up} up",
-            fix="Read it with up='y'." if (axis, sign) == ("y", "+") else "Turn the world, or mend gravity's sign.",
+            fix="Read it with up='y'." if (axis, sign) == ("y", "+") else "Rotate the world, or fix gravity's sign.",
         )  # fmt: skip
 
 
