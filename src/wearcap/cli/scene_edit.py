@@ -10,8 +10,8 @@ from wearcap.errors import WearcapError
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="wearcap scene edit",
-        description="Make an interactive environment of a scan, in the browser: cut objects out, say how they "
-        "move, try it. It saves itself; opened again, it goes on.",
+        description="Make an interactive environment of a scan, in the browser: cut objects out, set how they "
+        "move, try it. It saves automatically; opened again, it continues.",
     )
     parser.add_argument("scene", help="the scene's folder with pointcloud.ply, or a .ply or .pcd file")
     parser.add_argument(

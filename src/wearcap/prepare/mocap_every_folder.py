@@ -85,7 +85,7 @@ def _alignment(read: MocapEveryFolder, settings: MocapEverySettings, folder: Pat
     """Scale and T_world_slam from the calibration board, or from a given scale and a level first pose."""
     if settings.scale is None:
         if read.board is None:
-            raise WearcapError("it does not say how long a unit of SLAM is", where=folder,
+            raise WearcapError("it does not define the length of a unit of SLAM", where=folder,
                                expected="cam_scale_origin in config.yaml, and x and y in camera_calib.pkl",
                                fix="Measure it, and give scale=METRES_PER_UNIT.")  # fmt: skip
         board = read.board

@@ -85,7 +85,7 @@ def on_level_ground(take: OneObject, limits: CleaningLimits) -> OneObject:
     R = ground_rotation(positions[speed < limits.contact_speed])
     tilt = float(torch.rad2deg(torch.arccos(R[2, 2].clamp(max=1.0))))
     if tilt > MAX_TILT_DEG:
-        raise WearcapError(f"the ground beneath the feet leans by {tilt:.0f}°", where=take.name,
+        raise WearcapError(f"the ground below the feet is tilted by {tilt:.0f}°", where=take.name,
                            expected=f"at most {MAX_TILT_DEG:g}°", fix="Check which of the source's axes is up.")  # fmt: skip
     motion = replace(motion, provenance=motion.provenance | {"tilt_deg": f"{tilt:.2f}"})
     return replace(take, motion=motion).turned(R)

@@ -39,7 +39,7 @@ class _Shown:
     node: viser.PointCloudHandle | viser.MeshHandle
     label: viser.LabelHandle
     points: Float[np.ndarray, "shown 3"]
-    """World axes, for picking."""
+    """Points in world coordinates (m), for picking."""
 
 
 class EditorView:

@@ -102,7 +102,7 @@ def read_hps_sequence(root: str | Path, name: str, camera_hz: float | int = FPS)
     if localization_path is not None:
         localization = read_hps_localization(localization_path, camera_hz)
         if cam_start >= len(localization.timestamps):
-            raise WearcapError(f"cam_start {cam_start} lies beyond the {len(localization.timestamps)} localised frames", where=starts)  # fmt: skip
+            raise WearcapError(f"cam_start {cam_start} is beyond the {len(localization.timestamps)} localised frames", where=starts)  # fmt: skip
         localization = replace(localization, timestamps=localization.timestamps - cam_start / camera_hz)
         _warn_if_apart(motion, localization, motion_path)
     scan = _one(root, *(f"{depth}{scan_name(name)}/{CLOUD}" for depth in ("", "*/", "*/*/")))
@@ -142,7 +142,7 @@ def _suit(root: Path, name: str) -> Recording | None:
 def _with_suit(recording: Recording, suit: Recording, imu_start: int) -> Recording:
     assert suit.suit is not None
     if imu_start >= len(suit.suit):
-        raise WearcapError(f"imu_start {imu_start} lies beyond the suit's {len(suit.suit)} frames",
+        raise WearcapError(f"imu_start {imu_start} is beyond the suit's {len(suit.suit)} frames",
                            where=recording.name)  # fmt: skip
     clap_s = suit.suit.timestamps[imu_start]
 

@@ -114,7 +114,7 @@ def _check_gravity(gravity: np.ndarray, up: str, where: str | Path) -> None:
         axis = "xyz"[int(np.abs(upward).argmax())]
         sign = "-" if upward["xyz".index(axis)] < 0 else "+"
         raise WearcapError(
-            f"gravity {mean.round(2).tolist()} says that {sign}{axis} is up", where=where, expected=f"+{up} up",
+            f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up", where=where, expected=f"+{up} up",
             fix="Read it with up='y'." if (axis, sign) == ("y", "+") else "Rotate the world, or fix gravity's sign.",
         )  # fmt: skip
 

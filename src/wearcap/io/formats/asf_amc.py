@@ -374,7 +374,7 @@ def _layout_joints(path: Path, asf: AsfSkeleton, start: int, first: list[tuple[i
                                expected="bones of the skeleton, once per frame", fix="Check that AMC and ASF belong together.")  # fmt: skip
         if len(values) != (expected := len(asf.dof[asf.skeleton.index(name)])):
             raise WearcapError(f"{len(values)} values for {name!r}", where=at_line(path, line),
-                               expected=f"{expected} as the ASF says")  # fmt: skip
+                               expected=f"{expected} as in the ASF")  # fmt: skip
     moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
     if not names or moving - set(names):
         raise WearcapError(f"the first frame lacks {sorted(moving - set(names))[:5]}", where=at_line(path, start),

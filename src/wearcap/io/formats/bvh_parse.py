@@ -160,6 +160,6 @@ def parse_motion(
             break
     if len(values) != count * channels or not values:
         raise odd or WearcapError(
-            f"{rows} frames", where=path, expected=f"{count} frames, as the file says (at least one)"
+            f"{rows} frames", where=path, expected=f"{count} frames, as in the file's header (at least one)"
         )
     return step_s, np.asarray(values).reshape(count, channels)

@@ -142,7 +142,7 @@ def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> Non
         name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
         same = all(abs(a - b) < 1e-3 for a, b in zip(span, (clock.start_s, clock.stop_s)))
     except (KeyError, TypeError) as error:
-        raise WearcapError(f"does not say whose labels it holds ({error})", where=where) from error
+        raise WearcapError(f"does not name the recording of its labels ({error})", where=where) from error
     if name != clock.name or frames != clock.frames or not same:
         raise WearcapError(
             f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s", where=where,
@@ -174,7 +174,7 @@ def _span(pair: Any, clock: LabelClock, label: str, where: str | Path) -> tuple[
         clock.start_s - SLACK_S <= start < clock.stop_s - 1e-9
         and clock.start_s < stop <= clock.stop_s + SLACK_S
     ):
-        raise WearcapError(f"{label} from {start} to {end} s lies outside the recording", where=where,
+        raise WearcapError(f"{label} from {start} to {end} s is outside the recording", where=where,
                            expected=f"times from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
                            fix="Is it the file of another recording?")  # fmt: skip
     return max(float(start), clock.start_s), min(float(stop), clock.stop_s)

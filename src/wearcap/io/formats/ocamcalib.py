@@ -58,7 +58,7 @@ class OCamModel:
             raise WearcapError(f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}",
                                where=where, expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0")  # fmt: skip
         if not (0 <= self.row < self.height and 0 <= self.column < self.width):
-            raise WearcapError(f"its centre, row {self.row:g} and column {self.column:g}, lies outside the image of "
+            raise WearcapError(f"its centre, row {self.row:g} and column {self.column:g}, is outside the image of "
                                f"{self.height} rows and {self.width} columns", where=where,
                                expected="row first, then column")  # fmt: skip
         focal = -self.pol[0]

@@ -89,7 +89,7 @@ def _row_type(header: dict[str, list[str]], path: str | Path) -> np.dtype:
 
 def _require(complete: bool, path: str | Path) -> None:
     if not complete:
-        raise WearcapError("it holds fewer points than its header says", where=path,
+        raise WearcapError("it holds fewer points than its header states", where=path,
                            fix="The file was cut short: copy it again.")  # fmt: skip
 
 
@@ -101,7 +101,7 @@ def _ascii_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path)
             warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
             rows = np.loadtxt(lines, dtype=dtype, ndmin=1, comments=None)
     except (ValueError, OverflowError) as error:
-        raise WearcapError(f"a row is not as the header says ({error})"[:200], where=path) from error
+        raise WearcapError(f"a row does not match the header ({error})"[:200], where=path) from error
     _require(len(rows) == count, path)
     return rows
 

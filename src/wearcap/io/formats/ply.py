@@ -146,7 +146,7 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
 
 def _cut_short(path: str | Path, element: _Element) -> WearcapError:
     return WearcapError(f"it ends inside its {element.count} {element.name} rows", where=path,
-                        expected="as many rows as the header says", fix="The file was cut short: copy it again.")  # fmt: skip
+                        expected="as many rows as the header states", fix="The file was cut short: copy it again.")  # fmt: skip
 
 
 def _read_binary(elements: list[_Element], data: bytes, start: int, order: str, path) -> dict[str, dict]:
@@ -245,7 +245,7 @@ def _read_ascii(elements: list[_Element], body: memoryview, path) -> dict[str, d
             table, rows = (_ascii_lists if listed else _ascii_table)(element, lines)
         except (ValueError, IndexError, OverflowError) as error:
             raise WearcapError(
-                f"a {element.name} row is not as the header says ({error})"[:200], where=path
+                f"a {element.name} row does not match the header ({error})"[:200], where=path
             ) from error
         if rows < element.count:
             raise _cut_short(path, element)
