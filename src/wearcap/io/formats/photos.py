@@ -41,7 +41,7 @@ def read_photos(folder: str | Path) -> list[Photo]:
 
 
 def write_photos(photos: list[Photo], folder: str | Path) -> None:
-    """Write `photos.json`. Raises WearcapError for an image file that lies outside the folder."""
+    """Write `photos.json`. Raises WearcapError for an image file outside the folder."""
     folder = Path(folder)
     rows = []
     for photo in photos:
