@@ -82,7 +82,7 @@ def run(config: DictConfig) -> WornCalibration | None:
                            fix="Give them as " + " ".join(f"{key}=[…]" for key in missing) + ".")  # fmt: skip
     recording = None if config.recording is None else _base(Path(config.recording))
     found, checks = _measured(config, logs)
-    _tell(checks)
+    _show_report(checks)
     require(checks)
     write_watch_calibration(found, config.output, checks, _about(config))
     show(f"calibration: {escape(str(config.output))}")
@@ -127,7 +127,7 @@ def _measured(config: DictConfig, logs: Logs) -> tuple[WornCalibration, list[Ste
     limits = instantiate(config.watch_limits)
     checks = watch_checks(watches, limits)
     if not all(check.ok for check in checks):
-        _tell(checks)
+        _show_report(checks)
     # Swings of a wrongly calibrated watch would mislead.
     require_watches(logs.watches, watches, t_pose, limits)
     camera, head, clocks = None, None, {}
@@ -203,7 +203,7 @@ def _store(found: WornCalibration, logs: Logs, recording: Recording, where: Path
         store.add(recording, split=entry.split, config_hash=entry.config_hash)
 
 
-def _tell(checks: Sequence[StepCheck]) -> None:
+def _show_report(checks: Sequence[StepCheck]) -> None:
     table = Table()
     for column in ("step", "", "measured", "limit", "ok"):
         table.add_column(column, justify="right" if column in ("measured", "limit") else "left")

@@ -19,7 +19,7 @@ def run(config: DictConfig) -> Report:
     """Run the config's preparation: recordings by `tasks`, or by `rework` a change of an existing data set."""
     if "rework" in config:
         report = instantiate(config.rework, _convert_="all")
-        _tell(report, RecordingStore.open(config.output))
+        _show_report(report, RecordingStore.open(config.output))
         return report
     listed = splits_dir() / config.splits
     splits = read_splits(listed if listed.is_file() else Path(config.splits))
@@ -28,11 +28,11 @@ def run(config: DictConfig) -> Report:
         tasks, config.output, jobs=config.jobs, backend=config.backend, scheduler=config.scheduler,
         overwrite=config.overwrite,
     )  # fmt: skip
-    _tell(report, RecordingStore.open(config.output))
+    _show_report(report, RecordingStore.open(config.output))
     return report
 
 
-def _tell(report: Report, store: RecordingStore) -> None:
+def _show_report(report: Report, store: RecordingStore) -> None:
     for name, note in sorted(report.notes.items()):
         print(f"{name}: {note}")
     for name, reason in sorted(report.failed.items()):

@@ -52,7 +52,7 @@ def run(config: DictConfig) -> VisualMap:
         localizer = Localizer(made, extractor, matcher, instantiate(config.localizer), descriptor=descriptor)
         _check(localizer, [photos[number] for number in held_out])
         made = extended(made, *_part(photos, source, held_out), extractor, **options)
-    _tell(made)
+    _show_report(made)
     made.save(config.output)
     show(f"map: {config.output}")
     return made
@@ -63,7 +63,7 @@ def _part(photos: list[Photo], source: Scan | Tracks, chosen: np.ndarray) -> tup
     return [photos[number] for number in chosen], part
 
 
-def _tell(made: VisualMap) -> None:
+def _show_report(made: VisualMap) -> None:
     counts = np.diff(made.first)
     low, high = (reduce(made.t_world_cam, 0) for reduce in (np.min, np.max))
     table = Table(show_header=False)

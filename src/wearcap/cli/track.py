@@ -57,7 +57,7 @@ def run(config: DictConfig) -> Track:
         with _progress() as advance:
             found = track_pictures(config.source, output, settings, camera, advance)
     write_track(found, output, Path(named).name)
-    _tell(found, output)
+    _show_report(found, output)
     return found
 
 
@@ -80,7 +80,7 @@ def _progress() -> Iterator[Advance]:
         yield advance
 
 
-def _tell(found: Track, output: Path) -> None:
+def _show_report(found: Track, output: Path) -> None:
     show(f"{found.placed} of {found.pictures} pictures placed, {len(found.points_world)} points, reprojection "
          f"{found.reprojection_px:.2f} px; scale and axes are arbitrary")  # fmt: skip
     for start, stop, bridged in found.gaps_s:

@@ -46,10 +46,10 @@ def check_head_against_body(head: HeadStream, motion: Motion) -> list[Finding]:
     at = resample(device, body.timestamps[inside])
     T_head_device = Rigid(body.R_world_body[inside].double(), body.t_world_body[inside].double()).inverse() @ Rigid(
         at.R_world_body.double(), at.t_world_body.double())  # fmt: skip
-    return [*findings, _seat(T_head_device, head)]
+    return [*findings, _check_mounting(T_head_device, head)]
 
 
-def _seat(T_head_device: Rigid, head: HeadStream) -> Finding:
+def _check_mounting(T_head_device: Rigid, head: HeadStream) -> Finding:
     mean_R, mean_t = rotation.mean_rotation(T_head_device.R), T_head_device.t.median(0).values
     turn = math.degrees(quantile(rotation.geodesic(T_head_device.R, mean_R.expand_as(T_head_device.R)), 0.9))
     shift = quantile((T_head_device.t - mean_t).norm(dim=-1), 0.9)

@@ -65,7 +65,7 @@ class ObjectEditor:
         self._show_scan()
         self._show_box()
         self._show_objects()
-        self._tell()
+        self._show_status()
 
     @property
     def url(self) -> str:
@@ -325,7 +325,7 @@ class ObjectEditor:
             self._shown, self._changed_at = self.editing.revision, wall.monotonic()
             self._show_scan()
             self._show_objects()
-        self._tell()
+        self._show_status()
 
     def _show_objects(self) -> None:
         """Draw the objects at their poses, and the hinge, slide and handle of the current one."""
@@ -339,7 +339,7 @@ class ObjectEditor:
         by_hand = item is not None and tool == "try" and item.freedom.kind in ("plane", "free")
         self.view.show_try_handle(item if by_hand else None)
 
-    def _tell(self) -> None:
+    def _show_status(self) -> None:
         state = f"saved in {self.file.name}" if self.file.exists() else "nothing to save yet"
         if self.editing.revision is not self._saved:
             state = self._problem or "…"
@@ -363,7 +363,7 @@ class ObjectEditor:
             if revision is not self._saved:
                 write_environment(self.editing.environment, self.file)
                 self._saved, self._problem = revision, ""
-                self._tell()
+                self._show_status()
 
     def run(self, seconds: float = np.inf) -> None:
         """Serve until interrupted, or for the given seconds; changes are saved after a moment of inactivity."""
@@ -374,7 +374,7 @@ class ObjectEditor:
                     self.save()
                 except WearcapError as error:
                     self._problem, not_before = f"**not saved: {error}**", now + TRY_AGAIN_S
-                    self._tell()
+                    self._show_status()
             wall.sleep(0.1)
 
     def stop(self) -> None:

@@ -214,12 +214,12 @@ def _on_device(
         if contacts is None
         else ContactTrack(times, contacts.parts, _nearest(own.timestamps, contacts.contact, times))
     )
-    seat = alignment.T_head_device
+    T_head_device = alignment.T_head_device
     pose = Rigid(
         _resampled_rotations(track.timestamps, track.R_world_body, times),
         interpolate(track.timestamps, track.t_world_body, times),
     )
-    return motion, contact, HeadStream(times, pose.R, pose.t, seat.R, seat.t)
+    return motion, contact, HeadStream(times, pose.R, pose.t, T_head_device.R, T_head_device.t)
 
 
 def _resampled_rotations(

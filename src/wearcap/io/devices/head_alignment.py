@@ -100,11 +100,11 @@ def align_head(
     start, stop = suit.timestamps[shared][0].item(), suit.timestamps[shared][-1].item()
     grid = start + torch.arange(int((stop - start) * _RATE_HZ), dtype=torch.float64) / _RATE_HZ
     head, seen = (_double(resample(track, grid)) for track in (suit, device))
-    R_head_device = _seat_rotation(head.R, seen.R)
+    R_head_device = _mounting_rotation(head.R, seen.R)
     R_apart = seen.R @ R_head_device.mT @ head.R.mT
     yaw, knots = _windowed_yaw(R_apart, grid, window_s)
     R_world_suit = rotation.about_axis("z", _between(knots, yaw, grid))
-    t_seat = _seat_place(
+    t_seat = _mounting_position(
         Rigid(R_world_suit @ head.R, (R_world_suit @ head.t[..., None])[..., 0]), seen, t_head_device.double()
     )
     t_apart = seen.t - (R_world_suit @ (head.t + (head.R @ t_seat))[..., None])[..., 0]
@@ -121,7 +121,7 @@ def _double(track: Trajectory) -> Rigid:
     return Rigid(track.R_world_body.double(), track.t_world_body.double())
 
 
-def _seat_rotation(R_head: Tensor, R_device: Tensor) -> Float64[Tensor, "3 3"]:
+def _mounting_rotation(R_head: Tensor, R_device: Tensor) -> Float64[Tensor, "3 3"]:
     """R_head_device with turn_head = R_head_device · turn_device and up_head = R_head_device · up_device, robustly."""
     step = int(_STEP_S * _RATE_HZ)
     turn_head = rotation.log(R_head[:-step].mT @ R_head[step:])
@@ -141,7 +141,7 @@ def _seat_rotation(R_head: Tensor, R_device: Tensor) -> Float64[Tensor, "3 3"]:
     return R
 
 
-def _seat_place(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) -> Float64[Tensor, "3"]:
+def _mounting_position(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) -> Float64[Tensor, "3"]:
     """t_head_device from the device's displacement against the head joint while the head turns (least squares, Huber)."""
     step = int(_STEP_S * _RATE_HZ)
     A = head.R[step:] - head.R[:-step]

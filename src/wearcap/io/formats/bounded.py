@@ -45,7 +45,7 @@ class Budget:
         """Count bytes before or after they are unpacked. Raises WearcapError beyond the limit."""
         self.spent += size
         if self.spent > self.max_bytes:
-            raise WearcapError(f"larger than {_told(self.max_bytes)} once unpacked", where=self.path,
+            raise WearcapError(f"larger than {_size_text(self.max_bytes)} once unpacked", where=self.path,
                                expected="a smaller file", fix=_lift(self.spent))  # fmt: skip
         if self.spent > self._by_ratio:
             raise WearcapError(f"it unpacks to more than {MAX_RATIO} times its size", where=self.path,
@@ -71,7 +71,7 @@ def gib_bytes(text: str, where: str) -> int:
     return int(gib * (1 << 30))
 
 
-def _told(size: int) -> str:
+def _size_text(size: int) -> str:
     for unit, name in ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")):
         if size >= unit:
             return f"{size / unit:.4g} {name}"

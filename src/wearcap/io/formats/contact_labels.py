@@ -195,17 +195,19 @@ def interactions_of(labels: Labels) -> Interactions:
     """Labels as interactions: hands on the same named object share one; a new one starts when the hands change."""
     found: list[tuple[float, float, tuple[bool, ...], str, str]] = []
     for item in {(label.object, label.contact_class) for hand in HANDS for label in labels[hand]}:
-        held = [
+        by_hand = [
             [label for label in labels[hand] if (label.object, label.contact_class) == item] for hand in HANDS
         ]
         if not item[0]:  # two hands on unknown objects need not hold the same one
-            for number, spans in enumerate(held):
+            for number, spans in enumerate(by_hand):
                 one = tuple(other == number for other in range(len(HANDS)))
                 found += [(label.start_s, label.stop_s, one, *item) for label in spans]
             continue
-        edges = sorted({edge for spans in held for label in spans for edge in (label.start_s, label.stop_s)})
+        edges = sorted(
+            {edge for spans in by_hand for label in spans for edge in (label.start_s, label.stop_s)}
+        )
         for start, stop in itertools.pairwise(edges):
-            hands = tuple(any(s.start_s <= start < s.stop_s for s in spans) for spans in held)
+            hands = tuple(any(s.start_s <= start < s.stop_s for s in spans) for spans in by_hand)
             if any(hands):
                 found.append((start, stop, hands, *item))
     found.sort(key=lambda row: row[0])

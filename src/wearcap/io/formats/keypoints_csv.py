@@ -30,12 +30,12 @@ def read_keypoints(path: str | Path) -> dict[str, Cue]:
     times, confidence = table["timestamp"], table["confidence"]
     points = np.stack([table[axis] for axis in axes], -1)
     joints = np.char.strip(np.char.decode(table["joint"], "latin-1"))
-    said = confidence != 0
+    observed = confidence != 0
     for wrong, what, expected in (
         (~np.isfinite(times), "a timestamp that is no time", "seconds"),
         (~((confidence >= 0) & (confidence <= 1)), "a confidence that is none", "0 to 1"),
         (
-            said & ~(np.abs(points) <= MAX_PLACE).all(-1),
+            observed & ~(np.abs(points) <= MAX_PLACE).all(-1),
             "a place that is none",
             "numbers, or a confidence of 0",
         ),
@@ -44,8 +44,8 @@ def read_keypoints(path: str | Path) -> dict[str, Cue]:
         if wrong.any():
             raise WearcapError(what, where=f"{path}, row {int(wrong.argmax()) + 1} after the header", expected=expected)  # fmt: skip
     return {
-        str(joint): _cue(path, str(joint), *(part[said & (joints == joint)] for part in (times, points, confidence)))
-        for joint in np.unique(joints[said])
+        str(joint): _cue(path, str(joint), *(part[observed & (joints == joint)] for part in (times, points, confidence)))
+        for joint in np.unique(joints[observed])
     }  # fmt: skip
 
 
@@ -60,9 +60,11 @@ def write_keypoints(cues: Mapping[str, Cue], path: str | Path) -> None:
                            expected="pixels or places, one cue per joint")  # fmt: skip
     rows = []
     for cue in cues.values():
-        said = (cue.confidence > 0) & cue.points.isfinite().all(-1)
+        observed = (cue.confidence > 0) & cue.points.isfinite().all(-1)
         for time, point, confidence in zip(
-            cue.timestamps[said].tolist(), cue.points[said].tolist(), cue.confidence[said].tolist()
+            cue.timestamps[observed].tolist(),
+            cue.points[observed].tolist(),
+            cue.confidence[observed].tolist(),
         ):
             rows.append((time, cue.joint, [*point, confidence]))
     if not rows:

@@ -112,20 +112,20 @@ def _check(motion: Motion, path: str | Path) -> None:
         raise TypeError("provenance that is no text")
 
 
-def _check_interactions(held: Interactions, path: str | Path) -> None:
-    if not isinstance(held, Interactions) or held.hands.dtype != torch.bool:
+def _check_interactions(interactions: Interactions, path: str | Path) -> None:
+    if not isinstance(interactions, Interactions) or interactions.hands.dtype != torch.bool:
         raise TypeError("interactions that are none")
     arrays = {
-        "start_s": held.start_s.numpy(),
-        "stop_s": held.stop_s.numpy(),
-        "hands": held.hands.numpy().astype(np.uint8),
+        "start_s": interactions.start_s.numpy(),
+        "stop_s": interactions.stop_s.numpy(),
+        "hands": interactions.hands.numpy().astype(np.uint8),
     }
     count = require(
         arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS))
     )["interval"]
-    if {held.start_s.dtype, held.stop_s.dtype} != {torch.float64}:
+    if {interactions.start_s.dtype, interactions.stop_s.dtype} != {torch.float64}:
         raise TypeError("times of interactions of another number type")
-    for names in (held.objects, held.classes):
+    for names in (interactions.objects, interactions.classes):
         if (
             not isinstance(names, tuple)
             or len(names) != count
