@@ -1,8 +1,8 @@
 """SHA-256 of files, computed once per file and remembered by its size, time and inode.
 
-What is remembered lies in the user's cache folder, so that a data set is hashed when it is first used and not again by
-every process that opens it. A file whose bytes change without its time changing (a failing disk) is noticed by
-`wearcap doctor`, which hashes every file anew.
+The cache is in the user's cache folder, so that a data set is hashed when it is first used and not again by every
+process that opens it. A file whose bytes change without its time changing (a failing disk) is detected by
+`wearcap doctor`, which rehashes every file.
 """
 
 import json
@@ -14,15 +14,15 @@ from pathlib import Path
 from wearcap.files import sha256_of
 
 SETTLED_S = 2.0
-"""Files younger than this are hashed every time: a file system's clock may not tell two writes apart."""
+"""Age (s) below which files are hashed every time: a file system's clock may not separate two writes."""
 MAX_LEDGER_BYTES = 1 << 26
-"""Size (64 MiB, some 300,000 files) beyond which what is remembered is forgotten, and begun anew."""
+"""Size (64 MiB, some 300,000 files) beyond which the cache is cleared."""
 
 Key = tuple[str, int, int, int]
 
 
 def remembered_sha256(path: str | Path) -> str:
-    """Hex digest of a file's bytes, from memory where the file has been hashed before and looks the same.
+    """Hex digest of a file's bytes, from the cache if the file has been hashed before and looks the same.
 
     Raises OSError when it cannot be read.
     """
@@ -38,7 +38,7 @@ def remembered_sha256(path: str | Path) -> str:
 
 
 def cache_folder() -> Path:
-    """Where what can be made anew is kept: $WEARCAP_CACHE, else `wearcap` in the user's cache folder."""
+    """Folder of data that can be recomputed: $WEARCAP_CACHE, else `wearcap` in the user's cache folder."""
     if chosen := os.environ.get("WEARCAP_CACHE"):
         return Path(chosen)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wearcap"
@@ -55,7 +55,7 @@ def _ledger_path() -> Path:
 
 @cache
 def _ledger() -> dict[Key, str]:
-    """What earlier processes remembered; lines that are cut short or foreign count for nothing."""
+    """Digests cached by earlier processes; truncated or foreign lines are ignored."""
     known: dict[Key, str] = {}
     path = _ledger_path()
     try:
@@ -73,7 +73,7 @@ def _ledger() -> dict[Key, str]:
 
 
 def _append(key: Key, digest: str) -> None:
-    """Add a line in one write, which other processes' lines do not mix with; without a cache folder, memory serves."""
+    """Append a line in one write, so that lines of other processes do not mix with it; without a cache folder, only memory."""
     try:
         path = _ledger_path()
         path.parent.mkdir(parents=True, exist_ok=True)

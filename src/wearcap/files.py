@@ -28,10 +28,10 @@ MAX_JSON_DEPTH = 64
 """Deepest nesting of JSON that is read; what wearcap writes stays below 16."""
 
 LOCK = ".wearcap.lock"
-"""File in a folder that one process writes into, locked by it; it says who."""
+"""Lock file in a folder that one process writes into; it names that process."""
 
 LOCK_PATIENCE_S, ORPHANS_PATIENCE_S = 2.0, 20.0
-"""How long to wait for a lock that is held, and for one that only workers of a process that has ended hold still."""
+"""Time (s) to wait for a lock that is taken, and for one that only workers of an ended process still hold."""
 
 _TEMPORARY = re.compile(r"\..+\.tmp-[0-9a-f]{8}(\.[^.]+)?")
 _OF_WRITES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
@@ -41,9 +41,9 @@ _OF_WRITES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it is synced and renamed there, on failure removed.
 
-    The temporary file is locked while it is written, so that `remove_leftovers` can tell it from one whose writer was
-    killed; the first write into a folder removes those. Raises WearcapError when the disk is full or the folder cannot
-    be written; other errors of the `with` body, as of a source that it reads, pass as they are.
+    The temporary file is locked while it is written, so that `remove_leftovers` can distinguish it from one whose writer
+    was killed; the first write into a folder removes those. Raises WearcapError when the disk is full or the folder cannot
+    be written; other errors of the `with` body, such as those of a source that it reads, pass unchanged.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.tmp-{uuid.uuid4().hex[:8]}{path.suffix}")
@@ -69,9 +69,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def _explaining(path: Path, only_about: tuple[Path, ...] | None = None) -> Iterator[None]:
-    """Turn an OSError into one that says why `path` cannot be written.
+    """Turn an OSError into a WearcapError with the reason why `path` cannot be written.
 
-    With `only_about`, only errors that name one of those paths, or name none and can only be a write's.
+    With `only_about`, only errors that name one of those paths, or that name none and can only come from a write.
     """
     try:
         yield
@@ -108,7 +108,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _claim(temporary: Path) -> int | None:
-    """Create the file and hold a lock on it; the descriptor, or None where files cannot be locked."""
+    """Create and lock the file; returns the descriptor, or None where files cannot be locked."""
     if fcntl is None:
         return None
     while True:
@@ -124,10 +124,10 @@ def _claim(temporary: Path) -> int | None:
 
 
 def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
-    """Remove temporary files of `atomic_path` whose writer was killed, from a folder or with `below` from all in it.
+    """Remove temporary files of `atomic_path` whose writer was killed, from a folder or, with `below`, from its subfolders too.
 
-    A file whose writer lives is locked by it and stays, and so do files of any other name, and all where the file system
-    has no locks.
+    A file whose writer is alive is locked by it and stays, as do files of any other name, and all files if the file
+    system has no locks.
     """
     for where, _, names in os.walk(folder):
         for name in names:
@@ -143,7 +143,7 @@ def _remove_leftovers_once(folder: str) -> None:
 
 
 def _remove_unless_locked(path: Path) -> None:
-    with suppress(OSError):  # locked, removed by another, or not ours to remove
+    with suppress(OSError):  # locked, removed by another process, or without permission to remove
         if fcntl is None:
             path.unlink()  # Windows refuses this while a writer has it open
             return
@@ -157,11 +157,11 @@ def _remove_unless_locked(path: Path) -> None:
 
 @contextmanager
 def folder_lock(folder: str | Path, purpose: str) -> Iterator[int | None]:
-    """Hold a folder for one writer; readers are not hindered. The lock ends with its process, however that one dies.
+    """Lock a folder for one writer; readers are not affected. The lock ends with its process, however that one dies.
 
     Yields the lock's descriptor: workers that inherit it (`wearcap.workers`) hold the lock until they end, too, so that
-    none writes after another run has taken the folder. Forked children do not hold it. Where the file system has no
-    locks, a warning is given, and None. Raises WearcapError that names the holder when another process has the folder,
+    none writes after another run has taken the folder. Forked children do not hold it. If the file system has no locks,
+    it warns and yields None. Raises WearcapError that names the holder when another process has the folder,
     and when the folder cannot be written.
     """
     path = Path(folder) / LOCK
@@ -206,7 +206,7 @@ def _wait_for_lock(path: Path) -> int | None:
             _lock(descriptor)
             if os.path.samestat(os.fstat(descriptor), path.stat()):
                 return descriptor
-        except (BlockingIOError, FileNotFoundError):  # held, or removed by its holder, which has just ended
+        except (BlockingIOError, FileNotFoundError):  # locked, or removed by its holder, which has just ended
             pass
         except OSError as error:
             os.close(descriptor)
@@ -236,7 +236,7 @@ def _lock(descriptor: int) -> None:
 
 
 def _unlock(path: Path, descriptor: int) -> None:
-    """Remove a lock's file, if it is still the one in the folder, and give the lock up for all who share it."""
+    """Remove a lock's file, if it is still the one in the folder, and release the lock for all processes that share it."""
     with suppress(OSError):
         if fcntl is not None and os.path.samestat(os.fstat(descriptor), path.stat()):
             path.unlink()
@@ -257,7 +257,7 @@ def _lock_on_windows(descriptor: int, mode: int) -> None:
 
 
 def _holder(path: Path) -> dict[str, Any]:
-    """What a lock's file says of its holder; nothing in the moments while it is written."""
+    """Content of a lock's file about its holder; empty while it is being written."""
     try:
         holder = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -266,7 +266,7 @@ def _holder(path: Path) -> dict[str, Any]:
 
 
 def _has_ended(holder: dict[str, Any]) -> bool:
-    """Whether the process that took a lock is known to be no more: workers of it hold the lock still."""
+    """Whether the process that took a lock has certainly ended, while its workers still hold the lock."""
     if os.name != "posix" or holder.get("host") != platform.node() or holder["pid"] <= 0:
         return False
     try:
@@ -300,7 +300,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def parse_json(text: str | bytes, where: str | Path) -> Any:
-    """Content of JSON text that may come from a stranger.
+    """Content of untrusted JSON text.
 
     Raises WearcapError for text that is no JSON, not UTF-8, nested deeper than `MAX_JSON_DEPTH`, or with whole numbers
     beyond 64 bits.

@@ -14,14 +14,14 @@ from multiprocessing import reduction
 from typing import Any
 
 POLL_S = 0.2
-"""How often a worker looks for its parent where the system does not end it by itself."""
+"""Interval (s) at which a worker checks for its parent if the system does not end it by itself."""
 
 _PR_SET_PDEATHSIG = 1
-"""Of linux/prctl.h."""
+"""Constant of linux/prctl.h."""
 
 
 class Inherited:
-    """A file descriptor that a worker process inherits when this is among the arguments that it is started with."""
+    """A file descriptor that a worker process inherits if this object is among its start arguments."""
 
     def __init__(self, descriptor: int | None):
         self.descriptor = descriptor
@@ -36,9 +36,9 @@ def _inherited(shared: Any) -> Inherited:
 
 
 def bound_to_this_process(lock: int | None) -> dict[str, Any]:
-    """What loky's `initializer` and `initargs` must be for workers that end with this process.
+    """Values of loky's `initializer` and `initargs` for workers that end with this process.
 
-    Until they have ended they hold `lock` (`wearcap.files.folder_lock`). The pool must be shut down before the thread
+    Until they end, they hold `lock` (`wearcap.files.folder_lock`). The pool must be shut down before the thread
     that uses it ends: Linux ends a worker with the thread that started it.
     """
     return {"initializer": end_with_parent, "initargs": (os.getpid(), Inherited(lock))}
@@ -47,13 +47,13 @@ def bound_to_this_process(lock: int | None) -> dict[str, Any]:
 def end_with_parent(parent: int, lock: Inherited | None = None) -> None:
     """In a worker: end at once when the parent has ended, whatever this process is doing.
 
-    Linux kills it, even within native code. Elsewhere a thread looks for the parent every `POLL_S`; native code that
+    Linux kills it, even within native code. Elsewhere a thread checks for the parent every `POLL_S`; native code that
     holds Python's lock delays it.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.name == "posix" and os.getppid() != parent:
-        os._exit(1)  # it ended before this was said
+        os._exit(1)  # the parent ended before prctl was called
     if sys.platform != "linux":
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 

@@ -103,7 +103,7 @@ def test_a_ground_that_is_a_wall_is_refused(tmp_path, files, capsys):
     files.write_behave(tmp_path / "in", tilt_deg=42.0)
     with pytest.raises(SystemExit):
         prepared("behave", tmp_path)
-    assert "the ground beneath the feet leans by" in capsys.readouterr().err
+    assert "the ground below the feet is tilted by" in capsys.readouterr().err
 
 
 def test_the_ground_is_found_among_steps_that_are_off_it():

@@ -98,7 +98,7 @@ def test_every_frame_keeps_its_label_through_files_and_interactions(labels):
         (contacts([[1, 3], [2, 4]]), "overlap: one from 1.0 to 3.0 s, the next from 2.0 s"),
         (contacts([[3, 1], [5, 6]]), "overlap: one from 3.0 to the end of the recording"),
         (contacts([[2, 2]]), "left_hand label 0 is empty"),
-        (contacts((), [[8, 11]]), "right_hand label 0 from 8 to 11 s lies outside the recording"),
+        (contacts((), [[8, 11]]), "right_hand label 0 from 8 to 11 s is outside the recording"),
         (contacts([[-3, 1]]), "outside"),
         (contacts([[11, 1]]), "outside"),
         (contacts([[1, "2"]]), "expected|Expected"),
@@ -108,8 +108,8 @@ def test_every_frame_keeps_its_label_through_files_and_interactions(labels):
         (contacts([[1, 2]], objects={"left_hand": []}), "objects of left_hand"),
         (contacts([[1, 2]], classes={"left_hand": ["floating"]}), "class 'floating'"),
         (contacts(recording={"name": "flat_1"}), "schema version None"),
-        (contacts(recording={"name": "flat_1"}, schema_version=1), "whose labels"),
-        (contacts(recording=3, schema_version=1), "whose labels"),
+        (contacts(recording={"name": "flat_1"}, schema_version=1), "does not name the recording"),
+        (contacts(recording=3, schema_version=1), "does not name the recording"),
     ],
 )
 def test_impossible_labels_are_refused(content, message):

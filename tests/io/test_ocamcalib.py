@@ -77,7 +77,7 @@ def test_a_smaller_picture_of_the_same_lens():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"row": 2289.0, "column": 4600.0}, "lies outside the image"),
+        ({"row": 2289.0, "column": 4600.0}, "is outside the image"),
         ({"pol": (1983.0, 0.0, 2e-4)}, "begins with 1983"),
         ({"pol": (-1983.0, 0.0, -2e-2)}, "turns back"),
         ({"invpol": tuple(reversed(lens().invpol))}, "two polynomials differ"),

@@ -156,7 +156,7 @@ DEFECTS = {
     "imu: stale mounting": (lambda r: wrist(r, R_joint_imu=MOUNT @ rotation.about_axis("x", torch.tensor(0.6))), "warning", "imu left_wrist: mounting", "stated mounting"),
     "imu: NaN": (lambda r: wrist(r, gyro_imu=nan_at(r.imu["left_wrist"].gyro_imu, 9)), "error", "imu left_wrist: gyro_imu", "NaN"),
     "points: millimetres": (lambda r: replace(r, points=PointCloud(1000 * r.points.points_world)), "error", "points", "not a surrounding in metres"),
-    "points: elsewhere": (lambda r: replace(r, points=PointCloud(r.points.points_world + torch.tensor([500.0, 0, 0]))), "error", "points: floor", "no points beneath"),
+    "points: elsewhere": (lambda r: replace(r, points=PointCloud(r.points.points_world + torch.tensor([500.0, 0, 0]))), "error", "points: floor", "no points below"),
     "points: y up": (lambda r: replace(r, points=PointCloud(r.points.points_world @ Y_UP.T)), "note", "points: floor", "no clear floor"),
 }  # fmt: skip
 

@@ -58,7 +58,7 @@ def test_a_sound_environment_is_listed():
     ("item", "what", "severity"),
     [
         (thing("chair_9", (0.0009, 0.0006, 0.001), (7.0, 0.0, 0.0)), "the mesh is tiny", "warning"),
-        (thing("chair_9", (20.0, 0.6, 0.8), (0.0, 30.0, 0.0)), "the mesh is larger than a thing", "warning"),
+        (thing("chair_9", (20.0, 0.6, 0.8), (0.0, 30.0, 0.0)), "the mesh is larger than an object", "warning"),
         (thing("sofa_9"), "are at the same place", "warning"),
         (thing("chair_9", (0.4, 0.4, 0.5), (3.0, 0.0, 0.05)), "the first stands within the second's box", "note"),
         (thing("chair_9", at=(9.0, 0.0, -0.5)), "reaches below the floor", "warning"),

@@ -161,12 +161,12 @@ def test_objects_go_with_the_motion_that_moves_them(page):
     page.jump(0.2)
     for name, placed in page.bodies.items():
         wrist = placed.body.motion.joint("left_wrist").t[12].double().numpy()
-        assert [thing.name for thing in placed.objects.things] == ["carried"], name
+        assert [item.name for item in placed.objects.objects] == ["carried"], name
         np.testing.assert_allclose(
             placed.objects.handles[0].position, wrist + placed.body.offset, atol=1e-5, err_msg=name
         )
     still = page.layers[-1]
-    assert [thing.name for thing in still.things] == ["left alone"]
+    assert [item.name for item in still.objects] == ["left alone"]
 
 
 def test_motions_beside_each_other_cover_none(page):

@@ -1,5 +1,5 @@
 """The verbs: one module per verb with `HELP` (one line) and `main(arguments)`.
 
-Open `main.py` first: it finds the verb and ends errors in one line. Hydra is known here alone: `conf.py` composes
-configs, `load.py` makes pipelines of them and of checkpoints.
+Open `main.py` first: it dispatches to the verb and prints errors in one line. Hydra is used only here: `conf.py` composes
+configs, `load.py` builds pipelines from them and from checkpoints.
 """

@@ -55,7 +55,7 @@ def _annotate(options: argparse.Namespace) -> None:
     motion = read_motion(options.motion) if options.motion else None
     desk = Desk.of(options.recording, options.output, motion, options.video, options.video_start)
     if len(desk.names) == 1:
-        desk.file(0).read()  # labels that cannot be read are told here, before a page opens
+        desk.file(0).read()  # unreadable labels raise here, before a page opens
     if options.start:
         _start_from(desk, options.start)
     server = AnnotationServer(desk, options.port)

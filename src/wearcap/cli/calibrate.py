@@ -1,6 +1,6 @@
 """`wearcap calibrate`: a video or pictures of a checkerboard go in; a camera's intrinsics come out.
 
-`wearcap calibrate steps=watches` calibrates what MocapEvery's wearer has on: watches and head camera.
+`wearcap calibrate steps=watches` calibrates MocapEvery's sensors: watches and head camera.
 """
 
 from dataclasses import asdict
@@ -21,7 +21,7 @@ HELP = (
     "watches: wearcap calibrate steps=watches left=LEFT.csv right=RIGHT.csv --guide"
 )
 ENOUGH = 0.6
-"""Coverage below which the user is told of it."""
+"""Coverage below which a hint is printed."""
 
 
 def run(config: DictConfig) -> Calibration:
@@ -29,7 +29,7 @@ def run(config: DictConfig) -> Calibration:
     board = Board(config.columns, config.rows, config.square_m)
     pictures = read_pictures(config.source, config.max_pictures)
     found = calibrate_from_pictures(pictures, board, instantiate(config.settings))
-    _tell(found)
+    _show_report(found)
     write_camera(found.camera, config.output, _about(found, board, str(config.source)))
     show(f"camera: {config.output}")
     return found
@@ -44,7 +44,7 @@ def _about(found: Calibration, board: Board, source: str) -> dict:
     }  # fmt: skip
 
 
-def _tell(found: Calibration) -> None:
+def _show_report(found: Calibration) -> None:
     camera = found.camera
     table = Table(title=f"{len(found.views)} views used, {len(found.rejected)} rejected, of {found.seen} with the board in "
                         f"{found.examined} pictures", title_justify="left")  # fmt: skip

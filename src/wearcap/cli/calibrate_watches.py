@@ -1,4 +1,4 @@
-"""`wearcap calibrate steps=watches`: two watches' logs and a camera's path go in; where all of them are in the world comes out.
+"""`wearcap calibrate steps=watches`: two watches' logs and a camera's path go in; their poses, clocks and scale in the world come out.
 
 The steps are MocapEvery's (appendix C.2): board, T-pose, four camera positions, standing, arm swings.
 """
@@ -54,7 +54,7 @@ STAND_S = 8.0
 
 @dataclass(frozen=True)
 class Logs:
-    """What was recorded, and the moments (s) from which stretches count."""
+    """Recorded logs and camera path, and the times (s) that segments are relative to."""
 
     watches: dict[str, ImuStream]
     watch_zero: float
@@ -63,9 +63,9 @@ class Logs:
 
 
 def run(config: DictConfig) -> WornCalibration | None:
-    """Calibrate from the config's logs and stretches, write calibration.json and, where asked for, a recording.
+    """Calibrate from the config's logs and segments; write calibration.json and, if configured, a recording.
 
-    With `guide`, or when a stretch is missing, says what to do and where the logs seem to have it.
+    With `guide`, or when a segment is missing, prints what to do and where the logs probably contain it.
     """
     if config.steps != "watches":
         raise WearcapError(f"no steps {config.steps!r}", fix=nearest(str(config.steps), ["watches"]))
@@ -82,7 +82,7 @@ def run(config: DictConfig) -> WornCalibration | None:
                            fix="Give them as " + " ".join(f"{key}=[…]" for key in missing) + ".")  # fmt: skip
     recording = None if config.recording is None else _base(Path(config.recording))
     found, checks = _measured(config, logs)
-    _tell(checks)
+    _show_report(checks)
     require(checks)
     write_watch_calibration(found, config.output, checks, _about(config))
     show(f"calibration: {escape(str(config.output))}")
@@ -102,7 +102,7 @@ def _read(config: DictConfig) -> Logs:
 
 
 def _stretch(config: DictConfig, key: str, zero: float, place: int | None = None) -> Stretch:
-    """A stretch of the config on the log's clock."""
+    """A segment of the config on the log's clock."""
     value = config[key] if place is None else config[key][place]
     try:
         start, stop = (float(number) + zero for number in value)
@@ -127,8 +127,8 @@ def _measured(config: DictConfig, logs: Logs) -> tuple[WornCalibration, list[Ste
     limits = instantiate(config.watch_limits)
     checks = watch_checks(watches, limits)
     if not all(check.ok for check in checks):
-        _tell(checks)
-    # Swings of a watch that is calibrated wrongly would only confuse.
+        _show_report(checks)
+    # Swings of a wrongly calibrated watch would mislead.
     require_watches(logs.watches, watches, t_pose, limits)
     camera, head, clocks = None, None, {}
     if logs.slam is not None:
@@ -152,7 +152,7 @@ def _camera(config: DictConfig, slam: Trajectory, zero: float) -> tuple[SlamAlig
 
 
 def _clock(config: DictConfig, logs: Logs, watch: ImuStream, t_pose: Stretch) -> SwingClock:
-    """The clock of the camera and one watch, found from times after both logs' beginnings."""
+    """Clock relation of the camera and one watch, from times after both logs have begun."""
     start, stop = t_pose[1], watch.timestamps[-1].item()
     if config.swings_in is not None:
         start, stop = _stretch(config, "swings_in", logs.watch_zero)
@@ -164,7 +164,7 @@ def _clock(config: DictConfig, logs: Logs, watch: ImuStream, t_pose: Stretch) ->
 
 
 def _about(config: DictConfig) -> dict[str, Any]:
-    """What the calibration was made from."""
+    """Provenance of the calibration: its input files and settings."""
     keys = ("board", "tpose", "swings_in", "marks", "distances_m", "mark_height_m", "standing", "facing_deg", "swings", "camera_fps")  # fmt: skip
     given = OmegaConf.to_container(OmegaConf.masked_copy(config, [*keys]))
     assert isinstance(given, dict)
@@ -180,7 +180,7 @@ def _base(where: Path) -> Recording:
 
 
 def _store(found: WornCalibration, logs: Logs, recording: Recording, where: Path) -> None:
-    """Put the calibrated streams into a recording, in its data set or in a file of its own."""
+    """Add the calibrated streams to a recording, in its data set or in a separate file."""
     imu = {}
     for joint, stream in logs.watches.items():
         imu[joint] = found.watches[joint].apply(stream)
@@ -191,7 +191,7 @@ def _store(found: WornCalibration, logs: Logs, recording: Recording, where: Path
     recording = replace(recording, imu=recording.imu | imu)
     if logs.slam is not None and found.camera is not None and found.head is not None:
         head = found.head.apply(found.camera.apply(logs.slam))
-        # The world's zero is the floor that the wearer stands on: MocapEvery's h_0.
+        # The world's z = 0 is the floor that the wearer stands on: MocapEvery's h_0.
         floor = recording.floor or FloorTrack(head.timestamps[:1], torch.zeros(1))
         recording = replace(recording, head=head, floor=floor)
     if where.suffix == ".safetensors":
@@ -203,7 +203,7 @@ def _store(found: WornCalibration, logs: Logs, recording: Recording, where: Path
         store.add(recording, split=entry.split, config_hash=entry.config_hash)
 
 
-def _tell(checks: Sequence[StepCheck]) -> None:
+def _show_report(checks: Sequence[StepCheck]) -> None:
     table = Table()
     for column in ("step", "", "measured", "limit", "ok"):
         table.add_column(column, justify="right" if column in ("measured", "limit") else "left")
@@ -214,7 +214,7 @@ def _tell(checks: Sequence[StepCheck]) -> None:
 
 
 def _guide(config: DictConfig, logs: Logs) -> None:
-    """Say what each step is, whether its stretch is given, and where the logs seem to have it."""
+    """Print each step, whether its segment is configured, and where the logs probably contain it."""
     proposed = _proposed(logs)
     keys = [key for key in STEPS if key not in OF_CAMERA or logs.slam is not None]
     for number, key in enumerate(keys, 1):
@@ -234,7 +234,7 @@ def _guide(config: DictConfig, logs: Logs) -> None:
 
 
 def _proposed(logs: Logs) -> dict[str, str]:
-    """Stretches for the command line, by key."""
+    """Segments for the command line, by key."""
     found = {}
     for key, stretch in zip(("board", "tpose"), propose_steps(logs.watches)):
         if stretch is not None:

@@ -37,9 +37,9 @@ HELP = "turn a recording into motion: wearcap capture recording=DATASET/NAME, ch
 
 
 def run(config: DictConfig) -> Motion | None:
-    """Capture one recording and write motion.npz, .bvh, .glb and .mp4 (truth, where known, beside it).
+    """Capture one recording and write motion.npz, .bvh, .glb and .mp4 (beside the ground truth, if there is one).
 
-    A pipeline of stages writes report.json, too; `until` a stage before there is a motion, that alone.
+    A pipeline with stages also writes report.json, and only that if `until` names a stage before the motion exists.
     """
     pipeline = load_pipeline(config.checkpoint, config.pipeline, config.device)
     folder = Path(config.output)
@@ -95,7 +95,7 @@ def _write(motion: Motion, recording: Recording, folder: Path, config: DictConfi
 
 
 def _write_samples(draws: list[Motion], recording: Recording, folder: Path, config: DictConfig) -> None:
-    """sample-0.npz, …, and samples.png: what one input leaves open (thesis Fig. 6.6)."""
+    """Write sample-0.npz, …, and samples.png: the variety of motions from one input (thesis Fig. 6.6)."""
     shown = {f"sample {number}": motion for number, motion in enumerate(draws)}
     for label, motion in shown.items():
         write_motion(motion, folder / f"{label.replace(' ', '-')}.npz")
@@ -109,7 +109,7 @@ def _write_samples(draws: list[Motion], recording: Recording, folder: Path, conf
 
 
 def _objects(motion: Motion, recording: Recording, config: DictConfig) -> Environment | None:
-    """The objects that a motion with object poses is shown with."""
+    """Environment with the objects that a motion with object poses is shown with."""
     if motion.object_motion is None:
         return None
     return environment_of(recording, config.recording, config.pipeline.get("environment"))

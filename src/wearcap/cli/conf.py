@@ -1,4 +1,4 @@
-"""Configs: where they lie, how Hydra composes them, and a typo's nearest valid neighbour."""
+"""Configs: their location, their composition by Hydra, and suggestions for typos."""
 
 import functools
 import os
@@ -49,7 +49,7 @@ def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
 def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: list[str]) -> None:
     """Run `task(config)` as a Hydra application with its command line: overrides, `-m`, `--cfg job`, `--help` …
 
-    A WearcapError of the task comes out as it is; a config error comes out as a WearcapError.
+    A WearcapError of the task is raised unchanged; a config error is raised as a WearcapError.
     """
     guarded = _Guarded(task)
     application = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)
@@ -61,10 +61,10 @@ def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: l
 
 
 class _Guarded:
-    """A task that keeps for later what it refuses, so that Hydra prints nothing of its own about it.
+    """A task that stores its WearcapError for later, so that Hydra does not print its own message.
 
-    A class, because the joblib launcher has to pickle it. In a multirun the error goes through Hydra, which
-    says which of the jobs failed.
+    It is a class because the joblib launcher has to pickle it. In a multirun the error passes through Hydra, which
+    reports which of the jobs failed.
     """
 
     def __init__(self, task: Callable[[DictConfig], Any]):
@@ -83,7 +83,7 @@ class _Guarded:
 
 @contextmanager
 def _command_line(arguments: list[str]) -> Iterator[None]:
-    """Hydra reads sys.argv; with HYDRA_FULL_ERROR it raises its errors instead of printing them and leaving."""
+    """Set sys.argv, which Hydra reads, and HYDRA_FULL_ERROR, with which it raises errors instead of exiting."""
     before, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = [sys.argv[0], *arguments]
     os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -104,7 +104,7 @@ def _compose(config_name: str, overrides: list[str]) -> DictConfig:
 
 @contextmanager
 def explained(config_name: str, arguments: list[str]) -> Iterator[None]:
-    """Turn errors of composing or using a config into a WearcapError that says what to type instead."""
+    """Turn errors of composing or using a config into a WearcapError with a suggestion of what to type instead."""
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:
@@ -115,14 +115,14 @@ def explained(config_name: str, arguments: list[str]) -> Iterator[None]:
 
 
 def _cause(error: BaseException | None, kind: type[BaseException]):
-    """The first exception of a kind along the chain of causes."""
+    """First exception of a type along the chain of causes."""
     while error is not None and not isinstance(error, kind):
         error = error.__cause__
     return error
 
 
 def _explanation(error: Exception, config_name: str, arguments: list[str]) -> WearcapError:
-    """What a Hydra or OmegaConf error means for the person who typed the command."""
+    """Explanation of a Hydra or OmegaConf error for the person who typed the command."""
     for place, argument in enumerate(arguments[:-1]):
         if argument in ("--config-name", "-cn"):
             config_name = arguments[place + 1]
@@ -151,7 +151,7 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
 
 
 def _refused(error: InstantiationException) -> WearcapError:
-    """What the object that a config names had to say against its values."""
+    """Error that a configured object's constructor raised about its values."""
     cause: BaseException = error
     while cause.__cause__ is not None:
         cause = cause.__cause__

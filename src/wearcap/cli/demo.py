@@ -1,4 +1,4 @@
-"""`wearcap demo`: the whole way on simulated data, from nothing to a watched motion, in minutes."""
+"""`wearcap demo`: the complete workflow on simulated data, from preparation to a captured motion, in minutes."""
 
 import argparse
 import time

@@ -1,4 +1,4 @@
-"""`wearcap doctor`: examine recordings and say what is wrong with them and how to mend it."""
+"""`wearcap doctor`: examine recordings and report problems and how to fix them."""
 
 import argparse
 import json
@@ -11,7 +11,7 @@ from rich.text import Text
 
 from wearcap.doctor import Report, examine
 
-HELP = "say what a recording holds, what looks wrong in it, and how to mend it"
+HELP = "report what a recording holds, what looks wrong in it, and how to fix it"
 _COLOR = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
 
 
@@ -42,7 +42,7 @@ def main(arguments: list[str]) -> None:
 
 
 def _table(report: Report, quiet: bool) -> Table:
-    """One row per finding: what was looked at; what was found, the evidence, how to mend it, and in which recordings."""
+    """One row per finding: the check, the result, the evidence, the fix, and the recordings concerned."""
     table = Table(title=report.source, title_justify="left")
     for column in ("", "check", "finding"):
         table.add_column(column, no_wrap=column == "")

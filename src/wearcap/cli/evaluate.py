@@ -23,7 +23,7 @@ from wearcap.systems.ireplica.scores import with_interactions
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 
 OURS = "wearcap"
-"""Name of the checkpoint's method in the table."""
+"""Name of the evaluated checkpoint's method in the table."""
 
 HELP = "score a checkpoint: wearcap evaluate checkpoint=… [dataset=DIR] [split=test], or pipeline=hps dataset=DIR"
 
@@ -54,9 +54,9 @@ def run(config: DictConfig) -> Scores:
 
 
 def _learned(checkpoints: list[str], config: DictConfig, progress: Progress) -> tuple[RecordingStore, Scores]:
-    """The data set, and the checkpoints' scores beside the baselines'."""
-    told = bool(config.dataset) and not config.baselines
-    sources, validated = ([], None) if told else trained_on(checkpoints[0])
+    """Evaluate checkpoints; returns the data set, and their scores beside the baselines'."""
+    own_data = bool(config.dataset) and not config.baselines
+    sources, validated = ([], None) if own_data else trained_on(checkpoints[0])
     store = RecordingStore.open(config.dataset or validated)
     realism = None if config.realism is None else load_realism(config.realism)
     rows: list[Row] = []
@@ -78,7 +78,7 @@ def _learned(checkpoints: list[str], config: DictConfig, progress: Progress) -> 
 
 
 def _measured(pipeline: LearnedPipeline, store: RecordingStore) -> tuple[Pipeline, Measure]:
-    """A pipeline with what it needs of a data set beside the recordings, and the measures of its document."""
+    """A pipeline bound to the files of a data set that it needs, and the metrics of its paper."""
     if isinstance(pipeline, Echo):
         with_objects = EchoOnDataset(pipeline, store.root)
         return with_objects, with_objects.score
@@ -90,7 +90,7 @@ def _beside(realism: Realism | None, method: str, measure: Measure = score) -> M
 
 
 def _summaries(rows: list[Row], realism: Realism | None, method: str) -> dict[str, Summary]:
-    """A method's scores, and what its motions are like as a whole, if that is asked for."""
+    """A method's scores, with FID and Diversity of its motions if configured."""
     if realism is None:
         return aggregate(rows)
     if notice := realism.notice(method):

@@ -1,4 +1,4 @@
-"""`wearcap export`: a checkpoint's network as ONNX or torch.export, checked against eager, or the checkpoint to be shared."""
+"""`wearcap export`: a checkpoint's network as ONNX or torch.export, checked against eager, or the checkpoint for sharing."""
 
 from omegaconf import DictConfig
 from rich import print as show
@@ -24,7 +24,7 @@ HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2|safetens
 def run(config: DictConfig) -> dict[str, ExportReport]:
     """Export the networks with their sidecar; prints the errors against eager and both latencies.
 
-    format=safetensors writes the checkpoint itself: averaged weights and config, to be shared.
+    format=safetensors writes the checkpoint itself, averaged weights and config, for sharing.
     """
     if config.format == "safetensors":
         share_checkpoint(config.checkpoint, config.output, config.dtype)

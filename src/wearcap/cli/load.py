@@ -1,4 +1,4 @@
-"""From a checkpoint to the system its own config describes, and from a config to a pipeline, around it or without one."""
+"""Loading of a checkpoint's system by its own config, and of pipelines by a config, with or without a checkpoint."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -55,7 +55,7 @@ NETWORKS: dict[str, tuple[type[System], str]] = {
     "MocapEvery": (WatchRegression, "experiment=mocap_every"),
     "Echo": (EchoDiffusion, "experiment=echo"),
 }
-"""What a learned pipeline's checkpoint has to hold, and which experiment makes one."""
+"""System class that a learned pipeline's checkpoint must contain, and the experiment that trains one."""
 
 
 def load_system(checkpoint: str | Path) -> tuple[System, dict[str, Any]]:
@@ -70,10 +70,10 @@ def load_system(checkpoint: str | Path) -> tuple[System, dict[str, Any]]:
 def load_pipeline(
     checkpoint: str | Path | Sequence[str] | None, pipeline: DictConfig, device: str
 ) -> LearnedPipeline | StagedPipeline:
-    """The pipeline of a config group: around a checkpoint's network where it is learned (`_partial_`), else by itself.
+    """The pipeline of a config group: with a checkpoint's network if it is learned (`_partial_`), else without one.
 
     iReplica takes several checkpoints of contact networks, one per class. Raises WearcapError for a learned pipeline
-    without a checkpoint, and for a checkpoint that nothing is to be done with.
+    without a checkpoint, and for a checkpoint that the pipeline cannot use.
     """
     learned, name = bool(pipeline.get("_partial_")), pipeline._target_.rpartition(".")[2]
     given = [checkpoint] if isinstance(checkpoint, str | Path) else list(checkpoint or ())
@@ -107,7 +107,7 @@ def load_visual_cues(
 
 
 def load_realism(checkpoint: str | Path, stride_s: float = 1.0) -> Realism:
-    """What gathers FID and Diversity of windows so far apart, in the latent space of a motion autoencoder."""
+    """Collector of FID and Diversity in the latent space of a motion autoencoder, over windows at a fixed stride."""
     system, _ = load_system(checkpoint)
     if not isinstance(system, MotionEncoding):
         raise WearcapError("realism needs a motion autoencoder", where=checkpoint, expected="a checkpoint of experiment=motion_autoencoder")  # fmt: skip
@@ -115,13 +115,13 @@ def load_realism(checkpoint: str | Path, stride_s: float = 1.0) -> Realism:
 
 
 def staged(pipeline: StagedPipeline, config: DictConfig, data: str | Path, console: Console) -> StagedCapture:
-    """A pipeline of stages for the recordings of a data set: its files, its cache, the scene that was chosen."""
+    """A pipeline with stages bound to a data set: its folder, its cache, and the chosen scene."""
     scene, cache = (None if path is None else Path(path) for path in (config.scene, config.cache))
     return StagedCapture(pipeline, dataset_folder(data), scene, config.metres_per_unit, cache, console)
 
 
 def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:
-    """(folders of the training data sets, folder of the one it was validated on).
+    """(folders of the training data sets, folder of the validation data set) of a checkpoint.
 
     Raises WearcapError for a checkpoint that was shared without them.
     """
@@ -135,7 +135,7 @@ def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:
 
 
 def environment_of(recording: Recording, data: str | Path, given: str | Path | None) -> Environment | None:
-    """The objects of a file, or those that a recording of DATASET/NAME names, where its file is there; else None."""
+    """Objects from a file, or from the environment file that a recording of DATASET/NAME names; None if it is missing."""
     if given is not None:
         return read_environment(given)
     path = dataset_folder(data) / recording.environment if recording.environment else None

@@ -1,4 +1,4 @@
-"""`wearcap VERB …`: finds the verb's module, runs it, and turns what users can mend into one message."""
+"""`wearcap VERB …`: finds the verb's module, runs it, and turns errors that users can fix into one message."""
 
 import errno
 import importlib
@@ -15,7 +15,7 @@ VERBS = (
     "train", "evaluate", "capture", "export", "prepare", "view", "render", "annotate", "scene", "calibrate",
     "track", "doctor", "demo",
 )  # fmt: skip
-"""In the order of the help; a verb is there when its module is."""
+"""Verbs in the order of the help; a verb is available if its module exists."""
 
 USER_ERROR, INTERRUPTED = 2, 130
 
@@ -41,7 +41,7 @@ def usage() -> str:
 
 
 def run_verb(verb: str, arguments: list[str]) -> int:
-    """Run one verb and return the exit code; errors a user can mend become one message on stderr."""
+    """Run one verb and return the exit code; errors that a user can fix become one message on stderr."""
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
     try:
@@ -61,7 +61,7 @@ def run_verb(verb: str, arguments: list[str]) -> int:
 
 
 def explain(error: WearcapError | OSError) -> str:
-    """One message: a WearcapError's own, or what the operating system refused and where."""
+    """One message: a WearcapError's own, or the operating system's error with its path."""
     if isinstance(error, WearcapError):
         return str(error)
     where = f"{error.filename}: " if error.filename else ""
@@ -73,7 +73,7 @@ def explain(error: WearcapError | OSError) -> str:
 
 
 def _lift_limit(arguments: list[str]) -> list[str]:
-    """Set the limit of files' sizes that `--max-file-gib` gives, for worker processes too; the other arguments."""
+    """Apply `--max-file-gib` as the limit of file sizes, for worker processes too; returns the other arguments."""
     option = "--max-file-gib"
     place = next((i for i, word in enumerate(arguments) if word.split("=")[0] == option), None)
     if place is None:
@@ -86,7 +86,7 @@ def _lift_limit(arguments: list[str]) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """The console command. Exits with 0, 2 (an error a user can mend) or 130 (interrupted)."""
+    """The console command. Exits with 0, 2 (an error that a user can fix) or 130 (interrupted)."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         arguments = _lift_limit(arguments)

@@ -8,11 +8,11 @@ from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording.motion import Motion
 
 RESERVED = ("truth", "over", "beside")
-"""What the page and the pictures call other things."""
+"""Names that the page and the pictures use for other purposes."""
 
 
 def read_motions(paths: Sequence[str]) -> dict[str, Motion]:
-    """One file is "capture"; several go by their names, with their folders' where these agree.
+    """Motions by name: a single file is "capture"; several have their file names, prefixed by folders if these agree.
 
     Raises WearcapError for a file that is given twice, and as `read_motion` does.
     """

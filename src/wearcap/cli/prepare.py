@@ -16,10 +16,10 @@ HELP = "make a data set: wearcap prepare simulated, wearcap prepare cmu source=D
 
 
 def run(config: DictConfig) -> Report:
-    """Prepare what the config describes: recordings by `tasks`, or by `rework` a change to a data set that stands."""
+    """Run the config's preparation: recordings by `tasks`, or by `rework` a change of an existing data set."""
     if "rework" in config:
         report = instantiate(config.rework, _convert_="all")
-        _tell(report, RecordingStore.open(config.output))
+        _show_report(report, RecordingStore.open(config.output))
         return report
     listed = splits_dir() / config.splits
     splits = read_splits(listed if listed.is_file() else Path(config.splits))
@@ -28,11 +28,11 @@ def run(config: DictConfig) -> Report:
         tasks, config.output, jobs=config.jobs, backend=config.backend, scheduler=config.scheduler,
         overwrite=config.overwrite,
     )  # fmt: skip
-    _tell(report, RecordingStore.open(config.output))
+    _show_report(report, RecordingStore.open(config.output))
     return report
 
 
-def _tell(report: Report, store: RecordingStore) -> None:
+def _show_report(report: Report, store: RecordingStore) -> None:
     for name, note in sorted(report.notes.items()):
         print(f"{name}: {note}")
     for name, reason in sorted(report.failed.items()):
@@ -56,7 +56,7 @@ def sources() -> dict[str, Path]:
 
 
 def usage() -> str:
-    """What can be prepared."""
+    """Help text that lists the sources."""
     lines = ["usage: wearcap prepare SOURCE [key=value …]     wearcap prepare SOURCE --help", ""]
     for name, path in sources().items():
         about = next(line[2:] for line in path.read_text(encoding="utf-8").splitlines()
@@ -81,9 +81,7 @@ def main(arguments: list[str]) -> None:
         overrides = [f"prepare={source}", *(argument for argument in arguments if argument != source)]
         with explained("prepare", overrides):
             config = compose("prepare", overrides)
-            OmegaConf.to_container(
-                config, resolve=True, throw_on_missing=True
-            )  # what lacks a value is said here
+            OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # a missing value raises here
             report = run(config)
         if report.failed:
             sys.exit(1)

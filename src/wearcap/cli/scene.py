@@ -29,7 +29,7 @@ HELP = "the visual map of a scene: wearcap scene scene=FOLDER output=map.safeten
 
 
 def run(config: DictConfig) -> VisualMap:
-    """Build or extend the map that the config describes, report on it, and save it."""
+    """Build or extend the config's map, report on it, and save it."""
     if config.every < 1 or config.check < 0:
         raise WearcapError(f"every={config.every} check={config.check}", expected="every=1 (all photos) or more, check=0 or more")  # fmt: skip
     photos, source = read_scene(config.scene, config.images, config.metres_per_unit)
@@ -38,21 +38,21 @@ def run(config: DictConfig) -> VisualMap:
     )
     options = {"descriptor": descriptor, "settings": instantiate(config.settings), "progress": True}
     taken = np.arange(0, len(photos), config.every)
-    held = (
+    held_out = (
         taken[:: len(taken) // config.check][: config.check]
         if 0 < config.check <= len(taken) // 4
         else taken[:0]
     )
-    rest = np.setdiff1d(taken, held)
+    rest = np.setdiff1d(taken, held_out)
     if config.extend is None:
         made = build_map(*_part(photos, source, rest), extractor, **options)
     else:
         made = extended(VisualMap.load(config.extend), *_part(photos, source, rest), extractor, **options)
-    if len(held):
+    if len(held_out):
         localizer = Localizer(made, extractor, matcher, instantiate(config.localizer), descriptor=descriptor)
-        _check(localizer, [photos[number] for number in held])
-        made = extended(made, *_part(photos, source, held), extractor, **options)
-    _tell(made)
+        _check(localizer, [photos[number] for number in held_out])
+        made = extended(made, *_part(photos, source, held_out), extractor, **options)
+    _show_report(made)
     made.save(config.output)
     show(f"map: {config.output}")
     return made
@@ -63,7 +63,7 @@ def _part(photos: list[Photo], source: Scan | Tracks, chosen: np.ndarray) -> tup
     return [photos[number] for number in chosen], part
 
 
-def _tell(made: VisualMap) -> None:
+def _show_report(made: VisualMap) -> None:
     counts = np.diff(made.first)
     low, high = (reduce(made.t_world_cam, 0) for reduce in (np.min, np.max))
     table = Table(show_header=False)

@@ -1,4 +1,4 @@
-"""`wearcap scene edit`: the page that cuts objects out of a scan and says how they move."""
+"""`wearcap scene edit`: the page on which objects are cut out of a scan and their degrees of freedom are set."""
 
 import argparse
 import logging
@@ -10,8 +10,8 @@ from wearcap.errors import WearcapError
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="wearcap scene edit",
-        description="Make an interactive environment of a scan, in the browser: cut objects out, say how they "
-        "move, try it. It saves itself; opened again, it goes on.",
+        description="Make an interactive environment of a scan, in the browser: cut objects out, set how they "
+        "move, try it. It saves automatically; opened again, it continues.",
     )
     parser.add_argument("scene", help="the scene's folder with pointcloud.ply, or a .ply or .pcd file")
     parser.add_argument(
@@ -43,7 +43,7 @@ def main(arguments: list[str]) -> None:
         raise WearcapError(
             "an environment is a .json file", where=file, expected="environment.json or a folder"
         )
-    # Browsers open connections in advance and drop them; the server's log of that is no news to a user.
+    # Browsers open connections in advance and drop them; the server's log of that is of no use to a user.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     scan = read_scan(cloud, metres_per_unit=options.metres_per_unit)
     page = ObjectEditor(scan, file, title=cloud.parent.resolve().name, host=options.host, port=options.port)

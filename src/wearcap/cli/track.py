@@ -38,11 +38,11 @@ _WITH_VALUE = (
     "--config-dir",
     "-cd",
 )
-"""Hydra's options that a value follows."""
+"""Hydra's options that take a value."""
 
 
 def run(config: DictConfig) -> Track:
-    """Track the config's source, or take the path from a COLMAP model, and write what was found."""
+    """Track the config's source, or take the path from a COLMAP model, and write the result."""
     if config.source is None and config.from_model is None:
         raise WearcapError("nothing to track", expected="wearcap track VIDEO, or from_model=DIR")
     settings = instantiate(config.settings)
@@ -57,7 +57,7 @@ def run(config: DictConfig) -> Track:
         with _progress() as advance:
             found = track_pictures(config.source, output, settings, camera, advance)
     write_track(found, output, Path(named).name)
-    _tell(found, output)
+    _show_report(found, output)
     return found
 
 
@@ -80,7 +80,7 @@ def _progress() -> Iterator[Advance]:
         yield advance
 
 
-def _tell(found: Track, output: Path) -> None:
+def _show_report(found: Track, output: Path) -> None:
     show(f"{found.placed} of {found.pictures} pictures placed, {len(found.points_world)} points, reprojection "
          f"{found.reprojection_px:.2f} px; scale and axes are arbitrary")  # fmt: skip
     for start, stop, bridged in found.gaps_s:
@@ -89,7 +89,7 @@ def _tell(found: Track, output: Path) -> None:
 
 
 def overrides(arguments: list[str]) -> list[str]:
-    """`VIDEO` and `--from-model DIR` as what they stand for in the config; Hydra's own options stay."""
+    """Arguments with `VIDEO` and `--from-model DIR` replaced by config overrides; Hydra's own options stay."""
     given, rest = [], iter(arguments)
     for argument in rest:
         if argument == "--from-model":

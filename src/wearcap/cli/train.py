@@ -1,4 +1,4 @@
-"""`wearcap train`: compose a config, build what it names, fit."""
+"""`wearcap train`: compose a config, instantiate it, fit."""
 
 import warnings
 from contextlib import nullcontext
@@ -22,7 +22,7 @@ HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
 
 
 def train(config: DictConfig) -> float:
-    """Train what the config describes; returns the last validation loss (what a sweep minimises).
+    """Train the config's model; returns the last validation loss (which a sweep minimises).
 
     Raises WearcapError when another process trains in the run's folder.
     """
@@ -35,7 +35,7 @@ def _train(config: DictConfig, run: Path) -> float:
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     keep_freed_memory()
     _name_embeddings(config)
-    # A run's folder is its own; what Lightning deprecates within itself is not the user's to mend.
+    # Each run has its own folder; users cannot fix Lightning's internal deprecations.
     warnings.filterwarnings("ignore", "Experiment logs directory")
     warnings.filterwarnings("ignore", ".*LeafSpec")
     record_run(run, OmegaConf.to_yaml(config, resolve=True))
@@ -66,7 +66,7 @@ def _train(config: DictConfig, run: Path) -> float:
 
 
 def _name_embeddings(config: DictConfig) -> None:
-    """Which weights made the embeddings, and their dimension, are as the data has them (`surroundings.images=clip`)."""
+    """Set the name and the dimension of the image embeddings to those in the data (`surroundings.images=clip`)."""
     surroundings = config.get("surroundings")
     if surroundings and surroundings.images and "surroundings" in config.data:
         stores = [RecordingStore.open(source.root) for source in config.data.sources.values() if source]

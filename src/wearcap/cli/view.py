@@ -1,4 +1,4 @@
-"""`wearcap view`: a recording, and what was captured from it, in the browser."""
+"""`wearcap view`: a recording and motions captured from it, in the browser."""
 
 import argparse
 import logging
@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> None:
     from wearcap.recording.locate import dataset_folder, load_recording
     from wearcap.viewer.page import Page
 
-    # Browsers open connections in advance and drop them; the server's log of that is no news to a user.
+    # Browsers open connections in advance and drop them; the server's log of that is of no use to a user.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     recording = load_recording(options.recording)
     page = Page(

@@ -1,4 +1,4 @@
-"""The doctor: says what it sees in a recording, what looks wrong, and how to mend it."""
+"""The doctor: reports the content of a recording, likely problems, and how to fix them."""
 
 from wearcap.doctor.examine import examine, examine_recording
 from wearcap.doctor.report import Finding, Report

@@ -14,7 +14,7 @@ from wearcap.scene.floor import estimate_floor
 
 
 def check_head_against_body(head: HeadStream, motion: Motion) -> list[Finding]:
-    """The device sits still on the motion's head joint, where the recording says, and on the same clock."""
+    """The device is fixed to the motion's head joint, at the recorded pose and on the same clock."""
     if "head" not in motion.skeleton:
         return []
     joint = motion.joint("head")
@@ -46,10 +46,10 @@ def check_head_against_body(head: HeadStream, motion: Motion) -> list[Finding]:
     at = resample(device, body.timestamps[inside])
     T_head_device = Rigid(body.R_world_body[inside].double(), body.t_world_body[inside].double()).inverse() @ Rigid(
         at.R_world_body.double(), at.t_world_body.double())  # fmt: skip
-    return [*findings, _seat(T_head_device, head)]
+    return [*findings, _check_mounting(T_head_device, head)]
 
 
-def _seat(T_head_device: Rigid, head: HeadStream) -> Finding:
+def _check_mounting(T_head_device: Rigid, head: HeadStream) -> Finding:
     mean_R, mean_t = rotation.mean_rotation(T_head_device.R), T_head_device.t.median(0).values
     turn = math.degrees(quantile(rotation.geodesic(T_head_device.R, mean_R.expand_as(T_head_device.R)), 0.9))
     shift = quantile((T_head_device.t - mean_t).norm(dim=-1), 0.9)
@@ -72,7 +72,7 @@ def _seat(T_head_device: Rigid, head: HeadStream) -> Finding:
 
 
 def check_head_cue(head: HeadStream, cue: Cue) -> list[Finding]:
-    """A head joint that another system tracked rides on the device: same clock, same world, same wearer."""
+    """A head joint tracked by another system moves with the device: same clock, same world, same wearer."""
     check = "head against cues"
     inside = (cue.timestamps >= head.timestamps[0]) & (cue.timestamps <= head.timestamps[-1])
     inside &= (cue.confidence > 0) & cue.points.isfinite().all(-1)
@@ -92,7 +92,7 @@ def check_head_cue(head: HeadStream, cue: Cue) -> list[Finding]:
 
 
 def check_points(points: PointCloud, head: HeadStream | None) -> list[Finding]:
-    """A cloud in metres around the wearer, with a floor at walking distance beneath the head."""
+    """A cloud in metres around the wearer, with a floor at standing height below the head."""
     cloud = points.points_world
     if not cloud.isfinite().all():
         return [
@@ -132,7 +132,7 @@ def _floor_below(points: PointCloud, head: HeadStream) -> Finding:
         return Finding(
             "error",
             check,
-            "no points beneath the head",
+            "no points below the head",
             str(error),
             "Points and head are in different worlds, or z is not up.",
         )
@@ -155,11 +155,11 @@ def _floor_below(points: PointCloud, head: HeadStream) -> Finding:
             evidence,
             "Check unit and up axis of both.",
         )
-    return Finding("ok", check, "a floor beneath the head", evidence)
+    return Finding("ok", check, "a floor below the head", evidence)
 
 
 def floor_below(points: PointCloud, head: HeadStream) -> FloorTrack | None:
-    """The floor that the points show along the head's path; None where they show none."""
+    """Height of the floor in the points along the head's path; None if there is none."""
     try:
         floor = estimate_floor(points.points_world, head.t_world_device)
     except WearcapError:
@@ -168,7 +168,7 @@ def floor_below(points: PointCloud, head: HeadStream) -> FloorTrack | None:
 
 
 def check_camera(stream: CameraStream) -> list[Finding]:
-    """The camera looks ahead and stands upright on the head; as many images as timestamps."""
+    """The camera looks ahead and is upright on the head; it has as many images as timestamps."""
     findings = []
     count = len(stream.image_files) if stream.image_files is not None else None
     if stream.embedding is not None:

@@ -15,7 +15,7 @@ from wearcap.doctor.signals import quantile
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, interpolate, linear_velocity
-from wearcap.io.formats.bvh_check import HEIGHT_M, REACH_PER_HEIGHT, UNITS_M, longest_way
+from wearcap.io.formats.bvh_check import HEIGHT_M, REACH_PER_HEIGHT, UNITS_M, longest_path
 from wearcap.recording import FloorTrack, Motion
 
 
@@ -49,7 +49,7 @@ def _root(motion: Motion) -> Trajectory:
 def check_size(stream: str, skeleton: Skeleton) -> list[Finding]:
     """A person's size, the same left and right."""
     check = f"{stream}: body size"
-    height = longest_way(skeleton) / REACH_PER_HEIGHT
+    height = longest_path(skeleton) / REACH_PER_HEIGHT
     evidence = f"about {height:.3g} m tall by its bones"
     if not HEIGHT_M[0] < height < HEIGHT_M[1]:
         unit = min(UNITS_M, key=lambda name: abs(height * UNITS_M[name] - 1.7))
@@ -157,7 +157,7 @@ def check_knees(stream: str, motion: Motion, parts: Landmarks) -> list[Finding]:
         hip, knee, ankle = (position[:, joint] for joint in parts.limb[f"{side}_leg"])
         thigh, shank = (torch.nn.functional.normalize(v, dim=-1) for v in (knee - hip, ankle - knee))
         bent = (thigh * shank).sum(-1) < math.cos(math.radians(25))
-        # Flexion turns the shank about the axis to the left, so thigh × shank points to the right of the body.
+        # Flexion rotates the shank about the axis to the left, so thigh × shank points to the right of the body.
         wrong = (torch.linalg.cross(thigh, shank) * torch.nn.functional.normalize(across, dim=-1)).sum(
             -1
         ) < -0.2

@@ -1,4 +1,4 @@
-"""An interactive environment: its objects and how they may move, and what about them looks wrong."""
+"""Checks of an interactive environment: its objects, their degrees of freedom, and likely problems."""
 
 import math
 from pathlib import Path
@@ -14,10 +14,10 @@ from wearcap.scene.environment import Environment, box_in_world, hinge_gap_m, su
 from wearcap.scene.objects import SceneObject
 
 TINY_M, HUGE_M = 0.05, 12.0
-"""Sides of the box around an object, its longest, beyond which its unit is doubtful."""
+"""Range of the longest side (m) of an object's bounding box outside which its unit is doubtful."""
 HINGE_GAP_M = 0.10
 FLOOR_M = 0.10
-"""How far from the common floor of sliding objects another may stand."""
+"""Largest distance (m) of a sliding object from the common floor of all."""
 SAME_SURFACE_M = 0.02
 _SAME_SHARE, _INSIDE_SHARE = 0.5, 0.8
 _SAMPLES = 400
@@ -29,7 +29,7 @@ def is_environment(folder: Path) -> bool:
 
 
 def read_environment_file(path: Path) -> tuple[Recording, list[Finding]]:
-    """All findings about an environment.json; what cannot be read is one too."""
+    """All findings about an environment.json, including errors of reading it."""
     try:
         return Recording(path.name), check_environment(read_environment(path))
     except WearcapError as error:
@@ -37,7 +37,7 @@ def read_environment_file(path: Path) -> tuple[Recording, list[Finding]]:
 
 
 def check_environment(environment: Environment) -> list[Finding]:
-    """One finding per object that says how it may move, then whatever looks wrong."""
+    """One finding per object with its degrees of freedom, then likely problems."""
     objects = environment.objects
     if not objects:
         return [
@@ -59,13 +59,13 @@ def check_environment(environment: Environment) -> list[Finding]:
 
 
 def _about(item: SceneObject) -> Finding:
-    """What it is, where, and how it may move."""
+    """Category, position and degrees of freedom of an object."""
     low, high = box_in_world(item)
     size = " x ".join(f"{side:.2f}" for side in high - low)
     place = ", ".join(f"{v:.2f}" for v in item.t_world_object.tolist())
     triangles = len(item.mesh.faces)
     shape = f"{triangles} triangles" if triangles else f"a cloud of {len(item.mesh.vertices)} points"
-    return Finding("ok", f"object {item.name}", f"{item.category or 'thing'}: {_moves(item)}",
+    return Finding("ok", f"object {item.name}", f"{item.category or 'object'}: {_moves(item)}",
                    f"{size} m, {shape}, at ({place}) m")  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def _size(item: SceneObject) -> list[Finding]:
         return [Finding("warning", f"object {item.name}: size", "the mesh is tiny", f"{100 * longest:.2g} cm at most",
                         "Is it in another unit? Meshes are in metres.")]  # fmt: skip
     if longest > HUGE_M:
-        return [Finding("warning", f"object {item.name}: size", "the mesh is larger than a thing", f"{longest:.3g} m",
+        return [Finding("warning", f"object {item.name}: size", "the mesh is larger than an object", f"{longest:.3g} m",
                         "Is it in millimetres, or the whole scan?")]  # fmt: skip
     return []
 
@@ -126,7 +126,7 @@ def _freedom(item: SceneObject) -> list[Finding]:
 
 
 def _floor(objects: tuple[SceneObject, ...]) -> list[Finding]:
-    """Sliding objects stand on one floor, and nothing is beneath it."""
+    """Sliding objects stand on one floor, and nothing is below it."""
     lowest = {item.name: float(box_in_world(item)[0, 2]) for item in objects}
     standing = [lowest[item.name] for item in objects if item.freedom.kind == "plane"]
     if not standing:
@@ -139,12 +139,12 @@ def _floor(objects: tuple[SceneObject, ...]) -> list[Finding]:
                                  "Lift it, or cut the floor's points off its mesh."))  # fmt: skip
         elif height > FLOOR_M and item.freedom.kind == "plane":
             found.append(Finding("note", f"object {item.name}: floor", "slides above the others' floor", f"{100 * height:.0f} cm above it",
-                                 "Another storey, or not a thing that slides on the floor."))  # fmt: skip
+                                 "Another storey, or not an object that slides on the floor."))  # fmt: skip
     return found
 
 
 def _overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
-    """Pairs with much of one's surface at the other's, or one within the other's box."""
+    """Pairs of objects with overlapping surfaces, or with one inside the other's bounding box."""
     boxes = np.array([box_in_world(item) for item in objects])
     low, high = boxes[:, 0], boxes[:, 1]
     shared = np.maximum(
@@ -159,7 +159,7 @@ def _overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
         inside = float(shared[a, b] / volume[inner])
         if same > _SAME_SHARE:
             found.append(Finding("warning", f"objects {names}", "are at the same place", f"{100 * same:.0f} % of the first's surface is within 2 cm of the second's",
-                                 "Was one thing cut out twice? Remove one of them."))  # fmt: skip
+                                 "Was one object cut out twice? Remove one of them."))  # fmt: skip
         elif inside > _INSIDE_SHARE:
             found.append(Finding("note", f"objects {names}", "the first stands within the second's box", f"{100 * min(inside, 1):.0f} % of its own box",
                                  "A chair under a table does; a sofa in a wardrobe does not."))  # fmt: skip
@@ -167,7 +167,7 @@ def _overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
 
 
 def _share_at(inner: SceneObject, outer: SceneObject) -> float:
-    """Share of one object's surface that lies at another's."""
+    """Share of one object's surface that coincides with another's."""
     points = _surface(inner) @ inner.R_world_object.double().numpy().T + inner.t_world_object.double().numpy()
     local = (points - outer.t_world_object.double().numpy()) @ outer.R_world_object.double().numpy()
     distance, _ = surface_index(outer.mesh).nearest(np.ascontiguousarray(local))
@@ -175,7 +175,7 @@ def _share_at(inner: SceneObject, outer: SceneObject) -> float:
 
 
 def _surface(item: SceneObject) -> Float64[np.ndarray, "sample 3"]:
-    """Points spread over an object's surface (a cloud's own points), in its axes."""
+    """Points sampled on an object's surface (a cloud's own points), in its axes."""
     rng = np.random.default_rng(0)
     vertices, faces = item.mesh.vertices.astype(np.float64), item.mesh.faces
     if not len(faces):

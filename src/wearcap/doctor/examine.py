@@ -26,9 +26,9 @@ from wearcap.recording import Recording
 
 
 def examine(source: Recording | str | Path, progress: Callable[[int, int], None] | None = None) -> Report:
-    """Look at a recording, or at all in a data set, recording file, MPS folder, motion capture file or folder of them.
+    """Examine a recording, or all in a data set, recording file, MPS folder, motion capture file or folder of them.
 
-    What cannot be read is an error in the report; `progress(done, all)` is called after each recording.
+    Unreadable files are errors in the report; `progress(done, all)` is called after each recording.
     Raises WearcapError when there is nothing to examine.
     """
     if isinstance(source, Recording):
@@ -48,7 +48,7 @@ def _examine_file(patient: Patient) -> list[Finding]:
     except WearcapError as error:
         return [refusal(error)]
     if findings and recording.points is None and not _clocks(recording):
-        return findings  # what kept the reader from giving more has been said
+        return findings  # the reader's errors are already reported
     return [*findings, *examine_recording(recording)]
 
 
@@ -80,7 +80,7 @@ def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:
 
 
 def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
-    """Each usable stream by itself, then against the others; streams with errors are compared with nothing."""
+    """Findings about each usable stream, then about pairs of streams; streams with errors are not compared."""
     findings: list[Finding] = []
     head = recording.head if "head" in usable else None
     if head is not None:

@@ -1,4 +1,4 @@
-"""Inertial sensors: units, gravity, axes, and whether they tell of the motion they were worn in."""
+"""Checks of inertial sensors: units, gravity, axes, and agreement with the motion they were worn in."""
 
 import math
 
@@ -17,7 +17,7 @@ _ACC_UNITS = {"g": GRAVITY, "milli-g": GRAVITY / 1000, "cm/s²": 0.01}
 
 
 def check_imu(stream: str, imu: ImuStream, joint: Trajectory | None) -> list[Finding]:
-    """All checks of one sensor; `joint` is the path of the joint it is worn on, where the motion is known."""
+    """All checks of one sensor; `joint` is the path of the joint it is worn on, if there is a motion."""
     findings = []
     for name in ("acc_world", "acc_imu", "gyro_imu"):
         values = getattr(imu, name)
@@ -142,7 +142,7 @@ def check_gyroscope(stream: str, imu: ImuStream) -> list[Finding]:
 
 
 def check_against_motion(stream: str, imu: ImuStream, joint: Trajectory) -> list[Finding]:
-    """The sensor rides on its joint: constant mounting, the same turns and accelerations at the same time."""
+    """The sensor is fixed to its joint: constant mounting, the same rotations and accelerations at the same time."""
     findings = []
     lag = _clock_offset(imu, joint)
     if lag is not None:
@@ -182,7 +182,7 @@ def check_against_motion(stream: str, imu: ImuStream, joint: Trajectory) -> list
 
 
 def _clock_offset(imu: ImuStream, joint: Trajectory) -> Finding | None:
-    """From angular speed (any sensor axes); from acceleration where there is neither orientation nor gyroscope."""
+    """Lag from angular speed (any sensor axes), or from acceleration without orientation and gyroscope."""
     if imu.gyro_imu is not None:
         measured = imu.gyro_imu.double().norm(dim=-1)
     elif imu.R_world_imu is not None:
@@ -206,7 +206,7 @@ def _clock_offset(imu: ImuStream, joint: Trajectory) -> Finding | None:
 
 
 def offset_finding(lag: tuple[float, float, float] | None, who: str = "the sensor") -> Finding | None:
-    """What a lag between two clocks means; None where it could not be measured."""
+    """Finding about a lag between two clocks; None if it could not be measured."""
     if lag is None:
         return None
     seconds, best, unshifted = lag
@@ -215,7 +215,7 @@ def offset_finding(lag: tuple[float, float, float] | None, who: str = "the senso
         return Finding(
             "warning",
             "clock offset",
-            "does not tell of this motion",
+            "does not match this motion",
             evidence,
             "Another joint, another recording, or a clock more than a second off.",
         )
@@ -265,7 +265,7 @@ def _acceleration(check: str, acc_world: Tensor, joint: Trajectory, timestamps: 
     expected = interpolate(joint.timestamps, acceleration_of(joint), timestamps)
     window = (
         2 * round(0.033 / timestamps.diff().median().item()) + 1
-    )  # about the span that eq. 8 averages over
+    )  # approximately the span that eq. 8 averages over
     scale, agreement = _fit(expected.flatten(), mean_filter(acc_world, window).flatten())
     evidence = f"{scale:.2g} × the motion's, correlation {agreement:.2f}"
     if quantile(expected.norm(dim=-1), 0.9) < 0.5:

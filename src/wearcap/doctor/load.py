@@ -1,4 +1,4 @@
-"""What can be examined in a path: data sets, recording files, MPS folders, scenes, environments, motion capture files."""
+"""Recordings that can be examined in a path: data sets, files, MPS folders, scenes, environments, motion capture."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ Loaded = tuple[Recording, list[Finding]]
 
 @dataclass(frozen=True)
 class Patient:
-    """One recording to examine; `load` reads it, with findings of its own (a file's raw clock, a service's report)."""
+    """One recording to examine; `load` returns it with the reader's findings (a file's raw clock, a service's report)."""
 
     name: str
     load: Callable[[], Loaded]
@@ -73,7 +73,7 @@ def patients(path: Path) -> list[Patient]:
 
 
 def _kind(path: Path) -> str | None:
-    """The suffix that says how to read a file, compression left aside."""
+    """Suffix that determines a file's format, without compression."""
     suffixes = [suffix.lower() for suffix in path.suffixes if suffix.lower() not in (".gz", ".xz")]
     return suffixes[-1] if suffixes and suffixes[-1] in _READERS else None
 
@@ -99,7 +99,7 @@ def _as_head(track: Trajectory) -> HeadStream:
 
 
 def _read_stored(store: RecordingStore, name: str) -> Loaded:
-    """A recording of a data set, its bytes hashed anew."""
+    """A recording of a data set, with its bytes rehashed."""
     store.verify_one(name)
     recording = store.load(name)
     return recording, check_files(recording, store.root)
@@ -117,7 +117,7 @@ def _read_place(folder: Path) -> Loaded:
 
 
 def _read_mps(folder: Path) -> Loaded:
-    """An MPS folder at 60 Hz, with the raw file's clock, quality score, and what the service says of itself."""
+    """An MPS folder at 60 Hz, with findings about the raw file's clock, its quality score and the service's own report."""
     path = find_mps_file(folder, ("closed_loop_trajectory.csv",))
     assert path is not None, "is_mps_folder has seen it"
     raw = read_closed_loop(path)
@@ -162,7 +162,7 @@ def _read_recording(path: Path) -> Recording | Loaded:
 
 
 def _read_amc(path: Path) -> Motion:
-    """An AMC with the ASF beside it: the only one, or the one whose name it begins with."""
+    """An AMC file with the ASF beside it: the only one, or the one whose name it begins with."""
     beside = sorted(file for file in path.parent.iterdir() if ".asf" in file.suffixes)
     stem = path.name.split(".")[0]
     named = [file for file in beside if stem.startswith(file.name.split(".")[0])]
@@ -179,7 +179,7 @@ def _read_csv(path: Path) -> Recording | Trajectory:
 
 
 def _read_npz(path: Path) -> Recording | Motion:
-    """A motion of ours, Nymeria's suit data, or an AMASS file, by the arrays it holds."""
+    """A wearcap motion, Nymeria's suit data, or an AMASS file, recognised by its arrays."""
     if path.name == "xdata.npz":
         return read_xdata(path)[0]
     return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)

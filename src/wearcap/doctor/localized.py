@@ -1,4 +1,4 @@
-"""What a camera-localised recording (HPS) rests on: localisation, the suit's contacts, claps, the files it names."""
+"""Checks of a camera-localised recording (HPS): localisation, the suit's contacts, claps, referenced files."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ LONG_OUTAGE_S = 30.0
 
 
 def check_localization(found: Localization, body: Motion | None) -> list[Finding]:
-    """How often the camera was found, whether its path is one that a head takes, and the clock it is on."""
+    """Share of localised frames, plausibility of the camera's path for a head, and its clock."""
     known = found.confidence > 0
     share = known.float().mean().item()
     evidence = f"{100 * share:.0f} % of {len(known)} frames, longest outage {_longest_outage_s(found):.1f} s"
@@ -44,7 +44,7 @@ def check_localization(found: Localization, body: Motion | None) -> list[Finding
                 f"{100 * wrong:.1f} % lie further off than {MAX_SPEED:g} m/s allow",
                 "Raise the number of inliers that a pose needs." if wrong > 0.1 else ""))  # fmt: skip
     if track.R_world_body[:, 2, 1].median() > 0:  # an OpenCV camera's y axis points down
-        findings.append(Finding("warning", "localization: axes", "the camera hangs upside down", "its y axis points up in the world",
+        findings.append(Finding("warning", "localization: axes", "the camera is mounted upside down", "its y axis points up in the world",
                                 "Poses are of OpenCV's camera in the world (x right, y down, z forward), the world's z up."))  # fmt: skip
     return findings + _clock(track[good], share, body)
 
@@ -58,11 +58,11 @@ def _longest_outage_s(found: Localization) -> float:
 
 
 def _clock(track: Trajectory, share: float, body: Motion | None) -> list[Finding]:
-    """The camera turns as the body's head does, and when it does."""
+    """The camera turns like the body's head, at the same time."""
     if body is None or "head" not in body.skeleton or share < 0.5 or len(track) < 30:
         return []
     head, seen = body.joint("head"), smooth(track, 0.05)
-    # About the vertical, which suit and scene share: neither mount nor heading need be known.
+    # Turns about the vertical, which suit and scene share, depend on neither mount nor heading.
     turning = angular_velocity(Trajectory(body.timestamps, head.R, head.t))[:, 2]
     lag = lag_between(body.timestamps, turning, seen.timestamps, angular_velocity(seen)[:, 2])
     offset = offset_finding(lag, "the camera")
@@ -72,7 +72,7 @@ def _clock(track: Trajectory, share: float, body: Motion | None) -> list[Finding
 
 
 def check_contact_prob(stream: str, motion: Motion) -> list[Finding]:
-    """Foot contacts: one row per pose, probabilities, and neither never nor always."""
+    """Foot contacts have one row per pose, are probabilities, and are neither always nor never present."""
     contact, check = motion.contact_prob, f"{stream}: contacts"
     if contact is None:
         return []
@@ -92,7 +92,7 @@ def check_contact_prob(stream: str, motion: Motion) -> list[Finding]:
 
 
 def check_claps(recording: Recording) -> list[Finding]:
-    """Whether the wrists' sensors hold a clap, by which camera and suit can be put on one clock."""
+    """Whether the wrist sensors recorded a clap, by which camera and suit can be synchronised."""
     filmed = recording.localization is not None or (recording.camera is not None and recording.camera.video)
     wrists = [
         recording.imu[name]
@@ -114,7 +114,7 @@ def check_claps(recording: Recording) -> list[Finding]:
 
 
 def check_files(recording: Recording, root: Path) -> list[Finding]:
-    """The video and the scan that a recording names, seen from its data set's folder."""
+    """Existence of the video and the scan that a recording names, relative to its data set's folder."""
     findings = []
     stream = recording.camera
     if stream is not None and stream.video:

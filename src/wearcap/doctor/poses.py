@@ -1,4 +1,4 @@
-"""Poses over time: are they rotations, in metres, upright, in the right quaternion order, facing where they go?"""
+"""Checks of poses over time: valid rotations, metres, upright, quaternion order, heading along the path."""
 
 import math
 
@@ -12,14 +12,14 @@ from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, linear_velocity
 
 FASTEST_M_S = 12.0
-"""No one runs faster; a faster frame is a jump, a faster recording is in the wrong unit."""
+"""Highest running speed (m/s); a faster frame is a jump, a faster recording is in the wrong unit."""
 UPRIGHT = 0.7
-"""Mean z component of a head's or pelvis' own z axis in a recording of daily life is above this."""
+"""Least mean z component of a head's or pelvis' own z axis in a recording of daily life."""
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "CMU's units": 0.0254 / 0.45}
 
 
 def check_rotations(stream: str, R: Float[Tensor, "*batch 3 3"]) -> list[Finding]:
-    """Finite, orthonormal, right-handed; an empty list where they are."""
+    """Rotations are finite, orthonormal and right-handed; the list is empty if so."""
     check = f"{stream}: rotations"
     flat = R.reshape(-1, 3, 3).double()
     bad = ~flat.isfinite().all(-1).all(-1)
@@ -44,7 +44,7 @@ def check_rotations(stream: str, R: Float[Tensor, "*batch 3 3"]) -> list[Finding
 
 
 def check_speed(stream: str, track: Trajectory) -> list[Finding]:
-    """Positions in metres, without jumps."""
+    """Positions are in metres, without jumps."""
     check = f"{stream}: positions"
     if not track.t_world_body.isfinite().all():
         return [
@@ -86,7 +86,7 @@ def check_speed(stream: str, track: Trajectory) -> list[Finding]:
 
 
 def check_upright(stream: str, track: Trajectory) -> list[Finding]:
-    """Whether the body's own z axis points up the world's z, and if not, what was mixed up."""
+    """Whether the body's own z axis points along the world's z, and if not, the likely mix-up."""
     check = f"{stream}: up axis"
     R = track.R_world_body.double()
     up_world, up_body = R[:, :, 2].mean(0), R[:, 2, :].mean(0)
@@ -153,20 +153,20 @@ def check_facing(stream: str, track: Trajectory) -> list[Finding]:
 
 
 def _mean_angle(angle: Tensor) -> tuple[float, float]:
-    """Circular mean (rad) and how well the angles agree (0 … 1)."""
+    """Circular mean (rad) and concentration (0 … 1) of angles."""
     cos, sin = angle.cos().mean().item(), angle.sin().mean().item()
     return math.atan2(sin, cos), math.hypot(cos, sin)
 
 
 def _vertical_axis(track: Trajectory) -> int | None:
-    """World axis along which the body moves least, when it is clear: people move along the floor."""
+    """World axis along which the body clearly moves least, as people move along the floor; None if unclear."""
     spread = track.t_world_body.double().std(0)
     order = spread.argsort()
     return int(order[0]) if spread[order[0]] < 0.5 * spread[order[1]] else None
 
 
 def _quaternion_order(R: Tensor) -> str | None:
-    """How the file's four numbers should have been read for the body to be upright, if that helps."""
+    """Quaternion order that makes the body upright; None if none does."""
     wxyz = rotation.quat_wxyz_from_matrix(R)
     for shift, name in ((1, "xyzw"), (-1, "wxyz")):
         if rotation.matrix_from_quat_wxyz(wxyz.roll(shift, -1))[:, 2, 2].mean() > 0.85:

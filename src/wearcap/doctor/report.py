@@ -1,4 +1,4 @@
-"""What the doctor found: findings by recording, the worst first."""
+"""The doctor's findings by recording, the worst first."""
 
 from dataclasses import asdict, dataclass
 
@@ -14,11 +14,11 @@ class Finding:
     severity: str
     """"ok" (looked at and sound), "note" (worth knowing), "warning" (looks wrong) or "error" (is wrong)."""
     check: str
-    """What was looked at, in two or three words."""
+    """Name of the check, in two or three words."""
     what: str
     evidence: str = ""
     fix: str = ""
-    """How to mend it; empty where there is nothing to mend."""
+    """Fix; empty if there is nothing to fix."""
 
     def __post_init__(self):
         if self.severity not in SEVERITIES:
@@ -26,14 +26,14 @@ class Finding:
 
 
 def refusal(error: WearcapError, check: str = "reading") -> Finding:
-    """What a reader refused, as a finding."""
-    mend = " ".join(filter(None, [error.expected and f"Expected {error.expected}.", error.fix]))
-    return Finding("error", check, error.what, str(error.where or ""), mend)
+    """A reader's error as a finding."""
+    fix = " ".join(filter(None, [error.expected and f"Expected {error.expected}.", error.fix]))
+    return Finding("error", check, error.what, str(error.where or ""), fix)
 
 
 @dataclass(frozen=True)
 class Report:
-    """Findings of every recording that was looked at."""
+    """Findings of every examined recording."""
 
     source: str
     findings: dict[str, tuple[Finding, ...]]
@@ -48,7 +48,7 @@ class Report:
         return not self.of_severity("error")
 
     def grouped(self) -> list[tuple[Finding, list[str]]]:
-        """Findings that say the same of several recordings, put together: (the first, all recordings), worst first."""
+        """Equal findings of several recordings merged: (the first finding, all recordings), worst first."""
         groups: dict[tuple, tuple[Finding, list[str]]] = {}
         for name, found in self.findings.items():
             for finding in found:

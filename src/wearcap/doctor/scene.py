@@ -1,4 +1,4 @@
-"""A scene's folder: its scan (unit, colour, density, up axis), the photos that a map is built from, and the map."""
+"""Checks of a scene's folder: its scan (unit, colour, density, up axis), the database photos, and the map."""
 
 from pathlib import Path
 
@@ -19,22 +19,22 @@ from wearcap.recording.photo import Photo
 from wearcap.scene.scan import Scan
 
 SPARSE_M = 0.03
-"""Spacing beyond which pictures drawn from a scan have holes at arm's length."""
+"""Spacing (m) beyond which pictures rendered from a scan have holes at arm's length."""
 _CELL_M = 0.1
 _FEW_KEYPOINTS = 30
 _LOOKED_AT = 40
-"""Photos whose files are opened, of many."""
+"""Most photos whose files are opened."""
 _MARGIN_M = 1.0
-"""Photos may be taken so far outside the box around the scan."""
+"""Largest distance (m) of photos from the scan's bounding box."""
 _POINTS = 50_000
-"""Points of the scan that are projected into photos."""
+"""Number of points of the scan that are projected into photos."""
 
 NO_PHOTOS = Finding("error", "photos", "no photos", "a map of this scene would be empty",
                     "List pictures with their cameras and poses in photos.json.")  # fmt: skip
 
 
 def is_scene(folder: Path) -> bool:
-    """Whether a folder holds a scan with its photos: ours (photos.json) or NavVis' (sensor_frame.xml)."""
+    """Whether a folder holds a scan with photos: wearcap's (photos.json) or NavVis' (sensor_frame.xml)."""
     return (folder / FILE_NAME).is_file() or (folder / CLOUD).is_file() or is_hps_scene(folder)
 
 
@@ -43,7 +43,7 @@ def _is_navvis(folder: Path) -> bool:
 
 
 def read_scene(folder: Path) -> tuple[Recording, list[Finding]]:
-    """The scan as points, with all findings about scan and photos; what cannot be read is a finding too."""
+    """The scan as points, with all findings about scan and photos, including errors of reading them."""
     findings: list[Finding] = []
     scan, photos = None, None
     try:
@@ -65,7 +65,7 @@ def read_scene(folder: Path) -> tuple[Recording, list[Finding]]:
 
 
 def is_map(path: Path) -> bool:
-    """Whether a .safetensors file says that it is a visual map."""
+    """Whether a .safetensors file is marked as a visual map."""
     try:
         with safetensors.safe_open(str(path), framework="numpy") as file:
             return "wearcap_map" in (file.metadata() or {})
@@ -74,7 +74,7 @@ def is_map(path: Path) -> bool:
 
 
 def read_map(path: Path) -> tuple[Recording, list[Finding]]:
-    """A visual map, as its landmarks, and whether anything can be localised in it."""
+    """A visual map's landmarks, with findings about whether cameras can be localised in it."""
     visual_map = VisualMap.load(path)
     points, pictures = visual_map.landmarks.points_world, len(visual_map)
     if not len(points) or not pictures:
@@ -118,7 +118,7 @@ def check_scan(scan: Scan) -> list[Finding]:
 
 
 def check_photos(photos: list[Photo], scan: Scan | None) -> list[Finding]:
-    """Photos are there, of the size that they are calibrated for, and see the scan."""
+    """Photos exist, have their calibration's size, and see the scan."""
     if not photos:
         return [
             Finding(
@@ -132,7 +132,7 @@ def check_photos(photos: list[Photo], scan: Scan | None) -> list[Finding]:
     missing = [photo.file.name for photo in photos if not photo.file.is_file()]
     if missing:
         return [Finding("error", "photos", "image files are missing", f"{len(missing)} of {len(photos)}, as {missing[:3]}",
-                        "Put them where photos.json says.")]  # fmt: skip
+                        "Put them at the paths in photos.json.")]  # fmt: skip
     cameras = len({photo.camera for photo in photos})
     findings = [Finding("ok", "photos", f"{len(photos)} photos", f"{cameras} calibrations")]
     findings += _sizes(photos[:: -(-len(photos) // _LOOKED_AT)])
@@ -180,7 +180,7 @@ def _thinned(points: Float32[np.ndarray, "point 3"]) -> Float32[np.ndarray, "cho
 
 
 def _spacing_m(points: Float32[np.ndarray, "point 3"]) -> float:
-    """Distance of neighbours on a surface, from the points per occupied cell."""
+    """Distance (m) of neighbouring points on a surface, from the points per occupied cell."""
     cells = np.floor((points - points.min(0)) / _CELL_M).astype(np.int64)
     sides = cells.max(0) + 1
     _, counts = np.unique((cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2], return_counts=True)

@@ -14,7 +14,7 @@ LAG_RATE_HZ = 200.0
 
 
 def quantile(value: Float[Tensor, "*any"], q: float) -> float:
-    """Quantile of all entries (0 where there are none); long signals are thinned to a million entries."""
+    """Quantile of all entries (0 if empty); long signals are subsampled to a million entries."""
     flat = value.flatten().double()
     return torch.quantile(flat[:: len(flat) // 1_000_000 + 1], q).item() if len(flat) else 0.0
 
@@ -43,9 +43,9 @@ def lag_between(
     other: Float[Tensor, "sample"],
     max_lag_s: float = 1.0,
 ) -> tuple[float, float, float] | None:
-    """(lag in s, correlation at that lag, correlation without a shift) of two signals of the same quantity.
+    """(lag in s, correlation at that lag, correlation without a shift) between two signals of the same quantity.
 
-    A positive lag says that `other` shows things late. None where the streams share less than 4 s or a signal is still.
+    A positive lag means that `other` is late. None if the streams share less than 4 s or a signal is constant.
     """
     start = max(reference_times[0].item(), other_times[0].item())
     stop = min(reference_times[-1].item(), other_times[-1].item())
@@ -61,7 +61,7 @@ def lag_between(
     shifts, score = correlate_shifts(a.numpy(), b.numpy(), 0.7)
     near = abs(shifts) <= max_lag_s * LAG_RATE_HZ
     shifts, score = shifts[near], score[near]
-    # Walking repeats itself: of peaks as good as the highest, the least shift is meant.
+    # Walking is periodic: among peaks as good as the highest, the smallest shift is taken.
     rising = np.diff(score, prepend=-np.inf) > 0
     falling = np.diff(score, append=-np.inf) <= 0
     peaks = (rising & falling & (score >= score.max() - 0.02)).nonzero()[0]

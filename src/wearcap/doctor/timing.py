@@ -1,4 +1,4 @@
-"""Clocks: rates, gaps, jitter, order."""
+"""Checks of timestamps: rates, gaps, jitter, order."""
 
 from jaxtyping import Float64
 from torch import Tensor
@@ -57,7 +57,7 @@ def _gaps(check: str, timestamps: Tensor, step: float) -> list[Finding]:
 
 
 def check_spans(spans: dict[str, Float64[Tensor, "_"]]) -> list[Finding]:
-    """Whether all streams share a stretch of time."""
+    """Whether all streams overlap in time."""
     ends = {
         name: (t[0].item(), t[-1].item())
         for name, t in spans.items()

@@ -1,8 +1,8 @@
 """Readers and writers of files that others define: the one place that knows their units, axes and quirks.
 
 `formats/` are files that programs exchange, `devices/` what wearables write, `datasets/` public data sets. What a reader
-gives is metric, z up, and checked, and what it refuses it names with the file, what was expected, and what to do. Open
+returns is metric, z up and checked; errors name the file, what was expected and what to do. Open
 `formats/tum.py` first, a small whole one. Shared by all: `text.py`, `json_text.py`, `npz.py`, `csv_table.py`,
-`restricted_pickle.py`, and `smpl_axes.py` where SMPL's axes become ours. Our own files: `motion_npz.py`,
+`restricted_pickle.py`, and `smpl_axes.py`, which converts SMPL's axes to wearcap's. wearcap's own files: `motion_npz.py`,
 `environment.py`, `camera_json.py`, `photos.py`.
 """

@@ -12,10 +12,10 @@ from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 
 VERSION = 1
-"""Raised when the same source and settings would give another recording."""
+"""Version of the conversion, increased when the same source and settings yield another recording."""
 
 NO_MOTION = ("shape.npz", "stagei.npz")
-"""Ends of the names of files that hold no motion."""
+"""Name suffixes of files that hold no motion."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def amass_tasks(
 ) -> list[Task]:  # fmt: skip
     """One task per motion file below `source`, laid out DATASET/SUBJECT/MOTION.npz, of all data sets or of `subsets`.
 
-    A row of the split list that names a file (DATASET/SUBJECT/MOTION) goes before its subject's.
+    A row of the split list that names a file (DATASET/SUBJECT/MOTION) takes precedence over its subject's.
     """
     source = Path(source)
     if not source.is_dir():
@@ -63,7 +63,7 @@ def amass_tasks(
 
 
 def _within(files: list[Path], source: Path, subsets: Sequence[str]) -> list[Path]:
-    """Files of the named data sets. Raises WearcapError for one that is not there."""
+    """Files of the named data sets. Raises WearcapError for a missing one."""
     there = {path.relative_to(source).parts[0] for path in files}
     for name in subsets:
         if name not in there:

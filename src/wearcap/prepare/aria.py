@@ -10,7 +10,7 @@ from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 
 VERSION = 2
-"""Raised when the same source and settings would give another recording."""
+"""Version of the conversion, increased when the same source and settings yield another recording."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a recording must satisfy before it enters a data set."""
+"""Checks of a recording before it enters a data set."""
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ MAY_BE_UNKNOWN = ("localization.", "cues.")
 
 
 def check_recording(recording: Recording) -> None:
-    """Raise WearcapError when numbers are not finite, a clock stands still, or rotations are none.
+    """Raise WearcapError when numbers are not finite, timestamps do not rise, or rotations are invalid.
 
     Every stream needs rising timestamps; `motion` and `head` a plausible rate and at least `MIN_DURATION_S`.
     """

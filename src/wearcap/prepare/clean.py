@@ -1,4 +1,4 @@
-"""What motion capture needs before it is a truth: one rate, no glitches, a level floor, foot contacts."""
+"""Cleaning of motion capture for use as ground truth: one rate, no glitches, a level floor, foot contacts."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -17,22 +17,22 @@ TRUNK = ("pelvis", "l5", "l3", "t12", "t8", "neck", "head", "left_hip", "right_h
 
 @dataclass(frozen=True)
 class CleaningLimits:
-    """When a motion is taken for a glitch, a foot for planted, a floor for level."""
+    """Thresholds for a glitch, a planted foot and a level floor."""
 
     max_trunk_speed: float | int
-    """Of `TRUNK`'s joints (m/s); sprinters reach 12, CMU's runners 5."""
+    """Largest speed of `TRUNK`'s joints (m/s); sprinters reach 12, CMU's runners 5."""
     max_limb_speed: float | int
-    """Of all other joints (m/s); a kicking foot reaches 14 in CMU."""
+    """Largest speed of all other joints (m/s); a kicking foot reaches 14 in CMU."""
     contact_speed: float | int
-    """A foot patch slower than this (m/s) and …"""
+    """Speed (m/s) below which a foot patch may be in contact."""
     contact_height: float | int
-    """… lower than this above the floor (m) touches it."""
+    """Height above the floor (m) below which a slow foot patch is in contact."""
     level_within: float | int
     """Spread (m, 5th to 95th percentile) of the lowest planted patch's height up to which the floor is level."""
 
 
 def without_glitches(motion: Motion, limits: CleaningLimits) -> tuple[Motion, str]:
-    """The longest span between impossible steps, and a note that says what was cut ("" when nothing was).
+    """The longest span between impossible steps, and a note about the cut ("" if there was none).
 
     A step is impossible when a joint of the trunk moves faster than `max_trunk_speed`, or any other joint
     faster than `max_limb_speed`: markers that were swapped or lost flip limbs within one frame.
@@ -88,7 +88,7 @@ def foot_contacts(
     floor: float | None,
     limits: CleaningLimits,
 ) -> Bool[Tensor, "time patch"]:
-    """Contacts of `FOOT_PATCHES`: slow and, on a level floor (else None), low; lone frames follow their neighbours."""
+    """Contacts of `FOOT_PATCHES`: slow and, if the floor is level (else None), low; single frames follow their neighbours."""
     contact = speed < limits.contact_speed
     if floor is not None:
         contact &= positions[..., 2] < floor + limits.contact_height
@@ -97,5 +97,5 @@ def foot_contacts(
 
 
 def levelled(motion: Motion, floor: float) -> Motion:
-    """The motion moved so that its floor lies at z = 0."""
+    """The motion shifted so that its floor is at z = 0."""
     return replace(motion, t_world_root=motion.t_world_root - torch.tensor([0.0, 0.0, floor]))

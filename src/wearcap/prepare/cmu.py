@@ -21,19 +21,19 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 
 VERSION = 2
-"""Raised when the same source and settings would give another recording."""
+"""Version of the conversion, increased when the same source and settings yield another recording."""
 
 MOTION_SUFFIXES = (".amc", ".amc.xz", ".amc.gz", ".bvh", ".bvh.xz", ".bvh.gz")
 HEAD_TRIALS, HEAD_FRAME_STEP = 6, 12
-"""So many trials of a subject, and every twelfth frame of them, show how the head's markers sit."""
+"""Number of a subject's trials, and stride of their frames, from which the tilt of the head's markers is estimated."""
 
 CGSPEED_JOINT = "LHipJoint"
-"""A joint that only cgspeed's conversions of CMU have."""
+"""Joint by which cgspeed's conversions of CMU are recognised."""
 
 
 @dataclass(frozen=True)
 class BvhSettings:
-    """Units and axes of BVH files other than CMU's (those are known)."""
+    """Units and axes of BVH files other than CMU's, whose units and axes are known."""
 
     unit_m: float | int
     up: str
@@ -51,7 +51,7 @@ class Trial:
     bvh: BvhSettings
     settings: MocapSettings
     same_subject: tuple[Path, ...] = ()
-    """Trials of the same subject and skeleton file that tell how the head's markers sit."""
+    """Trials of the same subject and skeleton file from which the tilt of the head's markers is estimated."""
 
     def __call__(self) -> Recording:
         motion = on_xsens23(self.read())
@@ -81,7 +81,7 @@ def _head_face(asf: Path, files: tuple[Path, ...], fps: float | int) -> Float[Te
     for file in files:
         try:
             motion = read_amc(skeleton, file, fps)
-        except WearcapError:  # said when its own turn comes
+        except WearcapError:  # reported by the trial's own task
             continue
         thin = slice(None, None, HEAD_FRAME_STEP)
         motion = on_xsens23(replace(
@@ -99,7 +99,7 @@ def cmu_tasks(
     """One task per trial found anywhere below `source`.
 
     Files are named SUBJECT_TRIAL.amc or .bvh (also .xz, .gz); an .amc needs SUBJECT.asf in its folder. Where a
-    trial exists as both, the AMC is taken. `index.csv` (columns trial, category) gives activities when it is there.
+    trial exists as both, the AMC is taken. `index.csv` (columns trial, category) provides activities if it exists.
     """
     source = Path(source)
     if not source.is_dir():
@@ -126,7 +126,7 @@ def cmu_tasks(
 
 
 def _trials(source: Path) -> dict[str, Path]:
-    """Files of motion by trial; where a folder holds a trial in several forms, AMC goes before BVH."""
+    """Motion files by trial; if a folder has a trial in several formats, AMC takes precedence over BVH."""
     files: dict[str, Path] = {}
     for path in sorted(p for p in source.rglob("*") if p.name.lower().endswith(MOTION_SUFFIXES)):
         name = path.name.split(".")[0]

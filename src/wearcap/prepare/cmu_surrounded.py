@@ -1,4 +1,4 @@
-"""Captured motion put into simulated surroundings that fit it: the same recordings, with points and a head camera."""
+"""Captured motion in fitting simulated surroundings: the same recordings, with points and a head camera."""
 
 import zlib
 from dataclasses import dataclass, replace
@@ -20,12 +20,12 @@ from wearcap.simulation.surround import surround
 from wearcap.simulation.world import World
 
 TURNS, DOWN_DEG, VIEW_S = 12, (0.0, 38.0), 0.25
-"""Before the recording begins a wearer turns round in so many steps, looking ahead and then down, so long each."""
+"""Steps per turn, pitch of each turn (°), duration of a step (s) of the wearer's turns on the spot before the recording."""
 
 
 @dataclass(frozen=True)
 class Surrounded:
-    """One recording and what is simulated around it; picklable, callable as a task."""
+    """One recording and its simulated surroundings; picklable, callable as a task."""
 
     file: Path
     name: str
@@ -56,7 +56,7 @@ class Surrounded:
 def seen_points(world: World, head: HeadStream, look_round: bool, rng: np.random.Generator) -> PointCloud:
     """Semi-dense points along the head's path.
 
-    With `look_round`, what the wearer saw from where the path starts is known from its first moment.
+    With `look_round`, points that the wearer sees from the start of the path are available from its first frame.
     """
     points = semidense_points(
         world.mesh, world.face_texture, _turned_round(head) if look_round else head, rng
@@ -66,7 +66,7 @@ def seen_points(world: World, head: HeadStream, look_round: bool, rng: np.random
 
 
 def _turned_round(head: HeadStream) -> HeadStream:
-    """The path with two turns on the spot before it, level and looking down."""
+    """The path preceded by two turns on the spot, one level and one looking down."""
     ahead = head.R_world_device[0, :, 0]
     yaw = torch.atan2(ahead[1], ahead[0]) + torch.arange(TURNS) * (2 * torch.pi / TURNS)
     down = torch.tensor(DOWN_DEG).deg2rad().to(yaw.dtype)

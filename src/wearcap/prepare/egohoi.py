@@ -13,7 +13,7 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 
 VERSION = 1
-"""Raised when the same source and settings would give another recording."""
+"""Version of the conversion, increased when the same source and settings yield another recording."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class EgoHoiSequence:
     output: Path
 
     def __call__(self) -> Recording:
-        """The body at `fps`, objects where they were annotated; the environment is written beside the recording."""
+        """Recording with the body at `fps` and the annotated object poses; the environment is written beside it."""
         read = read_egohoi(self.root, self.name, self.motion_types, self.object_name)
         assert read.recording.motion is not None
         file = Path("scenes") / self.name / FILE_NAME

@@ -1,6 +1,6 @@
-"""Image embeddings put into the recordings of a data set that stands already.
+"""Adding image embeddings to the recordings of an existing data set.
 
-No engine of tasks: what fails here must leave the recording in its data set, and a large encoder is loaded once.
+This does not use the task engine: a failure must leave the recording in its data set, and a large encoder is loaded once.
 """
 
 import time
@@ -21,10 +21,10 @@ def embed_dataset(
     dataset: str | Path, encoder: ImageEncoder, cache: str | Path | None = None, overwrite: bool = False,
     progress: bool = True,
 ) -> Report:  # fmt: skip
-    """Give every recording with a head camera's pictures their embeddings by `encoder`, rewriting its file.
+    """Add embeddings by `encoder` to every recording with head-camera pictures, rewriting its file.
 
-    Recordings that have them already are left as they are, so that a killed run goes on where it was. A recording whose
-    pictures are missing or damaged is reported and stays as it was. The manifest's config hash stays: the source is
+    Recordings that have them already are left unchanged, so that a killed run resumes where it stopped. A recording whose
+    pictures are missing or damaged is reported and left unchanged. The manifest's config hash stays: the source is
     the same. `cache`: see `embed_camera`. Raises WearcapError when no recording has pictures, and when another run writes
     into the data set.
     """
@@ -38,7 +38,7 @@ def _embed_all(
     store: RecordingStore, encoder: ImageEncoder, cache: str | Path | None, overwrite: bool, progress: bool
 ) -> Report:
     name_of_all = embedding_name(encoder)
-    report, waiting, written_at = Report(), dict[str, Entry](), time.monotonic()
+    report, pending, written_at = Report(), dict[str, Entry](), time.monotonic()
     try:
         with progress_bar(len(store.entries), 0, progress) as advance:
             for name in store.names():
@@ -50,18 +50,18 @@ def _embed_all(
                     elif not overwrite and _is_current(store, name, camera, name_of_all):
                         report.current.append(name)
                     else:
-                        waiting[name] = _embed(
+                        pending[name] = _embed(
                             store, name, file, encoder, None if cache is None else Path(cache)
                         )
                         report.written.append(name)
                 except WearcapError as error:
                     report.failed[name] = str(error)
                 if time.monotonic() - written_at > REGISTER_EVERY_S:
-                    store.register(waiting)
-                    waiting, written_at = {}, time.monotonic()
+                    store.register(pending)
+                    pending, written_at = {}, time.monotonic()
                 advance()
     finally:
-        store.register(waiting)
+        store.register(pending)
     if len(report.notes) == len(store.entries):
         raise WearcapError("no recording has a head camera's pictures", where=store.root,
                            fix="Prepare it with them, as `wearcap prepare simulated camera=true` does.")  # fmt: skip
@@ -69,7 +69,7 @@ def _embed_all(
 
 
 def _is_current(store: RecordingStore, name: str, camera: CameraStream, embedded_by: str) -> bool:
-    """A run that was killed may have written a file that the manifest does not know yet: it is written again."""
+    """Whether a recording is up to date; a file of a killed run that is not in the manifest yet is written again."""
     known = _is_registered(store, name)
     both = camera.embedding is not None and camera.embedding_mirrored is not None
     return known and both and camera.embedding_name == embedded_by

@@ -31,13 +31,13 @@ from wearcap.workers import bound_to_this_process
 
 BACKENDS = ("loky", "threading", "dask", "ray")
 REGISTER_EVERY_S = 1.0
-"""The manifest is rewritten at most this often: a large data set's is megabytes long."""
+"""Least interval (s) between writes of the manifest: a large data set's has megabytes."""
 
 NOTE = "note"
-"""Key of a motion's provenance that the report repeats: what was cut, dropped or guessed."""
+"""Key of a motion's provenance that the report repeats: notes on cut, dropped or guessed data."""
 
 MAX_REASON = 500
-"""Longest reason (characters) that is told of a recording that failed."""
+"""Most characters of the reported reason why a recording failed."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +48,18 @@ class Task:
     make: Callable[[], Recording]
     split: str
     hash: str
-    """Changes when the source's bytes or the settings do."""
+    """Hash that changes when the source's bytes or the settings change."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a run did, by recording name."""
+    """Result of a run, by recording name."""
 
     written: list[str] = field(default_factory=list)
     current: list[str] = field(default_factory=list)
-    """Left as they were: their hash is current and their file whole."""
+    """Recordings left unchanged: their hash is current and their file complete."""
     failed: dict[str, str] = field(default_factory=dict)
-    """Name to reason."""
+    """Reasons of failed recordings by name."""
     notes: dict[str, str] = field(default_factory=dict)
 
 
@@ -76,7 +76,7 @@ def prepare(
     """Make every recording that is missing or out of date.
 
     `jobs` is joblib's (-1: all cores); with backend "dask" and no `scheduler` address, that many local workers.
-    A recording that cannot be made is reported and the rest goes on. Raises WearcapError when the output cannot be
+    A recording that cannot be made is reported, and the others continue. Raises WearcapError when the output cannot be
     written at all or another run writes there, and for an unknown backend or two tasks of one name.
     """
     if not tasks:
@@ -91,7 +91,7 @@ def prepare(
         raise WearcapError(f"no backend {backend!r}", expected=f"one of {', '.join(BACKENDS)}")
     with folder_lock(output, "prepare") as lock:
         store = RecordingStore(output)
-        store.register({})  # no permission or no space is better known now than after the first hour
+        store.register({})  # missing permission or space should show now and not after the first hour
         remove_leftovers(store.root, below=True)
         todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
         current = sorted(names - {task.name for task in todo})
@@ -103,30 +103,30 @@ def _collect(
     outcomes: Iterator[tuple[str, Entry | str, str]], store: RecordingStore, current: list[str], total: int,
     progress: bool,
 ) -> Report:  # fmt: skip
-    """Enter what workers have made in the manifest, and report."""
+    """Register the workers' results in the manifest, and report."""
     report = Report(current=current)
-    waiting: dict[str, Entry] = {}
+    pending: dict[str, Entry] = {}
     written_at = time.monotonic()
     try:
         with progress_bar(total, len(current), progress) as advance:
             for name, outcome, note in outcomes:
                 if isinstance(outcome, Entry):
-                    waiting[name] = outcome
+                    pending[name] = outcome
                     report.written.append(name)
                 else:
                     report.failed[name] = outcome
-                    store.entries.pop(name, None)  # of other settings: not what was asked for
+                    store.entries.pop(name, None)  # made with other settings
                 if note:
                     report.notes[name] = note
                 if time.monotonic() - written_at > REGISTER_EVERY_S:
-                    store.register(waiting)
-                    waiting, written_at = {}, time.monotonic()
+                    store.register(pending)
+                    pending, written_at = {}, time.monotonic()
                 advance()
     except BrokenExecutor as error:
         raise WearcapError("a worker process was killed (out of memory?)", where=store.root,
                            fix="What is finished is kept: run again with fewer jobs.") from error  # fmt: skip
     finally:
-        store.register(waiting)
+        store.register(pending)
     report.written.sort()
     return report
 
@@ -140,7 +140,7 @@ def _is_current(store: RecordingStore, task: Task) -> bool:
 
 
 def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
-    """In a worker: make, check and write one recording; (name, its entry or why there is none, note)."""
+    """In a worker: make, check and write one recording; returns (name, entry or reason of failure, note)."""
     with _one_thread():
         try:
             recording = task.make()
@@ -157,7 +157,7 @@ def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Recordings are the unit of parallelism; and sums over threads differ in their last bits."""
+    """Use one thread: recordings are the unit of parallelism, and sums over threads differ in their last bits."""
     before = torch.get_num_threads(), numba.get_num_threads()
     torch.set_num_threads(1)
     numba.set_num_threads(1)
@@ -174,7 +174,7 @@ def _outcomes(
     if not todo:
         return
     with _backend(backend, jobs, scheduler, lock) as as_generator:
-        chunk_size = len(todo) if as_generator else 64  # without a generator, results come chunk by chunk
+        chunk_size = len(todo) if as_generator else 64  # without a generator, results arrive chunk by chunk
         parallel = joblib.Parallel(
             n_jobs=jobs, batch_size=1, return_as="generator_unordered" if as_generator else "list"
         )
@@ -186,9 +186,9 @@ def _outcomes(
 
 @contextmanager
 def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -> Iterator[bool]:
-    """Make joblib's backend current; yields whether it can return results as they come.
+    """Activate joblib's backend; yields whether it can return results as they are finished.
 
-    Its local workers end with this process, and before the `lock` is given up.
+    Its local workers end with this process, and before the `lock` is released.
     """
     try:
         if backend == "dask":
@@ -221,7 +221,7 @@ def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -
 
 @contextmanager
 def progress_bar(total: int, done: int, visible: bool) -> Iterator[Callable[[], None]]:
-    """A bar of recordings on stderr; call what it yields for each one that is done."""
+    """Progress bar of recordings on stderr; the yielded function is called for each finished one."""
     columns = (TextColumn("recordings"), BarColumn(), MofNCompleteColumn(), TextColumn("left:"),
                TimeRemainingColumn())  # fmt: skip
     with Progress(*columns, console=Console(stderr=True), disable=not visible) as bar:

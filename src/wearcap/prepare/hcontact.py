@@ -13,7 +13,7 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 
 VERSION = 1
-"""Raised when the same source and settings would give another recording."""
+"""Version of the conversion, increased when the same source and settings yield another recording."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,9 @@ class HContactSequence:
 def hcontact_tasks(
     source: str | Path, splits: Splits, classes: dict[str, str], fps: float | int, license: str
 ) -> list[Task]:
-    """One task per sequence in `source`/body; `classes` gives the contact class by patterns of names, the first that
-    matches.
+    """One task per sequence in `source`/body; `classes` maps patterns of names to contact classes, the first match decides.
 
-    Where the set's own `splits/` is there, a subject of whom no window trains belongs to test, whatever the list says.
+    If the data set's own `splits/` exists, a subject without training windows belongs to test, regardless of the list.
     Raises WearcapError without sequences, and for a name that no pattern matches.
     """
     source = Path(source)
@@ -68,7 +67,7 @@ def hcontact_tasks(
 
 
 def held_out_subjects(source: Path, names: list[str]) -> set[str]:
-    """Subjects with windows in the set's own splits, none of which train."""
+    """Subjects with windows in the data set's own splits, none of them for training."""
     listed: dict[str, bool] = {}
     for path in sorted(source.glob("splits/**/*.json")):
         if path.stem in names:

@@ -12,7 +12,7 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 
 VERSION = 1
-"""Raised when the same source and settings would give another recording."""
+"""Version of the conversion, increased when the same source and settings yield another recording."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class HpsSequence:
 def hps_tasks(
     source: str | Path, splits: Splits, fps: float | int, camera_hz: float | int, license: str
 ) -> list[Task]:
-    """One task per sequence in `source`/hps_smpl; hashed by all files that bear its name, and its subject's betas."""
+    """One task per sequence in `source`/hps_smpl; hashed by all files with its name and its subject's betas."""
     source = Path(source)
     if not source.is_dir():
         raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
@@ -61,7 +61,7 @@ def hps_tasks(
         )
         small = [
             path for path in files if path.suffix.lower() != ".mp4"
-        ]  # of a video only its rate and length matter
+        ]  # only a video's rate and length matter
         sequence = HpsSequence(source, name, fps, camera_hz, license)
         settings_hash = content_hash(name, float(fps), float(camera_hz), license, VERSION, *small)
         tasks.append(Task(name, sequence, splits.of(subject), settings_hash))

@@ -1,6 +1,6 @@
-"""Keypoints of the head camera put beside the recordings of a data set: found in its pictures, recorded, or simulated.
+"""Adding head-camera keypoints to the recordings of a data set: detected in its pictures, recorded, or simulated.
 
-The new data set's recordings name videos and scenes where they are, in the old one.
+The new data set's recordings refer to videos and scenes in the old one.
 """
 
 import os
@@ -24,25 +24,25 @@ from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
 
 CAMERA_FPS = 30.0
-"""Of the camera that a recording without one is given."""
+"""Rate (Hz) of the simulated camera of a recording without one."""
 
 
 @runtime_checkable
 class Source(Protocol):
-    """Where keypoints come from; picklable."""
+    """Source of keypoints; picklable."""
 
     def __call__(self, recording: Recording, folder: Path) -> Recording:
-        """The recording, of the data set at `folder`, with its cues."""
+        """The recording, of the data set at `folder`, with cues added."""
         ...
 
     def settings(self, name: str) -> list[Any]:
-        """What the cues of the recording of this name depend on (`engine.content_hash`)."""
+        """Content that the cues of the recording of this name depend on (for `engine.content_hash`)."""
         ...
 
 
 @dataclass(frozen=True)
 class Found:
-    """Wrists that MediaPipe finds in the head camera's pictures, and optical flow follows where it misses them."""
+    """Wrists detected by MediaPipe in the head camera's pictures, tracked by optical flow where detections are missing."""
 
     model: str | None = None
     flow: FlowSettings = field(default_factory=FlowSettings)
@@ -59,7 +59,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Keypoints of files: `file`/NAME.csv for each recording, or `file` itself for the only one."""
+    """Keypoints from files: `file`/NAME.csv for each recording, or `file` itself for a single one."""
 
     file: str | None
     flow: FlowSettings = field(default_factory=FlowSettings)
@@ -86,7 +86,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Simulated:
-    """What a detector would find of the true motion; a recording without a head camera is given an action camera."""
+    """Simulated detections of the true motion; a recording without a head camera gets a simulated action camera."""
 
     joints: Sequence[str] = ("left_wrist", "right_wrist")
     noise_px: float | int = 4.0
@@ -112,7 +112,7 @@ class Simulated:
 
 @dataclass(frozen=True)
 class WithKeypoints:
-    """One recording and where its keypoints come from; picklable, callable as a task."""
+    """One recording and the source of its keypoints; picklable, callable as a task."""
 
     file: Path
     folder: Path
@@ -156,18 +156,18 @@ def _camera(recording: Recording) -> CameraStream:
     return recording.camera
 
 
-def _from_elsewhere(recording: Recording, way: str) -> Recording:
-    """The recording with its files named from another folder, `way` from there."""
+def _from_elsewhere(recording: Recording, prefix: str) -> Recording:
+    """The recording with `prefix` prepended to the paths of its files, for use from another folder."""
 
     def moved(name: str | None) -> str | None:
-        return name and Path(way, name).as_posix()
+        return name and Path(prefix, name).as_posix()
 
     camera = recording.camera
     if camera is not None:
         files = camera.image_files
         camera = replace(
             camera, video=moved(camera.video),
-            image_files=None if files is None else tuple(Path(way, name).as_posix() for name in files),
+            image_files=None if files is None else tuple(Path(prefix, name).as_posix() for name in files),
         )  # fmt: skip
     return replace(
         recording, camera=camera, scene=moved(recording.scene), environment=moved(recording.environment)

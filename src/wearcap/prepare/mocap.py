@@ -1,4 +1,4 @@
-"""From a captured motion, in whatever skeleton, to a recording with a head path, contacts and floor."""
+"""Conversion of a captured motion in any skeleton to a recording with a head path, contacts and floor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,17 +23,17 @@ from wearcap.recording.timing import resampled
 
 @dataclass(frozen=True)
 class MocapSettings:
-    """How motion capture without sensors becomes a recording."""
+    """Settings of the conversion of motion capture without sensors to a recording."""
 
     fps: float | int
     t_head_device: Sequence[float]
-    """Nominal place of a head-mounted device on the head joint (m)."""
+    """Nominal position of a head-mounted device in the head joint's frame (m)."""
     limits: CleaningLimits
 
 
 @dataclass(frozen=True)
 class About:
-    """What a recording says of itself."""
+    """Metadata of a recording."""
 
     name: str
     subject: str

@@ -22,19 +22,19 @@ from wearcap.sensors.camera_alignment import align_by_walks
 from wearcap.sensors.slam_track import clean_track
 
 VERSION = 1
-"""Raised when the same source and settings would give another recording."""
+"""Version of the conversion, increased when the same source and settings yield another recording."""
 
 
 @dataclass(frozen=True)
 class MocapEverySettings:
-    """How a capture folder becomes a recording in metres, z up."""
+    """Settings of the conversion of a capture folder to a recording in metres, z up."""
 
     scale: float | int | None
-    """Metres per unit of SLAM, with the first camera pose taken as level; None: as the board says."""
+    """Metres per unit of SLAM, with the first camera pose taken as level; None: from the calibration board."""
     height_m: float | int
-    """Of the first camera pose above the floor, where `scale` is given."""
+    """Height (m) of the first camera pose above the floor, used with `scale`."""
     max_acceleration: float | int
-    """Camera poses that accelerate more (m/s²) are outliers."""
+    """Acceleration (m/s²) beyond which camera poses are outliers."""
     max_burst_s: float | int
 
 
@@ -49,7 +49,7 @@ class MocapEveryCapture:
     license: str
 
     def __call__(self) -> Recording:
-        """Outliers are judged in metres, before anything is moved."""
+        """Recording without outlier poses, which are detected in metres before the world is changed."""
         read = read_mocap_every_folder(self.folder)
         scale, T_world_slam = _alignment(read, self.settings, self.folder)
         clean = clean_track(
@@ -62,7 +62,7 @@ class MocapEveryCapture:
 def mocap_every_folder_tasks(
     source: str | Path, splits: Splits, subject: str, settings: MocapEverySettings, license: str
 ) -> list[Task]:
-    """One task per capture folder at or below `source`; hashed by all files that are read, a video by its size."""
+    """One task per capture folder at or below `source`; hashed by all files read, a video by its size."""
     source = Path(source)
     if not source.is_dir():
         raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
@@ -82,10 +82,10 @@ def mocap_every_folder_tasks(
 
 
 def _alignment(read: MocapEveryFolder, settings: MocapEverySettings, folder: Path) -> tuple[float, Rigid]:
-    """Scale and T_world_slam: the board's, or with a given scale those of a level first pose."""
+    """Scale and T_world_slam from the calibration board, or from a given scale and a level first pose."""
     if settings.scale is None:
         if read.board is None:
-            raise WearcapError("it does not say how long a unit of SLAM is", where=folder,
+            raise WearcapError("it does not define the length of a unit of SLAM", where=folder,
                                expected="cam_scale_origin in config.yaml, and x and y in camera_calib.pkl",
                                fix="Measure it, and give scale=METRES_PER_UNIT.")  # fmt: skip
         board = read.board

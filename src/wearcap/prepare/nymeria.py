@@ -11,7 +11,7 @@ from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 
 VERSION = 2
-"""Raised when the same source and settings would give another recording."""
+"""Version of the conversion, increased when the same source and settings yield another recording."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def nymeria_tasks(
 ) -> list[Task]:
     """One task per sequence folder (with `body/xdata.npz`) below `source`; hashed by its motion, head path and points.
 
-    With `camera`, what the head's colour camera saw goes to `output`/videos, for sequences with `data.vrs`.
+    With `camera`, the video of the head's colour camera is written to `output`/videos, for sequences with `data.vrs`.
     """
     source = Path(source)
     if not source.is_dir():

@@ -18,21 +18,21 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 
 VERSION = 1
-"""Raised when the same source and settings would give another recording."""
+"""Version of the conversion, increased when the same source and settings yield another recording."""
 
 LOOKED_AT = 20
-"""Sequences, evenly over all, whose speeds tell whether the frame rate can be true."""
+"""Number of evenly chosen sequences whose speeds are used to check the frame rate."""
 FAST_PELVIS, FAST_FOOT = 2.5, 9.0
-"""Nobody who carries things about exceeds these for long (m/s): 95th percentile of the pelvis, 99th of the toes."""
+"""Speeds (m/s) that nobody carrying objects exceeds for long: 95th percentile of the pelvis, 99th of the toes."""
 SLOW_PELVIS, SLOW_FOOT = 0.4, 1.2
-"""Someone who walks exceeds one of these (m/s); a step lifts a foot at some 3 m/s."""
+"""Speeds (m/s) of pelvis and toes, one of which any walking person exceeds; a step lifts a foot at some 3 m/s."""
 WALKED_M = 1.0
-"""Sequences in which less was walked do not tell that a rate is too low."""
+"""Least walked distance (m) of sequences from which too low a rate can be concluded."""
 
 
 @dataclass(frozen=True, eq=False)
 class OmomoTake:
-    """One sequence, with its arrays: the file of all is read once. Picklable, callable as a task."""
+    """One sequence with its arrays, as the common file is read once; picklable, callable as a task."""
 
     root: Path
     sequence: OmomoSequence
@@ -42,7 +42,7 @@ class OmomoTake:
     output: Path
 
     def __call__(self) -> Recording:
-        """Body and object with the floor at z = 0; the environment is written beside the recording."""
+        """Recording of body and object with the floor at z = 0; the environment is written beside it."""
         take = omomo_take(self.sequence, self.root, self.source_fps)
         about = About(take.name, take.subject, "OMOMO", self.license, take.activity)
         return one_object_recording(take, about, self.settings, self.output)
@@ -54,8 +54,8 @@ def omomo_tasks(
 ) -> list[Task]:  # fmt: skip
     """One task per sequence of `source`'s files; environments go to `output`/scenes.
 
-    `source_fps` is the files' frame rate, which they do not tell. Raises WearcapError without sequences, for a rate that
-    is no positive number, and for one at which the people of the files would not move like people.
+    `source_fps` is the frame rate, which the files lack. Raises WearcapError without sequences, for a rate that is no
+    positive number, and for one at which the people would not move at human speeds.
     """
     source = Path(source)
     if not 0 < source_fps < 1e4:
@@ -76,10 +76,10 @@ def omomo_tasks(
 
 
 def check_rate(sequences: list[OmomoSequence], root: str | Path, fps: float | int) -> None:
-    """Raise WearcapError when people would, at this frame rate, run all the time or walk in slow motion.
+    """Raise WearcapError if, at this frame rate, people would run all the time or walk in slow motion.
 
-    Judged by the medians over `LOOKED_AT` sequences of the speeds of pelvis and toes; sequences that cannot be read are
-    left to their own tasks.
+    The check uses medians over `LOOKED_AT` sequences of the speeds of pelvis and toes; unreadable sequences are
+    reported by their own tasks.
     """
     speeds = []
     for index in sorted({int(k) for k in np.linspace(0, len(sequences) - 1, LOOKED_AT)}):
@@ -98,12 +98,12 @@ def check_rate(sequences: list[OmomoSequence], root: str | Path, fps: float | in
         raise WearcapError(
             f"at {fps:g} frames per second people walk at {pelvis:.2f} m/s and swing their feet at {foot:.2f} m/s",
             where=root, expected="some 1 and 3 m/s",
-            fix=f"The true rate is {'lower' if fast else 'higher'} (30 and 120 are told of): give it as source_fps=….",
+            fix=f"The true rate is {'lower' if fast else 'higher'} (public loaders use 30 or 120): give it as source_fps=….",
         )  # fmt: skip
 
 
 def walking_speeds(motion: Motion) -> tuple[float, float, float]:
-    """Speed over ground of the pelvis (95th percentile, m/s) and of the faster toes (99th), and the way walked (m)."""
+    """Speed over ground of the pelvis (95th percentile, m/s) and of the faster toes (99th), and the walked distance (m)."""
     motion = on_xsens23(motion)
     _, foot = foot_patches(motion)
     steps = motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1)
@@ -114,7 +114,7 @@ def walking_speeds(motion: Motion) -> tuple[float, float, float]:
 
 
 def _digest(sequence: OmomoSequence) -> str:
-    """Of a sequence's arrays: another one's change does not make this one out of date."""
+    """Hash of one sequence's arrays alone, so that changes of others do not make it out of date."""
     digest = hashlib.sha256()
     for key, array in sorted(sequence.arrays.items()):
         digest.update(f"{key} {array.dtype} {array.shape}".encode())

@@ -1,4 +1,4 @@
-"""From a person who handles one object to a recording with the object's path and an environment of that object."""
+"""Conversion of a take of a person and one object to a recording with the object's path and its environment."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -23,14 +23,14 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 
 MAX_GAP_S = 0.2
-"""Shorter gaps are bridged; at longer ones the take is cut."""
+"""Longest gap (s) that is interpolated; at longer ones the take is cut."""
 MAX_TILT_DEG = 30.0
-"""A floor that leans more than this is not one: the axes are others than told."""
+"""Largest tilt of the floor; beyond it the axes are not the documented ones."""
 
 _KNOWN_WITHIN_M = 0.1
-"""Feet that trod an area this wide (standard deviation) tell half of a tilt; wider, nearly all."""
+"""Spread (m, standard deviation) of foot positions at which half of the measured tilt is applied; nearly all if wider."""
 _ROBUST_M = (1.0, 0.03)
-"""Distance from the floor at which a step counts half, in the first and in the last round."""
+"""Distance (m) from the floor at which a step has half weight, in the first and in the last iteration."""
 _ROUNDS = 20
 _MIN_STEPS = 10
 _UPSIDE_DOWN_M = 0.2
@@ -39,11 +39,11 @@ _UPSIDE_DOWN_M = 0.2
 def one_object_recording(
     take: OneObject, about: About, settings: MocapSettings, output: str | Path
 ) -> Recording:
-    """As `mocap_recording`, with the object's path on the motion's clock and an environment of that one object.
+    """Like `mocap_recording`, with the object's path on the motion's clock and an environment of that one object.
 
-    The environment is written to `output`/scenes/NAME; the object is free to move and handled throughout, so that there
-    are no `interactions`. At gaps in the take and at glitches the longest stretch is kept, which the motion's provenance
-    notes. Raises WearcapError for an object of no known class and for a body that stands on its head.
+    The environment is written to `output`/scenes/NAME; the object is free to move and handled throughout, so there
+    are no `interactions`. Of the segments between gaps and glitches the longest is kept, as noted in the motion's
+    provenance. Raises WearcapError for an object of unknown class and for a body that is upside down.
     """
     kind = object_class(take.object_name)
     kept, cut = longest_stretch(take)
@@ -64,7 +64,7 @@ def one_object_recording(
 
 
 def longest_stretch(take: OneObject) -> tuple[OneObject, str]:
-    """The longest part of a take without gaps beyond `MAX_GAP_S`, and a note of what was cut ("" for nothing)."""
+    """The longest part of a take without gaps beyond `MAX_GAP_S`, and a note about the cut ("" if there was none)."""
     gaps = (take.motion.timestamps.diff() > MAX_GAP_S).nonzero()[:, 0].tolist()
     if not gaps:
         return take, ""
@@ -76,26 +76,26 @@ def longest_stretch(take: OneObject) -> tuple[OneObject, str]:
 
 
 def on_level_ground(take: OneObject, limits: CleaningLimits) -> OneObject:
-    """The take on xsens23, turned so that the ground it was trodden on is level; the tilt is noted in its provenance.
+    """The take on xsens23, rotated so that the ground below the planted feet is level; provenance notes the tilt.
 
-    Raises WearcapError for a ground that leans more than `MAX_TILT_DEG`.
+    Raises WearcapError for a ground tilted by more than `MAX_TILT_DEG`.
     """
     motion = on_xsens23(take.motion)
     positions, speed = foot_patches(motion)
     R = ground_rotation(positions[speed < limits.contact_speed])
     tilt = float(torch.rad2deg(torch.arccos(R[2, 2].clamp(max=1.0))))
     if tilt > MAX_TILT_DEG:
-        raise WearcapError(f"the ground beneath the feet leans by {tilt:.0f}°", where=take.name,
+        raise WearcapError(f"the ground below the feet is tilted by {tilt:.0f}°", where=take.name,
                            expected=f"at most {MAX_TILT_DEG:g}°", fix="Check which of the source's axes is up.")  # fmt: skip
     motion = replace(motion, provenance=motion.provenance | {"tilt_deg": f"{tilt:.2f}"})
     return replace(take, motion=motion).turned(R)
 
 
 def ground_rotation(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "3 3"]:
-    """The least rotation that makes the plane through points of planted feet level.
+    """Smallest rotation that levels the plane through positions of planted feet.
 
-    A robust plane z = a·x + b·y + c: points off it (feet on a step, on a chair's rung) lose their weight, and slopes are
-    held towards 0 as far as the feet stayed in one place. Too few points: no rotation.
+    The plane z = a·x + b·y + c is fitted robustly: points off it (feet on a step, on a chair's rung) lose their weight,
+    and slopes are regularised towards 0 if the feet stayed in one place. Too few points give no rotation.
     """
     if len(points_world) < _MIN_STEPS:
         return torch.eye(3, dtype=points_world.dtype)
@@ -119,7 +119,7 @@ def ground_rotation(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "3 
 
 
 def _on_clock(path: Trajectory, before: Motion, after: Motion) -> Trajectory:
-    """The object's path on the prepared motion's clock, moved as its first frame was: by the floor's height."""
+    """The object's path on the prepared motion's clock, with the same shift by the floor's height."""
     moved = after.t_world_root[0] - before.t_world_root[0]
     track = resample(path, before.timestamps[0] + after.timestamps)
     return Trajectory(after.timestamps, track.R_world_body, track.t_world_body + moved)

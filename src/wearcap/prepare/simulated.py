@@ -34,7 +34,7 @@ def simulated_tasks(
 ) -> list[Task]:  # fmt: skip
     """`recordings[split]` recordings of `duration_s` each; people and places of the splits never meet.
 
-    With `camera`, what a head camera sees goes to `output`/videos.
+    With `camera`, the head camera's video is written to `output`/videos.
 
     The hash covers the simulator's own source, so that a better simulator makes its recordings again.
     `world` is "flat", "outdoor" or None (drawn). Raises WearcapError for an unknown split or world, or when a
@@ -66,6 +66,6 @@ def checked_splits(recordings: Mapping[str, int], splits: Splits) -> None:
 
 
 def source_files() -> str:
-    """Digest of the code that simulates."""
+    """Digest of the simulator's source code."""
     folders = [Path(package.__file__ or "").parent for package in (wearcap.simulation, wearcap.sensors)]
     return content_hash(*(path for folder in folders for path in sorted(folder.glob("*.py"))))

@@ -1,4 +1,4 @@
-"""Simulated HPS recordings with their scenes: scan, database photos, and, where asked for, the head camera's video."""
+"""Simulated HPS recordings with their scenes: scan, database photos and, optionally, the head camera's video."""
 
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -23,18 +23,18 @@ from wearcap.simulation.views import Scenery
 
 @dataclass(frozen=True)
 class Video:
-    """What of the head camera's pictures is rendered."""
+    """Settings of the head camera's rendered video."""
 
     seconds: float | None
-    """From the recording's start; 0 nothing, None all of it."""
+    """Rendered duration (s) from the recording's start; 0: nothing, None: all of it."""
     fps: float
     changed: float
-    """Share of the movable things that stand elsewhere, or are gone, when it is filmed."""
+    """Share of the movable objects that have been moved or removed since the scan when the video is filmed."""
 
 
 @dataclass(frozen=True)
 class SimulatedHps:
-    """One recording by seed, and what of its scene is missing; picklable, callable as a task."""
+    """One recording by seed, and the missing files of its scene; picklable, callable as a task."""
 
     config: HpsConfig
     scene: SceneSettings | None
@@ -54,7 +54,7 @@ class SimulatedHps:
         return recording if self.video.seconds == 0 else self._filmed(simulated, recording)
 
     def _filmed(self, simulated: Simulated, recording: Recording) -> Recording:
-        """Film the first seconds; the camera's timestamps become the frames'."""
+        """Render the first seconds; the camera's timestamps become those of the frames."""
         rng = np.random.default_rng([21, self.seed])
         share = self.video.changed
         world = changed_world(simulated.world, rng, 0.7 * share, 0.3 * share) if share else simulated.world

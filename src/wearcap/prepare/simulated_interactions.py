@@ -28,7 +28,7 @@ MADE = "made.json"
 
 @dataclass(frozen=True)
 class SimulatedInteractionsTask:
-    """One recording by seed, and what of its scene is missing; picklable, callable as a task."""
+    """One recording by seed, and the missing files of its scene; picklable, callable as a task."""
 
     config: InteractionConfig
     spacing_m: float
@@ -49,7 +49,7 @@ class SimulatedInteractionsTask:
         )
 
     def _write_scene(self, simulated: SimulatedInteractions, folder: Path) -> None:
-        """The scan with everything at its initial pose, and the objects, unless they are there already."""
+        """Write the scan with everything at its initial pose and the objects, unless they exist already."""
         wanted = json.dumps({"spacing_m": self.spacing_m, "simulator": self.simulator})
         if is_made(folder, wanted, CLOUD, FILE_NAME):
             return
@@ -61,7 +61,7 @@ class SimulatedInteractionsTask:
 
 
 def is_made(folder: Path, wanted: str, *files: str) -> bool:
-    """Whether a scene's files are there, made as `wanted` says."""
+    """Whether a scene's files exist and were made with the settings `wanted`."""
     note = folder / MADE
     current = note.is_file() and note.read_text(encoding="utf-8") == wanted
     return current and all((folder / file).is_file() for file in files)

@@ -16,7 +16,7 @@ from wearcap.simulation.object_session import ObjectConfig, simulate_objects
 
 @dataclass(frozen=True)
 class SimulatedObjectsTask:
-    """One recording by seed, and its environment where that is missing; picklable, callable as a task."""
+    """One recording by seed, and its environment if missing; picklable, callable as a task."""
 
     config: ObjectConfig
     simulator: str

@@ -10,7 +10,7 @@ from wearcap.errors import WearcapError
 from wearcap.recording.store import SPLITS
 
 BY_HASH = "hash"
-"""Split of a pattern's subjects by their names' hash: 5 % val, 15 % test, the rest train."""
+"""Split of a pattern's subjects by the hash of their names: 5 % val, 15 % test, the others train."""
 
 
 @dataclass(frozen=True)

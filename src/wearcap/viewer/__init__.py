@@ -1,4 +1,4 @@
-"""Motion to look at: the 3D page in the browser, pictures and videos without a screen, annotator and object editor.
+"""Visualisation: the 3D page in the browser, pictures and videos without a screen, annotator and object editor.
 
 Open `page.py` first (`wearcap view`): it stacks `page_layers.py` and `page_motions.py` on one clock. `picture.py` and
 `video.py` draw without a browser (`wearcap render`); `annotate*.py` serve the page on which contacts are marked

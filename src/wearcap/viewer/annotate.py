@@ -1,4 +1,4 @@
-"""What the annotator sees of a recording (thesis §5.4.1): points of the body over time, a video, objects, labels."""
+"""A recording as shown in the annotator (thesis §5.4.1): points of the body over time, a video, objects, labels."""
 
 import threading
 from collections.abc import Callable
@@ -24,21 +24,21 @@ from wearcap.viewer.annotation_file import AnnotationFile, label_path
 
 _DRAWN_SITES = ("heel", "toe_tip", "fingertip")
 _NOSE = torch.tensor([0.13, 0.0, 0.09])
-"""On the head joint (m): shows where the wearer looks."""
+"""Point in front of the head joint (m) that shows the viewing direction."""
 
 
 @dataclass(frozen=True)
 class Video:
-    """A video file beside the motion."""
+    """A video file synchronised with the motion."""
 
     path: Path
     times: Float64[np.ndarray, "point 2"]
-    """Rising pairs: time of the recording, time of the video (s); straight lines between them."""
+    """Rising pairs of recording time and video time (s), interpolated linearly."""
 
 
 @dataclass(frozen=True)
 class Take:
-    """One recording as the page needs it."""
+    """Data of one recording for the page."""
 
     clock: LabelClock
     timestamps: Float64[np.ndarray, "time"]
@@ -47,15 +47,15 @@ class Take:
     point_names: tuple[str, ...]
     bones: tuple[tuple[int, int], ...]
     hands: tuple[int, ...]
-    """Point of each of `HANDS`."""
+    """Index of the point of each of `HANDS`."""
     objects: dict[str, str]
-    """Names of what can be touched, each with its contact class ("" where unknown)."""
+    """Names of objects that can be touched, each with its contact class ("" if unknown)."""
     video: Video | None = None
     notice: str = ""
-    """What the annotator should know, such as a video that is not there."""
+    """Notice for the annotator, such as a missing video."""
 
     def header(self) -> dict:
-        """Everything but the numbers per frame, for JSON."""
+        """All data except the numbers per frame, for JSON."""
         clock = self.clock
         return {
             "name": clock.name, "frames": clock.frames, "start_s": clock.start_s, "stop_s": clock.stop_s,
@@ -65,7 +65,7 @@ class Take:
         }  # fmt: skip
 
     def numbers(self) -> bytes:
-        """Little-endian, frame by frame: float64 timestamps, then float32 floor heights, then float32 points."""
+        """Little-endian bytes of all frames: float64 timestamps, then float32 floor heights, then float32 points."""
         parts = ((self.timestamps, "<f8"), (self.floor_z, "<f4"), (self.points_world, "<f4"))
         return b"".join(np.ascontiguousarray(array, dtype).tobytes() for array, dtype in parts)
 
@@ -73,7 +73,7 @@ class Take:
 def take_of(
     recording: Recording, folder: Path, motion: Motion | None = None, video: Video | None = None
 ) -> Take:
-    """The recording's true motion, else the suit's, unless one is given; its camera's video unless one is given.
+    """Data of a recording with its true motion, else the suit's, and its camera's video; `motion` and `video` replace these.
 
     `folder` is the data set's. Raises WearcapError without a motion, or for a body without hands.
     """
@@ -108,7 +108,7 @@ def video_from(path: str | Path, start_s: float) -> Video:
 
 
 def _drawn(motion: Motion) -> tuple[tuple[str, ...], Float32[np.ndarray, "time point 3"], tuple]:
-    """Joints, and where the skeleton has them hands, feet and face: names, positions, and pairs to be joined."""
+    """Joints, and hands, feet and face if the skeleton has them: names, positions, and pairs to connect."""
     skeleton, T = motion.skeleton, motion.T_world_joint
     sites = [name for name in skeleton.sites if name.endswith((*_DRAWN_SITES, "_palm")) or name == "crown"]
     names = [*skeleton.joint_names, *sites]
@@ -133,7 +133,7 @@ def _hands(motion: Motion, names: tuple[str, ...]) -> tuple[int, ...]:
 
 
 def _floor(recording: Recording, motion: Motion, points: np.ndarray) -> Float32[np.ndarray, "time"]:
-    """Height of the floor at each frame: as recorded, else a little below nearly all of the body."""
+    """Height (m) of the floor at each frame: as recorded, else slightly below nearly all of the body."""
     if recording.floor is not None and len(recording.floor.height):
         track = recording.floor
         heights = np.interp(motion.timestamps, track.timestamps, track.height)
@@ -143,19 +143,19 @@ def _floor(recording: Recording, motion: Motion, points: np.ndarray) -> Float32[
 
 
 def _objects(recording: Recording, folder: Path) -> dict[str, str]:
-    """What can be touched: the environment's objects, and those that the recording speaks of."""
+    """Objects that can be touched: the environment's, and those named in the recording."""
     objects = dict.fromkeys(recording.object_motion, "")
     if recording.interactions is not None:
         objects |= dict(zip(recording.interactions.objects, recording.interactions.classes))
     if recording.environment:
         environment = read_environment(folder / recording.environment)
-        objects |= {thing.name: thing.freedom.contact_class for thing in environment.objects}
+        objects |= {item.name: item.freedom.contact_class for item in environment.objects}
     objects.pop("", None)
     return dict(sorted(objects.items()))
 
 
 class Desk:
-    """The recordings that are to be annotated, and where their labels go. Recordings are loaded as they are opened."""
+    """The recordings to annotate and the folder of their labels. Recordings are loaded when they are opened."""
 
     def __init__(
         self, names: tuple[str, ...], recording: Callable[[int], Recording],
@@ -173,7 +173,7 @@ class Desk:
     ) -> "Desk":  # fmt: skip
         """A recording, or all of a data set's; labels go to `output` or outputs/annotate/<data set>.
 
-        A motion and a video go with one recording alone. Raises WearcapError where nothing is to be annotated.
+        A motion and a video require a single recording. Raises WearcapError if there is nothing to annotate.
         """
         folder = dataset_folder(where)
         places: list[str | Path] = [where]
@@ -202,7 +202,7 @@ class Desk:
         )
 
     def path(self, name: str) -> Path:
-        """Where the labels of a recording of that name lie, or will lie."""
+        """Path of the labels of a recording of that name, which need not exist yet."""
         return label_path(self.output, name)
 
     def file(self, index: int) -> AnnotationFile:

@@ -1,6 +1,6 @@
 """The annotator's web server: the page's own files, a recording's numbers once, its video in ranges, and saves.
 
-It listens on this machine alone, and answers only what its guard admits: its own page, opened with its token.
+It listens on this machine only, and answers only requests that its guard admits: its own page, opened with its token.
 """
 
 import contextlib
@@ -29,19 +29,19 @@ VIDEO_TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".
 MAX_SAVE_BYTES = 16 << 20
 PIECE_BYTES = 1 << 18
 MAX_CONNECTIONS = 32
-"""Connections at a time, each of which takes a thread; a browser opens six of them to a page.
+"""Most simultaneous connections, each with its own thread; a browser opens six of them to a page.
 
-Where more come, those that have not asked for anything yet, or not with the token, are closed first.
+Beyond it, connections without a request yet, or without the token, are closed first.
 """
 IDLE_S = 30.0
-"""A connection on which nothing moves for so long is closed. A browser opens it again when it needs it."""
+"""Idle time (s) after which a connection is closed. A browser reopens it when needed."""
 _CLOSE_S = 5.0
 _PORTS_TRIED = 50
 _GONE = (ConnectionError, TimeoutError)
 
 
 class AnnotationServer:
-    """Serves a desk until stopped; `port` is the next free one from the wished one on."""
+    """Serves a desk until stopped; `port` is the first free one from the requested one on."""
 
     def __init__(self, desk: Desk, port: int = 8090):
         """Raises WearcapError when no port is free."""
@@ -64,7 +64,7 @@ class AnnotationServer:
 
     @property
     def url(self) -> str:
-        """The address to open; it holds the token without which the page does not answer."""
+        """Address to open; it contains the token without which the page does not answer."""
         return self.guard.url(self.port)
 
     def wait(self) -> None:
@@ -73,7 +73,7 @@ class AnnotationServer:
             self._thread.join(1.0)
 
     def stop(self) -> None:
-        """No further answers, on connections that are open either."""
+        """Stop serving, on open connections too."""
         self._server.stopped = True
         self._server.shutdown()
         self._server.server_close()
@@ -81,7 +81,9 @@ class AnnotationServer:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    request_queue_size = 128  # a burst waits for its turn, instead of a second for the next try
+    request_queue_size = (
+        128  # queued requests of a burst are served in turn, instead of being retried after a second
+    )
     allow_reuse_address = os.name == "posix"
     desk: Desk
     guard: Guard
@@ -94,7 +96,7 @@ class _Server(ThreadingHTTPServer):
         self._idle_lock = threading.Lock()
 
     def process_request(self, request: Any, client_address) -> None:
-        """Answer a connection in a thread of its own; where there are too many, the longest idle one is closed."""
+        """Answer a connection in its own thread; if there are too many, close the one that has been idle longest."""
         if not self._free.acquire(blocking=False) and not (
             self._close_longest_idle() and self._free.acquire(timeout=_CLOSE_S)
         ):
@@ -106,7 +108,7 @@ class _Server(ThreadingHTTPServer):
         self.begin_idle(request)
         try:
             return super().process_request(request, client_address)
-        except BaseException:  # no thread was to be had
+        except BaseException:  # no thread was available
             self._release(request)
             raise
 
@@ -117,12 +119,12 @@ class _Server(ThreadingHTTPServer):
             self._release(request)
 
     def begin_idle(self, connection: socket.socket) -> None:
-        """From now on a connection may be closed for another one."""
+        """Mark a connection as idle: it may be closed in favour of another one."""
         with self._idle_lock:
             self._idle.setdefault(connection)
 
     def end_idle(self, connection: socket.socket) -> bool:
-        """From now on a connection is kept open. False where it has been closed for another one already."""
+        """Mark a connection as busy; returns False if it has already been closed in favour of another one."""
         with self._idle_lock:
             return self._idle.pop(connection, False) is None
 
@@ -141,7 +143,7 @@ class _Server(ThreadingHTTPServer):
         self._free.release()
 
     def handle_error(self, request, client_address) -> None:
-        """Browsers drop connections as they seek in a video, or let them lie; that is no news."""
+        """Ignore dropped and idle connections, which are normal when browsers seek in a video."""
         if not isinstance(sys.exception(), _GONE):
             super().handle_error(request, client_address)
 
@@ -152,7 +154,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = IDLE_S
 
     def log_message(self, format: str, *args) -> None:
-        """A line for every request helps nobody."""
+        """Log no requests."""
 
     def handle_one_request(self) -> None:
         self._granted: dict[str, str] = {}
@@ -169,7 +171,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(self._post)
 
     def _answer(self, action) -> None:
-        """Run an action that is admitted; what a user can mend becomes {"error": …} with a fitting status."""
+        """Run an admitted action; errors that a user can fix become {"error": …} with a fitting status."""
         if self.server.stopped:
             self.close_connection = True
             return
@@ -271,7 +273,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(data)
 
     def _send_video(self, path: Path) -> None:
-        """A whole file, or the one range that was asked for (RFC 9110, section 14)."""
+        """Send a whole file, or the one requested range (RFC 9110, section 14)."""
         size = path.stat().st_size
         span = byte_range(self.headers.get("Range", ""), size)
         if span is None:
@@ -300,7 +302,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def byte_range(header: str, size: int) -> tuple[int, int, bool] | None:
-    """Start, stop and whether it is a part, of a Range header; None where nothing of it lies in the file."""
+    """Start, stop and whether it is partial, of a Range header; None if the range is outside the file."""
     match = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", header.strip())
     if match is None or not (match[1] or match[2]):
         return 0, size, False

@@ -1,4 +1,4 @@
-"""One recording's labels on disk: written whole, never over something else, with backups of what was there before."""
+"""One recording's labels on disk: written atomically, never over other content, with backups of earlier states."""
 
 import hashlib
 import json
@@ -20,11 +20,11 @@ def label_path(output: str | Path, name: str) -> Path:
 
 
 class Conflict(WearcapError):
-    """The file is not the one that the labels were made from."""
+    """Raised if the file is not the one that the labels were made from."""
 
 
 class AnnotationFile:
-    """The file at `label_path`. Every state of it has a revision; "" where there is no file."""
+    """The file at `label_path`. Each of its states has a revision; "" if there is no file."""
 
     def __init__(self, output: str | Path, clock: LabelClock):
         self.path, self.clock = label_path(output, clock.name), clock
@@ -45,7 +45,7 @@ class AnnotationFile:
     def save(self, content: Any, base: str, *, client: str = "", force: bool = False) -> str:
         """Write labels (as `annotation_of` makes them) that were made from revision `base`, and return theirs.
 
-        A state that this session did not write itself is copied to `backups/` first. Raises WearcapError for
+        A state that was not written by this session is copied to `backups/` first. Raises WearcapError for
         impossible labels, and Conflict when the file has changed since `base` by another than `client`, unless
         forced.
         """

@@ -1,4 +1,4 @@
-"""Labels to start an annotation from: what a network or the recording says already, to be mended by hand."""
+"""Initial labels of an annotation, from a network or the recording, to be corrected by hand."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from wearcap.systems.ireplica.contact_intervals import ContactSettings, active, 
 def starting_labels(source: str | Path, recording: Recording, clock: LabelClock) -> Labels:
     """Labels of a label file (.json), of a captured motion (.npz), or for "recording" the recording's own.
 
-    Raises WearcapError when the source says nothing about contacts, or something impossible.
+    Raises WearcapError if the source has no contacts, or impossible ones.
     """
     if str(source) == "recording":
         if recording.interactions is None:
@@ -59,5 +59,5 @@ def _predicted(motion: Motion) -> Interactions | None:
 
 
 def _edges(timestamps: Float64[Tensor, "time"]) -> Float64[Tensor, "edge"]:
-    """Beginnings of frames, and the end of the last."""
+    """Start times of frames, and the end of the last."""
     return torch.cat([timestamps, timestamps[-1:] + timestamps.diff().median()])

@@ -1,4 +1,4 @@
-"""The points of a body that touch its object, lit: small balls on the skin, brighter the surer the contact is."""
+"""Contact points of a body with its object: small balls on the skin, brighter with the contact's probability."""
 
 import numpy as np
 import trimesh
@@ -13,21 +13,21 @@ from wearcap.recording.motion import Motion
 from wearcap.viewer.page_layers import nearest_frame
 
 LIT_PROB = 0.5
-"""Points are shown above this probability of contact."""
+"""Probability of contact above which points are shown."""
 BALL_M = 0.018
-"""Radius of a ball."""
+"""Radius of a ball (m)."""
 DIM, BRIGHT = np.array([0.55, 0.16, 0.02]), np.array([1.0, 0.86, 0.10])
-"""RGB at the threshold and at certainty."""
+"""Colours (RGB) at the threshold and at probability 1."""
 
 
 def lit_color(prob: Float[Tensor, "point"]) -> Float[np.ndarray, "point 3"]:
-    """RGB (0…1) of points by their probability of contact."""
+    """Colours (RGB, 0…1) of points by their probability of contact."""
     share = ((prob.double().numpy() - LIT_PROB) / (1 - LIT_PROB)).clip(0.0, 1.0)
     return DIM + share[:, None] * (BRIGHT - DIM)
 
 
 def lit_points(points: BodyModel, motion: Motion, frame: int) -> Mesh | None:
-    """Balls at the lit points of one frame; None where none is lit. `points`: a body of contact points alone."""
+    """Balls at the contact points of one frame; None if there are none. `points` is a body of contact points alone."""
     if motion.body_contact_prob is None:
         return None
     prob = motion.body_contact_prob[frame]
@@ -40,7 +40,7 @@ def lit_points(points: BodyModel, motion: Motion, frame: int) -> Mesh | None:
 
 
 class BodyPointsLayer:
-    """The balls of one motion on the page; a frame is their places, sizes (none where unlit) and colours."""
+    """The balls of one motion on the page; a frame is their positions, sizes (0 without contact) and colours."""
 
     def __init__(self, server: viser.ViserServer, name: str, motion: Motion, body: BodyModel):
         self.motion, self.points, self.offset = motion, contact_points(body), np.zeros(3)
@@ -64,7 +64,7 @@ class BodyPointsLayer:
         if not size.any() and not np.any(self.handle.batched_scales):
             return
         pose = self.motion.T_world_joint[frame]
-        # The balls hang on a node at the root, so that the browser's culling looks where the body is.
+        # The balls' parent node is at the root, so that the browser's culling considers the body's position.
         root = pose.t[0].double().numpy()
         self.handle.position = root + self.offset
         self.handle.batched_positions = (self.points.vertices(pose).double().numpy() - root).astype(

@@ -1,8 +1,8 @@
-"""Which requests a page in the browser answers: those that know its token, from its own pages, under its own name.
+"""Guard of a page in the browser: it admits requests with its token, from its own pages, under its own name.
 
-Every page that is open in a browser can send requests to this machine. Three things keep the others out: the token in
-the address that a command prints, which its page then holds as a cookie; `Origin`, which browsers do not let a page
-choose; and `Host`, which shows when a foreign name was made to point here.
+Every page that is open in a browser can send requests to this machine. Three checks keep the others out: the token in
+the address that a command prints, which its page then keeps as a cookie; `Origin`, which a page cannot choose in a
+browser; and `Host`, which reveals a foreign name that was made to point here.
 """
 
 import ipaddress
@@ -15,28 +15,28 @@ from urllib.parse import parse_qs
 
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 HEADERS = {
-    "Referrer-Policy": "same-origin",  # the address has the token in it
+    "Referrer-Policy": "same-origin",  # the address contains the token
     "X-Frame-Options": "DENY",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""Headers of every answer: they keep the token from leaving the page, and the page out of other pages."""
+"""Headers of every answer: they keep the token inside the page, and the page out of other pages' frames."""
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?")
 
 
 @runtime_checkable
 class Headers(Protocol):
-    """Headers of a request, as `http.server` and `websockets` have them."""
+    """Headers of a request, the common interface of `http.server` and `websockets`."""
 
     def get_all(self, name: str, /) -> list[str] | None: ...
 
 
 class Refused(Exception):
-    """A request that must not be answered, and why; to be sent with status 403."""
+    """Raised for a request that must not be answered, with the reason; to be sent with status 403."""
 
 
 @dataclass(frozen=True)
 class Guard:
-    """Admits requests to the page that is served on the address `host`. Its token is secret."""
+    """Admits requests to the page that is served on the address `host`, by a secret token."""
 
     host: str
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
@@ -71,7 +71,7 @@ class Guard:
         return self.host == "" or (address is not None and address.is_unspecified)
 
     def _is_ours(self, name: str) -> bool:
-        """Whether a name is one of the page's. No foreign name can be made an IP address, so any may be right."""
+        """Whether a name is one of the page's. A foreign name cannot be an IP address, so any IP address may be right."""
         if name in LOOPBACK or name == _plain(self.host):
             return True
         return self._everywhere and (_address(name) is not None or name == socket.gethostname().lower())
@@ -82,7 +82,7 @@ class Guard:
 
 
 def _single(headers: Headers, name: str) -> str | None:
-    """A header's value. Raises Refused where there are two, of which each reader may take another one."""
+    """A header's value. Raises Refused if there are two, of which different readers may take different ones."""
     values = headers.get_all(name) or []
     if len(values) > 1:
         raise Refused(f"{len(values)} headers {name}")
@@ -102,7 +102,7 @@ def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def _plain(name: str) -> str:
-    """A host's name or address in the one way it is compared: small letters, no brackets, shortest IPv6."""
+    """Canonical form of a host's name or address for comparison: lower case, no brackets, shortest IPv6."""
     name = name.strip("[]").lower()
     address = _address(name)
     return name if address is None else str(address)

@@ -15,13 +15,13 @@ from wearcap.viewer.picture import SKY, captioned
 
 PATH_COLOR, LOOK_COLOR = (0.85, 0.35, 0.12), (0.15, 0.35, 0.70)
 LOOKS = 12
-"""So many viewing directions are drawn along the path."""
+"""Number of viewing directions drawn along the path."""
 
 
 def draw_head_path(
     recording: Recording, size: tuple[int, int] = (640, 520)
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Two panels of `size` (width, height). Raises WearcapError when there is no head path either."""
+    """Two panels of `size` (width, height). Raises WearcapError if there is no head path either."""
     if recording.head is None:
         raise WearcapError("nothing to draw", where=recording.name, expected="a motion, or a head's path")
     path = recording.head.t_world_device.double().numpy()
@@ -39,7 +39,7 @@ def draw_head_path(
 
 
 def _path_mesh(recording: Recording, path: np.ndarray, radius: float) -> Mesh:
-    """The way as a tube, and short rods where the wearer looked."""
+    """The path as a tube, with short rods along the viewing directions."""
     assert recording.head is not None
     steps = path[:: max(1, len(path) // 300)]
     at = np.linspace(0, len(path) - 1, LOOKS).astype(int)

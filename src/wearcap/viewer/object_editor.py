@@ -1,6 +1,6 @@
-"""The page that makes an interactive environment: cut objects out of a scan, say how they move, try it, save.
+"""The page for making an interactive environment: cut objects out of a scan, set how they move, try it, save.
 
-What can be done to the objects stands in `scene/editing.py`; here clicks and drags become its verbs.
+The operations on objects are in `scene/editing.py`; this module maps clicks and drags to them.
 """
 
 import threading
@@ -30,7 +30,7 @@ from wearcap.viewer.page_server import start_server
 SNAP_M = 0.12
 SAVE_AFTER_S, TRY_AGAIN_S = 0.7, 10.0
 _CEILING_M = 2.1
-"""A view from above looks into the rooms: what is higher above the floor is hidden at first."""
+"""Height (m) above the floor beyond which points are hidden at first, to look into rooms from above."""
 _SIDE_M = 4.0
 
 
@@ -40,7 +40,7 @@ class ObjectEditor:
     def __init__(
         self, scan: Scan, file: Path, title: str = "scene", host: str = "127.0.0.1", port: int = 8080
     ):
-        """`file`: the environment.json to go on with, or to make. Raises WearcapError for one of another scene."""
+        """`file` is the environment.json to edit or create. Raises WearcapError for one of another scene."""
         environment = read_environment(file) if file.exists() else None
         try:
             self.editing = ObjectEditing(scan, environment)
@@ -65,11 +65,11 @@ class ObjectEditor:
         self._show_scan()
         self._show_box()
         self._show_objects()
-        self._tell()
+        self._show_status()
 
     @property
     def url(self) -> str:
-        """The address to open; it holds the token without which the page does not answer."""
+        """Address to open; it contains the token without which the page does not answer."""
         return self.guard.url(self.server.get_port())
 
     def _add_controls(self, title: str) -> None:
@@ -101,10 +101,10 @@ class ObjectEditor:
         self.top.on_update(self._acting(self._show_scan))
 
     def _acting(self, action: Callable[[], None]) -> Callable[..., None]:
-        """For a control: one action at a time, only when a person caused it, and what it refuses is shown to them."""
+        """Decorate a control's callback: one action at a time, only when a person caused it, with errors shown to them."""
 
         def act(event) -> None:
-            if event.client is None:  # our own writing of a control's value
+            if event.client is None:  # the editor itself set the control's value
                 return
             with self._lock:
                 try:
@@ -166,11 +166,11 @@ class ObjectEditor:
 
     @property
     def box(self):
-        """The box as it stands."""
+        """Current selection box."""
         return self.select.box(self.box_center)
 
     def use(self, tool: str) -> None:
-        """Take another tool."""
+        """Change the tool."""
         self.put_back()
         self.tool.value = tool
         self._hint.content = f"*{HINTS[tool]}*"
@@ -179,7 +179,7 @@ class ObjectEditor:
         self._show_objects()
 
     def clicked(self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]) -> None:
-        """A click in the view, as the ray from the camera; what it does is the tool's."""
+        """Apply the current tool to a click in the view, given as the ray from the camera."""
         tool = self.tool.value
         if tool == "look":
             if (name := self.view.picked(origin, direction)) is not None:
@@ -194,7 +194,7 @@ class ObjectEditor:
                 self._place_freedom(place, level=True)
 
     def paint(self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], fresh: bool) -> None:
-        """A dab of the brush or eraser where a ray meets the scan; `fresh` begins another stroke."""
+        """Apply the brush or eraser where a ray meets the scan; `fresh` begins a new stroke."""
         self._stroke += fresh
         place = self.view.hit(origin, direction)
         if place is None or self.tool.value not in ("brush", "eraser"):
@@ -229,14 +229,14 @@ class ObjectEditor:
         self._suggest_name()
 
     def next_hinge(self) -> None:
-        """The hinge at the next of the likely places round the object's footprint."""
+        """Place the hinge at the next likely position around the object's footprint."""
         item = self._item()
         places = hinge_places(points_world(item), float(item.t_world_object[2]))
         nearest = np.linalg.norm(places - np.array(item.freedom.pivot), axis=1).argmin()
         self._set_pivot(item, places[(nearest + 1) % len(places)])
 
     def try_value(self) -> None:
-        """Show the current object where the slider says, within its limits; its place in the file stays."""
+        """Show the current object at the slider's value, within its limits; its pose in the file stays."""
         item = self._item()
         if item.freedom.kind in ("hinge", "axis"):
             value = item.freedom.clamped(torch.tensor(self.objects.tried(item.freedom.kind)))
@@ -244,7 +244,7 @@ class ObjectEditor:
             self.view.place(item.name, self._tried)
 
     def put_back(self) -> None:
-        """Every object to its place at the beginning."""
+        """Show every object at its initial pose."""
         if self._tried is not None:
             self._tried = None
             self.objects.try_deg.value = self.objects.try_m.value = 0.0
@@ -274,7 +274,7 @@ class ObjectEditor:
         self._place_freedom(np.array(self.view.freedom_handle.position, np.float64), level=False)
 
     def _place_freedom(self, place: Float[np.ndarray, "3"], level: bool) -> None:
-        """The hinge at a place (at the object's edge if that is near), or the slide's axis toward it."""
+        """Place the hinge at a position (snapped to a near edge of the object), or point the slide's axis toward it."""
         item = self._item()
         if item.freedom.kind == "hinge":
             places = hinge_places(points_world(item), float(item.t_world_object[2]))
@@ -308,7 +308,7 @@ class ObjectEditor:
         self.view.show_box(self.box, self.tool.value == "box")
 
     def _try_dragged(self) -> None:
-        """On the floor: shifted and turned about z; carried: anywhere."""
+        """Pose of a dragged object: on the floor, shifted and turned about z; carried, any pose."""
         item, pose = self._item(), pose_of(self.view.try_handle)
         self._tried = pose
         self.view.place(item.name, pose)
@@ -317,7 +317,7 @@ class ObjectEditor:
         self.view.show_scan(self.editing.left(), float(self.top.value))
 
     def _refresh(self) -> None:
-        """Bring view and panels to the state of the editing; what is as it was is not sent again."""
+        """Update view and panels to the state of the editing; unchanged parts are not sent again."""
         if self.editing.selected is not self._selection:
             self._selection = self.editing.selected
             self.view.show_selection(self._selection)
@@ -325,10 +325,10 @@ class ObjectEditor:
             self._shown, self._changed_at = self.editing.revision, wall.monotonic()
             self._show_scan()
             self._show_objects()
-        self._tell()
+        self._show_status()
 
     def _show_objects(self) -> None:
-        """The objects in their places, and all that belongs to the current one."""
+        """Draw the objects at their poses, and the hinge, slide and handle of the current one."""
         items, tool = self.editing.environment.objects, self.tool.value
         if self.current not in [item.name for item in items]:
             self.current = items[-1].name if items else None
@@ -339,7 +339,7 @@ class ObjectEditor:
         by_hand = item is not None and tool == "try" and item.freedom.kind in ("plane", "free")
         self.view.show_try_handle(item if by_hand else None)
 
-    def _tell(self) -> None:
+    def _show_status(self) -> None:
         state = f"saved in {self.file.name}" if self.file.exists() else "nothing to save yet"
         if self.editing.revision is not self._saved:
             state = self._problem or "…"
@@ -357,16 +357,16 @@ class ObjectEditor:
         camera.position = tuple(middle + far * np.array([-0.4, -0.4, 1.0]))
 
     def save(self) -> None:
-        """Write the environment if it has changed. Raises WearcapError where that cannot be."""
+        """Write the environment if it has changed. Raises WearcapError if it cannot be written."""
         with self._lock:
             revision = self.editing.revision
             if revision is not self._saved:
                 write_environment(self.editing.environment, self.file)
                 self._saved, self._problem = revision, ""
-                self._tell()
+                self._show_status()
 
     def run(self, seconds: float = np.inf) -> None:
-        """Serve until interrupted, or for so many seconds; changes are saved when nothing happened for a moment."""
+        """Serve until interrupted, or for the given seconds; changes are saved after a moment of inactivity."""
         begin, not_before = wall.monotonic(), 0.0
         while not self._stopped and (now := wall.monotonic()) - begin < seconds:
             if now > max(not_before, self._changed_at + SAVE_AFTER_S):
@@ -374,11 +374,11 @@ class ObjectEditor:
                     self.save()
                 except WearcapError as error:
                     self._problem, not_before = f"**not saved: {error}**", now + TRY_AGAIN_S
-                    self._tell()
+                    self._show_status()
             wall.sleep(0.1)
 
     def stop(self) -> None:
-        """Save what is not saved yet, and close. Raises WearcapError where it cannot be written."""
+        """Save unsaved changes, and close. Raises WearcapError if they cannot be written."""
         self._stopped = True
         try:
             self.save()

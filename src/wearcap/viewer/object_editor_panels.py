@@ -1,4 +1,4 @@
-"""The object editor's controls: what is chosen there is read off, what has changed is written back."""
+"""The object editor's controls: values are read from them, and changes are written back."""
 
 import numpy as np
 import viser
@@ -23,7 +23,7 @@ _NAMES_OF_KINDS = {
 
 
 class SelectPanel:
-    """The box's shape, the brush's size, and what an object shall be called when it is cut out."""
+    """Shape of the box, size of the brush, and name and category of the next object to cut out."""
 
     def __init__(self, gui: viser.GuiApi):
         self.length = gui.add_slider("Length (m)", 0.02, 6.0, 0.01, 1.0)
@@ -40,7 +40,7 @@ class SelectPanel:
         self.cut = gui.add_button("Cut out", color="orange")
 
     def box(self, center: tuple[float, float, float]) -> Box:
-        """The box of this shape at a place."""
+        """Box of this shape at a position."""
         size = (self.length.value, self.width.value, self.height.value)
         return Box(center, size, float(np.deg2rad(self.turn.value)))
 
@@ -50,7 +50,7 @@ class SelectPanel:
 
 
 class ObjectPanel:
-    """The current object: its name, how it moves, its limits, and a slider to try it."""
+    """Controls of the current object: its name, its degrees of freedom, its limits, and a slider to try it."""
 
     def __init__(self, gui: viser.GuiApi):
         self.choice: viser.GuiDropdownHandle[str] = gui.add_dropdown("Object", (_NONE,))
@@ -82,17 +82,17 @@ class ObjectPanel:
         return self.least_deg, self.greatest_deg, self.least_m, self.greatest_m
 
     def limits(self, kind: str) -> tuple[float, float]:
-        """As the sliders stand: rad or m."""
+        """Limits set by the sliders: rad or m."""
         if kind == "hinge":
             return float(np.deg2rad(self.least_deg.value)), float(np.deg2rad(self.greatest_deg.value))
         return float(self.least_m.value), float(self.greatest_m.value)
 
     def tried(self, kind: str) -> float:
-        """Value that the slider asks for: rad or m."""
+        """Value of the slider: rad or m."""
         return float(np.deg2rad(self.try_deg.value)) if kind == "hinge" else float(self.try_m.value)
 
     def show(self, items: tuple[SceneObject, ...], current: SceneObject | None) -> None:
-        """All objects' names, and the current one's properties."""
+        """Show all objects' names, and the current one's properties."""
         names = tuple(item.name for item in items) or (_NONE,)
         if self.choice.options != names:
             self.choice.options = names
@@ -132,6 +132,6 @@ def _limits(freedom: Freedom, widest: float) -> tuple[float, float]:
 
 
 def _write(control, value) -> None:
-    """Only what has changed: a control that is being dragged must not jump."""
+    """Set a control's value only if it has changed: a control that is being dragged must not jump."""
     if control.value != value:
         control.value = value

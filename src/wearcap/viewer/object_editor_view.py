@@ -1,4 +1,4 @@
-"""What the object editor draws: the scan, the selection, the objects where they stand, hinges, slides and handles."""
+"""The object editor's 3D view: the scan, the selection, the objects at their poses, hinges, slides and handles."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ CURRENT_TINT = np.array([230, 60, 130])
 _ARROW_M = 0.5
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)], np.float32)
 _EDGES = _CORNERS[[[a, a + step] for step in (1, 2, 4) for a in range(8) if not a & step]]
-"""Of a unit box."""
+"""Pairs of corners that are edges of a unit box."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +39,11 @@ class _Shown:
     node: viser.PointCloudHandle | viser.MeshHandle
     label: viser.LabelHandle
     points: Float[np.ndarray, "shown 3"]
-    """Of the world, for picking."""
+    """Points in world coordinates (m), for picking."""
 
 
 class EditorView:
-    """The 3D part of the page. Everything here is told what to show; nothing is decided."""
+    """The 3D part of the page. It only draws what its methods receive."""
 
     def __init__(self, server: viser.ViserServer, scan: Scan):
         self.scene, self.scan = server.scene, scan
@@ -54,7 +54,7 @@ class EditorView:
         self.point_m = 1.9 * typical_spacing(scan.points[self._thinned])
         self._center = scan.points.mean(0, dtype=np.float64)
         self.visible = scan.points[:0]
-        """Points of the scan that are drawn."""
+        """Indices of the scan's points that are drawn."""
         self._objects: dict[str, _Shown] = {}
         self.box = self.scene.add_line_segments("/box", _EDGES, BOX_COLOR, thickness=0.012)
         self.box_handle = self.scene.add_transform_controls("/box_handle", scale=0.45, disable_rotations=True)
@@ -67,14 +67,14 @@ class EditorView:
         )
 
     def show_scan(self, left: Bool[np.ndarray, "point"], top_m: float) -> None:
-        """The points that belong to no object, up to a height."""
+        """Draw the points that belong to no object, up to a height."""
         shown = self._thinned[left[self._thinned]]
         shown = shown[self.scan.points[shown, 2] <= top_m]
         self.visible = self.scan.points[shown]
         self._add_cloud("/scan", self.visible, self._colors[shown], self.point_m)
 
     def show_selection(self, selected: Int64[np.ndarray, "selected"]) -> None:
-        """Densely, and a little larger than the scan's own points, so that they cover those."""
+        """Draw the selection densely, slightly larger than the scan's own points, so that it covers them."""
         shown = selected[:: max(1, -(-len(selected) // SHOWN_SELECTED))]
         colors = np.broadcast_to(np.array(SELECTED_COLOR, np.uint8), (len(shown), 3))
         self._add_cloud("/selection", self.scan.points[shown], colors, 1.8 * self.point_m)
@@ -108,7 +108,7 @@ class EditorView:
             self.brush.position = place
 
     def show_objects(self, items: tuple[SceneObject, ...], current: str | None) -> None:
-        """Each in its own tint, the current one in its own; what is shown already stays."""
+        """Draw each object in its own tint, the current one highlighted; objects already shown stay."""
         wanted = {item.name: (item, (k % len(TINTS), item.name == current)) for k, item in enumerate(items)}
         for name, shown in list(self._objects.items()):
             item, tinted = wanted.get(name, (None, None))
@@ -140,13 +140,13 @@ class EditorView:
         return _Shown(item, tinted, handle, label, points_world(item)[::every])
 
     def place(self, name: str, T_world_object: Rigid) -> None:
-        """Put an object somewhere (to try how it moves)."""
+        """Show an object at a pose (to try how it moves)."""
         node = self._objects[name].node
         node.wxyz = quat_wxyz_from_matrix(T_world_object.R.double()).numpy()
         node.position = T_world_object.t.double().numpy()
 
     def show_freedom(self, item: SceneObject | None, handled: bool) -> None:
-        """The current object's hinge as a line, or its slide as an arrow; with a handle to drag where asked for."""
+        """Draw the current object's hinge as a line, or its slide as an arrow, optionally with a handle to drag."""
         self.scene.remove_by_name("/freedom")
         kind = item.freedom.kind if item is not None else None
         self.freedom_handle.visible = handled and kind in ("hinge", "axis")
@@ -167,7 +167,7 @@ class EditorView:
             self.freedom_handle.position = tip
 
     def show_try_handle(self, item: SceneObject | None) -> None:
-        """A handle to move an object by hand: on the floor, or anywhere where it is carried."""
+        """Show a handle to move an object: on the floor, or in 3D if it is carried."""
         self.try_handle.visible = item is not None
         if item is not None:
             self.try_handle.active_axes = (True, True, item.freedom.kind == "free")
@@ -177,12 +177,12 @@ class EditorView:
     def hit(
         self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
     ) -> Float[np.ndarray, "3"] | None:
-        """The place on the scan that a ray of the view meets first."""
+        """First point of the scan that a ray of the view meets."""
         number = first_hit(self.visible, origin, direction, self.point_m)
         return None if number is None else self.visible[number].astype(np.float64)
 
     def picked(self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]) -> str | None:
-        """The object that a ray of the view meets first."""
+        """First object that a ray of the view meets."""
         best, nearest = None, np.inf
         for name, shown in self._objects.items():
             number = first_hit(shown.points, origin, direction, self.point_m)
@@ -192,34 +192,34 @@ class EditorView:
 
 
 def axis_toward(item: SceneObject, place: Float[np.ndarray, "3"]) -> tuple[float, float, float] | None:
-    """Unit vector from the middle of an object to a place; None where they coincide."""
+    """Unit vector from the middle of an object to a position; None if they coincide."""
     points = points_world(item)
-    way = place - (points.min(0) + points.max(0)) / 2
-    length = float(np.linalg.norm(way))
-    return None if length < 1e-3 else tuple((way / length).tolist())
+    direction = place - (points.min(0) + points.max(0)) / 2
+    length = float(np.linalg.norm(direction))
+    return None if length < 1e-3 else tuple((direction / length).tolist())
 
 
 def by_height(points: Float[np.ndarray, "point 3"]) -> UInt8[np.ndarray, "point 3"]:
-    """Colours for a scan without any: from blue at the floor to sand at the ceiling."""
+    """Colours for a scan without colours: from blue at the floor to sand at the ceiling."""
     low, high = np.quantile(points[:: max(1, len(points) // 10_000), 2], [0.02, 0.98])
     share = np.clip((points[:, 2:] - low) / max(high - low, 1e-6), 0, 1)
     return ((1 - share) * np.array([60, 90, 130]) + share * np.array([220, 170, 90])).astype(np.uint8)
 
 
 def typical_spacing(points: Float[np.ndarray, "point 3"]) -> float:
-    """Distance (m) of neighbours in a cloud: the median over a sample."""
+    """Median distance (m) of neighbours in a cloud, over a sample."""
     sample = points[:: max(1, len(points) // 500)]
     distance, _ = KDTree(points).query(sample, k=2)
     return float(np.clip(np.median(distance[:, -1]), 0.002, 0.2)) if len(points) > 1 else 0.02
 
 
 def ray_to(place: tuple[float, float, float], camera: viser.CameraHandle) -> tuple[np.ndarray, np.ndarray]:
-    """Origin and direction of the ray from a client's camera to a place."""
+    """Origin and direction of the ray from a client's camera to a position."""
     origin = np.asarray(camera.position, np.float64)
     return origin, np.asarray(place, np.float64) - origin
 
 
 def pose_of(handle: viser.TransformControlsHandle) -> Rigid:
-    """Where a handle was dragged to."""
+    """Pose that a handle was dragged to."""
     R = matrix_from_quat_wxyz(torch.tensor(np.asarray(handle.wxyz, np.float64)))
     return Rigid(R.float(), torch.tensor(np.asarray(handle.position, np.float64)).float())

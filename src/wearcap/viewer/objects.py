@@ -1,4 +1,4 @@
-"""Objects of an interactive environment as they are shown: posed meshes, and a layer of the page."""
+"""Display of an interactive environment's objects: posed meshes, and a layer of the page."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,53 +24,52 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
 
 CLOUD_BALLS, CLOUD_BALL_M = 1500, 0.012
-"""A cloud without faces is shown as so many small balls."""
+"""Number and radius (m) of small balls that show a cloud without faces."""
 
 
-def pose_at(track: Trajectory | None, thing: SceneObject, time_s: float) -> Rigid:
-    """Where an object is shown: its pose at the nearest frame of its track, or the initial one without a track."""
-    return poses_at(track, thing, torch.tensor([time_s], dtype=torch.float64))[0]
+def pose_at(track: Trajectory | None, item: SceneObject, time_s: float) -> Rigid:
+    """Displayed pose of an object: at the nearest frame of its track, or the initial pose without a track."""
+    return poses_at(track, item, torch.tensor([time_s], dtype=torch.float64))[0]
 
 
-def poses_at(track: Trajectory | None, thing: SceneObject, times: Float64[Tensor, "time"]) -> Rigid:
-    """`pose_at` of many times (s)."""
+def poses_at(track: Trajectory | None, item: SceneObject, times: Float64[Tensor, "time"]) -> Rigid:
+    """`pose_at` for many times (s)."""
     if track is None or not len(track):
-        T = thing.T_world_object
+        T = item.T_world_object
         return Rigid(T.R.expand(len(times), 3, 3), T.t.expand(len(times), 3))
     return track.T_world_body[nearest_frames(track.timestamps, times)]
 
 
 @lru_cache(maxsize=1024)
-def shown_mesh(thing: SceneObject) -> Mesh:
+def shown_mesh(item: SceneObject) -> Mesh:
     """An object's triangles in its own axes; small balls at the points of a cloud."""
-    if len(thing.mesh.faces):
-        return thing.mesh
-    points = thing.mesh.vertices[:: max(1, len(thing.mesh.vertices) // CLOUD_BALLS)].astype(np.float64)
+    if len(item.mesh.faces):
+        return item.mesh
+    points = item.mesh.vertices[:: max(1, len(item.mesh.vertices) // CLOUD_BALLS)].astype(np.float64)
     size = np.full(len(points), CLOUD_BALL_M)
     return capsules(points, points, size, size, np.full((len(points), 3), 0.6), 4)
 
 
 def posed_meshes(environment: Environment, tracks: dict[str, Trajectory], time_s: float) -> list[Mesh]:
-    """All objects at a time (s), in the world."""
+    """Meshes of all objects at a time (s), in the world."""
     return [
-        moved(shown_mesh(thing), pose_at(tracks.get(thing.name), thing, time_s))
-        for thing in environment.objects
+        moved(shown_mesh(item), pose_at(tracks.get(item.name), item, time_s)) for item in environment.objects
     ]
 
 
 def moved(mesh: Mesh, T_world_object: Rigid) -> Mesh:
-    """A mesh of an object's axes in the world."""
+    """A mesh transformed from an object's axes to the world."""
     R, t = T_world_object.R.double().numpy(), T_world_object.t.double().numpy()
     return replace(mesh, vertices=(mesh.vertices @ R.T + t).astype(np.float32))
 
 
 def with_objects(recording: Recording, environment: Environment | None = None) -> Motion | None:
-    """The true motion with the true objects, hands and contact points, for viewers that show one motion each."""
+    """The true motion with the true objects, hand contacts and contact points, for viewers of single motions."""
     truth = recording.motion
     if truth is None:
         return None
-    held = recording.interactions
-    hands = None if held is None else held.hand_contact(truth.timestamps).to(truth.t_world_root.dtype)
+    labels = recording.interactions
+    hands = None if labels is None else labels.hand_contact(truth.timestamps).to(truth.t_world_root.dtype)
     points = None if environment is None else true_body_contact(recording, truth, environment)
     return replace(
         truth, object_motion=recording.object_motion or None, hand_contact_prob=hands, body_contact_prob=points
@@ -82,7 +81,7 @@ def true_body_contact(
 ) -> Float[Tensor, "time point"] | None:
     """1 where a contact point of the body is within `TOUCH_M` of the active object's surface, else 0.
 
-    None where nothing tells which object is active, and for bodies that are no human's.
+    None if the recording does not state which object is active, and for bodies that are not human.
     """
     if recording.interactions is None and len(recording.object_motion) != 1:
         return None
@@ -91,29 +90,29 @@ def true_body_contact(
     except WearcapError:
         return None
     touches = torch.zeros(len(truth), len(points.rest_vertices))
-    names = [thing.name for thing in environment.objects]
+    names = [item.name for item in environment.objects]
     acts = [act for act in true_acts(recording) if act.object in names]
     active = active_at(acts, names, truth.timestamps)
     for number in active.unique().tolist():
         if number == NO_OBJECT:
             continue
-        thing, take = environment.objects[number], (active == number).nonzero()[:, 0]
-        T = poses_at(recording.object_motion.get(thing.name), thing, truth.timestamps[take])
+        item, take = environment.objects[number], (active == number).nonzero()[:, 0]
+        T = poses_at(recording.object_motion.get(item.name), item, truth.timestamps[take])
         places = points.vertices(truth.T_world_joint[take])
-        touches[take] = _touches(environment, thing, places, T).to(touches.dtype)
+        touches[take] = _touches(environment, item, places, T).to(touches.dtype)
     return touches
 
 
 def _touches(
-    environment: Environment, thing: SceneObject, places: Float[Tensor, "time point 3"], T_world_object: Rigid
+    environment: Environment, item: SceneObject, places: Float[Tensor, "time point 3"], T_world_object: Rigid
 ) -> Bool[Tensor, "time point"]:
-    """Whether points of the world (m) touch an object; only those inside the ball around it are measured."""
-    low, high = torch.from_numpy(np.stack([thing.mesh.vertices.min(0), thing.mesh.vertices.max(0)]))
+    """Whether points of the world (m) touch an object; only those inside its bounding sphere are measured."""
+    low, high = torch.from_numpy(np.stack([item.mesh.vertices.min(0), item.mesh.vertices.max(0)]))
     middle = T_world_object.R @ ((low + high) / 2).to(T_world_object.R) + T_world_object.t
     radius = (high - low).norm() / 2
     near = (places - middle[:, None]).norm(dim=-1) <= radius + TOUCH_M
     frame = near.nonzero()[:, 0]
-    distance, _ = environment.distance(thing.name, places[near], T_world_object[frame])
+    distance, _ = environment.distance(item.name, places[near], T_world_object[frame])
     touches = torch.zeros_like(near)
     touches[near] = distance <= TOUCH_M
     return touches
@@ -123,19 +122,19 @@ class ObjectsLayer:
     """Objects on the page; a frame is one pose per object."""
 
     def __init__(
-        self, server: viser.ViserServer, name: str, things: Sequence[SceneObject], tracks: dict[str, Trajectory],
+        self, server: viser.ViserServer, name: str, objects: Sequence[SceneObject], tracks: dict[str, Trajectory],
         tint: tuple[int, int, int] | None = None,
     ):  # fmt: skip
-        """`tint`: RGB (0…255) that the objects' own colours are mixed with half and half."""
-        self.things, self.tracks, self.offset = tuple(things), tracks, np.zeros(3)
+        """`tint` is the RGB colour (0…255) that the objects' own colours are mixed with equally."""
+        self.objects, self.tracks, self.offset = tuple(objects), tracks, np.zeros(3)
         self.handles = []
-        for thing in self.things:
-            mesh = shown_mesh(thing)
+        for item in self.objects:
+            mesh = shown_mesh(item)
             color = 255 * np.atleast_2d(mesh.color).mean(0)
             if tint is not None:
                 color = (color + tint) / 2
             self.handles.append(server.scene.add_mesh_simple(
-                f"/{name}/{thing.name}", mesh.vertices, mesh.faces.astype(np.uint32),
+                f"/{name}/{item.name}", mesh.vertices, mesh.faces.astype(np.uint32),
                 color=tuple(int(c) for c in color),
             ))  # fmt: skip
 
@@ -145,8 +144,8 @@ class ObjectsLayer:
             handle.visible = visible
 
     def show(self, time: float) -> None:
-        for thing, handle in zip(self.things, self.handles):
-            pose = pose_at(self.tracks.get(thing.name), thing, time)
+        for item, handle in zip(self.objects, self.handles):
+            pose = pose_at(self.tracks.get(item.name), item, time)
             wxyz, position = (
                 quat_wxyz_from_matrix(pose.R.double()).numpy(),
                 pose.t.double().numpy() + self.offset,

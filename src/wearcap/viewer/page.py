@@ -1,6 +1,6 @@
-"""The interactive page: a recording and what was captured from it, in the browser.
+"""The interactive page: a recording and motions captured from it, in the browser.
 
-Python keeps the clock and sends poses; the browser skins, draws and moves the camera.
+Python runs the clock and sends poses; the browser skins, draws and moves the camera.
 """
 
 import time as wall
@@ -30,10 +30,10 @@ class Page:
         self, recording: Recording, captures: dict[str, Motion] | None = None, *, folder: Path | None = None,
         host: str = "127.0.0.1", port: int = 8080, environment: Environment | None = None,
     ):  # fmt: skip
-        """`captures`: what was captured, by the name to show; several stand side by side at first.
+        """`captures` are the captured motions by display name; several are shown side by side at first.
 
-        `folder`: the data set's, where `recording.scene` lies. Objects of an `environment` that move do so with each
-        motion, the others stand where the truth, else the beginning, has them.
+        `folder` is the data set's folder, which `recording.scene` is relative to. Moving objects of an `environment` are
+        shown with each motion, the others at their true poses, else their initial ones.
         """
         motions = motions_shown(recording, captures or {}, environment)
         self.timeline = _timeline(recording, motions)
@@ -43,10 +43,10 @@ class Page:
         self.server = start_server(self.guard, port, "wearcap")
         self.server.scene.set_up_direction("+z")
         self.server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
-        things = moving_objects(list(motions.values()), environment)
-        self.bodies: dict[str, Placed] = placed_motions(self.server, recording, motions, things)
+        moving = moving_objects(list(motions.values()), environment)
+        self.bodies: dict[str, Placed] = placed_motions(self.server, recording, motions, moving)
         self.layers: list[Layer] = list(self.bodies.values())
-        self.aside_m = spacing_m(list(motions.values()), things) if len(motions) > 1 else 0.0
+        self.aside_m = spacing_m(list(motions.values()), moving) if len(motions) > 1 else 0.0
         if recording.head is not None and len(recording.head.timestamps):
             self.layers.append(HeadLayer(self.server, recording.head))
         self._surroundings = self.server.scene.add_frame("/surroundings", show_axes=False)
@@ -55,7 +55,7 @@ class Page:
         if scene is not None:
             self.server.scene.add_mesh_trimesh("/surroundings/scene", scene)
         if environment is not None:
-            still = [thing for thing in environment.objects if thing not in things]
+            still = [item for item in environment.objects if item not in moving]
             self.layers.append(ObjectsLayer(self.server, "surroundings", still, recording.object_motion))
         self.layout = BESIDE if len(self.bodies) - (TRUTH in self.bodies) > 1 else OVER
         self._followed = np.zeros(3)
@@ -66,7 +66,7 @@ class Page:
 
     @property
     def url(self) -> str:
-        """The address to open; it holds the token without which the page does not answer."""
+        """Address to open; it contains the token without which the page does not answer."""
         return self.guard.url(self.server.get_port())
 
     def _add_floor(self, recording: Recording) -> None:
@@ -87,7 +87,7 @@ class Page:
         )
         self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1×")
         self._follow = gui.add_checkbox("Follow with the camera", initial_value=False)
-        # What stands around one motion stands in the others' way where they are set aside.
+        # The surroundings of one motion would overlap the others where these are shown side by side.
         self._surroundings.visible = self.layout != BESIDE
         around = gui.add_checkbox("Surroundings", initial_value=self._surroundings.visible)
         around.on_update(lambda _: setattr(self._surroundings, "visible", around.value))
@@ -118,7 +118,7 @@ class Page:
         return (OVER, BESIDE, *self.bodies)
 
     def arrange(self, layout: str) -> None:
-        """Truth and captures "over" one another, "beside" (the first capture in its place), or one alone."""
+        """Show ground truth and captures "over" one another, "beside" (the first capture in its place), or one alone."""
         if layout not in self._layouts():
             raise WearcapError(f"no layout {layout!r}", expected=f"one of {', '.join(self._layouts())}")
         self.layout = layout
@@ -129,7 +129,7 @@ class Page:
         self.show()
 
     def _scrubbed(self, event: viser.GuiEvent) -> None:
-        if event.client is not None:  # not our own update of the slider while playing
+        if event.client is not None:  # not the page's own update of the slider while playing
             self.timeline.seek(self._slider.value)
             self.show()
 
@@ -142,7 +142,7 @@ class Page:
         self.server.flush()
 
     def _focus(self) -> np.ndarray:
-        """What the camera looks at: the middle of the bodies that are shown, or the head."""
+        """Point that the camera looks at: the middle of the shown bodies, or the head."""
         shown = [placed.body.handle.position for placed in self.bodies.values() if placed.body.handle.visible]
         if shown:
             return np.mean(shown, axis=0)
@@ -152,14 +152,14 @@ class Page:
         return np.zeros(3)
 
     def _point_camera(self) -> None:
-        """From the front left; several that stand side by side are looked at from in front of the middle one."""
+        """Place the camera at the front left, or in front of the middle one of several bodies side by side."""
         self._followed = self._focus()
-        way = np.array([2.2, 2.0, 0.9])
+        direction = np.array([2.2, 2.0, 0.9])
         if self.layout == BESIDE:
-            way = np.array([1.0, 0.15, 0.3]) * max(3.0, 1.0 + 0.35 * self.aside_m * len(self.bodies))
+            direction = np.array([1.0, 0.15, 0.3]) * max(3.0, 1.0 + 0.35 * self.aside_m * len(self.bodies))
         camera = self.server.initial_camera
         camera.look_at = tuple(self._followed)
-        camera.position = tuple(self._followed + way)
+        camera.position = tuple(self._followed + direction)
 
     def _follow_camera(self) -> None:
         focus = self._focus()
@@ -171,7 +171,7 @@ class Page:
             client.camera.position = client.camera.position + moved
 
     def run(self, seconds: float = np.inf) -> None:
-        """Keep the clock until interrupted, or for so many seconds."""
+        """Run the clock until interrupted, or for the given seconds."""
         begin = last = wall.monotonic()
         shown = 0
         while not self._stopped and (now := wall.monotonic()) - begin < seconds:
@@ -189,7 +189,7 @@ class Page:
 
 
 def _timeline(recording: Recording, motions: dict[str, Motion]) -> Timeline:
-    """From the first to the last moment of whatever moves."""
+    """First and last time (s) of all moving layers."""
     head = recording.head
     streams = [motion.timestamps for motion in motions.values()]
     if head is not None and len(head.timestamps):
@@ -202,7 +202,7 @@ def _timeline(recording: Recording, motions: dict[str, Motion]) -> Timeline:
 
 
 def _floor_height(recording: Recording) -> float:
-    """The lowest floor as recorded; else below nearly all points where no body stands; else zero."""
+    """Height (m) of the lowest recorded floor; without bodies, a height below nearly all points; else zero."""
     if recording.floor is not None and len(recording.floor.height):
         return float(recording.floor.height.min())
     if recording.motion is None and recording.points is not None and len(recording.points.points_world):

@@ -1,4 +1,4 @@
-"""What the page shows, layer by layer; each moves to a time by sending poses, never meshes anew."""
+"""Layers of the page; each moves to a time by sending poses, without resending meshes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +22,10 @@ from wearcap.recording import HeadStream, Motion, PointCloud
 
 MAX_POINTS = 200_000
 LABEL_ABOVE_M = 0.3
-"""Above the highest joint."""
+"""Height (m) of labels above the highest joint."""
 CONTACT_COLOR, AIR_COLOR = (230, 60, 40), (190, 190, 190)
 _R_DEVICE_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""A camera (x right, y down, z forward) that looks the way the head does."""
+"""Rotation of a camera (x right, y down, z forward) that looks in the head's direction."""
 
 
 class Layer(Protocol):
@@ -34,7 +34,7 @@ class Layer(Protocol):
 
 @runtime_checkable
 class MotionLayer(Layer, Protocol):
-    """What belongs to one motion: it can be set aside by an offset (m) and hidden."""
+    """Layer of one motion, which can be shifted by an offset (m) and hidden."""
 
     def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None: ...
 
@@ -61,12 +61,12 @@ def stick_body(skeleton: Skeleton) -> BodyModel:
         start, end = (np.concatenate([points, rest[[head]] + [0.02, 0.0, 0.09]]) for points in (start, end))
         radius, bones = np.append(radius, 0.10), [*bones, head]
     mesh = capsules(start, end, radius, radius, np.zeros((len(bones), 3)), segments=12)
-    held = torch.tensor(bones).repeat_interleave(len(mesh.vertices) // len(bones))
-    weights = torch.zeros(len(held), 4)
+    bone_of_vertex = torch.tensor(bones).repeat_interleave(len(mesh.vertices) // len(bones))
+    weights = torch.zeros(len(bone_of_vertex), 4)
     weights[:, 0] = 1
     return BodyModel(
         skeleton, torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces).long(),
-        held[:, None].repeat(1, 4), weights,
+        bone_of_vertex[:, None].repeat(1, 4), weights,
     )  # fmt: skip
 
 
@@ -107,7 +107,7 @@ class BodyLayer:
     def show(self, time: float) -> None:
         frame = nearest_frame(self.motion.timestamps, time)
         pose = self.motion.T_world_joint[frame]
-        # Bones hang on the mesh's node at the root, so that the browser's culling looks where the body is.
+        # Bones are children of the mesh's node at the root, so that the browser's culling considers the body's position.
         root = pose.t[0]
         self.handle.position = root.double().numpy() + self.offset
         quaternions = quat_wxyz_from_matrix(pose.R.double()).numpy()
@@ -145,7 +145,7 @@ class FeetLayer:
 
 
 class HeadLayer:
-    """The head's path and a frustum that looks where the head looks."""
+    """The head's path and a frustum in the head's viewing direction."""
 
     def __init__(self, server: viser.ViserServer, head: HeadStream):
         self.head = head
@@ -165,14 +165,14 @@ class HeadLayer:
 
 
 def add_points(server: viser.ViserServer, cloud: PointCloud) -> None:
-    """A point cloud coloured by height; a large one is thinned evenly."""
+    """A point cloud coloured by height; a large one is subsampled evenly."""
     points = cloud.points_world[:: max(1, -(-len(cloud.points_world) // MAX_POINTS))].double().numpy()
     if not len(points):
         return
     low, high = np.quantile(points[:, 2], [0.02, 0.98])
     share = np.clip((points[:, 2:] - low) / max(high - low, 1e-6), 0, 1)
     colors = (1 - share) * np.array([60, 90, 130]) + share * np.array([220, 170, 90])
-    # Half precision is exact to a millimetre only near the node, so the node stands in their middle.
+    # Half precision is exact to a millimetre only near the node, so the node is in the points' middle.
     centre = points.mean(0)
     server.scene.add_point_cloud(
         "/surroundings/points", (points - centre).astype(np.float32), colors.astype(np.uint8), point_size=0.012,
@@ -214,7 +214,7 @@ class LabelLayer:
 
 @dataclass
 class Placed:
-    """Layers of one motion, shown or hidden and set aside together."""
+    """Layers of one motion, which are shown, hidden and shifted together."""
 
     body: BodyLayer
     feet: FeetLayer | None
@@ -228,7 +228,7 @@ class Placed:
         return [layer for layer in every if layer is not None]
 
     def place(self, offset: Float[np.ndarray, "3"], visible: bool, named: bool = False) -> None:
-        """`named`: with its name, where it has a label."""
+        """`named` also shows the motion's label, if it has one."""
         for layer in self.layers:
             layer.place(offset, visible)
         if self.label is not None:

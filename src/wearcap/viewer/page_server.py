@@ -1,7 +1,7 @@
-"""A viser server that answers only what its guard admits.
+"""A viser server that answers only requests admitted by its guard.
 
-viser itself answers every page of every site, and has no setting for that. What decides about a request is the
-`process_request` that it gives `websockets`; while it starts, ours goes before it.
+viser itself answers every page of every site, and has no setting for that. Requests are decided by the
+`process_request` that it passes to `websockets`; while it starts, the guard's is put in front of it.
 """
 
 import socket
@@ -26,7 +26,7 @@ _starting = threading.Lock()
 def start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
     """A server on the guard's host and the next free port.
 
-    Raises WearcapError where the host is no address of this machine, or viser cannot be guarded.
+    Raises WearcapError if the host is no address of this machine, or viser cannot be guarded.
     """
     _check_host(guard.host)
     hooked = False
@@ -59,7 +59,7 @@ def start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
 
 
 def _check_host(host: str) -> None:
-    """Raises WearcapError where nothing can be served on a host; viser would try for ever."""
+    """Raise WearcapError if nothing can be served on a host; viser would retry forever."""
     problem = ""
     try:
         places = socket.getaddrinfo(host or None, 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)

@@ -1,4 +1,4 @@
-"""The clock of the viewer's page: plays, stops, jumps, loops."""
+"""Clock of the viewer's page: plays, stops, jumps, loops."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ class Timeline:
     speed: float = 1.0
 
     def advance(self, elapsed_s: float) -> bool:
-        """Let wall time pass; returns whether the shown time changed. At the end it starts again."""
+        """Advance by wall time; returns whether the shown time changed. It loops at the end."""
         if not self.playing or self.stop <= self.start:
             return False
         self.time += elapsed_s * self.speed

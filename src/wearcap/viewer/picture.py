@@ -1,4 +1,4 @@
-"""Pictures of motion without a screen: truth and captures beside each other, shaded, with feet one can judge."""
+"""Pictures of motion without a screen: ground truth and captures side by side, shaded, with foot contacts."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ VIEW = (-0.62, 0.78)
 
 @dataclass(frozen=True)
 class Actor:
-    """A motion with the surface that shows it."""
+    """A motion with the body surface that shows it."""
 
     label: str
     motion: Motion
@@ -49,10 +49,10 @@ class Actor:
     color: Float[np.ndarray, "3"]
     floor_z: float
     environment: Environment | None = None
-    """Objects that are drawn where the motion's `object_motion` has them."""
+    """Objects that are drawn at the poses of the motion's `object_motion`."""
 
     def meshes(self, frame: int) -> list[Mesh]:
-        """Body, marks of feet in contact, lit contact points (without them: marks of holding hands), and objects."""
+        """Body, marks of feet in contact, contact points (without them: marks of hands in contact), and objects."""
         T = self.motion.T_world_joint[frame]
         vertices = self.body.vertices(T).detach().numpy().astype(np.float32)
         body = Mesh(
@@ -154,11 +154,11 @@ def contact_sheet(
     environment: Environment | None = None,
     distance: float = 4.2,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Moments of motions on a shared clock, one row per motion, the camera following the first motion's root.
+    """Frames of motions on a shared clock, one row per motion, with the camera following the first motion's root.
 
     `size` is a panel's (width, height). `frames` are the first motion's, the others' are the nearest in time; without
     them `shared_frames` chooses `columns`. With more frames than columns, the rows repeat below. Objects of an
-    `environment` are drawn where each motion has them. Raises WearcapError for frames that are not there, and for
+    `environment` are drawn where each motion has them. Raises WearcapError for missing frames, and for
     motions that share no time.
     """
     shown = actors(motions, body, environment)
@@ -183,7 +183,7 @@ def contact_sheet(
 
 
 def shared_time(motions: Iterable[Motion]) -> tuple[float, float]:
-    """First and last moment (s) that all motions have. Raises WearcapError when there is none."""
+    """First and last time (s) that all motions share. Raises WearcapError if there is none."""
     clocks = [motion.timestamps for motion in motions]
     start, stop = max(clock[0].item() for clock in clocks), min(clock[-1].item() for clock in clocks)
     if stop < start:
@@ -192,7 +192,7 @@ def shared_time(motions: Iterable[Motion]) -> tuple[float, float]:
 
 
 def shared_frames(motions: dict[str, Motion], count: int) -> list[int]:
-    """`count` frames of the first motion (fewer where it has fewer), spread over the time that all motions have."""
+    """`count` frames of the first motion (or all, if it has fewer), spread over the time that all motions share."""
     start, stop = shared_time(motions.values())
     clock = next(iter(motions.values())).timestamps.numpy()
     first = int(np.searchsorted(clock, start))
@@ -201,7 +201,7 @@ def shared_frames(motions: dict[str, Motion], count: int) -> list[int]:
 
 
 def focus(motion: Motion, frame: int) -> Float[np.ndarray, "3"]:
-    """Where the camera looks: the root, a little below it (m)."""
+    """Target of the camera: a point slightly below the root (m)."""
     return motion.t_world_root[frame].double().numpy() - np.array([0.0, 0.0, 0.08])
 
 

@@ -28,7 +28,7 @@ def write_video(
     max_seconds: float | None = None,
     progress: bool = True,
 ) -> None:
-    """Panels of `size` (width, height) side by side, one per motion, on the clock that they share.
+    """Write panels of `size` (width, height) side by side, one per motion, on their shared clock.
 
     The camera follows the first motion. Raises WearcapError when the motions share no time, or for odd sizes.
     """

@@ -25,7 +25,7 @@ _BODY = {
     "right_shoulder": 25, "right_elbow": 26, "right_wrist": 27, "left_hip": 43, "left_knee": 44, "left_ankle": 45,
     "left_toe": 46, "right_hip": 47, "right_knee": 48, "right_ankle": 49, "right_toe": 50,
 }  # fmt: skip
-"""Row in the file's 51 joints (Skeleton, Ab, Chest, Neck, Head, LShoulder, LUArm, LFArm, LHand, 15 fingers …)."""
+"""Row of each joint among the file's 51 joints (Skeleton, Ab, Chest, Neck, Head, LShoulder, LUArm, LFArm, LHand, 15 fingers …)."""
 _JOINTS = 51
 
 
@@ -37,14 +37,14 @@ class AdtObject:
     category: str
     moves: bool
     box: Float[Tensor, "2 3"]
-    """Least and greatest corner in the object's axes (m)."""
+    """Minimum and maximum corner of the bounding box in the object's axes (m)."""
     T_world_obj: Rigid
     timestamps: Tensor | None = None
-    """Of the poses (s); None for a single, timeless pose."""
+    """Times of the poses (s); None for a single, timeless pose."""
 
 
 def is_adt(folder: str | Path) -> bool:
-    """Whether a folder is an ADT sequence."""
+    """Whether a folder holds an ADT sequence."""
     return (Path(folder) / "aria_trajectory.csv").is_file()
 
 
@@ -137,6 +137,6 @@ def _object_poses(rows: dict[str, np.ndarray], where: Path) -> tuple[Rigid, Tens
     return turned, None if timeless else track.timestamps
 
 
-def _path(thing: AdtObject) -> Trajectory:
-    assert thing.timestamps is not None
-    return Trajectory(thing.timestamps, thing.T_world_obj.R, thing.T_world_obj.t)
+def _path(tracked: AdtObject) -> Trajectory:
+    assert tracked.timestamps is not None
+    return Trajectory(tracked.timestamps, tracked.T_world_obj.R, tracked.T_world_obj.t)

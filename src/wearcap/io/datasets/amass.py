@@ -63,7 +63,7 @@ def write_amass(
     betas: Float[Tensor, "feature"] | None = None,
     t_template_pelvis: tuple[float, float, float] = PELVIS_SMPLH,
 ) -> None:
-    """Write a motion of an SMPL skeleton as an AMASS SMPL+H file; hands it lacks stay flat, gaps in time are held.
+    """Write a motion of an SMPL skeleton as an AMASS SMPL+H file; missing hands stay flat, gaps repeat the nearest frame.
 
     Raises WearcapError for another skeleton or values that are not finite.
     """
@@ -106,7 +106,7 @@ def _is_smplx(arrays: dict[str, np.ndarray]) -> bool:
 
 
 def _axis_angles(arrays: dict[str, np.ndarray], path: Path, stageii: bool) -> Float[Tensor, "time joint 3"]:
-    """Rotation vectors of the root and the joints of our skeleton, in SMPL's axes."""
+    """Rotation vectors (rad) in SMPL's axes of the root and the joints of wearcap's skeleton."""
     if stageii and "pose_body" in arrays:
         require(arrays, path, trans=("time", 3), root_orient=("time", 3), pose_body=("time", _SMPLX_BODY - 3))
         vectors = np.concatenate([arrays["root_orient"], arrays["pose_body"]], -1)

@@ -2,9 +2,9 @@
 
 Folders as they unpack: `sequences/DATE_SUBJECT_OBJECT[_ACT]/` (or `behave-30fps-params-v1/…`) with `info.json`,
 `smpl_fit_all.npz` and `object_fit_all.npz`, and `objects/OBJECT/` with the meshes. The world is the frame of one of the
-cameras (x right, y down, z forward), which hangs nearly level; here z is up, and what is left of the camera's tilt is
-for preparation to take out by the feet. Poses place a mesh whose vertices' mean is at the origin, and that of the very
-mesh that was registered: other resolutions of an object have another mean.
+cameras (x right, y down, z forward), which is mounted nearly level; the reader turns z up, and preparation removes the
+camera's remaining tilt from the planted feet. Poses refer to a mesh whose vertices' mean is at the origin, and to exactly
+the mesh that was registered: other resolutions of an object have another mean.
 """
 
 import re
@@ -30,19 +30,19 @@ from wearcap.io.formats.smpl_axes import shape_from_betas
 from wearcap.scene.object_mesh import centered, check_object_mesh
 
 FPS = 30
-"""Of the release that has `smpl_fit_all.npz`; the older one keeps a frame per second in folders."""
+"""Frame rate (Hz) of the release that has `smpl_fit_all.npz`; the older release has one frame per second in folders."""
 BODY_FILE, OBJECT_FILE, INFO_FILE = "smpl_fit_all.npz", "object_fit_all.npz", "info.json"
 R_WORLD_CAMERA = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""From the camera's axes (x right, y down, z forward) into x forward, y left, z up."""
+"""Rotation of the camera's axes (x right, y down, z forward) into x forward, y left, z up."""
 
 _FOLDERS = ("sequences", "behave-30fps-params-v1")
 _REGISTERED = {
     "chairblack": "chairblack_f2500.ply", "chairwood": "chairwood_f2500.ply", "monitor": "monitor_closed_f1000.ply",
     "tablesquare": "tablesquare_f2000.ply",
 }  # fmt: skip
-"""Meshes that were registered; all other objects' are OBJECT_f1000.ply."""
+"""Files of the registered meshes; those of all other objects are OBJECT_f1000.ply."""
 _OFF_GRID = 0.1
-"""How far (frames) a time may lie from a multiple of 1/30 s: they are rounded to milliseconds."""
+"""Largest distance (frames) of a time from a multiple of 1/30 s: times are rounded to milliseconds."""
 _COLOR = np.array([0.7, 0.7, 0.7], np.float32)
 
 
@@ -81,17 +81,17 @@ def read_behave(root: str | Path, name: str) -> OneObject:
                            expected="a folder DATE_SUBJECT_OBJECT, such as Date01_Sub01_boxlarge_hand")  # fmt: skip
     folder = behave_folder(root) / name
     body = read_npz(folder / BODY_FILE, ("poses", "trans", "betas", "frame_times"))
-    thing = read_npz(folder / OBJECT_FILE, ("angles", "trans", "frame_times"))
+    fitted = read_npz(folder / OBJECT_FILE, ("angles", "trans", "frame_times"))
     frames = require(body, folder / BODY_FILE, poses=("time", 156), trans=("time", 3))["time"]
-    require(thing, folder / OBJECT_FILE, angles=("time", 3), trans=("time", 3))
-    times = _common_times(body, thing, folder, frames)
+    require(fitted, folder / OBJECT_FILE, angles=("time", 3), trans=("time", 3))
+    times = _common_times(body, fitted, folder, frames)
     object_name, gender = _about(read_json(folder / INFO_FILE), folder / INFO_FILE)
     provenance = {"source": name, "format": "behave", **({"gender": gender} if gender else {})}
     pelvis = body["trans"].astype(np.float64) + PELVIS_SMPLH
     rotvec = torch.from_numpy(body["poses"].astype(np.float64)).unflatten(1, (-1, 3))
     motion = smpl_motion(times, smplh52(), rotvec, torch.from_numpy(pelvis), provenance)
-    R = rotation.exp(torch.from_numpy(thing["angles"].astype(np.float64)))
-    path = Trajectory(times, R.float(), torch.from_numpy(thing["trans"].astype(np.float32)))
+    R = rotation.exp(torch.from_numpy(fitted["angles"].astype(np.float64)))
+    path = Trajectory(times, R.float(), torch.from_numpy(fitted["trans"].astype(np.float32)))
     take = OneObject(
         name, motion, object_name, path, read_behave_mesh(root, object_name), _shape(body, folder / BODY_FILE, frames),
         subject=parts[1], activity="_".join(parts[2:]), location=parts[0],
@@ -100,12 +100,12 @@ def read_behave(root: str | Path, name: str) -> OneObject:
 
 
 def behave_mesh_path(root: str | Path, object_name: str) -> Path:
-    """Where the mesh lies that an object's poses belong to."""
+    """Path of the mesh that an object's poses refer to."""
     return Path(root) / "objects" / object_name / _REGISTERED.get(object_name, f"{object_name}_f1000.ply")
 
 
 def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
-    """The registered mesh of an object, centred on the mean of its vertices as the poses expect.
+    """Registered mesh of an object, centred on the mean of its vertices as the poses expect.
 
     Raises WearcapError where it is missing, and for what `check_object_mesh` refuses.
     """
@@ -125,15 +125,15 @@ def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
 
 
 def _common_times(
-    body: dict[str, np.ndarray], thing: dict[str, np.ndarray], folder: Path, frames: int
+    body: dict[str, np.ndarray], fitted: dict[str, np.ndarray], folder: Path, frames: int
 ) -> torch.Tensor:
-    """Times (s) of the object's frames, which must be the body's too."""
+    """Times (s) of the object's frames, which must equal the body's."""
     if not frames:
         raise WearcapError("no frames", where=folder / BODY_FILE, expected="poses of at least one frame")
-    if len(thing["angles"]) != frames:
-        raise WearcapError(f"the object has {len(thing['angles'])} frames, the body {frames}", where=folder,
+    if len(fitted["angles"]) != frames:
+        raise WearcapError(f"the object has {len(fitted['angles'])} frames, the body {frames}", where=folder,
                            expected=f"as many in {OBJECT_FILE} as in {BODY_FILE}", fix="Fetch both files again.")  # fmt: skip
-    times = _times(thing, folder / OBJECT_FILE, frames)
+    times = _times(fitted, folder / OBJECT_FILE, frames)
     if "frame_times" in body:
         other = _times(body, folder / BODY_FILE, frames)
         apart = np.flatnonzero(other != times)
@@ -146,12 +146,12 @@ def _common_times(
 
 
 def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np.ndarray, "time"]:
-    """Seconds of `frame_times` ("t0003.033"), brought to whole frames. Raises WearcapError for another rate than 30."""
-    told = arrays.get("frame_times")
-    if told is None or told.shape != (frames,) or told.dtype.kind not in "US":
-        raise WearcapError(f"frame_times is {'missing' if told is None else f'{told.dtype} {told.shape}'}", where=path,
+    """Times (s) from `frame_times` ("t0003.033"), snapped to whole frames. Raises WearcapError for rates other than 30."""
+    stamps = arrays.get("frame_times")
+    if stamps is None or stamps.shape != (frames,) or stamps.dtype.kind not in "US":
+        raise WearcapError(f"frame_times is {'missing' if stamps is None else f'{stamps.dtype} {stamps.shape}'}", where=path,
                            expected=f'{frames} texts such as "t0003.033" (s)')  # fmt: skip
-    texts = [text.decode("latin-1") if isinstance(text, bytes) else str(text) for text in told]
+    texts = [text.decode("latin-1") if isinstance(text, bytes) else str(text) for text in stamps]
     try:
         seconds = np.array([float(text.removeprefix("t")) for text in texts])
     except ValueError as error:
@@ -170,7 +170,7 @@ def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np
 
 
 def _about(info: Any, path: Path) -> tuple[str, str]:
-    """The object's name and the gender."""
+    """Name of the object and gender of the person."""
     if not isinstance(info, dict) or not isinstance(info.get("cat"), str) or not info["cat"].isidentifier():
         raise WearcapError(
             "does not name the object", where=path, expected='{"cat": "boxlarge", "gender": "male", …}'

@@ -37,21 +37,21 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 
 MOTION_TYPES = ("hinge", "along_floor", "free", "absent")
-"""The published configurations' words, and one for what is mapped but was not there."""
+"""Motion types of the published configurations, and "absent" for objects that were mapped but not present."""
 _CONTACTS = ("gt_contacts", "contacts")
 _COLOR = np.array([0.7, 0.7, 0.7], np.float32)
 
 
 @dataclass(frozen=True)
 class AnnotatedObject:
-    """Where an object was found, as annotated a few times in a sequence."""
+    """An object's poses, annotated a few times in a sequence."""
 
     center: tuple[float, float, float]
-    """Of the model, in its own (the scan's) axes (m): origin of our object's axes."""
+    """Centre of the model in its own (the scan's) axes (m): the origin of wearcap's object axes."""
     hinge: tuple[float, float, float] | None
-    """A point of its vertical axis in the world (m)."""
+    """A point on the hinge's vertical axis in the world (m); None without a hinge."""
     trajectory: Trajectory
-    """Sparse: one pose per annotation."""
+    """Sparse trajectory: one pose per annotation."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,11 @@ def egohoi_names(root: str | Path) -> list[str]:
 def read_egohoi(
     root: str | Path, name: str, motion_types: Mapping[str, str] | None = None, object_name: str | None = None
 ) -> EgoHoi:
-    """Read a sequence: `motion` (HPS's estimate), `object_motion` (sparse truth), `interactions`, and the environment.
+    """Read a sequence: `motion` (HPS's estimate), `object_motion` (sparse ground truth), `interactions`, environment.
 
-    `motion_types` gives the type (of `MOTION_TYPES`) by patterns of object names, the first that matches; by default
-    what has a hinge turns and the rest slides. `object_name` is that of a sequence with one object, where its own name
-    does not tell. Raises WearcapError for an unknown sequence, type or model, a hinged object without a hinge, and for
+    `motion_types` maps patterns of object names to one of `MOTION_TYPES`, the first match decides; by default objects
+    with a hinge turn and all others slide. `object_name` names the object of a single-object sequence whose own name
+    does not contain it. Raises WearcapError for an unknown sequence, type or model, a hinged object without a hinge, and for
     labels that end before they start, overlap, lie outside the motion or name unknown parts.
     """
     root = Path(root)
@@ -86,19 +86,21 @@ def read_egohoi(
     body = read_smpl_json(packed if packed.is_file() else packed.with_suffix(""))
     clock = LabelClock.of(name, body.motion.timestamps)
     objects, paths, contacts = [], {}, []
-    for thing, (locations, labels) in _object_files(root, name, object_name).items():
+    for object_id, (locations, labels) in _object_files(root, name, object_name).items():
         annotated = read_object_locations(locations)
-        kind = _motion_type(thing, annotated, motion_types or {}, locations)
+        kind = _motion_type(object_id, annotated, motion_types or {}, locations)
         if kind == "absent":
             continue
-        item = scene_object(thing, annotated, root / "object_models" / f"{thing}.ply", kind, clock.start_s)
+        item = scene_object(
+            object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s
+        )
         objects.append(item)
-        paths[thing] = annotated.trajectory
+        paths[object_id] = annotated.trajectory
         if labels is not None:
-            contacts.append(read_egohoi_contacts(labels, clock, thing, item.freedom.contact_class))
+            contacts.append(read_egohoi_contacts(labels, clock, object_id, item.freedom.contact_class))
     interactions = _joined(contacts) if contacts else None
     if interactions is not None:
-        labels_of(interactions, clock)  # refuses a hand that holds two things at once
+        labels_of(interactions, clock)  # raises for a hand that holds two objects at once
     shape = root / "smpl_shapes" / f"{subject_of(name)}.json"
     betas = body.shape or (shape_from_betas(read_hps_subject(shape).betas) if shape.is_file() else {})
     recording = Recording(
@@ -109,7 +111,7 @@ def read_egohoi(
 
 
 def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, tuple[Path, Path | None]]:
-    """Files of locations and of contacts (where there are any) by object."""
+    """Files of locations and of contacts (None where there are none) by object."""
     several, single = root / "object_locations" / name, root / "object_locations" / f"{name}.json"
     if several.is_dir():
         found = {path.stem: (path, Path(name) / path.name) for path in sorted(several.glob("*.json"))}
@@ -119,13 +121,16 @@ def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, t
         raise WearcapError(
             "no object locations of this sequence", where=single, expected=f"this file, or a folder {several}"
         )
-    places = {thing: [root / folder / labels for folder in _CONTACTS] for thing, (_, labels) in found.items()}
-    return {thing: (path, next((place for place in places[thing] if place.is_file()), None))
-            for thing, (path, _) in found.items()}  # fmt: skip
+    places = {
+        object_id: [root / folder / labels for folder in _CONTACTS]
+        for object_id, (_, labels) in found.items()
+    }
+    return {object_id: (path, next((place for place in places[object_id] if place.is_file()), None))
+            for object_id, (path, _) in found.items()}  # fmt: skip
 
 
 def _only_object(root: Path, name: str) -> str:
-    """The model that a sequence of one object is named after."""
+    """Name of the model that a single-object sequence is named after."""
     stem = name.split(".")[0].removeprefix(f"{subject_of(name)}_")
     models = sorted(path.stem for path in root.glob("object_models/*.ply"))
     fitting = [stem] if stem in models else [model for model in models if model.startswith(stem)]
@@ -135,13 +140,17 @@ def _only_object(root: Path, name: str) -> str:
     return fitting[0]
 
 
-def _motion_type(thing: str, annotated: AnnotatedObject, motion_types: Mapping[str, str], where: Path) -> str:
+def _motion_type(
+    object_id: str, annotated: AnnotatedObject, motion_types: Mapping[str, str], where: Path
+) -> str:
     default = "along_floor" if annotated.hinge is None else "hinge"
-    kind = next((kind for pattern, kind in motion_types.items() if fnmatchcase(thing, pattern)), default)
+    kind = next((kind for pattern, kind in motion_types.items() if fnmatchcase(object_id, pattern)), default)
     if kind not in MOTION_TYPES:
-        raise WearcapError(f"motion type {kind!r} of {thing}", expected=f"one of {', '.join(MOTION_TYPES)}")
+        raise WearcapError(
+            f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}"
+        )
     if kind == "hinge" and annotated.hinge is None:
-        raise WearcapError(f"{thing} is to turn about a hinge and has none", where=where, expected='"hinge": [x, y, z]',
+        raise WearcapError(f"{object_id} is to turn about a hinge and has none", where=where, expected='"hinge": [x, y, z]',
                            fix="Give it another motion type.")  # fmt: skip
     return kind
 
@@ -185,7 +194,7 @@ def _about_center(
     times: Float64[np.ndarray, "time"], positions: Float64[np.ndarray, "time 3"],
     quat_wxyz: Float64[np.ndarray, "time 4"], center: Float64[np.ndarray, "3"],
 ) -> Trajectory:  # fmt: skip
-    """R·v + p of a vertex v is R·(v - c) + (p + R·c): the second is where the centre is."""
+    """Trajectory of the centre c: a vertex v is at R·v + p = R·(v - c) + (p + R·c)."""
     R = rotation.matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz))
     t = torch.from_numpy(positions) + R @ torch.from_numpy(center)
     return Trajectory(torch.from_numpy(times), R.float(), t.float())
@@ -194,7 +203,7 @@ def _about_center(
 def scene_object(
     name: str, annotated: AnnotatedObject, model: str | Path, motion_type: str, start_s: float
 ) -> SceneObject:
-    """An object of our kind, where it was last seen at `start_s`, or else first. Raises WearcapError without its model."""
+    """SceneObject at its last annotated pose before `start_s`, else its first. Raises WearcapError without its model."""
     if not Path(model).is_file():
         raise WearcapError(f"no model of {name}", where=model, expected="object_models/OBJECT.ply")
     ply = read_ply(model)
@@ -213,7 +222,7 @@ def scene_object(
 def read_egohoi_contacts(
     path: str | Path, clock: LabelClock, object_name: str, contact_class: str
 ) -> Interactions:
-    """Read {"interactions": [{start, end, parts}]} with one object; stretches without parts hold nothing.
+    """Read {"interactions": [{start, end, parts}]} with one object; intervals without parts have no contact.
 
     Raises WearcapError for labels that end before they start, that overlap or lie outside the motion, for parts that
     are no hands, and for NaN.
@@ -246,7 +255,7 @@ def read_egohoi_contacts(
 
 
 def _joined(parts: list[Interactions]) -> Interactions:
-    """All objects' interactions by their start."""
+    """Interactions of all objects, sorted by start."""
     start, stop, hands = (
         torch.cat([getattr(part, key) for part in parts]) for key in ("start_s", "stop_s", "hands")
     )
@@ -261,7 +270,7 @@ def write_object_npz(
 ) -> None:
     """Write an object's path as the published tracker does: `translations`, `quaternions` (wxyz), `timestamps`.
 
-    `center`: origin of our object's axes in its model's. Raises WearcapError for poses that are not finite.
+    `center` is the origin of the object's axes in its model's axes (m). Raises WearcapError for poses that are not finite.
     """
     R, t = trajectory.R_world_body.double(), trajectory.t_world_body.double()
     if not (R.isfinite().all() and t.isfinite().all() and trajectory.timestamps.isfinite().all()):

@@ -1,4 +1,4 @@
-"""The H-contact data set: bodies by sequence, contacts of each hand, and how windows were divided.
+"""The H-contact data set: bodies by sequence, contacts of each hand, and the published split of windows.
 
 Folders as it unpacks: `body/NAME.json.zip`, `contacts/NAME.json`, and, from the published code, `splits/…/NAME.json`.
 """
@@ -20,7 +20,7 @@ ENDING = ".json.zip"
 
 @dataclass(frozen=True)
 class HContactSplit:
-    """Middle frames of the windows that train, validate and test, counted from the first whole window."""
+    """Middle frames of the training, validation and test windows, counted from the first whole window."""
 
     window_radius: int
     train: tuple[int, ...]
@@ -35,7 +35,7 @@ def hcontact_names(root: str | Path) -> list[str]:
 
 def read_hcontact(root: str | Path, name: str, contact_class: str = "") -> Recording:
     """Read a sequence: `motion` (smplh52 with hands, else smpl24) on its own clock, and `interactions` of unknown
-    objects, all of `contact_class` (of `scene.objects.CONTACT_CLASSES`, or "" where it is not known).
+    objects, all of `contact_class` (of `scene.objects.CONTACT_CLASSES`, or "" where unknown).
 
     A contact with end < start lasts until the sequence ends. Raises WearcapError for an unknown sequence or class,
     and for what the readers of bodies and contacts refuse.
@@ -59,7 +59,7 @@ def read_hcontact(root: str | Path, name: str, contact_class: str = "") -> Recor
 
 
 def _of_class(contacts: Interactions, contact_class: str) -> Interactions:
-    """Labels that name a class keep it."""
+    """The interactions with `contact_class` filled in where they have none."""
     return replace(contacts, classes=tuple(named or contact_class for named in contacts.classes))
 
 
@@ -70,7 +70,7 @@ def location_of(name: str) -> str:
 
 
 def activity_of(name: str) -> str:
-    """What was done, of a sequence's name."""
+    """Activity in a sequence's name."""
     rest = name.split(".")[0].removeprefix(f"{subject_of(name)}_").removeprefix(location_of(name))
     return rest.strip("_")
 

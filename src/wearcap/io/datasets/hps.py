@@ -25,13 +25,13 @@ from wearcap.io.formats.smpl_axes import rotations_from_smpl
 from wearcap.recording import Localization, Motion
 
 FPS = 30.0
-"""Of the motion, the suit's exports and, resampled from 29.97, the localised video."""
+"""Frame rate (Hz) of the motion, the suit's exports and the localised video (resampled from 29.97)."""
 IMAGE_SIZE = (1920, 1080)
 """Width and height of the head cameras' videos."""
 PELVIS_SMPL = (-0.0018, -0.2233, 0.0282)
-"""Pelvis of SMPL's mean template in its own axes (m); a person's own differs by a few centimetres with the betas."""
+"""Pelvis of SMPL's mean template in SMPL's axes (m); a person's own differs by a few centimetres with the betas."""
 MAX_FRAMES = 1_000_000
-"""Nine hours: what a file may name without listing it."""
+"""Most frames (nine hours) that a file's frame numbers may span; frames that are not listed are filled in."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def read_hps_localization(path: str | Path, fps: float | int = FPS) -> Localizat
     """Read `head_camera_localizations/*.json` {frame: {position, quaternion (w x y z)} or null}, frame 0 at 0 s.
 
     Frames that are null or absent have confidence 0, an identity rotation and position 0; the others confidence 1, for
-    the file knows no more. Raises WearcapError naming the frame for what is no pose, and when no frame has one.
+    the file has no others. Raises WearcapError naming the frame for what is no pose, and when no frame has one.
     """
     rows = read_json_object(path)
     frames = _frame_numbers(rows, path)
@@ -176,27 +176,27 @@ def read_hps_cameras(path: str | Path) -> dict[str, Camera]:
 
 
 def resampled_localization(localization: Localization, fps: float | int) -> Localization:
-    """Poses at another rate: between two found frames slerp and lerp, elsewhere confidence 0; covariances are dropped."""
+    """Poses at another rate: slerp and lerp between two localised frames, else confidence 0; covariances are dropped."""
     old = localization.timestamps
     count = int((old[-1] - old[0]).item() * fps + 1e-6) + 1
     times = old[0] + torch.arange(count, dtype=torch.float64) / fps
     after = torch.searchsorted(old, times).clamp(max=len(old) - 1)
     before = (after - 1).clamp(min=0)
     blend = ((times - old[before]) / (old[after] - old[before]).clamp(min=1e-9)).clamp(0, 1).float()
-    # A frame that all but coincides with an old one takes that alone: the next may have no pose to lean on.
+    # A frame that nearly coincides with an old one uses that one alone: the next may have no pose to interpolate with.
     blend = torch.where(blend < 1e-3, 0.0, torch.where(blend > 1 - 1e-3, 1.0, blend))
     sure = torch.minimum(localization.confidence[before], localization.confidence[after])
     sure = torch.where(blend == 0, localization.confidence[before], sure)
     sure = torch.where(blend == 1, localization.confidence[after], sure)
     R, t = localization.R_world_cam, localization.t_world_cam
     turn = rotation.exp(blend[:, None] * rotation.log(R[before].mT @ R[after]))
-    known = (sure > 0)[:, None]
+    found = (sure > 0)[:, None]
     return Localization(
-        times, torch.where(known[..., None], R[before] @ turn, torch.eye(3)),
-        torch.where(known, torch.lerp(t[before], t[after], blend[:, None]), torch.zeros(3)), sure,
+        times, torch.where(found[..., None], R[before] @ turn, torch.eye(3)),
+        torch.where(found, torch.lerp(t[before], t[after], blend[:, None]), torch.zeros(3)), sure,
     )  # fmt: skip
 
 
 def nominal_mount() -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """(R_head_cam, t_head_cam) of a camera on the forehead that looks ahead, upright (ours: it is not measured)."""
+    """(R_head_cam, t_head_cam) of an upright, forward-looking camera on the forehead (assumed: it is not measured)."""
     return torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), torch.tensor([0.12, 0.0, 0.12])

@@ -1,7 +1,7 @@
 """A scan of the HPS data set (unzipped): cloud, database photos of a fisheye rig, their calibration.
 
 `info/00000-info.json` gives the pose of each camera of the rig in the scan's world, along OpenCV's axes of the picture
-as it is stored (the trolley's cameras stand on edge: what is right in the picture may be down in the room).
+as stored (the trolley's cameras are mounted on their side: right in the picture may be down in the room).
 """
 
 import re
@@ -22,7 +22,7 @@ _PHOTO = re.compile(r"(\d+)-(cam\d+)\.jpe?g", re.IGNORECASE)
 
 
 def is_hps_scene(folder: str | Path) -> bool:
-    """Whether a folder is laid out as NavVis' scans are: a calibration, and poses of pictures."""
+    """Whether a folder has the layout of a NavVis scan: a calibration and poses of pictures."""
     return (Path(folder) / CALIBRATION).is_file() and (Path(folder) / "info").is_dir()
 
 

@@ -36,9 +36,9 @@ from wearcap.recording import CameraStream, Localization, Motion, Recording
 _SUBJECT = re.compile(r"SUB\d+")
 _SCAN_OF = {"SUB1": "MPI_BIBLIO_EG", "SUB2": "MPI_EG", "SUB3": "MPI_KINO", "SUB4": "MPI_Etage6", "SUB5": "MPI_GEB_AB",
             "SUB6": "MPI_BIBLIO_UG", "SUB7": "MPI_BIBLIO_OG"}  # fmt: skip
-"""Where a subject's sequences were recorded, but for those that `scan_name` treats on their own."""
+"""Scan of each subject's sequences, except those that `scan_name` handles individually."""
 FAR_M = 2.0
-"""A published motion whose pelvis is further from the localised camera (median) is not on its clock, or elsewhere."""
+"""Median distance (m) of pelvis and localised camera beyond which clocks or places of the two disagree."""
 
 
 def is_hps(folder: str | Path) -> bool:
@@ -60,7 +60,7 @@ def subject_of(name: str) -> str:
 
 
 def scan_name(name: str) -> str:
-    """The scan that a sequence was recorded in, as the published code assigns them."""
+    """Scan that a sequence was recorded in, as assigned by the published code."""
     subject = subject_of(name)
     if "double" in name.lower():
         return "MPI_EG"
@@ -70,8 +70,8 @@ def scan_name(name: str) -> str:
 
 
 def read_hps_sequence(root: str | Path, name: str, camera_hz: float | int = FPS) -> Recording:
-    """Read a sequence: `motion` (the published result, smpl24), and what else is there of `suit` (MVNX with contacts and
-    `imu`, else Unity's text), `localization`, `camera` (video and scan by absolute path) and `scene`.
+    """Read a sequence: `motion` (the published result, smpl24) and, where present, `suit` (MVNX with contacts and `imu`,
+    else Unity's text), `localization`, `camera` (video and scan by absolute path) and `scene`.
 
     `camera_hz` is the rate of the video that was localised: 30, or 29.97 where it was not resampled. Raises WearcapError
     when there is no such sequence, no starts for streams that need them, no intrinsics for its video, and for what the
@@ -102,7 +102,7 @@ def read_hps_sequence(root: str | Path, name: str, camera_hz: float | int = FPS)
     if localization_path is not None:
         localization = read_hps_localization(localization_path, camera_hz)
         if cam_start >= len(localization.timestamps):
-            raise WearcapError(f"cam_start {cam_start} lies beyond the {len(localization.timestamps)} localised frames", where=starts)  # fmt: skip
+            raise WearcapError(f"cam_start {cam_start} is beyond the {len(localization.timestamps)} localised frames", where=starts)  # fmt: skip
         localization = replace(localization, timestamps=localization.timestamps - cam_start / camera_hz)
         _warn_if_apart(motion, localization, motion_path)
     scan = _one(root, *(f"{depth}{scan_name(name)}/{CLOUD}" for depth in ("", "*/", "*/*/")))
@@ -128,7 +128,7 @@ def _shaped(root: Path, name: str, motion: Motion) -> tuple[dict[str, float], Mo
 
 
 def _suit(root: Path, name: str) -> Recording | None:
-    """The suit by itself, on its own clock."""
+    """Suit recording on its own clock."""
     mvnx = _one(root, f"*/{name}.mvnx", f"*/{name}.mvnx.gz")
     if mvnx is not None:
         read = read_mvnx(mvnx)
@@ -142,7 +142,7 @@ def _suit(root: Path, name: str) -> Recording | None:
 def _with_suit(recording: Recording, suit: Recording, imu_start: int) -> Recording:
     assert suit.suit is not None
     if imu_start >= len(suit.suit):
-        raise WearcapError(f"imu_start {imu_start} lies beyond the suit's {len(suit.suit)} frames",
+        raise WearcapError(f"imu_start {imu_start} is beyond the suit's {len(suit.suit)} frames",
                            where=recording.name)  # fmt: skip
     clap_s = suit.suit.timestamps[imu_start]
 
@@ -171,7 +171,7 @@ def _camera(root: Path, name: str, clap_s: float, localization: Localization | N
 
 
 def _video_times(path: Path) -> Float64[Tensor, "time"]:
-    """Times of a video's frames (s from its first), at its own rate; its pictures must have the calibration's size."""
+    """Times of a video's frames (s from its first), at its own rate; the pictures must have the calibration's size."""
     video = video_info(path)
     if (video.width, video.height) != IMAGE_SIZE or not video.frames:
         raise WearcapError(f"a video of {video.frames} frames of {video.width}x{video.height} pixels", where=path,
@@ -181,13 +181,13 @@ def _video_times(path: Path) -> Float64[Tensor, "time"]:
 
 def _warn_if_apart(motion: Motion, localization: Localization, path: Path) -> None:
     frame = torch.searchsorted(motion.timestamps, localization.timestamps).clamp(max=len(motion) - 1)
-    known = (localization.confidence > 0) & (localization.timestamps >= 0) & (
+    localized = (localization.confidence > 0) & (localization.timestamps >= 0) & (
         localization.timestamps <= motion.timestamps[-1]
     )  # fmt: skip
-    if not known.any():
+    if not localized.any():
         warnings.warn(f"{path}: no localised frame while the motion lasts", stacklevel=3)
         return
-    apart = (motion.t_world_root[frame] - localization.t_world_cam)[known].norm(dim=-1).median().item()
+    apart = (motion.t_world_root[frame] - localization.t_world_cam)[localized].norm(dim=-1).median().item()
     if apart > FAR_M:
         warnings.warn(f"{path}: pelvis and localised camera are {apart:.1f} m apart (median): other clocks, or another scan",
                       stacklevel=3)  # fmt: skip

@@ -1,9 +1,9 @@
-"""The suit's pose as the HPS data set gives it: text that Unity wrote (`*_pose.txt`, `*_trans.txt`).
+"""The suit's pose in the HPS data set: text written by Unity (`*_pose.txt`, `*_trans.txt`).
 
 Unity's world is left-handed (x right, y up, z forward) and turns by Euler angles "ZXY": first about z, then x, then y,
-all about fixed axes, in degrees. With x turned round it is SMPL's (x left, y up, z forward, right-handed): turns about
-x keep their sign, those about y and z change it, so R = Ry(-y) Rx(x) Rz(-z). SMPL's axes then become ours as in
-io/datasets/amass.py; here the world's too, for Unity's world is y up.
+all about fixed axes, in degrees. With x flipped it is SMPL's (x left, y up, z forward, right-handed): rotations about
+x keep their sign, those about y and z change it, so R = Ry(-y) Rx(x) Rz(-z). SMPL's axes are then converted as in
+io/datasets/amass.py; here the world's axes are, too, for Unity's world is y up.
 """
 
 from array import array
@@ -61,7 +61,7 @@ def read_unity_motion(
 
 
 def rotations_from_unity(angles_deg: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotations in SMPL's axes of Unity's Euler angles (x, y, z in degrees)."""
+    """Rotations in SMPL's axes from Unity's Euler angles (x, y, z in degrees)."""
     x, y, z = torch.deg2rad(angles_deg).unbind(-1)
     return about_axis("y", -y) @ about_axis("x", x) @ about_axis("z", -z)
 

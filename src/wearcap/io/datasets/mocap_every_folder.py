@@ -1,7 +1,7 @@
 """MocapEvery's capture folder: a SLAM trajectory and points, the head camera's video, and two watches' logs.
 
-Camera poses are of an OpenCV camera in SLAM's own world, whose unit and axes are arbitrary until the board says them
-(appendix C.2): its wearer's camera was carried along the board's x and y edge, whose lengths are known.
+Camera poses are of an OpenCV camera in SLAM's own world, whose unit and axes are arbitrary until the calibration board
+fixes them (appendix C.2): the wearer's camera was carried along the board's x and y edges, whose lengths are known.
 """
 
 from dataclasses import dataclass
@@ -30,40 +30,40 @@ from wearcap.io.formats.video import video_info
 from wearcap.recording import CameraStream, HeadStream, ImuStream, PointCloud, Recording
 
 FPS = 30.0
-"""Of the pictures that SLAM was given."""
+"""Frame rate (Hz) of SLAM's input pictures."""
 _MAX_CONFIG_BYTES = 1 << 16
 TRAJECTORY, CONFIG, MARKS = "cam_traj.pkl", "config.yaml", "camera_calib.pkl"
 POINTS, VIDEO = "sfm/pointcloud/pcd_results.ply", "video/ego_video.MP4"
 UNDISTORTED, LENS = "sfm/undistort_calib.txt", "sfm/calib.txt"
 LOGS = ("watch_sensorlog_1.csv", "watch_sensorlog_2.csv")
-"""Of the left and of the right wrist."""
+"""Logs of the left and the right wrist."""
 _SLAM_PIXELS = 384 * 512
-"""DROID-SLAM shrinks pictures to about so many pixels, and cuts both sides down to multiples of 8."""
+"""Approximate number of pixels to which DROID-SLAM shrinks pictures; it crops both sides to multiples of 8."""
 
 
 @dataclass(frozen=True)
 class BoardWalks:
-    """How the camera was carried over the calibration board: from where to where (SLAM's units), and what was measured."""
+    """Paths of the camera over the calibration board: start and end (SLAM's units), and the measured lengths."""
 
     x_slam: Float[Tensor, "end 3"]
     y_slam: Float[Tensor, "end 3"]
     length_m: tuple[float, float]
-    """Along x and along y."""
+    """Lengths of the paths along x and along y."""
     height_m: float
-    """Of the camera above the floor where the walk along y begins."""
+    """Height of the camera above the floor at the start of the path along y."""
 
 
 @dataclass(frozen=True)
 class MocapEveryFolder:
-    """What a capture folder holds, in SLAM's own world."""
+    """Content of a capture folder, in SLAM's own world."""
 
     name: str
     T_slam_cam: Trajectory
-    """30 Hz from the shutter's time (s since 1970, as the watches' clocks say), or from 0 where none is noted."""
+    """Camera poses at 30 Hz from the shutter's time (s since 1970, the watches' clock), or from 0 where none is noted."""
     camera: Camera | None = None
-    """Of the pictures that SLAM was given: undistorted and small."""
+    """Pinhole camera of SLAM's input pictures, which are undistorted and small."""
     lens: Camera | None = None
-    """Of the video itself."""
+    """Camera of the video itself, with distortion."""
     points_slam: Float[Tensor, "point 3"] | None = None
     video: Path | None = None
     imu: dict[str, ImuStream] | None = None
@@ -71,12 +71,12 @@ class MocapEveryFolder:
 
 
 def is_mocap_every_folder(folder: str | Path) -> bool:
-    """Whether a folder holds a camera trajectory of such a capture."""
+    """Whether a folder holds the camera trajectory of a capture."""
     return (Path(folder) / TRAJECTORY).is_file()
 
 
 def mocap_every_files(folder: str | Path) -> list[Path]:
-    """The files that are read of a folder."""
+    """Files of a folder that are read."""
     names = (TRAJECTORY, CONFIG, MARKS, POINTS, UNDISTORTED, LENS, *LOGS, VIDEO)
     return [path for name in names if (path := Path(folder) / name).is_file()]
 
@@ -104,10 +104,10 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
 def mocap_every_recording(
     folder: MocapEveryFolder, scale: float = 1.0, T_world_slam: Rigid | None = None
 ) -> Recording:
-    """The capture in the world p_world = T_world_slam @ (scale · p_slam); by default in SLAM's own.
+    """Recording in the world p_world = T_world_slam @ (scale · p_slam); by default in SLAM's own world.
 
-    The device sits where the camera does, with the head's axes (x forward, y left, z up), and both on the head as
-    `hps.nominal_mount` says. Watches are as read: their headings, mounts and clocks are not calibrated.
+    The device is at the camera's position with the head's axes (x forward, y left, z up), mounted on the head as in
+    `hps.nominal_mount`. Watches are as read: their headings, mounts and clocks are not calibrated.
     """
     T_world_slam = T_world_slam or Rigid.identity()
     track = folder.T_slam_cam
@@ -124,7 +124,7 @@ def mocap_every_recording(
 
 
 def _camera_stream(folder: MocapEveryFolder, T_head_cam: Rigid) -> CameraStream | None:
-    """The video with its lens where both are there, else the camera of SLAM's pictures."""
+    """Camera stream of the video with its lens where both exist, else of SLAM's pictures."""
     track = folder.T_slam_cam
     if folder.video is not None and folder.lens is not None:
         info = video_info(folder.video)
@@ -165,7 +165,7 @@ def _config(path: Path) -> dict[str, Any]:
 
 
 def _require_plain_yaml(text: str, path: Path) -> None:
-    """Refuse what makes YAML's parser run wild: references to its own parts, and depth, which costs time squared."""
+    """Raise WearcapError for YAML aliases and for deep nesting, whose parsing takes quadratic time."""
     depth = 0
     for event in yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
@@ -177,7 +177,7 @@ def _require_plain_yaml(text: str, path: Path) -> None:
 
 
 def _marks(path: Path) -> dict[str, Any]:
-    """Times at which the wearer did what calibrates: x and y (start, stop), and the shutter's (s)."""
+    """Times (s) of the calibration movements along x and y (start, stop), and of the shutter."""
     content = read_pickle(path) if path.is_file() else {}
     if not isinstance(content, dict):
         raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="a dict of times")
@@ -248,7 +248,7 @@ def _undistorted(path: Path, video: tuple[int, int] | None) -> Camera | None:
 
 
 def _lens(path: Path, video: tuple[int, int] | None) -> Camera | None:
-    """Calibration of the video's own pictures (OpenCV: k1 k2 p1 p2 [k3]), where it lies beside the other."""
+    """Calibration of the video's own pictures (OpenCV: k1 k2 p1 p2 [k3]); None where the file is missing."""
     if not path.is_file() or video is None:
         return None
     fx, fy, cx, cy, *bent = _intrinsics(path, (4, 8, 9))

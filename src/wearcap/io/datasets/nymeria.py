@@ -1,6 +1,6 @@
 """Nymeria and NymeriaPlus: Xsens body motion beside Project Aria's head trajectory and points, one folder per sequence.
 
-The suit's data has its own clock and a drifting world of its own; both are brought to the head device's
+The suit's data has its own clock and its own drifting world; both are aligned to the head device's
 (io/devices/head_alignment.py), whose world is metric with z up.
 """
 
@@ -37,7 +37,7 @@ SUIT_HZ = 240.0
 _STEP_TOLERANCE_S = 1e-3
 _DRIFT_TOLERANCE_S = 0.01
 MAX_RESIDUAL_M = 0.25
-"""A suit whose aligned head stays further from the device than this (median) is not aligned at all."""
+"""Median distance (m) of the suit's aligned head and the device beyond which the alignment has failed."""
 
 
 def is_nymeria(folder: str | Path) -> bool:
@@ -46,15 +46,15 @@ def is_nymeria(folder: str | Path) -> bool:
 
 
 def head_vrs(folder: str | Path) -> Path:
-    """Where the head device's own recording lies, if it was downloaded."""
+    """Path of the head device's own recording, if it was downloaded."""
     return Path(folder) / "recording_head" / "data" / "data.vrs"
 
 
 def read_xdata(path: str | Path) -> tuple[Motion, ContactTrack | None]:
     """Read `body/xdata.npz` as it is: the suit's own clock and world, 240 Hz, with its foot contacts.
 
-    Time steps more than 1 ms off become nominal, zero quaternions the one before. Bone lengths are the median of the
-    segments' distances. Raises WearcapError for missing or misshapen arrays, NaN, another frame rate, or cleaned
+    Time steps more than 1 ms off are replaced by the nominal one, zero quaternions by the previous one. Bone lengths are
+    the median of the segments' distances. Raises WearcapError for missing or misshapen arrays, NaN, another frame rate, or cleaned
     timestamps that end more than 10 ms from the file's.
     """
     keys = ("timestamps_us", "segment_tXYZ", "segment_qWXYZ", "frameRate", "foot_contacts")
@@ -96,7 +96,7 @@ def _clean_timestamps(seconds: np.ndarray, path: str | Path) -> np.ndarray:
 
 
 def _filled_quaternions(quat: np.ndarray) -> np.ndarray:
-    """Zero quaternions become the same segment's previous one (at the beginning: no rotation)."""
+    """Quaternions with zeros replaced by the same segment's previous one (at the beginning: no rotation)."""
     bad = np.linalg.norm(quat, axis=-1) < 0.5
     frame = np.where(bad, -1, np.arange(len(quat))[:, None])
     latest = np.maximum.accumulate(frame, axis=0)
@@ -106,7 +106,7 @@ def _filled_quaternions(quat: np.ndarray) -> np.ndarray:
 
 
 def _measured_skeleton(R_world_joint: Tensor, position: Tensor) -> Skeleton:
-    """The wearer's bone offsets: where each segment begins in its parent's axes, the median over a thousand frames."""
+    """The wearer's bone offsets (m): origin of each segment in its parent's axes, the median over a thousand frames."""
     skeleton = xsens23()
     frames = torch.linspace(0, len(position) - 1, min(len(position), 1000)).long()
     parents = list(skeleton.parents[1:])
@@ -214,18 +214,18 @@ def _on_device(
         if contacts is None
         else ContactTrack(times, contacts.parts, _nearest(own.timestamps, contacts.contact, times))
     )
-    seat = alignment.T_head_device
+    T_head_device = alignment.T_head_device
     pose = Rigid(
         _resampled_rotations(track.timestamps, track.R_world_body, times),
         interpolate(track.timestamps, track.t_world_body, times),
     )
-    return motion, contact, HeadStream(times, pose.R, pose.t, seat.R, seat.t)
+    return motion, contact, HeadStream(times, pose.R, pose.t, T_head_device.R, T_head_device.t)
 
 
 def _resampled_rotations(
     timestamps: Float64[Tensor, "time"], R: Float[Tensor, "time *rest"], at: Float64[Tensor, "new_time"]
 ) -> Float[Tensor, "new_time *rest"]:
-    """Rotations at other times: slerp between neighbours."""
+    """Rotations at other times, by slerp between neighbours."""
     after = torch.searchsorted(timestamps, at, right=True).clamp(1, len(timestamps) - 1)
     blend = (
         ((at - timestamps[after - 1]) / (timestamps[after] - timestamps[after - 1])).clamp(0, 1).to(R.dtype)
@@ -241,7 +241,7 @@ def _nearest(
 
 
 def read_metadata(folder: Path) -> dict:
-    """Subject, location, activity and size from metadata.json where it is there, else subject from the folder's name."""
+    """Subject, location, activity and size from metadata.json if present, else the subject from the folder's name."""
     parts = folder.resolve().name.split("_")
     about: dict = {"subject": "_".join(parts[2:4]) if len(parts) > 4 else "", "location": "", "activity": ""}
     path = folder / "metadata.json"

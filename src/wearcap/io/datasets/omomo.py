@@ -1,11 +1,11 @@
 """OMOMO: a person and one of fifteen objects, from optical motion capture.
 
 `train_diffusion_manip_seq_joints24.p` and `test_…` are joblib files of {number: sequence}, read with the restricted
-unpickler; `captured_objects/OBJECT_cleaned_simplified.obj` are the meshes. World: metres, z up. No file tells the frame
+unpickler; `captured_objects/OBJECT_cleaned_simplified.obj` are the meshes. World: metres, z up. No file has the frame
 rate. The root joint stands at `trans - trans2joint`. A vertex v of the file is at obj_scale · R · v + t: the meshes have
 a unit and an origin of their own, so here they are scaled to metres, centred on the mean of their vertices, and their
 paths are the centre's. Where an object's pose is missing its scale is 0. Of the two objects of two parts (mop, vacuum)
-`obj_rot` and `obj_trans` are the upper part's; here the whole mesh rides with it.
+`obj_rot` and `obj_trans` are the upper part's; here the whole mesh moves with it.
 """
 
 from dataclasses import dataclass
@@ -36,16 +36,16 @@ TWO_PARTS = ("mop", "vacuum")
 _KEYS = ("trans", "root_orient", "pose_body", "betas", "trans2joint", "obj_rot", "obj_trans", "obj_scale")
 _LEAST_SCALE = 1e-8
 _SCALE_WITHIN = 0.2
-"""Share by which an object's scale may vary within a sequence: it is a rigid object."""
+"""Largest relative variation of an object's scale within a sequence: objects are rigid."""
 _ORTHOGONAL_WITHIN = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class OmomoSequence:
-    """One sequence as the file has it; nothing but its name is checked yet."""
+    """One sequence as stored; only its name has been checked."""
 
     name: str
-    """SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000."""
+    """Name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000."""
     where: str
     arrays: dict[str, np.ndarray]
     gender: str
@@ -60,7 +60,7 @@ class OmomoSequence:
 
 
 def read_omomo(root: str | Path) -> list[OmomoSequence]:
-    """All sequences of those of `FILES` that are in a folder, by name.
+    """All sequences, by name, of the `FILES` that a folder contains.
 
     Raises WearcapError where there is none of them, for damaged files and for anything but arrays in them (which is
     never run), for what is no dict of sequences, and for sequences without a name such as sub1_largebox_000.
@@ -94,12 +94,12 @@ def _sequences(content: Any, path: Path) -> list[OmomoSequence]:
 
 
 def omomo_mesh_path(root: str | Path, object_name: str) -> Path:
-    """Where an object's mesh lies."""
+    """Path of an object's mesh."""
     return Path(root) / MESHES / f"{object_name}{MESH_ENDING}"
 
 
 def omomo_take(sequence: OmomoSequence, root: str | Path, fps: float | int) -> OneObject:
-    """One sequence as smplx22 with its object, from 0 s at `fps` (which no file tells); frames without an object's pose
+    """One sequence as smplx22 with its object, from 0 s at `fps` (which no file has); frames without an object's pose
     are gaps.
 
     Raises WearcapError for missing arrays, wrong shapes, NaN, body and object of different lengths, rotations that are
@@ -123,13 +123,13 @@ def omomo_take(sequence: OmomoSequence, root: str | Path, fps: float | int) -> O
     vectors = np.concatenate([arrays["root_orient"], arrays["pose_body"]], 1).astype(np.float64)
     rotvec = torch.from_numpy(vectors).unflatten(1, (-1, 3))
     motion = smpl_motion(times, smplx22(), rotvec, torch.from_numpy(_pelvis(arrays, where)), provenance)
-    known = arrays["obj_scale"] > _LEAST_SCALE
-    scale = _scale(arrays["obj_scale"][known], where)
+    posed = arrays["obj_scale"] > _LEAST_SCALE
+    scale = _scale(arrays["obj_scale"][posed], where)
     mesh, center = _mesh(root, sequence.object_name, scale)
-    path = _path(arrays, times, torch.from_numpy(center), torch.from_numpy(known), where)
+    path = _path(arrays, times, torch.from_numpy(center), torch.from_numpy(posed), where)
     take = OneObject(sequence.name, motion, sequence.object_name, path, mesh, shape_from_arrays(arrays, where), sequence.subject,
                      "_".join(sequence.name.split("_")[1:]))  # fmt: skip
-    return take.frames(torch.from_numpy(known))
+    return take.frames(torch.from_numpy(posed))
 
 
 def _flat(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -143,7 +143,7 @@ def _flat(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _pelvis(arrays: dict[str, np.ndarray], where: str) -> Float64[np.ndarray, "time 3"]:
-    """Where the root joint is (m): from `trans2joint`, or else the mean body's."""
+    """Position of the root joint (m): from `trans2joint`, else from the mean body."""
     trans = arrays["trans"].astype(np.float64)
     if "trans2joint" not in arrays:
         return trans + PELVIS_SMPLX
@@ -165,7 +165,7 @@ def _scale(scales: np.ndarray, where: str) -> float:
 
 
 def _mesh(root: str | Path, object_name: str, scale: float) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
-    """The mesh in metres about its centre, and where the centre is in the file's axes and unit."""
+    """The mesh in metres about its centre, and the centre in the file's axes and unit."""
     path = omomo_mesh_path(root, object_name)
     if not path.is_file():
         raise WearcapError(f"no mesh of {object_name}", where=path, expected=f"{MESHES}/OBJECT{MESH_ENDING}",
@@ -177,16 +177,16 @@ def _mesh(root: str | Path, object_name: str, scale: float) -> tuple[Mesh, Float
 
 
 def _path(
-    arrays: dict[str, np.ndarray], times: Tensor, center: Tensor, known: Tensor, where: str
+    arrays: dict[str, np.ndarray], times: Tensor, center: Tensor, posed: Tensor, where: str
 ) -> Trajectory:
-    """Of the mesh's centre: scale · R · c + t."""
+    """Trajectory of the mesh's centre: scale · R · c + t."""
     R = torch.from_numpy(arrays["obj_rot"].astype(np.float64))
     away = (R.mT @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
-    bad = ((away > _ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)) & known
+    bad = ((away > _ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)) & posed
     if bad.any():
         raise WearcapError(f"obj_rot of frame {int(bad.nonzero()[0])} is no rotation ({int(bad.sum())} such frames)",
                            where=where, expected="orthogonal matrices of determinant +1")  # fmt: skip
-    U, _, Vh = torch.linalg.svd(torch.where(known[:, None, None], R, torch.eye(3, dtype=R.dtype)))
+    U, _, Vh = torch.linalg.svd(torch.where(posed[:, None, None], R, torch.eye(3, dtype=R.dtype)))
     R = U @ Vh
     scale = torch.from_numpy(arrays["obj_scale"].astype(np.float64))
     t = torch.from_numpy(arrays["obj_trans"].astype(np.float64)) + scale[:, None] * (R @ center)

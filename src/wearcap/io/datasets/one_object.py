@@ -1,4 +1,4 @@
-"""What data sets of a person who handles one object have in common: body, object's path and mesh, on one clock."""
+"""Common form of data sets of a person who handles one object: body, object trajectory and mesh on one clock."""
 
 from dataclasses import dataclass, replace
 
@@ -20,18 +20,18 @@ class OneObject:
     name: str
     motion: Motion
     object_name: str
-    """The data set's own."""
+    """Name of the object in the data set."""
     path: Trajectory
-    """Of the mesh's axes in the world."""
+    """Poses of the mesh's axes in the world."""
     mesh: Mesh
-    """In metres, the mean of its vertices at the origin."""
+    """Mesh in metres, with the mean of its vertices at the origin."""
     shape: dict[str, float]
     subject: str
     activity: str
     location: str = ""
 
     def turned(self, R_new_old: Float[Tensor, "3 3"]) -> "OneObject":
-        """The take in other world axes of the same origin."""
+        """The take in rotated world axes with the same origin."""
         R_joints = self.motion.R_parent_joint
         R_new = R_new_old.to(R_joints.dtype)
         motion = replace(
@@ -43,7 +43,7 @@ class OneObject:
         return replace(self, motion=motion, path=turned)
 
     def frames(self, chosen: slice | Bool[Tensor, "time"]) -> "OneObject":
-        """Some of the frames of both, by slice or mask."""
+        """The take with the selected frames of body and object, by slice or mask."""
         motion = replace(
             self.motion, timestamps=self.motion.timestamps[chosen],
             R_parent_joint=self.motion.R_parent_joint[chosen], t_world_root=self.motion.t_world_root[chosen],
@@ -55,6 +55,6 @@ def smpl_motion(
     timestamps: Float64[Tensor, "time"], skeleton: Skeleton, rotvec: Float64[Tensor, "time joint 3"],
     t_world_pelvis: Float64[Tensor, "time 3"], provenance: dict[str, str],
 ) -> Motion:  # fmt: skip
-    """A motion of our skeleton from SMPL's rotation vectors (in SMPL's axes) and the pelvis' place (m)."""
+    """Motion of a wearcap skeleton from rotation vectors (rad) in SMPL's axes and the pelvis' position (m)."""
     R = rotations_from_smpl(rotvec)
     return Motion(timestamps, skeleton, R.float(), t_world_pelvis.float(), provenance=provenance)

@@ -1,7 +1,7 @@
-"""Real inertial sensors beside a true SMPL pose: TotalCapture (6 sensors) and DIP-IMU (17), as DIP's authors give them.
+"""Real inertial sensors with ground-truth SMPL poses: TotalCapture (6 sensors) and DIP-IMU (17), in DIP's format.
 
 Both worlds have y up and are turned by +90° about x. A sensor's orientation is that of its bone in SMPL's own axes (x
-left, y up, z forward), so that it is mounted on our joint's axes by `io.formats.smpl_axes.A`; accelerations are free of gravity.
+left, y up, z forward), so its mounting on wearcap's joint axes is `io.formats.smpl_axes.A`; accelerations are free of gravity.
 """
 
 import io
@@ -29,31 +29,31 @@ from wearcap.recording import ImuStream, Motion
 
 FPS = 60.0
 TOTALCAPTURE = ("left_elbow", "right_elbow", "left_knee", "right_knee", "head", "pelvis")
-"""Sensors of `ori` and `acc` as MocapEvery's authors read them, by the joint whose bone bears them: a forearm's is its
-elbow. Other tools name the shins first; what a file holds is checked against its pose."""
+"""Sensors of `ori` and `acc` as MocapEvery's authors read them, by the joint whose bone carries them: a forearm's is the
+elbow. Other tools list the shins first; a file's order is checked against its pose."""
 DIP_IMU = (
     "head", "spine3", "pelvis", "left_collar", "right_collar", "left_shoulder", "right_shoulder", "left_elbow",
     "right_elbow", "left_hip", "right_hip", "left_knee", "right_knee", "left_wrist", "right_wrist", "left_ankle",
     "right_ankle",
 )  # fmt: skip
 R_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-"""From a world with y up into ours: +90° about x."""
+"""Rotation of a world with y up to z up: +90° about x."""
 
 _LAG_S = 0.25
-"""Turns over so long are compared: far beyond a sensor's noise, and mostly below half a turn."""
+"""Span (s) of the rotations that are compared: far beyond a sensor's noise, and mostly below half a turn."""
 _WORSE = 1.5
-"""An order is wrong when another one fits so many times better …"""
+"""An order is wrong when another one has an error smaller by this factor …"""
 _WORSE_DEG = 2.0
-"""… and by so much, on the mean over the sensors that it moves."""
+"""… and by this many degrees, averaged over the sensors that it moves."""
 _MAX_DEG = 30.0
-"""Sensors that turn further apart from their bones than this, in whatever order, are of another recording."""
+"""Mean angle (°) between sensors and bones in the best order beyond which they are from different recordings."""
 _GRAVITY = 5.0
-"""m/s² of mean acceleration that only gravity explains."""
+"""Mean acceleration (m/s²) that only gravity explains."""
 _NOT_ORTHONORMAL = 0.02
 _MAX_STEPS, _MAX_WORD = 100_000, 1000
-"""Of the pickle that describes a PyTorch file's tensors; a dozen tensors take some hundred."""
+"""Most opcodes, and characters of a word, of the pickle in a PyTorch file; a dozen tensors take some hundred opcodes."""
 _PICKLES_OF_OLD_FILES = 5
-"""Before the numbers of a file that is no archive: a mark, a version, the system, the content, and its storages."""
+"""Pickles before the numbers of a non-archive file: magic number, version, system, content, storages."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def read_totalcapture(
     """Read `ori` (T, 6, 3, 3), `acc` (T, 6, 3) and, where it is there, `gt` (T, 72): a pickle, .npz or .pt, 60 Hz.
 
     The order of the sensors is checked against the file's pose, or against `motion` where the file has none; without
-    either it is believed. Raises WearcapError that names the order that fits when another one does, for anything but
+    either it is trusted. Raises WearcapError that names the order that fits when another one does, for anything but
     data in the file, for missing or misshapen arrays, matrices that are no rotations, and accelerations with gravity.
     """
     return _read(path, {"ori": "ori", "acc": "acc"}, order, motion)
@@ -116,21 +116,21 @@ def _read(path: str | Path, keys: dict[str, str], order: Sequence[str], motion: 
 
 
 def require_order(imu: Mapping[str, ImuStream], motion: Motion, where: str | Path) -> None:
-    """Raise WearcapError when the sensors turn as other joints do than those they are said to be worn on.
+    """Raise WearcapError when the sensors rotate like other joints than those they are assigned to.
 
-    Compared are the turns over a quarter of a second in the world, which no mounting changes. Joints that turn alike
-    may be confused without harm: an order is wrong only when another one fits far better.
+    Rotations over a quarter of a second in the world are compared, which do not depend on the mounting. Joints that turn
+    alike may be confused without harm: an order is wrong only when another one fits far better.
     """
     joints = list(imu)
     cost = _turn_differences(imu, motion)
     row, best = linear_sum_assignment(cost)
     moved = best != row
-    said, fits = np.rad2deg(np.diag(cost)), np.rad2deg(cost[row, best])
+    assigned, fits = np.rad2deg(np.diag(cost)), np.rad2deg(cost[row, best])
     if fits.mean() > _MAX_DEG:
         raise WearcapError(f"the sensors turn {fits.mean():.0f}° apart from the body, in whatever order", where=where,
                            expected="sensors and pose of the same recording")  # fmt: skip
     if moved.any():
-        now, other = said[moved].mean(), fits[moved].mean()
+        now, other = assigned[moved].mean(), fits[moved].mean()
         if now > _WORSE * other and now > other + _WORSE_DEG:
             order = ", ".join(joints[k] for k in best)
             raise WearcapError(f"the sensors are in another order: {now:.1f}° apart from their joints, {other:.1f}° in the order "
@@ -138,7 +138,7 @@ def require_order(imu: Mapping[str, ImuStream], motion: Motion, where: str | Pat
 
 
 def _turn_differences(imu: Mapping[str, ImuStream], motion: Motion) -> Float[np.ndarray, "sensor sensor"]:
-    """Mean angle (rad) between each sensor's turns (rows) and each joint's (columns), of frames that both have."""
+    """Mean angle (rad) between each sensor's rotations (rows) and each joint's (columns), over frames that both have."""
     lag = max(round(_LAG_S * motion.fps), 1) if len(motion) > 1 else 1
     if len(motion) <= lag:
         return np.zeros((len(imu), len(imu)))
@@ -176,7 +176,7 @@ def _motion(arrays: dict[str, np.ndarray], frames: int, path: Path) -> Motion:
 
 
 def _stream(joint: str, R: Float[Tensor, "time 3 3"], acc: Float[Tensor, "time 3"], where: str) -> ImuStream:
-    """One sensor's stream, without the samples that are NaN."""
+    """One sensor's stream without NaN samples."""
     there = R.isfinite().all(-1).all(-1) & acc.isfinite().all(-1)
     if there.sum() < max(len(R) // 2, 1):
         raise WearcapError(f"{int((~there).sum())} of {len(R)} samples are not finite", where=where, expected="half of them at least")  # fmt: skip
@@ -221,13 +221,13 @@ def _torch_content(path: Path) -> Any:
         return torch.load(path, map_location="cpu", weights_only=True)
     except WearcapError:
         raise
-    except Exception as error:  # the opcodes are the file's own program: there is no telling what they break
+    except Exception as error:  # the opcodes are the file's own program and can raise anything
         raise WearcapError(f"not a readable PyTorch file ({' '.join(str(error).split())[:120]})", where=path,
                            expected="a dict of tensors, without code") from error  # fmt: skip
 
 
 def _require_short_words(path: Path) -> None:
-    """Refuse long words and programs: torch searches its own messages, which repeat them, in time squared."""
+    """Raise for long words and programs: torch searches its messages, which repeat them, in quadratic time."""
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             for name in archive.namelist():

@@ -1,8 +1,8 @@
 """Project Aria's machine perception services (MPS): head trajectory and semi-dense points from CSV files.
 
 Frames: `aria` is MPS's own device frame (on Gen 1 glasses the left SLAM camera), `cpf` the central pupil frame
-(x left, y up, z forward, midway between the pupils), `device` that same point in the house's head axes
-(x forward, y left, z up), which is what a `HeadStream` holds.
+(x left, y up, z forward, midway between the pupils), `device` that same point with wearcap's head axes
+(x forward, y left, z up), the frame of a `HeadStream`.
 """
 
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ from wearcap.io.formats.poses import check_finite, checked_trajectory
 from wearcap.recording import HeadStream, PointCloud, Recording
 
 MAX_INV_DIST_STD, MAX_DIST_STD = 0.005, 0.01
-"""Semi-dense points with a larger standard deviation (1/m, m) are left out."""
+"""Largest standard deviation (1/m, m) of semi-dense points; points with a larger one are dropped."""
 
 T_HEAD_DEVICE = Rigid(torch.eye(3), torch.tensor([0.09, 0.0, 0.075]))
-"""Assumed where nothing is calibrated: the pupils' midpoint before and above the head joint, axes parallel (ours)."""
+"""Default pose of the device on the head joint (assumed): the pupils' midpoint in front of and above it, axes parallel."""
 
 _MAX_DURATION_S = 12 * 3600
 R_CPF_DEVICE = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-"""House head axes (x forward, y left, z up) in the central pupil frame (x left, y up, z forward)."""
+"""Head axes (x forward, y left, z up) in the central pupil frame (x left, y up, z forward)."""
 
 _SUFFIXES = ("", ".gz", ".xz")
 _TRAJECTORY = ("closed_loop_trajectory.csv",)
@@ -55,7 +55,7 @@ def nominal_T_aria_cpf() -> Rigid:
 
 @dataclass(frozen=True)
 class MpsTrajectory:
-    """A closed-loop trajectory as the file has it: poses of the `aria` frame in a world with z up."""
+    """A closed-loop trajectory: poses of the `aria` frame in a world with z up."""
 
     T_world_aria: Trajectory
     vel_aria: Float[Tensor, "time 3"]
@@ -63,7 +63,7 @@ class MpsTrajectory:
     angvel_aria: Float[Tensor, "time 3"]
     """Angular velocity in the device's axes (rad/s)."""
     quality: Float[Tensor, "time"]
-    """MPS's own score, 0 … 1."""
+    """Quality score of MPS, 0 … 1."""
 
 
 def read_closed_loop(path: str | Path, *, up: str = "z") -> MpsTrajectory:
@@ -114,8 +114,8 @@ def _check_gravity(gravity: np.ndarray, up: str, where: str | Path) -> None:
         axis = "xyz"[int(np.abs(upward).argmax())]
         sign = "-" if upward["xyz".index(axis)] < 0 else "+"
         raise WearcapError(
-            f"gravity {mean.round(2).tolist()} says that {sign}{axis} is up", where=where, expected=f"+{up} up",
-            fix="Read it with up='y'." if (axis, sign) == ("y", "+") else "Turn the world, or mend gravity's sign.",
+            f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up", where=where, expected=f"+{up} up",
+            fix="Read it with up='y'." if (axis, sign) == ("y", "+") else "Rotate the world, or fix gravity's sign.",
         )  # fmt: skip
 
 
@@ -156,10 +156,10 @@ def read_points(
     up: str = "z",
     observations: str | Path | None = None,
 ) -> PointCloud:
-    """Semi-dense points that MPS is sure of; confidence 1 - inv_dist_std / max_inv_dist_std (ours), 0 … 1.
+    """Reliable semi-dense points; their confidence is 1 - inv_dist_std / max_inv_dist_std (our choice), 0 … 1.
 
-    `observations` is the file that says when points were seen (`semidense_observations.csv`, tens of millions of rows,
-    read in pieces): `first_seen` comes from it, and points that it does not name are left out.
+    `observations` is the file of observation times (`semidense_observations.csv`, tens of millions of rows, read in
+    chunks): `first_seen` comes from it, and points without an observation are dropped.
     Raises WearcapError for missing columns or NaN positions, and for the observations of another recording.
     """
     position = [f"p{axis}_world" for axis in "xyz"]
@@ -178,7 +178,7 @@ def read_points(
 
 
 def _first_seen(path: str | Path, uid: np.ndarray) -> np.ndarray:
-    """When each point was first observed (s, the device's clock); infinite for points without an observation."""
+    """Time of each point's first observation (s, the device's clock); infinite for points without one."""
     order = np.argsort(uid, kind="stable")
     known = uid[order]
     first_us = np.full(len(uid), np.iinfo(np.int64).max)
@@ -226,7 +226,7 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
 
 
 def read_mps_points(folder: str | Path) -> PointCloud | None:
-    """Points of an MPS output folder, with the time of their first observation where that file is there, too."""
+    """Points of an MPS output folder, with the time of their first observation if that file exists."""
     points = find_mps_file(folder, _POINTS)
     if points is None:
         return None
@@ -234,6 +234,6 @@ def read_mps_points(folder: str | Path) -> PointCloud | None:
 
 
 def mps_files(folder: str | Path) -> list[Path]:
-    """The files that `read_mps` reads of a folder."""
+    """Files of a folder that `read_mps` reads."""
     found = (find_mps_file(folder, names) for names in (_TRAJECTORY, _POINTS, _OBSERVATIONS))
     return [path for path in found if path is not None]

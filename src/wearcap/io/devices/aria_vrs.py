@@ -33,12 +33,12 @@ IMU_LABELS = ("imu-left", "imu-right")
 
 @dataclass(frozen=True)
 class AriaDevice:
-    """A recording's own calibration."""
+    """Factory calibration stored in a recording."""
 
     T_aria_cpf: Rigid
-    """Central pupil frame in the device frame; give it to `read_mps` or `head_stream` in place of the nominal one."""
+    """Central pupil frame in the device frame; pass it to `read_mps` or `head_stream` in place of the nominal one."""
     T_aria_sensor: dict[str, Rigid]
-    """Poses of cameras (OpenCV axes) and IMUs by label: "camera-rgb", "camera-slam-left", "imu-right" …"""
+    """Poses of cameras (OpenCV axes) and IMUs in the device frame by label: "camera-rgb", "camera-slam-left", "imu-right" …"""
     subtype: str
     """"DVT-S" or "DVT-L": the size of the glasses."""
 
@@ -59,7 +59,7 @@ def read_device(path: str | Path) -> AriaDevice:
 def read_imus(path: str | Path, T_head_device: Rigid | None = None) -> dict[str, ImuStream]:
     """Rectified accelerometer and gyroscope streams by label ("imu-left", "imu-right"), worn on the head joint.
 
-    `T_head_device` is the glasses' seat on the head joint; by default the assumed one of io/devices/aria_mps.py. Samples that
+    `T_head_device` is the pose of the glasses on the head joint; by default the assumed one of io/devices/aria_mps.py. Samples that
     the device marks invalid are left out. Raises WearcapError as `read_device` does.
     """
     provider, device = _open(path), read_device(path)
@@ -156,7 +156,7 @@ class _UprightView:
         self._finer = finer
 
     def times(self) -> Float64[Tensor, "time"]:
-        """When each picture was taken (s, the device's clock)."""
+        """Capture time of each picture (s, the device's clock)."""
         stamps = self.provider.get_timestamps_ns(self.source, TimeDomain.DEVICE_TIME)
         return torch.tensor(stamps, dtype=torch.int64).double() * 1e-9
 
@@ -191,7 +191,7 @@ def timecode_offset_s(path: str | Path) -> float:
 
 
 def _open(path: str | Path):
-    """A data provider of projectaria-tools, or a WearcapError that says what is missing."""
+    """Data provider of projectaria-tools. Raises WearcapError that names what is missing."""
     if data_provider is None:
         raise WearcapError("reading VRS recordings needs projectaria-tools", where=path,
                            fix='Install it with `pip install "wearcap[aria]"` (about 1 GB).')  # fmt: skip
@@ -205,5 +205,5 @@ def _open(path: str | Path):
 
 
 def _rigid(pose) -> Rigid:
-    """A Sophus SE3 as ours."""
+    """A Sophus SE3 as a Rigid."""
     return Rigid.from_matrix(torch.tensor(pose.to_matrix(), dtype=torch.float32))

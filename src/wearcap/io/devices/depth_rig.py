@@ -24,12 +24,12 @@ from wearcap.io.formats.text import read_text
 from wearcap.recording.photo import Photo
 
 _FARTHEST_MM = 20_000
-"""No such camera sees further: images beyond are not in millimetres."""
+"""Largest depth (mm) of such a camera: images with larger values are not in millimetres."""
 
 
 @dataclass(frozen=True)
 class DepthCameraFiles:
-    """One camera: its lens, approximate pose in the scene, and image files."""
+    """One camera: calibration, approximate pose in the scene, and image files."""
 
     name: str
     camera: Camera
@@ -40,15 +40,15 @@ class DepthCameraFiles:
 
 @dataclass(frozen=True, eq=False)
 class DepthRigFiles:
-    """A recording of all cameras, its images not yet read: a minute of three is 4 GB."""
+    """A recording of all cameras whose images are not read yet: a minute of three cameras is 4 GB."""
 
     cameras: tuple[DepthCameraFiles, ...]
     timestamps: Float64[np.ndarray, "time"]
-    """Of each camera's `depth`, s."""
+    """Times (s) of each camera's `depth` images."""
 
 
 def read_depth_rig(folder: str | Path) -> DepthRigFiles:
-    """Find a rig's files. Raises WearcapError where a camera has no empty frames, or another number than times."""
+    """Find a rig's files. Raises WearcapError where a camera has no empty frames, or a different number of images than times."""
     folder = Path(folder)
     timestamps = _timestamps(folder / "timestamps.txt")
     cameras = []

@@ -1,4 +1,4 @@
-"""Align a motion capture suit with the head device worn on it: clocks, seat of the device, and the suit's drifting world."""
+"""Align a motion capture suit with the head device worn on it: clocks, mounting of the device, and the suit's drifting world."""
 
 from dataclasses import dataclass
 
@@ -14,29 +14,29 @@ from wearcap.geometry.trajectory import Trajectory, interpolate, resample
 
 _RATE_HZ = 60.0
 _STEP_S = 0.5
-"""Span of the relative motions that are compared: long against noise, short against the suit's drift."""
+"""Span (s) of the compared relative motions: long against noise, short against the suit's drift."""
 _SEAT_PRIOR_M = 0.05
-"""Standard deviation of the device's place on the head about the assumed one (ours)."""
+"""Standard deviation (m) of the device's position on the head about the assumed one (our choice)."""
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How suit and device hang together."""
+    """Alignment of suit and device."""
 
     T_head_device: Rigid
-    """The device on the suit's head joint (constant)."""
+    """Constant pose of the device on the suit's head joint."""
     T_world_suit: Rigid
-    """The suit's world in the device's, per suit frame: a turn about the vertical and a shift."""
+    """Pose of the suit's world in the device's world, per suit frame: a yaw rotation and a translation."""
     residual_m: float
     residual_rad: float
-    """Median distance and angle between the aligned head and the device."""
+    """Median distance (m) and angle between the aligned head and the device."""
 
 
 def clock_offset(suit: Trajectory, device: Trajectory) -> float:
     """Seconds to add to the suit's timestamps to bring them to the device's clock, from angular speed alone.
 
-    Clocks may differ by any amount; the whole recordings are correlated. Raises WearcapError when no shift makes the
-    head's and the device's turns alike (correlation below 0.5).
+    Clocks may differ by any amount; the whole recordings are correlated. Raises WearcapError when the head's and
+    the device's turns correlate below 0.5 at every shift.
     """
     grids, speeds = [], []
     for track in (suit, device):
@@ -88,9 +88,9 @@ def align_head(
 ) -> Alignment:
     """Solve device = T_world_suit(t) · suit head · T_head_device, both streams on one clock, both worlds z up.
 
-    The seat's rotation comes from relative turns and from both streams' sense of up (Wahba's problem), its place from
-    head turns with `t_head_device` (m) as a weak prior; the suit's world then is the median turn and shift in windows
-    of `window_s`, interpolated. Raises WearcapError where the streams share less than 10 s or the head hardly turns.
+    The mounting's rotation comes from relative rotations and from both streams' up direction (Wahba's problem), its
+    position from head turns with `t_head_device` (m) as a weak prior; the suit's world then is the median yaw and
+    translation in windows of `window_s`, interpolated. Raises WearcapError where the streams share less than 10 s or the head hardly turns.
     """
     shared = (suit.timestamps >= device.timestamps[0]) & (suit.timestamps <= device.timestamps[-1])
     if shared.sum() < 2 or suit.timestamps[shared][-1] - suit.timestamps[shared][0] < 10:
@@ -100,11 +100,11 @@ def align_head(
     start, stop = suit.timestamps[shared][0].item(), suit.timestamps[shared][-1].item()
     grid = start + torch.arange(int((stop - start) * _RATE_HZ), dtype=torch.float64) / _RATE_HZ
     head, seen = (_double(resample(track, grid)) for track in (suit, device))
-    R_head_device = _seat_rotation(head.R, seen.R)
+    R_head_device = _mounting_rotation(head.R, seen.R)
     R_apart = seen.R @ R_head_device.mT @ head.R.mT
     yaw, knots = _windowed_yaw(R_apart, grid, window_s)
     R_world_suit = rotation.about_axis("z", _between(knots, yaw, grid))
-    t_seat = _seat_place(
+    t_seat = _mounting_position(
         Rigid(R_world_suit @ head.R, (R_world_suit @ head.t[..., None])[..., 0]), seen, t_head_device.double()
     )
     t_apart = seen.t - (R_world_suit @ (head.t + (head.R @ t_seat))[..., None])[..., 0]
@@ -121,7 +121,7 @@ def _double(track: Trajectory) -> Rigid:
     return Rigid(track.R_world_body.double(), track.t_world_body.double())
 
 
-def _seat_rotation(R_head: Tensor, R_device: Tensor) -> Float64[Tensor, "3 3"]:
+def _mounting_rotation(R_head: Tensor, R_device: Tensor) -> Float64[Tensor, "3 3"]:
     """R_head_device with turn_head = R_head_device · turn_device and up_head = R_head_device · up_device, robustly."""
     step = int(_STEP_S * _RATE_HZ)
     turn_head = rotation.log(R_head[:-step].mT @ R_head[step:])
@@ -141,8 +141,8 @@ def _seat_rotation(R_head: Tensor, R_device: Tensor) -> Float64[Tensor, "3 3"]:
     return R
 
 
-def _seat_place(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) -> Float64[Tensor, "3"]:
-    """t_head_device from how the device moves against the head joint while the head turns (least squares, Huber)."""
+def _mounting_position(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) -> Float64[Tensor, "3"]:
+    """t_head_device from the device's displacement against the head joint while the head turns (least squares, Huber)."""
     step = int(_STEP_S * _RATE_HZ)
     A = head.R[step:] - head.R[:-step]
     b = (seen.t[step:] - seen.t[:-step]) - (head.t[step:] - head.t[:-step])
@@ -150,7 +150,7 @@ def _seat_place(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) -> Floa
     for _ in range(8):
         residual = (b - A @ t).norm(dim=-1)
         scale = residual.median().clamp(min=1e-4)
-        # Half-second differences overlap thirtyfold, so the samples count for so much less.
+        # Half-second differences overlap thirtyfold, so the samples' weight is reduced accordingly.
         weight = 1 / (residual / scale).clamp(min=1.0) / (scale**2 * step)
         normal = (
             torch.einsum("n,nki,nkj->ij", weight, A, A) + torch.eye(3, dtype=torch.float64) / _SEAT_PRIOR_M**2
@@ -161,7 +161,7 @@ def _seat_place(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) -> Floa
 
 
 def _windowed_yaw(R_apart: Tensor, grid: Tensor, window_s: float) -> tuple[Tensor, Tensor]:
-    """Turn about the vertical (rad, unwrapped) by window, and the windows' middles."""
+    """Yaw (rad, unwrapped) by window, and the windows' middles."""
     cos, sin = R_apart[:, 0, 0] + R_apart[:, 1, 1], R_apart[:, 1, 0] - R_apart[:, 0, 1]
     length = torch.hypot(cos, sin).clamp(min=1e-9)
     count = max(2, round((grid[-1] - grid[0]).item() / (window_s / 2)) + 1)
@@ -182,5 +182,5 @@ def _windowed_median(value: Tensor, grid: Tensor, knots: Tensor, window_s: float
 
 
 def _between(knots: Tensor, value: Tensor, at: Tensor) -> Tensor:
-    """Linear interpolation between knots, held outside them."""
+    """Linear interpolation between knots, constant outside them."""
     return interpolate(knots, value, at.clamp(knots[0].item(), knots[-1].item()))

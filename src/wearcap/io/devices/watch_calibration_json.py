@@ -31,11 +31,11 @@ _CAMERA = ("scale", "residual_m", "scale_spread", "corner_deg")
 
 @dataclass(frozen=True)
 class WornCalibration:
-    """All that a guided calibration finds."""
+    """Result of a guided calibration."""
 
     watches: dict[str, WatchCalibration]
     clocks: dict[str, SwingClock] = field(default_factory=dict)
-    """Of the camera and each watch."""
+    """Clock relation of the camera and each watch."""
     camera: SlamAlignment | None = None
     head: HeadMount | None = None
 
@@ -46,7 +46,7 @@ def write_watch_calibration(
     checks: Sequence[StepCheck] = (),
     about: dict[str, Any] | None = None,
 ) -> None:
-    """Write a calibration, its checks and what is known about it (plain numbers, text, lists), atomically."""
+    """Write a calibration, its checks and its metadata (plain numbers, text, lists), atomically."""
     content: dict[str, Any] = {
         "watches": {
             joint: {"R_world_ref_wxyz": _wxyz(one.R_world_ref), "R_joint_imu_wxyz": _wxyz(one.R_joint_imu)}

@@ -1,9 +1,9 @@
 """Motion logs of a watch: SensorLog's CSV, and Sensor Logger's or Apple Watch's WristMotion.csv (MocapEvery §4.2).
 
-Both hold what Core Motion says: attitude, turn rate, the direction of gravity and the acceleration without it. What a
-file's numbers mean is found in the numbers: their unit by the length of gravity, whether the attitude leads from the
-watch to the world or back by which of the two turns gravity upright, and the sign by whether gravity points down
-(Core Motion, whose accelerations have the sign reversed: at rest it says -1 g along the axis that is up) or up.
+Both hold Core Motion's output: attitude, turn rate, the direction of gravity and the acceleration without it. The
+conventions of a file are inferred from its values: the unit from the length of gravity, the direction of the attitude
+(watch to world or back) from which of the two turns gravity upright, and the sign from whether gravity points down
+(Core Motion, whose accelerations have the sign reversed: at rest it reports -1 g along the axis that is up) or up.
 """
 
 from datetime import datetime
@@ -20,7 +20,7 @@ from wearcap.recording import ImuStream
 G_M_S2 = 9.80665
 MIN_RATE_HZ = 20.0
 UPRIGHT = 0.98
-"""Length of the mean direction of gravity in the world, and its share along z, that a sound log has at least."""
+"""Least length of the mean direction of gravity in the world, and its least share along z, of a valid log."""
 WRISTS = ("left_wrist", "right_wrist")
 _XYZ = ("X", "Y", "Z")
 _SENSOR_LOGGER = {
@@ -35,11 +35,11 @@ _SENSOR_LOG = {
 
 
 def read_watch_log(path: str | Path, joint: str) -> ImuStream:
-    """A watch's stream: attitude in a world whose z is up, free acceleration there (m/s²), what it felt itself, turn rate.
+    """A watch's stream: attitude in a world with z up, free acceleration there (m/s²), specific force, turn rate.
 
     Timestamps are seconds since 1970. The world's heading is the watch's own and arbitrary.
     Raises WearcapError for a joint that is no wrist, a file that is neither format, times that do not grow, values that
-    are not finite, gravity that is neither 1 g nor 9.8 m/s² long, or that no reading of the attitude turns upright.
+    are not finite, gravity that is neither 1 g nor 9.8 m/s² long, or that neither direction of the attitude turns upright.
     """
     if joint not in WRISTS:
         raise WearcapError(f"a watch on {joint!r}", where=path, expected=" or ".join(WRISTS))
@@ -52,7 +52,7 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
     gravity = parts["gravity"] if "gravity" in parts else parts["whole"] - parts["free"]
     unit = _unit(gravity, path)
     R, upright = _attitude(parts["quaternion"], gravity, path)
-    # Core Motion's gravity points down, and its accelerations are what would have to be undone.
+    # Core Motion's gravity points down, and its accelerations have the opposite sign.
     free, felt = np.sign(upright) * unit * parts["free"], np.sign(upright) * unit * (parts["free"] + gravity)
     turn = torch.from_numpy(parts["turn"]).float() if "turn" in parts else None
     return ImuStream(
@@ -69,7 +69,7 @@ def _columns(path: str | Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         table = read_columns(path, [name for group in groups.values() for name in group], whole=[time])
         seconds = table[time] / 1e9
     elif "motionQuaternionW(R)" in header:
-        # Which of Core Motion's other outputs are logged is the wearer's choice.
+        # The wearer chooses which of Core Motion's other outputs are logged.
         groups = {name: group for name, group in _SENSOR_LOG.items() if name != "turn" or set(group) <= set(header)}  # fmt: skip
         time = "loggingTime(txt)"
         table = read_columns(path, [name for group in groups.values() for name in group], text=[time])
@@ -112,7 +112,7 @@ def _unit(gravity: np.ndarray, path: str | Path) -> float:
 
 
 def _attitude(quaternion: np.ndarray, gravity: np.ndarray, path: str | Path) -> tuple[np.ndarray, float]:
-    """R_world_imu, and the share of gravity along the world's z: about 1 or -1."""
+    """R_world_imu, and the component of gravity along the world's z: about 1 or -1."""
     length = np.linalg.norm(quaternion, axis=1)
     if (np.abs(length - 1) > 0.01).any():
         row = int(np.argmax(np.abs(length - 1)))

@@ -24,7 +24,7 @@ from wearcap.io.formats.text import at_line, finite_floats, is_finite_number, nu
 from wearcap.recording.motion import Motion
 
 R_WORLD_FILE = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-"""From the file's axes (x left, y up, z forward) into ours (x forward, y left, z up)."""
+"""Rotation of the file's axes (x left, y up, z forward) into wearcap's (x forward, y left, z up)."""
 
 INCH_M = 0.0254
 MAX_BONES = 2000
@@ -48,7 +48,7 @@ class _Bone:
 
 @dataclass(frozen=True)
 class AsfSkeleton:
-    """What an AMC file needs to know of its ASF; per joint in the order of `skeleton.joint_names`."""
+    """Content of an ASF file that reading an AMC file needs; per joint in the order of `skeleton.joint_names`."""
 
     skeleton: Skeleton
     dof: tuple[tuple[str, ...], ...]
@@ -56,7 +56,7 @@ class AsfSkeleton:
     order: tuple[str, ...]
     """Order in which a joint's rotations act on the bone: "xyz" means Rz · Ry · Rx."""
     R_bind_axis: Float64[Tensor, "joint 3 3"]
-    """C: each joint's own axes in the bind pose, in the file's axes."""
+    """C of the module's formula: each joint's own axes in the bind pose, in the file's axes."""
     t_root: Float64[Tensor, "3"]
     """Position of the root when its channels are zero, in the file's axes (m)."""
     unit_m: float
@@ -302,7 +302,7 @@ def _heel(foot: Float[Tensor, "3"], shin: Float[Tensor, "3"]) -> tuple[float, ..
 
 
 def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Float64[Tensor, "time channel"]]:
-    """Frame numbers, joints in the file's order, and all channel values; every frame must be laid out like the first."""
+    """Frame numbers, joints in the file's order, and all channel values; every frame must have the first one's layout."""
     lines = _amc_lines(path, asf)
     beginning = list(islice(lines, 1))
     first, following = [], []
@@ -374,7 +374,7 @@ def _layout_joints(path: Path, asf: AsfSkeleton, start: int, first: list[tuple[i
                                expected="bones of the skeleton, once per frame", fix="Check that AMC and ASF belong together.")  # fmt: skip
         if len(values) != (expected := len(asf.dof[asf.skeleton.index(name)])):
             raise WearcapError(f"{len(values)} values for {name!r}", where=at_line(path, line),
-                               expected=f"{expected} as the ASF says")  # fmt: skip
+                               expected=f"{expected} as in the ASF")  # fmt: skip
     moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
     if not names or moving - set(names):
         raise WearcapError(f"the first frame lacks {sorted(moving - set(names))[:5]}", where=at_line(path, start),

@@ -1,8 +1,8 @@
-"""The one door to files of strangers: regular files alone, unpacked no further than a limit that the user can lift.
+"""Boundary check of untrusted files: only regular files are read, unpacked up to a limit that the user can raise.
 
-A packed file of kilobytes may unpack to all memory there is. What is read is counted against a limit of bytes, and,
+A compressed file of kilobytes may unpack to more than all memory. Bytes read are counted against a limit of size and,
 beyond `FREE_BYTES`, of the ratio to the packed bytes. `wearcap --max-file-gib N` (for worker processes the environment
-variable `WEARCAP_MAX_FILE_GIB`) or a reader's `max_bytes` replaces both: the user decides how much may be read.
+variable `WEARCAP_MAX_FILE_GIB`) or a reader's `max_bytes` replaces both limits.
 """
 
 import gzip
@@ -21,18 +21,18 @@ from wearcap.errors import WearcapError
 
 VARIABLE = "WEARCAP_MAX_FILE_GIB"
 MAX_BYTES = 1 << 32
-"""Largest unpacked size of one file, where its reader knows no better (4 GiB)."""
+"""Largest unpacked size of one file unless its reader sets another (4 GiB)."""
 FREE_BYTES = 1 << 26
 """Unpacked bytes up to which their ratio to the packed ones does not matter (64 MiB)."""
 MAX_RATIO = 100
-"""Captures as text pack 5 to 30 times, bombs a thousand times and more."""
+"""Largest ratio of unpacked to packed bytes: text captures reach 5 to 30, decompression bombs a thousand and more."""
 _CHUNK = 1 << 18
 _OPENERS: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
 _DAMAGE = (EOFError, lzma.LZMAError, gzip.BadGzipFile, zlib.error)
 
 
 class Budget:
-    """What may still be unpacked of one file."""
+    """Number of bytes that may still be unpacked from one file."""
 
     def __init__(self, path: str | Path, packed: int, usual: int = MAX_BYTES, max_bytes: int | None = None):
         """`packed` is the file's size in bytes, `usual` the limit of its kind, `max_bytes` the caller's own."""
@@ -45,7 +45,7 @@ class Budget:
         """Count bytes before or after they are unpacked. Raises WearcapError beyond the limit."""
         self.spent += size
         if self.spent > self.max_bytes:
-            raise WearcapError(f"larger than {_told(self.max_bytes)} once unpacked", where=self.path,
+            raise WearcapError(f"larger than {_size_text(self.max_bytes)} once unpacked", where=self.path,
                                expected="a smaller file", fix=_lift(self.spent))  # fmt: skip
         if self.spent > self._by_ratio:
             raise WearcapError(f"it unpacks to more than {MAX_RATIO} times its size", where=self.path,
@@ -53,7 +53,7 @@ class Budget:
 
 
 def _from_environment() -> int | None:
-    """The limit in bytes that the user has set for all files; None where there is none."""
+    """Limit (bytes) that the user has set for all files; None if none is set."""
     text = os.environ.get(VARIABLE, "").strip()
     return None if not text else gib_bytes(text, VARIABLE)
 
@@ -71,7 +71,7 @@ def gib_bytes(text: str, where: str) -> int:
     return int(gib * (1 << 30))
 
 
-def _told(size: int) -> str:
+def _size_text(size: int) -> str:
     for unit, name in ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")):
         if size >= unit:
             return f"{size / unit:.4g} {name}"
@@ -103,7 +103,7 @@ def file_size(path: str | Path, kind: str = "file") -> int:
 
 @contextmanager
 def explained(path: str | Path, kind: str = "file") -> Iterator[None]:
-    """Turn what the operating system and unpackers say of a file into WearcapError."""
+    """Turn errors of the operating system and of decompressors into WearcapError."""
     try:
         yield
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -128,13 +128,13 @@ def open_bytes(
     """Open a file for reading bytes, unpacked when its name ends in .gz or .xz.
 
     Raises WearcapError, while opening or while reading inside the `with` block, when the file is missing, no regular
-    file, not what its name says, or larger than `max_bytes` (default: `usual`, as far as the user has not lifted it).
+    file, not in the format of its suffix, or larger than `max_bytes` (default: `usual`, unless the user raised it).
     """
     size = file_size(path)
     opener = _OPENERS.get(Path(path).suffix, open)
     budget = Budget(path, size, usual, max_bytes)
     if opener is open:
-        Budget(path, size, usual, max_bytes).spend(size)  # refused before a byte is read
+        Budget(path, size, usual, max_bytes).spend(size)  # raises before a byte is read
     with explained(path), opener(path, "rb") as file, counted(file, budget) as reader:
         yield reader
 
@@ -158,7 +158,7 @@ class _Counted(io.RawIOBase):
         return len(content)
 
     def readall(self) -> bytes:
-        """The rest, held in memory once: BytesIO hands out its own buffer."""
+        """The remaining bytes, in memory only once: BytesIO returns its own buffer."""
         whole = io.BytesIO()
         while content := self._file.read(_CHUNK):
             self._budget.spend(len(content))

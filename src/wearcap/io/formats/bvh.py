@@ -30,10 +30,10 @@ END_SITES = {
     "handindex1": "fingertip",
     "thumb": "thumb_tip",
 }
-"""End Sites that get our name for the point: by the joint's name without its side."""
+"""wearcap's names of End Sites, by the joint's name without its side."""
 
 STRETCH_M = 0.005
-"""A bone may change its length this much before the reader warns."""
+"""Largest change of a bone's length without a warning."""
 
 CGSPEED_UNIT_M = 0.0254 / 0.45
 CGSPEED_THORAX = (0.0, 2.07, 0.0)
@@ -53,7 +53,7 @@ def read_bvh(
 
     `unit_m`: metres per unit. `up`, `forward`: the file's axes ("x", "-y" …) that point up, and ahead of the body in
     its bind pose. `offsets` (file units) replaces OFFSETs that are known to be wrong. Raises WearcapError naming file
-    and line, and, unless `check` is False, when the body is no person's size or lies down, with the setting that mends it.
+    and line, and, unless `check` is False, when the body is no person's size or lies down, with the setting that fixes it.
     """
     path = Path(path)
     R_world_file = _axes(path, up, forward)

@@ -1,4 +1,4 @@
-"""Is this the body of a person, upright and in metres? If not, which setting would make it one."""
+"""Check that a body is a person's, upright and in metres; if not, name the setting that would make it so."""
 
 from pathlib import Path
 
@@ -13,14 +13,14 @@ from wearcap.recording.motion import Motion
 UNITS_M = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254,
            "feet": 0.3048, "CMU's units": 0.0254 / 0.45}  # fmt: skip
 REACH_PER_HEIGHT = 1.46
-"""Longest way along the bones (fingertip to toe tip) over body height, in the skeletons at hand 1.46 … 1.53."""
+"""Longest path along the bones (fingertip to toe tip) over body height; in the tested skeletons 1.46 … 1.53."""
 
 HEIGHT_M = (0.6, 2.6)
 
 
 def check_body(motion: Motion, path: Path, unit_m: float, R_world_file: Float[Tensor, "3 3"]) -> None:
-    """Raise WearcapError, naming the setting that mends it, when the body is no person's size or lies on its side."""
-    height = longest_way(motion.skeleton) / REACH_PER_HEIGHT
+    """Raise WearcapError, naming the setting that fixes it, when the body is no person's size or lies on its side."""
+    height = longest_path(motion.skeleton) / REACH_PER_HEIGHT
     if not HEIGHT_M[0] < height < HEIGHT_M[1]:
         nearest = {name: abs(height / unit_m * unit - 1.7) for name, unit in UNITS_M.items()}
         name = min(nearest, key=lambda name: nearest[name])
@@ -49,8 +49,8 @@ def _mirror_error(skeleton: Skeleton, axis: int) -> float:
     return torch.cdist(skeleton.rest_joints * mirror, skeleton.rest_joints).amin(1).mean().item()
 
 
-def longest_way(skeleton: Skeleton) -> float:
-    """Length (m) of the longest way along the bones from one end of the tree to another."""
+def longest_path(skeleton: Skeleton) -> float:
+    """Length (m) of the longest path along the bones from one end of the tree to another."""
     bones = skeleton.t_parent_joint.double().norm(dim=-1).tolist()
     down = [0.0] * len(skeleton)
     for site in skeleton.sites.values():
@@ -58,9 +58,9 @@ def longest_way(skeleton: Skeleton) -> float:
         down[joint] = max(down[joint], torch.tensor(site.t_joint_site).norm().item())
     longest = 0.0
     for joint in range(len(skeleton) - 1, 0, -1):
-        parent, way = skeleton.parents[joint], down[joint] + bones[joint]
-        longest = max(longest, down[parent] + way)
-        down[parent] = max(down[parent], way)
+        parent, length = skeleton.parents[joint], down[joint] + bones[joint]
+        longest = max(longest, down[parent] + length)
+        down[parent] = max(down[parent], length)
     return longest
 
 

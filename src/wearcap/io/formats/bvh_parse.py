@@ -1,4 +1,4 @@
-"""The two halves of a BVH file, HIERARCHY and MOTION, as they stand: the file's units, axes and channel order."""
+"""Parser of a BVH file's HIERARCHY and MOTION parts, in the file's own units, axes and channel order."""
 
 from array import array
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ from wearcap.io.formats.text import at_line, finite_floats, is_finite_number
 CHANNELS = {f"{axis}{kind}": (kind[0], axis) for axis in "xyz" for kind in ("position", "rotation")}
 MAX_JOINTS = 2000
 _MAX_WORDS = 64
-"""Of a joint's name."""
+"""Most words of a joint's name."""
 _END_SITE = -1
-"""Stands for an End Site among the open blocks."""
+"""Index that marks an End Site among the open blocks."""
 
 
 @dataclass
 class BvhJoint:
-    """One joint as the file has it; offsets in file units."""
+    """One joint of the file; offsets in file units."""
 
     name: str
     parent: int
@@ -33,7 +33,7 @@ class BvhJoint:
 
 
 def parse_hierarchy(path: Path, lines: Iterator[tuple[int, str]]) -> tuple[list[BvhJoint], int]:
-    """Joints with parents first, and the number of the MOTION line, up to which the lines are used up."""
+    """Joints with parents first, and the number of the MOTION line, up to which the lines are consumed."""
     words = _Words(lines)
     joints: list[BvhJoint] = []
     blocks: list[int] = []
@@ -66,7 +66,7 @@ def parse_hierarchy(path: Path, lines: Iterator[tuple[int, str]]) -> tuple[list[
 
 
 class _Words:
-    """The words of a hierarchy one after another, until the line MOTION; `line` is where the last one stands."""
+    """The words of a hierarchy one after another, until the line MOTION; `line` is the number of the last one's line."""
 
     def __init__(self, lines: Iterator[tuple[int, str]]):
         self.line, self.motion_line = 1, 0
@@ -160,6 +160,6 @@ def parse_motion(
             break
     if len(values) != count * channels or not values:
         raise odd or WearcapError(
-            f"{rows} frames", where=path, expected=f"{count} frames, as the file says (at least one)"
+            f"{rows} frames", where=path, expected=f"{count} frames, as in the file's header (at least one)"
         )
     return step_s, np.asarray(values).reshape(count, channels)

@@ -21,7 +21,7 @@ def camera_row(camera: Camera) -> dict[str, Any]:
 
 
 def camera_from_row(row: Any, where: str | Path) -> Camera:
-    """The camera of such numbers. Raises WearcapError naming `where` when they are missing or none of a camera."""
+    """Camera from the dict of `camera_row`. Raises WearcapError naming `where` when numbers are missing or invalid."""
     try:
         if not all(math.isfinite(float(value)) for value in (row["cx"], row["cy"], *row["distortion"])):
             raise ValueError("numbers that are not finite")
@@ -35,7 +35,7 @@ def camera_from_row(row: Any, where: str | Path) -> Camera:
 
 
 def write_camera(camera: Camera, path: str | Path, calibration: dict[str, Any] | None = None) -> None:
-    """Write a camera, and beside it what is known of its calibration (numbers, text, lists), atomically."""
+    """Write a camera and the metadata of its calibration (numbers, text, lists) atomically."""
     content = {"camera": camera_row(camera)} | ({"calibration": calibration} if calibration else {})
     write_text(path, json.dumps(content, indent=1) + "\n")
 

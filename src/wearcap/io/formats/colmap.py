@@ -29,7 +29,7 @@ _MODELS = {
     "SIMPLE_PINHOLE": ("pinhole", 3), "PINHOLE": ("pinhole", 4), "SIMPLE_RADIAL": ("opencv", 4),
     "RADIAL": ("opencv", 5), "OPENCV": ("opencv", 8), "OPENCV_FISHEYE": ("fisheye", 8),
 }  # fmt: skip
-"""Our model, and how many parameters COLMAP's has."""
+"""wearcap's camera model, and the number of parameters of COLMAP's."""
 _BY_NUMBER = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
@@ -38,17 +38,17 @@ _BY_NUMBER = (
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """3D points of structure from motion, and where each was observed."""
+    """3D points of structure from motion and their observations."""
 
     points_world: Float64[np.ndarray, "point 3"]
     colors: UInt8[np.ndarray, "point 3"]
     photo: Int64[np.ndarray, "observation"]
-    """Number of the photo that holds the observation."""
+    """Index of the photo of each observation."""
     point: Int64[np.ndarray, "observation"]
     pixels: Float32[np.ndarray, "observation 2"]
 
     def of_photos(self, chosen: Int64[np.ndarray, "chosen"]) -> "Tracks":
-        """The observations of some photos, which are numbered anew in the order given."""
+        """The observations in some photos, which are renumbered in the given order."""
         order = np.argsort(chosen)
         place = np.minimum(np.searchsorted(chosen[order], self.photo), max(len(chosen) - 1, 0))
         keep = np.isin(self.photo, chosen)
@@ -57,7 +57,7 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """What a COLMAP model says: photos in the order of their names, and the tracks."""
+    """Content of a COLMAP model: photos in the order of their names, and the tracks."""
 
     photos: list[Photo]
     tracks: Tracks
@@ -84,7 +84,7 @@ class _Points:
 def read_colmap(folder: str | Path, images: str | Path | None = None) -> ColmapModel:
     """Read cameras, images and points3D (.bin where it is there, else .txt) from a model's folder.
 
-    Without a points3D file, as some give poses alone, there are no tracks.
+    Without a points3D file, as in models of poses alone, there are no tracks.
     `images`: folder of the picture files (default: `images` beside the model, else the model's own folder).
     Raises WearcapError for missing or truncated files, unknown camera models, and numbers that name nothing.
     """
@@ -162,7 +162,7 @@ def _camera(model: str, width: int, height: int, values: list[float], where: str
 
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Where each line stands and its words, without comments; empty lines come, too."""
+    """Position and words of each line, without comments but with empty lines."""
     for number, line in numbered_lines(path):
         if not line.startswith("#"):
             yield at_line(path, number), line.split()
@@ -222,7 +222,7 @@ def _read_points_txt(path: Path) -> _Points:
                     raise ValueError("too few numbers")
                 numbers.append(int(words[0]))
                 xyz.extend(map(float, words[1:4]))
-                rgb += bytes(map(int, words[4:7]))  # refuses what is beyond 0…255
+                rgb += bytes(map(int, words[4:7]))  # raises beyond 0…255
             except (ValueError, IndexError, OverflowError) as error:
                 raise _damaged(where, error, "POINT3D_ID X Y Z R G B ERROR TRACK…") from error
     return _checked_points(numbers, xyz, rgb, path)
@@ -242,7 +242,7 @@ def _checked_points(numbers: "array[int]", xyz: "array[float]", rgb: bytearray, 
 
 
 class _Cursor:
-    """Reads structures one after another and says which part of the file ended too early."""
+    """Reads structures one after another; errors name the part of the file that ended too early."""
 
     def __init__(self, path: Path):
         self.path, self.data, self.place = path, read_bytes(path, usual=_MAX_BYTES), 0

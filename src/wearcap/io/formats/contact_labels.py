@@ -1,7 +1,7 @@
-"""When each hand holds something, as an annotator marked it: H-contact's JSON, and the same with what we know besides.
+"""Annotated hand contacts: H-contact's JSON, and wearcap's extension of it by objects, classes and the recording.
 
 H-contact: `{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}}` in seconds on the motion's clock; a
-label with end < start lasts until the recording ends. Our own files add `objects` and `classes` (one entry per label,
+label with end < start lasts until the recording ends. wearcap's own files add `objects` and `classes` (one entry per label,
 "" where unknown) and the `recording` that the labels were made for.
 """
 
@@ -25,7 +25,7 @@ from wearcap.scene.objects import CONTACT_CLASSES
 
 SCHEMA = 1
 SLACK_S = 0.05
-"""How far a label may stand outside the recording: a video's and a suit's clocks seldom end together."""
+"""Largest time (s) that a label may exceed the recording: a video's and a suit's clocks seldom end together."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def hcontact_of(labels: Labels, clock: LabelClock) -> dict[str, list[list[float]
 
 
 def annotation_of(labels: Labels, clock: LabelClock) -> dict[str, Any]:
-    """Our own file: H-contact's content, objects and classes beside it, and whose labels they are."""
+    """wearcap's own file: H-contact's content with objects, classes and the recording that the labels belong to."""
     return {
         "schema_version": SCHEMA,
         "recording": {
@@ -110,7 +110,7 @@ def annotation_of(labels: Labels, clock: LabelClock) -> dict[str, Any]:
 
 
 def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Labels:
-    """Check what a label file says; `where` is named in errors. Raises WearcapError as `read_contact_labels`."""
+    """Labels of a label file's content; errors name `where`. Raises WearcapError as `read_contact_labels`."""
     contacts = content.get("contacts") if isinstance(content, dict) else None
     names = [f"{hand}_hand" for hand in HANDS]
     if not isinstance(contacts, dict) or not all(isinstance(contacts.get(name), list) for name in names):
@@ -126,7 +126,7 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
             raise WearcapError(f"class {unknown.pop()!r} in {name}", where=where,
                                expected=f"one of {', '.join(CONTACT_CLASSES)}")  # fmt: skip
         spans = [_span(pair, clock, f"{name} label {place}", where) for place, pair in enumerate(pairs)]
-        found = [Label(*span, thing, kind) for span, thing, kind in zip(spans, objects, classes)]
+        found = [Label(*span, item, kind) for span, item, kind in zip(spans, objects, classes)]
         labels[hand] = tuple(sorted(found, key=lambda label: label.start_s))
         _refuse_overlap(labels[hand], clock, name, where)
     return labels
@@ -142,7 +142,7 @@ def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> Non
         name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
         same = all(abs(a - b) < 1e-3 for a, b in zip(span, (clock.start_s, clock.stop_s)))
     except (KeyError, TypeError) as error:
-        raise WearcapError(f"does not say whose labels it holds ({error})", where=where) from error
+        raise WearcapError(f"does not name the recording of its labels ({error})", where=where) from error
     if name != clock.name or frames != clock.frames or not same:
         raise WearcapError(
             f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s", where=where,
@@ -152,7 +152,7 @@ def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> Non
 
 
 def _texts(content: dict, key: str, name: str, count: int, where: str | Path) -> list[str]:
-    """One text per label of a hand; empty ones where the file has none."""
+    """One text per label of a hand; empty if the file has none."""
     texts = content.get(key, {})
     texts = texts.get(name, [""] * count) if isinstance(texts, dict) else None
     if not isinstance(texts, list) or len(texts) != count or not all(isinstance(text, str) for text in texts):
@@ -174,7 +174,7 @@ def _span(pair: Any, clock: LabelClock, label: str, where: str | Path) -> tuple[
         clock.start_s - SLACK_S <= start < clock.stop_s - 1e-9
         and clock.start_s < stop <= clock.stop_s + SLACK_S
     ):
-        raise WearcapError(f"{label} from {start} to {end} s lies outside the recording", where=where,
+        raise WearcapError(f"{label} from {start} to {end} s is outside the recording", where=where,
                            expected=f"times from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
                            fix="Is it the file of another recording?")  # fmt: skip
     return max(float(start), clock.start_s), min(float(stop), clock.stop_s)
@@ -192,23 +192,24 @@ def _refuse_overlap(labels: Sequence[Label], clock: LabelClock, name: str, where
 
 
 def interactions_of(labels: Labels) -> Interactions:
-    """Labels as interactions: hands that hold the same named object share one; where its hands change, a new begins."""
+    """Labels as interactions: hands on the same named object share one; a new one starts when the hands change."""
     found: list[tuple[float, float, tuple[bool, ...], str, str]] = []
-    for thing in {(label.object, label.contact_class) for hand in HANDS for label in labels[hand]}:
-        held = [
-            [label for label in labels[hand] if (label.object, label.contact_class) == thing]
-            for hand in HANDS
+    for item in {(label.object, label.contact_class) for hand in HANDS for label in labels[hand]}:
+        by_hand = [
+            [label for label in labels[hand] if (label.object, label.contact_class) == item] for hand in HANDS
         ]
-        if not thing[0]:  # two hands at unknown things need not be at the same
-            for number, spans in enumerate(held):
+        if not item[0]:  # two hands on unknown objects need not hold the same one
+            for number, spans in enumerate(by_hand):
                 one = tuple(other == number for other in range(len(HANDS)))
-                found += [(label.start_s, label.stop_s, one, *thing) for label in spans]
+                found += [(label.start_s, label.stop_s, one, *item) for label in spans]
             continue
-        edges = sorted({edge for spans in held for label in spans for edge in (label.start_s, label.stop_s)})
+        edges = sorted(
+            {edge for spans in by_hand for label in spans for edge in (label.start_s, label.stop_s)}
+        )
         for start, stop in itertools.pairwise(edges):
-            hands = tuple(any(s.start_s <= start < s.stop_s for s in spans) for spans in held)
+            hands = tuple(any(s.start_s <= start < s.stop_s for s in spans) for spans in by_hand)
             if any(hands):
-                found.append((start, stop, hands, *thing))
+                found.append((start, stop, hands, *item))
     found.sort(key=lambda row: row[0])
     column = lambda index: [row[index] for row in found]  # noqa: E731
     return Interactions(
@@ -218,22 +219,22 @@ def interactions_of(labels: Labels) -> Interactions:
 
 
 def labels_of(interactions: Interactions, clock: LabelClock) -> Labels:
-    """Each hand's labels; stretches at the same named object that follow each other become one.
+    """Each hand's labels; adjacent intervals on the same named object become one.
 
-    Raises WearcapError where a hand would hold two things at once, or outside the recording.
+    Raises WearcapError where a hand would hold two objects at once, or outside the recording.
     """
     labels: Labels = {}
     rows = list(zip(interactions.start_s.tolist(), interactions.stop_s.tolist(), interactions.hands.tolist(),
                     interactions.objects, interactions.classes))  # fmt: skip
     for number, hand in enumerate(HANDS):
         joined: list[Label] = []
-        for start, stop, hands, thing, kind in sorted(rows, key=lambda row: row[0]):
+        for start, stop, hands, item, kind in sorted(rows, key=lambda row: row[0]):
             if not hands[number]:
                 continue
             span = _span([start, stop], clock, f"{hand}_hand's interaction", clock.name)
-            label = Label(*span, thing, kind)
+            label = Label(*span, item, kind)
             last = joined[-1] if joined else None
-            if last and thing and (last.stop_s, last.object, last.contact_class) == (span[0], thing, kind):
+            if last and item and (last.stop_s, last.object, last.contact_class) == (span[0], item, kind):
                 joined[-1] = replace(last, stop_s=span[1])
             else:
                 joined.append(label)

@@ -16,7 +16,7 @@ from wearcap.io.formats.bounded import open_bytes
 MAX_BYTES = 1 << 31
 """Largest table that is taken into memory as a whole (2 GiB: two hours of poses at 1 kHz)."""
 MAX_STREAMED_BYTES = 1 << 36
-"""Largest table that is read in pieces (64 GiB)."""
+"""Largest table that is read in chunks (64 GiB)."""
 MAX_LINE = 1 << 16
 
 
@@ -103,7 +103,9 @@ def _read_rows(
 ) -> np.ndarray:
     """The next rows of an open file as a structured array; `done` were read before."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # numpy's own word on an empty file; ours follows
+        warnings.simplefilter(
+            "ignore", UserWarning
+        )  # numpy warns about an empty file; the WearcapError follows
         try:
             return np.loadtxt(
                 file, dtype=np.dtype(list(kinds.items())), delimiter=",", usecols=[header.index(name) for name in kinds],

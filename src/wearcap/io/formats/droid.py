@@ -1,7 +1,7 @@
 """DROID-SLAM's reconstruction folder: keyframes' poses, and points from their disparities.
 
 `poses.npy` (N, 7) holds tx ty tz qx qy qz qw of the world in the camera's axes (OpenCV), `tstamps.npy` (N) the numbers
-of the frames that SLAM was given, `disps.npy` (N, H, W) inverse depths, `intrinsics.npy` (N, 4) fx fy cx cy at an eighth
+of SLAM's input frames, `disps.npy` (N, H, W) inverse depths, `intrinsics.npy` (N, 4) fx fy cx cy at an eighth
 of the pictures' size. Unit and axes of the world are SLAM's own: neither metres nor gravity.
 """
 
@@ -22,19 +22,19 @@ from wearcap.io.formats.poses import check_finite, check_rising, checked_traject
 from wearcap.recording import PointCloud
 
 REDUCED = 8
-"""SLAM works on pictures so many times smaller; its intrinsics are theirs."""
+"""Factor by which SLAM's internal pictures are smaller; its intrinsics refer to them."""
 
 
 @dataclass(frozen=True)
 class DroidPoints:
-    """Which pixels of the keyframes become points; the values are ours, after DROID-SLAM's own viewer."""
+    """Selection of the keyframes' pixels that become points; our values, modelled on DROID-SLAM's own viewer."""
 
     stride: int = 4
-    """Every so many pixels of a row and of a column."""
+    """Stride (pixels) along rows and columns."""
     neighbors: int = 3
-    """Keyframes on either side that a point is compared with."""
+    """Number of keyframes on either side that a point is compared with."""
     agreement: float = 0.05
-    """Largest relative difference of depth with which a neighbour agrees."""
+    """Largest relative difference of depth at which a neighbour agrees."""
     min_agreeing: int = 2
     min_disparity: float = 0.25
     """Smallest disparity, as a share of the mean: far points are noise."""
@@ -46,17 +46,17 @@ class DroidTrack:
 
     T_world_cam: Trajectory
     camera: Camera
-    """Pinhole of the pictures that SLAM was given, at the size of the disparities."""
+    """Pinhole camera of SLAM's input pictures, at the size of the disparities."""
     points: PointCloud | None
-    """Confidence is the share of the neighbours that agree; seen first by the keyframe they come from."""
+    """Points; `confidence` is the share of neighbours that agree, `first_seen` the time of a point's own keyframe."""
 
 
 def read_droid(
     folder: str | Path, stamps_per_s: float, points: DroidPoints | None = DroidPoints()
 ) -> DroidTrack:
-    """Read a reconstruction; `stamps_per_s` counts the frames that SLAM was given (a 30 Hz video at stride 3: 10).
+    """Read a reconstruction; `stamps_per_s` is the rate of SLAM's input frames (a 30 Hz video at stride 3: 10).
 
-    Without `points`, of the disparities only the size is read. Raises WearcapError for missing files, arrays of objects, wrong
+    Without `points`, only the size of the disparities is read. Raises WearcapError for missing files, arrays of objects, wrong
     shapes, NaN, stamps that do not rise, quaternions far from unit norm, and intrinsics of no such picture.
     """
     folder = Path(folder)
@@ -78,7 +78,7 @@ def read_droid(
 
 
 def _load(path: Path) -> np.ndarray:
-    """A .npy file, mapped: its size is checked before anything is reserved."""
+    """A memory-mapped .npy file, whose size is checked before memory is allocated."""
     if not path.exists():
         raise WearcapError("no such file", where=path, expected="a reconstruction of DROID-SLAM",
                            fix="Run it with --reconstruction_path.")  # fmt: skip
@@ -146,7 +146,7 @@ def _mean(disparity: np.ndarray, folder: Path) -> float:
 def _agrees(
     points: Float[Tensor, "point 3"], T_world_cam: Rigid, disparity: np.ndarray, camera: Camera, within: float
 ) -> Tensor:
-    """Where another keyframe sees points (world) at the depth that its own disparity says."""
+    """Mask of points (world) whose depth in another keyframe agrees with that keyframe's own disparity."""
     points_cam: Tensor = T_world_cam.inverse() @ points  # pyright: ignore[reportAssignmentType]
     pixels, visible = camera.project(points_cam)
     column, row = pixels.round().long().unbind(-1)

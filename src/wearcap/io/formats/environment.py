@@ -22,7 +22,7 @@ from wearcap.scene.objects import FREEDOMS, Freedom, SceneObject
 SCHEMA = 1
 FILE_NAME = "environment.json"
 MAX_HINGE_GAP_M = 0.5
-"""A hinge further than this from its object's box, seen from above, is a mistake."""
+"""Largest horizontal distance (m) of a hinge from its object's bounding box."""
 
 _KEYS = ("name", "category", "mesh", "R_world_object", "t_world_object", "freedom")
 _FREEDOM_KEYS = {
@@ -32,7 +32,7 @@ _OPTIONAL = ("limits_deg", "limits_m")
 _ORTHOGONAL_WITHIN = 1e-3
 _LARGEST = float(np.finfo(np.float32).max)
 _COLOR = np.array([0.7, 0.7, 0.7], np.float32)
-"""Of meshes without any."""
+"""Colour of meshes without one."""
 
 
 def read_environment(path: str | Path) -> Environment:
@@ -60,7 +60,7 @@ def read_environment(path: str | Path) -> Environment:
 def write_environment(environment: Environment, path: str | Path) -> None:
     """Write environment.json (`path`, or in that folder) and objects/NAME.ply; the list last, each file atomically.
 
-    Meshes keep colours of 8 bits. Raises WearcapError for what `read_environment` would refuse.
+    Meshes keep colours of 8 bits. Raises WearcapError for anything that `read_environment` refuses.
     """
     path = Path(path)
     path = path if path.suffix == ".json" else path / FILE_NAME
@@ -166,12 +166,12 @@ def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
 
 
 def _shortest(value: float) -> float:
-    """A number of single precision in as few digits as tell it apart."""
+    """A single-precision number with the fewest digits that identify it."""
     return float(f"{value:.9g}")
 
 
 def _file_name(name: str, taken: set[str]) -> str:
-    """A name that every file system takes, and that no other object of this environment has."""
+    """A file name that every file system accepts and that is unique in this environment."""
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "object"
     if re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", plain):
         plain = f"{plain}_"
@@ -183,7 +183,7 @@ def _file_name(name: str, taken: set[str]) -> str:
 
 
 def _ply(mesh: Mesh) -> Ply:
-    """With a colour per vertex: faces that have their own get their own vertices too."""
+    """The mesh with a colour per vertex: faces with their own colour get their own vertices."""
     vertices, faces, color = mesh.vertices, mesh.faces, mesh.color
     if color.ndim == 2 and len(color) != len(vertices):
         vertices, color = vertices[faces.ravel()], np.repeat(color, 3, axis=0)
@@ -193,7 +193,7 @@ def _ply(mesh: Mesh) -> Ply:
 
 
 def _check(item: SceneObject, where: str) -> None:
-    """What cannot be true of an object, whoever made it."""
+    """Raise WearcapError for properties that no object can have."""
     pose = [*item.R_world_object.flatten().tolist(), *item.t_world_object.tolist()]
     freedom = [*(item.freedom.pivot or ()), *(item.freedom.axis or ()), *(item.freedom.limits or ())]
     if not item.name.strip() or not len(item.mesh.vertices):
@@ -210,7 +210,7 @@ def _check(item: SceneObject, where: str) -> None:
 
 
 def _rotation(value: Any, where: str) -> Float64[np.ndarray, "3 3"]:
-    """The rotation nearest to a matrix that is one but for its rounding."""
+    """The rotation nearest to a matrix that is a rotation up to rounding."""
     R = _numbers(value, (3, 3), "R_world_object", where)
     if np.abs(R.T @ R - np.eye(3)).max() > _ORTHOGONAL_WITHIN or np.linalg.det(R) < 0:
         raise WearcapError("R_world_object is no rotation", where=where,

@@ -18,7 +18,9 @@ def read_euroc(path: str | Path) -> Trajectory:
     """
     try:
         with open_text(path) as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # numpy's own word on an empty file; ours follows
+            warnings.simplefilter(
+                "ignore", UserWarning
+            )  # numpy warns about an empty file; the WearcapError follows
             lines = (line for line in file if line.strip() and not line.startswith("#"))
             table = np.loadtxt(lines, delimiter=",", ndmin=2, usecols=range(8))
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Formats with a fixed frame rate: which frames of a motion stand on an even time grid."""
+"""Frames of a motion on an even time grid, for formats with a fixed frame rate."""
 
 import torch
 from jaxtyping import Int64
@@ -8,13 +8,13 @@ from wearcap.errors import WearcapError
 from wearcap.recording.motion import Motion
 
 STILL_FPS = 30.0
-"""Rate written for a motion of a single frame, which has none."""
+"""Rate (Hz) written for a motion of a single frame, which has none."""
 
 
 def even_frames(motion: Motion) -> tuple[Int64[Tensor, "time"], float]:
     """Index of the nearest frame at each step of the motion's nominal rate, and that rate (Hz).
 
-    An even motion keeps every frame once; over a gap the nearest frame stands still, so that nothing shifts in time.
+    An even motion keeps every frame once; over a gap the nearest frame is repeated, so that nothing shifts in time.
     Raises WearcapError for a motion without frames or with a gap of more than a minute.
     """
     if len(motion) == 0:
@@ -32,5 +32,5 @@ def even_frames(motion: Motion) -> tuple[Int64[Tensor, "time"], float]:
 
 
 def nominal_fps(fps: float) -> float:
-    """The whole number that a rate means when it was rounded on its way (120.0005 Hz from a step of .0083333 s)."""
+    """Nearest integer rate if the rate was only rounded (120.0005 Hz from a step of .0083333 s), else the rate itself."""
     return float(round(fps)) if round(fps) and abs(fps - round(fps)) < 1e-4 * fps else fps

@@ -1,7 +1,7 @@
 """Motion as glTF 2.0 binary (.glb): an animated, skinned figure that Blender and web viewers open.
 
-One node per joint, with our axes and offsets, hangs on a node that turns z up into glTF's y up. The inverse bind
-matrices undo the rest pose with the root at the origin, which is how a body's vertices are given.
+One node per joint, with wearcap's axes and offsets, below a node that turns z up into glTF's y up. The inverse bind
+matrices undo the rest pose with the root at the origin, the pose of a body's vertices.
 """
 
 import json
@@ -21,7 +21,7 @@ from wearcap.io.formats.gltf_mesh import SkinnedMesh, skin_of, sticks
 from wearcap.recording.motion import Motion
 
 _Z_UP_XYZW = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
-"""Turns our z up into glTF's y up."""
+"""Rotation of z up into glTF's y up."""
 
 _COMPONENT = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _TYPE = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}

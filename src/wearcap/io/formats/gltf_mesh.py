@@ -1,4 +1,4 @@
-"""What a .glb shows of a body: its skin, or sticks for its bones where there is no body."""
+"""Mesh of a body in a .glb: its skin, or sticks for its bones if there is no body model."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh, capsules
 
 _THICK_M, _THIN_M = 0.022, 0.012
-"""Radius of a stick where it begins and where it ends."""
+"""Radii (m) of a stick at its start and its end."""
 
 _GREY = np.full(3, 0.7, np.float32)
 
 
 @dataclass(frozen=True)
 class SkinnedMesh:
-    """A mesh at rest (m, our axes, root at the origin), and up to four joints with weights per vertex."""
+    """A mesh in the rest pose (m, wearcap's axes, root at the origin), with up to four weighted joints per vertex."""
 
     mesh: Mesh
     joints: Int[np.ndarray, "vertex 4"]
@@ -58,7 +58,7 @@ def sticks(skeleton: Skeleton) -> SkinnedMesh:
     bones.append((0, torch.zeros(3)))
     owners = np.array([joint for joint, _ in bones])
     start = skeleton.rest_joints.double().numpy()[owners]
-    end = start + torch.stack([way for _, way in bones]).double().numpy()
+    end = start + torch.stack([offset for _, offset in bones]).double().numpy()
     mesh = capsules(
         start,
         end,

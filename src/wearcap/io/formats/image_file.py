@@ -1,4 +1,4 @@
-"""The door to image files of strangers: a few plain formats, and no more pixels than such a file may hold.
+"""Boundary check of untrusted image files: a few plain formats, with a limited number of pixels.
 
 Pillow guesses the format from the content, whatever the name says, and for some formats starts other programs
 (Ghostscript for EPS); half a megabyte of PNG may unpack to gigabytes.
@@ -20,7 +20,7 @@ FORMATS = ("BMP", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
 _PIXEL_BYTES = 4
 _DAMAGE = (OSError, SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, AttributeError, struct.error,
            zlib.error, EOFError, RuntimeError, MemoryError, Image.DecompressionBombError)  # fmt: skip
-"""What Pillow raises on files that are cut short or tampered with."""
+"""Exceptions that Pillow raises on truncated or damaged files."""
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""JSON files that strangers wrote."""
+"""Untrusted JSON files."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ from wearcap.files import parse_json
 from wearcap.io.formats.text import read_text
 
 MAX_BYTES = 1 << 28
-"""Largest JSON that is read (256 MiB): as Python's objects it takes up to twenty times as much."""
+"""Largest JSON file that is read (256 MiB): as Python objects it takes up to twenty times as much."""
 
 
 def read_json(path: str | Path, max_bytes: int | None = None) -> Any:

@@ -1,6 +1,6 @@
 """Recorded keypoints as CSV: timestamp (s), joint, x, y (pixels) or x, y, z (m, in the world), confidence (0…1).
 
-A row is one joint at one time, in any order. A file holds pixels or places, not both.
+A row is one joint at one time, in any order. A file holds pixels or 3D positions, not both.
 """
 
 from collections.abc import Mapping
@@ -16,26 +16,26 @@ from wearcap.recording.recording import Cue
 
 AXES = "xyz"
 MAX_PLACE = 1e9
-"""Farthest place (m or pixels); larger numbers need not be finite as float32."""
+"""Largest coordinate (m or pixels); larger numbers need not be finite as float32."""
 
 
 def read_keypoints(path: str | Path) -> dict[str, Cue]:
-    """Cues by joint, their times rising. Rows with a confidence of 0 say nothing and are left out.
+    """Cues by joint, with rising times. Rows with a confidence of 0 carry no information and are dropped.
 
     Raises WearcapError for a missing column, a field that is no number, a time, place or confidence that cannot be one,
-    and a joint that is twice at one time. Whether a skeleton has the joints is not asked here.
+    and a joint that occurs twice at one time. Whether a skeleton has the joints is not checked here.
     """
     axes = list(AXES if "z" in read_header(path) else AXES[:2])
     table = read_columns(path, ["timestamp", *axes, "confidence"], text=["joint"])
     times, confidence = table["timestamp"], table["confidence"]
     points = np.stack([table[axis] for axis in axes], -1)
     joints = np.char.strip(np.char.decode(table["joint"], "latin-1"))
-    said = confidence != 0
+    observed = confidence != 0
     for wrong, what, expected in (
         (~np.isfinite(times), "a timestamp that is no time", "seconds"),
         (~((confidence >= 0) & (confidence <= 1)), "a confidence that is none", "0 to 1"),
         (
-            said & ~(np.abs(points) <= MAX_PLACE).all(-1),
+            observed & ~(np.abs(points) <= MAX_PLACE).all(-1),
             "a place that is none",
             "numbers, or a confidence of 0",
         ),
@@ -44,13 +44,13 @@ def read_keypoints(path: str | Path) -> dict[str, Cue]:
         if wrong.any():
             raise WearcapError(what, where=f"{path}, row {int(wrong.argmax()) + 1} after the header", expected=expected)  # fmt: skip
     return {
-        str(joint): _cue(path, str(joint), *(part[said & (joints == joint)] for part in (times, points, confidence)))
-        for joint in np.unique(joints[said])
+        str(joint): _cue(path, str(joint), *(part[observed & (joints == joint)] for part in (times, points, confidence)))
+        for joint in np.unique(joints[observed])
     }  # fmt: skip
 
 
 def write_keypoints(cues: Mapping[str, Cue], path: str | Path) -> None:
-    """Write cues atomically, row by row as time goes on; what has no confidence is left out.
+    """Write cues atomically, rows sorted by time; cues without confidence are left out.
 
     Raises WearcapError when nothing is left, for two cues of one joint, and for pixels beside places.
     """
@@ -60,9 +60,11 @@ def write_keypoints(cues: Mapping[str, Cue], path: str | Path) -> None:
                            expected="pixels or places, one cue per joint")  # fmt: skip
     rows = []
     for cue in cues.values():
-        said = (cue.confidence > 0) & cue.points.isfinite().all(-1)
+        observed = (cue.confidence > 0) & cue.points.isfinite().all(-1)
         for time, point, confidence in zip(
-            cue.timestamps[said].tolist(), cue.points[said].tolist(), cue.confidence[said].tolist()
+            cue.timestamps[observed].tolist(),
+            cue.points[observed].tolist(),
+            cue.confidence[observed].tolist(),
         ):
             rows.append((time, cue.joint, [*point, confidence]))
     if not rows:

@@ -1,4 +1,4 @@
-"""Our own motion file: one .npz that holds a Motion exactly, readable with nothing but NumPy.
+"""wearcap's motion file: one .npz that holds a Motion exactly, readable with NumPy alone.
 
 Arrays by the Motion's field names (`timestamps`, `R_parent_joint`, `skeleton.t_parent_joint`, …), `wearcap` (JSON with
 everything that is no array), and for tools that know AMASS' keys `trans`, `poses` (axis-angle of each joint in its
@@ -69,7 +69,7 @@ def _damaged(error: Exception, path: str | Path) -> WearcapError:
 
 
 def _check(motion: Motion, path: str | Path) -> None:
-    """What the container's annotations promise, for a file that may say anything."""
+    """Check the shapes and types of the container's annotations, for a file with arbitrary content."""
     if not isinstance(motion, Motion):
         raise WearcapError("holds no motion", where=path)
     skeleton = motion.skeleton
@@ -112,20 +112,20 @@ def _check(motion: Motion, path: str | Path) -> None:
         raise TypeError("provenance that is no text")
 
 
-def _check_interactions(held: Interactions, path: str | Path) -> None:
-    if not isinstance(held, Interactions) or held.hands.dtype != torch.bool:
+def _check_interactions(interactions: Interactions, path: str | Path) -> None:
+    if not isinstance(interactions, Interactions) or interactions.hands.dtype != torch.bool:
         raise TypeError("interactions that are none")
     arrays = {
-        "start_s": held.start_s.numpy(),
-        "stop_s": held.stop_s.numpy(),
-        "hands": held.hands.numpy().astype(np.uint8),
+        "start_s": interactions.start_s.numpy(),
+        "stop_s": interactions.stop_s.numpy(),
+        "hands": interactions.hands.numpy().astype(np.uint8),
     }
     count = require(
         arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS))
     )["interval"]
-    if {held.start_s.dtype, held.stop_s.dtype} != {torch.float64}:
+    if {interactions.start_s.dtype, interactions.stop_s.dtype} != {torch.float64}:
         raise TypeError("times of interactions of another number type")
-    for names in (held.objects, held.classes):
+    for names in (interactions.objects, interactions.classes):
         if (
             not isinstance(names, tuple)
             or len(names) != count

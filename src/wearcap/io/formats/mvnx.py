@@ -32,7 +32,7 @@ MAX_BYTES = 1 << 34
 _MAX_ELEMENTS = 100_000
 _CHUNK, _MAX_SILENCE = 1 << 16, 1 << 26
 _MAX_NUMBER = 64
-"""Characters of a number at most."""
+"""Most characters of a number."""
 
 _SIDED = {"shoulder": "collar", "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist", "upperleg": "hip",
           "lowerleg": "knee", "foot": "ankle", "toe": "toe"}  # fmt: skip
@@ -46,13 +46,13 @@ _SITE_OF = {"ptopofhead": "crown"} | {
     for side in ("left", "right")
     for point, site in (("heelfoot", "heel"), ("toe", "toe_tip"), ("topofhand", "fingertip"))
 }
-"""Anatomical points of the segments that are our sites."""
+"""Anatomical points of the segments that are wearcap's sites."""
 
 _FIELDS = {
     "orientation": ("segments", 4), "position": ("segments", 3), "footContacts": ("contacts", 1),
     "sensorFreeAcceleration": ("sensors", 3), "sensorOrientation": ("sensors", 4),
 }  # fmt: skip
-"""What is read of each frame: of which things, and how many numbers for each."""
+"""Fields of each frame: the list of items that a field covers, and the number of values per item."""
 
 _REST_TYPES = ("identity", "tpose")
 BONE_CHANGE_M = 0.02
@@ -60,7 +60,7 @@ BONE_CHANGE_M = 0.02
 
 @dataclass
 class _File:
-    """What has been read so far."""
+    """Content read so far."""
 
     path: Path
     fps: float = 0.0
@@ -104,7 +104,7 @@ def read_mvnx(path: str | Path, max_bytes: int | None = None) -> Recording:
 
 
 class _Chunks:
-    """Reads that double until an element begins or ends: expat scans a long tag or comment anew with every read."""
+    """Read sizes that double until an element begins or ends: expat rescans a long tag or comment with every read."""
 
     def __init__(self, source: io.BufferedReader):
         self._source, self._size = source, _CHUNK
@@ -123,12 +123,12 @@ class _Chunks:
 def _elements(events: Iterator[tuple[str, Element]], chunks: _Chunks) -> Iterator[Element]:
     """Complete elements of interest; frames are forgotten once they are used, so that memory stays flat."""
     frames: Element | None = None
-    held = 0
+    kept = 0
     for event, element in events:
         chunks.restart()
         name = _name(element)
-        held += event == "start"
-        if held > _MAX_ELEMENTS:
+        kept += event == "start"
+        if kept > _MAX_ELEMENTS:
             raise ValueError(f"more than {_MAX_ELEMENTS} elements beside its frames")
         if event == "start" and name == "frames":
             frames = element
@@ -138,7 +138,7 @@ def _elements(events: Iterator[tuple[str, Element]], chunks: _Chunks) -> Iterato
             yield element
             if name == "frame" and frames is not None:
                 frames.clear()
-                held = 0
+                kept = 0
 
 
 def _name(element: Element) -> str:
@@ -150,7 +150,7 @@ def _plain(label: str) -> str:
 
 
 def _take(file: _File, element: Element) -> None:
-    """Add one element to what is known."""
+    """Add one element to the content."""
     name = _name(element)
     if name == "subject":
         file.fps = float(finite_floats([element.get("frameRate", "")])[0])
@@ -204,8 +204,8 @@ def _require_segments(file: _File) -> None:
 
 def _field(file: _File, name: str, text: str) -> np.ndarray:
     """The numbers of one of a frame's fields."""
-    things, width = _FIELDS[name]
-    count = width * (len(getattr(file, things)) or len(FOOT_PATCHES) * (things == "contacts"))
+    listing, width = _FIELDS[name]
+    count = width * (len(getattr(file, listing)) or len(FOOT_PATCHES) * (listing == "contacts"))
     if len(text) > 1000 + _MAX_NUMBER * count:
         raise ValueError(f"{name} with {len(text)} characters where {count} numbers belong")
     found = finite_floats(text.split())
@@ -242,7 +242,7 @@ def _label_of(joint: str) -> str:
 
 
 def _timestamps(file: _File) -> Tensor:
-    """From the frame numbers, which unlike the times are not rounded to milliseconds."""
+    """Timestamps (s) from the frame numbers, which unlike the times are not rounded to milliseconds."""
     index = torch.tensor(file.index, dtype=torch.float64)
     if not (index.diff() > 0).all():
         raise WearcapError("frame numbers repeat or fall", where=file.path, expected="rising `index`")

@@ -1,4 +1,4 @@
-"""Arrays from .npz and .npy files of strangers: no pickles, no sizes that the file cannot hold."""
+"""Arrays from untrusted .npz and .npy files: no pickles, no sizes that the file cannot hold."""
 
 import io
 import lzma
@@ -18,7 +18,7 @@ from wearcap.errors import WearcapError
 from wearcap.io.formats.bounded import Budget, explained, file_size
 
 MAX_BYTES = 1 << 32
-"""Largest sum of the arrays that are read of one file (4 GiB)."""
+"""Largest total size of the arrays that are read from one file (4 GiB)."""
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _MAX_HEADER = 1 << 14
@@ -26,16 +26,16 @@ _CHUNK = 1 << 20
 DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, ValueError, OSError,
           NotImplementedError, RuntimeError, SyntaxError, tokenize.TokenError, LookupError, TypeError,
           OverflowError, MemoryError, AttributeError)  # fmt: skip
-"""What zipfile and numpy raise on files that are cut short or tampered with."""
+"""Exceptions that zipfile and numpy raise on truncated or damaged files."""
 
 
 def read_npz(
     path: str | Path, keys: Iterable[str] | None = None, max_bytes: int | None = None
 ) -> dict[str, np.ndarray]:
-    """The arrays of an .npz file, of those named in `keys` the ones that are there (None: all).
+    """Arrays of an .npz file: those named in `keys` that exist (None: all).
 
-    Raises WearcapError for a missing or damaged file, for an array of Python objects, and where the arrays that are
-    asked for hold more than `max_bytes` together.
+    Raises WearcapError for a missing or damaged file, for an array of Python objects, and where the requested
+    arrays exceed `max_bytes` together.
     """
     path = Path(path)
     budget = Budget(path, file_size(path), MAX_BYTES, max_bytes)
@@ -92,7 +92,7 @@ def _header(head: io.BytesIO, where: str) -> tuple[tuple[int, ...], bool, np.dty
 
 
 def _fill(view: memoryview, head: io.BytesIO, rest: io.BufferedIOBase) -> None:
-    """Fill an array's memory piece by piece, so that nothing large is there twice."""
+    """Fill an array's memory chunk by chunk, so that nothing large is in memory twice."""
     place = 0
     while place < len(view):
         content = head.read(_CHUNK) or rest.read(min(_CHUNK, len(view) - place))
@@ -103,7 +103,7 @@ def _fill(view: memoryview, head: io.BytesIO, rest: io.BufferedIOBase) -> None:
 
 
 def map_npy(path: str | Path) -> np.ndarray:
-    """The array of an .npy file, mapped: nothing is reserved for what the file does not hold.
+    """The memory-mapped array of an .npy file: no memory is allocated for data that the file does not hold.
 
     Raises WearcapError for a missing or damaged file, and for an array of Python objects.
     """

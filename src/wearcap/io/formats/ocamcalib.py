@@ -1,6 +1,6 @@
 """OCamCalib's fisheye calibrations: `calib_results.txt`, and NavVis' `sensor_frame.xml` (HPS and iReplica scans).
 
-Scaramuzza's camera sees a pixel at (row, column) under the direction (u, v, f(ρ)), f(ρ) = a₀ + a₁ρ + a₂ρ² + …, where
+Scaramuzza's model maps a pixel at (row, column) to the direction (u, v, f(ρ)), f(ρ) = a₀ + a₁ρ + a₂ρ² + …, where
 ρ² = u² + v² and [row; column] = [c d; e 1] [u; v] + [xc; yc], counted from 0. Its axes are u down the image, v along
 it and w backwards (a₀ is negative): (v, u, -w) are OpenCV's. The file's second polynomial, in the angle
 atan(w / √(u² + v²)), is a fit to the inverse of the first.
@@ -19,31 +19,31 @@ from wearcap.geometry.camera import Camera
 from wearcap.io.formats.text import at_line, finite_floats, numbered_lines, read_text
 
 POWERS = 10
-"""k1…k10: NavVis' lenses are met within 0.002 px at 4592 px width."""
+"""Number of coefficients (k1…k10): NavVis' lenses are fitted within 0.002 px at 4592 px width."""
 _MAX_BYTES = 1 << 24
 """Largest calibration that is read (16 MiB; they take kilobytes)."""
 _MAX_SIDE = 1 << 20
 """Largest width and height of an image (pixels)."""
 MAX_MISFIT_PX = 0.5
 MAX_DISAGREEMENT_PX = 3.0
-"""Between the two polynomials of a file, which are fits to each other."""
+"""Largest disagreement of a file's two polynomials, which are fits to each other."""
 _COUNTS = {"world2cam": (2, 64), "cam2world": (3, 64)}
 _TEXT_LINES = ("the direct polynomial", "the inverse polynomial", "the centre", "the affine parameters", "the image size")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class OCamModel:
-    """What a calibration holds, in OCamCalib's own convention."""
+    """A calibration in OCamCalib's own convention."""
 
     pol: tuple[float, ...]
-    """a₀, a₁ … of f(ρ) (pixels)."""
+    """Coefficients a₀, a₁ … of f(ρ) (pixels)."""
     invpol: tuple[float, ...]
-    """Of ρ (pixels) in atan(w / √(u² + v²)), lowest power first; empty where the file has none."""
+    """Coefficients of ρ (pixels) in atan(w / √(u² + v²)), lowest power first; empty if the file has none."""
     row: float
     column: float
-    """The centre (pixels, from 0)."""
+    """Position of the centre along the columns; `row` is its other coordinate (pixels, from 0)."""
     affine: tuple[float, float, float]
-    """c, d, e."""
+    """Affine parameters c, d, e."""
     width: int
     height: int
 
@@ -58,7 +58,7 @@ class OCamModel:
             raise WearcapError(f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}",
                                where=where, expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0")  # fmt: skip
         if not (0 <= self.row < self.height and 0 <= self.column < self.width):
-            raise WearcapError(f"its centre, row {self.row:g} and column {self.column:g}, lies outside the image of "
+            raise WearcapError(f"its centre, row {self.row:g} and column {self.column:g}, is outside the image of "
                                f"{self.height} rows and {self.width} columns", where=where,
                                expected="row first, then column")  # fmt: skip
         focal = -self.pol[0]
@@ -75,7 +75,7 @@ class OCamModel:
         )
 
     def _curve(self, determinant: float, where: str | Path) -> tuple[np.ndarray, np.ndarray]:
-        """Radii ρ (pixels) as far as the image's furthest corner, and their angles θ from the axis (rad)."""
+        """Radii ρ (pixels) up to the image's furthest corner, and their angles θ from the axis (rad)."""
         c, d, e = self.affine
         corners = np.array(
             [(row, column) for row in (0, self.height - 1) for column in (0, self.width - 1)], np.float64
@@ -87,7 +87,7 @@ class OCamModel:
         theta = np.arctan2(rho, -np.polynomial.polynomial.polyval(rho, self.pol))
         falling = np.diff(theta) <= 0
         last = int(falling.argmax()) if falling.any() else len(rho) - 1
-        # A lens whose polynomial turns within the image draws a circle smaller than the picture.
+        # If the polynomial turns within the image, the lens's image circle is smaller than the picture.
         if last < len(rho) // 4:
             raise WearcapError(f"its direct polynomial turns back {rho[last]:.0f} px from the centre", where=where,
                                expected="angles that rise with the radius")  # fmt: skip
@@ -102,7 +102,7 @@ class OCamModel:
 
 
 def _fitted(radius: np.ndarray, theta: np.ndarray) -> tuple[tuple[float, ...], float]:
-    """k1…k10 of radius = θ + k1 θ² + …, and the largest residual."""
+    """Coefficients k1…k10 of radius = θ + k1 θ² + …, and the largest residual."""
     share = theta / theta[-1]  # powers of numbers up to 1 keep the system solvable
     basis = np.stack([share**power for power in range(2, POWERS + 2)], 1)
     solution = np.linalg.lstsq(basis, radius - theta, rcond=None)[0]
@@ -160,7 +160,7 @@ def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
         name = _text(element, "SensorName", path)
         where = f"{path}, camera {name!r}"
         if _child(element, "OCamModel") is None:
-            continue  # other lens models stand beside OCamCalib's
+            continue  # other lens models are listed beside OCamCalib's
         if name in found:
             raise WearcapError("the camera is there twice", where=where)
         found[name] = _from_xml(element, where)

@@ -13,7 +13,7 @@ from wearcap.io.formats.ply import Ply
 
 _MAX_HEADER_BYTES = 1 << 16
 _MAX_COUNT = 1 << 12
-"""Numbers of one field; the longest features that PCL knows hold some 2000."""
+"""Most numbers of one field; PCL's longest features have some 2000."""
 _TYPES = {("F", 4): "<f4", ("F", 8): "<f8"} | {
     (kind, size): f"<{letter}{size}" for kind, letter in (("I", "i"), ("U", "u")) for size in (1, 2, 4, 8)
 }
@@ -38,7 +38,7 @@ def read_pcd(path: str | Path) -> Ply:
         rows = _compressed_rows(memoryview(data)[body:], dtype, count, path)
     else:
         raise WearcapError(f"DATA {encoding}", where=path, expected="ascii, binary or binary_compressed")
-    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is left out
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is dropped
         points = np.stack([rows[axis] for axis in "xyz"], 1).astype(np.float32)
     valid = np.isfinite(points).all(1)
     packed = next(
@@ -89,7 +89,7 @@ def _row_type(header: dict[str, list[str]], path: str | Path) -> np.dtype:
 
 def _require(complete: bool, path: str | Path) -> None:
     if not complete:
-        raise WearcapError("it holds fewer points than its header says", where=path,
+        raise WearcapError("it holds fewer points than its header states", where=path,
                            fix="The file was cut short: copy it again.")  # fmt: skip
 
 
@@ -98,16 +98,16 @@ def _ascii_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path)
     lines = islice((line for line in text if line.strip()), count)
     try:
         with warnings.catch_warnings(), np.errstate(over="ignore", invalid="ignore"):
-            warnings.simplefilter("ignore", UserWarning)  # numpy's own word on a file that ends here
+            warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
             rows = np.loadtxt(lines, dtype=dtype, ndmin=1, comments=None)
     except (ValueError, OverflowError) as error:
-        raise WearcapError(f"a row is not as the header says ({error})"[:200], where=path) from error
+        raise WearcapError(f"a row does not match the header ({error})"[:200], where=path) from error
     _require(len(rows) == count, path)
     return rows
 
 
 def _compressed_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path) -> np.ndarray:
-    """LZF data in which each field's values stand together."""
+    """Decompressed LZF data, in which each field's values are contiguous."""
     _require(len(body) >= 8, path)
     compressed, size = (int(v) for v in np.frombuffer(body, "<u4", 2))
     _require(len(body) >= 8 + compressed and size == count * dtype.itemsize, path)

@@ -23,7 +23,7 @@ _EXAMPLE = (
 
 
 def read_photos(folder: str | Path) -> list[Photo]:
-    """Photos of a scene's folder, their files as paths; that these exist is checked by who opens them.
+    """Photos of a scene's folder, with files as paths; whether these exist is checked when they are opened.
 
     Raises WearcapError when `photos.json` is missing or not as `write_photos` writes it, naming the photo.
     """
@@ -41,14 +41,14 @@ def read_photos(folder: str | Path) -> list[Photo]:
 
 
 def write_photos(photos: list[Photo], folder: str | Path) -> None:
-    """Write `photos.json`. Raises WearcapError for an image file that lies outside the folder."""
+    """Write `photos.json`. Raises WearcapError for an image file outside the folder."""
     folder = Path(folder)
     rows = []
     for photo in photos:
         file = Path(photo.file)
         if file.is_absolute() or file.is_relative_to(folder):
             if not file.is_relative_to(folder):
-                raise WearcapError("this photo lies outside its scene", where=file, expected=f"in {folder}")
+                raise WearcapError("this photo is outside its scene", where=file, expected=f"in {folder}")
             file = file.relative_to(folder)
         rows.append(
             {"file": file.as_posix(), "camera": camera_row(photo.camera),
@@ -67,7 +67,7 @@ def _photo(row: Any, folder: Path, where: str) -> Photo:
         raise WearcapError(f"unreadable ({what})", where=where, expected=_EXAMPLE) from error
     lens = camera_from_row(camera, where)
     if file.is_absolute() or ".." in file.parts:
-        raise WearcapError(f"file {str(file)!r} lies outside the scene's folder", where=where)
+        raise WearcapError(f"file {str(file)!r} is outside the scene's folder", where=where)
     if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
         raise WearcapError(
             f"a pose of shapes {R.shape} and {t.shape}", where=where, expected="finite 3x3 and 3"

@@ -15,7 +15,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 def read_pictures(
     source: str | Path, max_count: int
 ) -> Iterator[tuple[str, UInt8[np.ndarray, "height width 3"]]]:
-    """(name, RGB picture) of up to `max_count` files of a folder, in order of name, or evenly spaced frames of a video.
+    """Yield (name, RGB picture) of up to `max_count` files of a folder, by name, or evenly spaced frames of a video.
 
     Raises WearcapError when there is no picture, and for one that cannot be decoded, naming it.
     """

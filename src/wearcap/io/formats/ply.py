@@ -23,17 +23,17 @@ _TYPES = {
 _BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER_BYTES = 1 << 16
 _MAX_EVEN_BYTES = 1 << 28
-"""Largest row that is read as one field of NumPy's, whose sizes are 32 bits."""
+"""Largest row (bytes) that is read as one NumPy field, whose sizes are 32 bits."""
 
 
 @dataclass(frozen=True)
 class Ply:
-    """Vertices (in the file's unit and axes), and what comes with them."""
+    """Vertices (in the file's unit and axes) with their colours, and faces."""
 
     points: Float32[np.ndarray, "point 3"]
     colors: UInt8[np.ndarray, "point 3"] | None = None
     faces: Int32[np.ndarray, "face 3"] | None = None
-    """Triangles; polygons with more corners are cut into fans."""
+    """Triangles; polygons with more corners are split into fans."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class _Property:
     name: str
     dtype: str
     count_dtype: str | None = None
-    """Set for a list: the type of its length."""
+    """Type of a list's length; None for a scalar."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def read_ply(path: str | Path) -> Ply:
     }
     if not {"x", "y", "z"} <= set(vertex):
         raise WearcapError("no vertices with x, y, z", where=path, expected="a PLY with `element vertex`")
-    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is refused below
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is refused below
         points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float32)
     if not np.isfinite(points).all():
         raise WearcapError(f"{int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite", where=path,
@@ -146,7 +146,7 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
 
 def _cut_short(path: str | Path, element: _Element) -> WearcapError:
     return WearcapError(f"it ends inside its {element.count} {element.name} rows", where=path,
-                        expected="as many rows as the header says", fix="The file was cut short: copy it again.")  # fmt: skip
+                        expected="as many rows as the header states", fix="The file was cut short: copy it again.")  # fmt: skip
 
 
 def _read_binary(elements: list[_Element], data: bytes, start: int, order: str, path) -> dict[str, dict]:
@@ -170,7 +170,7 @@ def _read_fixed_rows(element: _Element, data: bytes, start: int, order: str, pat
 
 
 def _read_list_rows(element: _Element, data: bytes, start: int, order: str, path) -> tuple[dict, int]:
-    """Rows with lists: at once where every list is as long as the first row's, row by row where not."""
+    """Rows with lists: read at once if all lists are as long as the first row's, else row by row."""
     table, stop = _read_even_lists(element, data, start, order)
     if table is not None:
         return table, stop
@@ -245,7 +245,7 @@ def _read_ascii(elements: list[_Element], body: memoryview, path) -> dict[str, d
             table, rows = (_ascii_lists if listed else _ascii_table)(element, lines)
         except (ValueError, IndexError, OverflowError) as error:
             raise WearcapError(
-                f"a {element.name} row is not as the header says ({error})"[:200], where=path
+                f"a {element.name} row does not match the header ({error})"[:200], where=path
             ) from error
         if rows < element.count:
             raise _cut_short(path, element)
@@ -255,7 +255,7 @@ def _read_ascii(elements: list[_Element], body: memoryview, path) -> dict[str, d
 
 def _ascii_table(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
     with warnings.catch_warnings(), np.errstate(invalid="ignore", over="ignore"):
-        warnings.simplefilter("ignore", UserWarning)  # numpy's own word on a file that ends here
+        warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
         values = np.loadtxt(islice(lines, element.count), ndmin=2, comments=None)
         return {p.name: values[:, i].astype(p.dtype) for i, p in enumerate(element.properties) if len(values)}, len(values)  # fmt: skip
 

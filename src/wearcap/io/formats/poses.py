@@ -10,7 +10,7 @@ from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.geometry.trajectory import Trajectory
 
 NORM_TOLERANCE = 0.02
-"""How far from 1 a quaternion's norm may lie: text files round, but a mixed-up column is far off."""
+"""Largest deviation of a quaternion's norm from 1: text files round, but a mixed-up column is far off."""
 
 
 def checked_trajectory(

@@ -49,17 +49,17 @@ def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
     except _RefusedError as error:
         raise WearcapError(str(error), where=path, expected="numbers, text, lists, dicts and NumPy arrays only",
                            fix="Anything else in a pickle can run code when it is loaded, and is never read.") from error  # fmt: skip
-    except Exception as error:  # the opcodes are the file's own program: there is no telling what they break
+    except Exception as error:  # the opcodes are the file's own program and can raise anything
         raise WearcapError(f"a damaged pickle ({type(error).__name__}: {error})"[:300], where=path,
                            expected="a whole pickle file", fix="Fetch it again.") from error  # fmt: skip
 
 
 class _RefusedError(Exception):
-    """Something that is never admitted."""
+    """Raised for content that is never admitted."""
 
 
 def _unpacked(path: str | Path, max_bytes: int | None) -> bytes:
-    """joblib packs whole files; their first bytes tell how."""
+    """Decompressed content of a joblib file, whose first bytes name the compression."""
     packed = Budget(path, file_size(path), MAX_BYTES, max_bytes)
     packed.spend(file_size(path))
     with explained(path), open(path, "rb") as file:
@@ -77,7 +77,7 @@ def _unpacked(path: str | Path, max_bytes: int | None) -> bytes:
 
 
 class _Inflated(io.BufferedIOBase):
-    """What a stream packed by zlib unpacks to."""
+    """Decompressed content of a zlib stream."""
 
     def __init__(self, file: io.BufferedIOBase):
         self._file, self._unpacker, self._rest = file, zlib.decompressobj(), b""
@@ -94,9 +94,9 @@ class _Inflated(io.BufferedIOBase):
 
 
 def _require_plain(value: Any) -> None:
-    """Refuse what is left of half-built objects and of names that were never called, and what unfolds without end.
+    """Raise for half-built objects, for names that were never called, and for structures that unfold without end.
 
-    A list may stand in many others, or in itself: it counts as often as it is met.
+    A list may be contained in many others, or in itself: it counts as often as it is reached.
     """
     level, count = [value], 0
     for _ in range(_MAX_DEPTH):
@@ -115,7 +115,7 @@ def _require_plain(value: Any) -> None:
     raise _RefusedError(f"it holds lists within lists, {_MAX_DEPTH} deep")
 
 
-# --- what the admitted names stand for -----------------------------------------------------------------------
+# --- replacements of the admitted names ----------------------------------------------------------------------
 
 
 class _NdarrayName:
@@ -139,7 +139,7 @@ def _encode(text: str, encoding: str = "latin1") -> bytes:
 
 
 def _checked(buffer: Any, dtype: Any, shape: Any) -> tuple[bytes, tuple[int, ...]]:
-    """The bytes and shape of an array that they can fill."""
+    """Bytes and shape of an array, checked to fit together."""
     data = buffer.encode("latin1") if isinstance(buffer, str) else buffer
     shape = (shape,) if isinstance(shape, int) else tuple(shape)
     if not isinstance(dtype, np.dtype) or dtype.hasobject or any(length < 0 for length in shape):
@@ -188,11 +188,11 @@ _NAMES: dict[str, dict[str, Any]] = {
 
 
 _PythonUnpickler: Any = getattr(pickle, "_Unpickler")  # noqa: B009
-"""The pure Python one, for its opcodes can be replaced one by one."""
+"""Unpickler in pure Python, whose opcodes can be replaced one by one."""
 
 
 def _stepping(load: Callable[[Any], None]) -> Callable[[Any], None]:
-    """An opcode that is counted."""
+    """An opcode's function that counts its calls."""
 
     def step(self: Any) -> None:
         self.steps += 1
@@ -220,7 +220,7 @@ class _Unpickler(_PythonUnpickler):
         raise _RefusedError("it refers to objects outside the file")
 
     def load_build(self) -> None:
-        """Fill an array or a byte order; nothing else has a state here."""
+        """Set the state of an array or a dtype; nothing else has one here."""
         state = self.stack.pop()
         target = self.stack[-1]
         if isinstance(target, np.ndarray):
@@ -242,7 +242,7 @@ class _Unpickler(_PythonUnpickler):
             or dtype.isbuiltin == 1
         ):
             raise _RefusedError("it holds an array of structures")
-        # Sizes count for text alone; numbers know theirs.
+        # Sizes matter for text alone; numbers have fixed ones.
         sizes = (dtype.itemsize, dtype.alignment) if dtype.kind in "SU" else (-1, -1)
         dtype.__setstate__((3, order, None, None, None, *sizes, 0))  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -261,7 +261,7 @@ class _Unpickler(_PythonUnpickler):
         return _array(data, dtype, shape)
 
     def load_bytearray8(self) -> None:
-        """As the original, but without reserving what the file cannot hold."""
+        """The original opcode without allocating more than the file can hold."""
         (length,) = struct.unpack("<Q", self.read(8))
         if length > self._source.getbuffer().nbytes:
             raise ValueError("bytes beyond the end of the file")

@@ -1,4 +1,4 @@
-"""Scans of a scene from PLY and PCD files, refused where they cannot be one."""
+"""Scans of a scene from PLY and PCD files, with checks of unit, extent and density."""
 
 from pathlib import Path
 
@@ -11,10 +11,10 @@ from wearcap.io.formats.ply import read_ply
 from wearcap.scene.scan import Scan
 
 MAX_EXTENT_M = 5000.0
-"""No scene that a person walks through in one recording is longer."""
+"""Largest extent (m) of a scene that a person walks through in one recording."""
 MAX_HEIGHT_M = 500.0
 DENSE_FROM = 1000
-"""Clouds of fewer points may be sparse without being in another unit."""
+"""Number of points below which a cloud may be sparse without being in another unit."""
 _CELL_M = 0.5
 _MIN_PER_CELL = 1.5
 """Points per occupied half-metre cell below which a cloud is no dense scan (at 5 mm spacing a wall puts 10 000 there)."""
@@ -44,7 +44,7 @@ def read_scan(path: str | Path, *, needs_colors: bool = False, metres_per_unit: 
 
 
 def unit_fault(points: Float32[np.ndarray, "point 3"]) -> str | None:
-    """Why these points cannot be a scene in metres; None where they can.
+    """Reason why these points cannot be a scene in metres; None if they can.
 
     Millimetres show in the extent of whole scenes, and in the density of small ones: every point alone in its
     half-metre cell.

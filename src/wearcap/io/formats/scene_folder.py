@@ -1,4 +1,4 @@
-"""Scenes on disk, whoever made them: database photos, and the geometry that lifts their keypoints."""
+"""Scenes on disk in any supported layout: database photos, and the geometry that lifts their keypoints to 3D."""
 
 from pathlib import Path
 

@@ -1,6 +1,6 @@
-"""SMPL's door, the one place that knows its axes: rotation vectors become our rotations, coefficients get names.
+"""Conversion from SMPL's axes, only here: rotation vectors to wearcap's rotation matrices, coefficients by name.
 
-SMPL's joint frames look x left, y up, z forward; ours x forward, y left, z up. With A turning those axes into ours, a
+SMPL's joint frames are x left, y up, z forward; wearcap's x forward, y left, z up. With A rotating the former into the latter, a
 joint's rotation is A · R · Aᵀ and the root's R · Aᵀ, in the world of the file.
 """
 
@@ -16,17 +16,17 @@ from wearcap.geometry import rotation
 from wearcap.io.formats.npz import require
 
 A = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-"""From SMPL's axes into ours."""
+"""Rotation of SMPL's axes into wearcap's."""
 
 
 def rotations_from_smpl(rotvec: Float64[Tensor, "time joint 3"]) -> Float64[Tensor, "time joint 3 3"]:
-    """R_parent_joint of SMPL's rotation vectors (rad), the root first."""
+    """R_parent_joint from SMPL's rotation vectors (rad), the root first."""
     R = rotation.exp(rotvec)
     return torch.cat([R[:, :1] @ A.T, A @ R[:, 1:] @ A.T], 1)
 
 
 def shape_from_betas(betas: Sequence[float] | Float[np.ndarray, "beta"]) -> dict[str, float]:
-    """SMPL's coefficients as a recording's `shape` names them: beta_0 …"""
+    """SMPL's coefficients by their names in a recording's `shape`: beta_0 …"""
     return {f"beta_{k}": float(beta) for k, beta in enumerate(betas)}
 
 

@@ -1,7 +1,7 @@
 """Bodies of the H-contact and EgoHOI data sets: SMPL or SMPL+H poses frame by frame, as `.json.zip` or older `.json`.
 
 The world is metric and z up, joint frames are SMPL's (x left, y up, z forward) as in AMASS, but `transl` is the place of
-the root joint itself. Fingers may be relative to SMPL+H's mean hand, which the files do not say.
+the root joint itself. Fingers may be relative to SMPL+H's mean hand, which the files do not state.
 """
 
 import zipfile
@@ -23,7 +23,7 @@ from wearcap.io.formats.smpl_axes import rotations_from_smpl, shape_from_betas
 from wearcap.recording.motion import Motion
 
 _BODY = 63
-"""Numbers of SMPL+H's 21 body joints; SMPL has two more, its hands, behind them."""
+"""Number of values of SMPL+H's 21 body joints; SMPL's two hand joints follow them."""
 _EXPECTED = '{"sequence": [{"time", "global_orient", "body_pose" (63 or 69), "transl", …}], "global": {"betas", "gender"}}'
 
 
@@ -35,7 +35,7 @@ class SmplSequence:
     shape: dict[str, float]
     """SMPL's coefficients by name: beta_0 …"""
     placed: bool
-    """Whether the file says where the body is; else its root stays at the origin."""
+    """Whether the file has the body's position; else the root stays at the origin."""
 
 
 def read_smpl_json(path: str | Path) -> SmplSequence:
@@ -76,7 +76,7 @@ def read_smpl_json(path: str | Path) -> SmplSequence:
 
 
 def _rotations(arrays: dict[str, np.ndarray]) -> torch.Tensor:
-    """Rotations of the skeleton's joints in our axes: R "time joint 3 3"."""
+    """Rotations of the skeleton's joints in wearcap's axes."""
     body = arrays["body_pose"]
     if "left_hand_pose" in arrays:
         parts = [body[:, :_BODY], arrays["left_hand_pose"], arrays["right_hand_pose"]]
@@ -112,7 +112,7 @@ def _unzipped(path: Path) -> Any:
 
 
 def _frames(content: Any, path: Path) -> tuple[list[dict], dict]:
-    """Frames in the newer form, and what holds for all of them."""
+    """Frames in the newer layout, and the content that applies to all of them."""
     sequence = content.get("sequence") if isinstance(content, dict) else content
     if (
         not isinstance(sequence, list)

@@ -1,4 +1,4 @@
-"""Reading text files that strangers wrote: plain, .gz or .xz, of bounded size, with errors that name the line."""
+"""Reading untrusted text files: plain, .gz or .xz, of bounded size, with errors that name the line."""
 
 import codecs
 import io
@@ -16,11 +16,11 @@ MAX_BYTES = 1 << 29
 MAX_STREAMED_BYTES = 1 << 32
 """Largest text that is read line by line (4 GiB)."""
 MAX_LINE = 1 << 24
-"""Longest line (characters): COLMAP lists all points of a picture in one."""
+"""Longest line (characters): COLMAP lists all points of a picture in one line."""
 
 
 def _as_latin1(error: UnicodeError) -> tuple[str, int]:
-    """Bytes that are no UTF-8, read as Latin-1."""
+    """Error handler of decoding that reads bytes that are no UTF-8 as Latin-1."""
     assert isinstance(error, UnicodeDecodeError)
     return error.object[error.start : error.end].decode("latin-1"), error.end
 
@@ -71,7 +71,7 @@ def numbered_lines(path: str | Path, usual: int = MAX_STREAMED_BYTES) -> Iterato
 
 
 def at_line(path: str | Path, line: int) -> str:
-    """Where an error sits: file and line, counted from 1."""
+    """Position of an error: file and line, counted from 1."""
     return f"{path}, line {line}"
 
 

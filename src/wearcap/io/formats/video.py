@@ -17,12 +17,12 @@ from wearcap.io.formats.bounded import file_size
 from wearcap.io.formats.image_file import open_image
 
 MAX_PIXELS = 1 << 26
-"""Of a video's picture (8192 x 8192)."""
+"""Most pixels of a video's picture (8192 x 8192)."""
 _MAX_FPS = 10_000
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
-    """Pixels of an image file as they are stored: calibrations speak of these, so no EXIF turn is applied.
+    """Pixels of an image file as stored, which calibrations refer to: no EXIF rotation is applied.
 
     Raises WearcapError as `open_image` does.
     """
@@ -33,7 +33,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
 def read_frames(
     path: str | Path, start: int = 0, stop: int | None = None, step: int = 1
 ) -> Iterator[tuple[float, UInt8[np.ndarray, "height width 3"]]]:
-    """Every `step`-th of the frames `start` to `stop` of a video: time (s) from its first frame, and picture.
+    """Yield every `step`-th of the frames `start` to `stop` of a video: time (s) from its first frame, and picture.
 
     Times are those written in the file; where it has none, frames follow its average rate.
     Raises WearcapError when the file is missing, damaged or without pictures.
@@ -69,7 +69,7 @@ def _pictures_of(container: InputContainer, path: str | Path) -> VideoStream:
         raise WearcapError(
             "pictures packed in a way that is not known", where=path, expected="a video in H.264, say"
         )
-    stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # for sizes that only the pictures tell
+    stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # for sizes that only the pictures have
     if stream.width * stream.height > MAX_PIXELS:
         raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path,
                            expected=f"at most {MAX_PIXELS} pixels", fix="Scale the video down.")  # fmt: skip
@@ -78,13 +78,13 @@ def _pictures_of(container: InputContainer, path: str | Path) -> VideoStream:
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video's header says."""
+    """Content of a video's header."""
 
     width: int
     height: int
     fps: float
     frames: int
-    """0 where neither the number of frames nor the duration is stated."""
+    """Number of frames; 0 if neither it nor the duration is stated."""
 
 
 def video_info(path: str | Path) -> VideoInfo:
@@ -106,7 +106,7 @@ def video_info(path: str | Path) -> VideoInfo:
 
 
 def video_encoder(crf: int) -> tuple[str, dict[str, str]]:
-    """Name and options of an encoder with which equal pictures give equal bytes; `crf` is H.264's quality, smaller is better."""
+    """Name and options of an encoder that maps equal pictures to equal bytes; `crf` is H.264's quality, smaller is better."""
     if "libx264" not in av.codecs_available:
         return "mpeg4", {"threads": "1"}
     # With x264's mbtree the bytes differ from one process to the next.

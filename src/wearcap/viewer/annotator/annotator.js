@@ -28,7 +28,7 @@ class Annotator {
       const wished = this.recordings.findIndex(each => each.name === decodeURIComponent(location.hash.slice(1)));
       await this.open(Math.max(0, wished));
     } catch (error) {
-      this.tell(error.message, true);
+      this.notify(error.message, true);
     }
     requestAnimationFrame(now => this.tick(now));
   }
@@ -46,13 +46,13 @@ class Annotator {
       this.index = index;
       [$("recordings").value, $("previous").disabled, $("next").disabled] = [index, index === 0, index === this.recordings.length - 1];
       history.replaceState(null, "", `#${encodeURIComponent(this.recordings[index].name)}`);
-      this.tell("");
+      this.notify("");
       this.showSaved("", "opening …");
       this.take = await fetchTake(index);
       this.begin();
     } catch (error) {
       this.showSaved("failed", "not opened");
-      this.tell(error.message, true);
+      this.notify(error.message, true);
     }
     this.opening = false;
     if (this.wished !== index) await this.open(this.wished);
@@ -63,7 +63,7 @@ class Annotator {
     document.title = `${header.name} – wearcap annotate`;
     $("film").hidden = !header.video;
     $("objects").replaceChildren(...Object.keys(header.objects).map(name => new Option(name, name)));
-    if (header.notice) this.tell(header.notice);
+    if (header.notice) this.notify(header.notice);
     this.labels = new Labels(this.take);
     this.player.open(this.take);
     this.view.open(this.take);
@@ -140,7 +140,7 @@ class Annotator {
     [$("object").value, $("class").value] = [label.object, label.kind];
   }
 
-  /** What the chosen contact holds; an object of the recording says itself how it moves. */
+  /** Object of the chosen contact; an object of the recording has its own contact class. */
   describe(about) {
     const chosen = this.timeline.chosen;
     if (!chosen) return;
@@ -189,7 +189,7 @@ class Annotator {
 
   async export() {
     await this.saver.save();
-    if (this.saver.dirty) return this.tell("Not exported: the labels are not saved yet.", true);
+    if (this.saver.dirty) return this.notify("Not exported: the labels are not saved yet.", true);
     const link = document.createElement("a");
     link.href = `/recordings/${this.index}/export`;
     link.download = "";
@@ -203,10 +203,10 @@ class Annotator {
 
   showSaved(state, text) {
     [$("saved").className, $("saved").textContent] = [state, text];
-    if (state === "saved" && this.message === "not saved") this.tell("");
+    if (state === "saved" && this.message === "not saved") this.notify("");
   }
 
-  tell(text, failed = false) {
+  notify(text, failed = false) {
     const box = $("message");
     [box.hidden, box.className] = [!text, failed ? "failed" : ""];
     box.querySelector("span").textContent = text;
@@ -214,19 +214,19 @@ class Annotator {
     this.message = "";
   }
 
-  /** Two states of the labels, or a refused save: say so, and let the annotator choose. */
+  /** Two states of the labels, or a refused save: show it, and let the annotator choose. */
   ask({kind, labels, error}) {
     if (kind === "restored") {
       this.restored = this.read(labels);
       return;
     }
     if (kind === "refused") {
-      this.tell(`Not saved: ${error} The labels stay here, and in this browser.`, true);
+      this.notify(`Not saved: ${error} The labels stay here, and in this browser.`, true);
       this.message = "not saved";
       return;
     }
     const found = kind === "kept";
-    this.tell(found ? "This browser keeps labels that were never saved, and the file has changed since." : `Not saved: ${error}`, true);
+    this.notify(found ? "This browser keeps labels that were never saved, and the file has changed since." : `Not saved: ${error}`, true);
     this.offer("mine", found ? "Use this browser's" : "Save mine (the other file is kept in backups)", () => {
       if (found) this.labels.become(this.read(labels)); else this.saver.save(true);
     });
@@ -236,7 +236,7 @@ class Annotator {
   offer(id, text, action) {
     [$(id).hidden, $(id).textContent] = [false, text];
     $(id).onclick = () => {
-      this.tell("");
+      this.notify("");
       action();
     };
   }
@@ -272,7 +272,7 @@ class Annotator {
     released("class", target => this.describe({kind: target.value}));
     window.addEventListener("pagehide", () => this.saver && this.saver.leave());
     window.addEventListener("beforeunload", event => {
-      if (this.saver && this.saver.failed) event.preventDefault(); // what only waits is sent on leaving
+      if (this.saver && this.saver.failed) event.preventDefault(); // pending changes are sent on leaving
     });
   }
 
@@ -308,7 +308,7 @@ class Annotator {
     return [box.x + x, box.y + y];
   }
 
-  /** Where a time is on a hand's lane (pixels). */
+  /** Position of a time in a hand's row (pixels). */
   lanePosition(hand, time) {
     const box = $("timeline").getBoundingClientRect();
     return [box.x + this.timeline.x(time), box.y + this.timeline.laneTop(hand) + 16];

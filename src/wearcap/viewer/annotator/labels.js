@@ -107,7 +107,7 @@ export function fromFile(file, end) {
   return state;
 }
 
-/** Whether two stored states say the same. */
+/** Whether two stored states are equal. */
 export function same(one, other) {
   return ["contacts", "objects", "classes"].every(key => HANDS.every(hand =>
     JSON.stringify(one[key][`${hand}_hand`]) === JSON.stringify(other[key][`${hand}_hand`])));

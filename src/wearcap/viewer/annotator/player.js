@@ -6,7 +6,7 @@ export const SPEEDS = [0.25, 0.5, 0.75, 1, 1.25, 1.5, 2];
 const INSIDE_S = 0.002;
 
 export class Player {
-  /** `onPlay()`: it started or stopped; `onNote(text)`: what the film has to say. */
+  /** `onPlay()`: it started or stopped; `onNote(text)`: messages about the video. */
   constructor(video, onPlay, onNote) {
     Object.assign(this, {video, onPlay, onNote, playing: false, speed: 1, time: 0, usable: false});
     video.addEventListener("seeked", () => this.follow());
@@ -81,7 +81,7 @@ export class Player {
     if (Math.abs(this.video.currentTime - wanted) > 1e-4) this.video.currentTime = wanted;
   }
 
-  /** Let wall time pass (s). While the film runs it is the clock; where it waits, the pose waits too. */
+  /** Advance by wall time (s). While the video plays it is the clock; if it buffers, the pose waits too. */
   advance(elapsed) {
     if (!this.playing) return;
     if (!this.filmed()) {

@@ -66,7 +66,7 @@ export class Saver {
         this.base = answer.revision;
         if (version === this.version) this.done(); else this.keep();
       } else if (reply.status === 403) { // another start has another token; its page brings it to this one too
-        this.later("not saved: the server was started anew, open the address that it printed");
+        this.later("not saved: the server was restarted, open the address that it printed");
       } else {
         this.refuse(reply.status, answer.error);
       }
@@ -100,12 +100,12 @@ export class Saver {
     const body = JSON.stringify({labels: this.labels.toFile(), base: this.base, client: CLIENT, force});
     return fetch(`/recordings/${this.index}/labels`, {
       method: "POST", headers: {"Content-Type": "application/json"}, body,
-      // A browser carries 64 kB beyond a page's end; longer ones wait in its storage.
+      // A browser sends 64 kB after a page has closed; longer requests stay in its storage.
       keepalive: leaving && body.length < 60000,
     });
   }
 
-  /** The page goes: send what is left without waiting. */
+  /** The page closes: send the remaining changes without waiting. */
   leave() {
     if (this.dirty && !this.refused) this.post(false, true).catch(() => {});
   }

@@ -16,7 +16,7 @@ export class SkeletonView {
     this.stale = true;
     canvas.addEventListener("pointerdown", event => this.press(event));
     canvas.addEventListener("pointermove", event => this.move(event));
-    canvas.addEventListener("pointerup", () => { this.held = null; });
+    canvas.addEventListener("pointerup", () => { this.grabbed = null; });
     canvas.addEventListener("wheel", event => this.zoom(event), {passive: false});
     new ResizeObserver(() => this.resize()).observe(canvas);
   }
@@ -43,20 +43,20 @@ export class SkeletonView {
     this.canvas.setPointerCapture(event.pointerId);
     const hand = this.handAt(event.offsetX, event.offsetY);
     if (hand) return this.onHand(hand);
-    this.held = {x: event.clientX, y: event.clientY};
+    this.grabbed = {x: event.clientX, y: event.clientY};
   }
 
   move(event) {
-    if (!this.held) {
+    if (!this.grabbed) {
       const hand = this.handAt(event.offsetX, event.offsetY);
       if (hand !== this.hover) this.stale = true;
       this.hover = hand;
       this.canvas.classList.toggle("hand", Boolean(hand));
       return;
     }
-    this.yaw -= (event.clientX - this.held.x) * 0.008;
-    this.pitch = Math.max(-0.2, Math.min(1.5, this.pitch + (event.clientY - this.held.y) * 0.006));
-    this.held = {x: event.clientX, y: event.clientY};
+    this.yaw -= (event.clientX - this.grabbed.x) * 0.008;
+    this.pitch = Math.max(-0.2, Math.min(1.5, this.pitch + (event.clientY - this.grabbed.y) * 0.006));
+    this.grabbed = {x: event.clientX, y: event.clientY};
     this.stale = true;
   }
 
@@ -84,7 +84,7 @@ export class SkeletonView {
     this.focal = 1.55 * Math.min(this.height, this.width * 1.2);
   }
 
-  /** Pixels (x, y) and depth (m) of a place; depth ≤ 0 lies behind the eye. */
+  /** Pixels (x, y) and depth (m) of a position; depth ≤ 0 is behind the camera. */
   project(place) {
     const from = [place[0] - this.eye[0], place[1] - this.eye[1], place[2] - this.eye[2]];
     const depth = dot(from, this.forward), scale = this.focal / Math.max(depth, 0.05);
