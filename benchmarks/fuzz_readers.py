@@ -40,7 +40,7 @@ from wearcap.errors import WearcapError
 
 ALARM_S, DEAF_S, MEMORY_BYTES = 5.0, 30.0, 3 << 29
 """An input's time; that of one which hears no alarm; memory beyond what the imports take."""
-BLOCK = 250
+BLOCK = 2000
 _FORK = multiprocessing.get_context("fork")
 
 

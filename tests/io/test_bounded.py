@@ -311,3 +311,11 @@ def test_colmap_lines_are_no_bombs(tmp_path):
 def test_an_empty_list_is_json(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps([]))
     assert read_json(tmp_path / "a.json") == []
+
+
+@pytest.mark.parametrize("dtype", ["<f8,<f4", "M8[s]", "V4"])
+def test_arrays_of_neither_numbers_nor_text(tmp_path, dtype):
+    for name, save, read in (("a.npy", np.save, map_npy), ("a.npz", np.savez, read_npz)):
+        save(tmp_path / name, np.zeros(3, dtype))
+        with pytest.raises(WearcapError, match="an array of"):
+            read(tmp_path / name)

@@ -86,6 +86,8 @@ def _header(head: io.BytesIO, where: str) -> tuple[tuple[int, ...], bool, np.dty
     if dtype.hasobject:
         raise WearcapError("it holds Python objects", where=where, expected="plain numbers or text",
                            fix="Such arrays can run code when they are loaded and are never read.")  # fmt: skip
+    if dtype.kind not in "biufcSU":
+        raise WearcapError(f"an array of {dtype}"[:100], where=where, expected="plain numbers or text")
     if any(length < 0 for length in shape):
         raise ValueError(f"an array of shape {shape}")
     return shape, fortran, dtype
