@@ -65,7 +65,7 @@ def run_method(method: Method, case: Case) -> Result:
             seeds = seeds[:1]
     realism = None if case.realism is None else load_realism(case.realism, STRIDE_S)
     measure = scored if realism is None else realism.beside(scored, method.name)
-    rows = list(evaluate(pipeline, store, case.names, seeds, items=8, measure=measure))
+    rows = list(evaluate(pipeline, store, case.names, seeds, batch_size=8, measure=measure))
     scores = aggregate(rows)
     if realism is not None:
         scores |= realism.scores(method.name)

@@ -100,7 +100,7 @@ def test_hanging_the_truth_from_its_own_head_changes_nothing():
 
 def test_evaluation_scores_every_recording_once_per_seed(tmp_path):
     store = small_dataset(tmp_path)
-    rows = list(evaluate(pipeline(), store, store.names("test"), [0, 1], items=3))
+    rows = list(evaluate(pipeline(), store, store.names("test"), [0, 1], batch_size=3))
     assert sorted((row.recording, row.seed) for row in rows) == [(n, s) for n in ("r4", "r5") for s in (0, 1)]
     assert all(row.scores["mpjpe_cm"] > 1 for row in rows)
     assert {row.frames for row in rows} == {260, 300}
