@@ -1,6 +1,7 @@
 """The house's rules on the source: imports only point down, files and functions stay short."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,23 @@ TRAINING = {"training", "calibration", "validation"} | {
     f"{name}_training" for name in ("egoview", "manifold", "object", "point_codes")
 }
 """Modules of a system that are LightningModules and callbacks."""
+PRIVATE_WORDS = {
+    "told",
+    "said",
+    "unsaid",
+    "lane",
+    "lanes",
+    "hung",
+    "beneath",
+    "thing",
+    "things",
+    "belt",
+    "robbed",
+    "amend",
+    "amended",
+    "asked",
+}
+"""Of identifiers: condition, output, batch item, anchored, below, object, rolling schedule, dropped, correction instead."""
 MODULES = sorted(SOURCE.rglob("*.py"))
 MAX_FUNCTION, MAX_MODULE, MAX_ENTRY = 60, 400, 40
 
@@ -112,6 +130,23 @@ def test_folders_of_one_floor_do_not_use_each_other_in_a_circle():
             border = set().union(*(uses.get(name, set()) for name in border)) - reached
             reached |= border
         assert folder not in reached, f"{folder} uses itself through {sorted(reached)}"
+
+
+def test_identifiers_are_the_fields_own():
+    """Words that docs/conventions.md gives another word for are no names (SIMD lanes of the kernels are lanes)."""
+    for path in MODULES:
+        tree = parsed(path)
+        names = [node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+        names += [node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)]
+        names += [node.id for node in ast.walk(tree) if isinstance(node, ast.Name)]
+        names += [node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
+        words = {
+            word
+            for name in names
+            for word in re.findall("[a-z]+", re.sub("([a-z])([A-Z])", r"\1_\2", name).lower())
+        }
+        wrong = words & PRIVATE_WORDS
+        assert not wrong - ({"lane", "lanes"} if "kinematics" in path.stem else set()), f"{path}: {wrong}"
 
 
 def test_a_lightning_module_stays_small():

@@ -11,8 +11,8 @@ from handled import assert_natural, level_world, palm_errors, performed, plan_at
 from wearcap.simulation.handhelds import MAKERS, ball, bottle, drill, hammer, mop
 from wearcap.simulation.handling import object_motion
 from wearcap.simulation.holding import put_down, take_options, take_up
+from wearcap.simulation.movables import floor_pose, make_movable
 from wearcap.simulation.person import draw_person
-from wearcap.simulation.things import floor_pose, make_movable
 from wearcap.simulation.using import use
 from wearcap.simulation.walking import walk_along
 

@@ -9,11 +9,11 @@ from wearcap.geometry import rotation
 from wearcap.simulation.carrying import carry_options, lift, put_down
 from wearcap.simulation.distractors import bend_over, gesture_at, hover, squat_by
 from wearcap.simulation.handling import hand_rows, interactions_of, object_motion
+from wearcap.simulation.movables import MOVABLES, floor_pose, make_movable
 from wearcap.simulation.outline import distance_to_convex, rectangle
 from wearcap.simulation.person import draw_person
 from wearcap.simulation.plan import SIDES
 from wearcap.simulation.sliding import slide, slide_options
-from wearcap.simulation.things import MOVABLES, floor_pose, make_movable
 from wearcap.simulation.walking import turn_to, walk_along
 
 

@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.data.datamodule import SeededWindows
 from wearcap.data.motion_features import MotionFeatures, Movement
-from wearcap.data.windows import Source, asked_for, joint_twins, share_out
+from wearcap.data.windows import Source, joint_twins, requested, share_out
 from wearcap.recording.store import RecordingFile
 
 
@@ -37,7 +37,7 @@ class MovementDataset(Dataset):
         return len(self.starts)
 
     def __getitem__(self, item: tuple[int, int] | int) -> Movement:
-        index, random = asked_for(item)
+        index, random = requested(item)
         shift, mirrored = torch.rand(2, generator=random).tolist()
         recording, start, _ = self.starts[index].tolist()
         store, name = self.recordings[recording]

@@ -109,7 +109,7 @@ def _usable(store: RecordingStore, split: str, fps: float, min_frames: int) -> I
             yield name
 
 
-def asked_for(item: tuple[int, int] | int) -> tuple[int, torch.Generator]:
+def requested(item: tuple[int, int] | int) -> tuple[int, torch.Generator]:
     """Window index of a data set's item, and the random generator of its augmentation.
 
     An index without a seed comes from Lightning's overfit_batches, which replaces the sampler: the index is the seed.
@@ -151,7 +151,7 @@ class WindowDataset(Dataset):
         return len(self.starts)
 
     def __getitem__(self, item: tuple[int, int] | int) -> Window:
-        index, random = asked_for(item)
+        index, random = requested(item)
         recording, start, frames = self.starts[index].tolist()
         shift, mirrored, cut, end = torch.rand(4, generator=random).tolist()
         if self.mirror:

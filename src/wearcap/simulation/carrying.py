@@ -11,9 +11,9 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.grips import Grip, GripPlace
 from wearcap.simulation.handling import Handling, handling_of
+from wearcap.simulation.movables import Movable
 from wearcap.simulation.plan import SIDES, Plan, wrap
 from wearcap.simulation.shuffling import step_to
-from wearcap.simulation.things import Movable
 from wearcap.simulation.track import ease
 
 BEFORE_CHEST_M = (0.17, 0.22)

@@ -16,9 +16,9 @@ from wearcap.simulation.carrying import DEEP, Errand, arrive, bend_for, bow, ear
 from wearcap.simulation.grips import Grip
 from wearcap.simulation.handling import Handling, handling_of
 from wearcap.simulation.hands import ON_THIGHS, hold
+from wearcap.simulation.movables import Movable
 from wearcap.simulation.outline import turn
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan
-from wearcap.simulation.things import Movable
 from wearcap.simulation.track import Track, ease
 
 BESIDE = ("suitcase", "backpack")

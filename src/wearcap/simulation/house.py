@@ -14,9 +14,9 @@ from wearcap.recording.motion import Motion
 from wearcap.simulation.grips import GripPlace
 from wearcap.simulation.handling import Handling, interactions_of, object_motion
 from wearcap.simulation.interactive_flat import InteractiveFlat, obstacle
+from wearcap.simulation.movables import Movable
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.plan import Plan
-from wearcap.simulation.things import Movable
 from wearcap.simulation.world import World, WorldObject
 
 Distractor = Callable[[Plan, dict[str, GripPlace], Rigid, float, np.random.Generator], None]

@@ -12,12 +12,12 @@ from wearcap.simulation.actions import ACTIVITIES, follow, start_place
 from wearcap.simulation.distractors import bend_over, gesture_at, hover, linger, squat_by
 from wearcap.simulation.grips import GripPlace
 from wearcap.simulation.house import Distractor, House
+from wearcap.simulation.movables import Movable
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.opening import operate
 from wearcap.simulation.outline import distance_to_convex
 from wearcap.simulation.plan import Plan
 from wearcap.simulation.rearranging import fetch, floor_place, rearrange, relocate
-from wearcap.simulation.things import Movable
 from wearcap.simulation.wearer import TAIL_S, Wearer
 
 WEIGHTS = {

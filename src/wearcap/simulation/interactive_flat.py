@@ -14,9 +14,9 @@ from wearcap.simulation.flat import lay_out
 from wearcap.simulation.fronts import FRONTED
 from wearcap.simulation.furnish import FRONT_M, Box, Plan
 from wearcap.simulation.furniture import MAKERS
+from wearcap.simulation.movables import Movable, make_movable
 from wearcap.simulation.openables import Openable, at, direction, hinged
 from wearcap.simulation.outline import distance_to_convex, points_in_convex, rectangle, turn
-from wearcap.simulation.things import Movable, make_movable
 from wearcap.simulation.walls import DOOR_HEIGHT, THICKNESS, WINDOW
 from wearcap.simulation.world import Door, World, WorldObject
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from wearcap.data.surface_points import POINTS, object_cloud
 from wearcap.errors import WearcapError, nearest
 from wearcap.simulation.interactive_flat import build_interactive_flat
-from wearcap.simulation.things import MOVABLES, make_movable
+from wearcap.simulation.movables import MOVABLES, make_movable
 
 OPENABLES = ("door", "window", "drawer", "cabinet_door")
 

@@ -13,12 +13,12 @@ from wearcap.simulation.holding import Take, take_options, take_up
 from wearcap.simulation.holding import put_down as put_held_down
 from wearcap.simulation.house import Distractor, House
 from wearcap.simulation.interactive_flat import obstacle
+from wearcap.simulation.movables import Movable, floor_pose
 from wearcap.simulation.openables import Openable
 from wearcap.simulation.outline import distance_to_convex, rectangle, turn
 from wearcap.simulation.plan import Plan
 from wearcap.simulation.shuffling import step_to
 from wearcap.simulation.sliding import Slide, slide, slide_options
-from wearcap.simulation.things import Movable, floor_pose
 from wearcap.simulation.using import use
 from wearcap.simulation.world import World
 

@@ -12,9 +12,9 @@ from wearcap.simulation.gait import glide
 from wearcap.simulation.gaze import turn_head
 from wearcap.simulation.grips import Grip, GripPlace, Moves, drawn_grip
 from wearcap.simulation.handling import Handling, handling_of
+from wearcap.simulation.movables import Movable, Rail, floor_pose
 from wearcap.simulation.plan import LEFT_SIGN, SIDES, Plan, wrap
 from wearcap.simulation.shuffling import shuffle, step_to
-from wearcap.simulation.things import Movable, Rail, floor_pose
 from wearcap.simulation.track import ease
 
 SPEEDS = {"sofa": (0.12, 0.26), "table": (0.13, 0.32), "chair": (0.18, 0.42)}

@@ -5,10 +5,10 @@ import numpy as np
 from wearcap.simulation.handhelds import MAKERS
 from wearcap.simulation.house import House
 from wearcap.simulation.interactive_flat import InteractiveFlat, obstacle
+from wearcap.simulation.movables import Movable, make_movable
 from wearcap.simulation.openables import at
 from wearcap.simulation.outline import rectangle
 from wearcap.simulation.rearranging import APART_M, apart, kept_free, outlines
-from wearcap.simulation.things import Movable, make_movable
 
 TWICE = 0.4
 """Probability of two objects of a kind."""

@@ -15,7 +15,7 @@ from wearcap.body.contact_points import TOUCH_M, contact_points, mirrored_points
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
 from wearcap.data.datamodule import SeededWindows
 from wearcap.data.features import body_size
-from wearcap.data.windows import MIRROR, Source, asked_for, joint_twins, mirrored_rotations, share_out
+from wearcap.data.windows import MIRROR, Source, joint_twins, mirrored_rotations, requested, share_out
 from wearcap.diffusion.levels import DRAWS
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -204,7 +204,7 @@ class EchoDataset(Dataset):
         return echo_track(recording, environment, self._reader, every, self.within_m)
 
     def __getitem__(self, item: tuple[int, int] | int) -> EchoWindow:
-        index, random = asked_for(item)
+        index, random = requested(item)
         number, start, frames = self.starts[index].tolist()
         shift, mirrored, cut, end = torch.rand(4, generator=random).tolist()
         if self.mirror:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from wearcap.data.datamodule import SeededWindows
-from wearcap.data.windows import Source, asked_for, share_out
+from wearcap.data.windows import Source, requested, share_out
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.store import RecordingFile
@@ -65,7 +65,7 @@ class PlaceDataset(Dataset):
         return len(self.starts)
 
     def __getitem__(self, item: tuple[int, int] | int) -> Places:
-        index, random = asked_for(item)
+        index, random = requested(item)
         recording, start, count = self.starts[index].tolist()
         store, name = self.recordings[recording]
         chosen = start + torch.randint(min(self.window, count - start), (self.frames,), generator=random)

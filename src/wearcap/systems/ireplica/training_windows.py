@@ -16,8 +16,8 @@ from wearcap.body.skeletons import skeleton_by_name
 from wearcap.data.datamodule import SeededWindows
 from wearcap.data.windows import (
     Source,
-    asked_for,
     mirrored_rotations,
+    requested,
     share_out,
 )
 from wearcap.errors import WearcapError
@@ -78,7 +78,7 @@ class ContactDataset(Dataset):
         return len(self.starts)
 
     def __getitem__(self, item: tuple[int, int] | int) -> ContactWindow:
-        index, random = asked_for(item)
+        index, random = requested(item)
         recording, start, _ = self.starts[index].tolist()
         store, name = self.recordings[recording]
         poses = _poses(store.path_of(name), self.stream, self.skeleton.name, self.fps)

@@ -15,9 +15,9 @@ from wearcap.data.datamodule import SeededWindows
 from wearcap.data.features import body_size
 from wearcap.data.windows import (
     Source,
-    asked_for,
     joint_twins,
     mirrored_rotations,
+    requested,
     share_out,
     true_foot_contact,
 )
@@ -94,7 +94,7 @@ class WatchDataset(Dataset):
         return len(self.starts)
 
     def __getitem__(self, item: tuple[int, int] | int) -> WatchWindow:
-        index, random = asked_for(item)
+        index, random = requested(item)
         shift, mirror, turn, begins, padding, faster, larger = torch.rand(7, generator=random).tolist()
         recording, start, _ = self.starts[index].tolist()
         store, name = self.recordings[recording]
