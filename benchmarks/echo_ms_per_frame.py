@@ -1,8 +1,8 @@
-"""ECHO on a GPU, the document's size without guidance: milliseconds per frame.
+"""ECHO on a GPU, the paper's size without guidance: milliseconds per frame.
 
 Drawn weights; context and steps of `pipeline=echo` (two for every frame that enters), compiled with CUDA graphs in float32.
 A frame is everything from what is told of it to body, object and contacts in the world: one wearer alone, and eight side by
-side, of whom each has an eighth of the time. baseline: the document's 13.73 ms on an RTX 4090; ratio = baseline / value, to
+side, of whom each has an eighth of the time. baseline: the paper's 13.73 ms on an RTX 4090; ratio = baseline / value, to
 be at least `goal` (1.4 ms, on an H200). Without a CUDA device it is left out.
 """
 

@@ -60,17 +60,17 @@ DATA = {
 SHARED = "pipeline.synchronization.clock=shared"
 HMD2, WATCHES, ECHO = ("hmd2", "walkers"), ("mocap_every", "keyed"), ("echo", "objects")
 CAPTURES: dict[str, tuple[str | None, str, tuple[str, ...]]] = {
-    "hmd2": (*HMD2, ()), "hmd2_document": (*HMD2, ()), "hmd2_mean": (*HMD2, ()), "hmd2_online": (*HMD2, ()),
+    "hmd2": (*HMD2, ()), "hmd2_paper": (*HMD2, ()), "hmd2_mean": (*HMD2, ()), "hmd2_online": (*HMD2, ()),
     "egoego_style": (*HMD2, ("pipeline.steps=4",)),
-    "mocap_every": (*WATCHES, ()), "mocap_every_document": (*WATCHES, ()), "mocap_every_cues": (*WATCHES, ()),
+    "mocap_every": (*WATCHES, ()), "mocap_every_paper": (*WATCHES, ()), "mocap_every_cues": (*WATCHES, ()),
     "mocap_every_online": (*WATCHES, ()),
-    "echo": (*ECHO, ()), "echo_document": (*ECHO, ()), "echo_online": (*ECHO, ("pipeline.runtime=eager",)),
+    "echo": (*ECHO, ()), "echo_paper": (*ECHO, ()), "echo_online": (*ECHO, ("pipeline.runtime=eager",)),
     "echo_rewindow": (*ECHO, ("pipeline.per_frame=1",)), "echo_search": (*ECHO, ()), "bodiffusion_object": (*ECHO, ()),
-    "hps": (None, "hps", (SHARED,)), "hps_document": (None, "hps", (SHARED,)), "hps_document_adam": (None, "hps", (SHARED, "pipeline.solver.settings.steps=4")),
+    "hps": (None, "hps", (SHARED,)), "hps_paper": (None, "hps", (SHARED,)), "hps_paper_adam": (None, "hps", (SHARED, "pipeline.solver.settings.steps=4")),
     "hps_without_scene": (None, "hps", (SHARED,)), "hps_imu": (None, "hps", (SHARED,)), "hps_imu_cam": (None, "hps", (SHARED,)),
     "hps_imu_cam_filtered": (None, "hps", (SHARED,)), "bent_suit": (None, "hps", (SHARED,)),
     "ireplica": ("contact_sequence", "flats", ()), "ireplica_without_correction": ("contact_sequence", "flats", ()),
-    "ireplica_document": ("[contact_transformer_sliding,contact_transformer_hinged]", "flats", ()),
+    "ireplica_paper": ("[contact_transformer_sliding,contact_transformer_hinged]", "flats", ()),
     "pose_regressor": ("runs/pose_regressor_hands/checkpoints/last.ckpt", "walkers", ()),
 }  # fmt: skip
 """Pipelines with their checkpoint, data set, and overrides that keep them short."""

@@ -31,10 +31,10 @@ ROWS = {
     "IMU + Cam": "hps_imu_cam",
     "IMU + Cam (filtered)": "hps_imu_cam_filtered",
     "HPS w/o scene": "hps_without_scene",
-    "HPS": "hps_document",
+    "HPS": "hps_paper",
     "ours": "hps",
 }
-"""The documents' rows, as this project states them, and ours: names of pipeline configs."""
+"""The papers' rows, as this project states them, and ours: names of pipeline configs."""
 DISTURBED = ("IMU + Cam (filtered)", "HPS", "ours")
 OUTAGES_S = (30.0, 60.0)
 TRUTH = "the truth itself"

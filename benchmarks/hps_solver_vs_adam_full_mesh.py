@@ -1,6 +1,6 @@
-"""HPS: our banded second-order solver against the document's Adam over windows, same recording, same energy.
+"""HPS: our banded second-order solver against the paper's Adam over windows, same recording, same energy.
 
-The energy is the document's (conf/problem/hps_document.yaml), the recording a simulated walk of 60 s at 30 Hz with a
+The energy is the paper's (conf/problem/hps_paper.yaml), the recording a simulated walk of 60 s at 30 Hz with a
 scanned floor. Adam takes 500 steps per window of 100 frames and skins a whole body of SMPL's size (6890 vertices) at
 each, in single precision on both cores; it is run on the first two windows, since the whole takes hours. Ours solves
 the whole recording. Energies are compared on those two windows; the benchmark fails when ours is higher.
@@ -60,7 +60,7 @@ def measure(duration_s: float = 60.0, steps: int = 500) -> list[dict]:
 
 
 def document_energy() -> HpsEnergy:
-    config = compose("capture", ["pipeline=hps_document", "recording=none"])
+    config = compose("capture", ["pipeline=hps_paper", "recording=none"])
     return instantiate(config.pipeline.energy, _convert_="all")
 
 

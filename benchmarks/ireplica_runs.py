@@ -38,7 +38,7 @@ ON_BENT_PATH = (
 )  # fmt: skip
 """Rows whose wearer is registered as documented; HPS registers the others'."""
 GAPS_S = (0.0, 0.25, 0.5, 1.0, 2.0)
-"""Of the document's Table 5.4."""
+"""Of the paper's Table 5.4."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
     torch.set_num_threads(1)
     case = Case.load(run.dataset, run.name)
     ours = pipeline_of("ireplica", run.networks.ours)
-    published = pipeline_of("ireplica_document", run.networks.published)
+    published = pipeline_of("ireplica_paper", run.networks.published)
     motion, bent = ours.registered(case.source), published.registered(case.source)
     contacts = {"ours": _contacts(ours, case), "published": _contacts(published, case)}
     rows = {
@@ -135,7 +135,7 @@ def _rows(
         "ours, arms moved, wearer not": track(replace(ours.tracker, correction=None), "ours"),
         "ours, on the bent path": track(ours.tracker, "ours"),
         "ours, on the bent path, w/o contact corr.": track(replace(ours.tracker, correction=None, hands=None), "ours"),
-        "ours, the document's correction": track(replace(ours.tracker, correction=published.tracker.correction), "ours"),
+        "ours, the paper's correction": track(replace(ours.tracker, correction=published.tracker.correction), "ours"),
         "ours, no fit about hinges": track(replace(ours.tracker, correction=replace(correction, hinge=None)), "ours"),  # pyright: ignore[reportArgumentType, reportCallIssue]
         "ours, published networks": track(ours.tracker, "published"),
         "ours, right hand carries": track(changed(anchor="right"), "ours"),

@@ -26,7 +26,7 @@ from wearcap.systems.mocap_every.visual_cues import at_frames
 
 NEAR_M = 0.03
 SLAM_DEG, SLAM_M, SLAM_PERIOD_S = 2.4, 0.05, 4.0
-"""Deviation of camera-derived head poses (the document's Table 5: 2.1 and 2.7 degrees, 4.7 and 5.1 cm), all of it slow:
+"""Deviation of camera-derived head poses (the paper's Table 5: 2.1 and 2.7 degrees, 4.7 and 5.1 cm), all of it slow:
 what jumps is found by its acceleration."""
 DETECTOR_PX, MISSED = 4.0, 0.1
 
@@ -60,7 +60,7 @@ def captures(
 
 
 def with_slam(recording: Recording) -> Recording:
-    """The recording with head poses that are off as in the document's Table 5."""
+    """The recording with head poses that are off as in the paper's Table 5."""
     head = recording.head
     assert head is not None
     fps = 1 / head.timestamps.diff().median().item()
@@ -74,7 +74,7 @@ def with_slam(recording: Recording) -> Recording:
 
 
 def body_row(recording: Recording, captured: Captured, seed: int = 0) -> Row:
-    """Scores in the world, the document's metrics among them."""
+    """Scores in the world, the paper's metrics among them."""
     return score_in_world(captured.motion, recording, recording.name, seed)
 
 

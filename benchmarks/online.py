@@ -124,8 +124,8 @@ def figure(name: str, value: float, baseline: float, goal: float) -> dict:
     }  # fmt: skip
 
 
-def beside_document(name: str, stride: int, document: float, pushes: int) -> list[dict]:
-    """Full model on a GPU at one stride in 20 steps, beside the document's frames per second; nothing without a GPU."""
+def beside_paper(name: str, stride: int, document: float, pushes: int) -> list[dict]:
+    """Full model on a GPU at one stride in 20 steps, beside the paper's frames per second; nothing without a GPU."""
     if without_cuda(name):
         return []
     pipeline = pipeline_of(

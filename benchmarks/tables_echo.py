@@ -1,9 +1,9 @@
-"""ECHO on held-out people, places and objects: the document's Tables 1, 2, 3, 4 (ablation) and S2 on the data at hand.
+"""ECHO on held-out people, places and objects: the paper's Tables 1, 2, 3, 4 (ablation) and S2 on the data at hand.
 
 Bodies and objects are measured where they are put in the world, over whole recordings. Rows without a checkpoint are
 left out and said so. Checkpoints come by name (checkpoints/) or path; those of baselines and ablations from
 RUNS/NAME/checkpoints/last.ckpt, where `wearcap train experiment=NAME paths.run=RUNS/NAME` puts them. Means and spreads
-are over seeds of the diffusion, as in the document.
+are over seeds of the diffusion, as in the paper.
 """
 
 import argparse
@@ -38,7 +38,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "no contacts": ("echo_without_contacts", *UNGUIDED),
     "no humans alone": ("echo_without_people", *UNGUIDED),
     "no auxiliary losses": ("echo_without_auxiliary", *UNGUIDED),
-    "document's weights of losses": ("echo_document_losses", *UNGUIDED),
+    "document's weights of losses": ("echo_paper_losses", *UNGUIDED),
     "three tokens per frame": ("echo_three_streams", *UNGUIDED),
     "BoDiffusion-style + object": ("bodiffusion_object", "pipeline=bodiffusion_object"),
 }
@@ -52,7 +52,7 @@ SETTINGS = {
     "the stochastic posterior": ("pipeline=echo", "pipeline.eta=1.0"),
     "noise redrawn (eq. 11 as printed)": ("pipeline=echo", "pipeline.step=redraw", "pipeline.spacing=1.0"),
     "context of 40: latency of 20 frames": ("pipeline=echo", "pipeline.context=40"),
-    "all as in the document": ("pipeline=echo_document",),
+    "all as in the paper": ("pipeline=echo_paper",),
 }
 SHARES = {"human": (0.01, 0.05, 0.1, 0.25, 1.0), "object": (0.01, 0.05, 0.1, 0.25, 1.0), "contact": (0.01, 0.05, 0.1, 0.25, 1.0)}  # fmt: skip
 DOCUMENT: Scores = {

@@ -91,7 +91,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         found[title] = [result for result in results[: len(methods)] if result is not None]
         results = results[len(methods) :]
         console.print(_table(f"{title} ({case.dataset.name}, {options.split})", found[title]))
-    console.print(_document())
+    console.print(_paper())
     for metric, title in (
         ("mpjpe_cm", "MPJPE (cm)"),
         ("hand_pe_cm", "hand error (cm)"),
@@ -138,11 +138,11 @@ def _ours(options: argparse.Namespace, name: str, *overrides: str, pipeline: str
 
 
 def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
-    """A stride of Table 6.5 as in the document, and as ours, in as many steps."""
+    """A stride of Table 6.5 as in the paper, and as ours, in as many steps."""
     ahead = min(LOOKAHEAD, 240 - h)
     both = (f"pipeline.stride={h}", "pipeline.steps=5", "pipeline.live=true")
     return [
-        _ours(options, f"h = {h}, the document's", *both, pipeline="hmd2_document"),
+        _ours(options, f"h = {h}, the paper's", *both, pipeline="hmd2_paper"),
         _ours(options, f"h = {h}", *both, "pipeline.fade=10", "pipeline.lookahead=0"),
         _ours(options, f"h = {h}, {ahead} ahead", *both, "pipeline.fade=10", f"pipeline.lookahead={ahead}"),
     ]
@@ -162,7 +162,7 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     wanted = [
         *(Method(name) for name in BASELINES), Method("EgoEgo-style", options.egoego, ("pipeline=egoego_style",)),
         *regressors, *ablations, *separate,
-        _ours(options, "full, the document's windows", pipeline="hmd2_document"),
+        _ours(options, "full, the paper's windows", pipeline="hmd2_paper"),
         _ours(options, "full, one step to the mean", pipeline="hmd2_mean"),
     ]  # fmt: skip
     there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
@@ -186,8 +186,8 @@ def _table(title: str, results: list[Result]) -> Table:
     return table
 
 
-def _document() -> Table:
-    table = new_table("the document, on Nymeria", ["", "MPJPE", "hand", "FID", "divers.", "phys.", "floor"])
+def _paper() -> Table:
+    table = new_table("the paper, on Nymeria", ["", "MPJPE", "hand", "FID", "divers.", "phys.", "floor"])
     for name, values in DOCUMENT.items():
         table.add_row(name, *(f"{value:.2f}" for value in values))
     return table

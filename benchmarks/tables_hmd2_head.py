@@ -1,4 +1,4 @@
-"""HMD2 on the head path alone: the document's row "without points, without images", on the data at hand.
+"""HMD2 on the head path alone: the paper's row "without points, without images", on the data at hand.
 
 Without --checkpoint the rows are trained first, once per seed, with the configuration of their experiment.
 """
@@ -16,7 +16,7 @@ from wearcap.metrics.table import Scores, Summary, rich_table, write_scores
 
 OURS = ("experiment=motion_diffusion_head",)
 ABLATIONS = {
-    "document's frame, losses and draws": ("experiment=motion_diffusion_head_document",),
+    "document's frame, losses and draws": ("experiment=motion_diffusion_head_paper",),
     "noise levels drawn uniformly": (*OURS, "model.level_tilt=0"),
     "all windows drawn alike": (*OURS, "data.balance=1"),
     "condition without context": (*OURS, "model.net.context=0"),

@@ -161,7 +161,7 @@ def _outages(runs: list[dict[str, Any]], row: str) -> dict[str, Any]:
 
 
 def _chamfer_table(name: str, places: list[str], entries: dict[str, Any]) -> Table:
-    title = f"{TITLES[name]}: bidirectional Chamfer (cm), in brackets the document's"
+    title = f"{TITLES[name]}: bidirectional Chamfer (cm), in brackets the paper's"
     table = new_table(title, ["", *places])
     for row, summaries in entries.items():
         known = DOCUMENT[name].get(row, ())
@@ -173,7 +173,7 @@ def _chamfer_table(name: str, places: list[str], entries: dict[str, Any]) -> Tab
 
 def _feet_table(tree: dict[str, Any]) -> Table:
     table = new_table(
-        "Table 4.3: feet in contact (cm; sliding per frame), in brackets the document's",
+        "Table 4.3: feet in contact (cm; sliding per frame), in brackets the paper's",
         ["", "to surface, signed", "absolute", "sliding", "absolute, true contact", "sliding, true contact"],
     )
     for row, feet in tree["feet"].items():

@@ -193,7 +193,7 @@ def _show(tree: dict[str, Any]) -> None:
 
 
 def _ends(tree: dict[str, Any]) -> Table:
-    shown = new_table("Table 5.1: objects where they were left, cm / degrees; in brackets the document's, on its recordings",
+    shown = new_table("Table 5.1: objects where they were left, cm / degrees; in brackets the paper's, on its recordings",
                       ["", *KINDS, "all", "median"])  # fmt: skip
     for row, found in tree["rows"].items():
         known = DOCUMENT_END.get(row)
@@ -211,7 +211,7 @@ def _two(found: dict[str, Any], spread: bool = False) -> str:
 def _hands(tree: dict[str, Any]) -> Table:
     columns = {"hand_object_cm": "hand to object", "hand_cm": "hand, to its true place", "object_cm": "object, to its true place",
                "object_deg": "degrees"}  # fmt: skip
-    shown = new_table("Table 5.2: during true contact (cm); in brackets the document's", ["", *columns.values(), "body (MPJPE)", "untouched moved"])  # fmt: skip
+    shown = new_table("Table 5.2: during true contact (cm); in brackets the paper's", ["", *columns.values(), "body (MPJPE)", "untouched moved"])  # fmt: skip
     for row, found in tree["rows"].items():
         known = DOCUMENT_HAND.get(row)
         cells = [cell(found["all"][name], 1) for name in columns]
@@ -231,19 +231,19 @@ def _detections(tree: dict[str, Any]) -> Table:
         shown.add_row(name, *(cell(found["detection"][column], 3) for column in columns))
         for kind, scores in found["by_class"].items():
             shown.add_row(f"  {kind}", *(cell(scores[column], 3) for column in columns))
-    shown.add_row("the document's, on H-contact", *(f"{value:.3f}" for value in DOCUMENT_DETECTION), "")
+    shown.add_row("the paper's, on H-contact", *(f"{value:.3f}" for value in DOCUMENT_DETECTION), "")
     return shown
 
 
 def _gaps(tree: dict[str, Any]) -> Table:
     shown = new_table("Table 5.4: gaps filled (s) and where objects end (cm)", ["", *tree["gaps"]])
     shown.add_row("ours", *(cell(found, 1) for found in tree["gaps"].values()))
-    shown.add_row("the document's", *(f"{value:.2f}" for value in DOCUMENT_GAPS))
+    shown.add_row("the paper's", *(f"{value:.2f}" for value in DOCUMENT_GAPS))
     return shown
 
 
 def _chamfer(tree: dict[str, Any]) -> Table:
-    shown = new_table("Table 5.5: Chamfer to the true surfaces during interactions (cm); in brackets the document's",
+    shown = new_table("Table 5.5: Chamfer to the true surfaces during interactions (cm); in brackets the paper's",
                       ["", "body", "object"])  # fmt: skip
     for row, found in tree["rows"].items():
         known = DOCUMENT_CHAMFER.get(row)

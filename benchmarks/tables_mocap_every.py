@@ -1,4 +1,4 @@
-"""MocapEvery on held-out people and places: the document's Tables 2 to 7 on the data at hand.
+"""MocapEvery on held-out people and places: the paper's Tables 2 to 7 on the data at hand.
 
 Bodies are measured where they are put in the world. Rows without a checkpoint are left out and said so. Checkpoints
 come by name (checkpoints/) or path; those of baselines and ablations from RUNS/NAME/checkpoints/last.ckpt, where
@@ -37,7 +37,7 @@ FLOOR = (
 CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
 TRAINED = {
     "AvatarPoser-style, watches": ("mocap_every_avatarposer", ("pipeline=mocap_every", "pipeline.stride=1", "pipeline.lookahead=0", "pipeline.mirror_average=false")),
-    "as in the document": ("mocap_every_document", ("pipeline=mocap_every_document",)),
+    "as in the paper": ("mocap_every_paper", ("pipeline=mocap_every_paper",)),
     "neither": ("mocap_every_neither", ("pipeline=mocap_every",)),
     "+ representation": ("mocap_every_one_stage", ("pipeline=mocap_every",)),
     "+ multi-stage": ("mocap_every_short", ("pipeline=mocap_every",)),
@@ -124,11 +124,11 @@ def _floor(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[
     """Table 3: stairs and ramps between terraces at -4 to 4 m."""
     store, names = recordings_of(options, "simulated_hillside")
     methods = [Method(f"floor {floor}", options.checkpoint, ("pipeline=mocap_every", f"pipeline.floor={floor}")) for floor in FLOORS]  # fmt: skip
-    run, pipeline = TRAINED["as in the document"]
+    run, pipeline = TRAINED["as in the paper"]
     path = options.runs / run / "checkpoints" / "last.ckpt"
     if path.is_file():
         methods += [
-            Method(f"as in the document, floor {floor}", str(path), (*pipeline, f"pipeline.floor={floor}"))
+            Method(f"as in the paper, floor {floor}", str(path), (*pipeline, f"pipeline.floor={floor}"))
             for floor in ("fixed", "update")
         ]
     scores = {}

@@ -3,7 +3,7 @@
 Baselines: the most similar grid of the training split, 128 principal components of it, and always saying "no point".
 Distances are compared over all cells, and over those that hold a point (2 % of them in simulated data, so that
 saying nothing is hard to beat over all cells). For methods that tell distances and never "no point" (principal components,
-the document's squared error), the distance below which a cell counts as held is the one best on validation data.
+the paper's squared error), the distance below which a cell counts as held is the one best on validation data.
 Speed: grids per second of one core. Writes a picture of slices, too.
 """
 

@@ -88,7 +88,7 @@ def test_a_data_set_is_scored(data, tmp_path, capfd):
 
 def test_localisation_by_learned_features_is_a_choice():
     chosen = compose(
-        "capture", ["pipeline=hps_document", "recording=x", "localization@pipeline.localization=superpoint"]
+        "capture", ["pipeline=hps_paper", "recording=x", "localization@pipeline.localization=superpoint"]
     )
     assert chosen.pipeline.localization.extractor._target_.endswith("SuperPointExtractor")
     assert chosen.pipeline.localization._target_.endswith("MapLocalization")

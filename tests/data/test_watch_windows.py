@@ -49,7 +49,7 @@ def told(features: WatchFeatures, window: WatchWindow) -> torch.Tensor:
     [({"frame": "head"}, 31), ({"frame": "head", "absolute": False}, 27), ({"body": True}, 35), ({"frame": "world", "absolute": False}, 27),
      ({"wrists": "positions"}, 31), ({"frame": "own"}, 31), ({"frame": "own", "body": True}, 35)],
 )  # fmt: skip
-def test_sizes_are_the_documents(root, settings, size):
+def test_sizes_are_the_papers(root, settings, size):
     features = WatchFeatures(**settings)
     assert features.size == size
     assert told(features, batch(root)).shape == (8, 40, size)

@@ -40,7 +40,7 @@ def test_a_step_with_the_true_x0_keeps_the_marginals(schedule, eta):
     assert x_s.var().item() == pytest.approx(1 - alpha_bar, rel=0.02)
 
 
-def test_posterior_is_the_documents_formula():
+def test_posterior_is_the_papers_formula():
     """Mean and variance of thesis eq. 6.2, 6.3, written out with per-step α = ᾱ_t / ᾱ_s."""
     schedule = CosineSchedule()
     x_t, x0, noise = (torch.randn(3, 4, 2, dtype=torch.float64) for _ in range(3))

@@ -108,7 +108,7 @@ def test_a_feature_of_one_point_repeated_is_finite():
     assert network()(torch.ones(1, 50, 3, dtype=torch.float64)).isfinite().all()
 
 
-def test_the_documents_size():
+def test_the_papers_size():
     net = PointNeXt()
     assert net.size == 1024
     # 4.523 M of OpenPoints' config with C=64, without its head of 512 and 256

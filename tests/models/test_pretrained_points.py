@@ -104,7 +104,7 @@ def test_the_weights_make_what_they_make_there(suffix, normalized, tmp_path):
     assert not any(p.requires_grad for p in net.parameters())
 
 
-def test_the_documents_size_is_read_off_the_file(tmp_path):
+def test_the_papers_size_is_read_off_the_file(tmp_path):
     net = load_openpoints(saved(tmp_path / "w.pth", openpoints(64)))
     assert net.size == 1024
     assert sum(p.numel() for p in net.parameters()) == sum(

@@ -38,7 +38,7 @@ def test_shapes_and_ranges(layers):
     assert all(parameter.grad is not None for parameter in net.parameters())
 
 
-def test_the_documents_layers():
+def test_the_papers_layers():
     """Kernel 3, 16/32/64/128 channels there and back, ReLU between, averaged to one vector."""
     layers = VoxelAutoencoder(layers="convolutions").layers
     down = [m for m in layers.encoder if isinstance(m, torch.nn.Conv3d)]

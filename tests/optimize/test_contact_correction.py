@@ -1,4 +1,4 @@
-"""Moving the wearer onto what is touched: the offset against a dense solve, its shape, the document's bending."""
+"""Moving the wearer onto what is touched: the offset against a dense solve, its shape, the paper's bending."""
 
 import functools
 import math

@@ -309,7 +309,7 @@ def test_corrections_move_the_wearer_to_the_object_and_back(scene):
         assert least <= distance.mean() < most
 
 
-def test_the_documents_correction_runs_on_the_same_contacts(scene):
+def test_the_papers_correction_runs_on_the_same_contacts(scene):
     motion, environment = scene
     off = replace(motion, t_world_root=motion.t_world_root + torch.tensor([0.0, -0.25, 0.0]))
     contacts = {"timestamps": motion.timestamps, "sliding": held_left()}

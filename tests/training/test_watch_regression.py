@@ -28,7 +28,7 @@ from wearcap_testing import small_dataset
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
 EXPERIMENTS = (
-    "mocap_every", "mocap_every_document", "mocap_every_one_stage", "mocap_every_neither", "mocap_every_hands",
+    "mocap_every", "mocap_every_paper", "mocap_every_one_stage", "mocap_every_neither", "mocap_every_hands",
     "mocap_every_avatarposer",
 )  # fmt: skip
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
@@ -112,7 +112,7 @@ def test_both_stages_and_contacts_are_learned(data):
 
 
 def test_contacts_come_before_the_body():
-    """The document's order: what is said of contacts changes what is said of the body."""
+    """The paper's order: what is said of contacts changes what is said of the body."""
     torch.manual_seed(0)
     net = TwoStageEstimator(31, 141, 40, 32, 1, 2, 32, 16, 0.0).eval()
     features = torch.randn(2, 40, 31)
@@ -135,7 +135,7 @@ def test_the_last_pose_alone():
     assert output.contact_logit.shape == (3, 1, 2)
 
 
-def test_the_documents_size():
+def test_the_papers_size():
     config = compose("train", ["experiment=mocap_every_full", "paths.run=none"])
     net = instantiate(config.model, _convert_="all").net
     assert net.embed.out_features == 640
