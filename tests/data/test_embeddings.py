@@ -231,3 +231,5 @@ def test_the_command_embeds_by_a_checkpoint(filmed, tmp_path, capsys):
     assert camera.embedding.shape == (28, 8)
     with pytest.raises(WearcapError, match="encoder"):
         prepare.main(["embeddings", f"dataset={filmed.root}", "encoder=egoveiw"])
+    with pytest.raises(WearcapError, match="rewrites the recordings of its data set"):
+        prepare.main(["embeddings", f"dataset={filmed.root}", f"output={tmp_path}/other"])

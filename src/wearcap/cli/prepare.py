@@ -18,6 +18,9 @@ HELP = "make a data set: wearcap prepare simulated, wearcap prepare cmu source=D
 def run(config: DictConfig) -> Report:
     """Run the config's preparation: recordings by `tasks`, or by `rework` a change of an existing data set."""
     if "rework" in config:
+        if "output" not in config.rework and Path(config.output) != Path(config.dataset):
+            raise WearcapError(f"output={config.output}, but this source rewrites the recordings of its data set",
+                               where=config.dataset, fix="Leave output=… out, or copy the data set first.")  # fmt: skip
         report = instantiate(config.rework, _convert_="all")
         _show_report(report, RecordingStore.open(config.output))
         return report
