@@ -5,6 +5,7 @@ left, y up, z forward), so its mounting on wearcap's joint axes is `io.formats.s
 """
 
 import io
+import mmap
 import pickletools
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -234,12 +235,13 @@ def _require_short_words(path: Path) -> None:
                 if name.rpartition("/")[2] == "data.pkl":
                     _walk(io.BytesIO(archive.read(name)))
     else:
-        with open(path, "rb") as file:
+        # Mapped: a length in it reserves no more memory than the file has bytes.
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
             for _ in range(_PICKLES_OF_OLD_FILES):
-                _walk(file)
+                _walk(mapped)
 
 
-def _walk(stream: io.BufferedIOBase) -> None:
+def _walk(stream: io.BytesIO | mmap.mmap) -> None:
     """Go through one pickle without running it."""
     for step, (_, argument, _) in enumerate(pickletools.genops(stream)):
         if step > _MAX_STEPS or (isinstance(argument, str | bytes) and len(argument) > _MAX_WORD):
