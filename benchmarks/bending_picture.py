@@ -83,9 +83,7 @@ def panel(
     draw.text((240, 22), f"{100 * off:.1f} cm off the points on average", fill=INK, font=small)
     draw.line((24, PANEL[1] - 24, 24 + SCALE, PANEL[1] - 24), fill=INK, width=3)
     draw.text((30 + SCALE, PANEL[1] - 36), "1 m", fill=INK, font=small)
-    for row, (name, color) in enumerate(
-        (("original", ORIGINAL), ("bent", RESULT), ("control points", CONTROL))
-    ):
+    for row, (name, color) in enumerate((("original", ORIGINAL), ("bent", RESULT), ("control points", CONTROL))):
         draw.rectangle((180 + 150 * row, PANEL[1] - 32, 204 + 150 * row, PANEL[1] - 18), fill=color)
         draw.text((212 + 150 * row, PANEL[1] - 36), name, fill=INK, font=small)
     return image

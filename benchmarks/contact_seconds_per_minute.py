@@ -23,6 +23,12 @@ def measure(seconds: float = SECONDS, rounds: int = 15) -> list[dict]:
         spent.append(time.perf_counter() - begin)
     value = statistics.median(spent)
     return [
-        {"name": "contact_seconds_per_minute", "value": value, "unit": "s", "baseline": seconds,
-         "ratio": seconds / value, "goal": SECONDS / 0.15}
-    ]  # fmt: skip
+        {
+            "name": "contact_seconds_per_minute",
+            "value": value,
+            "unit": "s",
+            "baseline": seconds,
+            "ratio": seconds / value,
+            "goal": SECONDS / 0.15,
+        }
+    ]

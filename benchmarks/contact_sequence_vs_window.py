@@ -42,6 +42,12 @@ def measure(seconds: float = SECONDS, rounds: int = 5) -> list[dict]:
                 spent.append(time.perf_counter() - begin)
     value, baseline = (statistics.median(spent) for spent in times)
     return [
-        {"name": "contact_sequence_vs_window", "value": value, "unit": "s", "baseline": baseline,
-         "ratio": baseline / value, "goal": 20.0}
-    ]  # fmt: skip
+        {
+            "name": "contact_sequence_vs_window",
+            "value": value,
+            "unit": "s",
+            "baseline": baseline,
+            "ratio": baseline / value,
+            "goal": 20.0,
+        }
+    ]

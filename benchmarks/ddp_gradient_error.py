@@ -50,16 +50,20 @@ def measure() -> list[dict]:
     difference = max((shared[name] - joint[name]).abs().max().item() for name in joint)
     largest = max(value.abs().max().item() for value in joint.values())
     return [
-        {"name": "ddp_gradient_error", "value": difference, "unit": "gradient", "baseline": largest,
-         "ratio": difference / largest, "goal": 1e-5}
-    ]  # fmt: skip
+        {
+            "name": "ddp_gradient_error",
+            "value": difference,
+            "unit": "gradient",
+            "baseline": largest,
+            "ratio": difference / largest,
+            "goal": 1e-5,
+        }
+    ]
 
 
 def gradients(folder: str, rank: int, world: int) -> dict[str, Tensor]:
     """Gradients of one step on this process's share of the joint batch."""
-    config = compose(
-        "train", ["experiment=motion_diffusion_head", f"paths.datasets={folder}", "paths.run=unused"]
-    )
+    config = compose("train", ["experiment=motion_diffusion_head", f"paths.datasets={folder}", "paths.run=unused"])
     data: MotionWindows = instantiate(config.data)
     dataset = data.dataset("train")
     loss = WeightedLoss(instantiate(config.model)).eval()
@@ -67,9 +71,7 @@ def gradients(folder: str, rank: int, world: int) -> dict[str, Tensor]:
     random = torch.Generator().manual_seed(0)
     for parameter in loss.parameters():  # the network starts as zero, which would hide most of it
         nn.init.normal_(parameter, std=0.05, generator=random)
-    batch = collate(
-        [dataset[item] for item in SeededSampler(dataset.weights, JOINT_BATCH, SEED, rank, world)]
-    )
+    batch = collate([dataset[item] for item in SeededSampler(dataset.weights, JOINT_BATCH, SEED, rank, world)])
     distributed = DistributedDataParallel(loss) if world > 1 else loss  # it must outlive the backward pass
     distributed(batch).backward()
     return {name: parameter.grad for name, parameter in loss.named_parameters() if parameter.grad is not None}

@@ -36,9 +36,15 @@ class Discriminator(nn.Module):
     def __init__(self, channels: int, width: int = 32):
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Conv1d(channels, width, 5, stride=2), nn.ReLU(), nn.Dropout(0.2),
-            nn.Conv1d(width, width, 5, stride=2), nn.ReLU(), nn.AdaptiveAvgPool1d(1), nn.Flatten(), nn.Linear(width, 1),
-        )  # fmt: skip
+            nn.Conv1d(channels, width, 5, stride=2),
+            nn.ReLU(),
+            nn.Dropout(0.2),
+            nn.Conv1d(width, width, 5, stride=2),
+            nn.ReLU(),
+            nn.AdaptiveAvgPool1d(1),
+            nn.Flatten(),
+            nn.Linear(width, 1),
+        )
 
     def forward(self, x: Float[Tensor, "window frame channel"]) -> Float[Tensor, "window"]:
         return self.layers(x.transpose(1, 2))[:, 0]
@@ -51,15 +57,20 @@ def held_out_accuracy(
     sides = [_by_person(clips, walking) for clips in (simulated, recorded)]
     if min(len(side) for side in sides) < 2:
         counts = " and ".join(str(len(side)) for side in sides)
-        raise WearcapError(f"{counts} people with {'walking ' if walking else ''}windows of 2 s",
-                           expected="two on each side at least, one of whom is held out")  # fmt: skip
+        raise WearcapError(
+            f"{counts} people with {'walking ' if walking else ''}windows of 2 s",
+            expected="two on each side at least, one of whom is held out",
+        )
     results = [_one_training(sides, seed, steps) for seed in seeds]
     accuracies = torch.tensor([accuracy for accuracy, _ in results])
     spread = accuracies.std().item() if len(accuracies) > 1 else 0.0
     return {
-        "mean": accuracies.mean().item(), "std": spread, "accuracies": accuracies.tolist(),
-        "people": sum(len(side) for side in sides), "held_out_windows": results[0][1],
-    }  # fmt: skip
+        "mean": accuracies.mean().item(),
+        "std": spread,
+        "accuracies": accuracies.tolist(),
+        "people": sum(len(side) for side in sides),
+        "held_out_windows": results[0][1],
+    }
 
 
 def _by_person(clips: list[Clip], walking: bool) -> dict[str, Tensor]:

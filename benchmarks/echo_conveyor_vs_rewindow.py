@@ -82,14 +82,9 @@ def _errors(conveyor: Echo, windows: Echo, recordings: int, seconds: float) -> l
     for pipeline in (conveyor, windows):
         on = EchoOnDataset(pipeline, DATASET)
         motions = on.capture(shown, [0] * len(shown))
-        scores = [
-            on.score(motion, recording, recording.name, 0).scores for motion, recording in zip(motions, shown)
-        ]
+        scores = [on.score(motion, recording, recording.name, 0).scores for motion, recording in zip(motions, shown)]
         means.append(
-            {
-                name: statistics.mean(score[name] for score in scores if name in score)
-                for name in ("v2v_cm", "mpjpe_mm")
-            }
+            {name: statistics.mean(score[name] for score in scores if name in score) for name in ("v2v_cm", "mpjpe_mm")}
         )
     ours, theirs = means
     return [
@@ -106,7 +101,9 @@ def _beginning(recording: Recording, seconds: float) -> Recording:
     return replace(
         recording,
         head=replace(
-            head, timestamps=head.timestamps[:count], R_world_device=head.R_world_device[:count],
+            head,
+            timestamps=head.timestamps[:count],
+            R_world_device=head.R_world_device[:count],
             t_world_device=head.t_world_device[:count],
         ),
-    )  # fmt: skip
+    )

@@ -26,14 +26,18 @@ FRAMES, LONGEST_S = 6, 14.0
 KINDS = ("box", "table", "suitcase")
 
 
-def draw(dataset: Path, split: str, checkpoint: str, folder: Path, kinds: tuple[str, ...], overrides: list[str]) -> None:  # fmt: skip
+def draw(
+    dataset: Path, split: str, checkpoint: str, folder: Path, kinds: tuple[str, ...], overrides: list[str]
+) -> None:
     """One sheet per kind, of the act whose object is neither better nor worse placed than half of its kind's."""
     config = compose("evaluate", ["pipeline=echo", *overrides])
     pipeline, store = load_pipeline(checkpoint, config.pipeline, "cpu"), RecordingStore.open(dataset)
     assert isinstance(pipeline, Echo)
     on, reader = EchoOnDataset(pipeline, store.root), pipeline.reader()
     found: dict[str, list[tuple[float, int, Act]]] = {kind: [] for kind in kinds}
-    shown = [(recording, acts) for recording in map(store.load, store.names(split)) if (acts := _acts(on, recording, kinds))]  # fmt: skip
+    shown = [
+        (recording, acts) for recording in map(store.load, store.names(split)) if (acts := _acts(on, recording, kinds))
+    ]
     recordings = [recording for recording, _ in shown]
     motions = on.capture(recordings, [0] * len(recordings))
     for number, (recording, acts) in enumerate(shown):
@@ -48,8 +52,13 @@ def draw(dataset: Path, split: str, checkpoint: str, folder: Path, kinds: tuple[
         recording, motion = recordings[number], motions[number]
         environment = on.environment(recording)
         assert environment is not None
-        save_png(folder / f"{kind}.png", sheet(with_objects(recording, environment), motion, environment, act, recording.shape))  # fmt: skip
-        print(f"{kind}: {recording.name}, {act.object}, {act.start_s:.1f} to {act.stop_s:.1f} s, {100 * error:.0f} cm off, the median of {len(acts)}")  # fmt: skip
+        save_png(
+            folder / f"{kind}.png",
+            sheet(with_objects(recording, environment), motion, environment, act, recording.shape),
+        )
+        print(
+            f"{kind}: {recording.name}, {act.object}, {act.start_s:.1f} to {act.stop_s:.1f} s, {100 * error:.0f} cm off, the median of {len(acts)}"
+        )
 
 
 def _acts(on: EchoOnDataset, recording: Recording, kinds: tuple[str, ...]) -> list[tuple[Act, SceneObject]]:
@@ -78,13 +87,24 @@ def sheet(truth: Motion | None, motion: Motion, environment: Environment, act: A
     times = torch.linspace(act.start_s + 1.0, stop, FRAMES, dtype=torch.float64)
     frames = torch.searchsorted(truth.timestamps, times).clamp(0, len(truth) - 1).tolist()
     return contact_sheet(
-        {"truth": truth, "captured": motion}, frames, columns=FRAMES, size=(300, 320),
-        body=anny_body(motion.skeleton, shape or None), environment=Environment((environment.by_name(act.object),)),
+        {"truth": truth, "captured": motion},
+        frames,
+        columns=FRAMES,
+        size=(300, 320),
+        body=anny_body(motion.skeleton, shape or None),
+        environment=Environment((environment.by_name(act.object),)),
         distance=4.2,
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":
     static_threshold = sys.argv[5:]
     chosen = tuple(word for word in static_threshold if "=" not in word) or KINDS
-    draw(Path(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4]), chosen, [word for word in static_threshold if "=" in word])  # fmt: skip
+    draw(
+        Path(sys.argv[1]),
+        sys.argv[2],
+        sys.argv[3],
+        Path(sys.argv[4]),
+        chosen,
+        [word for word in static_threshold if "=" in word],
+    )

@@ -59,9 +59,7 @@ def captured(
         motions = on.echo.capture_scenarios(scenarios, [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):
             scenario = observed_parts[name]
-            item = batch_item_of(
-                scenario, head_path(scenario.recording, on.echo.skeleton, on.echo.fps), reader
-            )
+            item = batch_item_of(scenario, head_path(scenario.recording, on.echo.skeleton, on.echo.fps), reader)
             yield Captured(name, seed, motion, on.truth(motion, scenario.recording), item)
 
 

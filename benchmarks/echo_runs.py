@@ -39,9 +39,7 @@ def pipeline_of(
         assert isinstance(pipeline, Echo)
         return pipeline
     torch.manual_seed(0)
-    system = instantiate(
-        compose("train", [f"experiment={experiment}", *overrides]).model, _convert_="all"
-    ).eval()
+    system = instantiate(compose("train", [f"experiment={experiment}", *overrides]).model, _convert_="all").eval()
     for parameter in system.net.parameters():
         torch.nn.init.normal_(parameter, std=0.02)
     count = sum(parameter.numel() for parameter in system.net.parameters()) / 1e6

@@ -107,13 +107,26 @@ def _train(folder: Path, finished: Finished) -> None:
             finished(checkpoint["global_step"])
 
     RunCheckpointIO.save_checkpoint = saved
-    train.main([
-        "experiment=motion_diffusion_head", f"data.sources.simulated.root={data}", "debug=fast", "callbacks.capture=null",
-        f"hydra.run.dir={folder}", f"paths.outputs={folder.parent}", "data.window=60", "trainer.accelerator=cpu",
-        "trainer.max_steps=100000000", "logger.csv.flush_logs_every_n_steps=1", "trainer.log_every_n_steps=1",
-        "trainer.enable_progress_bar=false", "trainer.enable_model_summary=false", "callbacks.progress=null", "resume=auto",
-        *(f"model.net.{part}" for part in small),
-    ])  # fmt: skip
+    train.main(
+        [
+            "experiment=motion_diffusion_head",
+            f"data.sources.simulated.root={data}",
+            "debug=fast",
+            "callbacks.capture=null",
+            f"hydra.run.dir={folder}",
+            f"paths.outputs={folder.parent}",
+            "data.window=60",
+            "trainer.accelerator=cpu",
+            "trainer.max_steps=100000000",
+            "logger.csv.flush_logs_every_n_steps=1",
+            "trainer.log_every_n_steps=1",
+            "trainer.enable_progress_bar=false",
+            "trainer.enable_model_summary=false",
+            "callbacks.progress=null",
+            "resume=auto",
+            *(f"model.net.{part}" for part in small),
+        ]
+    )
 
 
 def _saved_step(folder: Path) -> int:
@@ -137,8 +150,17 @@ def _capture(folder: Path, finished: Finished) -> None:
     data, turn = folder.with_name("data"), 0
     while True:
         with contextlib.redirect_stdout(None):
-            capture.main(["pipeline=hmd2", "checkpoint=hmd2", "pipeline.steps=1", f"recording={data}/r2", "video=false",
-                          f"hydra.run.dir={folder}", "body=false"])  # fmt: skip
+            capture.main(
+                [
+                    "pipeline=hmd2",
+                    "checkpoint=hmd2",
+                    "pipeline.steps=1",
+                    f"recording={data}/r2",
+                    "video=false",
+                    f"hydra.run.dir={folder}",
+                    "body=false",
+                ]
+            )
         turn += 1
         finished(turn)
 
@@ -159,17 +181,10 @@ def _export(folder: Path, finished: Finished) -> None:
         for name in ("contact_sequence", "hmd2"):
             shared = f"output={folder}/{name}.safetensors"
             with contextlib.redirect_stdout(None):
-                export.main(
-                    [f"checkpoint={name}", "format=safetensors", shared, f"hydra.run.dir={folder}/run"]
-                )
+                export.main([f"checkpoint={name}", "format=safetensors", shared, f"hydra.run.dir={folder}/run"])
         with contextlib.redirect_stdout(None):
             export.main(
-                [
-                    "checkpoint=contact_sequence",
-                    "format=pt2",
-                    f"output={folder}/x.pt2",
-                    f"hydra.run.dir={folder}/run",
-                ]
+                ["checkpoint=contact_sequence", "format=pt2", f"output={folder}/x.pt2", f"hydra.run.dir={folder}/run"]
             )
         turn += 1
         finished(turn)
@@ -239,11 +254,7 @@ WRITERS = {
 
 def _child(writer: Writer, folder: Path, done) -> None:
     torch.set_num_threads(1)
-    with (
-        open(os.devnull, "w") as nowhere,
-        contextlib.redirect_stderr(nowhere),
-        contextlib.redirect_stdout(nowhere),
-    ):
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere), contextlib.redirect_stdout(nowhere):
         writer.write(folder, lambda number: setattr(done, "value", max(done.value, number)))
 
 
@@ -303,11 +314,4 @@ def measure(kills: int = 100, writers: tuple[str, ...] = tuple(WRITERS), seed: i
 
 
 def _figure(name: str, lost: int, struck: int) -> dict:
-    return {
-        "name": name,
-        "value": lost,
-        "unit": "kills",
-        "baseline": struck,
-        "ratio": lost / max(struck, 1),
-        "goal": 0,
-    }
+    return {"name": name, "value": lost, "unit": "kills", "baseline": struck, "ratio": lost / max(struck, 1), "goal": 0}

@@ -58,10 +58,16 @@ def measure(batch: int = BATCH, blocks: int = 8) -> list[dict]:
     finally:
         torch.set_num_threads(threads)
     return [
-        {"name": "fk_vs_joint_loop", "value": value, "unit": unit, "baseline": baseline,
-         "ratio": baseline / value, "goal": goal}
+        {
+            "name": "fk_vs_joint_loop",
+            "value": value,
+            "unit": unit,
+            "baseline": baseline,
+            "ratio": baseline / value,
+            "goal": goal,
+        }
         for (value, baseline), unit, goal in ((forward, "ms forward", 10.0), (both, "ms forward + backward", 5.0))
-    ]  # fmt: skip
+    ]
 
 
 def _medians_ms(sides: list, blocks: int, warm_up: int = 2, timed: int = 10) -> list[float]:

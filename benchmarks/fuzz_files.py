@@ -52,12 +52,7 @@ from wearcap.io.datasets import (  # noqa: E402
     omomo,
     totalcapture,
 )
-from wearcap.io.devices import (  # noqa: E402
-    aria_mps,
-    depth_rig,
-    watch_calibration_json,
-    watch_log,
-)
+from wearcap.io.devices import aria_mps, depth_rig, watch_calibration_json, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
     asf_amc,
     bvh,
@@ -87,7 +82,7 @@ from wearcap.io.formats import (  # noqa: E402
     tum,
     video,
     wavefront,
-)  # fmt: skip
+)
 from wearcap.recording import Cue  # noqa: E402
 from wearcap.recording.photo import Photo  # noqa: E402
 from wearcap_testing import swaying_motion  # noqa: E402
@@ -106,12 +101,8 @@ POSE = Rigid(torch.eye(3), torch.tensor([1.0, 2.0, 3.0]))
 FRAMES = 12
 """Of data sets whose files are long: short ones show the same faults sooner."""
 TUM = "".join(f"{0.1 * k:.1f} {k} 2 3 0 0 0 1\n" for k in range(12))
-EUROC = "#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z\n" + "".join(
-    f"{10**9 * k},{k},0,0,1,0,0,0\n" for k in range(1, 9)
-)
-POINTS = (
-    "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std\n1,g,1,2,0,0.001,0.001\n2,g,1,2,9,0.1,1\n"
-)
+EUROC = "#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z\n" + "".join(f"{10**9 * k},{k},0,0,1,0,0,0\n" for k in range(1, 9))
+POINTS = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std\n1,g,1,2,0,0.001,0.001\n2,g,1,2,9,0.1,1\n"
 ASCII_PLY = """ply
 format ascii 1.0
 element vertex 4
@@ -182,45 +173,60 @@ def _adt_objects(folder: Path) -> None:
     (folder / "3d_bounding_box.csv").write_text(
         f"object_uid,timestamp[ns],{bounds}\n9007199254740993,-1,-1,1,-2,2,-3,3\n77,-1,0,1,0,1,0,1\n"
     )
-    about = {uid: {"instance_name": name, "category": name, "motion_type": motion}
-             for uid, name, motion in (("9007199254740993", "sofa", "static"), ("77", "cup", "dynamic"))}  # fmt: skip
+    about = {
+        uid: {"instance_name": name, "category": name, "motion_type": motion}
+        for uid, name, motion in (("9007199254740993", "sofa", "static"), ("77", "cup", "dynamic"))
+    }
     (folder / "instances.json").write_text(json.dumps(about))
 
 
 def _xdata(path: Path) -> None:
     joints = swaying_motion(30, fps=240.0).T_world_joint
     quat = np.tile([1, 0, 0, 0], (30, 23)).astype(np.float32)
-    np.savez(path, timestamps_us=np.arange(30) * 4167, frameCount=[30], frameRate=[240], segmentCount=[23],
-             segment_tXYZ=joints.t.reshape(30, -1).numpy(), segment_qWXYZ=quat,
-             foot_contacts=np.zeros((30, 4), np.int8))  # fmt: skip
+    np.savez(
+        path,
+        timestamps_us=np.arange(30) * 4167,
+        frameCount=[30],
+        frameRate=[240],
+        segmentCount=[23],
+        segment_tXYZ=joints.t.reshape(30, -1).numpy(),
+        segment_qWXYZ=quat,
+        foot_contacts=np.zeros((30, 4), np.int8),
+    )
 
 
 def _environment(folder: Path) -> None:
     mesh = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 2], [0, 0, 2]], np.float32)
-    ply.write_ply(
-        ply.Ply(mesh, None, np.array([[0, 1, 2], [0, 2, 3]], np.int32)), folder / "objects/door.ply"
-    )
-    row = {"name": "door", "category": "door", "mesh": "objects/door.ply", "R_world_object": np.eye(3).tolist(),
-           "t_world_object": [0, 0, 0],
-           "freedom": {"kind": "hinge", "pivot": [0, 0, 0], "limits_deg": [-5, 90]}}  # fmt: skip
+    ply.write_ply(ply.Ply(mesh, None, np.array([[0, 1, 2], [0, 2, 3]], np.int32)), folder / "objects/door.ply")
+    row = {
+        "name": "door",
+        "category": "door",
+        "mesh": "objects/door.ply",
+        "R_world_object": np.eye(3).tolist(),
+        "t_world_object": [0, 0, 0],
+        "freedom": {"kind": "hinge", "pivot": [0, 0, 0], "limits_deg": [-5, 90]},
+    }
     (folder / "environment.json").write_text(json.dumps({"schema_version": 1, "objects": [row]}))
 
 
 def _watch_calibration(path: Path) -> None:
     watch = {"R_world_ref_wxyz": [1, 0, 0, 0], "R_joint_imu_wxyz": [1, 0, 0, 0]}
     watch |= dict.fromkeys(watch_calibration_json._WATCH, 0.5)
-    clock = {"camera_s": [0, 9], "watch_s": [1, 10], "swings": 3, "drift_s_per_hour": 0.1, "residual_s": 0.01, "std_s": 0.01}  # fmt: skip
-    camera = dict.fromkeys(watch_calibration_json._CAMERA, 0.5) | {"R_world_slam_wxyz": [1, 0, 0, 0], "t_world_slam": [0, 0, 1]}  # fmt: skip
+    clock = {
+        "camera_s": [0, 9],
+        "watch_s": [1, 10],
+        "swings": 3,
+        "drift_s_per_hour": 0.1,
+        "residual_s": 0.01,
+        "std_s": 0.01,
+    }
+    camera = dict.fromkeys(watch_calibration_json._CAMERA, 0.5) | {
+        "R_world_slam_wxyz": [1, 0, 0, 0],
+        "t_world_slam": [0, 0, 1],
+    }
     head = {"R_head_cam_wxyz": [1, 0, 0, 0], "t_head_cam": [0, 0, 0.1], "still_deg": 0.5}
     path.write_text(
-        json.dumps(
-            {
-                "watches": {"left_wrist": watch},
-                "clocks": {"left_wrist": clock},
-                "camera": camera,
-                "head": head,
-            }
-        )
+        json.dumps({"watches": {"left_wrist": watch}, "clocks": {"left_wrist": clock}, "camera": camera, "head": head})
     )
 
 
@@ -246,16 +252,12 @@ def _video(path: Path) -> None:
 
 def _depth_rig(folder: Path) -> None:
     images = np.random.default_rng(0).integers(800, 4000, (3, 12, 16)).astype(np.uint16)
-    depth_rig.write_depth_rig(
-        folder, {"k0": (LENS, POSE)}, {"k0": images[:1]}, {"k0": images}, np.arange(3) / 30
-    )
+    depth_rig.write_depth_rig(folder, {"k0": (LENS, POSE)}, {"k0": images[:1]}, {"k0": images}, np.arange(3) / 30)
 
 
 def _cues(path: Path) -> None:
     times = torch.arange(5, dtype=torch.float64) / 30
-    keypoints_csv.write_keypoints(
-        {"left_wrist": Cue(times, "left_wrist", torch.rand(5, 3), torch.ones(5))}, path
-    )
+    keypoints_csv.write_keypoints({"left_wrist": Cue(times, "left_wrist", torch.rand(5, 3), torch.ones(5))}, path)
 
 
 def _mocap_every(folder: Path) -> None:
@@ -264,7 +266,13 @@ def _mocap_every(folder: Path) -> None:
 
 
 def _nymeria(path: Path) -> None:
-    np.savez(path, timestamps=np.arange(9) / 30, global_orient=np.zeros((9, 3)), body_pose=np.zeros((9, 69)), transl=np.zeros((9, 3)))  # fmt: skip
+    np.savez(
+        path,
+        timestamps=np.arange(9) / 30,
+        global_orient=np.zeros((9, 3)),
+        body_pose=np.zeros((9, 69)),
+        transl=np.zeros((9, 3)),
+    )
 
 
 def _amass(path: Path) -> None:
@@ -274,73 +282,130 @@ def _amass(path: Path) -> None:
 CLOCK = contact_labels.LabelClock.of("flat_1", torch.arange(600, dtype=torch.float64) / 60)
 HCONTACT_JSON = json.dumps(hoi_files.smpl_content(hoi_files.motion(4)))
 LENSES = {"cam0": ocam_files.lens(0.2), "cam1": ocam_files.lens(0.2)}
-PICKLED = pickle.dumps(
-    {"a": [1, 2.5, "x", (None, True)], "b": np.arange(12.0).reshape(3, 4), "c": np.float32(2)}
-)
+PICKLED = pickle.dumps({"a": [1, 2.5, "x", (None, True)], "b": np.arange(12.0).reshape(3, 4), "c": np.float32(2)})
 
 READERS: dict[str, Reader] = {
     "adt_skeleton": _made("s.json", test_adt.skeleton_file, adt.read_skeleton),
     "adt_objects": Reader(_adt_objects, adt.read_objects),
     "amass": _made("a.npz", _amass, amass.read_amass),
-    "aria_closed_loop": _made("a.csv", lambda path: test_aria_mps.write(path, test_aria_mps.rows(12)), aria_mps.read_closed_loop),
+    "aria_closed_loop": _made(
+        "a.csv", lambda path: test_aria_mps.write(path, test_aria_mps.rows(12)), aria_mps.read_closed_loop
+    ),
     "aria_points": _one("a.csv.gz", gzip.compress(POINTS.encode()), aria_mps.read_points),
     "aria_mps": Reader(_mps, aria_mps.read_mps),
     "asf": _one("a.asf", test_asf_amc.ASF, asf_amc.read_asf),
-    "amc": Reader(lambda folder: test_asf_amc.write(folder, amc=test_asf_amc.amc_text(4)),
-                  lambda folder: asf_amc.read_amc(asf_amc.read_asf(next(folder.glob("*.asf"))), next(folder.glob("*.amc")))),
-    "behave": Reader(lambda folder: one_object_files.write_behave(folder, body={"gender": None}),
-                     lambda folder: behave.read_behave(folder, one_object_files.BEHAVE_NAME)),
+    "amc": Reader(
+        lambda folder: test_asf_amc.write(folder, amc=test_asf_amc.amc_text(4)),
+        lambda folder: asf_amc.read_amc(asf_amc.read_asf(next(folder.glob("*.asf"))), next(folder.glob("*.amc"))),
+    ),
+    "behave": Reader(
+        lambda folder: one_object_files.write_behave(folder, body={"gender": None}),
+        lambda folder: behave.read_behave(folder, one_object_files.BEHAVE_NAME),
+    ),
     "behave_mesh": Reader(one_object_files.write_behave, lambda folder: behave.read_behave_mesh(folder, "boxlarge")),
     "bvh": _made("a.bvh", lambda path: bvh.write_bvh(swaying_motion(4), path), bvh.read_bvh),
     "camera_json": _made("c.json", lambda path: camera_json.write_camera(LENS, path), camera_json.read_camera),
     "colmap_text": Reader(test_colmap.write_text_model, colmap.read_colmap),
     "colmap_binary": Reader(test_colmap.write_binary_model, colmap.read_colmap),
-    "contact_labels": _one("c.json", json.dumps(CONTACTS), lambda path: contact_labels.read_contact_labels(path, CLOCK)),
-    "csv_table": _one("a.csv", "a,b,n\n1,x,3\n2.5,y,4\n", lambda path: csv_table.read_columns(path, ["a"], text=["b"], whole=["n"])),
+    "contact_labels": _one(
+        "c.json", json.dumps(CONTACTS), lambda path: contact_labels.read_contact_labels(path, CLOCK)
+    ),
+    "csv_table": _one(
+        "a.csv", "a,b,n\n1,x,3\n2.5,y,4\n", lambda path: csv_table.read_columns(path, ["a"], text=["b"], whole=["n"])
+    ),
     "depth_rig": Reader(_depth_rig, depth_rig.read_depth_rig),
-    "depth_image": _made("d.png", lambda path: depth_rig.write_depth(path, np.full((12, 16), 2000, np.uint16)),
-                         lambda path: depth_rig.read_depth(path, LENS)),
+    "depth_image": _made(
+        "d.png",
+        lambda path: depth_rig.write_depth(path, np.full((12, 16), 2000, np.uint16)),
+        lambda path: depth_rig.read_depth(path, LENS),
+    ),
     "droid": Reader(test_droid.reconstruction, lambda folder: droid.read_droid(folder, 10.0)),
-    "egohoi": Reader(lambda folder: test_egohoi.write_set(folder, FRAMES), lambda folder: egohoi.read_egohoi(folder, test_egohoi.ONE)),
+    "egohoi": Reader(
+        lambda folder: test_egohoi.write_set(folder, FRAMES), lambda folder: egohoi.read_egohoi(folder, test_egohoi.ONE)
+    ),
     "egohoi_locations": _one("l.json", json.dumps(test_egohoi.SLID), egohoi.read_object_locations),
-    "egohoi_npz": _made("o.npz", lambda path: np.savez(path, translations=np.zeros((4, 3)), timestamps=np.arange(4.0),
-                                                       quaternions=np.tile([1.0, 0, 0, 0], (4, 1))), egohoi.read_object_npz),
+    "egohoi_npz": _made(
+        "o.npz",
+        lambda path: np.savez(
+            path, translations=np.zeros((4, 3)), timestamps=np.arange(4.0), quaternions=np.tile([1.0, 0, 0, 0], (4, 1))
+        ),
+        egohoi.read_object_npz,
+    ),
     "environment": Reader(_environment, environment.read_environment),
     "euroc": _one("e.csv", EUROC, euroc.read_euroc),
-    "hcontact": Reader(lambda folder: test_hcontact.write_set(folder, frames=FRAMES), lambda folder: hcontact.read_hcontact(folder, test_hcontact.DOOR)),
-    "hcontact_split": _one("s.json", json.dumps({"window_radius": 30, "train": [31, 99], "valid": [], "test": [150]}), hcontact.read_hcontact_split),
+    "hcontact": Reader(
+        lambda folder: test_hcontact.write_set(folder, frames=FRAMES),
+        lambda folder: hcontact.read_hcontact(folder, test_hcontact.DOOR),
+    ),
+    "hcontact_split": _one(
+        "s.json",
+        json.dumps({"window_radius": 30, "train": [31, 99], "valid": [], "test": [150]}),
+        hcontact.read_hcontact_split,
+    ),
     "hps_motion": _made("m.pkl", lambda path: hps_files.write_smpl(hps_files.motion(4), path), hps.read_hps_motion),
-    "hps_subject": _one("s.json", json.dumps({"betas": [0.1] * 10, "gender": "male", "root_to_heel": 0.93}), hps.read_hps_subject),
+    "hps_subject": _one(
+        "s.json", json.dumps({"betas": [0.1] * 10, "gender": "male", "root_to_heel": 0.93}), hps.read_hps_subject
+    ),
     "hps_starts": _one("s.json", json.dumps({"cam_start": 3, "imu_start": 4}), hps.read_hps_starts),
-    "hps_localization": _made("l.json", lambda path: hps_files.write_localization(hps_files.motion(20), path, 3, (4,)), hps.read_hps_localization),
+    "hps_localization": _made(
+        "l.json",
+        lambda path: hps_files.write_localization(hps_files.motion(20), path, 3, (4,)),
+        hps.read_hps_localization,
+    ),
     "hps_cameras": _one("c.json", json.dumps(hps_files.CAMERA), hps.read_hps_cameras),
     "hps_scene": Reader(hps_files.write_scan, hps_scene.read_hps_scene),
-    "hps_sequence": Reader(lambda folder: hps_files.write_hps(folder, frames=FRAMES), lambda folder: hps_sequence.read_hps_sequence(folder, hps_files.NAME)),
-    "hps_unity": Reader(lambda folder: hps_files.write_unity(hps_files.motion(4), folder, "u"),
-                        lambda folder: hps_unity.read_unity_motion(folder / "u_pose.txt", folder / "u_trans.txt")),
+    "hps_sequence": Reader(
+        lambda folder: hps_files.write_hps(folder, frames=FRAMES),
+        lambda folder: hps_sequence.read_hps_sequence(folder, hps_files.NAME),
+    ),
+    "hps_unity": Reader(
+        lambda folder: hps_files.write_unity(hps_files.motion(4), folder, "u"),
+        lambda folder: hps_unity.read_unity_motion(folder / "u_pose.txt", folder / "u_trans.txt"),
+    ),
     "json_text": _one("a.json", '{"a": [1, 2.5, null], "b": {"c": "x"}}', json_text.read_json_object),
     "keypoints_csv": _made("k.csv", _cues, keypoints_csv.read_keypoints),
     "mocap_every": Reader(_mocap_every, mocap_every_folder.read_mocap_every_folder),
     "motion_npz": _made("m.npz", lambda path: motion_npz.write_motion(swaying_motion(4), path), motion_npz.read_motion),
     "mvnx": _one("m.mvnx", test_mvnx.mvnx(test_mvnx.sample(2)), mvnx.read_mvnx),
-    "mvnx_packed": _one("m.mvnx.xz", lzma.compress(test_mvnx.mvnx(test_mvnx.sample(2)).encode(), preset=0), mvnx.read_mvnx),
-    "npy": _made("a.npy", lambda path: np.save(path, np.arange(12.0).reshape(3, 4)), lambda path: npz.map_npy(path).sum()),
-    "npz": _made("a.npz", lambda path: np.savez_compressed(path, a=np.arange(12.0), b=np.array("text"), c=np.asfortranarray(np.eye(3))), npz.read_npz),
+    "mvnx_packed": _one(
+        "m.mvnx.xz", lzma.compress(test_mvnx.mvnx(test_mvnx.sample(2)).encode(), preset=0), mvnx.read_mvnx
+    ),
+    "npy": _made(
+        "a.npy", lambda path: np.save(path, np.arange(12.0).reshape(3, 4)), lambda path: npz.map_npy(path).sum()
+    ),
+    "npz": _made(
+        "a.npz",
+        lambda path: np.savez_compressed(path, a=np.arange(12.0), b=np.array("text"), c=np.asfortranarray(np.eye(3))),
+        npz.read_npz,
+    ),
     "nymeria_xdata": _made("x.npz", _xdata, nymeria.read_xdata),
     "nymeria_smpl": _made("x.npz", _nymeria, nymeria.read_smpl_neutral),
-    "nymeria_metadata": Reader(lambda folder: (folder / "metadata.json").write_text('{"fake_name": "a", "participant_height_cm": 160}'),
-                               nymeria.read_metadata),
-    "ocamcalib": _one("c.txt", ocam_files.text_of(LENSES["cam0"]), lambda path: ocamcalib.read_ocamcalib(path).camera()),
-    "sensor_frame": _one("s.xml", ocam_files.xml_of(LENSES),
-                         lambda path: [model.camera() for model in ocamcalib.read_sensor_frame(path).values()]),
+    "nymeria_metadata": Reader(
+        lambda folder: (folder / "metadata.json").write_text('{"fake_name": "a", "participant_height_cm": 160}'),
+        nymeria.read_metadata,
+    ),
+    "ocamcalib": _one(
+        "c.txt", ocam_files.text_of(LENSES["cam0"]), lambda path: ocamcalib.read_ocamcalib(path).camera()
+    ),
+    "sensor_frame": _one(
+        "s.xml",
+        ocam_files.xml_of(LENSES),
+        lambda path: [model.camera() for model in ocamcalib.read_sensor_frame(path).values()],
+    ),
     "omomo": Reader(_joblib, lambda folder: [omomo.omomo_take(one, folder, 30.0) for one in omomo.read_omomo(folder)]),
     "pcd_ascii": _one("a.pcd", PCD + "ascii\n0 0 0 1\n1 2 3 4\n2 3 4 5\nnan nan nan 0\n", pcd.read_pcd),
     "pcd_binary": _one("a.pcd", (PCD + "binary\n").encode() + bytes(64), pcd.read_pcd),
     "pcd_compressed": _one("a.pcd", _compressed_pcd(), pcd.read_pcd),
-    "photos": Reader(lambda folder: photos.write_photos([Photo(Path("a.png"), LENS, POSE)], folder), photos.read_photos),
+    "photos": Reader(
+        lambda folder: photos.write_photos([Photo(Path("a.png"), LENS, POSE)], folder), photos.read_photos
+    ),
     "pictures": Reader(_pictures, lambda folder: list(pictures.read_pictures(folder, 2))),
     "ply_ascii": _one("a.ply", ASCII_PLY, ply.read_ply),
-    "ply_even": _made("a.ply", lambda path: ply.write_ply(ply.Ply(_points(), None, np.array([[0, 1, 2]] * 4, np.int32)), path), ply.read_ply),
+    "ply_even": _made(
+        "a.ply",
+        lambda path: ply.write_ply(ply.Ply(_points(), None, np.array([[0, 1, 2]] * 4, np.int32)), path),
+        ply.read_ply,
+    ),
     "ply_little": _one("a.ply", _uneven_ply("little"), ply.read_ply),
     "ply_big": _one("a.ply", _uneven_ply("big"), ply.read_ply),
     "pickle": _one("a.pkl", PICKLED, restricted_pickle.read_pickle),
@@ -350,12 +415,32 @@ READERS: dict[str, Reader] = {
     "scene_folder": Reader(hps_files.write_scan, scene_folder.read_scene),
     "smpl_files": _made("m.npz", _smpl, smpl_files.read_smpl),
     "smpl_json": _one("m.json", HCONTACT_JSON, smpl_json.read_smpl_json),
-    "smpl_json_zip": _made("m.json.zip", lambda path: hoi_files.write_zip(HCONTACT_JSON, path), smpl_json.read_smpl_json),
-    "text": _one("a.txt.gz", gzip.compress(b"some words\nof text\n"), lambda path: (text.read_text(path), list(text.numbered_lines(path)))),
-    "totalcapture_pickle": _made("t.pkl", lambda path: test_totalcapture.write(path, test_totalcapture.recorded(frames=12)), totalcapture.read_totalcapture),
-    "totalcapture_npz": _made("t.npz", lambda path: test_totalcapture.write(path, test_totalcapture.recorded(frames=12)), totalcapture.read_totalcapture),
-    "totalcapture_torch": _made("t.pt", lambda path: test_totalcapture.write(path, test_totalcapture.recorded(frames=12)), totalcapture.read_totalcapture),
-    "dip_imu": _made("t.pkl", lambda path: test_totalcapture.write(path, test_totalcapture.dip(12)), totalcapture.read_dip_imu),
+    "smpl_json_zip": _made(
+        "m.json.zip", lambda path: hoi_files.write_zip(HCONTACT_JSON, path), smpl_json.read_smpl_json
+    ),
+    "text": _one(
+        "a.txt.gz",
+        gzip.compress(b"some words\nof text\n"),
+        lambda path: (text.read_text(path), list(text.numbered_lines(path))),
+    ),
+    "totalcapture_pickle": _made(
+        "t.pkl",
+        lambda path: test_totalcapture.write(path, test_totalcapture.recorded(frames=12)),
+        totalcapture.read_totalcapture,
+    ),
+    "totalcapture_npz": _made(
+        "t.npz",
+        lambda path: test_totalcapture.write(path, test_totalcapture.recorded(frames=12)),
+        totalcapture.read_totalcapture,
+    ),
+    "totalcapture_torch": _made(
+        "t.pt",
+        lambda path: test_totalcapture.write(path, test_totalcapture.recorded(frames=12)),
+        totalcapture.read_totalcapture,
+    ),
+    "dip_imu": _made(
+        "t.pkl", lambda path: test_totalcapture.write(path, test_totalcapture.dip(12)), totalcapture.read_dip_imu
+    ),
     "tum": _one("t.txt", TUM, tum.read_tum),
     "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode()), tum.read_tum),
     "tum_xz": _one("t.txt.xz", lzma.compress(TUM.encode()), tum.read_tum),
@@ -363,8 +448,16 @@ READERS: dict[str, Reader] = {
     "video_frames": _made("a.mp4", _video, lambda path: list(video.read_frames(path))),
     "video_info": _made("a.mp4", _video, video.video_info),
     "watch_calibration": _made("w.json", _watch_calibration, watch_calibration_json.read_watch_calibration),
-    "watch_log_logger": _made("w.csv", lambda path: test_watch_log.sensor_logger(test_watch_log.moved(20), path), lambda path: watch_log.read_watch_log(path, "left_wrist")),
-    "watch_log_log": _made("w.csv", lambda path: test_watch_log.sensor_log(test_watch_log.moved(20), path), lambda path: watch_log.read_watch_log(path, "left_wrist")),
+    "watch_log_logger": _made(
+        "w.csv",
+        lambda path: test_watch_log.sensor_logger(test_watch_log.moved(20), path),
+        lambda path: watch_log.read_watch_log(path, "left_wrist"),
+    ),
+    "watch_log_log": _made(
+        "w.csv",
+        lambda path: test_watch_log.sensor_log(test_watch_log.moved(20), path),
+        lambda path: watch_log.read_watch_log(path, "left_wrist"),
+    ),
     "wavefront": _one("a.obj", one_object_files.obj_text(), wavefront.read_obj),
-}  # fmt: skip
+}
 """Readers by name. Aria's VRS recordings are left out: they are read by projectaria-tools."""

@@ -11,12 +11,49 @@ import zlib
 from collections.abc import Callable
 
 NUMBER = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
-VALUES = [b"0", b"-1", b"1", b"1e308", b"-1e308", b"nan", b"inf", b"-inf", b"2147483648", b"9223372036854775808",
-          b"1000000000000", b"1e-320", b"0.5", b"9" * 400, b"", b"null", b'"a"', b"[]", b"{}", b"true"]  # fmt: skip
+VALUES = [
+    b"0",
+    b"-1",
+    b"1",
+    b"1e308",
+    b"-1e308",
+    b"nan",
+    b"inf",
+    b"-inf",
+    b"2147483648",
+    b"9223372036854775808",
+    b"1000000000000",
+    b"1e-320",
+    b"0.5",
+    b"9" * 400,
+    b"",
+    b"null",
+    b'"a"',
+    b"[]",
+    b"{}",
+    b"true",
+]
 WHOLE = [0, 1, -1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 10**12, 255, 65536]
 FLOATS = [float("nan"), float("inf"), 1e308, -1.0, 0.0, 1e-320]
-JUNK = [b"\0", b"\xff\xfe", b"{", b"}", b"[" * 100_000, b'{"a":' * 100_000, b"<a>" * 20_000, b"A" * 200_000, b"- " * 3000,
-        b"&a;", b"\n", b",", b'"', b"#", b"(" * 5000, b"end\n", b" 7" * 5000]  # fmt: skip
+JUNK = [
+    b"\0",
+    b"\xff\xfe",
+    b"{",
+    b"}",
+    b"[" * 100_000,
+    b'{"a":' * 100_000,
+    b"<a>" * 20_000,
+    b"A" * 200_000,
+    b"- " * 3000,
+    b"&a;",
+    b"\n",
+    b",",
+    b'"',
+    b"#",
+    b"(" * 5000,
+    b"end\n",
+    b" 7" * 5000,
+]
 
 
 def mutated(content: bytes, other: bytes, seed: random.Random) -> bytes:
@@ -140,4 +177,4 @@ def _splice(content: bytes, other: bytes, seed: random.Random) -> bytes:
     return content[: _place(content, seed)] + other[_place(other, seed) :]
 
 
-_ALL = (_flip, _run, _cut, _drop, _again, _junk, _whole, _number, _number, _number, _parts(b"\n"), _parts(b" ,:<"))  # fmt: skip
+_ALL = (_flip, _run, _cut, _drop, _again, _junk, _whole, _number, _number, _number, _parts(b"\n"), _parts(b" ,:<"))

@@ -58,8 +58,7 @@ def outcome(read, folder: Path) -> str:
     except WearcapError as error:
         # FFmpeg calls it lack of memory when a header asks for more than it ever reserves.
         lacking = any(
-            isinstance(cause, MemoryError) and not isinstance(cause, av.FFmpegError)
-            for cause in _causes(error)
+            isinstance(cause, MemoryError) and not isinstance(cause, av.FFmpegError) for cause in _causes(error)
         )
         return "memory" if lacking else "refused"
     except MemoryError:
@@ -182,9 +181,7 @@ def block(name: str, seed: int, first: int, last: int, kept: Path) -> tuple[Coun
     return counts, peak
 
 
-def fuzz(
-    name: str, inputs: int, seed: int, kept: Path, stop_s: float = float("inf"), jobs: int = 1, step=None
-) -> dict:
+def fuzz(name: str, inputs: int, seed: int, kept: Path, stop_s: float = float("inf"), jobs: int = 1, step=None) -> dict:
     """Outcomes of `inputs` damaged files, or as many as are read until the clock `stop_s`."""
     begin, counts, peak = time.monotonic(), Counter(), 0.0
     for found, used in _blocks(name, inputs, seed, kept, stop_s, jobs):
@@ -193,10 +190,16 @@ def fuzz(
             step(found.total())
     others = {key: n for key, n in sorted(counts.items()) if key not in ("fine", "refused", "slow", "memory")}
     return {
-        "reader": name, "inputs": counts.total(), "fine": counts["fine"], "refused": counts["refused"],
-        "slow": counts["slow"], "memory": counts["memory"], "others": others, "peak_mib": round(peak),
+        "reader": name,
+        "inputs": counts.total(),
+        "fine": counts["fine"],
+        "refused": counts["refused"],
+        "slow": counts["slow"],
+        "memory": counts["memory"],
+        "others": others,
+        "peak_mib": round(peak),
         "seconds": round(time.monotonic() - begin, 1),
-    }  # fmt: skip
+    }
 
 
 def _blocks(
@@ -219,9 +222,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Fuzz the named readers; 1 when one of them failed."""
     words = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=words)
-    parser.add_argument(
-        "readers", nargs="*", metavar="READER", help=f"of {', '.join(READERS)} (default: all)"
-    )
+    parser.add_argument("readers", nargs="*", metavar="READER", help=f"of {', '.join(READERS)} (default: all)")
     parser.add_argument("--inputs", type=int, default=100_000, help="for each reader (default: 100000)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=float("inf"), help="for each reader at most")
@@ -240,14 +241,31 @@ def main(arguments: list[str] | None = None) -> int:
         for name in names:
             progress.update(task, description=name)
             stop_s = time.monotonic() + options.seconds
-            rows.append(fuzz(name, options.inputs, options.seed, options.output, stop_s, options.jobs,
-                             lambda count: progress.advance(task, count)))  # fmt: skip
+            rows.append(
+                fuzz(
+                    name,
+                    options.inputs,
+                    options.seed,
+                    options.output,
+                    stop_s,
+                    options.jobs,
+                    lambda count: progress.advance(task, count),
+                )
+            )
             print(json.dumps(rows[-1]), flush=True)
     sums = {key: sum(row[key] for row in rows) for key in ("inputs", "fine", "refused", "slow", "memory")}
     others = sum((Counter(row["others"]) for row in rows), Counter())
-    print(json.dumps({"reader": "total", "readers": len(rows)} | sums | {
-        "others": dict(others), "peak_mib": max(row["peak_mib"] for row in rows), "seconds": round(time.monotonic() - begin, 1),
-    }))  # fmt: skip
+    print(
+        json.dumps(
+            {"reader": "total", "readers": len(rows)}
+            | sums
+            | {
+                "others": dict(others),
+                "peak_mib": max(row["peak_mib"] for row in rows),
+                "seconds": round(time.monotonic() - begin, 1),
+            }
+        )
+    )
     return int(any(map(failed, rows)))
 
 

@@ -17,10 +17,15 @@ from wearcap.recording import Recording
 FPS = 30
 WINDOW = 2 * FPS
 HOP = FPS
-JOINTS = ("pelvis", "head", *(
-    f"{side}_{name}" for side in ("left", "right")
-    for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
-))  # fmt: skip
+JOINTS = (
+    "pelvis",
+    "head",
+    *(
+        f"{side}_{name}"
+        for side in ("left", "right")
+        for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
+    ),
+)
 
 
 @dataclass(frozen=True)
@@ -75,10 +80,7 @@ def is_walking(clip: Clip) -> Bool[Tensor, "window"]:
     slowest = step.norm(dim=-1).amin(1) * FPS
     middle = pelvis[:, WINDOW // 2, :2]
     turned = _between(
-        *(
-            torch.nn.functional.pad(half, (0, 1))
-            for half in (middle - pelvis[:, 0, :2], pelvis[:, -1, :2] - middle)
-        )
+        *(torch.nn.functional.pad(half, (0, 1)) for half in (middle - pelvis[:, 0, :2], pelvis[:, -1, :2] - middle))
     )
     straight = (net > 0.97 * arc) & (turned.rad2deg() < 4)
     return (speed > 0.6) & (speed < 1.9) & straight & (height < 0.12) & (slowest > 0.3)
@@ -89,9 +91,7 @@ def statistics(clip: Clip) -> dict[str, Float[Tensor, "window"]]:
     chosen = is_walking(clip)
     joint = {name: windows_of(value)[chosen] for name, value in clip.joints.items()}
     pelvis = joint["pelvis"]
-    forward = torch.nn.functional.normalize(
-        (pelvis[:, -1] - pelvis[:, 0]) * torch.tensor([1.0, 1.0, 0.0]), dim=-1
-    )
+    forward = torch.nn.functional.normalize((pelvis[:, -1] - pelvis[:, 0]) * torch.tensor([1.0, 1.0, 0.0]), dim=-1)
     left = torch.stack([-forward[:, 1], forward[:, 0], 0 * forward[:, 0]], -1)
     along = lambda value, axis: (value * axis[:, None]).sum(-1)  # noqa: E731
     speed = along(pelvis[:, -1:] - pelvis[:, :1], forward)[:, 0] * FPS / (WINDOW - 1)
@@ -110,7 +110,7 @@ def statistics(clip: Clip) -> dict[str, Float[Tensor, "window"]]:
         "head_yaw_spread_deg": _yaw_spread(R_head),
         "head_jerk_m_s3": jerk(joint["head"]),
         "pelvis_jerk_m_s3": jerk(pelvis),
-    }  # fmt: skip
+    }
     for name in ("wrist", "ankle"):
         found[f"{name}_jerk_m_s3"] = 0.5 * (jerk(joint[f"left_{name}"]) + jerk(joint[f"right_{name}"]))
     for name, angles in _limb_angles(joint, along, forward).items():
@@ -118,16 +118,14 @@ def statistics(clip: Clip) -> dict[str, Float[Tensor, "window"]]:
     return found
 
 
-def _limb_angles(
-    joint: dict[str, Tensor], along, forward: Tensor
-) -> dict[str, Float[Tensor, "side window frame"]]:
+def _limb_angles(joint: dict[str, Tensor], along, forward: Tensor) -> dict[str, Float[Tensor, "side window frame"]]:
     """Thigh and upper arm against the vertical in the plane of walking; knee, ankle and elbow between bones."""
-    bones = {
-        "hip": ("hip", "knee"), "shoulder": ("shoulder", "elbow"),
-    }  # fmt: skip
+    bones = {"hip": ("hip", "knee"), "shoulder": ("shoulder", "elbow")}
     hinges = {
-        "knee": ("hip", "knee", "ankle"), "ankle": ("knee", "ankle", "toe"), "elbow": ("shoulder", "elbow", "wrist"),
-    }  # fmt: skip
+        "knee": ("hip", "knee", "ankle"),
+        "ankle": ("knee", "ankle", "toe"),
+        "elbow": ("shoulder", "elbow", "wrist"),
+    }
     found: dict[str, list[Tensor]] = {name: [] for name in (*bones, *hinges)}
     for side in ("left", "right"):
         at = lambda name, side=side: joint[f"{side}_{name}"]  # noqa: E731

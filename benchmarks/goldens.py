@@ -48,31 +48,53 @@ Arrays = dict[str, np.ndarray]
 
 DATA = {
     "walkers": ("simulated", "recordings={train: 2, val: 1, test: 1}", "duration_s=10", "camera=true"),
-    "hps": ("simulated_hps", "recordings={test: 1}", "spacing_m=0.05", "photo_m=0", "video_s=0", "returns_m=[8,16]",
-            "end_m=24"),
+    "hps": (
+        "simulated_hps",
+        "recordings={test: 1}",
+        "spacing_m=0.05",
+        "photo_m=0",
+        "video_s=0",
+        "returns_m=[8,16]",
+        "end_m=24",
+    ),
     "flats": ("simulated_interactions", "recordings={train: 1, val: 1, test: 1}", "minutes=0.5", "spacing_m=0.05"),
     "objects": ("simulated_objects", "recordings={train: 1, val: 1, test: 1}", "minutes=0.3"),
     "embedded": ("embeddings", "dataset=data/walkers", "encoder=egoview"),
     "keyed": ("keypoints", "dataset=data/walkers", "detector=simulated"),
-}  # fmt: skip
+}
 """Data sets by name: what `wearcap prepare` is asked for."""
 
 SHARED = "pipeline.synchronization.clock=shared"
 HMD2, WATCHES, ECHO = ("hmd2", "walkers"), ("mocap_every", "keyed"), ("echo", "objects")
 CAPTURES: dict[str, tuple[str | None, str, tuple[str, ...]]] = {
-    "hmd2": (*HMD2, ()), "hmd2_paper": (*HMD2, ()), "hmd2_mean": (*HMD2, ()), "hmd2_online": (*HMD2, ()),
+    "hmd2": (*HMD2, ()),
+    "hmd2_paper": (*HMD2, ()),
+    "hmd2_mean": (*HMD2, ()),
+    "hmd2_online": (*HMD2, ()),
     "egoego_style": (*HMD2, ("pipeline.steps=4",)),
-    "mocap_every": (*WATCHES, ()), "mocap_every_paper": (*WATCHES, ()), "mocap_every_cues": (*WATCHES, ()),
+    "mocap_every": (*WATCHES, ()),
+    "mocap_every_paper": (*WATCHES, ()),
+    "mocap_every_cues": (*WATCHES, ()),
     "mocap_every_online": (*WATCHES, ()),
-    "echo": (*ECHO, ()), "echo_paper": (*ECHO, ()), "echo_online": (*ECHO, ("pipeline.runtime=eager",)),
-    "echo_rewindow": (*ECHO, ("pipeline.per_frame=1",)), "echo_search": (*ECHO, ()), "bodiffusion_object": (*ECHO, ()),
-    "hps": (None, "hps", (SHARED,)), "hps_paper": (None, "hps", (SHARED,)), "hps_paper_adam": (None, "hps", (SHARED, "pipeline.solver.settings.steps=4")),
-    "hps_without_scene": (None, "hps", (SHARED,)), "hps_imu": (None, "hps", (SHARED,)), "hps_imu_cam": (None, "hps", (SHARED,)),
-    "hps_imu_cam_filtered": (None, "hps", (SHARED,)), "bent_suit": (None, "hps", (SHARED,)),
-    "ireplica": ("contact_sequence", "flats", ()), "ireplica_without_correction": ("contact_sequence", "flats", ()),
+    "echo": (*ECHO, ()),
+    "echo_paper": (*ECHO, ()),
+    "echo_online": (*ECHO, ("pipeline.runtime=eager",)),
+    "echo_rewindow": (*ECHO, ("pipeline.per_frame=1",)),
+    "echo_search": (*ECHO, ()),
+    "bodiffusion_object": (*ECHO, ()),
+    "hps": (None, "hps", (SHARED,)),
+    "hps_paper": (None, "hps", (SHARED,)),
+    "hps_paper_adam": (None, "hps", (SHARED, "pipeline.solver.settings.steps=4")),
+    "hps_without_scene": (None, "hps", (SHARED,)),
+    "hps_imu": (None, "hps", (SHARED,)),
+    "hps_imu_cam": (None, "hps", (SHARED,)),
+    "hps_imu_cam_filtered": (None, "hps", (SHARED,)),
+    "bent_suit": (None, "hps", (SHARED,)),
+    "ireplica": ("contact_sequence", "flats", ()),
+    "ireplica_without_correction": ("contact_sequence", "flats", ()),
     "ireplica_paper": ("[contact_transformer_sliding,contact_transformer_hinged]", "flats", ()),
     "pose_regressor": ("runs/pose_regressor_hands/checkpoints/last.ckpt", "walkers", ()),
-}  # fmt: skip
+}
 """Pipelines with their checkpoint, data set, and overrides that keep them short."""
 
 QUIET = "callbacks.capture=null"
@@ -106,8 +128,12 @@ EVALUATIONS = {
     "echo": ("checkpoint=echo", "pipeline=echo", "dataset=data/objects", "seeds=[0]"),
     "hps": ("pipeline=hps", "dataset=data/hps", "seeds=[0]", SHARED),
     "ireplica": ("pipeline=ireplica", "checkpoint=contact_sequence", "dataset=data/flats", "seeds=[0]"),
-    "pose_regressor": ("checkpoint=runs/pose_regressor_hands/checkpoints/last.ckpt", "pipeline=pose_regressor", "seeds=[0]"),
-}  # fmt: skip
+    "pose_regressor": (
+        "checkpoint=runs/pose_regressor_hands/checkpoints/last.ckpt",
+        "pipeline=pose_regressor",
+        "seeds=[0]",
+    ),
+}
 EXPORTS = {"hmd2": "hmd2", "mocap_every": "mocap_every", "echo": "echo", "contact_sequence": "hmd2"}
 """Checkpoints with the pipeline that they are exported for."""
 
@@ -128,8 +154,11 @@ def prepared(name: str) -> Arrays:
         settings = [f"output=data/{name}", *settings]
     prepare.main([kind, "jobs=1", *settings])
     folder = Path("data", "walkers" if name == "embedded" else name)
-    return {f"{path.stem}/{key}": value.numpy() for path in sorted(folder.glob("recordings/*.safetensors"))
-            for key, value in load_file(path).items()}  # fmt: skip
+    return {
+        f"{path.stem}/{key}": value.numpy()
+        for path in sorted(folder.glob("recordings/*.safetensors"))
+        for key, value in load_file(path).items()
+    }
 
 
 def arrays_of(motion: Motion) -> Arrays:
@@ -140,19 +169,41 @@ def captured(name: str) -> Arrays:
     checkpoint, dataset, settings = CAPTURES[name]
     given = [] if checkpoint is None else [f"checkpoint={checkpoint}"]
     output = Path("captures", name)
-    capture.main([f"pipeline={name}", f"recording={recording_of(dataset)}", f"output={output}", "video=false",
-                  "body=false", f"hydra.run.dir={output}", *given, *settings])  # fmt: skip
+    capture.main(
+        [
+            f"pipeline={name}",
+            f"recording={recording_of(dataset)}",
+            f"output={output}",
+            "video=false",
+            "body=false",
+            f"hydra.run.dir={output}",
+            *given,
+            *settings,
+        ]
+    )
     return arrays_of(read_motion(output / "motion.npz"))
 
 
 def trained(name: str) -> Arrays:
     output = Path("runs", name)
     shutil.rmtree(output, ignore_errors=True)
-    train.main([f"experiment={name}", f"hydra.run.dir={output}", "trainer.max_steps=3", "data.steps_per_epoch=3",
-                "data.batch_size=4", "trainer.log_every_n_steps=1", *TRAININGS[name]])  # fmt: skip
+    train.main(
+        [
+            f"experiment={name}",
+            f"hydra.run.dir={output}",
+            "trainer.max_steps=3",
+            "data.steps_per_epoch=3",
+            "data.batch_size=4",
+            "trainer.log_every_n_steps=1",
+            *TRAININGS[name],
+        ]
+    )
     rows = read_metrics(output / "metrics.csv")
-    return {key: np.array([float(row[key]) for row in rows if row.get(key)]) for key in sorted({k for row in rows for k in row})
-            if "loss" in key}  # fmt: skip
+    return {
+        key: np.array([float(row[key]) for row in rows if row.get(key)])
+        for key in sorted({k for row in rows for k in row})
+        if "loss" in key
+    }
 
 
 def evaluated(name: str) -> Arrays:
@@ -181,7 +232,9 @@ def exported(name: str) -> Arrays:
     import onnxruntime
 
     output = Path("exports", name, "network.onnx")
-    export.main([f"checkpoint={name}", f"pipeline={EXPORTS[name]}", f"output={output}", f"hydra.run.dir={output.parent}"])  # fmt: skip
+    export.main(
+        [f"checkpoint={name}", f"pipeline={EXPORTS[name]}", f"output={output}", f"hydra.run.dir={output.parent}"]
+    )
     found, random = {}, np.random.default_rng(0)
     for path in sorted(output.parent.glob("*.onnx")):
         session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
@@ -190,10 +243,9 @@ def exported(name: str) -> Arrays:
         for item in sorted(session.get_inputs(), key=lambda item: item.name):
             shape = [size if isinstance(size, int) else sizes.setdefault(size, 2) for size in item.shape]
             drawn = random.random(shape, np.float32)
-            inputs[item.name] = {
-                "tensor(bool)": drawn > 0.3,
-                "tensor(int64)": (3 * drawn).astype(np.int64),
-            }.get(item.type, drawn)
+            inputs[item.name] = {"tensor(bool)": drawn > 0.3, "tensor(int64)": (3 * drawn).astype(np.int64)}.get(
+                item.type, drawn
+            )
         for item, value in zip(session.get_outputs(), session.run(None, inputs)):
             found[f"{path.stem}/{item.name}"] = np.asarray(value)
     return found
@@ -207,9 +259,7 @@ def _pipeline(name: str, dataset: str, *settings: str) -> tuple[Any, Recording, 
 
 
 def hmd2_streamed() -> Motion | None:
-    pipeline, recording, _ = _pipeline(
-        "hmd2_online", "walkers", "pipeline.runtime=eager", "pipeline.precision=float32"
-    )
+    pipeline, recording, _ = _pipeline("hmd2_online", "walkers", "pipeline.runtime=eager", "pipeline.precision=float32")
     head, points, camera = recording.head, recording.points, recording.camera
     assert head is not None
     assert points is not None
@@ -224,9 +274,7 @@ def hmd2_streamed() -> Motion | None:
             else (camera.timestamps > before) & (camera.timestamps <= now)
         )
         embedding = camera.embedding[shown][-1] if shown is not None and bool(shown.any()) else None
-        parts += session.push(
-            [[Sensed(now, head.T_world_device[number], points.points_world[new], embedding)]]
-        )
+        parts += session.push([[Sensed(now, head.T_world_device[number], points.points_world[new], embedding)]])
         before = now
         if number == len(head.timestamps) // 2:
             session.save("streams/hmd2.safetensors")
@@ -235,15 +283,11 @@ def hmd2_streamed() -> Motion | None:
 
 
 def mocap_every_streamed() -> Motion | None:
-    pipeline, recording, _ = _pipeline(
-        "mocap_every_online", "keyed", "pipeline.runtime=eager", "pipeline.int8=false"
-    )
+    pipeline, recording, _ = _pipeline("mocap_every_online", "keyed", "pipeline.runtime=eager", "pipeline.int8=false")
     head = recording.head
     assert head is not None
     mounts = {joint: stream.R_joint_imu for joint, stream in recording.imu.items() if "wrist" in joint}
-    session = MocapEverySession(
-        pipeline, Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts)
-    )
+    session = MocapEverySession(pipeline, Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts))
     parts, before = [], -np.inf
     for number, now in enumerate(head.timestamps.tolist()):
         session.head(now, head.T_world_device[number])
@@ -279,9 +323,7 @@ def echo_streamed() -> Motion | None:
 
 
 def hps_streamed() -> Motion | None:
-    pipeline, recording, place = _pipeline(
-        "hps_without_scene", "hps", "pipeline.synchronization.clock=shared"
-    )
+    pipeline, recording, place = _pipeline("hps_without_scene", "hps", "pipeline.synchronization.clock=shared")
     return joined(list(follow(pipeline, _pieces(recording, 4.0), None, Path(place).parent)))
 
 
@@ -294,17 +336,23 @@ def _pieces(recording: Recording, seconds: float) -> Iterator[Recording]:
     for start in np.arange(suit.timestamps[0].item(), suit.timestamps[-1].item(), seconds).tolist():
         first, stop = (int(torch.searchsorted(suit.timestamps, start + t)) for t in (0.0, seconds))
         here = (seen.timestamps >= start) & (seen.timestamps < start + seconds)
-        parts = {
-            name: getattr(seen, name)[here]
-            for name in ("timestamps", "R_world_cam", "t_world_cam", "confidence")
-        }
-        yield replace(recording, suit=suit.sliced(first, stop), localization=replace(seen, **parts), motion=None, contacts=None,
-                      camera=replace(camera, timestamps=seen.timestamps[here]))  # fmt: skip
+        parts = {name: getattr(seen, name)[here] for name in ("timestamps", "R_world_cam", "t_world_cam", "confidence")}
+        yield replace(
+            recording,
+            suit=suit.sliced(first, stop),
+            localization=replace(seen, **parts),
+            motion=None,
+            contacts=None,
+            camera=replace(camera, timestamps=seen.timestamps[here]),
+        )
 
 
 STREAMS: dict[str, Callable[[], Motion | None]] = {
-    "hmd2": hmd2_streamed, "mocap_every": mocap_every_streamed, "echo": echo_streamed, "hps": hps_streamed,
-}  # fmt: skip
+    "hmd2": hmd2_streamed,
+    "mocap_every": mocap_every_streamed,
+    "echo": echo_streamed,
+    "hps": hps_streamed,
+}
 
 
 def streamed(name: str) -> Arrays:
@@ -315,9 +363,13 @@ def streamed(name: str) -> Arrays:
 
 
 KINDS: dict[str, tuple[Callable[[str], Arrays], Any]] = {
-    "data": (prepared, DATA), "train": (trained, TRAININGS), "capture": (captured, CAPTURES), "stream": (streamed, STREAMS),
-    "evaluate": (evaluated, EVALUATIONS), "export": (exported, EXPORTS),
-}  # fmt: skip
+    "data": (prepared, DATA),
+    "train": (trained, TRAININGS),
+    "capture": (captured, CAPTURES),
+    "stream": (streamed, STREAMS),
+    "evaluate": (evaluated, EVALUATIONS),
+    "export": (exported, EXPORTS),
+}
 CASES = [f"{kind}/{name}" for kind, (_, names) in KINDS.items() for name in names]
 
 
@@ -326,11 +378,7 @@ def described(arrays: Arrays) -> dict[str, dict[str, Any]]:
     found = {}
     for key, array in sorted(arrays.items()):
         array = np.ascontiguousarray(array)
-        spread = (
-            np.unique(np.linspace(0, max(array.size - 1, 0), VALUES).round().astype(int))
-            if array.size
-            else []
-        )
+        spread = np.unique(np.linspace(0, max(array.size - 1, 0), VALUES).round().astype(int)) if array.size else []
         values = [float(f"{value:.8g}") for value in array.reshape(-1)[spread].astype(np.float64)]
         digest = hashlib.sha256(array.tobytes()).hexdigest()[:16]
         found[key] = {"shape": list(array.shape), "sha256": digest, "values": values}
@@ -355,9 +403,7 @@ def difference(found: dict[str, Any], golden: dict[str, Any]) -> tuple[str, floa
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="*", metavar="CASE", help="KIND/NAME or KIND (default: all)")
     parser.add_argument("--write", action="store_true", help="write the goldens of these cases anew")
     parser.add_argument("--list", action="store_true", help="name the cases and leave")
@@ -370,9 +416,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     if unknown := [name for name in options.cases if name not in CASES and name not in KINDS]:
         parser.error(f"no case {', '.join(unknown)}. `--list` names them.")
-    wanted = [
-        case for case in CASES if not options.cases or {case, case.partition("/")[0]} & set(options.cases)
-    ]
+    wanted = [case for case in CASES if not options.cases or {case, case.partition("/")[0]} & set(options.cases)]
     goldens_file = options.goldens.resolve()
     goldens = json.loads(goldens_file.read_text(encoding="utf-8")) if goldens_file.exists() else {}
     options.output.mkdir(parents=True, exist_ok=True)
@@ -396,13 +440,20 @@ def main(arguments: list[str] | None = None) -> int:
             )
             words, largest = "written", 0.0
         else:
-            words, largest = (
-                difference(found, goldens[case]) if case in goldens else ("no golden", float("inf"))
-            )
+            words, largest = difference(found, goldens[case]) if case in goldens else ("no golden", float("inf"))
         failed = largest > options.tolerance
         bad += failed
-        print(json.dumps({"case": case, "result": "differs" if failed and words == "close" else words, "largest": largest,
-                          "seconds": round(time.monotonic() - begin, 1)}), flush=True)  # fmt: skip
+        print(
+            json.dumps(
+                {
+                    "case": case,
+                    "result": "differs" if failed and words == "close" else words,
+                    "largest": largest,
+                    "seconds": round(time.monotonic() - begin, 1),
+                }
+            ),
+            flush=True,
+        )
     return int(bad > 0)
 
 

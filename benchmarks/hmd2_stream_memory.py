@@ -23,10 +23,21 @@ from wearcap.systems.hmd2.stream import Session, Wearer
 def measure(minutes: int = 60, settle: int = 10, max_points: int = 100_000) -> list[dict]:
     torch.manual_seed(0)
     features = HeadFeatures(contacts=True, body=True)
-    net = MotionDenoiser(features.motion_size, features.condition_size, 240, 32, 1, 2, 64, frames_per_token=4,
-                         points_size=VoxelAutoencoder().size, image_size=8)  # fmt: skip
-    pipeline = HMD2(net, features, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any",
-                    steps=1, stride=60, lookahead=0)  # fmt: skip
+    net = MotionDenoiser(
+        features.motion_size,
+        features.condition_size,
+        240,
+        32,
+        1,
+        2,
+        64,
+        frames_per_token=4,
+        points_size=VoxelAutoencoder().size,
+        image_size=8,
+    )
+    pipeline = HMD2(
+        net, features, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any", steps=1, stride=60, lookahead=0
+    )
     session = Session(pipeline, [Wearer(xsens23())], [0], Memory(max_points=max_points))
     walk, early, predicted = Walk(pipeline, new_points=10, forever=True), 0.0, 0
     for second in range(60 * minutes):
@@ -36,7 +47,16 @@ def measure(minutes: int = 60, settle: int = 10, max_points: int = 100_000) -> l
             early = _peak_mib()
     assert predicted == 3600 * minutes
     late = _peak_mib()
-    return [{"name": "hmd2_stream_memory", "value": late, "unit": "MiB", "baseline": early, "ratio": late / early, "goal": 1.05}]  # fmt: skip
+    return [
+        {
+            "name": "hmd2_stream_memory",
+            "value": late,
+            "unit": "MiB",
+            "baseline": early,
+            "ratio": late / early,
+            "goal": 1.05,
+        }
+    ]
 
 
 def _peak_mib() -> float:

@@ -29,10 +29,7 @@ def measure(batch: int = BATCH, steps: int = 30) -> list[dict]:
         return []
     peak = next((rate for name, rate in PEAK_TFLOPS.items() if name in torch.cuda.get_device_name()), None)
     if peak is None:
-        print(
-            f"hmd2_train_mfu: left out, the peak of {torch.cuda.get_device_name()} is not known",
-            file=sys.stderr,
-        )
+        print(f"hmd2_train_mfu: left out, the peak of {torch.cuda.get_device_name()} is not known", file=sys.stderr)
         return []
     windows = Window(*(part.cuda() for part in _windows(batch)))
     with FlopCounterMode(display=False) as counter:
@@ -46,7 +43,16 @@ def measure(batch: int = BATCH, steps: int = 30) -> list[dict]:
         training.step(windows)
     torch.cuda.synchronize()
     rate = counter.get_total_flops() * steps / (time.perf_counter() - begin) / 1e12
-    return [{"name": "hmd2_train_mfu", "value": rate, "unit": "TFLOP/s", "baseline": peak, "ratio": rate / peak, "goal": 0.25}]  # fmt: skip
+    return [
+        {
+            "name": "hmd2_train_mfu",
+            "value": rate,
+            "unit": "TFLOP/s",
+            "baseline": peak,
+            "ratio": rate / peak,
+            "goal": 0.25,
+        }
+    ]
 
 
 class _Training:
@@ -58,7 +64,7 @@ class _Training:
         places = VoxelAutoencoder()
         self.system: MotionDiffusion = instantiate(
             config.model, place_encoder=places, image_encoder="any", image_size=IMAGE, _convert_="all"
-        ).to(device)  # fmt: skip
+        ).to(device)
         self.system.train()
         self.optimizer = torch.optim.AdamW(self.system.net.parameters(), fused=device == "cuda")
 
@@ -76,10 +82,20 @@ def _windows(batch: int, time_steps: int = 240, joints: int = 23) -> Window:
     turns = torch.linalg.qr(torch.randn(*shape, joints, 3, 3))[0]
     there = torch.ones(shape, dtype=torch.bool)
     return Window(
-        R_parent_joint=turns, R_world_head=turns[:, :, 0].clone(), t_world_head=torch.randn(*shape, 3),
-        floor_height=torch.zeros(shape), floor_from_head=torch.zeros(shape), valid=there,
-        t_parent_joint=0.2 * torch.randn(batch, joints, 3), size=torch.ones(batch, len(LIMBS)),
-        foot_contact=torch.rand(*shape, 2).round(), points=torch.randn(*shape, VoxelAutoencoder().size), points_valid=there,
-        image=torch.randn(*shape, IMAGE), image_valid=there, noise=torch.randn(*shape, 6 * joints + 2),
-        level=torch.rand(batch, 1), chance=torch.rand(batch, 3),
-    )  # fmt: skip
+        R_parent_joint=turns,
+        R_world_head=turns[:, :, 0].clone(),
+        t_world_head=torch.randn(*shape, 3),
+        floor_height=torch.zeros(shape),
+        floor_from_head=torch.zeros(shape),
+        valid=there,
+        t_parent_joint=0.2 * torch.randn(batch, joints, 3),
+        size=torch.ones(batch, len(LIMBS)),
+        foot_contact=torch.rand(*shape, 2).round(),
+        points=torch.randn(*shape, VoxelAutoencoder().size),
+        points_valid=there,
+        image=torch.randn(*shape, IMAGE),
+        image_valid=there,
+        noise=torch.randn(*shape, 6 * joints + 2),
+        level=torch.rand(batch, 1),
+        chance=torch.rand(batch, 3),
+    )

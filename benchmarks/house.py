@@ -54,18 +54,10 @@ def wide_constructors(trees: dict[Path, ast.Module]) -> list[str]:
         for node in ast.walk(tree):
             if not isinstance(node, ast.ClassDef):
                 continue
-            made = next(
-                (f for f in node.body if isinstance(f, ast.FunctionDef) and f.name == "__init__"), None
-            )
+            made = next((f for f in node.body if isinstance(f, ast.FunctionDef) and f.name == "__init__"), None)
             fields = [part for part in node.body if isinstance(part, ast.AnnAssign)]
             dataclass = any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list)
-            count = (
-                len(made.args.args) + len(made.args.kwonlyargs) - 1
-                if made
-                else len(fields)
-                if dataclass
-                else 0
-            )
+            count = len(made.args.args) + len(made.args.kwonlyargs) - 1 if made else len(fields) if dataclass else 0
             if count > MANY_ARGUMENTS:
                 found.append(f"{path.stem}.{node.name}")
     return found
@@ -98,19 +90,23 @@ def figures(root: Path) -> dict[str, object]:
     lines = {path: len(text.splitlines()) for path, text in texts.items()}
     once, every = called_once(trees)
     return {
-        "lines": sum(lines.values()), "files": len(lines),
-        "simulation_lines": sum(count for path, count in lines.items() if "simulation" in path.relative_to(source).parts),
+        "lines": sum(lines.values()),
+        "files": len(lines),
+        "simulation_lines": sum(
+            count for path, count in lines.items() if "simulation" in path.relative_to(source).parts
+        ),
         "fmt_skip": sum(len(re.findall(r"# fmt: skip", text)) for text in texts.values()),
-        "private_functions_called_once": round(once / every, 3), "public_names": sum(len(public_names(tree)) for tree in trees.values()),
+        "private_functions_called_once": round(once / every, 3),
+        "public_names": sum(len(public_names(tree)) for tree in trees.values()),
         "wide_constructors": wide_constructors(trees),
-        "followed": {system: followed(source, trees, system) for system in SYSTEMS if (source / "systems" / system).is_dir()},
-    }  # fmt: skip
+        "followed": {
+            system: followed(source, trees, system) for system in SYSTEMS if (source / "systems" / system).is_dir()
+        },
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[1], help="a checkout")
     for name, value in figures(parser.parse_args().root).items():
         print(json.dumps({"name": name, "value": value}))

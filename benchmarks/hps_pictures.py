@@ -37,9 +37,7 @@ def _font(size: int) -> Any:
     return ImageFont.load_default(size=size)
 
 
-def draw_paths(
-    path: Path, session: Session, truth: HpsTruth, motions: dict[str, Motion], width: int = 1800
-) -> None:
+def draw_paths(path: Path, session: Session, truth: HpsTruth, motions: dict[str, Motion], width: int = 1800) -> None:
     """Roots from above over the scan: where the wearer went, and where each row believes that; the camera as dots."""
     ways = {"truth": truth.motion, **motions}
     true = truth.motion.t_world_root[:, :2].double().numpy()
@@ -85,9 +83,7 @@ def _plan(
     return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
 
 
-def draw_drift(
-    path: Path, drifts: dict[str, Sequence[dict[str, Any]]], size: tuple[int, int] = (1200, 700)
-) -> None:
+def draw_drift(path: Path, drifts: dict[str, Sequence[dict[str, Any]]], size: tuple[int, int] = (1200, 700)) -> None:
     """Mean root error of every row over the way, on a logarithmic axis; bands: least and largest over seeds."""
     width, height = size
     left, right, top, bottom = 80, width - 240, 30, height - 70
@@ -124,9 +120,7 @@ def draw_drift(
     save_png(path, np.asarray(picture))
 
 
-def draw_feet(
-    path: Path, session: Session, truth: HpsTruth, motions: dict[str, Motion], count: int = 4
-) -> None:
+def draw_feet(path: Path, session: Session, truth: HpsTruth, motions: dict[str, Motion], count: int = 4) -> None:
     """Left feet that stand, seen level with the floor, over the scan's points: a column per row of the tables."""
     shown = {"truth": truth.motion, **motions}
     touching = truth.true_contact[:, [FOOT_PATCHES.index(p) for p in ("left_heel", "left_toe_tip")]].all(1)
@@ -147,9 +141,7 @@ def draw_feet(
     save_png(path, np.asarray(sheet))
 
 
-def _beside(
-    middle: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]
-) -> tuple[Rigid, Float[np.ndarray, "3"]]:
+def _beside(middle: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]) -> tuple[Rigid, Float[np.ndarray, "3"]]:
     """A camera beside a foot, a hand's breadth above the floor, and the foot's middle."""
     side = np.array([-along[1], along[0], 0.0])
     position = middle + 0.75 * side / np.linalg.norm(side) + [0.0, 0.0, 0.07]
@@ -162,7 +154,7 @@ def _foot(
     vertices = truth.body.vertices(motion.T_world_joint[frame]).numpy().astype(np.float32)
     body = Mesh(
         vertices, truth.body.faces.numpy().astype(np.int32), np.array([0.55, 0.65, 0.8], np.float32), smooth=True
-    )  # fmt: skip
+    )
     near = (np.abs(session.scan.points - middle) < 0.45).all(1)
     colors = session.scan.colors
     color = np.full(3, 0.6, np.float32) if colors is None else (colors[near] / 255).astype(np.float32)

@@ -17,14 +17,7 @@ from wearcap.metrics.surface import FootSurface
 from wearcap.recording import Motion
 from wearcap.runtime.stages import Source, run_stages
 from wearcap.simulation.localization_noise import with_outage
-from wearcap.systems.hps.scores import (
-    HpsScores,
-    HpsTruth,
-    Outage,
-    disturbance,
-    planted_outages,
-    score_hps,
-)
+from wearcap.systems.hps.scores import HpsScores, HpsTruth, Outage, disturbance, planted_outages, score_hps
 
 ROWS = {
     "IMU": "hps_imu",
@@ -77,15 +70,24 @@ def run_seed(run: SeedRun) -> dict[str, Any]:
     assert recording.localization is not None
     gc.collect()
     return {
-        "seed": run.seed, "subject": recording.subject, "location": recording.location,
-        "seconds": recording.duration_s, "frames": len(truth.motion), "scan_points": len(session.scan.points),
-        "visits": [{"name": name, "distance_m": float(distance)} for name, distance in
-                   zip(recording.intervals.names, recording.intervals.distance_m)],
+        "seed": run.seed,
+        "subject": recording.subject,
+        "location": recording.location,
+        "seconds": recording.duration_s,
+        "frames": len(truth.motion),
+        "scan_points": len(session.scan.points),
+        "visits": [
+            {"name": name, "distance_m": float(distance)}
+            for name, distance in zip(recording.intervals.names, recording.intervals.distance_m)
+        ],
         "localized": float((recording.localization.confidence > 0).float().mean()),
-        "clock_error_ms": 1000 * clock_error, "clock_rate_ms_per_h": 3.6e6 * (clock.rate - 1),
+        "clock_error_ms": 1000 * clock_error,
+        "clock_rate_ms_per_h": 3.6e6 * (clock.rate - 1),
         "rig_error_cm": [100 * error for error in session.rig_error_m],
-        "scores": scores, "outages": outages, "stage_seconds": seconds,
-    }  # fmt: skip
+        "scores": scores,
+        "outages": outages,
+        "stage_seconds": seconds,
+    }
 
 
 class Teller:
@@ -102,9 +104,11 @@ def _captured(session: Session, pipeline: str, run: SeedRun) -> tuple[Motion, di
     """The motion, seconds per stage, and the largest error of the clock that was found (s)."""
     clock = TrueClock.of(session.recording)
     overrides = [
-        f"pipeline={pipeline}", "checkpoint=null", "recording=null",
+        f"pipeline={pipeline}",
+        "checkpoint=null",
+        "recording=null",
         f"pipeline.synchronization.camera_claps_s={clock.heard_s(session.recording, run.seed)}",
-    ]  # fmt: skip
+    ]
     config = compose("capture", overrides).pipeline
     if "solver" in config and "jobs" in config.solver:
         config.solver.jobs = run.solver_jobs
@@ -135,11 +139,8 @@ def _outages(
         found[row] = {}
         for name, frames in {**parts, "whole recording": everywhere}.items():
             result = disturbance(motion, motions[row], truth.motion, frames)
-            found[row][name] = asdict(result) | {
-                "root_ratio": result.root_ratio,
-                "joint_ratio": result.joint_ratio,
-            }
-        worst = {name: f"{part['root_cm']:.1f} ({part['root_ratio']:.1f}x)" for name, part in found[row].items()}  # fmt: skip
+            found[row][name] = asdict(result) | {"root_ratio": result.root_ratio, "joint_ratio": result.joint_ratio}
+        worst = {name: f"{part['root_cm']:.1f} ({part['root_ratio']:.1f}x)" for name, part in found[row].items()}
         tell(f"{row}, with outages: root {worst}")
     return {"planted": [asdict(outage) for outage in planted], "rows": found}
 
@@ -152,9 +153,7 @@ def _plain(scores: HpsScores) -> dict[str, Any]:
     """Scores as JSON holds them, Chamfer with both directions and their mean."""
     tree = asdict(scores)
     for form in ("literal", "surface"):
-        tree[form] = [
-            asdict(part) | {"mean_cm": part.mean_cm} for part in vars(scores)[form]
-        ]  # fmt: skip
+        tree[form] = [asdict(part) | {"mean_cm": part.mean_cm} for part in vars(scores)[form]]
     return tree
 
 

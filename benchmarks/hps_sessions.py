@@ -76,9 +76,8 @@ def load_session(settings: SessionSettings, seed: int, cache: Path) -> Session:
     visits = tuple(tuple(RigCloud(time, next(parts)) for time in visit) for visit in about["times_s"])
     scan = read_ply(folder / SCAN)
     return Session(
-        RecordingFile(folder / RECORDING).load(), Scan(scan.points, scan.colors), visits,
-        tuple(about["rig_error_m"]),
-    )  # fmt: skip
+        RecordingFile(folder / RECORDING).load(), Scan(scan.points, scan.colors), visits, tuple(about["rig_error_m"])
+    )
 
 
 def _make(settings: SessionSettings, seed: int, folder: Path) -> None:
@@ -147,9 +146,7 @@ class TrueClock:
     def heard_s(self, recording: Recording, seed: int) -> list[float]:
         """The claps as the camera's microphone hears them, s from the first picture, as pipelines take them."""
         assert recording.camera is not None
-        off = MICROPHONE_S * torch.from_numpy(
-            np.random.default_rng([33, seed]).standard_normal(len(self.claps_s))
-        )
+        off = MICROPHONE_S * torch.from_numpy(np.random.default_rng([33, seed]).standard_normal(len(self.claps_s)))
         return (self.to_camera(self.claps_s) + off - recording.camera.timestamps[0]).tolist()
 
     def error_s(self, clock: Clock) -> float:

@@ -36,9 +36,7 @@ def measure(duration_s: float = 60.0, steps: int = 500) -> list[dict]:
     settings = BandedSettings(iterations=20, relaxation=1.5)
 
     def ours() -> HpsState:
-        return solve_in_stretches(
-            energy, data, settings, stretch=len(data) // 2, jobs=os.cpu_count() or 1
-        ).state
+        return solve_in_stretches(energy, data, settings, stretch=len(data) // 2, jobs=os.cpu_count() or 1).state
 
     ours()  # compiled, and its memory warm
     begin = time.perf_counter()
@@ -53,9 +51,16 @@ def measure(duration_s: float = 60.0, steps: int = 500) -> list[dict]:
         adam_energy = total(energy, data[WINDOWS], adam.state)
         if ours_energy > adam_energy:
             raise SystemExit(f"error: our energy {ours_energy:.4f} is above Adam's {adam_energy:.4f}")
-        figures.append({"name": f"hps_solver_vs_adam{name or '_full_mesh'}", "value": value,
-                        "unit": f"ms per frame (energy {ours_energy:.3f} against {adam_energy:.3f})",
-                        "baseline": baseline, "ratio": baseline / value, "goal": goal})  # fmt: skip
+        figures.append(
+            {
+                "name": f"hps_solver_vs_adam{name or '_full_mesh'}",
+                "value": value,
+                "unit": f"ms per frame (energy {ours_energy:.3f} against {adam_energy:.3f})",
+                "baseline": baseline,
+                "ratio": baseline / value,
+                "goal": goal,
+            }
+        )
     return figures
 
 
@@ -72,9 +77,7 @@ def total(energy: HpsEnergy, data: HpsData, state: HpsState) -> float:
 def walk(duration_s: float, vertices: int | None = None, seed: int = 3) -> HpsData:
     """A simulated wearer's suit on a scanned floor, localised to 5 cm and 1°."""
     rng = np.random.default_rng(seed)
-    config = SimulationConfig(
-        duration_s=duration_s, fps=30.0, points=False, world="flat", activities=("walk", "stand")
-    )
+    config = SimulationConfig(duration_s=duration_s, fps=30.0, points=False, world="flat", activities=("walk", "stand"))
     recording = simulate_recording(config, "walk", "train", seed)
     suit, true = recording.suit, recording.motion
     assert suit is not None
@@ -90,7 +93,14 @@ def walk(duration_s: float, vertices: int | None = None, seed: int = 3) -> HpsDa
     assert suit.contact_prob is not None
     return HpsData(
         FootPatches.of(anny_body(suit.skeleton, recording.shape, vertices)),
-        HpsState(rotation.log(R[:, 1:]), R[:, 0], t), torch.eye(3, dtype=torch.float64), R_cam, one, one.clone(),
-        suit.contact_prob.double(), suit.t_world_root.double().diff(dim=0), turns(R[:, 0]), turns(head),
+        HpsState(rotation.log(R[:, 1:]), R[:, 0], t),
+        torch.eye(3, dtype=torch.float64),
+        R_cam,
+        one,
+        one.clone(),
+        suit.contact_prob.double(),
+        suit.t_world_root.double().diff(dim=0),
+        turns(R[:, 0]),
+        turns(head),
         SurfaceIndex.build(floor.astype(np.float32)),
-    )  # fmt: skip
+    )

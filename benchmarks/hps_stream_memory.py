@@ -29,9 +29,7 @@ def measure(minutes: int = 60, settle: int = 10) -> list[dict]:
     """A minute there and back, over and over: as long as one likes, and without a jump."""
     config = compose("capture", ["pipeline=hps", "recording=none"]).pipeline
     hps, rng = instantiate(config, _convert_="all"), np.random.default_rng(0)
-    simulated = SimulationConfig(
-        duration_s=60.0, fps=30.0, points=False, world="flat", activities=("walk", "stand")
-    )
+    simulated = SimulationConfig(duration_s=60.0, fps=30.0, points=False, world="flat", activities=("walk", "stand"))
     recording = simulate_recording(simulated, "minute", "train", 3)
     assert recording.suit is not None
     assert recording.motion is not None
@@ -45,7 +43,16 @@ def measure(minutes: int = 60, settle: int = 10) -> list[dict]:
         if minute + 1 == settle:
             early = _peak_mib()
     late = _peak_mib()
-    return [{"name": "hps_stream_memory", "value": late, "unit": "MiB", "baseline": early, "ratio": late / early, "goal": 1.05}]  # fmt: skip
+    return [
+        {
+            "name": "hps_stream_memory",
+            "value": late,
+            "unit": "MiB",
+            "baseline": early,
+            "ratio": late / early,
+            "goal": 1.05,
+        }
+    ]
 
 
 def _piece(
@@ -60,22 +67,21 @@ def _piece(
     noise = torch.from_numpy(rng.normal(0, 1, (2, len(number), 3))).float()
     assert suit.contact_prob is not None
     piece = replace(
-        suit, timestamps=times, R_parent_joint=suit.R_parent_joint[number],
-        t_world_root=suit.t_world_root[number], contact_prob=suit.contact_prob[number],
-    )  # fmt: skip
+        suit,
+        timestamps=times,
+        R_parent_joint=suit.R_parent_joint[number],
+        t_world_root=suit.t_world_root[number],
+        contact_prob=suit.contact_prob[number],
+    )
     found = Localization(
-        times,
-        rotation.exp(0.01 * noise[0]) @ T_world_cam.R,
-        T_world_cam.t + 0.03 * noise[1],
-        torch.ones(len(number)),
+        times, rotation.exp(0.01 * noise[0]) @ T_world_cam.R, T_world_cam.t + 0.03 * noise[1], torch.ones(len(number))
     )
     return piece, found
 
 
 def _floor(motion: Motion, rng: np.random.Generator) -> Scan:
     low, high = (
-        getattr(motion.t_world_root, end)(0).values[:2].numpy() - side
-        for end, side in (("min", 1.5), ("max", -1.5))
+        getattr(motion.t_world_root, end)(0).values[:2].numpy() - side for end, side in (("min", 1.5), ("max", -1.5))
     )
     count = int(np.prod(high - low) / 0.015**2)
     points = np.column_stack([rng.uniform(low, high, (count, 2)), rng.normal(0, 0.002, count)])

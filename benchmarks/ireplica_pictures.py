@@ -22,13 +22,7 @@ from wearcap.viewer.picture import contact_sheet, save_png
 FRAMES, AROUND_S = 5, 0.5
 NEAR_M = 2.2
 """Other objects are drawn when they are so near to the one that is moved."""
-WANTED = {
-    "door": ("door",),
-    "sofa": ("sofa",),
-    "table": ("table",),
-    "chair": ("chair",),
-    "drawer": ("drawer",),
-}
+WANTED = {"door": ("door",), "sofa": ("sofa",), "table": ("table",), "chair": ("chair",), "drawer": ("drawer",)}
 
 
 def draw(dataset: Path, split: str, checkpoint: str, folder: Path) -> None:
@@ -63,21 +57,28 @@ def sheet(case: Case, true: Motion, motion: Motion, thing: str, start: float, st
     frames = torch.searchsorted(motion.timestamps, times).clamp(0, len(motion) - 1).tolist()
     body = anny_body(motion.skeleton, case.recording.shape or None)
     return contact_sheet(
-        {"truth": true, "captured": motion}, frames, columns=FRAMES, size=(300, 300), body=body,
-        environment=surroundings(case.environment, thing), distance=5.0,
-    )  # fmt: skip
+        {"truth": true, "captured": motion},
+        frames,
+        columns=FRAMES,
+        size=(300, 300),
+        body=body,
+        environment=surroundings(case.environment, thing),
+        distance=5.0,
+    )
 
 
 def surroundings(environment: Environment, thing: str) -> Environment:
     """What is moved, and what stands beside it, walls of cupboards and doors that would hide it left out."""
     moved = environment.by_name(thing)
     near = [
-        item for item in environment.objects
-        if item is moved or (
+        item
+        for item in environment.objects
+        if item is moved
+        or (
             float((item.t_world_object - moved.t_world_object).norm()) < NEAR_M
             and item.category in ("sofa", "armchair", "table", "coffee_table", "chair", "box")
         )
-    ]  # fmt: skip
+    ]
     return Environment(tuple(near))
 
 

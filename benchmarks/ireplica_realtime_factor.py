@@ -21,8 +21,9 @@ GOAL = 10.0
 
 def measure() -> list[dict]:
     if not (DATASET / "manifest.json").is_file():
-        raise WearcapError("no such data set", where=DATASET,
-                           fix="Run: wearcap prepare simulated_interactions preset=quick")  # fmt: skip
+        raise WearcapError(
+            "no such data set", where=DATASET, fix="Run: wearcap prepare simulated_interactions preset=quick"
+        )
     case = Case.load(DATASET, RecordingStore.open(DATASET).names("test")[0])
     pipeline = pipeline_of("ireplica", (CHECKPOINT,), jobs=torch.get_num_threads())
     suit = case.recording.suit

@@ -25,17 +25,15 @@ from wearcap.systems.ireplica.contact_intervals import ContactSettings
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.object_tracker import ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
-from wearcap.systems.ireplica.published import (
-    held_when_near,
-    interpolated_objects,
-    nearness,
-    static_objects,
-)
+from wearcap.systems.ireplica.published import held_when_near, interpolated_objects, nearness, static_objects
 from wearcap.systems.ireplica.scores import score_interactions
 
 ON_BENT_PATH = (
-    "as published", "as published, w/o contact corr.", "ours, on the bent path", "ours, on the bent path, w/o contact corr.",
-)  # fmt: skip
+    "as published",
+    "as published, w/o contact corr.",
+    "ours, on the bent path",
+    "ours, on the bent path, w/o contact corr.",
+)
 """Rows whose wearer is registered as documented; HPS registers the others'."""
 GAPS_S = (0.0, 0.25, 0.5, 1.0, 2.0)
 """Of the paper's Table 5.4."""
@@ -98,16 +96,21 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
         for name, capture in _rows(case, ours, published, contacts).items()
     }
     found = {
-        "recording": run.name, "subject": case.recording.subject, "location": case.recording.location,
+        "recording": run.name,
+        "subject": case.recording.subject,
+        "location": case.recording.location,
         "rows": {name: scored(captured, case) for name, captured in rows.items()},
-        "gaps": {str(gap): scored(_with_gap(ours.tracker, gap)(motion, contacts["ours"], case.environment), case)
-                 for gap in GAPS_S},
+        "gaps": {
+            str(gap): scored(_with_gap(ours.tracker, gap)(motion, contacts["ours"], case.environment), case)
+            for gap in GAPS_S
+        },
         "detection": {
             **{name: detection(value, case.recording) for name, value in contacts.items()},
             "nearest object by distance": detection(
-                {"timestamps": motion.timestamps, **nearness(motion, {}, case.environment)}, case.recording),
+                {"timestamps": motion.timestamps, **nearness(motion, {}, case.environment)}, case.recording
+            ),
         },
-    }  # fmt: skip
+    }
     if run.robustness:
         found["robustness"] = {name: _worse(ours, case, change) for name, change in DISTURBANCES.items()}
     return found
@@ -142,7 +145,7 @@ def _rows(
         "ours, no gaps filled": track(_with_gap(ours.tracker, 0.0), "ours"),
         "ours, classes in parallel": track(changed(one_class=False), "ours"),
         "ours, true contacts": lambda motion: ours.tracker(motion, oracle, environment),
-    }  # fmt: skip
+    }
 
 
 def _with_gap(tracker: ObjectTracker, gap_s: float) -> ObjectTracker:
@@ -156,9 +159,7 @@ def _contacts(pipeline: IReplica, case: Case) -> dict[str, Tensor]:
 
 def true_contacts(held: Interactions, timestamps: Tensor) -> dict[str, Tensor]:
     """The truth in place of a network."""
-    return {"timestamps": timestamps} | {
-        name: held.hand_contact(timestamps, name).float() for name in CONTACT_CLASSES
-    }
+    return {"timestamps": timestamps} | {name: held.hand_contact(timestamps, name).float() for name in CONTACT_CLASSES}
 
 
 def detection(contacts: dict[str, Tensor], recording: Recording) -> dict[str, dict[str, list[float]]]:
@@ -168,10 +169,12 @@ def detection(contacts: dict[str, Tensor], recording: Recording) -> dict[str, di
     every = max(1, round(1 / (20 * contacts["timestamps"].diff().median().item())))
     times = contacts["timestamps"][::every].contiguous()
     return {
-        name: {"prob": [round(p, 4) for p in contacts[name][::every].flatten().tolist()],
-               "true": held.hand_contact(times, name).flatten().int().tolist()}
+        name: {
+            "prob": [round(p, 4) for p in contacts[name][::every].flatten().tolist()],
+            "true": held.hand_contact(times, name).flatten().int().tolist(),
+        }
         for name in CONTACT_CLASSES
-    }  # fmt: skip
+    }
 
 
 def scored(motion: Motion, case: Case) -> dict[str, Any]:
@@ -225,10 +228,16 @@ def frames_lost(share: float) -> Callable[[Recording], Recording]:
         kept = torch.rand(len(suit), generator=torch.Generator().manual_seed(9)) >= share
         kept[[0, -1]] = True
         contact = None if suit.contact_prob is None else suit.contact_prob[kept]
-        return replace(recording, suit=replace(
-            suit, timestamps=suit.timestamps[kept], R_parent_joint=suit.R_parent_joint[kept],
-            t_world_root=suit.t_world_root[kept], contact_prob=contact,
-        ))  # fmt: skip
+        return replace(
+            recording,
+            suit=replace(
+                suit,
+                timestamps=suit.timestamps[kept],
+                R_parent_joint=suit.R_parent_joint[kept],
+                t_world_root=suit.t_world_root[kept],
+                contact_prob=contact,
+            ),
+        )
 
     return change
 

@@ -43,9 +43,16 @@ def measure(duration_s: float = 60.0, steps: int = 500) -> list[dict]:
         energies.append(sum(solution.history[-1]["total"] for solution in solutions))
     if energies[0] > energies[1]:
         raise SystemExit(f"error: Adam's energy {energies[1]:.4f} is below ours {energies[0]:.4f}")
-    return [{"name": "latent_optimisation_vs_adam", "value": seconds[0],
-             "unit": f"s (energy {energies[0]:.2f} against {energies[1]:.2f})", "baseline": seconds[1],
-             "ratio": seconds[1] / seconds[0], "goal": 10.0}]  # fmt: skip
+    return [
+        {
+            "name": "latent_optimisation_vs_adam",
+            "value": seconds[0],
+            "unit": f"s (energy {energies[0]:.2f} against {energies[1]:.2f})",
+            "baseline": seconds[1],
+            "ratio": seconds[1] / seconds[0],
+            "goal": 10.0,
+        }
+    ]
 
 
 def _seen(duration_s: float) -> tuple[Motion, Recording]:

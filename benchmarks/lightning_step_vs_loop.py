@@ -32,28 +32,43 @@ def measure(steps: int = 100, overrides: tuple[str, ...] = ()) -> list[dict]:
         config = compose(
             "train",
             [
-                "experiment=motion_diffusion_head", f"paths.datasets={folder}", f"paths.run={folder}",
-                f"trainer.max_steps={steps + WARM_UP}", f"data.steps_per_epoch={steps + WARM_UP}", *overrides,
+                "experiment=motion_diffusion_head",
+                f"paths.datasets={folder}",
+                f"paths.run={folder}",
+                f"trainer.max_steps={steps + WARM_UP}",
+                f"data.steps_per_epoch={steps + WARM_UP}",
+                *overrides,
             ],
-        )  # fmt: skip
+        )
         torch.manual_seed(0)
         turns = _TakeTurns(_hand_written(config))
         system, data = instantiate(config.model), instantiate(config.data)
         system.set_statistics(data.dataset("train"))
         trainer = lightning.Trainer(
-            accelerator="cpu", max_steps=config.trainer.max_steps, gradient_clip_val=config.trainer.gradient_clip_val,
-            log_every_n_steps=config.trainer.log_every_n_steps, use_distributed_sampler=False, limit_val_batches=0,
-            logger=False, enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+            accelerator="cpu",
+            max_steps=config.trainer.max_steps,
+            gradient_clip_val=config.trainer.gradient_clip_val,
+            log_every_n_steps=config.trainer.log_every_n_steps,
+            use_distributed_sampler=False,
+            limit_val_batches=0,
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
             callbacks=[turns],
-        )  # fmt: skip
+        )
         trainer.fit(system, datamodule=data)
-    value, baseline = (
-        1000 * statistics.median(times[WARM_UP:]) for times in (turns.lightning, turns.by_hand)
-    )
+    value, baseline = (1000 * statistics.median(times[WARM_UP:]) for times in (turns.lightning, turns.by_hand))
     return [
-        {"name": "lightning_step_vs_loop", "value": value, "unit": "ms per step", "baseline": baseline,
-         "ratio": value / baseline, "goal": 1.05}
-    ]  # fmt: skip
+        {
+            "name": "lightning_step_vs_loop",
+            "value": value,
+            "unit": "ms per step",
+            "baseline": baseline,
+            "ratio": value / baseline,
+            "goal": 1.05,
+        }
+    ]
 
 
 class _TakeTurns(Callback):
@@ -87,9 +102,7 @@ def _hand_written(config: DictConfig) -> Iterator[float]:
     system.train()
     for batch in itertools.chain.from_iterable(itertools.repeat(loader)):
         optimizer.zero_grad()
-        loss = torch.stack(
-            [weights.get(name, 0.0) * term for name, term in system.terms(batch).items()]
-        ).sum()
+        loss = torch.stack([weights.get(name, 0.0) * term for name, term in system.terms(batch).items()]).sum()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(system.net.parameters(), config.trainer.gradient_clip_val)
         optimizer.step()

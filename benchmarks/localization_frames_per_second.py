@@ -68,7 +68,7 @@ def building() -> Scan:
 
 def looking(x: float, y: float, z: float, yaw: float, pitch: float) -> Rigid:
     """Pose of an OpenCV camera that looks along yaw and down by pitch (rad)."""
-    turn = rotation.about_axis("z", torch.tensor(yaw).double()) @ rotation.about_axis("y", torch.tensor(pitch).double())  # fmt: skip
+    turn = rotation.about_axis("z", torch.tensor(yaw).double()) @ rotation.about_axis("y", torch.tensor(pitch).double())
     axes = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=torch.float64)
     return Rigid(turn @ axes, torch.tensor([x, y, z], dtype=torch.float64))
 
@@ -76,10 +76,16 @@ def looking(x: float, y: float, z: float, yaw: float, pitch: float) -> Rigid:
 def database_poses() -> list[Rigid]:
     random = np.random.default_rng(1)
     return [
-        looking(room * ROOM_M[0] + random.uniform(1.2, 4.8), random.uniform(1.2, 3.8), random.uniform(1.4, 1.9),
-                2 * np.pi * k / PER_ROOM * 5, random.uniform(-0.2, 0.3))
-        for room in range(ROOMS) for k in range(PER_ROOM)
-    ]  # fmt: skip
+        looking(
+            room * ROOM_M[0] + random.uniform(1.2, 4.8),
+            random.uniform(1.2, 3.8),
+            random.uniform(1.4, 1.9),
+            2 * np.pi * k / PER_ROOM * 5,
+            random.uniform(-0.2, 0.3),
+        )
+        for room in range(ROOMS)
+        for k in range(PER_ROOM)
+    ]
 
 
 def walk(count: int) -> list[Rigid]:
@@ -134,9 +140,7 @@ def measure(frames: int = 24, baseline_frames: int = 4) -> list[dict]:
     rates = []
     for one_by_one in (False, True):
         begin = time.perf_counter()
-        found = localize_video(
-            images, torch.arange(frames).double() / 30, QUERY, localizer, use_prior=not one_by_one
-        )
+        found = localize_video(images, torch.arange(frames).double() / 30, QUERY, localizer, use_prior=not one_by_one)
         rates.append(frames / (time.perf_counter() - begin))
         check(found.t_world_cam, found.R_world_cam, truth)
     begin = time.perf_counter()
@@ -144,7 +148,13 @@ def measure(frames: int = 24, baseline_frames: int = 4) -> list[dict]:
         pairwise(image, QUERY)
     baseline = baseline_frames / (time.perf_counter() - begin)
     return [
-        {"name": "localization_frames_per_second", "value": value, "unit": f"frames/s, {unit}", "baseline": baseline,
-         "ratio": value / baseline, "goal": 5.0}
+        {
+            "name": "localization_frames_per_second",
+            "value": value,
+            "unit": f"frames/s, {unit}",
+            "baseline": baseline,
+            "ratio": value / baseline,
+            "goal": 5.0,
+        }
         for value, unit in zip(rates, ("video", "single pictures"))
-    ]  # fmt: skip
+    ]

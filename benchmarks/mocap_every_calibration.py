@@ -11,18 +11,16 @@ from wearcap.sensors.arm_swings import fit_swing_clock, swing_peaks
 from wearcap.sensors.camera_alignment import align_by_marks, mark_positions, mount_by_standing
 from wearcap.sensors.gravity_scale import GravityScale, by_floor, by_head_imu
 from wearcap.sensors.watch_calibration import calibrate_watches
-from wearcap.simulation.calibration_session import (
-    MARKS,
-    STANDING,
-    SWINGS_S,
-    CalibrationSession,
-    simulate_calibration,
-)
+from wearcap.simulation.calibration_session import MARKS, STANDING, SWINGS_S, CalibrationSession, simulate_calibration
 
 GOALS = {
-    "watch_world_deg": 0.5, "watch_wrist_deg": 0.5, "slam_world_deg": 0.5, "head_camera_deg": 0.5, "scale_percent": 0.5,
+    "watch_world_deg": 0.5,
+    "watch_wrist_deg": 0.5,
+    "slam_world_deg": 0.5,
+    "head_camera_deg": 0.5,
+    "scale_percent": 0.5,
     "clock_ms": 5.0,
-}  # fmt: skip
+}
 """Frames of the watches, their mounts, the SLAM's world, the camera's mount, its scale, the watches' clocks."""
 EPOCH_S = 1.7e9
 """Watches count seconds since 1970; a timecode brings the clocks near each other first."""
@@ -70,15 +68,12 @@ def _errors(made: CalibrationSession, fps: float) -> dict[str, list[float]]:
         "head_camera_deg": [_apart_deg(mount.R_head_cam, made.R_head_cam)],
         "scale_percent": [100 * abs(aligned.scale / made.scale - 1)],
         "clock_ms": [1000 * error for error in clocks],
-    }  # fmt: skip
+    }
 
 
 def _scale_and_tilt(found: GravityScale, made: CalibrationSession) -> dict[str, float]:
     cos = (found.R_world_slam[2] @ made.R_world_slam[2]).clamp_max(1).item()
-    return {
-        "slam_world_deg": math.degrees(math.acos(cos)),
-        "scale_percent": 100 * abs(found.scale / made.scale - 1),
-    }
+    return {"slam_world_deg": math.degrees(math.acos(cos)), "scale_percent": 100 * abs(found.scale / made.scale - 1)}
 
 
 def _apart_deg(a: torch.Tensor, b: torch.Tensor) -> float:

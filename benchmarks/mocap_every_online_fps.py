@@ -20,10 +20,7 @@ from wearcap.systems.mocap_every.stream import MocapEverySession, WatchSample, W
 def measure(duration_s: float = 30.0, repeats: int = 3) -> list[dict]:
     pipeline, recording = pipeline_of("mocap_every_online"), watched(duration_s)
     rows = []
-    for name, stride in (
-        ("mocap_every_online_fps", pipeline.stride),
-        ("mocap_every_online_each_frame_fps", 1),
-    ):
+    for name, stride in (("mocap_every_online_fps", pipeline.stride), ("mocap_every_online_each_frame_fps", 1)):
         stepping = replace(pipeline, stride=stride)
         with undisturbed(pipeline.runtime == "onnx"):
             rates = sorted(_rate(stepping, recording) for _ in range(repeats))

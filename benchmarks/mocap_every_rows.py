@@ -68,9 +68,7 @@ def with_slam(recording: Recording) -> Recording:
     noise = smooth_noise(rng, len(head.timestamps), 6, SLAM_PERIOD_S, fps) / np.sqrt(3)
     turn = rotation.exp(np.deg2rad(SLAM_DEG) * noise[:, :3])
     moved = head.t_world_device + SLAM_M * noise[:, 3:]
-    return replace(
-        recording, head=replace(head, R_world_device=head.R_world_device @ turn, t_world_device=moved)
-    )
+    return replace(recording, head=replace(head, R_world_device=head.R_world_device @ turn, t_world_device=moved))
 
 
 def body_row(recording: Recording, captured: Captured, seed: int = 0) -> Row:
@@ -110,18 +108,14 @@ def _smoothed(height: Tensor, fps: float) -> Tensor:
     return padded.unfold(0, len(reach), 1) @ (kernel / kernel.sum())
 
 
-def cue_row(
-    recording: Recording, pipeline: MocapEvery, manifold: str, solver: LatentSolver
-) -> tuple[Row, Row] | None:
+def cue_row(recording: Recording, pipeline: MocapEvery, manifold: str, solver: LatentSolver) -> tuple[Row, Row] | None:
     """Scores at the frames that show the right wrist, before and after editing by it; None where none does."""
     motion, head = recording.motion, recording.head
     assert motion is not None
     assert head is not None
     camera = action_camera(head.timestamps)
     rng = np.random.default_rng([6, *recording.name.encode()])
-    cues = seen_joints(
-        motion, camera_path(motion, camera), camera.camera, ["right_wrist"], DETECTOR_PX, MISSED, rng
-    )
+    cues = seen_joints(motion, camera_path(motion, camera), camera.camera, ["right_wrist"], DETECTOR_PX, MISSED, rng)
     if not cues:
         return None
     shown = replace(recording, camera=camera, cues=cues, imu={})
@@ -146,8 +140,10 @@ def _at(motion: Motion, truth: Motion, seen: Tensor, name: str) -> Row:
         if not any(p in j for p in ("hip", "knee", "ankle", "toe", "pelvis"))
     ]
     scores = {
-        "right_hand_cm": error[arm[-1]].item(), "right_arm_cm": error[arm].mean().item(),
-        "upper_cm": error[upper].mean().item(), "mpjpe_cm": error.mean().item(),
+        "right_hand_cm": error[arm[-1]].item(),
+        "right_arm_cm": error[arm].mean().item(),
+        "upper_cm": error[upper].mean().item(),
+        "mpjpe_cm": error.mean().item(),
         "jitter_m_s3": evaluate_motion(motion, truth)["jitter_m_s3"],
-    }  # fmt: skip
+    }
     return Row(name, 0, int(seen.sum()), scores)

@@ -37,12 +37,19 @@ def pipeline_of(size: str, device: str = "cpu", **settings) -> HMD2:
         assert isinstance(pipeline, HMD2)
     else:
         given = {name: value for name, value in OmegaConf.to_container(config).items() if name[0] != "_"}
-        pipeline = HMD2(random_net(size), _FEATURES, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any",
-                        **given, device=device)  # fmt: skip
-        count = sum(parameter.numel() for parameter in pipeline.net.parameters()) / 1e6
-        print(
-            f"no checkpoint {EXPERIMENTS[size]!r}: random weights, {count:.1f} M parameters", file=sys.stderr
+        pipeline = HMD2(
+            random_net(size),
+            _FEATURES,
+            CosineSchedule(),
+            xsens23(),
+            60.0,
+            VoxelAutoencoder(),
+            "any",
+            **given,
+            device=device,
         )
+        count = sum(parameter.numel() for parameter in pipeline.net.parameters()) / 1e6
+        print(f"no checkpoint {EXPERIMENTS[size]!r}: random weights, {count:.1f} M parameters", file=sys.stderr)
     return replace(pipeline, **settings)
 
 
@@ -54,9 +61,11 @@ def random_net(size: str) -> MotionDenoiser:
     torch.manual_seed(0)
     config = compose("train", [f"experiment={EXPERIMENTS[size]}"])
     net = instantiate(config.model.net)(
-        motion_size=_FEATURES.motion_size, condition_size=_FEATURES.condition_size,
-        points_size=VoxelAutoencoder().size, image_size=IMAGE,
-    )  # fmt: skip
+        motion_size=_FEATURES.motion_size,
+        condition_size=_FEATURES.condition_size,
+        points_size=VoxelAutoencoder().size,
+        image_size=IMAGE,
+    )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.02)
     return net
@@ -120,17 +129,20 @@ def frames_per_second(pipeline: HMD2, pushes: int = 40) -> float:
 
 def figure(name: str, value: float, baseline: float, goal: float) -> dict:
     return {
-        "name": name, "value": value, "unit": "frames/s", "baseline": baseline, "ratio": value / baseline, "goal": goal,
-    }  # fmt: skip
+        "name": name,
+        "value": value,
+        "unit": "frames/s",
+        "baseline": baseline,
+        "ratio": value / baseline,
+        "goal": goal,
+    }
 
 
 def beside_paper(name: str, stride: int, document: float, pushes: int) -> list[dict]:
     """Full model on a GPU at one stride in 20 steps, beside the paper's frames per second; nothing without a GPU."""
     if without_cuda(name):
         return []
-    pipeline = pipeline_of(
-        "full", "cuda", stride=stride, steps=20, spacing=1.0, runtime="auto", precision="auto"
-    )
+    pipeline = pipeline_of("full", "cuda", stride=stride, steps=20, spacing=1.0, runtime="auto", precision="auto")
     return [figure(name, frames_per_second(pipeline, pushes), document, 10.0)]
 
 

@@ -26,9 +26,7 @@ def flat(count: int, seed: int = 0) -> torch.Tensor:
     place[:, 2] = 0.4
     side = torch.randn(int(rows.sum()), 3, generator=random)
     side /= side.abs().amax(1, keepdim=True)
-    points[rows] = place[torch.randint(24, (len(side),), generator=random)] + side * torch.tensor(
-        [0.4, 0.3, 0.4]
-    )
+    points[rows] = place[torch.randint(24, (len(side),), generator=random)] + side * torch.tensor([0.4, 0.3, 0.4])
     return points + 0.01 * torch.randn(count, 3, generator=random)
 
 

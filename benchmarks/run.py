@@ -35,9 +35,7 @@ def run(name: str) -> list[dict]:
     figures = importlib.import_module(name).measure()
     for figure in figures:
         if tuple(figure) != KEYS:
-            raise SystemExit(
-                f"error: benchmark {name} gave keys {', '.join(figure)}. Expected {', '.join(KEYS)}."
-            )
+            raise SystemExit(f"error: benchmark {name} gave keys {', '.join(figure)}. Expected {', '.join(KEYS)}.")
     return figures
 
 

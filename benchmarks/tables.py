@@ -47,11 +47,7 @@ def about(arguments: list[str]) -> dict[str, str]:
 
 def main(arguments: list[str]) -> None:
     if not arguments or arguments[0] not in systems():
-        wanted = (
-            ""
-            if not arguments or arguments[0].startswith("-")
-            else f"error: no tables of {arguments[0]!r}\n\n"
-        )
+        wanted = "" if not arguments or arguments[0].startswith("-") else f"error: no tables of {arguments[0]!r}\n\n"
         print(f"{wanted}{__doc__}", file=sys.stderr if wanted else sys.stdout)
         sys.exit(2 if wanted else 0)
     system = importlib.import_module(f"tables_{arguments[0]}")

@@ -70,15 +70,21 @@ DOCUMENT: Scores = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--datasets", type=Path, default=Path("datasets"), help="folder of the prepared data sets")  # fmt: skip
+    parser.add_argument("--datasets", type=Path, default=Path("datasets"), help="folder of the prepared data sets")
     parser.add_argument("--split", default="test", help="train, val or test")
     parser.add_argument("--checkpoint", default="echo", help="ours")
-    parser.add_argument("--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings")  # fmt: skip
+    parser.add_argument("--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings")
     parser.add_argument("--recordings", type=int, help="no more than so many of each data set")
     parser.add_argument("--seeds", type=int, default=4, help="runs of each row")
     parser.add_argument("--lanes", type=int, default=12, help="recordings that share a batch")
-    parser.add_argument("--pipeline", nargs="*", default=[], help="overrides for all rows, as pipeline.per_frame=1")  # fmt: skip
-    parser.add_argument("--parts", nargs="*", default=["objects", "ablation", "sparse", "human"], choices=list(PARTS), help="tables to make")  # fmt: skip
+    parser.add_argument("--pipeline", nargs="*", default=[], help="overrides for all rows, as pipeline.per_frame=1")
+    parser.add_argument(
+        "--parts",
+        nargs="*",
+        default=["objects", "ablation", "sparse", "human"],
+        choices=list(PARTS),
+        help="tables to make",
+    )
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -99,7 +105,10 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, tupl
     store, names = recordings_of(options, "simulated_objects")
     ours = Method("ours", options.checkpoint)
     scores: Scores = {}
-    data = instantiate(compose("train", ["experiment=echo", "paths.run=none", f"paths.datasets={options.datasets}"]).data, _convert_="all")  # fmt: skip
+    data = instantiate(
+        compose("train", ["experiment=echo", "paths.run=none", f"paths.datasets={options.datasets}"]).data,
+        _convert_="all",
+    )
     training = data.dataset("train")
     scores["nearest training window"] = _baseline(NearestEcho.fit(training), store, names, ours)
     wrist = RigidWrist.fit(training)
@@ -125,9 +134,7 @@ def _ablation(options: argparse.Namespace, progress: Progress) -> tuple[str, tup
     return f"Ablation: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
 
 
-def _trained(
-    rows: dict[str, tuple[str, ...]], options: argparse.Namespace, progress: Progress
-) -> list[Method]:
+def _trained(rows: dict[str, tuple[str, ...]], options: argparse.Namespace, progress: Progress) -> list[Method]:
     """Those of which there is a training."""
     methods = []
     for name, (run, *pipeline) in rows.items():
@@ -144,10 +151,8 @@ def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple
     store, names = recordings_of(options, "simulated_objects")
     rows = [None, *((modality, share) for modality, shares in SHARES.items() for share in shares)]
     methods = [Method(_given(row), options.checkpoint, UNGUIDED, row) for row in rows]
-    methods += [
-        Method(f"{_given(row)}, guided", options.checkpoint, observed=row) for row in (None, ("contact", 1.0))
-    ]
-    return f"Tables 3, S2: observed, {options.split}", OBJECTS, _scores(methods, options, progress, store, names)  # fmt: skip
+    methods += [Method(f"{_given(row)}, guided", options.checkpoint, observed=row) for row in (None, ("contact", 1.0))]
+    return f"Tables 3, S2: observed, {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
 
 
 def _given(row: tuple[str, float] | None) -> str:
@@ -157,11 +162,7 @@ def _given(row: tuple[str, float] | None) -> str:
 def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 2: people without objects."""
     store, names = recordings_of(options, "cmu")
-    names_of = (
-        "ours without guidance, as long as the others",
-        "no humans alone",
-        "BoDiffusion-style + object",
-    )
+    names_of = ("ours without guidance, as long as the others", "no humans alone", "BoDiffusion-style + object")
     methods = [
         Method("ours", options.checkpoint),
         *_trained({name: ABLATIONS[name] for name in names_of}, options, progress),
@@ -171,7 +172,7 @@ def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[
 
 def _scores(
     methods: list[Method], options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]
-) -> Scores:  # fmt: skip
+) -> Scores:
     scores: Scores = {}
     for method in methods:
         made = [
@@ -196,7 +197,7 @@ def _captured(
         yield one
 
 
-def _baseline(method: NearestEcho, store: RecordingStore, names: list[str], like: Method) -> dict[str, Summary]:  # fmt: skip
+def _baseline(method: NearestEcho, store: RecordingStore, names: list[str], like: Method) -> dict[str, Summary]:
     """Scores of what draws nothing."""
     on = EchoOnDataset(pipeline_of(like), store.root)
     made = []
@@ -207,10 +208,4 @@ def _baseline(method: NearestEcho, store: RecordingStore, names: list[str], like
     return aggregate(made)
 
 
-PARTS = {
-    "objects": _objects,
-    "ablation": _ablation,
-    "settings": _settings,
-    "sparse": _sparse,
-    "human": _human,
-}
+PARTS = {"objects": _objects, "ablation": _ablation, "settings": _settings, "sparse": _sparse, "human": _human}

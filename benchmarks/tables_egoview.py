@@ -17,9 +17,13 @@ from wearcap.systems.hmd2.egoview_frames import POINTS, EgoFrame, EgoFrames
 from wearcap.systems.hmd2.egoview_training import EgoView, view_scores
 
 COLUMNS = {
-    "hand_share": "hands seen", "hand_average_precision": "AP", "hand_error_cm": "hand (cm)",
-    "hand_error_cm_of_mean": "mean's (cm)", "point_error_cm": "limbs (cm)", "point_error_cm_of_mean": "mean's (cm)",
-}  # fmt: skip
+    "hand_share": "hands seen",
+    "hand_average_precision": "AP",
+    "hand_error_cm": "hand (cm)",
+    "hand_error_cm_of_mean": "mean's (cm)",
+    "point_error_cm": "limbs (cm)",
+    "point_error_cm_of_mean": "mean's (cm)",
+}
 EVERY = 4
 """Frames of the data are this far apart."""
 

@@ -21,10 +21,19 @@ from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
 
 COLUMNS = {
-    "mpjpe_cm": "MPJPE", "hand_pe_cm": "hand", "upper_pe_cm": "upper", "lower_pe_cm": "lower", "p95_cm": "95 %",
-    "fid": "FID", "diversity": "divers.", "physicality": "phys.", "floor_penetration_cm": "floor",
-    "foot_skate_cm_s": "skate", "jitter_ratio": "jitter", "seam_ratio": "seam",
-}  # fmt: skip
+    "mpjpe_cm": "MPJPE",
+    "hand_pe_cm": "hand",
+    "upper_pe_cm": "upper",
+    "lower_pe_cm": "lower",
+    "p95_cm": "95 %",
+    "fid": "FID",
+    "diversity": "divers.",
+    "physicality": "phys.",
+    "floor_penetration_cm": "floor",
+    "foot_skate_cm_s": "skate",
+    "jitter_ratio": "jitter",
+    "seam_ratio": "seam",
+}
 DOCUMENT = {
     "EgoEgo": (16.61, 34.64, 35.69, 20.15, 3.68, 2.43),
     "AvatarPoser (head)": (10.64, 21.51, 27.61, 12.99, 1.69, 4.21),
@@ -32,12 +41,7 @@ DOCUMENT = {
     "HMD² (h = 10)": (9.19, 17.67, 5.00, 15.23, 1.30, 1.19),
 }
 """Thesis Table 6.1, on Nymeria: MPJPE, hand, FID, Diversity (truth 16.13), Physicality (truth 0.56), floor penetration."""
-MODALITIES = {
-    "full": "[points,images]",
-    "w/o images": "[points]",
-    "w/o points": "[images]",
-    "head alone": "[]",
-}
+MODALITIES = {"full": "[points,images]", "w/o images": "[points]", "w/o points": "[images]", "head alone": "[]"}
 STRIDES = (230, 180, 120, 60, 30, 10, 1)
 STEPS = (2, 3, 5, 10, 20, 40, 80)
 LOOKAHEAD = 20
@@ -46,26 +50,46 @@ WIDTH = 170
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--dataset", type=Path, default=Path("datasets/simulated_camera"),
-                        help="whose split is captured (datasets/cmu_surrounded: real motion, too short for FID)")  # fmt: skip
-    parser.add_argument("--training", nargs="+", default=["datasets/simulated_camera", "datasets/cmu_surrounded"],
-                        help="data sets that mean pose and nearest window learn from")  # fmt: skip
+    parser.add_argument(
+        "--dataset",
+        type=Path,
+        default=Path("datasets/simulated_camera"),
+        help="whose split is captured (datasets/cmu_surrounded: real motion, too short for FID)",
+    )
+    parser.add_argument(
+        "--training",
+        nargs="+",
+        default=["datasets/simulated_camera", "datasets/cmu_surrounded"],
+        help="data sets that mean pose and nearest window learn from",
+    )
     parser.add_argument("--split", default="test", help="train, val or test")
     parser.add_argument("--seeds", type=int, default=8, help="repetitions (2 when quick)")
     parser.add_argument("--recordings", type=int, help="no more than so many of the split")
     parser.add_argument("--checkpoint", default="hmd2", help="the full model")
     parser.add_argument("--egoego", default="egoego_style", help="the EgoEgo-style diffusion")
-    parser.add_argument("--regressors", nargs=2, default=["pose_regressor_head", "pose_regressor_hands"],
-                        help="AvatarPoser-style regressors of the head, and of head and hands")  # fmt: skip
-    parser.add_argument("--separate", nargs="*", default=[], metavar="NAME=CHECKPOINT",
-                        help="rows trained by themselves, such as head=…")  # fmt: skip
-    parser.add_argument("--realism", default="motion_autoencoder", help="the motion autoencoder")
     parser.add_argument(
-        "--sweep-recordings", type=int, default=6, help="recordings of the sweeps over h and steps"
+        "--regressors",
+        nargs=2,
+        default=["pose_regressor_head", "pose_regressor_hands"],
+        help="AvatarPoser-style regressors of the head, and of head and hands",
     )
+    parser.add_argument(
+        "--separate",
+        nargs="*",
+        default=[],
+        metavar="NAME=CHECKPOINT",
+        help="rows trained by themselves, such as head=…",
+    )
+    parser.add_argument("--realism", default="motion_autoencoder", help="the motion autoencoder")
+    parser.add_argument("--sweep-recordings", type=int, default=6, help="recordings of the sweeps over h and steps")
     parser.add_argument("--sweep-seeds", type=int, default=2, help="repetitions of the sweeps")
-    parser.add_argument("--strides", type=int, nargs="*", default=STRIDES,
-                        help="h of Table 6.5 (h = 1 takes ten times as long as all others together)")  # fmt: skip
+    parser.add_argument(
+        "--strides",
+        type=int,
+        nargs="*",
+        default=STRIDES,
+        help="h of Table 6.5 (h = 1 takes ten times as long as all others together)",
+    )
     parser.add_argument("--steps", type=int, nargs="*", default=STEPS, help="steps of Table 6.7")
     parser.add_argument("--device", default="cpu", help="device that captures")
     parser.add_argument("--jobs", type=int, default=2, help="rows at a time")
@@ -75,13 +99,15 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write the tables; returns the file."""
     case = _case(options)
     console = Console(width=WIDTH)
-    short = replace(
-        case, names=case.names[: options.sweep_recordings], seeds=case.seeds[: options.sweep_seeds]
+    short = replace(case, names=case.names[: options.sweep_recordings], seeds=case.seeds[: options.sweep_seeds])
+    sweeps = (
+        []
+        if options.quick
+        else [
+            ("Table 6.5: latency", short, [method for h in options.strides for method in _latencies(options, h)]),
+            ("Table 6.7: steps", short, [_ours(options, f"{n} steps", f"pipeline.steps={n}") for n in options.steps]),
+        ]
     )
-    sweeps = [] if options.quick else [
-        ("Table 6.5: latency", short, [method for h in options.strides for method in _latencies(options, h)]),
-        ("Table 6.7: steps", short, [_ours(options, f"{n} steps", f"pipeline.steps={n}") for n in options.steps]),
-    ]  # fmt: skip
     jobs = [("Tables 6.1 and 6.3", case, _methods(options, console)), *sweeps]
     results = Parallel(n_jobs=options.jobs)(
         delayed(run_method)(method, where) for _, where, methods in jobs for method in methods
@@ -98,9 +124,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         ("lower_pe_cm", "lower body (cm)"),
     ):
         console.print(
-            _activities(
-                f"Tables 6.8–6.10: {title} by what was mostly done", found["Tables 6.1 and 6.3"], metric
-            )
+            _activities(f"Tables 6.8–6.10: {title} by what was mostly done", found["Tables 6.1 and 6.3"], metric)
         )
     path = options.output / f"hmd2_{case.dataset.name}.json"
     tree = {title: [asdict(result) for result in rows] for title, rows in found.items()}
@@ -117,8 +141,11 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 
 def _case(options: argparse.Namespace) -> Case:
     if not (options.dataset / "manifest.json").is_file():
-        raise WearcapError("no such data set", where=options.dataset,
-                           fix="Run: wearcap prepare simulated camera=true output=datasets/simulated_camera")  # fmt: skip
+        raise WearcapError(
+            "no such data set",
+            where=options.dataset,
+            fix="Run: wearcap prepare simulated camera=true output=datasets/simulated_camera",
+        )
     names = RecordingStore.open(options.dataset).names(options.split)
     names = names[: 3 if options.quick else options.recordings]
     seeds = tuple(range(2 if options.quick else options.seeds))
@@ -160,11 +187,14 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
         for name, _, checkpoint in (row.partition("=") for row in options.separate)
     ]
     wanted = [
-        *(Method(name) for name in BASELINES), Method("EgoEgo-style", options.egoego, ("pipeline=egoego_style",)),
-        *regressors, *ablations, *separate,
+        *(Method(name) for name in BASELINES),
+        Method("EgoEgo-style", options.egoego, ("pipeline=egoego_style",)),
+        *regressors,
+        *ablations,
+        *separate,
         _ours(options, "full, the paper's windows", pipeline="hmd2_paper"),
         _ours(options, "full, one step to the mean", pipeline="hmd2_mean"),
-    ]  # fmt: skip
+    ]
     there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
     for method in wanted:
         if method not in there:
@@ -180,9 +210,7 @@ def _table(title: str, results: list[Result]) -> Table:
     if results:
         first = results[0].scores
         truth = {"physicality": "truth_physicality", "diversity": "truth_diversity"}
-        table.add_row(
-            "truth", *(f"{first[truth[key]].mean:.2f}" if truth.get(key) in first else "" for key in COLUMNS)
-        )
+        table.add_row("truth", *(f"{first[truth[key]].mean:.2f}" if truth.get(key) in first else "" for key in COLUMNS))
     return table
 
 

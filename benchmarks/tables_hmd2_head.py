@@ -25,15 +25,18 @@ DOCUMENT: Scores = {
     "HMD2's document, on Nymeria": {"mpjpe_cm": Summary(9.28, None, 1), "hand_pe_cm": Summary(19.47, None, 1)}
 }
 COLUMNS = (
-    "mpjpe_cm", "hand_pe_cm", "lower_pe_cm", "upper_pe_cm", "p95_cm", "jitter_ratio", "foot_skate_cm_s",
-    "physicality", "truth_physicality", "floor_penetration_cm",
-)  # fmt: skip
-QUICK = (
-    "trainer.max_steps=300",
-    "data.steps_per_epoch=100",
-    "data.batch_size=16",
-    "callbacks.average.decay=0.98",
+    "mpjpe_cm",
+    "hand_pe_cm",
+    "lower_pe_cm",
+    "upper_pe_cm",
+    "p95_cm",
+    "jitter_ratio",
+    "foot_skate_cm_s",
+    "physicality",
+    "truth_physicality",
+    "floor_penetration_cm",
 )
+QUICK = ("trainer.max_steps=300", "data.steps_per_epoch=100", "data.batch_size=16", "callbacks.average.decay=0.98")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,11 +60,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
             scores["wearcap, latency 0.17 s"] = _evaluated(checkpoints, options, "hmd2_online")["wearcap"]
     path = options.output / "hmd2_head.json"
     show(rich_table(f"HMD2, head path alone ({options.data})", {**scores, **DOCUMENT}, COLUMNS))
-    facts = {
-        "data": options.data,
-        "quick": str(options.quick),
-        "checkpoints": " ".join(map(str, checkpoints)),
-    }
+    facts = {"data": options.data, "quick": str(options.quick), "checkpoints": " ".join(map(str, checkpoints))}
     write_scores(path, {**scores, **DOCUMENT}, {**about, **facts})
     return path
 
@@ -72,21 +71,27 @@ def _trained(row: str, changes: tuple[str, ...], options: argparse.Namespace) ->
     for seed in range(1 if options.quick else options.seeds):
         run = options.output / "runs" / f"{re.sub(r'[^a-z]+', '_', row)}_{options.data}_{seed}"
         overrides = [
-            *changes, f"data={options.data}", f"seed={seed}", f"paths.datasets={options.datasets}",
-            f"paths.run={run}", "callbacks.capture=null", *(QUICK if options.quick else ()),
-        ]  # fmt: skip
+            *changes,
+            f"data={options.data}",
+            f"seed={seed}",
+            f"paths.datasets={options.datasets}",
+            f"paths.run={run}",
+            "callbacks.capture=null",
+            *(QUICK if options.quick else ()),
+        ]
         train.train(compose("train", overrides))
         found.append(str(run / "checkpoints" / "last.ckpt"))
     return found
 
 
-def _evaluated(
-    checkpoints: list[str], options: argparse.Namespace, pipeline: str, baselines: bool = False
-) -> Scores:
+def _evaluated(checkpoints: list[str], options: argparse.Namespace, pipeline: str, baselines: bool = False) -> Scores:
     """Scores of whole recordings of the test split, over trainings and sampling seeds."""
     overrides = [
-        f"checkpoint={json.dumps(checkpoints)}", f"pipeline={pipeline}", f"baselines={baselines}",
-        f"seeds={[0] if options.quick else [0, 1, 2]}", f"device={options.device}",
+        f"checkpoint={json.dumps(checkpoints)}",
+        f"pipeline={pipeline}",
+        f"baselines={baselines}",
+        f"seeds={[0] if options.quick else [0, 1, 2]}",
+        f"device={options.device}",
         f"output={options.output / 'runs' / 'last_evaluation.json'}",
-    ]  # fmt: skip
+    ]
     return evaluate.run(compose("evaluate", overrides))

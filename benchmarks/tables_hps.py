@@ -36,9 +36,12 @@ DOCUMENT = {
 }  # fmt: skip
 """Thesis Tables 4.1 and 4.2 (cm)."""
 DOCUMENT_FEET = {
-    "IMU": (188.38, 0.92), "IMU + Cam": (39.8, 52.09), "IMU + Cam (filtered)": (0.95, 1.75),
-    "HPS w/o scene": (0.32, 2.00), "HPS": (0.056, 0.90),
-}  # fmt: skip
+    "IMU": (188.38, 0.92),
+    "IMU + Cam": (39.8, 52.09),
+    "IMU + Cam (filtered)": (0.95, 1.75),
+    "HPS w/o scene": (0.32, 2.00),
+    "HPS": (0.056, 0.90),
+}
 """Thesis Table 4.3: distance to surface (cm), foot sliding (cm per frame)."""
 TITLES = {"stand": "Table 4.1: standing in an A-pose", "move": "Table 4.2: walking, standing, leaning"}
 WIDTH = 150
@@ -52,12 +55,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--split", default="test", help="whose people and sites: train, val or test")
     parser.add_argument("--spacing", type=float, default=0.02, help="between points of the scan (m)")
-    parser.add_argument("--returns", type=float, nargs="+", default=list(Protocol.returns_m),
-                        help="distances (m) after which the wearer is back at the capture spot")  # fmt: skip
-    parser.add_argument("--end", type=float, default=Protocol.end_m, help="length of the session (m)")
     parser.add_argument(
-        "--jobs", type=int, default=2, help="seeds at a time; a single one uses as many cores"
+        "--returns",
+        type=float,
+        nargs="+",
+        default=list(Protocol.returns_m),
+        help="distances (m) after which the wearer is back at the capture spot",
     )
+    parser.add_argument("--end", type=float, default=Protocol.end_m, help="length of the session (m)")
+    parser.add_argument("--jobs", type=int, default=2, help="seeds at a time; a single one uses as many cores")
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -78,7 +84,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     show = Console(width=max(Console().width, WIDTH), highlight=False).print
     for name in ("stand", "move"):
         show(_chamfer_table(name, places, tree["chamfer_cm"][name]))
-    for table in (_feet_table(tree), _drift_table(tree), _whole_table(tree), _outage_table(tree), _seconds_table(tree)):  # fmt: skip
+    for table in (_feet_table(tree), _drift_table(tree), _whole_table(tree), _outage_table(tree), _seconds_table(tree)):
         show(table)
     show(_order_line(tree["order_beyond_start"]))
     draw_drift(folder / "drift.png", {row: [run["scores"][row]["drift"] for run in runs] for row in ROWS})
@@ -106,11 +112,15 @@ def summarized(runs: list[dict[str, Any]]) -> dict[str, Any]:
             best: {name: [_ordered(run, name, best) for run in runs] for name in TITLES} for best in ("HPS", "ours")
         },
         "outages": {row: _outages(runs, row) for row in DISTURBED},
-        "stage_seconds": {row: {
-            stage: summarize([run["stage_seconds"][row][stage] for run in runs]) for stage in runs[0]["stage_seconds"][row]
-        } for row in ROWS},
+        "stage_seconds": {
+            row: {
+                stage: summarize([run["stage_seconds"][row][stage] for run in runs])
+                for stage in runs[0]["stage_seconds"][row]
+            }
+            for row in ROWS
+        },
         "frames": summarize([float(run["frames"]) for run in runs]),
-    }  # fmt: skip
+    }
 
 
 def _of_visits(run: dict[str, Any], row: str, name: str, form: str, key: str) -> list[float]:
@@ -127,7 +137,7 @@ def _chamfer(runs: list[dict[str, Any]], rows: tuple[str, ...], form: str, key: 
             for row in rows
         }
         for name in TITLES
-    }  # fmt: skip
+    }
 
 
 def _standing_slope(run: dict[str, Any], row: str) -> float:
@@ -147,17 +157,20 @@ def _ordered(run: dict[str, Any], name: str, best: str) -> bool:
 
 def _over_seeds(runs: list[dict[str, Any]], rows: tuple[str, ...], part: str) -> dict[str, Any]:
     return {
-        row: {name: summarize([run["scores"][row][part][name] for run in runs]) for name in runs[0]["scores"][row][part]}
+        row: {
+            name: summarize([run["scores"][row][part][name] for run in runs]) for name in runs[0]["scores"][row][part]
+        }
         for row in rows
-    }  # fmt: skip
+    }
 
 
 def _outages(runs: list[dict[str, Any]], row: str) -> dict[str, Any]:
     parts = [run["outages"]["rows"][row] for run in runs]
     return {
         where: {name: summarize([part[where][name] for part in parts]) for name in parts[0][where]}
-        for where in parts[0] if all(where in part for part in parts)
-    }  # fmt: skip
+        for where in parts[0]
+        if all(where in part for part in parts)
+    }
 
 
 def _chamfer_table(name: str, places: list[str], entries: dict[str, Any]) -> Table:
@@ -180,22 +193,20 @@ def _feet_table(tree: dict[str, Any]) -> Table:
         known, true = DOCUMENT_FEET.get(row), tree["feet_true_contact"][row]
         beside = [f"  [{value:g}]" for value in known] if known else ["", ""]
         table.add_row(
-            row, cell(feet["distance_cm"], 3) + beside[0], cell(feet["absolute_distance_cm"], 3),
-            cell(feet["sliding_cm"], 3) + beside[1], cell(true["absolute_distance_cm"], 3), cell(true["sliding_cm"], 3),
-        )  # fmt: skip
+            row,
+            cell(feet["distance_cm"], 3) + beside[0],
+            cell(feet["absolute_distance_cm"], 3),
+            cell(feet["sliding_cm"], 3) + beside[1],
+            cell(true["absolute_distance_cm"], 3),
+            cell(true["sliding_cm"], 3),
+        )
     return table
 
 
 def _drift_table(tree: dict[str, Any]) -> Table:
-    table = new_table(
-        "Growth with distance (cm per 100 m)", ["", "root error, bins of 20 m", "standing Chamfer"]
-    )
+    table = new_table("Growth with distance (cm per 100 m)", ["", "root error, bins of 20 m", "standing Chamfer"])
     for row in ROWS:
-        table.add_row(
-            row,
-            cell(tree["slope_cm_per_100m"][row], 3),
-            cell(tree["standing_slope_cm_per_100m"][row], 3),
-        )
+        table.add_row(row, cell(tree["slope_cm_per_100m"][row], 3), cell(tree["standing_slope_cm_per_100m"][row], 3))
     return table
 
 
@@ -214,7 +225,9 @@ def _outage_table(tree: dict[str, Any]) -> Table:
     )
     for row, parts in tree["outages"].items():
         for where, scores in parts.items():
-            table.add_row(row, where, *(cell(scores[name]) for name in ("root_cm", "root_ratio", "joint_cm", "joint_ratio")))  # fmt: skip
+            table.add_row(
+                row, where, *(cell(scores[name]) for name in ("root_cm", "root_ratio", "joint_cm", "joint_ratio"))
+            )
     return table
 
 
@@ -226,15 +239,17 @@ def _seconds_table(tree: dict[str, Any]) -> Table:
     for row, seconds in tree["stage_seconds"].items():
         total = sum(summary["mean"] for summary in seconds.values())
         table.add_row(
-            row, *(cell(seconds[stage], 1) if stage in seconds else "" for stage in stages),
+            row,
+            *(cell(seconds[stage], 1) if stage in seconds else "" for stage in stages),
             f"{tree['frames']['mean'] / max(total, 1e-9):.0f}",
-        )  # fmt: skip
+        )
     return table
 
 
 def _order_line(order: dict[str, dict[str, list[bool]]]) -> str:
     parts = [
         f"{' > '.join((*ORDERED, best))}, {name}: {sum(held)} of {len(held)} seeds"
-        for best, kinds in order.items() for name, held in kinds.items()
-    ]  # fmt: skip
+        for best, kinds in order.items()
+        for name, held in kinds.items()
+    ]
     return "Order beyond the start (mean over visits):\n  " + "\n  ".join(parts)

@@ -25,18 +25,9 @@ from wearcap.metrics.detection import mean_detection_scores
 from wearcap.recording import RecordingStore
 from wearcap.scene.objects import CONTACT_CLASSES
 
-DOCUMENT_END = {
-    "HPS": (60.81, 46.89),
-    "as published": (6.88, 7.13),
-    "as published, w/o contact corr.": (11.68, 10.28),
-}
+DOCUMENT_END = {"HPS": (60.81, 46.89), "as published": (6.88, 7.13), "as published, w/o contact corr.": (11.68, 10.28)}
 """Thesis Table 5.1, column All: cm and degrees."""
-DOCUMENT_HAND = {
-    "HPS": 33.61,
-    "HPS w/ GT": 10.44,
-    "as published": 2.93,
-    "as published, w/o contact corr.": 11.37,
-}
+DOCUMENT_HAND = {"HPS": 33.61, "HPS w/ GT": 10.44, "as published": 2.93, "as published, w/o contact corr.": 11.37}
 """Thesis Table 5.2, column All (cm)."""
 DOCUMENT_DETECTION = (0.807, 0.786, 0.880, 0.905)
 """Thesis Table 5.3: AP, precision, recall, accuracy at 0.5."""
@@ -45,23 +36,33 @@ DOCUMENT_GAPS = (13.61, 8.49, 7.13, 8.86, 8.86)
 DOCUMENT_CHAMFER = {"HPS": (9.771, 22.651), "as published": (8.981, 8.471)}
 """Thesis Table 5.5: body and object (cm)."""
 KINDS = {
-    "door": ("door", "window", "cabinet_door"), "drawer": ("drawer",), "sofa": ("sofa", "armchair"),
-    "table": ("table", "coffee_table"), "chair": ("chair",), "box": ("box",),
-}  # fmt: skip
+    "door": ("door", "window", "cabinet_door"),
+    "drawer": ("drawer",),
+    "sofa": ("sofa", "armchair"),
+    "table": ("table", "coffee_table"),
+    "chair": ("chair",),
+    "box": ("box",),
+}
 """Columns of the tables, and the categories that they gather."""
 WIDTH = 170
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--dataset", type=Path, default=Path("datasets/simulated_interactions"),
-                        help="made by `wearcap prepare simulated_interactions preset=standard`")  # fmt: skip
+    parser.add_argument(
+        "--dataset",
+        type=Path,
+        default=Path("datasets/simulated_interactions"),
+        help="made by `wearcap prepare simulated_interactions preset=standard`",
+    )
     parser.add_argument("--split", default="test", help="whose people and objects: train, val or test")
     parser.add_argument("--seeds", type=int, default=5, help="groups of recordings (2 when quick)")
-    parser.add_argument("--ours", nargs="+", default=["contact_sequence"],
-                        help="checkpoint(s) of our contact network")  # fmt: skip
-    parser.add_argument("--published", nargs="+",
-                        default=[f"contact_transformer_{name}" for name in CONTACT_CLASSES],
-                        help="checkpoints of the published networks, one per class")  # fmt: skip
+    parser.add_argument("--ours", nargs="+", default=["contact_sequence"], help="checkpoint(s) of our contact network")
+    parser.add_argument(
+        "--published",
+        nargs="+",
+        default=[f"contact_transformer_{name}" for name in CONTACT_CLASSES],
+        help="checkpoints of the published networks, one per class",
+    )
     parser.add_argument("--no-robustness", action="store_true", help="leave out the runs with worse sensors")
     parser.add_argument("--jobs", type=int, default=2, help="recordings at a time")
 
@@ -69,22 +70,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write the tables; returns the file."""
     if not (options.dataset / "manifest.json").is_file():
-        raise WearcapError("no such data set", where=options.dataset,
-                           fix=f"Run: wearcap prepare simulated_interactions preset=standard output={options.dataset}")  # fmt: skip
+        raise WearcapError(
+            "no such data set",
+            where=options.dataset,
+            fix=f"Run: wearcap prepare simulated_interactions preset=standard output={options.dataset}",
+        )
     names = RecordingStore.open(options.dataset).names(options.split)
     seeds = min(2 if options.quick else options.seeds, len(names))
     names = names[:seeds] if options.quick else names
     networks = Networks(tuple(options.ours), tuple(options.published))
     # worse sensors once per group: HPS is run again for each
     runs = [
-        RecordingRun(
-            options.dataset, name, networks, index < seeds and not (options.no_robustness or options.quick)
-        )
+        RecordingRun(options.dataset, name, networks, index < seeds and not (options.no_robustness or options.quick))
         for index, name in enumerate(names)
     ]
     found = Parallel(n_jobs=options.jobs)(delayed(_told)(run) for run in runs)
     groups: list[list[Any]] = [list(found[k::seeds]) for k in range(seeds)]
-    tree = {"about": about | {"dataset": str(options.dataset), "split": options.split, "recordings": names}} | _tree(groups)  # fmt: skip
+    tree = {"about": about | {"dataset": str(options.dataset), "split": options.split, "recordings": names}} | _tree(
+        groups
+    )
     _show(tree)
     path = options.output / "ireplica.json"
     write_text(path, json.dumps(finite(tree), indent=1, allow_nan=False) + "\n")
@@ -116,8 +120,10 @@ def _tree(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
             name: _row([[run[name] for run in group] for group in disturbed])
             | _detection([[run[name]["detection"] for run in group] for group in disturbed])
             for name in DISTURBANCES
-        } if any(disturbed) else {},
-    }  # fmt: skip
+        }
+        if any(disturbed)
+        else {},
+    }
 
 
 def _row(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
@@ -132,9 +138,7 @@ def _row(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
         "all": {name: _measure(groups, name, None) for name in measures},
         "median": {name: _measure(groups, name, None, middle=True) for name in ("end_cm", "end_deg")},
         "kinds": kinds,
-        "whole": {
-            name: summarize([_mean([run[name] for run in group]) for group in groups]) for name in whole
-        },
+        "whole": {name: summarize([_mean([run[name] for run in group]) for group in groups]) for name in whole},
     }
 
 
@@ -143,12 +147,7 @@ def _measure(
 ) -> dict[str, Any]:
     """Mean (or median) over the handlings of each group, summarised over groups."""
     values = [
-        [
-            row[name]
-            for run in group
-            for row in run["handlings"]
-            if categories is None or row["category"] in categories
-        ]
+        [row[name] for run in group for row in run["handlings"] if categories is None or row["category"] in categories]
         for group in groups
     ]
     return summarize([_median(group) if middle else _mean(group) for group in values])
@@ -193,8 +192,10 @@ def _show(tree: dict[str, Any]) -> None:
 
 
 def _ends(tree: dict[str, Any]) -> Table:
-    shown = new_table("Table 5.1: objects where they were left, cm / degrees; in brackets the paper's, on its recordings",
-                      ["", *KINDS, "all", "median"])  # fmt: skip
+    shown = new_table(
+        "Table 5.1: objects where they were left, cm / degrees; in brackets the paper's, on its recordings",
+        ["", *KINDS, "all", "median"],
+    )
     for row, found in tree["rows"].items():
         known = DOCUMENT_END.get(row)
         beside = f"  [{known[0]:.1f} / {known[1]:.1f}]" if known else ""
@@ -209,24 +210,27 @@ def _two(found: dict[str, Any], spread: bool = False) -> str:
 
 
 def _hands(tree: dict[str, Any]) -> Table:
-    columns = {"hand_object_cm": "hand to object", "hand_cm": "hand, to its true place", "object_cm": "object, to its true place",
-               "object_deg": "degrees"}  # fmt: skip
-    shown = new_table("Table 5.2: during true contact (cm); in brackets the paper's", ["", *columns.values(), "body (MPJPE)", "untouched moved"])  # fmt: skip
+    columns = {
+        "hand_object_cm": "hand to object",
+        "hand_cm": "hand, to its true place",
+        "object_cm": "object, to its true place",
+        "object_deg": "degrees",
+    }
+    shown = new_table(
+        "Table 5.2: during true contact (cm); in brackets the paper's",
+        ["", *columns.values(), "body (MPJPE)", "untouched moved"],
+    )
     for row, found in tree["rows"].items():
         known = DOCUMENT_HAND.get(row)
         cells = [cell(found["all"][name], 1) for name in columns]
         cells[0] += f"  [{known:.1f}]" if known else ""
-        shown.add_row(
-            row, *cells, cell(found["whole"]["mpjpe_cm"], 1), cell(found["whole"]["false_moves_cm"], 1)
-        )
+        shown.add_row(row, *cells, cell(found["whole"]["mpjpe_cm"], 1), cell(found["whole"]["false_moves_cm"], 1))
     return shown
 
 
 def _detections(tree: dict[str, Any]) -> Table:
     columns = ("average_precision", "precision", "recall", "accuracy", "calibration_error")
-    shown = new_table(
-        "Table 5.3: contact, mean over hands and classes; per class in the rows below", ["", *columns]
-    )
+    shown = new_table("Table 5.3: contact, mean over hands and classes; per class in the rows below", ["", *columns])
     for name, found in tree["detection"].items():
         shown.add_row(name, *(cell(found["detection"][column], 3) for column in columns))
         for kind, scores in found["by_class"].items():
@@ -243,8 +247,10 @@ def _gaps(tree: dict[str, Any]) -> Table:
 
 
 def _chamfer(tree: dict[str, Any]) -> Table:
-    shown = new_table("Table 5.5: Chamfer to the true surfaces during interactions (cm); in brackets the paper's",
-                      ["", "body", "object"])  # fmt: skip
+    shown = new_table(
+        "Table 5.5: Chamfer to the true surfaces during interactions (cm); in brackets the paper's",
+        ["", "body", "object"],
+    )
     for row, found in tree["rows"].items():
         known = DOCUMENT_CHAMFER.get(row)
         beside = [f"  [{value:.1f}]" for value in known] if known else ["", ""]
@@ -254,10 +260,15 @@ def _chamfer(tree: dict[str, Any]) -> Table:
 
 
 def _robustness(tree: dict[str, Any]) -> Table:
-    shown = new_table("Worse sensors: ours, one recording per group", ["", "AP", "end cm / degrees", "hand cm", "object cm"])  # fmt: skip
+    shown = new_table(
+        "Worse sensors: ours, one recording per group", ["", "AP", "end cm / degrees", "hand cm", "object cm"]
+    )
     for name, found in tree["robustness"].items():
         shown.add_row(
-            name, cell(found["detection"]["average_precision"], 3), _two(found["all"], spread=True),
-            cell(found["all"]["hand_cm"], 1), cell(found["all"]["object_cm"], 1),
-        )  # fmt: skip
+            name,
+            cell(found["detection"]["average_precision"], 3),
+            _two(found["all"], spread=True),
+            cell(found["all"]["hand_cm"], 1),
+            cell(found["all"]["object_cm"], 1),
+        )
     return shown

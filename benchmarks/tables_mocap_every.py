@@ -23,26 +23,29 @@ from wearcap.models.checkpoint import checkpoint_file
 from wearcap.systems.mocap_every.energy import LatentSolver
 
 BODY = (
-    "r_mpjpe_cm", "mpjpe_cm", "mpjve_cm_s", "root_cm", "jitter_ratio", "upper_pe_cm", "lower_pe_cm", "hand_pe_cm",
-    "foot_skate_cm_s",
-)  # fmt: skip
-FLOOR = (
+    "r_mpjpe_cm",
+    "mpjpe_cm",
+    "mpjve_cm_s",
+    "root_cm",
+    "jitter_ratio",
     "upper_pe_cm",
     "lower_pe_cm",
-    "mpjpe_cm",
-    "floor_cm",
-    "floor_within_3cm",
-    "floor_within_3cm_smoothed",
+    "hand_pe_cm",
+    "foot_skate_cm_s",
 )
+FLOOR = ("upper_pe_cm", "lower_pe_cm", "mpjpe_cm", "floor_cm", "floor_within_3cm", "floor_within_3cm_smoothed")
 CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
 TRAINED = {
-    "AvatarPoser-style, watches": ("mocap_every_avatarposer", ("pipeline=mocap_every", "pipeline.stride=1", "pipeline.lookahead=0", "pipeline.mirror_average=false")),
+    "AvatarPoser-style, watches": (
+        "mocap_every_avatarposer",
+        ("pipeline=mocap_every", "pipeline.stride=1", "pipeline.lookahead=0", "pipeline.mirror_average=false"),
+    ),
     "as in the paper": ("mocap_every_paper", ("pipeline=mocap_every_paper",)),
     "neither": ("mocap_every_neither", ("pipeline=mocap_every",)),
     "+ representation": ("mocap_every_one_stage", ("pipeline=mocap_every",)),
     "+ multi-stage": ("mocap_every_short", ("pipeline=mocap_every",)),
     "+ multi-stage, hands tracked": ("mocap_every_hands", ("pipeline=mocap_every",)),
-}  # fmt: skip
+}
 """Rows: run, and pipeline. "+ multi-stage" is experiment=mocap_every, trained for as many steps as the others."""
 DOCUMENT: Scores = {
     name: {key: Summary(value, None, 1) for key, value in zip(BODY, values)}
@@ -56,20 +59,14 @@ FLOORS = ("fixed", "update", "points", "follow")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--datasets", type=Path, default=Path("datasets"), help="folder of the prepared data sets"
-    )
+    parser.add_argument("--datasets", type=Path, default=Path("datasets"), help="folder of the prepared data sets")
     parser.add_argument("--split", default="test", help="train, val or test")
     parser.add_argument("--checkpoint", default="mocap_every", help="ours")
     parser.add_argument("--manifold", default="motion_manifold", help="where motion is edited by cues")
-    parser.add_argument(
-        "--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings"
-    )
+    parser.add_argument("--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings")
     parser.add_argument("--recordings", type=int, help="no more than so many of each data set")
     parser.add_argument("--sessions", type=int, default=30, help="simulated calibrations")
-    parser.add_argument(
-        "--parts", nargs="*", default=["body", "floor", "cues", "calibration"], help="tables to make"
-    )
+    parser.add_argument("--parts", nargs="*", default=["body", "floor", "cues", "calibration"], help="tables to make")
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -91,17 +88,28 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
     ours = [
         Method("ours", options.checkpoint, ("pipeline=mocap_every", level)),
         Method("ours, floor followed", options.checkpoint),
-        Method("ours, without mirror averaging", options.checkpoint, ("pipeline=mocap_every", level, "pipeline.mirror_average=false")),
-        Method("ours, not anchored to the head", options.checkpoint, ("pipeline=mocap_every", level, "pipeline.anchor=false")),
+        Method(
+            "ours, without mirror averaging",
+            options.checkpoint,
+            ("pipeline=mocap_every", level, "pipeline.mirror_average=false"),
+        ),
+        Method(
+            "ours, not anchored to the head",
+            options.checkpoint,
+            ("pipeline=mocap_every", level, "pipeline.anchor=false"),
+        ),
         Method("ours, three frames at a time", options.checkpoint, ("pipeline=mocap_every_online", level)),
         Method("ours, heads as by SLAM", options.checkpoint, slam=True),
-        Method("ours, heads as by SLAM, not anchored", options.checkpoint, ("pipeline=mocap_every", "pipeline.anchor=false"), slam=True),
-    ]  # fmt: skip
+        Method(
+            "ours, heads as by SLAM, not anchored",
+            options.checkpoint,
+            ("pipeline=mocap_every", "pipeline.anchor=false"),
+            slam=True,
+        ),
+    ]
     trained = {}
     for name, (run, pipeline) in TRAINED.items():
-        paths = [
-            options.runs / seeded / "checkpoints" / "last.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")
-        ]
+        paths = [options.runs / seeded / "checkpoints" / "last.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
         trained[name] = [Method(name, str(path), (*pipeline, level)) for path in paths if path.is_file()]
         if not trained[name]:
             progress.console.print(f"left out: {name} (no {paths[0]})")
@@ -123,7 +131,10 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
 def _floor(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 3: stairs and ramps between terraces at -4 to 4 m."""
     store, names = recordings_of(options, "simulated_hillside")
-    methods = [Method(f"floor {floor}", options.checkpoint, ("pipeline=mocap_every", f"pipeline.floor={floor}")) for floor in FLOORS]  # fmt: skip
+    methods = [
+        Method(f"floor {floor}", options.checkpoint, ("pipeline=mocap_every", f"pipeline.floor={floor}"))
+        for floor in FLOORS
+    ]
     run, pipeline = TRAINED["as in the paper"]
     path = options.runs / run / "checkpoints" / "last.ckpt"
     if path.is_file():
@@ -149,8 +160,11 @@ def _cues(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
     level = pipeline_of(Method("ours", options.checkpoint, ("pipeline=mocap_every", "pipeline.floor=fixed")))
     pipelines = {"cmu": level, "simulated": pipeline_of(Method("ours", options.checkpoint))}
     # Adam takes ten times as long: on the smaller data set alone.
-    rows = (("cmu", "edited", LatentSolver()), ("cmu", "edited by 500 Adam steps", LatentSolver("adam", 500)),
-            ("simulated", "edited", LatentSolver()))  # fmt: skip
+    rows = (
+        ("cmu", "edited", LatentSolver()),
+        ("cmu", "edited by 500 Adam steps", LatentSolver("adam", 500)),
+        ("simulated", "edited", LatentSolver()),
+    )
     scores: Scores = {}
     for data, label, solver in rows:
         store, names = recordings_of(options, data)

@@ -38,9 +38,7 @@ def views(clouds: Tensor, turned: float | None) -> Tensor:
     if turned is None:
         return clouds
     vary = CloudAugmentation(stretch=0.0, turned=turned)
-    return torch.stack(
-        [vary(cloud, torch.Generator().manual_seed(seed)) for seed, cloud in enumerate(clouds)]
-    )
+    return torch.stack([vary(cloud, torch.Generator().manual_seed(seed)) for seed, cloud in enumerate(clouds)])
 
 
 def by_extents(classes: list[str], test: Tensor, labels: Tensor, per_class: int) -> float:
@@ -58,9 +56,7 @@ def milliseconds(system: ObjectEncoding, clouds: Float[Tensor, "batch point 3"])
     return 1e3 * (time.thread_time() - begin) / len(clouds[:30])
 
 
-def scored(
-    system: ObjectEncoding, clouds: Tensor, labels: Tensor
-) -> tuple[dict[str, dict[str, float]], Tensor]:
+def scored(system: ObjectEncoding, clouds: Tensor, labels: Tensor) -> tuple[dict[str, dict[str, float]], Tensor]:
     """Scores by view, and the confusion of views turned in any way (rows: true)."""
     rows, projected, said = {}, {}, labels
     for name, turned in VIEWS.items():
@@ -87,20 +83,30 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     classes, per_class = list(system.net.classes), 10 if options.quick else options.per_class
     clouds, labels = generate_clouds("test", classes, per_class)
     rows, confusion = scored(system, clouds, labels)
-    table = new_table(f"{len(clouds)} objects of {len(classes)} classes", ["turned", "accuracy", "extents' error", "found again"])  # fmt: skip
+    table = new_table(
+        f"{len(clouds)} objects of {len(classes)} classes", ["turned", "accuracy", "extents' error", "found again"]
+    )
     for name, row in rows.items():
         table.add_row(name, *(f"{row[key]:.3f}" for key in ("accuracy", "extents_error", "found_again")))
     baseline = by_extents(classes, clouds, labels, per_class)
     table.add_row("nearest by extents (m)", f"{baseline:.3f}", "", "")
     confused = {
         f"{one} as {other}": int(confusion[i, j])
-        for i, one in enumerate(classes) for j, other in enumerate(classes) if i != j and confusion[i, j]
-    }  # fmt: skip
+        for i, one in enumerate(classes)
+        for j, other in enumerate(classes)
+        if i != j and confusion[i, j]
+    }
     speed = milliseconds(system, clouds)
     console = Console(width=120)
     console.print(table)
     console.print(f"turned in any way, taken for others: {confused}\n{speed:.1f} ms per cloud")
     path = options.output / "objects.json"
-    content = about | {"objects": len(clouds), "rows": rows, "by_extents": baseline, "confused": confused, "ms_per_cloud": speed}  # fmt: skip
+    content = about | {
+        "objects": len(clouds),
+        "rows": rows,
+        "by_extents": baseline,
+        "confused": confused,
+        "ms_per_cloud": speed,
+    }
     write_text(path, json.dumps(finite(content), indent=1) + "\n")
     return path

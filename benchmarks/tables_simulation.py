@@ -20,9 +20,7 @@ from wearcap.recording import RecordingStore
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--simulated", default="datasets/simulated", help="prepared data set of simulated people"
-    )
+    parser.add_argument("--simulated", default="datasets/simulated", help="prepared data set of simulated people")
     parser.add_argument("--cmu", default="datasets/cmu", help="prepared data set of CMU")
     parser.add_argument("--seeds", type=int, default=5, help="trainings of the discriminator (2 when quick)")
 
@@ -30,8 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write both tables; returns the path of the JSON file."""
     clips = {
-        name: _clips(root, options.quick)
-        for name, root in (("simulated", options.simulated), ("cmu", options.cmu))
+        name: _clips(root, options.quick) for name, root in (("simulated", options.simulated), ("cmu", options.cmu))
     }
     statistics = _compared(walking_windows(clips["simulated"]), walking_windows(clips["cmu"]))
     show(_statistics_table(statistics))
@@ -63,9 +60,7 @@ def _halves(clips: list[Clip]) -> tuple[list[Clip], list[Clip]]:
     return [c for c in clips if c.person in first], [c for c in clips if c.person not in first]
 
 
-def _compared(
-    simulated: dict[str, torch.Tensor], cmu: dict[str, torch.Tensor]
-) -> dict[str, dict[str, float]]:
+def _compared(simulated: dict[str, torch.Tensor], cmu: dict[str, torch.Tensor]) -> dict[str, dict[str, float]]:
     """Mean and spread of every statistic on both sides, and the Kolmogorov–Smirnov distance between them."""
     rows = {}
     for name in cmu:
@@ -73,10 +68,14 @@ def _compared(
         if min(len(a), len(b)) < 2:
             continue
         rows[name] = {
-            "simulated_mean": a.mean().item(), "simulated_std": a.std().item(), "simulated_windows": len(a),
-            "cmu_mean": b.mean().item(), "cmu_std": b.std().item(), "cmu_windows": len(b),
+            "simulated_mean": a.mean().item(),
+            "simulated_std": a.std().item(),
+            "simulated_windows": len(a),
+            "cmu_mean": b.mean().item(),
+            "cmu_std": b.std().item(),
+            "cmu_windows": len(b),
             "ks_distance": float(ks_2samp(a.numpy(), b.numpy())[0]),
-        }  # fmt: skip
+        }
     return rows
 
 
@@ -84,9 +83,11 @@ def _statistics_table(statistics: dict[str, dict[str, float]]) -> Table:
     first = next(iter(statistics.values()), {"simulated_windows": 0, "cmu_windows": 0})
     table = Table(title="Straight walking, windows of 2 s")
     for name in (
-        "statistic", f"simulated ({first['simulated_windows']})", f"CMU ({first['cmu_windows']})",
+        "statistic",
+        f"simulated ({first['simulated_windows']})",
+        f"CMU ({first['cmu_windows']})",
         "Kolmogorov–Smirnov",
-    ):  # fmt: skip
+    ):
         table.add_column(name, justify="left" if name == "statistic" else "right")
     for name, row in statistics.items():
         sides = [f"{row[side + '_mean']:.2f} ± {row[side + '_std']:.2f}" for side in ("simulated", "cmu")]

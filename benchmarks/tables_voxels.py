@@ -31,13 +31,14 @@ Rebuild = Callable[[Tensor], Tensor]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", type=Path, default=Path("datasets/simulated_camera"), help="prepared data set")
     parser.add_argument(
-        "--data", type=Path, default=Path("datasets/simulated_camera"), help="prepared data set"
+        "--checkpoints",
+        nargs="*",
+        default=["ours=voxel_autoencoder"],
+        metavar="[LABEL=]PATH",
+        help="voxel autoencoders to compare",
     )
-    parser.add_argument(
-        "--checkpoints", nargs="*", default=["ours=voxel_autoencoder"],
-        metavar="[LABEL=]PATH", help="voxel autoencoders to compare",
-    )  # fmt: skip
 
 
 def grids_of(root: Path, split: str, count: int, grid: VoxelGrid) -> Tensor:
@@ -107,8 +108,9 @@ def methods(options: argparse.Namespace, train: Tensor) -> tuple[dict[str, Rebui
     """Ways to rebuild grids by label, and the encoders among them."""
     rebuilds: dict[str, Rebuild] = {
         "no point anywhere": lambda grids: torch.full_like(grids, VoxelGrid().clip_m),
-        "nearest of training": nearest(train), "128 principal components": principal(train),
-    }  # fmt: skip
+        "nearest of training": nearest(train),
+        "128 principal components": principal(train),
+    }
     encoders = {}
     for given in options.checkpoints:
         label, _, path = given.rpartition("=")
@@ -132,11 +134,15 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     rows = {label: scored(rebuild, val, test, grid.clip_m) for label, rebuild in rebuilds.items()}
     for label, encode in encoders.items():
         rows[label]["encoded_per_s"] = encoded_per_second(encode, test)
-    table = new_table(f"Grids of {options.data.name} from their codes ({len(test)} of the test split)",
-                      ["", "distance, cm", "of held cells, cm", "occupancy IoU", "encoded/s"])  # fmt: skip
+    table = new_table(
+        f"Grids of {options.data.name} from their codes ({len(test)} of the test split)",
+        ["", "distance, cm", "of held cells, cm", "occupancy IoU", "encoded/s"],
+    )
     for label, row in rows.items():
         speed = f"{row['encoded_per_s']:.0f}" if "encoded_per_s" in row else ""
-        table.add_row(label, f"{row['distance_cm']:.4f}", f"{row['held_distance_cm']:.2f}", f"{row['occupancy_iou']:.3f}", speed)  # fmt: skip
+        table.add_row(
+            label, f"{row['distance_cm']:.4f}", f"{row['held_distance_cm']:.2f}", f"{row['occupancy_iou']:.3f}", speed
+        )
     Console(width=120).print(table)
     shown = test[:: len(test) // 12][:12]
     pictured = {"true": shown} | {label: rebuild(shown) for label, rebuild in rebuilds.items()}

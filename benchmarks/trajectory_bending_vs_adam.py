@@ -36,9 +36,16 @@ def measure(duration_s: float = 600.0, longest: int = LONGEST, repeats: int = 5)
     )
     if reached < ours:
         raise SystemExit(f"error: Adam's energy {reached:.4f} is below ours {ours:.4f}")
-    return [{"name": "trajectory_bending_vs_adam", "value": value,
-             "unit": f"ms (energy {ours:.2f} against {reached:.2f} after {after} iterations)",
-             "baseline": baseline, "ratio": baseline / value, "goal": 20.0}]  # fmt: skip
+    return [
+        {
+            "name": "trajectory_bending_vs_adam",
+            "value": value,
+            "unit": f"ms (energy {ours:.2f} against {reached:.2f} after {after} iterations)",
+            "baseline": baseline,
+            "ratio": baseline / value,
+            "goal": 20.0,
+        }
+    ]
 
 
 def adam(problem: BendingProblem, rate: float, longest: int, enough: float) -> tuple[float, float, int]:
@@ -58,9 +65,7 @@ def least(solved: BentPath) -> float:
 def walk(duration_s: float, drift: float = 0.01, noise_m: float = 0.07, seed: int = 0) -> BendingProblem:
     """A walk in random curves, at 0 to 1.8 m/s, with its heading drifting, and noisy positions at every frame."""
     rng, count = np.random.default_rng(seed), int(duration_s * FPS)
-    settings = instantiate(compose("capture", ["recording=none", "+bending=adam"]).bending).keywords[
-        "settings"
-    ]
+    settings = instantiate(compose("capture", ["recording=none", "+bending=adam"]).bending).keywords["settings"]
 
     def slow(seconds: float) -> np.ndarray:
         window = np.hanning(int(seconds * FPS))

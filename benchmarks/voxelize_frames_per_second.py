@@ -35,6 +35,13 @@ def measure(points: int = 1_000_000, frames: int = 54_000) -> list[dict]:
         growing.voxelize(pose[frame : frame + 1])
     streamed = (last - 1) / (time.thread_time() - begin)
     return [
-        {"name": "voxelize_frames_per_second", "value": value, "unit": unit, "baseline": FPS, "ratio": value / FPS, "goal": 1000.0}
+        {
+            "name": "voxelize_frames_per_second",
+            "value": value,
+            "unit": unit,
+            "baseline": FPS,
+            "ratio": value / FPS,
+            "goal": 1000.0,
+        }
         for value, unit in ((whole, "frames/s, whole recording"), (streamed, "frames/s, growing map"))
-    ]  # fmt: skip
+    ]

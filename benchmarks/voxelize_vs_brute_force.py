@@ -63,6 +63,14 @@ def measure(points: int = 1_000_000, frames: int = 18_000, compared: int = 40) -
         error = float(np.abs(grids[chosen].numpy() - np.stack(theirs)).max())
         if error > 1e-3:
             raise SystemExit(f"error: the grids differ by {error} m ({unit})")
-        figures.append({"name": "voxelize_vs_brute_force", "value": value, "unit": unit, "baseline": baseline,
-                        "ratio": value / baseline, "goal": goal})  # fmt: skip
+        figures.append(
+            {
+                "name": "voxelize_vs_brute_force",
+                "value": value,
+                "unit": unit,
+                "baseline": baseline,
+                "ratio": value / baseline,
+                "goal": goal,
+            }
+        )
     return figures

@@ -53,9 +53,7 @@ def main(arguments: list[str]) -> None:
     save_png(Path(arguments[1] if len(arguments) > 1 else "docs/mocap_every_watch.png"), np.asarray(sheet))
 
 
-def _curves(
-    draw: ImageDraw.ImageDraw, font, top: int, title: str, time: np.ndarray, values: np.ndarray
-) -> None:
+def _curves(draw: ImageDraw.ImageDraw, font, top: int, title: str, time: np.ndarray, values: np.ndarray) -> None:
     row = lambda v: top + 34 + (HIGH - np.clip(v, LOW, HIGH)) / (HIGH - LOW) * (BAND - 50)  # noqa: E731
     column = MARGIN + (WIDTH - MARGIN - 20) * time / time[-1]
     lost = np.isnan(values[:, 0])
@@ -73,11 +71,14 @@ def _curves(
     draw.text((MARGIN, top + 8), title, fill=INK, font=font)
 
 
-def _watches(
-    draw: ImageDraw.ImageDraw, font, top: int, time: np.ndarray, R: torch.Tensor, world: torch.Tensor
-) -> None:
+def _watches(draw: ImageDraw.ImageDraw, font, top: int, time: np.ndarray, R: torch.Tensor, world: torch.Tensor) -> None:
     """The watch's axes at some moments, seen from aside and above, and the smoothed force (black)."""
-    draw.text((MARGIN, top + 8), "the watch's axes, z up in the picture; black: the force that holds it (1 g as long as an axis)", fill=INK, font=font)  # fmt: skip
+    draw.text(
+        (MARGIN, top + 8),
+        "the watch's axes, z up in the picture; black: the force that holds it (1 g as long as an axis)",
+        fill=INK,
+        font=font,
+    )
     view = rotation.about_axis("x", torch.tensor(-0.4)) @ rotation.about_axis("z", torch.tensor(0.6))
     there = np.flatnonzero(world.isfinite().all(-1).numpy())
     for number, frame in enumerate(there[np.linspace(0, len(there) - 1, WATCHES).astype(int)].tolist()):

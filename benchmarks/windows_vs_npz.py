@@ -36,9 +36,15 @@ def measure(minutes: float = MINUTES, windows: int = 200, npz_windows: int = 5) 
         baseline = _median_ms(from_npz, starts[:npz_windows])
         value = _median_ms(from_store, starts)
     return [
-        {"name": "windows_vs_npz", "value": value, "unit": "ms per window", "baseline": baseline,
-         "ratio": baseline / value, "goal": 20.0}
-    ]  # fmt: skip
+        {
+            "name": "windows_vs_npz",
+            "value": value,
+            "unit": "ms per window",
+            "baseline": baseline,
+            "ratio": baseline / value,
+            "goal": 20.0,
+        }
+    ]
 
 
 def _median_ms(load: Callable, starts: list[int]) -> float:

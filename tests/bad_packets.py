@@ -13,20 +13,41 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 
 TIMES = {
-    "nan": math.nan, "infinite": math.inf, "absurd": 1e18, "milliseconds": 1.7e12, "far": 1e9, "ahead": 100.0,
-    "none": None, "text": "now", "huge": 10**400, "complex": 1j,
-}  # fmt: skip
+    "nan": math.nan,
+    "infinite": math.inf,
+    "absurd": 1e18,
+    "milliseconds": 1.7e12,
+    "far": 1e9,
+    "ahead": 100.0,
+    "none": None,
+    "text": "now",
+    "huge": 10**400,
+    "complex": 1j,
+}
 VECTORS = {
-    "nan": torch.tensor([0.0, math.nan, 0.0]), "infinite": torch.tensor([0.0, 0.0, -math.inf]),
-    "large": torch.tensor([1e30, 0.0, 0.0]), "short": torch.zeros(2), "integer": torch.zeros(3, dtype=torch.int64),
-    "complex": torch.zeros(3, dtype=torch.complex64), "numpy": np.zeros(3), "none": None, "list": [0.0, 0.0, 0.0],
-    "sparse": torch.zeros(3).to_sparse(), "meta": torch.zeros(3, device="meta"),
-}  # fmt: skip
+    "nan": torch.tensor([0.0, math.nan, 0.0]),
+    "infinite": torch.tensor([0.0, 0.0, -math.inf]),
+    "large": torch.tensor([1e30, 0.0, 0.0]),
+    "short": torch.zeros(2),
+    "integer": torch.zeros(3, dtype=torch.int64),
+    "complex": torch.zeros(3, dtype=torch.complex64),
+    "numpy": np.zeros(3),
+    "none": None,
+    "list": [0.0, 0.0, 0.0],
+    "sparse": torch.zeros(3).to_sparse(),
+    "meta": torch.zeros(3, device="meta"),
+}
 ROTATIONS = {
-    "nan": torch.full((3, 3), math.nan), "flat": torch.eye(3, 4), "scaled": 2 * torch.eye(3),
-    "mirror": torch.diag(torch.tensor([1.0, 1.0, -1.0])), "zero": torch.zeros(3, 3),
-    "integer": torch.eye(3, dtype=torch.int64), "numpy": np.eye(3), "none": None, "batch": torch.eye(3)[None],
-}  # fmt: skip
+    "nan": torch.full((3, 3), math.nan),
+    "flat": torch.eye(3, 4),
+    "scaled": 2 * torch.eye(3),
+    "mirror": torch.diag(torch.tensor([1.0, 1.0, -1.0])),
+    "zero": torch.zeros(3, 3),
+    "integer": torch.eye(3, dtype=torch.int64),
+    "numpy": np.eye(3),
+    "none": None,
+    "batch": torch.eye(3)[None],
+}
 
 
 def unchecked(call: Callable) -> Callable:

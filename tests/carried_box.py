@@ -47,10 +47,7 @@ def boxes(carried=CARRIED) -> Environment:
     """An environment with the carried boxes; the second one is a chair of another size."""
     names = dict.fromkeys(name for name, *_ in carried)
     return Environment(
-        tuple(
-            scene_object(name, CLASSES[k % 2], box_mesh(HALF / (1 + k), MIDDLE * k))
-            for k, name in enumerate(names)
-        )
+        tuple(scene_object(name, CLASSES[k % 2], box_mesh(HALF / (1 + k), MIDDLE * k)) for k, name in enumerate(names))
     )
 
 
@@ -65,15 +62,20 @@ def carrying(seconds: float = 2.0, name: str = "carry", carried=CARRIED, fps: fl
         tracks[box] = Trajectory(time, T.R, T.t)
     start, stop = (torch.tensor([row[k] for row in carried], dtype=torch.float64) for k in (2, 3))
     hands = torch.tensor([[row[1] == "left", row[1] == "right"] for row in carried]).bool().reshape(-1, 2)
-    interactions = Interactions(
-        start, stop, hands, tuple(row[0] for row in carried), ("sliding",) * len(carried)
-    )
+    interactions = Interactions(start, stop, hands, tuple(row[0] for row in carried), ("sliding",) * len(carried))
     return Recording(
-        name, head=HeadStream(time, T_world_device.R, T_world_device.t, SEAT.R, SEAT.t), motion=motion,
-        contacts=ContactTrack(time, FOOT_PATCHES, contact), floor=FloorTrack(time, torch.zeros(len(time))),
-        skeleton=motion.skeleton, object_motion=tracks, interactions=interactions if carried else None,
-        subject=f"subject_{name}", location="nowhere", license="MIT",
-    )  # fmt: skip
+        name,
+        head=HeadStream(time, T_world_device.R, T_world_device.t, SEAT.R, SEAT.t),
+        motion=motion,
+        contacts=ContactTrack(time, FOOT_PATCHES, contact),
+        floor=FloorTrack(time, torch.zeros(len(time))),
+        skeleton=motion.skeleton,
+        object_motion=tracks,
+        interactions=interactions if carried else None,
+        subject=f"subject_{name}",
+        location="nowhere",
+        license="MIT",
+    )
 
 
 def carried_dataset(root: Path, splits: Sequence[str] = ("train", "val", "test"), fps: float = FPS) -> str:
@@ -95,13 +97,7 @@ def small_features(frame: str = "own", **changes) -> EchoFeatures:
 def small_net(features: EchoFeatures, **changes) -> EchoDenoiser:
     """A network with random weights, and statistics with which any output is a valid pose."""
     torch.manual_seed(0)
-    sizes = (
-        features.human_size,
-        OBJECT_SIZE,
-        CONTACTS,
-        features.condition_size,
-        features.object_condition_size,
-    )
+    sizes = (features.human_size, OBJECT_SIZE, CONTACTS, features.condition_size, features.object_condition_size)
     settings = {"window": WINDOW, "width": 32, "layers": 1, "heads": 2, "feedforward": 32, "dropout": 0.0}
     net = EchoDenoiser(*sizes, **settings | changes)
     for parameter in net.parameters():

@@ -52,8 +52,14 @@ def few_statistics():
     from wearcap.training.motion_autoencoder import MotionEncoding
 
     systems = (
-        ContactDetection, EchoDiffusion, ManifoldTraining, MotionEncoding, PoseRegression, VoxelReconstruction, WatchRegression,
-    )  # fmt: skip
+        ContactDetection,
+        EchoDiffusion,
+        ManifoldTraining,
+        MotionEncoding,
+        PoseRegression,
+        VoxelReconstruction,
+        WatchRegression,
+    )
     with pytest.MonkeyPatch.context() as patch:
         for system in systems:
             patch.setattr(system, "set_statistics", partialmethod(system.set_statistics, limit=100))

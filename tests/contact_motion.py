@@ -29,9 +29,12 @@ def bending(frames: int, seed: int = 0, skeleton: Skeleton | None = None) -> tup
         R[:, elbow] = R[:, elbow] @ rotation.about_axis("z", -1.4 * sign * rise.float())
         R[:, shoulder] = R[:, shoulder] @ rotation.about_axis("x", 1.2 * k * sign * rise.float())
     interactions = Interactions(
-        start, start + 1.0, torch.nn.functional.one_hot(hand, 2).bool(), ("thing",) * len(start),
+        start,
+        start + 1.0,
+        torch.nn.functional.one_hot(hand, 2).bool(),
+        ("thing",) * len(start),
         tuple(CLASSES[k] for k in kind.tolist()),
-    )  # fmt: skip
+    )
     return replace(motion, R_parent_joint=R), interactions
 
 

@@ -19,9 +19,18 @@ from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import RecordingStore
 from wearcap_testing import recording_of, small_dataset, suited, swaying_motion
 
-SMALL = ["debug=fast", "data.window=60", "trainer.accelerator=cpu", "model.net.width=32", "model.net.layers=1",
-         "model.net.heads=4", "model.net.feedforward=32", "trainer.enable_progress_bar=false",
-         "trainer.enable_model_summary=false", "callbacks.progress=null"]  # fmt: skip
+SMALL = [
+    "debug=fast",
+    "data.window=60",
+    "trainer.accelerator=cpu",
+    "model.net.width=32",
+    "model.net.layers=1",
+    "model.net.heads=4",
+    "model.net.feedforward=32",
+    "trainer.enable_progress_bar=false",
+    "trainer.enable_model_summary=false",
+    "callbacks.progress=null",
+]
 
 
 def motion_file(write, name: str) -> bytes:
@@ -49,9 +58,7 @@ CUT_SHORT = {
     "motion.npz": lambda: motion_file(write_motion, "a.npz")[:-500],
     "amass.npz": lambda: arrays(poses=np.zeros((9, 156)), trans=np.zeros((9, 3)), mocap_framerate=60)[:-90],
     "xdata.npz": lambda: arrays(segment_qWXYZ=np.zeros((9, 92)), segment_tXYZ=np.zeros((9, 69)))[:-90],
-    "a.mvnx": lambda: (
-        b'<?xml version="1.0"?><mvnx version="4"><subject label="a" frameRate="60"><segments><segm'
-    ),
+    "a.mvnx": lambda: b'<?xml version="1.0"?><mvnx version="4"><subject label="a" frameRate="60"><segments><segm',
     "a.amc": lambda: b"#!OML:ASF\n:FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 0 0 0 0 0\n2\nroot 0 0",
     "closed_loop_trajectory.csv": lambda: MPS.encode(),
     "closed_loop_trajectory.csv.gz": lambda: gzip.compress(MPS.encode())[:-12],
@@ -127,19 +134,8 @@ def training(data: Path, out: Path, *more: str) -> list[str]:
 
 
 def with_checkpoint(verb: str, checkpoint: Path, out: Path, *more: str) -> list[str]:
-    written = {
-        "evaluate": f"output={out}/table.json",
-        "export": f"output={out}/d.onnx",
-        "capture": "video=false",
-    }
-    return [
-        verb,
-        f"checkpoint={checkpoint}",
-        f"hydra.run.dir={out}",
-        "pipeline.steps=2",
-        written[verb],
-        *more,
-    ]
+    written = {"evaluate": f"output={out}/table.json", "export": f"output={out}/d.onnx", "capture": "video=false"}
+    return [verb, f"checkpoint={checkpoint}", f"hydra.run.dir={out}", "pipeline.steps=2", written[verb], *more]
 
 
 def hps(data: Path, out: Path, *more: str) -> list[str]:
@@ -151,103 +147,193 @@ def hps(data: Path, out: Path, *more: str) -> list[str]:
 ROWS = {
     "train: no data set": (lambda data, ckpt, tmp, out: training(tmp / "none", out), "no data set here"),
     "train: three frames": (
-        lambda data, ckpt, tmp, out: training(brief_dataset(tmp / "brief"), out), "no windows in split 'train'"),
+        lambda data, ckpt, tmp, out: training(brief_dataset(tmp / "brief"), out),
+        "no windows in split 'train'",
+    ),
     "train: cut short": (
-        lambda data, ckpt, tmp, out: training(truncated_dataset(tmp / "cut"), out), "It was cut short or replaced"),
+        lambda data, ckpt, tmp, out: training(truncated_dataset(tmp / "cut"), out),
+        "It was cut short or replaced",
+    ),
     "train: fps 0": (lambda data, ckpt, tmp, out: training(still_dataset(tmp / "still"), out), "0.0 frames per second"),
     "train: typo": (
-        lambda data, ckpt, tmp, out: training(data, out, "trainer.max_step=3"), "Did you mean 'trainer.max_steps'"),
+        lambda data, ckpt, tmp, out: training(data, out, "trainer.max_step=3"),
+        "Did you mean 'trainer.max_steps'",
+    ),
     "train: a value the model refuses": (
-        lambda data, ckpt, tmp, out: training(data, out, "model.net.width=191"), "cannot build model: width 191 must be"),
+        lambda data, ckpt, tmp, out: training(data, out, "model.net.width=191"),
+        "cannot build model: width 191 must be",
+    ),
     "train: resume": (
-        lambda data, ckpt, tmp, out: training(data, out, "resume=none.ckpt"), "no such checkpoint to resume from"),
+        lambda data, ckpt, tmp, out: training(data, out, "resume=none.ckpt"),
+        "no such checkpoint to resume from",
+    ),
     "evaluate: other model": (
         lambda data, ckpt, tmp, out: with_checkpoint("evaluate", other_checkpoint(tmp / "o.ckpt", ckpt), out),
-        "do not fit this model"),
+        "do not fit this model",
+    ),
     "export: other model": (
         lambda data, ckpt, tmp, out: with_checkpoint("export", other_checkpoint(tmp / "o.ckpt", ckpt), out),
-        "do not fit this model"),
+        "do not fit this model",
+    ),
     "capture: other model": (
         lambda data, ckpt, tmp, out: with_checkpoint(
-            "capture", other_checkpoint(tmp / "o.ckpt", ckpt), out, f"recording={data}/r4"), "do not fit this model"),
+            "capture", other_checkpoint(tmp / "o.ckpt", ckpt), out, f"recording={data}/r4"
+        ),
+        "do not fit this model",
+    ),
     "evaluate: three frames": (
-        lambda data, ckpt, tmp, out: with_checkpoint(
-            "evaluate", ckpt, out, f"dataset={brief_dataset(tmp / 'brief')}"), "3 frames"),
+        lambda data, ckpt, tmp, out: with_checkpoint("evaluate", ckpt, out, f"dataset={brief_dataset(tmp / 'brief')}"),
+        "3 frames",
+    ),
     "evaluate: cut short": (
         lambda data, ckpt, tmp, out: with_checkpoint(
-            "evaluate", ckpt, out, f"dataset={truncated_dataset(tmp / 'cut')}"), "cut short"),
+            "evaluate", ckpt, out, f"dataset={truncated_dataset(tmp / 'cut')}"
+        ),
+        "cut short",
+    ),
     "evaluate: no data set": (
-        lambda data, ckpt, tmp, out: with_checkpoint("evaluate", ckpt, out, f"dataset={tmp}/none"), "no data set here"),
+        lambda data, ckpt, tmp, out: with_checkpoint("evaluate", ckpt, out, f"dataset={tmp}/none"),
+        "no data set here",
+    ),
     "capture: three frames": (
         lambda data, ckpt, tmp, out: with_checkpoint(
-            "capture", ckpt, out, f"recording={brief_dataset(tmp / 'brief')}/r4"), "3 frames"),
+            "capture", ckpt, out, f"recording={brief_dataset(tmp / 'brief')}/r4"
+        ),
+        "3 frames",
+    ),
     "capture: cut short": (
         lambda data, ckpt, tmp, out: with_checkpoint(
-            "capture", ckpt, out, f"recording={truncated_dataset(tmp / 'cut')}/r4"), "cut short"),
+            "capture", ckpt, out, f"recording={truncated_dataset(tmp / 'cut')}/r4"
+        ),
+        "cut short",
+    ),
     "capture: no recording": (
-        lambda data, ckpt, tmp, out: with_checkpoint("capture", ckpt, out, f"recording={tmp}/none"), "no recording here"),
+        lambda data, ckpt, tmp, out: with_checkpoint("capture", ckpt, out, f"recording={tmp}/none"),
+        "no recording here",
+    ),
     "capture: no checkpoint": (
         lambda data, ckpt, tmp, out: with_checkpoint("capture", tmp / "none.ckpt", out, f"recording={data}/r4"),
-        "no such checkpoint"),
+        "no such checkpoint",
+    ),
     "capture: learned, without a checkpoint": (
         lambda data, ckpt, tmp, out: ["capture", f"recording={data}/r4", f"hydra.run.dir={out}"],
-        "no checkpoint, but HMD2 needs a trained network"),
+        "no checkpoint, but HMD2 needs a trained network",
+    ),
     "capture: a checkpoint for nothing": (
-        lambda data, ckpt, tmp, out: hps(data, out, f"checkpoint={ckpt}"), "a checkpoint, but HPS has no network"),
+        lambda data, ckpt, tmp, out: hps(data, out, f"checkpoint={ckpt}"),
+        "a checkpoint, but HPS has no network",
+    ),
     "capture: echo without a checkpoint": (
         lambda data, ckpt, tmp, out: ["capture", "pipeline=echo", f"recording={data}/r4", f"hydra.run.dir={out}"],
-        "no checkpoint, but Echo needs a trained network"),
+        "no checkpoint, but Echo needs a trained network",
+    ),
     "capture: echo with another's checkpoint": (
         lambda data, ckpt, tmp, out: [
-            "capture", "pipeline=echo", f"checkpoint={ckpt}", f"recording={data}/r4", f"hydra.run.dir={out}", "video=false"],
-        "experiment=echo"),
+            "capture",
+            "pipeline=echo",
+            f"checkpoint={ckpt}",
+            f"recording={data}/r4",
+            f"hydra.run.dir={out}",
+            "video=false",
+        ],
+        "experiment=echo",
+    ),
     "train: echo without objects' files": (
-        lambda data, ckpt, tmp, out: ["train", "experiment=echo", f"paths.datasets={tmp}/none", "data.encoder=null", f"hydra.run.dir={out}"],
-        "no data set here"),
+        lambda data, ckpt, tmp, out: [
+            "train",
+            "experiment=echo",
+            f"paths.datasets={tmp}/none",
+            "data.encoder=null",
+            f"hydra.run.dir={out}",
+        ],
+        "no data set here",
+    ),
     "capture: stages of a pipeline without": (
         lambda data, ckpt, tmp, out: with_checkpoint("capture", ckpt, out, f"recording={data}/r4", "until=align"),
-        "until=align cache=None"),
+        "until=align cache=None",
+    ),
     "hps: no suit": (lambda data, ckpt, tmp, out: hps(data, out), "r4: no suit and no camera in this recording"),
     "hps: no camera": (
-        lambda data, ckpt, tmp, out: hps(suited(tmp / "d", camera=None), out), "r: no camera in this recording"),
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d", camera=None), out),
+        "r: no camera in this recording",
+    ),
     "hps: no poses, no map": (
-        lambda data, ckpt, tmp, out: hps(suited(tmp / "d", localization=None), out), "no localisation in this recording, and no map"),
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d", localization=None), out),
+        "no localisation in this recording, and no map",
+    ),
     "hps: no such map": (
-        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline.localization.map=none.map"), "none.map: no such map"),
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline.localization.map=none.map"),
+        "none.map: no such map",
+    ),
     "hps: no scan": (
-        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out), "no scan of the scene, which the energy's term contact_plane needs"),
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out),
+        "no scan of the scene, which the energy's term contact_plane needs",
+    ),
     "hps: a scene without a cloud": (
-        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, f"scene={data}"), "no scan of a scene here"),
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, f"scene={data}"),
+        "no scan of a scene here",
+    ),
     "hps: no clap": (
         lambda data, ckpt, tmp, out: hps(
-            suited(tmp / "d"), out, "pipeline=hps_without_scene", "pipeline.synchronization.clock=claps",
-            "pipeline.synchronization.camera_claps_s=[1.0]"), "no clap found"),
+            suited(tmp / "d"),
+            out,
+            "pipeline=hps_without_scene",
+            "pipeline.synchronization.clock=claps",
+            "pipeline.synchronization.camera_claps_s=[1.0]",
+        ),
+        "no clap found",
+    ),
     "hps: a clock that is none": (
-        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline.synchronization.clock=clap"), "clock='clap'"),
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline.synchronization.clock=clap"),
+        "clock='clap'",
+    ),
     "hps: contacts shorter than poses": (
-        lambda data, ckpt, tmp, out: hps(suited(tmp / "d", short=True), out), "Motion.contact_prob has 50 rows for 90 timestamps"),
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d", short=True), out),
+        "Motion.contact_prob has 50 rows for 90 timestamps",
+    ),
     "hps: no stage": (
-        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline=hps_without_scene", "until=optimise"), "no stage 'optimise'"),
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline=hps_without_scene", "until=optimise"),
+        "no stage 'optimise'",
+    ),
     "evaluate: no data set for hps": (
         lambda data, ckpt, tmp, out: ["evaluate", "pipeline=hps", f"hydra.run.dir={out}", f"output={out}/t.json"],
-        "dataset has no value"),
+        "dataset has no value",
+    ),
     "prepare: no folder": (
-        lambda data, ckpt, tmp, out: ["prepare", "cmu", f"source={tmp}/none", f"output={out}"], "no such folder"),
+        lambda data, ckpt, tmp, out: ["prepare", "cmu", f"source={tmp}/none", f"output={out}"],
+        "no such folder",
+    ),
     "prepare: typo": (
-        lambda data, ckpt, tmp, out: ["prepare", "cmu", "sorce=x", f"output={out}"], "Did you mean 'source'"),
+        lambda data, ckpt, tmp, out: ["prepare", "cmu", "sorce=x", f"output={out}"],
+        "Did you mean 'source'",
+    ),
     "view: no recording": (lambda data, ckpt, tmp, out: ["view", f"{tmp}/none"], "no recording here"),
     "render: no recording": (
-        lambda data, ckpt, tmp, out: ["render", f"{tmp}/none", "--out", f"{out}/a.png"], "no recording here"),
+        lambda data, ckpt, tmp, out: ["render", f"{tmp}/none", "--out", f"{out}/a.png"],
+        "no recording here",
+    ),
     "prepare hps: no folder": (
-        lambda data, ckpt, tmp, out: ["prepare", "hps", f"source={tmp}/none", f"output={out}"], "no such folder"),
+        lambda data, ckpt, tmp, out: ["prepare", "hps", f"source={tmp}/none", f"output={out}"],
+        "no such folder",
+    ),
     "calibrate: no video": (
-        lambda data, ckpt, tmp, out: ["calibrate", f"source={tmp}/none.mp4", "columns=9", "rows=6", "square_m=0.02",
-                                      f"hydra.run.dir={out}", f"output={out}/camera.json"], "no such file or folder"),
+        lambda data, ckpt, tmp, out: [
+            "calibrate",
+            f"source={tmp}/none.mp4",
+            "columns=9",
+            "rows=6",
+            "square_m=0.02",
+            f"hydra.run.dir={out}",
+            f"output={out}/camera.json",
+        ],
+        "no such file or folder",
+    ),
     "calibrate: no square": (
         lambda data, ckpt, tmp, out: ["calibrate", f"source={tmp}", "columns=9", "rows=6", f"hydra.run.dir={out}"],
-        "square_m has no value"),
+        "square_m has no value",
+    ),
     "doctor: nothing there": (lambda data, ckpt, tmp, out: ["doctor", f"{tmp}/none"], "no such file or folder"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("row", ROWS)
@@ -267,8 +353,11 @@ def test_a_verb_says_it_once_and_leaves_nothing(row, trained, tmp_path, capfd):
 
 @pytest.mark.parametrize(
     ("fault", "message"),
-    [(errno.ENOSPC, "the disk is full. Free some space"), (errno.EACCES, "no permission to write here. Choose another")],
-)  # fmt: skip
+    [
+        (errno.ENOSPC, "the disk is full. Free some space"),
+        (errno.EACCES, "no permission to write here. Choose another"),
+    ],
+)
 @pytest.mark.parametrize("verb", ["train", "evaluate", "capture", "export", "prepare", "render"])
 def test_a_full_disk_and_a_locked_folder(verb, fault, message, trained, tmp_path, capfd, monkeypatch):
     data, checkpoint = trained

@@ -35,13 +35,18 @@ def photo_rows(folder: Path, change) -> None:
 
 
 SCENES = {
-    "missing intrinsics": (lambda scene, folder: photo_rows(folder, lambda rows: rows[0]["camera"].pop("fx")), "lacks 'fx'"),
+    "missing intrinsics": (
+        lambda scene, folder: photo_rows(folder, lambda rows: rows[0]["camera"].pop("fx")),
+        "lacks 'fx'",
+    ),
     "an empty map": (lambda scene, folder: photo_rows(folder, lambda rows: rows.clear()), "no photos"),
     "a cloud without colour": (lambda scene, folder: scene.write_room(folder, colors=False), "no colour"),
     "a scene in millimetres": (lambda scene, folder: scene.write_room(folder, unit=1000), "looks like millimetres"),
     "image size and calibration": (
-        lambda scene, folder: photo_rows(folder, lambda rows: rows[0]["camera"].update(width=160)), "size and calibration differ"),
-}  # fmt: skip
+        lambda scene, folder: photo_rows(folder, lambda rows: rows[0]["camera"].update(width=160)),
+        "size and calibration differ",
+    ),
+}
 
 
 @pytest.mark.parametrize("row", SCENES)
@@ -77,9 +82,7 @@ def test_no_clap_is_said(tmp_path, capsys):
     with suppress(SystemExit):
         cli.main(["doctor", "--json", str(tmp_path)])
     findings = json.loads(capsys.readouterr().out)["findings"]["r"]
-    assert ["no clap found" in finding["what"] for finding in findings if finding["check"] == "claps"] == [
-        True
-    ]
+    assert ["no clap found" in finding["what"] for finding in findings if finding["check"] == "claps"] == [True]
 
 
 # Objects that can be moved, and contact labels -----------------------------------------------------------------------
@@ -89,9 +92,7 @@ def spoiled_environment(folder: Path, change) -> Path:
     """The file of one door, with something changed in it."""
     corners = np.array([[x, y, z] for x in (0.0, 0.8) for y in (0.0, 0.04) for z in (0.0, 2.0)], np.float32)
     mesh = Mesh(corners, np.zeros((0, 3), np.int32), np.ones(3, np.float32))
-    door = SceneObject(
-        "door", "door", mesh, torch.eye(3), torch.zeros(3), Freedom("hinge", pivot=(0.0, 0.0, 0.0))
-    )
+    door = SceneObject("door", "door", mesh, torch.eye(3), torch.zeros(3), Freedom("hinge", pivot=(0.0, 0.0, 0.0)))
     write_environment(Environment((door,)), folder)
     path = folder / "environment.json"
     content = json.loads(path.read_text())
@@ -104,7 +105,7 @@ OBJECTS = {
     "an object without degrees of freedom": (lambda row: row.pop("freedom"), "no degree of freedom"),
     "a hinge far from its mesh": (lambda row: row["freedom"].update(pivot=[9.0, 0.0, 0.0]), "8.20 m from its mesh"),
     "a missing mesh": (lambda row: row.update(mesh="objects/none.ply"), "its mesh objects/none.ply is missing"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("row", OBJECTS)
@@ -122,15 +123,28 @@ def test_an_environments_fault_is_one_error(row, tmp_path, capsys):
 
 
 LABELS = {
-    "overlapping labels": ({"contacts": {"left_hand": [[0.1, 0.6], [0.4, 0.8]], "right_hand": []}}, "labels of left_hand overlap"),
+    "overlapping labels": (
+        {"contacts": {"left_hand": [[0.1, 0.6], [0.4, 0.8]], "right_hand": []}},
+        "labels of left_hand overlap",
+    ),
     "an end before the start, and more": (
-        {"contacts": {"left_hand": [[0.5, 0.2], [0.6, 0.8]], "right_hand": []}}, "an end before its start means"),
+        {"contacts": {"left_hand": [[0.5, 0.2], [0.6, 0.8]], "right_hand": []}},
+        "an end before its start means",
+    ),
     "an empty label": ({"contacts": {"left_hand": [], "right_hand": [[0.5, 0.5]]}}, "right_hand label 0 is empty"),
     "another recording": (
-        {"schema_version": 1, "recording": {"name": "other", "frames": 9, "start_s": 0.0, "stop_s": 9.0},
-         "contacts": {"left_hand": [], "right_hand": []}}, "labels of recording 'other'"),
-    "longer than the recording": ({"contacts": {"left_hand": [[0.1, 60.0]], "right_hand": []}}, "outside the recording"),
-}  # fmt: skip
+        {
+            "schema_version": 1,
+            "recording": {"name": "other", "frames": 9, "start_s": 0.0, "stop_s": 9.0},
+            "contacts": {"left_hand": [], "right_hand": []},
+        },
+        "labels of recording 'other'",
+    ),
+    "longer than the recording": (
+        {"contacts": {"left_hand": [[0.1, 60.0]], "right_hand": []}},
+        "outside the recording",
+    ),
+}
 
 
 @pytest.mark.parametrize("row", LABELS)

@@ -19,7 +19,9 @@ def commands(text: str) -> list[str]:
     blocks = text.split("```")[1::2]
     lines = [line.split(" #")[0].strip() for block in blocks for line in block.splitlines()]
     scripts = tuple(f"python {verb}.py" for verb in HYDRA_VERBS)
-    return [line.removeprefix("$ ") for line in lines if line.removeprefix("$ ").startswith(("wearcap ", "make ", *scripts))]  # fmt: skip
+    return [
+        line.removeprefix("$ ") for line in lines if line.removeprefix("$ ").startswith(("wearcap ", "make ", *scripts))
+    ]
 
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -49,16 +51,26 @@ def test_a_command_of_the_pages_is_understood(page, line, tmp_path, monkeypatch)
     elif verb == "prepare":
         composes("prepare", [f"prepare={arguments[0]}", *arguments[1:]])
     elif verb != "demo":
-        with pytest.raises(
-            WearcapError
-        ):  # the recording is not there; what does not parse ends in SystemExit
+        with pytest.raises(WearcapError):  # the recording is not there; what does not parse ends in SystemExit
             importlib.import_module(f"wearcap.cli.{verb}").main(arguments)
 
 
 def test_the_pages_name_the_main_commands():
     told = " ".join(line for _, line in COMMANDS)
-    for word in ("make demo", "make test", "prepare cmu", "train.py", "evaluate.py", "capture.py", "export.py",
-                 "wearcap view", "wearcap render", "wearcap doctor", "launcher=joblib", "launcher=slurm"):  # fmt: skip
+    for word in (
+        "make demo",
+        "make test",
+        "prepare cmu",
+        "train.py",
+        "evaluate.py",
+        "capture.py",
+        "export.py",
+        "wearcap view",
+        "wearcap render",
+        "wearcap doctor",
+        "launcher=joblib",
+        "launcher=slurm",
+    ):
         assert word in told
 
 
@@ -68,9 +80,7 @@ def test_a_launcher_composes(launcher):
 
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
         config = hydra.compose(
-            "train",
-            ["experiment=motion_diffusion_head", f"hydra/launcher={launcher}"],
-            return_hydra_config=True,
+            "train", ["experiment=motion_diffusion_head", f"hydra/launcher={launcher}"], return_hydra_config=True
         )
     target = config.hydra.launcher._target_
     assert hydra.utils.get_class(target).__name__ in ("JoblibLauncher", "SlurmLauncher", "LocalLauncher")

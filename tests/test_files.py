@@ -77,10 +77,7 @@ def test_an_error_of_a_source_keeps_its_path_and_message(tmp_path):
 )
 @pytest.mark.parametrize("named", [True, False])
 def test_an_error_of_the_target_is_explained(tmp_path, number, said, named):
-    with (
-        pytest.raises(WearcapError, match=rf"target\.npz: {said}"),
-        atomic_path(tmp_path / "target.npz") as to,
-    ):
+    with pytest.raises(WearcapError, match=rf"target\.npz: {said}"), atomic_path(tmp_path / "target.npz") as to:
         raise OSError(number, os.strerror(number), *([str(to)] if named else []))
     assert not names(tmp_path)
 

@@ -94,9 +94,7 @@ def test_systems_do_not_use_each_other():
 
 def trains(path: Path) -> bool:
     """Whether a module may know Lightning: `training/`, a DataModule, and what trains in a system's folder."""
-    return folder_of(path) in ("training", "data", "cli") or (
-        folder_of(path) == "systems" and path.stem in TRAINING
-    )
+    return folder_of(path) in ("training", "data", "cli") or (folder_of(path) == "systems" and path.stem in TRAINING)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(SOURCE).as_posix())
@@ -141,9 +139,7 @@ def test_identifiers_are_the_fields_own():
         names += [node.id for node in ast.walk(tree) if isinstance(node, ast.Name)]
         names += [node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
         words = {
-            word
-            for name in names
-            for word in re.findall("[a-z]+", re.sub("([a-z])([A-Z])", r"\1_\2", name).lower())
+            word for name in names for word in re.findall("[a-z]+", re.sub("([a-z])([A-Z])", r"\1_\2", name).lower())
         }
         wrong = words & PRIVATE_WORDS
         assert not wrong - ({"lane", "lanes"} if "kinematics" in path.stem else set()), f"{path}: {wrong}"
@@ -152,9 +148,7 @@ def test_identifiers_are_the_fields_own():
 def test_a_lightning_module_stays_small():
     for path in (path for path in MODULES if trains(path)):
         for node in ast.walk(parsed(path)):
-            if isinstance(node, ast.ClassDef) and any(
-                "LightningModule" in ast.unparse(b) for b in node.bases
-            ):
+            if isinstance(node, ast.ClassDef) and any("LightningModule" in ast.unparse(b) for b in node.bases):
                 assert (node.end_lineno or 0) - node.lineno < 200, f"{path.name}: {node.name}"
 
 
@@ -173,23 +167,14 @@ def test_nothing_unsafe_is_read():
         assert not names & {"dill", "shelve", "marshal", "cloudpickle"}, path
         assert not {name for name in names if name.startswith("pickle.")} - {"pickle.UnpicklingError"}, path
         used = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-        assert not used & {
-            "pickle.load",
-            "pickle.loads",
-            "pickle.Unpickler",
-            "pickle.dump",
-            "pickle.dumps",
-        }, path
+        assert not used & {"pickle.load", "pickle.loads", "pickle.Unpickler", "pickle.dump", "pickle.dumps"}, path
         for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
             function = ast.unparse(call.func)
             assert function not in ("eval", "exec", "yaml.load", "np.load", "numpy.load") or any(
-                keyword.arg == "allow_pickle" and ast.unparse(keyword.value) == "False"
-                for keyword in call.keywords
+                keyword.arg == "allow_pickle" and ast.unparse(keyword.value) == "False" for keyword in call.keywords
             ), f"{path}: {ast.unparse(call)}"
             if function == "torch.load":
-                assert any(
-                    k.arg == "weights_only" and ast.unparse(k.value) == "True" for k in call.keywords
-                ), path
+                assert any(k.arg == "weights_only" and ast.unparse(k.value) == "True" for k in call.keywords), path
 
 
 @pytest.mark.parametrize(

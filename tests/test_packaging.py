@@ -26,9 +26,7 @@ def project() -> dict:
 
 @pytest.fixture(scope="module")
 def pins() -> dict[str, str]:
-    lines = [
-        line for line in (ROOT / "requirements.lock").read_text().splitlines() if line and line[0] != "#"
-    ]
+    lines = [line for line in (ROOT / "requirements.lock").read_text().splitlines() if line and line[0] != "#"]
     assert all(re.fullmatch(r"[\w.\-]+==[\w.]+", line) for line in lines), "exact pins alone"
     return {name.lower().replace("_", "-"): version for name, version in (line.split("==") for line in lines)}
 
@@ -64,8 +62,12 @@ def unpacked(tmp_path_factory) -> Path:
     """The wheel, built and unpacked like an installation."""
     pytest.importorskip("hatchling")
     folder = tmp_path_factory.mktemp("wheel")
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder], cwd=ROOT, check=True,
-                   capture_output=True)  # fmt: skip
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+    )
     with zipfile.ZipFile(next(folder.glob("*.whl"))) as wheel:
         wheel.extractall(folder / "site")
     return folder / "site"
@@ -87,9 +89,7 @@ def test_the_wheel_carries_every_config_and_split_list(unpacked, tmp_path):
         assert expected == {
             path.relative_to(resources / theirs) for path in (resources / theirs).rglob("*") if path.is_file()
         }
-    told = run(
-        unpacked, tmp_path, "-c", "from wearcap.cli import conf; print(conf.conf_dir(), conf.splits_dir())"
-    )
+    told = run(unpacked, tmp_path, "-c", "from wearcap.cli import conf; print(conf.conf_dir(), conf.splits_dir())")
     assert told.stdout.split() == [str(resources / "conf"), str(resources / "splits")]
 
 

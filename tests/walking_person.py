@@ -82,9 +82,7 @@ def inertial(joint, seconds, rate=120.0):
     gyro = log((before.R @ MOUNT.double()).mT @ (after.R @ MOUNT.double())) / (2 * fine)
     up = torch.tensor([0.0, 0.0, 9.81], dtype=torch.float64)
     acc_imu = (R_world_imu.mT @ (acc_world + up)[..., None])[..., 0]
-    return ImuStream(
-        time, joint, R_world_imu.float(), acc_world.float(), acc_imu.float(), gyro.float(), MOUNT
-    )
+    return ImuStream(time, joint, R_world_imu.float(), acc_world.float(), acc_imu.float(), gyro.float(), MOUNT)
 
 
 def double(pose):
@@ -105,7 +103,12 @@ def sound_recording(seconds=24.0, fps=60.0):
     motion, contact = walk(time)
     T_world_device = motion.joint("head") @ SEAT
     return Recording(
-        "walk", head=HeadStream(time, T_world_device.R, T_world_device.t, SEAT.R, SEAT.t), motion=motion,
-        imu={"left_wrist": inertial("left_wrist", seconds), "head": inertial("head", seconds)}, points=room(),
-        contacts=ContactTrack(time, FOOT_PATCHES, contact), floor=FloorTrack(time, torch.zeros(len(time))), skeleton=motion.skeleton,
-    )  # fmt: skip
+        "walk",
+        head=HeadStream(time, T_world_device.R, T_world_device.t, SEAT.R, SEAT.t),
+        motion=motion,
+        imu={"left_wrist": inertial("left_wrist", seconds), "head": inertial("head", seconds)},
+        points=room(),
+        contacts=ContactTrack(time, FOOT_PATCHES, contact),
+        floor=FloorTrack(time, torch.zeros(len(time))),
+        skeleton=motion.skeleton,
+    )

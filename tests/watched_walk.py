@@ -16,9 +16,7 @@ def drawn_pipeline(multi_stage: bool = True, **settings) -> MocapEvery:
     """A small pipeline whose network has drawn weights."""
     torch.manual_seed(0)
     features = WatchFeatures(body=True)
-    net = TwoStageEstimator(
-        features.size, features.motion_size, WINDOW, 32, 1, 2, 32, 16, 0.0, multi_stage, 2
-    )
+    net = TwoStageEstimator(features.size, features.motion_size, WINDOW, 32, 1, 2, 32, 16, 0.0, multi_stage, 2)
     given = {"stride": 4, "lookahead": 8, **settings}
     return MocapEvery(net.eval(), features, xsens23(), FPS, **given)
 
@@ -30,7 +28,12 @@ def watched_walk(seconds: float = 4.0, watch_hz: float = 100.0) -> Recording:
     T_world_device = motion.joint("head") @ SEAT
     imu = {joint: inertial(joint, seconds, watch_hz) for joint in ("left_wrist", "right_wrist")}
     return Recording(
-        "walk", head=HeadStream(time, T_world_device.R, T_world_device.t, SEAT.R, SEAT.t), motion=motion, imu=imu,
-        points=room(), contacts=ContactTrack(time, FOOT_PATCHES, contact),
-        floor=FloorTrack(time, torch.zeros(len(time))), skeleton=motion.skeleton,
-    )  # fmt: skip
+        "walk",
+        head=HeadStream(time, T_world_device.R, T_world_device.t, SEAT.R, SEAT.t),
+        motion=motion,
+        imu=imu,
+        points=room(),
+        contacts=ContactTrack(time, FOOT_PATCHES, contact),
+        floor=FloorTrack(time, torch.zeros(len(time))),
+        skeleton=motion.skeleton,
+    )

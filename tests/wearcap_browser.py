@@ -25,9 +25,7 @@ _CODES = {"Enter": 13, "Tab": 9, "Escape": 27, "Backspace": 8, "Delete": 46, "En
 
 
 @contextmanager
-def chromium(
-    folder: Path, url: str, size: tuple[int, int] = (1100, 700), webgl: bool = True
-) -> Iterator["Chromium"]:
+def chromium(folder: Path, url: str, size: tuple[int, int] = (1100, 700), webgl: bool = True) -> Iterator["Chromium"]:
     """A browser on a page, closed at the end; `folder` keeps its profile. Skips the test where none is installed.
 
     Pages that need no WebGL are drawn many times faster without: a processor that plays graphics card is slow.
@@ -45,22 +43,28 @@ def chromium(
 class Chromium:
     """One browser window, spoken to over its debugging socket. Positions are pixels from the upper left."""
 
-    def __init__(
-        self, binary: str, folder: Path, url: str, size: tuple[int, int] = (1100, 700), webgl: bool = True
-    ):
+    def __init__(self, binary: str, folder: Path, url: str, size: tuple[int, int] = (1100, 700), webgl: bool = True):
         drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"] if webgl else ["--disable-gpu"]
         command = [
-            binary, "--headless=new", "--no-sandbox", *drawing,
-            "--hide-scrollbars", f"--window-size={size[0]},{size[1]}", f"--user-data-dir={folder}",
-            "--remote-debugging-port=0", "--remote-allow-origins=*", "about:blank",
-        ]  # fmt: skip
+            binary,
+            "--headless=new",
+            "--no-sandbox",
+            *drawing,
+            "--hide-scrollbars",
+            f"--window-size={size[0]},{size[1]}",
+            f"--user-data-dir={folder}",
+            "--remote-debugging-port=0",
+            "--remote-allow-origins=*",
+            "about:blank",
+        ]
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         self.count, self.exceptions = 0, []
         port = self.poll(lambda: (folder / "DevToolsActivePort").read_text().split()[0])
         targets = self.poll(lambda: [t for t in self._targets(port) if t["type"] == "page"])
         self.socket = connect(targets[0]["webSocketDebuggerUrl"], max_size=2**26)
-        self.call("Emulation.setDeviceMetricsOverride", width=size[0], height=size[1],
-                  deviceScaleFactor=1, mobile=False)  # fmt: skip
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
+        )
         self.call("Runtime.enable")
         self.go(url)
 
@@ -120,8 +124,10 @@ class Chromium:
 
     def labelled(self, text: str, among: str = "button") -> tuple[float, float]:
         """Centre of the first visible element of a CSS selector with just this text."""
-        return self.element(f"[...document.querySelectorAll({json.dumps(among)})]"
-                            f".find(e => e.innerText.trim() === {json.dumps(text)} && e.offsetParent)")  # fmt: skip
+        return self.element(
+            f"[...document.querySelectorAll({json.dumps(among)})]"
+            f".find(e => e.innerText.trim() === {json.dumps(text)} && e.offsetParent)"
+        )
 
     def click(self, x: float, y: float, modifiers: int = 0, count: int = 1) -> None:
         """Move there, press and release; `count=2` for a double click."""
@@ -140,13 +146,19 @@ class Chromium:
         time.sleep(pause_s)
         self._mouse("mouseReleased", *way[-1], modifiers, 1)
 
-    def _mouse(
-        self, kind: str, x: float, y: float, modifiers: int, count: int = 0, pressed: bool = False
-    ) -> None:
+    def _mouse(self, kind: str, x: float, y: float, modifiers: int, count: int = 0, pressed: bool = False) -> None:
         button = {"button": "left"} if count or pressed else {}
         held = 1 if pressed or kind == "mousePressed" else 0
-        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, modifiers=modifiers, clickCount=count,
-                  buttons=held, **button)  # fmt: skip
+        self.call(
+            "Input.dispatchMouseEvent",
+            type=kind,
+            x=x,
+            y=y,
+            modifiers=modifiers,
+            clickCount=count,
+            buttons=held,
+            **button,
+        )
 
     def key(self, key: str, modifiers: int = 0) -> None:
         """Press and release one key: a character, or a name such as Enter or ArrowLeft."""

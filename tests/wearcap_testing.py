@@ -40,10 +40,14 @@ def recording_of(motion: Motion, name: str, **about: str) -> Recording:
     device = HeadStream(motion.timestamps, head.R, head @ offset, torch.eye(3), offset)
     none = torch.zeros(len(motion), len(FOOT_PATCHES), dtype=torch.bool)
     return Recording(
-        name, head=device, motion=motion, contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, none),
-        floor=FloorTrack(motion.timestamps, torch.zeros(len(motion))), skeleton=motion.skeleton,
+        name,
+        head=device,
+        motion=motion,
+        contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, none),
+        floor=FloorTrack(motion.timestamps, torch.zeros(len(motion))),
+        skeleton=motion.skeleton,
         **{"subject": f"subject_{name}", "location": "nowhere", "license": "MIT"} | about,
-    )  # fmt: skip
+    )
 
 
 def small_dataset(root: Path, frames: tuple[int, ...] = (400, 300, 90, 300, 260, 300)) -> RecordingStore:

@@ -173,8 +173,12 @@ def folder_lock(folder: str | Path, purpose: str) -> Iterator[int | None]:
         return
     _HELD.add(descriptor)
     try:
-        holder = {"pid": os.getpid(), "host": platform.node(), "purpose": purpose,
-                  "since": time.strftime("%Y-%m-%d %H:%M:%S")}  # fmt: skip
+        holder = {
+            "pid": os.getpid(),
+            "host": platform.node(),
+            "purpose": purpose,
+            "since": time.strftime("%Y-%m-%d %H:%M:%S"),
+        }
         with _explaining(path.parent):
             path.write_text(json.dumps(holder), encoding="utf-8")
         yield descriptor
@@ -280,17 +284,21 @@ def _has_ended(holder: dict[str, Any]) -> bool:
 
 def _held_by(holder: dict[str, Any], folder: Path) -> WearcapError:
     pid, host = holder.get("pid", "unknown"), holder.get("host", "unknown")
-    who = (
-        f"process {pid} on {host}, {holder.get('purpose', 'unknown')}, since {holder.get('since', 'unknown')}"
-    )
+    who = f"process {pid} on {host}, {holder.get('purpose', 'unknown')}, since {holder.get('since', 'unknown')}"
     if _has_ended(holder):
-        return WearcapError(f"workers of a run that has ended still write here ({who})", where=folder,
-                            expected="one run at a time in a folder",
-                            fix="Run again when they have ended, or end them.")  # fmt: skip
+        return WearcapError(
+            f"workers of a run that has ended still write here ({who})",
+            where=folder,
+            expected="one run at a time in a folder",
+            fix="Run again when they have ended, or end them.",
+        )
     end = f"end it (kill {pid})" if host == platform.node() else f"end it on {host}"
-    return WearcapError(f"another run writes here ({who})", where=folder,
-                        expected="one run at a time in a folder",
-                        fix=f"Wait until it has ended, {end}, or choose another folder.")  # fmt: skip
+    return WearcapError(
+        f"another run writes here ({who})",
+        where=folder,
+        expected="one run at a time in a folder",
+        fix=f"Wait until it has ended, {end}, or choose another folder.",
+    )
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -310,7 +318,7 @@ def parse_json(text: str | bytes, where: str | Path) -> Any:
     except RecursionError as error:
         raise _too_deep(where) from error
     except ValueError as error:  # JSONDecodeError and UnicodeDecodeError are ValueErrors
-        raise WearcapError(f"not readable JSON ({error})"[:300], where=where, expected="a whole JSON text") from error  # fmt: skip
+        raise WearcapError(f"not readable JSON ({error})"[:300], where=where, expected="a whole JSON text") from error
     level = [content]
     for _ in range(MAX_JSON_DEPTH):
         level = [
@@ -333,7 +341,7 @@ def _whole_number(text: str) -> int:
 
 
 def _too_deep(where: str | Path) -> WearcapError:
-    return WearcapError("JSON that is nested too deeply", where=where, expected=f"at most {MAX_JSON_DEPTH} levels")  # fmt: skip
+    return WearcapError("JSON that is nested too deeply", where=where, expected=f"at most {MAX_JSON_DEPTH} levels")
 
 
 def sha256_of(path: str | Path) -> str:

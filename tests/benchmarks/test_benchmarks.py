@@ -30,9 +30,7 @@ def test_unknown_names_are_refused():
     ended = subprocess.run(command, capture_output=True, text=True)
     assert ended.returncode == 2
     assert "windows_vs_npz" in ended.stderr
-    ended = subprocess.run(
-        [sys.executable, str(FOLDER / "tables.py"), "hmd3"], capture_output=True, text=True
-    )
+    ended = subprocess.run([sys.executable, str(FOLDER / "tables.py"), "hmd3"], capture_output=True, text=True)
     assert ended.returncode == 2
     assert "hmd2_head" in ended.stderr
 
@@ -119,9 +117,7 @@ def walker(speed: float, person: str, seconds: int = 6, bob: float = 0.03, swing
         side = {"left": 1.0, "right": -1.0}.get(name.split("_")[0], 0.0)
         drop = {"head": -0.6, "knee": 0.45, "ankle": 0.9, "toe": 0.95, "shoulder": -0.45, "wrist": 0.1}
         down = drop.get(name.split("_")[-1], 0.0)
-        offset = torch.stack(
-            [side * swing * max(down, 0.0) * phase.sin(), 0 * t + 0.1 * side, 0 * t - down], -1
-        )
+        offset = torch.stack([side * swing * max(down, 0.0) * phase.sin(), 0 * t + 0.1 * side, 0 * t - down], -1)
         joints[name] = pelvis + offset
     return gait.Clip(person, joints, torch.eye(3).expand(len(t), 3, 3), torch.zeros(len(t)), 1.55)
 
@@ -145,9 +141,7 @@ def test_discriminator_tells_what_can_be_told_and_no_more():
 
     random = torch.Generator().manual_seed(0)
     speeds = 0.9 + 0.6 * torch.rand(2, 12, generator=random)
-    some, alike = (
-        [walker(v, f"{i}_{k}") for k, v in enumerate(row.tolist())] for i, row in enumerate(speeds)
-    )
+    some, alike = ([walker(v, f"{i}_{k}") for k, v in enumerate(row.tolist())] for i, row in enumerate(speeds))
     other = [walker(1.1, f"f{k}", swing=0.35) for k in range(12)]
     assert held_out_accuracy(some, other, True, range(2), 100)["mean"] > 0.9
     assert 0.2 < held_out_accuracy(some, alike, True, range(3), 100)["mean"] < 0.8

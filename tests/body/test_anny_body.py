@@ -55,9 +55,7 @@ def test_soles_stand_on_the_floor_and_limbs_hold_their_joints(name):
         assert vertices[:, 2].min() == pytest.approx(-skeleton.root_height, abs=0.003)
         for side in ("left", "right"):
             tip = skeleton.rest_sites[f"{side}_toe_tip"][0].item()
-            assert body.vertices(rest_pose(skeleton), f"{side}_toes")[:, 0].max() == pytest.approx(
-                tip, abs=0.015
-            )
+            assert body.vertices(rest_pose(skeleton), f"{side}_toes")[:, 0].max() == pytest.approx(tip, abs=0.015)
     names = ("lradius", "ltibia") if name == "cmu31" else ("left_elbow", "left_knee")
     for joint in skeleton.indices(*names):
         near = (vertices - skeleton.rest_joints[joint]).norm(dim=-1) < 0.09
@@ -69,10 +67,7 @@ def test_soles_stand_on_the_floor_and_limbs_hold_their_joints(name):
 def test_regions_are_where_they_say():
     body = anny_body(xsens23())
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        part = {
-            name: body.rest_vertices[body.regions[f"{side}_{name}"]]
-            for name in ("toes", "heel", "sole", "palm")
-        }
+        part = {name: body.rest_vertices[body.regions[f"{side}_{name}"]] for name in ("toes", "heel", "sole", "palm")}
         assert all(len(vertices) >= 8 for vertices in part.values())
         assert all((sign * vertices[:, 1] > 0).all() for vertices in part.values())
         assert part["toes"][:, 0].min() > part["heel"][:, 0].max()
@@ -164,11 +159,7 @@ def test_cache_gives_the_same_and_survives_damage(tmp_path, monkeypatch):
     load = load_assets.__wrapped__
     first, second = load(4000), load(4000)
     assert reads == [4000]
-    assert (second.components, second.bones, set(second.joints)) == (
-        first.components,
-        first.bones,
-        set(first.joints),
-    )
+    assert (second.components, second.bones, set(second.joints)) == (first.components, first.bones, set(first.joints))
     for name in ("template", "targets", "faces", "surface", "weights"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     file = next(tmp_path.iterdir())

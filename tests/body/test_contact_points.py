@@ -93,7 +93,10 @@ def test_a_surface_that_is_cut_in_another_order_is_another_surface(points):
     place = torch.empty_like(order)
     place[order] = torch.arange(len(order))
     shuffled = replace(
-        body, rest_vertices=body.rest_vertices[order], faces=place[body.faces], skin_joints=body.skin_joints[order],
+        body,
+        rest_vertices=body.rest_vertices[order],
+        faces=place[body.faces],
+        skin_joints=body.skin_joints[order],
         skin_weights=body.skin_weights[order],
-    )  # fmt: skip
+    )
     torch.testing.assert_close(contact_points(shuffled).rest_vertices, points.rest_vertices)

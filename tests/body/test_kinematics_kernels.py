@@ -44,10 +44,7 @@ def between_guards(array, at_end):
 
 
 def same_between_guards(samples, dtype, per_sample_offsets):
-    cases = zip(
-        (kinematics_kernels.forward, kinematics_kernels.backward),
-        arrays(samples, dtype, per_sample_offsets),
-    )
+    cases = zip((kinematics_kernels.forward, kinematics_kernels.backward), arrays(samples, dtype, per_sample_offsets))
     for kernel, plain in cases:
         for at_end in (False, True):
             expected = [array.copy() for array in plain]
@@ -63,9 +60,7 @@ def same_between_guards(samples, dtype, per_sample_offsets):
 @pytest.mark.parametrize("per_sample", [False, True])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_no_memory_around_the_arrays_is_touched(samples, per_sample, dtype):
-    child = multiprocessing.get_context("fork").Process(
-        target=same_between_guards, args=(samples, dtype, per_sample)
-    )
+    child = multiprocessing.get_context("fork").Process(target=same_between_guards, args=(samples, dtype, per_sample))
     child.start()
     child.join(60)
     assert child.exitcode == 0, "killed by a touch of a guard page, or unequal results"
@@ -98,10 +93,7 @@ def test_only_the_samples_asked_for_are_written(dtype):
 def test_one_rounding_of_error_against_plain_matrices():
     (R_local, root, offsets, R, t), _ = arrays(4, np.float32, True)
     kinematics_kernels.forward(0, 4, PARENTS, R_local, root, offsets, R, t)
-    local, offset = (
-        R_local.astype(float).reshape(4, JOINTS, 3, 3),
-        offsets.astype(float).reshape(4, JOINTS, 3),
-    )
+    local, offset = (R_local.astype(float).reshape(4, JOINTS, 3, 3), offsets.astype(float).reshape(4, JOINTS, 3))
     R_true, t_true = [local[:, 0]], [root.astype(float).reshape(4, 3)]
     for joint, parent in list(enumerate(PARENTS))[1:]:
         R_true.append(R_true[parent] @ local[:, joint])

@@ -15,9 +15,14 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 
 PAIRS = [
-    ("hip", "femur"), ("knee", "tibia"), ("ankle", "foot"), ("toe", "toes"),
-    ("shoulder", "humerus"), ("elbow", "radius"), ("wrist", "hand"),
-]  # fmt: skip
+    ("hip", "femur"),
+    ("knee", "tibia"),
+    ("ankle", "foot"),
+    ("toe", "toes"),
+    ("shoulder", "humerus"),
+    ("elbow", "radius"),
+    ("wrist", "hand"),
+]
 
 
 def a_motion(skeleton: Skeleton, frames: int = 40, seed: int = 0):
@@ -29,14 +34,20 @@ def a_motion(skeleton: Skeleton, frames: int = 40, seed: int = 0):
 
 
 def renamed(skeleton: Skeleton, names: dict[str, str]) -> Skeleton:
-    return replace(
-        skeleton, name="foreign", joint_names=tuple(names[n] for n in skeleton.joint_names), sites={}
-    )
+    return replace(skeleton, name="foreign", joint_names=tuple(names[n] for n in skeleton.joint_names), sites={})
 
 
 def mixamo(skeleton: Skeleton) -> Skeleton:
-    part = {"hip": "UpLeg", "knee": "Leg", "ankle": "Foot", "toe": "ToeBase", "collar": "Shoulder",
-            "shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand"}  # fmt: skip
+    part = {
+        "hip": "UpLeg",
+        "knee": "Leg",
+        "ankle": "Foot",
+        "toe": "ToeBase",
+        "collar": "Shoulder",
+        "shoulder": "Arm",
+        "elbow": "ForeArm",
+        "wrist": "Hand",
+    }
     trunk = {"pelvis": "Hips", "l5": "Spine", "l3": "Spine1", "t12": "Spine2", "t8": "Spine3"}
     names = {}
     for name in skeleton.joint_names:
@@ -77,9 +88,7 @@ def test_bind_pose_does_not_matter(angle):
     back = forward_kinematics(skeleton, R_back, t_back)
     assert (back.t - T.t).norm(dim=-1).max() < 4e-4  # single precision at a nearly straight knee
     assert rotation.geodesic(back.R, T.R).max() < 5e-3
-    torch.testing.assert_close(
-        fit_offsets(other, skeleton).t_parent_joint, skeleton.t_parent_joint, atol=1e-5, rtol=0
-    )
+    torch.testing.assert_close(fit_offsets(other, skeleton).t_parent_joint, skeleton.t_parent_joint, atol=1e-5, rtol=0)
 
 
 def test_foreign_names_are_recognised():

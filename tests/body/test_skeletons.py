@@ -19,9 +19,7 @@ def test_counts_and_symmetry(name):
     assert len(skeleton) == int(name[-2:])
     other = {"left": "right", "right": "left", "l": "r", "r": "l"}
     for joint, label in enumerate(skeleton.joint_names):
-        side = (
-            label.split("_")[0] if "_" in label else label[0] if name == "cmu31" and label[0] in "lr" else ""
-        )
+        side = label.split("_")[0] if "_" in label else label[0] if name == "cmu31" and label[0] in "lr" else ""
         twin = other.get(side, side) + label[len(side) :]
         if side and twin in skeleton.joint_names:
             mirrored = skeleton.rest_joints[skeleton.index(twin)] * torch.tensor([1.0, -1.0, 1.0])

@@ -29,11 +29,14 @@ def model_file(path, name="smpl24", extra=()):
     rng = np.random.default_rng(0)
     parents = [*body.skeleton.parents, *extra]
     arrays = {
-        "v_template": rest, "shapedirs": 0.01 * rng.standard_normal((count, 3, 4)),
-        "posedirs": 0.01 * rng.standard_normal((count, 3, 9 * (len(parents) - 1))), "J_regressor": regressor,
-        "weights": weights, "f": body.faces.numpy().astype(np.uint32),
+        "v_template": rest,
+        "shapedirs": 0.01 * rng.standard_normal((count, 3, 4)),
+        "posedirs": 0.01 * rng.standard_normal((count, 3, 9 * (len(parents) - 1))),
+        "J_regressor": regressor,
+        "weights": weights,
+        "f": body.faces.numpy().astype(np.uint32),
         "kintree_table": np.stack([np.array(parents).astype(np.uint32), np.arange(len(parents))]),
-    }  # fmt: skip
+    }
     np.savez(path, **arrays)
     return arrays
 

@@ -15,13 +15,7 @@ from wearcap.io.formats.tum import write_tum
 from wearcap.recording import ImuStream, RecordingStore
 from wearcap.recording.locate import load_recording
 from wearcap.sensors.watches import WRISTS, watches_at
-from wearcap.simulation.calibration_session import (
-    MARKS,
-    STANDING,
-    SWINGS_S,
-    CalibrationSession,
-    simulate_calibration,
-)
+from wearcap.simulation.calibration_session import MARKS, STANDING, SWINGS_S, CalibrationSession, simulate_calibration
 from wearcap_testing import recording_of, swaying_motion
 
 G = 9.80665
@@ -34,7 +28,7 @@ def write_sensor_log(watch: ImuStream, path: Path) -> None:
     gravity = R[:, 2] * G
     quaternion = rotation.quat_wxyz_from_matrix(R)[:, [1, 2, 3, 0]]
     names = [f"accelerometerAcceleration{axis}(G)" for axis in "XYZ"]
-    names += [f"motionUserAcceleration{axis}(G)" for axis in "XYZ"] + [f"motionQuaternion{axis}(R)" for axis in "XYZW"]  # fmt: skip
+    names += [f"motionUserAcceleration{axis}(G)" for axis in "XYZ"] + [f"motionQuaternion{axis}(R)" for axis in "XYZW"]
     table = torch.cat([-(free + gravity) / G, -free / G, quaternion], -1).tolist()
     rows = [
         ",".join([datetime.fromtimestamp(time, UTC).isoformat(), *(f"{value:.7f}" for value in row)])
@@ -67,13 +61,25 @@ def arguments(made: CalibrationSession, files: Path, out: Path, camera: bool = T
         key: written([at - zero for at in stretch["left_wrist"]])
         for key, stretch in (("board", made.board), ("tpose", made.t_pose))
     }
-    given = {"steps": "watches", "left": f"{files}/left.csv", "right": f"{files}/right.csv", **steps,
-             "output": f"{out}/calibration.json", "hydra.run.dir": f"{out}/run"}  # fmt: skip
+    given = {
+        "steps": "watches",
+        "left": f"{files}/left.csv",
+        "right": f"{files}/right.csv",
+        **steps,
+        "output": f"{out}/calibration.json",
+        "hydra.run.dir": f"{out}/run",
+    }
     if camera:
         swings = ",".join(f"{at:.4f}" for at in made.swings_s.tolist())
-        given |= {"camera": f"{files}/camera.txt", "marks": f"[{written(*MARKS)}]", "standing": written(STANDING),
-                  "distances_m": f"[{made.distances_m[0]},{made.distances_m[1]}]", "mark_height_m": str(made.mark_height_m),
-                  "swings": f"[{swings}]", "camera_fps": "60"}  # fmt: skip
+        given |= {
+            "camera": f"{files}/camera.txt",
+            "marks": f"[{written(*MARKS)}]",
+            "standing": written(STANDING),
+            "distances_m": f"[{made.distances_m[0]},{made.distances_m[1]}]",
+            "mark_height_m": str(made.mark_height_m),
+            "swings": f"[{swings}]",
+            "camera_fps": "60",
+        }
     return given
 
 

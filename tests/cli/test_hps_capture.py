@@ -44,12 +44,7 @@ def test_a_recording_becomes_files_and_a_report(data, tmp_path, capfd):
     told = capfd.readouterr().err
     assert "initialize: reused" in told
     assert "optimize: reused" not in told
-    assert {path.name for path in out.glob("motion.*")} == {
-        "motion.npz",
-        "motion.bvh",
-        "motion.glb",
-        "motion.mp4",
-    }
+    assert {path.name for path in out.glob("motion.*")} == {"motion.npz", "motion.bvh", "motion.glb", "motion.mp4"}
     report = json.loads((out / "report.json").read_text())
     assert [stage["reused"] for stage in report["stages"]] == [True] * 4 + [False]
     assert report["localized"]["share"] == 1.0
@@ -73,9 +68,7 @@ def test_another_scene_can_be_given(data, tmp_path):
 
 def test_a_data_set_is_scored(data, tmp_path, capfd):
     table = tmp_path / "table.json"
-    evaluate.main(
-        arguments(data, tmp_path, f"dataset={data}", f"output={table}", f"cache={tmp_path / 'cache'}")
-    )
+    evaluate.main(arguments(data, tmp_path, f"dataset={data}", f"output={table}", f"cache={tmp_path / 'cache'}"))
     written = json.loads(table.read_text())
     assert written["about"]["dataset"] == str(data)
     scores = written["methods"]["hps"]
@@ -87,9 +80,7 @@ def test_a_data_set_is_scored(data, tmp_path, capfd):
 
 
 def test_localisation_by_learned_features_is_a_choice():
-    chosen = compose(
-        "capture", ["pipeline=hps_paper", "recording=x", "localization@pipeline.localization=superpoint"]
-    )
+    chosen = compose("capture", ["pipeline=hps_paper", "recording=x", "localization@pipeline.localization=superpoint"])
     assert chosen.pipeline.localization.extractor._target_.endswith("SuperPointExtractor")
     assert chosen.pipeline.localization._target_.endswith("MapLocalization")
 

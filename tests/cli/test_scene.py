@@ -82,12 +82,16 @@ def test_a_colmap_model_becomes_a_map(tmp_path, capsys):
             row.append(f"{x + 0.5} {y + 0.5} {point}")
             tracks[point] += [number, place]
         quaternion = "0.5 0.5 -0.5 0.5"  # of R_cam_world
-        images.append(f"{number} {quaternion} {' '.join(map(str, back.t.tolist()))} 1 {photo.file.name}\n{' '.join(row)}\n")  # fmt: skip
+        images.append(
+            f"{number} {quaternion} {' '.join(map(str, back.t.tolist()))} 1 {photo.file.name}\n{' '.join(row)}\n"
+        )
     (tmp_path / "images.txt").write_text("".join(images))
-    (tmp_path / "cameras.txt").write_text(f"1 PINHOLE 240 180 {CAMERA.fx} {CAMERA.fy} {CAMERA.cx + 0.5} {CAMERA.cy + 0.5}\n")  # fmt: skip
+    (tmp_path / "cameras.txt").write_text(
+        f"1 PINHOLE 240 180 {CAMERA.fx} {CAMERA.fy} {CAMERA.cx + 0.5} {CAMERA.cy + 0.5}\n"
+    )
     (tmp_path / "points3D.txt").write_text(
         "".join(f"{k} {x} {y} {z} 9 9 9 0.1 {' '.join(map(str, tracks[k]))}\n" for k, (x, y, z) in enumerate(points))
-    )  # fmt: skip
+    )
     made = run(tmp_path, f"images={tmp_path / 'photos'}", "check=2", "settings.track_distance_px=1")
     assert len(made) == 9
     assert np.abs(made.positions[:, 0] - 3).max() < 1e-4

@@ -43,14 +43,7 @@ def test_a_folder_or_a_file_opens_with_what_was_made_before(tmp_path, pages, cap
     assert str(tmp_path / "environment.json") in said
     assert pages[0].current == "crate"
     scene.main(
-        [
-            "edit",
-            str(tmp_path / "pointcloud.ply"),
-            "--environment",
-            str(tmp_path / "other.json"),
-            "--port",
-            "18420",
-        ]
+        ["edit", str(tmp_path / "pointcloud.ply"), "--environment", str(tmp_path / "other.json"), "--port", "18420"]
     )
     assert pages[1].file == tmp_path / "other.json"
     assert pages[1].current is None
@@ -77,9 +70,7 @@ def test_what_is_wrong_is_said(tmp_path, pages):
     with pytest.raises(WearcapError, match=r"a \.json file"):
         scene.main(["edit", str(tmp_path), "--environment", str(tmp_path / "map.ply")])
     write_environment(an_environment(50.0), tmp_path / "environment.json")
-    with pytest.raises(
-        WearcapError, match=r"environment\.json: the object 'crate' stands .* outside the scan"
-    ):
+    with pytest.raises(WearcapError, match=r"environment\.json: the object 'crate' stands .* outside the scan"):
         scene.main(["edit", str(tmp_path)])
     (tmp_path / "environment.json").write_text("{")
     with pytest.raises(WearcapError, match=r"environment\.json"):

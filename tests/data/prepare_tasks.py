@@ -21,9 +21,7 @@ def recording(name: str, seed: int, frames: int = 120, fps: float = 60.0) -> Rec
     generator = torch.Generator().manual_seed(seed)
     skeleton = xsens23()
     R = exp(0.3 * torch.randn(frames, len(skeleton), 3, generator=generator))
-    times = (
-        torch.arange(frames, dtype=torch.float64) / fps if fps else torch.zeros(frames, dtype=torch.float64)
-    )
+    times = torch.arange(frames, dtype=torch.float64) / fps if fps else torch.zeros(frames, dtype=torch.float64)
     t_root = torch.randn(frames, 3, generator=generator)
     return Recording(name, motion=Motion(times, skeleton, R, t_root), skeleton=skeleton, subject=f"s{seed}")
 
@@ -46,8 +44,9 @@ class Make:
             re.match(r"(a+)+$", "a" * 40 + "b")
         if self.fault == "killed":
             os.kill(os.getpid(), signal.SIGKILL)
-        made = recording(self.name, self.seed, 3 if self.fault == "short" else 120,
-                         0.0 if self.fault == "still" else 60.0)  # fmt: skip
+        made = recording(
+            self.name, self.seed, 3 if self.fault == "short" else 120, 0.0 if self.fault == "still" else 60.0
+        )
         if self.fault == "nan":
             made.motion.t_world_root[7, 1] = float("nan")
         if self.fault == "sheared":

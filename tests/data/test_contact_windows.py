@@ -37,9 +37,7 @@ def test_a_plain_window_is_the_recordings_own(root):
     window = windows[(1, 5)]
     assert torch.equal(window.R_parent_joint, motion.R_parent_joint[40:160])
     for index, name in enumerate(CLASSES):
-        assert torch.equal(
-            window.contact[..., index], interactions.hand_contact(motion.timestamps[40:160], name)
-        )
+        assert torch.equal(window.contact[..., index], interactions.hand_contact(motion.timestamps[40:160], name))
     assert window.contact.any()
     assert not window.error.any()
 
@@ -83,7 +81,9 @@ def test_lost_frames_are_bridged():
     kept = torch.ones(30, dtype=torch.bool)
     kept[[7, 8, 15]] = False
     R = interpolated(motion.R_parent_joint, kept, torch.arange(29) * 1.0)
-    assert torch.equal(R[kept[:29]], rotation.matrix_from_rot6d(rotation.rot6d_from_matrix(motion.R_parent_joint[:29]))[kept[:29]])  # fmt: skip
+    assert torch.equal(
+        R[kept[:29]], rotation.matrix_from_rot6d(rotation.rot6d_from_matrix(motion.R_parent_joint[:29]))[kept[:29]]
+    )
     assert rotation.geodesic(R, motion.R_parent_joint[:29]).max() < math.radians(3)
 
 
@@ -99,9 +99,11 @@ def test_another_skeleton_and_rate_are_converted(tmp_path):
     recording = bending_recording(400, "slow")
     assert recording.suit is not None
     half = replace(
-        recording.suit, timestamps=recording.suit.timestamps[::2], R_parent_joint=recording.suit.R_parent_joint[::2],
+        recording.suit,
+        timestamps=recording.suit.timestamps[::2],
+        R_parent_joint=recording.suit.R_parent_joint[::2],
         t_world_root=recording.suit.t_world_root[::2],
-    )  # fmt: skip
+    )
     store.add(replace(recording, suit=half), split="train", config_hash="test")
     window = dataset(tmp_path, skeleton=smpl24())[(0, 0)]
     expected = in_skeleton(xsens23(), worn(xsens23(), smpl24()), recording.suit.R_parent_joint[:120])
@@ -115,16 +117,16 @@ def test_recordings_without_truth_or_suit_are_named(tmp_path):
     with pytest.raises(WearcapError, match="a.safetensors: this recording has no interactions"):
         dataset(tmp_path)[(0, 0)]
     with pytest.raises(WearcapError, match="no suit"):
-        ContactDataset([Source(str(tmp_path))], "val", window=120, stride=40, fps=60.0, classes=CLASSES, skeleton=xsens23())[(0, 0)]  # fmt: skip
+        ContactDataset(
+            [Source(str(tmp_path))], "val", window=120, stride=40, fps=60.0, classes=CLASSES, skeleton=xsens23()
+        )[(0, 0)]
     with pytest.raises(WearcapError, match='expected.*"suit" or "motion"|"suit" or "motion"'):
         dataset(tmp_path, stream="watch")
 
 
 def test_angles_are_smpls_in_its_own_axes():
     rotvec = torch.zeros(2, 24, 3)
-    rotvec[0, smpl24().index("left_knee")] = torch.tensor(
-        [0.1, 0.5, 0.2]
-    )  # ours: about x forward, y left, z up
+    rotvec[0, smpl24().index("left_knee")] = torch.tensor([0.1, 0.5, 0.2])  # ours: about x forward, y left, z up
     angles = SmplAngles().encode(rotation.exp(rotvec))
     assert angles.shape == (2, 69)
     knee = smpl24().index("left_knee") - 1

@@ -93,9 +93,11 @@ def test_the_condition_is_eq_4(walked, frame):
         origin = at.t[0, min(k, at.t.shape[1] - 1)]
         for p in range(3):
             turned = own @ R[0, k, p]
-            torch.testing.assert_close(condition[k, 6 * p : 6 * p + 6], turned[:, :2].T.flatten(), atol=1e-5, rtol=0)  # fmt: skip
+            torch.testing.assert_close(condition[k, 6 * p : 6 * p + 6], turned[:, :2].T.flatten(), atol=1e-5, rtol=0)
             step = R[0, k - 1, p].mT @ R[0, k, p]
-            torch.testing.assert_close(condition[k, 18 + 6 * p : 24 + 6 * p], step[:, :2].T.flatten(), atol=1e-5, rtol=0)  # fmt: skip
+            torch.testing.assert_close(
+                condition[k, 18 + 6 * p : 24 + 6 * p], step[:, :2].T.flatten(), atol=1e-5, rtol=0
+            )
             velocity = own @ (t[0, k, p] - t[0, k - 1, p]) * 30
             torch.testing.assert_close(condition[k, 45 + 3 * p : 48 + 3 * p], velocity, atol=1e-4, rtol=0)
             if p or frame != "own":
@@ -105,7 +107,7 @@ def test_the_condition_is_eq_4(walked, frame):
 
 def test_in_its_own_frame_the_heads_path_is_relative_to_the_windows_first_frame(walked):
     points, *_, floor = walked
-    own, window = (small_features(frame, body=False).condition(points, floor, SIZE) for frame in ("own", "window"))  # fmt: skip
+    own, window = (small_features(frame, body=False).condition(points, floor, SIZE) for frame in ("own", "window"))
     torch.testing.assert_close(own[..., 36:39], window[..., 36:39], atol=1e-5, rtol=0)
     heading = own[0, :, 54:]
     torch.testing.assert_close(heading.norm(dim=-1), torch.ones(30), atol=1e-5, rtol=0)

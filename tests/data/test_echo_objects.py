@@ -49,7 +49,11 @@ def test_its_feature_is_the_encoders_and_its_mirror_images(shape):
 
 def test_a_mesh_is_read_once_for_all_objects_that_have_it():
     reader, mesh = ObjectReader(small_features(), None), box_mesh()
-    one, two, chair = reader(scene_object("a", mesh=mesh)), reader(scene_object("b", mesh=mesh)), reader(scene_object("c", "chair", mesh))  # fmt: skip
+    one, two, chair = (
+        reader(scene_object("a", mesh=mesh)),
+        reader(scene_object("b", mesh=mesh)),
+        reader(scene_object("c", "chair", mesh)),
+    )
     assert one.surface is two.surface
     assert (one.name, two.name) == ("a", "b")
     assert not torch.equal(one.code, chair.code)

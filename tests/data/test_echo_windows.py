@@ -6,14 +6,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from carried_box import (
-    WINDOW,
-    boxes,
-    carried_dataset,
-    carrying,
-    scene_object,
-    small_features,
-)
+from carried_box import WINDOW, boxes, carried_dataset, carrying, scene_object, small_features
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, contact_points
 from wearcap.body.kinematics import forward_kinematics
@@ -100,7 +93,7 @@ def test_contacts_in_a_mirror_are_those_of_the_mirrored_geometry(root):
         body = forward_kinematics(SKELETON, *window.body, window.t_parent_joint[None])
         touches = body_contact(surface.vertices(body), shape, window.T_world_object, 0.05)
         labels = window.contact[:, :BODY_POINTS] > 0
-        same, total, touching = same + (touches == labels).sum(), total + labels.numel(), touching + labels.sum()  # fmt: skip
+        same, total, touching = same + (touches == labels).sum(), total + labels.numel(), touching + labels.sum()
         assert (touches != labels).any(1).sum() <= WINDOW
     assert touching > 200
     assert (total - same) < 0.15 * touching, "twins are mirror images to within some millimetres"
@@ -114,12 +107,10 @@ def test_the_mirrored_box_is_where_the_mirrored_window_has_it(root):
     shape = windows.track(0).objects[0]
     flip = torch.tensor([1.0, -1.0, 1.0])
     world = (plain.T_world_object[:, None] @ shape.cloud) * flip
-    torch.testing.assert_close(
-        flipped.T_world_object[:, None] @ (shape.cloud * flip), world, atol=1e-5, rtol=0
-    )
+    torch.testing.assert_close(flipped.T_world_object[:, None] @ (shape.cloud * flip), world, atol=1e-5, rtol=0)
     mirrored = shape.cloud * flip
     torch.testing.assert_close(flipped.object_mean[0], mirrored.mean(0), atol=1e-6, rtol=0)
-    torch.testing.assert_close(flipped.object_spread[0], mirrored.T @ mirrored / len(mirrored), atol=1e-5, rtol=0)  # fmt: skip
+    torch.testing.assert_close(flipped.object_spread[0], mirrored.T @ mirrored / len(mirrored), atol=1e-5, rtol=0)
 
 
 def test_windows_are_functions_of_their_seed(root):
@@ -183,9 +174,7 @@ def test_an_object_may_change_within_a_window():
     for k, shape in ((4, first), (5, second)):
         assert torch.equal(window.object_code[k], shape.code)
         assert torch.equal(window.object_mean[k], shape.mean)
-        truth = shape.centred(
-            recording.object_motion[shape.name].T_world_body[change - 5 + k : change - 4 + k]
-        )
+        truth = shape.centred(recording.object_motion[shape.name].T_world_body[change - 5 + k : change - 4 + k])
         torch.testing.assert_close(window.t_world_object[k], truth.t[0], atol=1e-5, rtol=0)
     assert not torch.equal(window.object_spread[4], window.object_spread[5])
 
@@ -202,16 +191,12 @@ def test_a_track_without_an_active_object_has_index_minus_one():
 @pytest.mark.parametrize("fps", [45.0, 25.0, 120.0])
 def test_rates_that_are_no_multiple_are_refused(tmp_path, fps):
     root = small_dataset(tmp_path).root
-    with pytest.raises(
-        WearcapError, match="recordings of 60 frames per second. Expected one rate that is a whole"
-    ):
+    with pytest.raises(WearcapError, match="recordings of 60 frames per second. Expected one rate that is a whole"):
         dataset(str(root), features=small_features(fps=fps))
 
 
 def test_recordings_without_foot_contacts_are_refused():
-    with pytest.raises(
-        WearcapError, match=f"carry: no foot contacts.*Expected contacts of {FOOT_PATCHES[0]}"
-    ):
+    with pytest.raises(WearcapError, match=f"carry: no foot contacts.*Expected contacts of {FOOT_PATCHES[0]}"):
         track_of(replace(carrying(0.5), contacts=None))
 
 
@@ -228,7 +213,12 @@ def test_the_measured_head_is_the_condition_and_not_the_true_one():
     track = track_of(replace(recording, head=head))
     true = recording.motion.joint("head").t
     torch.testing.assert_close(track.points.t_world_point[:, 0], true + 0.1, atol=1e-4, rtol=0)
-    short = replace(head, timestamps=head.timestamps[:3], R_world_device=head.R_world_device[:3], t_world_device=head.t_world_device[:3])  # fmt: skip
+    short = replace(
+        head,
+        timestamps=head.timestamps[:3],
+        R_world_device=head.R_world_device[:3],
+        t_world_device=head.t_world_device[:3],
+    )
     track = track_of(replace(recording, head=short))
     torch.testing.assert_close(track.points.t_world_point[:, 0], true, atol=1e-4, rtol=0)
 

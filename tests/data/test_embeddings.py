@@ -84,9 +84,7 @@ def test_what_was_embedded_is_not_embedded_again(tmp_path):
     assert torch.equal(first.embedding, again.embedding)
     kept = next((tmp_path / "cache/embeddings-corners-00000000").iterdir())
     kept.write_bytes(kept.read_bytes()[:-5])  # cut short: made again
-    assert torch.equal(
-        embed_camera(stream(20, video="videos/b.mp4"), tmp_path, encoder).embedding, first.embedding
-    )
+    assert torch.equal(embed_camera(stream(20, video="videos/b.mp4"), tmp_path, encoder).embedding, first.embedding)
     assert encoder.seen == 80
     write_video(tmp_path / "videos/b.mp4", 21)  # another content: made anew
     embed_camera(stream(21, video="videos/b.mp4"), tmp_path, encoder, cache=tmp_path / "elsewhere")
@@ -146,9 +144,7 @@ def film(tmp_path_factory) -> Path:
         if name != "r2":
             write_video(store.root / f"videos/{name}.mp4", 28 + number)
             camera = stream(28 + number, video=f"videos/{name}.mp4")
-            store.add(
-                replace(store.load(name), camera=camera), split=store.entries[name].split, config_hash="made"
-            )
+            store.add(replace(store.load(name), camera=camera), split=store.entries[name].split, config_hash="made")
     return store.root
 
 
@@ -220,9 +216,7 @@ def test_the_command_embeds_by_a_checkpoint(filmed, tmp_path, capsys):
     encoder = EgoViewEncoder(size=8, channels=[4, 4, 4])
     net = {"_target_": "wearcap.models.image_encoder.EgoViewEncoder", "size": 8, "channels": [4, 4, 4]}
     state = {f"net.{key}": value for key, value in encoder.state_dict().items()}
-    torch.save(
-        {"wearcap": {"config": json.dumps({"model": {"net": net}})}, "state_dict": state}, tmp_path / "e.ckpt"
-    )
+    torch.save({"wearcap": {"config": json.dumps({"model": {"net": net}})}, "state_dict": state}, tmp_path / "e.ckpt")
     prepare.main(["embeddings", f"dataset={filmed.root}", f"checkpoint={tmp_path}/e.ckpt"])
     assert "5 written, 0 current, 0 failed" in capsys.readouterr().out
     camera = RecordingStore.open(filmed.root).load("r0").camera

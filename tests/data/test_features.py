@@ -36,9 +36,7 @@ def test_condition_keeps_gravity():
     R, t, floor, stature = path()
     tilt = rotation.about_axis("x", torch.tensor(0.3))
     assert not torch.allclose(
-        features.condition(tilt @ R, t, floor, stature, FPS),
-        features.condition(R, t, floor, stature, FPS),
-        atol=0.05,
+        features.condition(tilt @ R, t, floor, stature, FPS), features.condition(R, t, floor, stature, FPS), atol=0.05
     )
 
 

@@ -54,8 +54,9 @@ def test_a_body_that_glides_along_a_circle_says_so():
     still = encoded(Motion(time, skeleton, R[:1].expand_as(R), root[:1].expand_as(root)))
     assert still[..., -4:].min() == 1
     raised = still.new_tensor([0.0, 0.0, 0.3])
-    lifted = FEATURES.movement(Motion(time, skeleton, R[:1].expand_as(R), (root[:1] + raised).expand_as(root)),
-                               torch.zeros(40)).windows(20, 20)  # fmt: skip
+    lifted = FEATURES.movement(
+        Motion(time, skeleton, R[:1].expand_as(R), (root[:1] + raised).expand_as(root)), torch.zeros(40)
+    ).windows(20, 20)
     assert FEATURES.encode(lifted)[..., -4:].max() == 0
 
 

@@ -15,9 +15,7 @@ CLASSES = ["box", "chair", "drawer", "door"]
 
 def mesh_of(vertices: list, faces: list) -> Mesh:
     return Mesh(
-        np.array(vertices, np.float32).reshape(-1, 3),
-        np.array(faces, np.int32).reshape(-1, 3),
-        np.zeros(3, np.float32),
+        np.array(vertices, np.float32).reshape(-1, 3), np.array(faces, np.int32).reshape(-1, 3), np.zeros(3, np.float32)
     )
 
 
@@ -115,9 +113,6 @@ def test_a_datamodule_keeps_its_objects_in_a_file(tmp_path):
     made = (tmp_path / "train.safetensors").stat().st_mtime_ns
     data.dataset("train")
     assert (tmp_path / "train.safetensors").stat().st_mtime_ns == made
-    assert (
-        len(ObjectClouds(str(tmp_path), generate_clouds, **settings | {"per_class": 4}).dataset("train"))
-        == 16
-    )
+    assert len(ObjectClouds(str(tmp_path), generate_clouds, **settings | {"per_class": 4}).dataset("train")) == 16
     with pytest.raises(WearcapError, match="'chair'"):
         ObjectClouds(str(tmp_path), generate_clouds, **settings | {"classes": ["chairr"]}).dataset("train")

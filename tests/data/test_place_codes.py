@@ -19,9 +19,7 @@ from wearcap_testing import recording_of, swaying_motion
 
 def cloud(seed: int) -> PointCloud:
     random = torch.Generator().manual_seed(seed)
-    points = torch.rand(2000, 3, generator=random) * torch.tensor([6.0, 6.0, 2.0]) - torch.tensor(
-        [3.0, 3.0, 0.0]
-    )
+    points = torch.rand(2000, 3, generator=random) * torch.tensor([6.0, 6.0, 2.0]) - torch.tensor([3.0, 3.0, 0.0])
     return PointCloud(points, first_seen=2 * torch.rand(2000, generator=random, dtype=torch.float64))
 
 
@@ -39,8 +37,10 @@ def store(tmp_path_factory) -> RecordingStore:
 def checkpoint(path, seed: int, **settings):
     torch.manual_seed(seed)
     net = VoxelAutoencoder(**settings)
-    model = {"_target_": "wearcap.systems.hmd2.point_codes_training.VoxelReconstruction",
-             "net": {"_target_": "wearcap.models.voxel_autoencoder.VoxelAutoencoder", **settings}}  # fmt: skip
+    model = {
+        "_target_": "wearcap.systems.hmd2.point_codes_training.VoxelReconstruction",
+        "net": {"_target_": "wearcap.models.voxel_autoencoder.VoxelAutoencoder", **settings},
+    }
     state = {f"net.{name}": value for name, value in net.state_dict().items()}
     torch.save({"wearcap": {"config": json.dumps({"model": model})}, "state_dict": state}, path)
     return net.eval()
@@ -102,8 +102,15 @@ def test_drawn_grids_are_the_recordings_own(store):
     everything = []
     for name in ("r0", "r1"):
         recording = store.load(name)
-        everything.append(voxelize(recording.points.points_world, recording.head.T_world_device, VoxelGrid(),
-                                   recording.points.first_seen, recording.head.timestamps))  # fmt: skip
+        everything.append(
+            voxelize(
+                recording.points.points_world,
+                recording.head.T_world_device,
+                VoxelGrid(),
+                recording.points.first_seen,
+                recording.head.timestamps,
+            )
+        )
     for index, (recording, start) in enumerate([(0, 0), (0, 60), (1, 0), (1, 60)]):
         for grid in dataset[(index, 7)].grids:
             own = everything[recording][start : start + 60]
@@ -116,10 +123,12 @@ def test_what_is_drawn_depends_on_the_seed_alone(store):
     assert not torch.equal(dataset[(1, 5)].grids, dataset[(1, 6)].grids)
     plain = drawn(store)
     kinds = {
-        (torch.equal(dataset[(1, seed)].grids, plain[(1, seed)].grids),
-         torch.equal(dataset[(1, seed)].grids, mirrored(plain[(1, seed)].grids)))
+        (
+            torch.equal(dataset[(1, seed)].grids, plain[(1, seed)].grids),
+            torch.equal(dataset[(1, seed)].grids, mirrored(plain[(1, seed)].grids)),
+        )
         for seed in range(12)
-    }  # fmt: skip
+    }
     assert kinds == {(True, False), (False, True)}
 
 

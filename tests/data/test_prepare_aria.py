@@ -11,9 +11,7 @@ from wearcap.recording import RecordingStore
 
 @pytest.mark.real
 def test_a_real_aria_recording_is_prepared_and_found_sound(real_data, tmp_path):
-    assert (
-        run_verb("prepare", ["aria", f"source={real_data / 'aria_mps'}", f"output={tmp_path}", "jobs=1"]) == 0
-    )
+    assert run_verb("prepare", ["aria", f"source={real_data / 'aria_mps'}", f"output={tmp_path}", "jobs=1"]) == 0
     recording = RecordingStore.open(tmp_path).load("aria_mps")
     assert recording.head is not None
     assert recording.points is not None

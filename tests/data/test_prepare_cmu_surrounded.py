@@ -25,9 +25,16 @@ def source(root, **changed) -> RecordingStore:
     for name, motion in MOTIONS.items():
         subject = name.split("_")[0]
         recording = replace(
-            Recording(name, head=nominal_head(motion, [0.09, 0.0, 0.09]), motion=motion,
-                      skeleton=motion.skeleton, subject=subject, activity="walk"), **changed,
-        )  # fmt: skip
+            Recording(
+                name,
+                head=nominal_head(motion, [0.09, 0.0, 0.09]),
+                motion=motion,
+                skeleton=motion.skeleton,
+                subject=subject,
+                activity="walk",
+            ),
+            **changed,
+        )
         save_recording(recording, recording_path(root, name))
         store.register({name: entry_for(recording, root, "train" if subject == "7" else "test", "0")})
     return store
@@ -71,9 +78,7 @@ def test_again_is_current_and_elsewhere_the_same_bytes(plain, tmp_path):
     assert again.current == sorted(MOTIONS)
     surrounded(store.root, tmp_path, "camera=false")
     other = RecordingStore.open(tmp_path)
-    assert {n: e.sha256 for n, e in other.entries.items()} == {
-        n: e.sha256 for n, e in prepared.entries.items()
-    }
+    assert {n: e.sha256 for n, e in other.entries.items()} == {n: e.sha256 for n, e in prepared.entries.items()}
 
 
 def test_without_a_turn_less_is_known(plain, tmp_path):
@@ -102,8 +107,7 @@ def test_the_camera_films_into_the_data_set(plain, tmp_path, monkeypatch):
     assert recording.camera is not None
     assert recording.camera.video == "videos/7_01.mp4"
     points = [
-        root.open_file("7_01").tensor("points.points_world")
-        for root in (RecordingStore.open(tmp_path), prepared)
+        root.open_file("7_01").tensor("points.points_world") for root in (RecordingStore.open(tmp_path), prepared)
     ]
     assert torch.equal(*points)
 

@@ -178,8 +178,7 @@ def test_split_lists(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "subject\n14\n", "subject,split\n14,trian\n", "subject,split\n14\n", "subject,split,x\n1,test,3\n"],
+    "text", ["", "subject\n14\n", "subject,split\n14,trian\n", "subject,split\n14\n", "subject,split,x\n1,test,3\n"]
 )
 def test_broken_split_lists_are_refused(tmp_path, text):
     (tmp_path / "s.csv").write_text(text)

@@ -166,9 +166,7 @@ def test_an_interrupted_run_ends_its_workers_before_it_gives_the_folder_up(tmp_p
             try:
                 yield lock
             finally:
-                after.extend(
-                    Path(f"/proc/{pid}/cmdline") for pid in descendants(os.getpid()) if pid not in before
-                )
+                after.extend(Path(f"/proc/{pid}/cmdline") for pid in descendants(os.getpid()) if pid not in before)
                 after[:] = [path for path in after if path.exists() and "popen_loky" in path.read_text()]
 
     def interrupt():
@@ -201,18 +199,14 @@ def test_a_second_run_into_the_folder_is_refused_and_harms_nothing(alone, tmp_pa
 @posix
 def test_a_folder_in_which_orphans_write_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "ORPHANS_PATIENCE_S", 0.1)
-    process = subprocess.Popen(
-        [sys.executable, "-c", UNBOUND_WORKER, tmp_path], stdout=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen([sys.executable, "-c", UNBOUND_WORKER, tmp_path], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     with process.stdout:
         orphan = int(process.stdout.readline())
     process.kill()
     process.wait()
     try:
-        with pytest.raises(
-            WearcapError, match=rf"workers of a run that has ended .+process {process.pid} on"
-        ):
+        with pytest.raises(WearcapError, match=rf"workers of a run that has ended .+process {process.pid} on"):
             prepare(tasks(1), tmp_path, jobs=1, progress=False)
     finally:
         os.kill(orphan, signal.SIGKILL)

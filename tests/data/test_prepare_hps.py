@@ -65,8 +65,6 @@ def test_a_folder_without_sequences_is_refused(tmp_path):
 def test_contacts_are_resampled_with_the_motion(fps):
     motion = swaying_motion(61, fps=60.0)
     ramp = torch.linspace(0, 1, 61)[:, None].expand(-1, 4)
-    read = resampled(
-        Motion(motion.timestamps, motion.skeleton, motion.R_parent_joint, motion.t_world_root, ramp), fps
-    )
+    read = resampled(Motion(motion.timestamps, motion.skeleton, motion.R_parent_joint, motion.t_world_root, ramp), fps)
     assert read.contact_prob is not None
     torch.testing.assert_close(read.contact_prob[:, 2], read.timestamps.float(), atol=1e-5, rtol=0)

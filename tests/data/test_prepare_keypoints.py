@@ -79,7 +79,12 @@ def assert_followed(recording: Recording) -> None:
 
 
 def test_simulated_keypoints_come_with_a_camera(filmed, tmp_path):
-    report = keypoints_dataset(filmed.root, tmp_path / "new", Simulated(joints=("left_toe", "left_wrist", "left_hand"), noise_px=0, drop=0), progress=False)  # fmt: skip
+    report = keypoints_dataset(
+        filmed.root,
+        tmp_path / "new",
+        Simulated(joints=("left_toe", "left_wrist", "left_hand"), noise_px=0, drop=0),
+        progress=False,
+    )
     assert report.written == ["r0", "r1", "r2"]
     store = RecordingStore.open(tmp_path / "new")
     assert all(wrong is None for _, wrong in store.verify())
@@ -100,7 +105,12 @@ def test_simulated_keypoints_come_with_a_camera(filmed, tmp_path):
             assert (pixels - cue.points).abs().max() < 0.1
     entry, old = store.entries["r1"], filmed.entries["r1"]
     assert (entry.split, entry.subject) == (old.split, old.subject)
-    again = keypoints_dataset(filmed.root, store.root, Simulated(joints=("left_toe", "left_wrist", "left_hand"), noise_px=0, drop=0), progress=False)  # fmt: skip
+    again = keypoints_dataset(
+        filmed.root,
+        store.root,
+        Simulated(joints=("left_toe", "left_wrist", "left_hand"), noise_px=0, drop=0),
+        progress=False,
+    )
     assert (len(again.current), again.written) == (3, [])
 
 

@@ -88,8 +88,12 @@ def test_any_rate_becomes_60_and_keeps_its_motion(fps, frames):
 def test_a_gap_in_the_clock_is_bridged_at_an_even_rate():
     motion = standing(1.0)
     kept = torch.cat([torch.arange(40), torch.arange(60, 120)])
-    motion = replace(motion, timestamps=motion.timestamps[kept], R_parent_joint=motion.R_parent_joint[kept],
-                     t_world_root=motion.t_world_root[kept])  # fmt: skip
+    motion = replace(
+        motion,
+        timestamps=motion.timestamps[kept],
+        R_parent_joint=motion.R_parent_joint[kept],
+        t_world_root=motion.t_world_root[kept],
+    )
     steps = resampled(motion, 60.0).timestamps.diff()
     assert steps.max().item() == pytest.approx(1 / 60, abs=1e-6)
 
@@ -116,12 +120,37 @@ def test_steps_have_no_level_floor():
 
 def walking_bvh(path: Path) -> None:
     """A small upright figure in centimetres, 30 frames at 60 Hz."""
-    joints = ["Hips", "Spine", "Neck", "Head", "LeftArm", "LeftForeArm", "LeftHand", "RightArm", "RightForeArm",
-              "RightHand", "LeftUpLeg", "LeftLeg", "LeftFoot", "RightUpLeg", "RightLeg", "RightFoot"]  # fmt: skip
+    joints = [
+        "Hips",
+        "Spine",
+        "Neck",
+        "Head",
+        "LeftArm",
+        "LeftForeArm",
+        "LeftHand",
+        "RightArm",
+        "RightForeArm",
+        "RightHand",
+        "LeftUpLeg",
+        "LeftLeg",
+        "LeftFoot",
+        "RightUpLeg",
+        "RightLeg",
+        "RightFoot",
+    ]
     offsets = {"Spine": (0, 15, 0), "Neck": (0, 35, 0), "Head": (0, 12, 0), "Arm": (18, 30, 0), "ForeArm": (28, 0, 0),
                "Hand": (25, 0, 0), "UpLeg": (9, 0, 0), "Leg": (0, -42, 0), "Foot": (0, -42, 0)}  # fmt: skip
-    parents = {"Spine": "Hips", "Neck": "Spine", "Head": "Neck", "Arm": "Spine", "ForeArm": "Arm", "Hand": "ForeArm",
-               "UpLeg": "Hips", "Leg": "UpLeg", "Foot": "Leg"}  # fmt: skip
+    parents = {
+        "Spine": "Hips",
+        "Neck": "Spine",
+        "Head": "Neck",
+        "Arm": "Spine",
+        "ForeArm": "Arm",
+        "Hand": "ForeArm",
+        "UpLeg": "Hips",
+        "Leg": "UpLeg",
+        "Foot": "Leg",
+    }
     ends = {"Head": (0, 18, 0), "Hand": (15, 0, 0), "Foot": (0, -6, 18)}
 
     def bare(name: str) -> str:
@@ -133,13 +162,15 @@ def walking_bvh(path: Path) -> None:
         sign = -1 if side == "Right" else 1
         channels = "6 Xposition Yposition Zposition" if name == "Hips" else "3"
         pad = "  " * depth
-        lines = [f"{pad}{'ROOT' if depth == 0 else 'JOINT'} {name}", pad + "{", f"{pad}  OFFSET {sign * x} {y} {z}",
-                 f"{pad}  CHANNELS {channels} Zrotation Xrotation Yrotation"]  # fmt: skip
+        lines = [
+            f"{pad}{'ROOT' if depth == 0 else 'JOINT'} {name}",
+            pad + "{",
+            f"{pad}  OFFSET {sign * x} {y} {z}",
+            f"{pad}  CHANNELS {channels} Zrotation Xrotation Yrotation",
+        ]
         for child in joints:
             parent = parents.get(bare(child))
-            sided = parent and (
-                parent if parent in ("Hips", "Spine", "Neck") else child[: -len(bare(child))] + parent
-            )
+            sided = parent and (parent if parent in ("Hips", "Spine", "Neck") else child[: -len(bare(child))] + parent)
             if child != "Hips" and sided == name:
                 lines += block(child, depth + 1)
         if bare(name) in ends:
@@ -190,9 +221,7 @@ def test_amass_as_it_unpacks(tmp_path):
     t = torch.tensor([0.0, 0.0, skeleton.root_height]).repeat(120, 1)
     folder = tmp_path / "in" / "HumanEva" / "S1"
     folder.mkdir(parents=True)
-    write_amass(
-        Motion(torch.arange(120, dtype=torch.float64) / 120, skeleton, R, t), folder / "walk_poses.npz"
-    )
+    write_amass(Motion(torch.arange(120, dtype=torch.float64) / 120, skeleton, R, t), folder / "walk_poses.npz")
     (folder / "shape.npz").write_bytes(b"")
     verb.main(["amass", f"source={tmp_path / 'in'}", f"output={tmp_path / 'out'}", "jobs=1"])
     store = RecordingStore.open(tmp_path / "out")
@@ -216,15 +245,14 @@ def test_amass_by_data_set_and_by_files(tmp_path):
     license = compose("prepare", ["prepare=amass"]).license
     tasks = amass_tasks(tmp_path / "in", splits, SETTINGS, license, ["CMU", "BMLmovi"])
     assert {task.name: task.split for task in tasks} == {
-        "BMLmovi__S1__c_poses": "train", "CMU__14__a_poses": "val", "CMU__14__b_poses": "test",
-    }  # fmt: skip
+        "BMLmovi__S1__c_poses": "train",
+        "CMU__14__a_poses": "val",
+        "CMU__14__b_poses": "test",
+    }
     assert len(amass_tasks(tmp_path / "in", splits, SETTINGS, license)) == 4
     with pytest.raises(WearcapError, match="no data set 'BMLmov'. Did you mean 'BMLmovi'"):
         amass_tasks(tmp_path / "in", splits, SETTINGS, license, ["BMLmov"])
-    assert compose("prepare", ["prepare=amass", "subsets=[CMU,MPI_HDM05]"]).tasks.subsets == [
-        "CMU",
-        "MPI_HDM05",
-    ]
+    assert compose("prepare", ["prepare=amass", "subsets=[CMU,MPI_HDM05]"]).tasks.subsets == ["CMU", "MPI_HDM05"]
 
 
 @pytest.mark.parametrize(
@@ -267,12 +295,7 @@ def test_cmus_split_covers_every_subject_and_keeps_its_largest_for_training():
     splits = read_splits(splits_dir() / "cmu.csv")
     places = {number: splits.of(str(number)) for number in range(1, 145)}
     assert places[14] == "train"
-    assert [number for number in places if places[number] == "test" and number in (5, 26, 35, 127)] == [
-        5,
-        26,
-        35,
-        127,
-    ]
+    assert [number for number in places if places[number] == "test" and number in (5, 26, 35, 127)] == [5, 26, 35, 127]
     assert 100 < list(places.values()).count("train") < 125
 
 
@@ -281,9 +304,7 @@ def test_cmus_split_covers_every_subject_and_keeps_its_largest_for_training():
 def test_every_kind_of_cmu_trial_becomes_a_recording(real_data):
     config = compose("prepare", ["prepare=cmu"])
     splits = read_splits(splits_dir() / "cmu.csv")
-    tasks = cmu_tasks(
-        real_data / "cmu_mocap", splits, SETTINGS, BvhSettings(0.01, "y", "z"), config.amc_fps, "CMU"
-    )
+    tasks = cmu_tasks(real_data / "cmu_mocap", splits, SETTINGS, BvhSettings(0.01, "y", "z"), config.amc_fps, "CMU")
     indices = [path.read_text(encoding="utf-8") for path in (real_data / "cmu_mocap").glob("index*.csv")]
     assert len(tasks) == sum(len(text.splitlines()) - 1 for text in indices) >= 240
     by_name = {task.name: task for task in tasks}
@@ -311,8 +332,10 @@ def test_xz_and_plain_give_the_same_recording(real_data, tmp_path):
     folder = real_data / "cmu_mocap/trials/035"
     plain = tmp_path / "35_20.amc"
     plain.write_bytes(read_bytes(folder / "35_20.amc.xz"))
-    make = [Trial(path, folder / "35.asf", ABOUT, 120, BvhSettings(0.01, "y", "z"), SETTINGS)
-            for path in (folder / "35_20.amc.xz", plain)]  # fmt: skip
+    make = [
+        Trial(path, folder / "35.asf", ABOUT, 120, BvhSettings(0.01, "y", "z"), SETTINGS)
+        for path in (folder / "35_20.amc.xz", plain)
+    ]
     first, second = (trial().motion for trial in make)
     assert first is not None
     assert second is not None

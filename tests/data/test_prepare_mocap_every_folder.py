@@ -22,9 +22,7 @@ def files(monkeypatch):
 
 
 def prepared(tmp_path: Path, *more: str):
-    verb.main(
-        ["mocap_every_folder", f"source={tmp_path / 'in'}", f"output={tmp_path / 'out'}", "jobs=1", *more]
-    )
+    verb.main(["mocap_every_folder", f"source={tmp_path / 'in'}", f"output={tmp_path / 'out'}", "jobs=1", *more])
     return RecordingStore.open(tmp_path / "out")
 
 
@@ -66,8 +64,5 @@ def test_what_is_missing_is_named(tmp_path, files, capsys):
     with pytest.raises(SystemExit):
         verb.main([*arguments, "scale=-1"])
     (tmp_path / "none").mkdir()
-    assert (
-        run_verb("prepare", ["mocap_every_folder", f"source={tmp_path / 'none'}", f"output={tmp_path / 'o'}"])
-        == 2
-    )
+    assert run_verb("prepare", ["mocap_every_folder", f"source={tmp_path / 'none'}", f"output={tmp_path / 'o'}"]) == 2
     assert "no capture" in capsys.readouterr().err

@@ -47,13 +47,7 @@ def test_a_sequence_with_its_own_recording_brings_a_video(tmp_path, monkeypatch)
     drawn = []
     monkeypatch.setattr(aria_vrs, "write_frames", lambda file, frames, fps: drawn.append((file, fps)))
     folder = write_sequence(tmp_path / "in" / "20230607_s0_ada_byron_act0_e72nhq")
-    arguments = [
-        "nymeria",
-        f"source={tmp_path / 'in'}",
-        f"output={tmp_path / 'out'}",
-        "jobs=1",
-        "camera=true",
-    ]
+    arguments = ["nymeria", f"source={tmp_path / 'in'}", f"output={tmp_path / 'out'}", "jobs=1", "camera=true"]
     verb.main(arguments)
     assert RecordingStore.open(tmp_path / "out").load(folder.name).camera is None, "nothing was downloaded"
     (folder / "recording_head" / "data").mkdir()

@@ -69,12 +69,7 @@ def test_behave_becomes_a_data_set(tmp_path, files):
     assert store.names("test") == [files.BEHAVE_NAME]
     assert store.names("train") == ["Date01_Sub01_boxlarge_lift"]
     entry = store.entries[files.BEHAVE_NAME]
-    assert (entry.subject, entry.location, entry.activity, entry.fps) == (
-        "Sub04",
-        "Date03",
-        "boxlarge_hand",
-        30.0,
-    )
+    assert (entry.subject, entry.location, entry.activity, entry.fps) == ("Sub04", "Date03", "boxlarge_hand", 30.0)
     assert "non-commercial" in entry.license
     check_take(store, files.BEHAVE_NAME, "boxlarge", files)
     assert store.load(files.BEHAVE_NAME).source == "BEHAVE"
@@ -169,7 +164,7 @@ def walker(files, fps: float) -> dict:
     return entry
 
 
-@pytest.mark.parametrize(("true", "said", "advice"), [(30.0, 120, "is lower"), (120.0, 30, "is higher")])  # fmt: skip
+@pytest.mark.parametrize(("true", "said", "advice"), [(30.0, 120, "is lower"), (120.0, 30, "is higher")])
 def test_a_rate_at_which_nobody_walks_is_refused(tmp_path, files, true, said, advice):
     files.write_omomo(tmp_path, walker(files, true))
     sequences = read_omomo(tmp_path)
@@ -181,10 +176,7 @@ def test_a_rate_at_which_nobody_walks_is_refused(tmp_path, files, true, said, ad
 def test_rates_that_are_none_and_sequences_that_fail_alone(tmp_path, files, capsys):
     files.write_omomo(tmp_path / "in", files.omomo_entry(), files.omomo_entry(name="sub1_spaceship_000"))
     assert (
-        run_verb(
-            "prepare", ["omomo", f"source={tmp_path / 'in'}", f"output={tmp_path / 'out'}", "source_fps=0"]
-        )
-        == 2
+        run_verb("prepare", ["omomo", f"source={tmp_path / 'in'}", f"output={tmp_path / 'out'}", "source_fps=0"]) == 2
     )
     assert "a frame rate of 0 Hz" in capsys.readouterr().err
     with pytest.raises(SystemExit):

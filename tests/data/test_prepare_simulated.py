@@ -49,9 +49,7 @@ def test_a_small_set(tmp_path):
     assert recording.floor is not None
     assert (len(recording.motion), recording.imu.keys()) == (180, {"left_wrist", "right_wrist"})
     with_two = prepare_here(tmp_path / "b", "jobs=2", "backend=threading")
-    assert {n: e.sha256 for n, e in with_two.entries.items()} == {
-        n: e.sha256 for n, e in store.entries.items()
-    }
+    assert {n: e.sha256 for n, e in with_two.entries.items()} == {n: e.sha256 for n, e in store.entries.items()}
     manifest = sha256_of(store.manifest_path)
     prepare_here(tmp_path / "a", "jobs=1")
     assert sha256_of(store.manifest_path) == manifest
@@ -60,14 +58,7 @@ def test_a_small_set(tmp_path):
 def test_wrong_settings_are_refused():
     splits = read_splits(splits_dir() / "simulated.csv")
     for wrong in ({"fps": 0}, {"duration_s": -1}, {"recordings": {"trian": 1}}):
-        right = {
-            "recordings": {"train": 1},
-            "duration_s": 3,
-            "fps": 60,
-            "points": False,
-            "activities": None,
-            "seed": 0,
-        }
+        right = {"recordings": {"train": 1}, "duration_s": 3, "fps": 60, "points": False, "activities": None, "seed": 0}
         with pytest.raises(WearcapError):
             simulated_tasks(splits, **(right | wrong))
 

@@ -16,9 +16,18 @@ from wearcap.recording.store import RecordingStore
 
 def tasks_of(root: Path, **changes):
     settings = {
-        "recordings": {"test": 1}, "fps": 60, "camera_fps": 30, "returns_m": [], "end_m": 15, "spacing_m": 0.4,
-        "photo_m": 14.0, "video_s": 0.8, "video_fps": 5, "changed": 0.3, "seed": 0,
-    }  # fmt: skip
+        "recordings": {"test": 1},
+        "fps": 60,
+        "camera_fps": 30,
+        "returns_m": [],
+        "end_m": 15,
+        "spacing_m": 0.4,
+        "photo_m": 14.0,
+        "video_s": 0.8,
+        "video_fps": 5,
+        "changed": 0.3,
+        "seed": 0,
+    }
     return simulated_hps_tasks(read_splits(splits_dir() / "simulated.csv"), str(root), **(settings | changes))
 
 
@@ -42,23 +51,20 @@ def test_a_data_set_is_made_and_then_left_alone(tmp_path):
 def test_settings_change_the_hash(tmp_path):
     hashes = {
         tasks_of(tmp_path, **change)[0].hash
-        for change in (
-            {},
-            {"photo_m": 3.0},
-            {"changed": 0.0},
-            {"end_m": 20},
-            {"video_s": None},
-            {"spacing_m": None},
-        )
+        for change in ({}, {"photo_m": 3.0}, {"changed": 0.0}, {"end_m": 20}, {"video_s": None}, {"spacing_m": None})
     }
     assert len(hashes) == 6
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"returns_m": [80, 70]}, "rise"), ({"end_m": 0}, "rise"), ({"recordings": {"exam": 1}}, "exam"),
-     ({"camera_fps": 0}, "Hz")],
-)  # fmt: skip
+    [
+        ({"returns_m": [80, 70]}, "rise"),
+        ({"end_m": 0}, "rise"),
+        ({"recordings": {"exam": 1}}, "exam"),
+        ({"camera_fps": 0}, "Hz"),
+    ],
+)
 def test_wrong_settings_are_refused(tmp_path, change, message):
     with pytest.raises(WearcapError, match=message):
         tasks_of(tmp_path, **change)
@@ -67,8 +73,6 @@ def test_wrong_settings_are_refused(tmp_path, change, message):
 @pytest.mark.parametrize("preset", ["quick", "standard"])
 def test_the_presets_make_tasks(preset, tmp_path):
     config = compose("prepare", ["prepare=simulated_hps", f"preset={preset}", f"output={tmp_path}"])
-    tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(
-        splits=read_splits(splits_dir() / config.splits)
-    )
+    tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=read_splits(splits_dir() / config.splits))
     assert {task.split for task in tasks} <= {"train", "val", "test"}
     assert len({task.name for task in tasks}) == len(tasks) >= 1

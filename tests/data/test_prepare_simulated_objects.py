@@ -15,9 +15,7 @@ SPLITS = read_splits(Path(__file__).parents[2] / "data_prep/splits/simulated.csv
 
 
 def tasks(output, recordings, **how):
-    return simulated_objects_tasks(
-        SPLITS, str(output), recordings, **({"minutes": 0.15, "fps": 30, "seed": 0} | how)
-    )
+    return simulated_objects_tasks(SPLITS, str(output), recordings, **({"minutes": 0.15, "fps": 30, "seed": 0} | how))
 
 
 def test_recordings_come_with_their_environments_and_are_current_afterwards(tmp_path):

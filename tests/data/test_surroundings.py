@@ -39,9 +39,14 @@ def store(tmp_path) -> RecordingStore:
         if name == "a":
             picture = torch.arange(150).half()[:, None].repeat(1, SIZE)
             camera = CameraStream(
-                recording.head.timestamps[::2], Camera("pinhole", 8, 6, 4.0, 4.0, 3.5, 2.5), torch.eye(3),
-                torch.zeros(3), embedding=picture, embedding_mirrored=-picture, embedding_name="toy",
-            )  # fmt: skip
+                recording.head.timestamps[::2],
+                Camera("pinhole", 8, 6, 4.0, 4.0, 3.5, 2.5),
+                torch.eye(3),
+                torch.zeros(3),
+                embedding=picture,
+                embedding_mirrored=-picture,
+                embedding_name="toy",
+            )
             recording = replace(recording, camera=camera)
         store.add(recording, split="train", config_hash="test")
     return store
@@ -105,13 +110,13 @@ def test_beginnings_are_cut_short(store):
 def test_data_without_the_encoders_embeddings_is_refused(store):
     surroundings = Surroundings(None, "clip")
     with pytest.raises(WearcapError, match="no recording has embeddings of 'clip'.*prepare embeddings"):
-        WindowDataset(
-            [Source(str(store.root))], "train", window=120, stride=60, fps=60.0, surroundings=surroundings
-        )
+        WindowDataset([Source(str(store.root))], "train", window=120, stride=60, fps=60.0, surroundings=surroundings)
 
 
 def test_the_newest_picture_counts_while_it_is_fresh():
-    number, valid = latest_before(torch.tensor([1.0, 1.1, 2.0]).double(), torch.tensor([0.9, 1.05, 1.1, 1.25, 1.5, 2.1]).double())  # fmt: skip
+    number, valid = latest_before(
+        torch.tensor([1.0, 1.1, 2.0]).double(), torch.tensor([0.9, 1.05, 1.1, 1.25, 1.5, 2.1]).double()
+    )
     assert number.tolist() == [0, 0, 1, 1, 1, 2]
     assert valid.tolist() == [False, True, True, True, False, True]
     assert not latest_before(torch.zeros(0).double(), torch.zeros(3).double())[1].any()
@@ -139,9 +144,7 @@ def test_a_tracked_floor_knows_nothing_of_what_comes():
     random = torch.Generator().manual_seed(0)
     time = torch.arange(0, 20, 1 / 60).double()
     head = torch.stack([0.2 * time, 0 * time, 0.3 + 1.6 + 0 * time], -1).float()
-    points = torch.rand(9000, 3, generator=random) * torch.tensor([6.0, 3.0, 0.02]) - torch.tensor(
-        [1.0, 1.5, -0.29]
-    )
+    points = torch.rand(9000, 3, generator=random) * torch.tensor([6.0, 3.0, 0.02]) - torch.tensor([1.0, 1.5, -0.29])
     seen = 20 * torch.rand(9000, generator=random).double()
     whole = tracked_floor(PointCloud(points, None, seen), time, head, 1.6, 60.0)
     assert (whole - 0.3).abs().max() < 0.02

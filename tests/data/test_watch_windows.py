@@ -46,9 +46,16 @@ def told(features: WatchFeatures, window: WatchWindow) -> torch.Tensor:
 
 @pytest.mark.parametrize(
     ("settings", "size"),
-    [({"frame": "head"}, 31), ({"frame": "head", "absolute": False}, 27), ({"body": True}, 35), ({"frame": "world", "absolute": False}, 27),
-     ({"wrists": "positions"}, 31), ({"frame": "own"}, 31), ({"frame": "own", "body": True}, 35)],
-)  # fmt: skip
+    [
+        ({"frame": "head"}, 31),
+        ({"frame": "head", "absolute": False}, 27),
+        ({"body": True}, 35),
+        ({"frame": "world", "absolute": False}, 27),
+        ({"wrists": "positions"}, 31),
+        ({"frame": "own"}, 31),
+        ({"frame": "own", "body": True}, 35),
+    ],
+)
 def test_sizes_are_the_papers(root, settings, size):
     features = WatchFeatures(**settings)
     assert features.size == size
@@ -93,9 +100,7 @@ def test_in_a_mirror_the_wrists_are_still_those_of_the_body(root):
         turned(dataset(root)[0], 2.0),
         scaled(dataset(root)[0], 1.2),
     ):
-        body = forward_kinematics(
-            SKELETON, window.R_parent_joint, window.t_world_root, window.t_parent_joint[None]
-        )
+        body = forward_kinematics(SKELETON, window.R_parent_joint, window.t_world_root, window.t_parent_joint[None])
         wrists = SKELETON.indices(*ENDS[:2])
         torch.testing.assert_close(body.R[:, wrists], window.R_world_wrist, atol=1e-4, rtol=0)
         torch.testing.assert_close(body.t[:, wrists], window.t_world_wrist, atol=1e-4, rtol=0)
@@ -135,9 +140,7 @@ def test_errors_are_those_of_the_variation(root):
         a, b = plain[(0, k)], wrong[(0, k)]
         off = a.R_world_wrist.mT @ b.R_world_wrist
         torch.testing.assert_close(off, off[:1].expand_as(off), atol=1e-4, rtol=0)
-        angles.append(
-            torch.arccos(((off[0].diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)).rad2deg()
-        )
+        angles.append(torch.arccos(((off[0].diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)).rad2deg())
     assert 3.0 < torch.stack(angles).mean() < 6.5  # √(8/π) · 3 degrees
     torch.testing.assert_close(plain[(0, 1)].R_parent_joint, wrong[(0, 1)].R_parent_joint)
 

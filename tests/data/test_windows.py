@@ -126,9 +126,7 @@ def test_a_wrong_rate_and_an_empty_split_are_named(store):
 
 
 def test_datamodule_batches(store):
-    data = MotionWindows(
-        {"a": {"root": str(store.root)}, "b": None}, 120, 60, 60.0, batch_size=4, steps_per_epoch=3
-    )
+    data = MotionWindows({"a": {"root": str(store.root)}, "b": None}, 120, 60, 60.0, batch_size=4, steps_per_epoch=3)
     data.setup("fit")
     batches = list(data.train_dataloader())
     assert len(batches) == 3

@@ -54,7 +54,7 @@ def test_a_belt_counts_what_is_on_it():
 def test_a_level_per_frame_and_feature_is_one_per_frame_for_each_modality(levels_of):
     random = torch.Generator().manual_seed(0)
     x0, x_t, noise = (torch.randn(2, 7, 5, generator=random) for _ in range(3))
-    level = torch.rand(2, 7, 2, generator=random) if levels_of == "modality" else torch.rand(2, 7, 1).expand(-1, -1, 2)  # fmt: skip
+    level = torch.rand(2, 7, 2, generator=random) if levels_of == "modality" else torch.rand(2, 7, 1).expand(-1, -1, 2)
     after = level * torch.rand(2, 7, 1, generator=random)
     wide = Conveyor(BELT, SCHEDULE, SIZES, 2).wide
     noised = add_noise(x0, noise, wide(level), SCHEDULE)
@@ -62,7 +62,7 @@ def test_a_level_per_frame_and_feature_is_one_per_frame_for_each_modality(levels
     for k, part in enumerate((slice(0, 2), slice(2, 5))):
         own = add_noise(x0[..., part], noise[..., part], level[..., k], SCHEDULE)
         assert torch.equal(noised[..., part], own)
-        own = posterior_step(x_t[..., part], x0[..., part], level[..., k], after[..., k], noise[..., part], SCHEDULE)  # fmt: skip
+        own = posterior_step(x_t[..., part], x0[..., part], level[..., k], after[..., k], noise[..., part], SCHEDULE)
         assert torch.equal(stepped[..., part], own)
 
 
@@ -171,7 +171,5 @@ def test_every_prediction_may_be_amended():
     conveyor = Conveyor(BELT, SCHEDULE, SIZES, 1)
     conveyor.push(torch.zeros(1, 5))
     for _ in range(BELT.ramp):
-        conveyor.run(
-            lambda x, level: torch.zeros_like(x), free(1, 1), torch.zeros(3, 1, 1, 5), lambda x0: x0 + 2.0
-        )
+        conveyor.run(lambda x, level: torch.zeros_like(x), free(1, 1), torch.zeros(3, 1, 1, 5), lambda x0: x0 + 2.0)
     torch.testing.assert_close(conveyor.x, torch.full((1, 1, 5), 2.0))

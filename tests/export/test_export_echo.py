@@ -85,7 +85,7 @@ def test_it_runs_without_lightning_and_hydra(exports, tmp_path):
         "import sys; from wearcap.export.echo import main; main(sys.argv[1:]); "
         "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
     )
-    run([sys.executable, "-c", program, exports["onnx"].path, source, tmp_path / "out.safetensors"], check=True)  # fmt: skip
+    run([sys.executable, "-c", program, exports["onnx"].path, source, tmp_path / "out.safetensors"], check=True)
     motion = RecordingFile(tmp_path / "out.safetensors").load().motion
     assert motion is not None, root
     assert len(motion) == 60
@@ -110,7 +110,7 @@ def test_files_that_do_not_belong_are_refused(exports, tmp_path):
     with pytest.raises(WearcapError, match="belongs to another"):
         load_exported_echo(path)
     encoder.unlink()
-    with pytest.raises(WearcapError, match=r"net\.objects\.safetensors: a part of the exported model is missing"):  # fmt: skip
+    with pytest.raises(WearcapError, match=r"net\.objects\.safetensors: a part of the exported model is missing"):
         load_exported_echo(path)
     encoder.write_bytes(kept)
     sidecar.unlink()

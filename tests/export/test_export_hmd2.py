@@ -46,17 +46,25 @@ def pipeline() -> HMD2:
     torch.manual_seed(0)
     features, places = HeadFeatures(contacts=True, body=True), VoxelAutoencoder(size=16).eval()
     net = MotionDenoiser(
-        features.motion_size, features.condition_size, WINDOW, width=32, layers=1, heads=2, feedforward=64,
-        frames_per_token=2, blend=5, points_size=places.size, image_size=IMAGE, self_conditioning=True,
-    )  # fmt: skip
+        features.motion_size,
+        features.condition_size,
+        WINDOW,
+        width=32,
+        layers=1,
+        heads=2,
+        feedforward=64,
+        frames_per_token=2,
+        blend=5,
+        points_size=places.size,
+        image_size=IMAGE,
+        self_conditioning=True,
+    )
     for parameter in net.parameters():
         nn.init.normal_(parameter, std=0.05)
     size = features.motion_size
     net.motion_normalizer.set(torch.randn(size) * 0.1, torch.rand(size) + 0.5)
     net.condition_encoder.normalizer.set(torch.randn(17) * 0.1, torch.rand(17) + 0.5)
-    return HMD2(
-        net, features, CosineSchedule(), xsens23(), 60.0, places, "eyes", steps=3, stride=16, guidance=1.5
-    )
+    return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, places, "eyes", steps=3, stride=16, guidance=1.5)
 
 
 @pytest.fixture(scope="module")
@@ -69,9 +77,13 @@ def recording() -> Recording:
     random = torch.Generator().manual_seed(0)
     points = PointCloud(torch.rand(400, 3, generator=random) * 2 - 0.5)
     camera = CameraStream(
-        t[10:40:2], Camera.pinhole(32, 32, 90.0), torch.eye(3), torch.zeros(3),
-        embedding=torch.randn(15, IMAGE, generator=random), embedding_name="eyes",
-    )  # fmt: skip
+        t[10:40:2],
+        Camera.pinhole(32, 32, 90.0),
+        torch.eye(3),
+        torch.zeros(3),
+        embedding=torch.randn(15, IMAGE, generator=random),
+        embedding_name="eyes",
+    )
     return Recording("walk", head=head, points=points, camera=camera, skeleton=xsens23())
 
 

@@ -20,8 +20,7 @@ def exports(tmp_path_factory):
     """What is told of a pipeline's file in either format."""
     folder, formats = tmp_path_factory.mktemp("mocap_every"), ("onnx", "pt2")
     return {
-        format: export_mocap_every(drawn_pipeline(), folder / format / f"net.{format}", format)
-        for format in formats
+        format: export_mocap_every(drawn_pipeline(), folder / format / f"net.{format}", format) for format in formats
     }
 
 

@@ -91,8 +91,7 @@ def test_fisheye_formula():
     k1, k2, k3, k4 = camera.distortion
     bent = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8)
     point = torch.tensor(
-        [math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)],
-        dtype=torch.float64,
+        [math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)], dtype=torch.float64
     )
     expected = (camera.fx * bent * math.cos(phi) + camera.cx, camera.fy * bent * math.sin(phi) + camera.cy)
     assert camera.project(5 * point)[0].tolist() == pytest.approx(expected, abs=1e-9)
@@ -122,8 +121,7 @@ def test_ocam_formula():
     c, d, e = OCAM[:3]
     expected = (276.0 * (e * down + right) + camera.cx, 276.0 * (c * down + d * right) + camera.cy)
     point = torch.tensor(
-        [math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)],
-        dtype=torch.float64,
+        [math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)], dtype=torch.float64
     )
     assert camera.project(5 * point)[0].tolist() == pytest.approx(expected, abs=1e-9)
 
@@ -157,9 +155,7 @@ def test_scaled_image(camera):
     if camera.model == "pinhole":
         assert torch.allclose(half.project(camera.unproject(corner))[0], corner, atol=1e-9)
     double = half.scaled(camera.width, camera.height)
-    assert (double.fx, double.fy, double.cx, double.cy) == pytest.approx(
-        (camera.fx, camera.fy, camera.cx, camera.cy)
-    )
+    assert (double.fx, double.fy, double.cx, double.cy) == pytest.approx((camera.fx, camera.fy, camera.cx, camera.cy))
 
 
 def test_field_of_view():

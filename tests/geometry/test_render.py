@@ -17,12 +17,7 @@ RED, BLUE = np.array([1, 0, 0], np.float32), np.array([0, 0, 1], np.float32)
 
 def square(depth: float, half: float, color: np.ndarray = RED, x: float = 0.0) -> Mesh:
     """A square across the optical axis of a camera at the origin."""
-    corners = [
-        [x - half, -half, depth],
-        [x + half, -half, depth],
-        [x + half, half, depth],
-        [x - half, half, depth],
-    ]
+    corners = [[x - half, -half, depth], [x + half, -half, depth], [x + half, half, depth], [x - half, half, depth]]
     return Mesh(np.array(corners, np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32), color)
 
 
@@ -33,9 +28,7 @@ def ball(center: tuple[float, float, float], radius: float, segments: int = 96) 
 
 def looking_down(height: float) -> Rigid:
     """A camera above the origin, its picture's top towards +x."""
-    return Rigid(
-        torch.tensor([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), torch.tensor([0.0, 0.0, height])
-    )
+    return Rigid(torch.tensor([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), torch.tensor([0.0, 0.0, height]))
 
 
 def pixel_rays(camera: Camera) -> np.ndarray:
@@ -55,9 +48,7 @@ def test_depth_of_a_slanted_plane_is_exact():
 
 def test_depth_of_a_sphere_seen_by_a_moved_camera():
     center, radius = np.array([0.3, -0.2, 3.0]), 0.8
-    turn = torch.linalg.qr(
-        torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    )[0]
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
     turn = turn * torch.linalg.det(turn)
     pose = Rigid(turn, torch.tensor([4.0, 5.0, -6.0], dtype=torch.float64))
     world = (pose @ torch.from_numpy(center)).tolist()
@@ -106,9 +97,7 @@ def test_neighbouring_triangles_leave_no_gap():
     grid = np.stack(np.meshgrid(np.linspace(-3, 3, 20), np.linspace(-3, 3, 20)), -1).reshape(-1, 2)
     vertices = np.concatenate([grid, 2 + 0.3 * random.random((400, 1))], 1).astype(np.float32)
     cell = (20 * np.arange(19)[:, None] + np.arange(19)).ravel()
-    faces = np.concatenate(
-        [np.stack([cell, cell + 1, cell + 21], -1), np.stack([cell, cell + 21, cell + 20], -1)]
-    )
+    faces = np.concatenate([np.stack([cell, cell + 1, cell + 21], -1), np.stack([cell, cell + 21, cell + 20], -1)])
     assert (render(CAMERA, EYE, [Mesh(vertices, faces.astype(np.int32), RED)]).index >= 0).all()
 
 
@@ -137,9 +126,7 @@ def test_supersampling_smooths_edges_and_keeps_the_picture():
     mesh = [square(2.0, 0.5)]
     plain, fine = render(CAMERA, EYE, mesh), render(CAMERA, EYE, mesh, supersample=3)
     assert plain.color.shape == fine.color.shape
-    assert len(np.unique(fine.color.reshape(-1, 3), axis=0)) > len(
-        np.unique(plain.color.reshape(-1, 3), axis=0)
-    )
+    assert len(np.unique(fine.color.reshape(-1, 3), axis=0)) > len(np.unique(plain.color.reshape(-1, 3), axis=0))
     assert np.abs(plain.color.astype(float) - fine.color).mean() < 2
 
 

@@ -12,8 +12,7 @@ from wearcap.geometry import rotation
 
 COORDINATE = st.floats(-1, 1, allow_nan=False)
 ANGLES = st.one_of(
-    st.floats(0, math.pi - 1e-6),
-    st.sampled_from([0.0, 1e-12, 1e-8, 1e-5, 1e-3, math.pi - 1e-3, math.pi - 1e-5]),
+    st.floats(0, math.pi - 1e-6), st.sampled_from([0.0, 1e-12, 1e-8, 1e-5, 1e-3, math.pi - 1e-3, math.pi - 1e-5])
 )
 
 
@@ -114,11 +113,7 @@ def test_gradients_stay_finite_at_identity_and_pi(dtype):
     eye = torch.eye(3, dtype=dtype)
     for turn in (torch.zeros(3, dtype=dtype), torch.tensor([0, math.pi, 0], dtype=dtype)):
         R = rotation.exp(turn).requires_grad_()
-        for value in (
-            rotation.geodesic(R, eye),
-            rotation.log(R).sum(),
-            rotation.quat_wxyz_from_matrix(R).sum(),
-        ):
+        for value in (rotation.geodesic(R, eye), rotation.log(R).sum(), rotation.quat_wxyz_from_matrix(R).sum()):
             (gradient,) = torch.autograd.grad(value, R)
             assert gradient.isfinite().all()
 
@@ -126,9 +121,7 @@ def test_gradients_stay_finite_at_identity_and_pi(dtype):
 def test_about_axis_agrees_with_exp():
     angle = torch.linspace(-4, 4, 9, dtype=torch.float64)
     for axis, name in zip(torch.eye(3, dtype=torch.float64), "xyz"):
-        assert torch.allclose(
-            rotation.about_axis(name, angle), rotation.exp(axis * angle[:, None]), atol=1e-12
-        )
+        assert torch.allclose(rotation.about_axis(name, angle), rotation.exp(axis * angle[:, None]), atol=1e-12)
 
 
 def test_rot6d_is_the_first_two_columns():

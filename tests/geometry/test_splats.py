@@ -76,9 +76,18 @@ def test_blocks_behind_and_beside_are_not_projected():
     pose = np.concatenate([np.eye(3), np.zeros((3, 1))], 1)
     picture = np.full((48, 64), -np.inf, np.float32), np.full((48, 64), -1, np.int32)
     projected = raster.draw_splats(
-        cloud.points, cloud.first, cloud.centers, cloud.radii, pose, view_planes(camera), lens_numbers(camera),
-        0.01, True, 0, *picture,
-    )  # fmt: skip
+        cloud.points,
+        cloud.first,
+        cloud.centers,
+        cloud.radii,
+        pose,
+        view_planes(camera),
+        lens_numbers(camera),
+        0.01,
+        True,
+        0,
+        *picture,
+    )
     assert projected < 0.45 * 20000
 
 

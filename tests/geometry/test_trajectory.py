@@ -28,9 +28,7 @@ SPIN = torch.tensor([0.3, -0.4, 1.2], dtype=torch.float64)
 def screw(timestamps: torch.Tensor) -> Trajectory:
     """Constant velocity and constant spin about a fixed world axis."""
     start = rotation.exp(torch.tensor([0.5, 0.1, -0.7], dtype=torch.float64))
-    return Trajectory(
-        timestamps, rotation.exp(timestamps[:, None] * SPIN) @ start, timestamps[:, None] * VELOCITY
-    )
+    return Trajectory(timestamps, rotation.exp(timestamps[:, None] * SPIN) @ start, timestamps[:, None] * VELOCITY)
 
 
 def walk(frames: int, fps: float = 30.0) -> Trajectory:
@@ -94,9 +92,7 @@ def test_velocities_of_one_frame_are_zero():
     assert angular_velocity(walk(1)).tolist() == [[0, 0, 0]]
 
 
-@pytest.mark.parametrize(
-    "bad", [[17], [0], [59], [10, 11, 12, 13], [5, 30, 31, 50], [20, 22, 24, 26]], ids=str
-)
+@pytest.mark.parametrize("bad", [[17], [0], [59], [10, 11, 12, 13], [5, 30, 31, 50], [20, 22, 24, 26]], ids=str)
 def test_outliers_fall_and_good_neighbours_stay(bad):
     track = walk(60)
     position = track.t_world_body.clone()
@@ -159,14 +155,24 @@ def test_smoothing_keeps_a_straight_line_and_reduces_noise():
 
 @pytest.mark.parametrize(
     ("times", "word"),
-    [([0.0, 0.1, 0.1], "repeats"), ([0.0, 0.2, 0.1], "before its predecessor"), ([0.0, math.nan, 0.2], "not a number"),
-     ([0.0, math.inf, 0.2], "not a number")],
-)  # fmt: skip
+    [
+        ([0.0, 0.1, 0.1], "repeats"),
+        ([0.0, 0.2, 0.1], "before its predecessor"),
+        ([0.0, math.nan, 0.2], "not a number"),
+        ([0.0, math.inf, 0.2], "not a number"),
+    ],
+)
 @pytest.mark.parametrize(
     "function",
-    [linear_velocity, angular_velocity, lambda t: outlier_mask(t, 3.0), lambda t: smooth(t, 0.1),
-     lambda t: resample(t, t.timestamps[:1]), lambda t: find_gaps(t.timestamps, 0.1)],
-)  # fmt: skip
+    [
+        linear_velocity,
+        angular_velocity,
+        lambda t: outlier_mask(t, 3.0),
+        lambda t: smooth(t, 0.1),
+        lambda t: resample(t, t.timestamps[:1]),
+        lambda t: find_gaps(t.timestamps, 0.1),
+    ],
+)
 def test_hostile_timestamps_are_named(times, word, function):
     track = walk(3)
     bad = Trajectory(torch.tensor(times, dtype=torch.float64), track.R_world_body, track.t_world_body)

@@ -28,8 +28,11 @@ def smpl_frames(motion: Motion, placed: bool = True, body: int = 69) -> list[dic
         frame = {"time": time, "global_orient": pose[:3].tolist(), "body_pose": pose[3:72].tolist()}
         if hands:
             padding = [0.0] * (body - 63)
-            frame |= {"body_pose": pose[3:66].tolist() + padding, "left_hand_pose": pose[66:111].tolist(),
-                      "right_hand_pose": pose[111:].tolist()}  # fmt: skip
+            frame |= {
+                "body_pose": pose[3:66].tolist() + padding,
+                "left_hand_pose": pose[66:111].tolist(),
+                "right_hand_pose": pose[111:].tolist(),
+            }
         frames.append(frame | ({"transl": t} if placed else {}))
     return frames
 
@@ -40,8 +43,15 @@ def smpl_content(motion: Motion, **more) -> dict:
 
 def older(motion: Motion) -> list[dict]:
     """The older form, without hands."""
-    return [{"time": frame["time"], "pose": frame["global_orient"] + frame["body_pose"], "translation": frame["transl"],
-             "shape": [0.5, -1.0]} for frame in smpl_frames(motion)]  # fmt: skip
+    return [
+        {
+            "time": frame["time"],
+            "pose": frame["global_orient"] + frame["body_pose"],
+            "translation": frame["transl"],
+            "shape": [0.5, -1.0],
+        }
+        for frame in smpl_frames(motion)
+    ]
 
 
 def write_zip(content, path: Path, inner: str = "data.json") -> None:

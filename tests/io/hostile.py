@@ -3,28 +3,9 @@
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-fuzz = settings(
-    max_examples=4 * settings().max_examples, deadline=None, suppress_health_check=list(HealthCheck)
-)
+fuzz = settings(max_examples=4 * settings().max_examples, deadline=None, suppress_health_check=list(HealthCheck))
 
-JUNK = [
-    "nan",
-    "-1e400",
-    "\n",
-    "9" * 30,
-    "\0",
-    "{",
-    "}",
-    ":",
-    "#",
-    "begin\n",
-    "<",
-    ">",
-    "&a;",
-    '"',
-    "-1",
-    "1e9",
-]
+JUNK = ["nan", "-1e400", "\n", "9" * 30, "\0", "{", "}", ":", "#", "begin\n", "<", ">", "&a;", '"', "-1", "1e9"]
 
 
 def mutated(text: str):

@@ -23,11 +23,14 @@ CAM_START, IMU_START = 20, 35
 FRAMES = 90
 CAMERA = {
     "029756": {
-        "parameters": {"focal_dist_xy": [871.80, 885.58], "center_xy": [961.54, 550.69],
-                       "dist_coeffs": [-0.2546, 0.0804, 1.458e-4, -1.397e-5, 0.0]},
+        "parameters": {
+            "focal_dist_xy": [871.80, 885.58],
+            "center_xy": [961.54, 550.69],
+            "dist_coeffs": [-0.2546, 0.0804, 1.458e-4, -1.397e-5, 0.0],
+        },
         "captured_videos": [f"{NAME}.MP4", "SUB4_other.MP4"],
     }
-}  # fmt: skip
+}
 
 
 def motion(frames: int = FRAMES, seed: int = 0) -> Motion:
@@ -67,9 +70,7 @@ def write_unity(motion: Motion, folder: Path, name: str = NAME, inner_root: bool
         (folder / f"{name}_{suffix}.txt").write_text("\n".join(lines) + "\n")
 
 
-def write_localization(
-    motion: Motion, path: Path, cam_start: int = CAM_START, lost: tuple[int, ...] = (3, 40)
-) -> None:
+def write_localization(motion: Motion, path: Path, cam_start: int = CAM_START, lost: tuple[int, ...] = (3, 40)) -> None:
     """A camera on the head by its nominal mount; the clap is at frame `cam_start`, before it stands still."""
     R_head_cam, t_head_cam = nominal_mount()
     head = motion.joint("head")
@@ -111,10 +112,7 @@ def write_hps(root: Path, name: str = NAME, scan: bool = True, frames: int = FRA
     truth = motion(frames)
     write_smpl(truth, root / "hps_smpl" / f"{name}.pkl")
     subject = {"betas": [0.1 * k for k in range(10)], "gender": "male", "root_to_heel": 0.93}
-    for folder, content in (
-        ("hps_betas", subject),
-        ("hps_inits", {"cam_start": CAM_START, "imu_start": IMU_START}),
-    ):
+    for folder, content in (("hps_betas", subject), ("hps_inits", {"cam_start": CAM_START, "imu_start": IMU_START})):
         path = root / folder / (f"{name.split('_')[0]}.json" if folder == "hps_betas" else f"{name}.json")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(content))

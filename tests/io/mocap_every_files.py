@@ -24,7 +24,7 @@ SHIFT = np.array([0.3, -2.0, 1.0])
 def truth(seconds: float = 8.0) -> tuple[np.ndarray, Rotation]:
     """Positions (m) and orientations (OpenCV camera) in the world: x, then y along the board, then a circle, level."""
     time = np.arange(int(seconds * 30)) / 30
-    board = np.clip(time, 0, 1)[:, None] * [BOARD_M[0], 0, 0] + np.clip(time - 1.5, 0, 1)[:, None] * [0, BOARD_M[1], 0]  # fmt: skip
+    board = np.clip(time, 0, 1)[:, None] * [BOARD_M[0], 0, 0] + np.clip(time - 1.5, 0, 1)[:, None] * [0, BOARD_M[1], 0]
     angle = np.clip(time - 3.0, 0, None)
     circle = np.stack([np.sin(angle), 1 - np.cos(angle), 0.3 * np.sin(angle / 2)], 1)
     looking = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # ahead along x, upright
@@ -34,10 +34,10 @@ def truth(seconds: float = 8.0) -> tuple[np.ndarray, Rotation]:
 
 def cloud() -> np.ndarray:
     """Points of a floor (m)."""
-    return np.stack([*np.meshgrid(np.linspace(-2, 2, 9), np.linspace(-2, 2, 9)), np.zeros((9, 9))], -1).reshape(-1, 3)  # fmt: skip
+    return np.stack([*np.meshgrid(np.linspace(-2, 2, 9), np.linspace(-2, 2, 9)), np.zeros((9, 9))], -1).reshape(-1, 3)
 
 
-def write_capture(folder: Path, *, leave_out: tuple[str, ...] = (), order: str = "xyzw", seconds: float = 8.0) -> None:  # fmt: skip
+def write_capture(folder: Path, *, leave_out: tuple[str, ...] = (), order: str = "xyzw", seconds: float = 8.0) -> None:
     """Write the folder but for the files named in `leave_out`."""
     (folder / "sfm" / "pointcloud").mkdir(parents=True, exist_ok=True)
     (folder / "video").mkdir(exist_ok=True)
@@ -49,8 +49,10 @@ def write_capture(folder: Path, *, leave_out: tuple[str, ...] = (), order: str =
     marks = {"shutter": SHUTTER_S, "clap": [SHUTTER_S + 3, SHUTTER_S + 4]}
     marks |= {"x": [SHUTTER_S, SHUTTER_S + 1.2], "y": [SHUTTER_S + 1.3, SHUTTER_S + 2.8]}
     (folder / "camera_calib.pkl").write_bytes(pickle.dumps(marks))
-    (folder / "config.yaml").write_text(f"cam_scale_origin:\n  dist: [{BOARD_M[0]}, {BOARD_M[1]}]\n  height: {HEIGHT_M}\n")  # fmt: skip
-    write_ply(Ply((FIX.apply(cloud() - SHIFT) / SCALE).astype(np.float32)), folder / "sfm/pointcloud/pcd_results.ply")  # fmt: skip
+    (folder / "config.yaml").write_text(
+        f"cam_scale_origin:\n  dist: [{BOARD_M[0]}, {BOARD_M[1]}]\n  height: {HEIGHT_M}\n"
+    )
+    write_ply(Ply((FIX.apply(cloud() - SHIFT) / SCALE).astype(np.float32)), folder / "sfm/pointcloud/pcd_results.ply")
     (folder / "sfm/undistort_calib.txt").write_text("300.5 301.0 291.0 162.0")
     (folder / "sfm/calib.txt").write_text("210.0 211.0 159.5 89.5 -0.1 0.02 0.001 0.002")
     write_frames(folder / "video/ego_video.MP4", np.zeros((12, 180, 320, 3), np.uint8), 30.0)

@@ -13,24 +13,20 @@ def lens(scale: float = 1.0) -> OCamModel:
     invpol = np.polynomial.polynomial.polyfit(angle, rho, 14)
     width, height = round(4592 * scale), round(3448 * scale)
     return OCamModel(
-        tuple(pol.tolist()), tuple(invpol.tolist()), 1745.64 * scale, 2289.58 * scale, (1.0005, -0.0014, 0.0015),
-        width, height,
-    )  # fmt: skip
+        tuple(pol.tolist()),
+        tuple(invpol.tolist()),
+        1745.64 * scale,
+        2289.58 * scale,
+        (1.0005, -0.0014, 0.0015),
+        width,
+        height,
+    )
 
 
 def text_of(model: OCamModel) -> str:
     rows = ["#polynomial coefficients for the DIRECT mapping function", ""]
-    rows += [
-        f"{len(model.pol)} " + " ".join(f"{a:.9e}" for a in model.pol),
-        "",
-        "#inverse mapping function",
-        "",
-    ]
-    rows += [
-        f"{len(model.invpol)} " + " ".join(f"{a:.6f}" for a in model.invpol),
-        "",
-        '#center: "row" and "column"',
-    ]
+    rows += [f"{len(model.pol)} " + " ".join(f"{a:.9e}" for a in model.pol), "", "#inverse mapping function", ""]
+    rows += [f"{len(model.invpol)} " + " ".join(f"{a:.6f}" for a in model.invpol), "", '#center: "row" and "column"']
     rows += [f"{model.row} {model.column}", "", '#affine parameters "c", "d", "e"', ""]
     rows += [
         " ".join(map(str, model.affine)),

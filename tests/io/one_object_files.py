@@ -46,9 +46,7 @@ def standing_about(seconds: float = 6.0, fps: float = 30.0, skeleton: Skeleton |
 
 def carried(motion: Motion) -> Trajectory:
     """The path of the box' centre, half a metre before the pelvis."""
-    R = rotation.exp(
-        torch.stack([0.4 * motion.timestamps, 0.2 * motion.timestamps, motion.timestamps], -1)
-    ).float()
+    R = rotation.exp(torch.stack([0.4 * motion.timestamps, 0.2 * motion.timestamps, motion.timestamps], -1)).float()
     return Trajectory(motion.timestamps, R, motion.t_world_root + torch.tensor([0.5, 0.0, 0.1]))
 
 
@@ -69,21 +67,29 @@ def behave_arrays(tilt_deg: float = 0.0, seconds: float = 6.0) -> tuple[dict, di
     path = carried(motion)
     C = rotation.about_axis("x", torch.tensor(tilt_deg).deg2rad()) @ T_CAMERA_WORLD
     body = {
-        "poses": smpl_vectors(motion, C), "trans": (motion.t_world_root @ C.T).numpy() - PELVIS_SMPLH,
-        "betas": np.tile(np.arange(10) / 10, (len(motion), 1)), "frame_times": frame_times(len(motion)),
+        "poses": smpl_vectors(motion, C),
+        "trans": (motion.t_world_root @ C.T).numpy() - PELVIS_SMPLH,
+        "betas": np.tile(np.arange(10) / 10, (len(motion), 1)),
+        "frame_times": frame_times(len(motion)),
         "gender": np.array("male"),
-    }  # fmt: skip
+    }
     thing = {
         "angles": rotation.log(C.double() @ path.R_world_body.double()).numpy(),
-        "trans": (path.t_world_body @ C.T).numpy(), "frame_times": frame_times(len(motion)),
-    }  # fmt: skip
+        "trans": (path.t_world_body @ C.T).numpy(),
+        "frame_times": frame_times(len(motion)),
+    }
     return body, thing
 
 
 def write_behave(
-    root: Path, name: str = BEHAVE_NAME, body: dict | None = None, thing: dict | None = None, cat: str = "boxlarge",
-    ply: Ply | None = None, tilt_deg: float = 0.0,
-) -> Path:  # fmt: skip
+    root: Path,
+    name: str = BEHAVE_NAME,
+    body: dict | None = None,
+    thing: dict | None = None,
+    cat: str = "boxlarge",
+    ply: Ply | None = None,
+    tilt_deg: float = 0.0,
+) -> Path:
     """A data set of one sequence; arrays that are given as None are left out."""
     first, second = behave_arrays(tilt_deg)
     folder = root / "sequences" / name
@@ -104,12 +110,19 @@ def omomo_entry(fps: float = 30.0, name: str = OMOMO_NAME, seconds: float = 6.0)
     center = torch.from_numpy(CORNERS.mean(0))
     t = path.t_world_body - path.R_world_body @ center
     return {
-        "seq_name": name, "gender": np.array("female"), "betas": np.full((1, 16), 0.25, np.float32),
-        "trans": motion.t_world_root.numpy() + TRANS2JOINT, "trans2joint": TRANS2JOINT,
-        "root_orient": vectors[:, :3], "pose_body": vectors[:, 3:66], "rest_offsets": np.zeros((24, 3), np.float32),
-        "obj_rot": path.R_world_body.numpy(), "obj_trans": t.numpy()[:, :, None],
-        "obj_scale": np.full(len(motion), SCALE, np.float32), "obj_com_pos": path.t_world_body.numpy(),
-    }  # fmt: skip
+        "seq_name": name,
+        "gender": np.array("female"),
+        "betas": np.full((1, 16), 0.25, np.float32),
+        "trans": motion.t_world_root.numpy() + TRANS2JOINT,
+        "trans2joint": TRANS2JOINT,
+        "root_orient": vectors[:, :3],
+        "pose_body": vectors[:, 3:66],
+        "rest_offsets": np.zeros((24, 3), np.float32),
+        "obj_rot": path.R_world_body.numpy(),
+        "obj_trans": t.numpy()[:, :, None],
+        "obj_scale": np.full(len(motion), SCALE, np.float32),
+        "obj_com_pos": path.t_world_body.numpy(),
+    }
 
 
 def obj_text(unit: float = 1 / SCALE) -> str:
@@ -120,10 +133,6 @@ def obj_text(unit: float = 1 / SCALE) -> str:
 
 def write_omomo(root: Path, *entries: dict, mesh: str | None = None, split: str = "test") -> Path:
     (root / "captured_objects").mkdir(parents=True, exist_ok=True)
-    (root / "captured_objects" / "largebox_cleaned_simplified.obj").write_text(
-        obj_text() if mesh is None else mesh
-    )
-    joblib.dump(
-        dict(enumerate(entries or (omomo_entry(),))), root / f"{split}_diffusion_manip_seq_joints24.p"
-    )
+    (root / "captured_objects" / "largebox_cleaned_simplified.obj").write_text(obj_text() if mesh is None else mesh)
+    joblib.dump(dict(enumerate(entries or (omomo_entry(),))), root / f"{split}_diffusion_manip_seq_joints24.p")
     return root

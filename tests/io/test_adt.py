@@ -34,12 +34,7 @@ def test_skeleton_becomes_cues(tmp_path):
 
 @pytest.mark.parametrize(
     "content",
-    [
-        "{",
-        "[]",
-        '{"frames": [{"joints": [[1, 2]]}]}',
-        '{"frames": [{"timestamp_ns": 1, "joints": [[1, 2, 3]]}]}',
-    ],
+    ["{", "[]", '{"frames": [{"joints": [[1, 2]]}]}', '{"frames": [{"timestamp_ns": 1, "joints": [[1, 2, 3]]}]}'],
 )
 def test_malformed_skeletons_are_named(tmp_path, content):
     (tmp_path / "s.json").write_text(content)
@@ -50,12 +45,16 @@ def test_malformed_skeletons_are_named(tmp_path, content):
 def test_objects_from_small_files(tmp_path):
     (tmp_path / "scene_objects.csv").write_text(
         "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m],q_wo_w,q_wo_x,q_wo_y,q_wo_z\n"
-        "9007199254740993,-1,1,2,3,1,0,0,0\n77,1000000000,0,0,0,1,0,0,0\n77,2000000000,1,0,0,1,0,0,0\n")  # fmt: skip
+        "9007199254740993,-1,1,2,3,1,0,0,0\n77,1000000000,0,0,0,1,0,0,0\n77,2000000000,1,0,0,1,0,0,0\n"
+    )
     (tmp_path / "3d_bounding_box.csv").write_text(
         "object_uid,timestamp[ns],p_local_obj_xmin[m],p_local_obj_xmax[m],p_local_obj_ymin[m],p_local_obj_ymax[m],p_local_obj_zmin[m],p_local_obj_zmax[m]\n"
-        "9007199254740993,-1,-1,1,-2,2,-3,3\n77,-1,0,1,0,1,0,1\n")  # fmt: skip
-    about = {"9007199254740993": {"instance_name": "Sofa", "category": "sofa", "motion_type": "static"},
-             "77": {"instance_name": "Cup", "category": "cup", "motion_type": "dynamic"}}  # fmt: skip
+        "9007199254740993,-1,-1,1,-2,2,-3,3\n77,-1,0,1,0,1,0,1\n"
+    )
+    about = {
+        "9007199254740993": {"instance_name": "Sofa", "category": "sofa", "motion_type": "static"},
+        "77": {"instance_name": "Cup", "category": "cup", "motion_type": "dynamic"},
+    }
     (tmp_path / "instances.json").write_text(json.dumps(about))
     sofa, cup = sorted(read_objects(tmp_path), key=lambda o: o.moves)
     assert (sofa.name, sofa.moves, cup.name, cup.moves) == ("Sofa", False, "Cup", True)
@@ -123,9 +122,7 @@ def test_real_objects(real_data):
 
 @pytest.mark.real
 def test_truncated_trajectory_is_named(real_data, tmp_path):
-    shutil.copytree(
-        real_data / "aria_adt_sample" / "raw", tmp_path / "s", ignore=shutil.ignore_patterns("*.vrs")
-    )
+    shutil.copytree(real_data / "aria_adt_sample" / "raw", tmp_path / "s", ignore=shutil.ignore_patterns("*.vrs"))
     path = tmp_path / "s" / "aria_trajectory.csv"
     path.chmod(0o644)
     path.write_text(path.read_text()[:-60])

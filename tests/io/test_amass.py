@@ -22,20 +22,33 @@ random = np.random.default_rng(5)
 
 def smplh_file(frames: int = 5, **changes) -> dict:
     arrays = {
-        "trans": random.normal(size=(frames, 3)), "gender": np.array("female"), "mocap_framerate": np.array(120.0),
-        "betas": np.arange(16) / 10, "dmpls": np.zeros((frames, 8)), "poses": random.normal(0, 0.4, (frames, 156)),
-    }  # fmt: skip
+        "trans": random.normal(size=(frames, 3)),
+        "gender": np.array("female"),
+        "mocap_framerate": np.array(120.0),
+        "betas": np.arange(16) / 10,
+        "dmpls": np.zeros((frames, 8)),
+        "poses": random.normal(0, 0.4, (frames, 156)),
+    }
     return {key: value for key, value in (arrays | changes).items() if value is not None}
 
 
 def stageii_file(frames: int = 5) -> dict:
     poses = random.normal(0, 0.4, (frames, 165))
     return {
-        "gender": np.array(b"male"), "surface_model_type": np.array("smplx"), "mocap_frame_rate": np.array(30.0),
-        "mocap_time_length": np.array(0.2), "trans": random.normal(size=(frames, 3)), "poses": poses,
-        "betas": np.zeros(16), "root_orient": poses[:, :3], "pose_body": poses[:, 3:66], "pose_hand": poses[:, 75:],
-        "pose_jaw": poses[:, 66:69], "pose_eye": poses[:, 69:75], "labels_obs": np.array([{}], dtype=object),
-    }  # fmt: skip
+        "gender": np.array(b"male"),
+        "surface_model_type": np.array("smplx"),
+        "mocap_frame_rate": np.array(30.0),
+        "mocap_time_length": np.array(0.2),
+        "trans": random.normal(size=(frames, 3)),
+        "poses": poses,
+        "betas": np.zeros(16),
+        "root_orient": poses[:, :3],
+        "pose_body": poses[:, 3:66],
+        "pose_hand": poses[:, 75:],
+        "pose_jaw": poses[:, 66:69],
+        "pose_eye": poses[:, 69:75],
+        "labels_obs": np.array([{}], dtype=object),
+    }
 
 
 def test_smplh_file(tmp_path):
@@ -63,9 +76,7 @@ def test_joint_frames_are_turned_from_smpls_to_ours(tmp_path):
     motion = read_amass(tmp_path / "a.npz").motion
     torch.testing.assert_close(motion.R_parent_joint[0, 0], torch.eye(3), atol=1e-6, rtol=0)
     bent = rotation.about_axis("y", torch.tensor(0.7))
-    torch.testing.assert_close(
-        motion.R_parent_joint[0, motion.skeleton.index("left_knee")], bent, atol=1e-6, rtol=0
-    )
+    torch.testing.assert_close(motion.R_parent_joint[0, motion.skeleton.index("left_knee")], bent, atol=1e-6, rtol=0)
     foot, knee_t = motion.joint("left_ankle").t[0], motion.joint("left_knee").t[0]
     assert foot[0] < knee_t[0] - 0.2  # the shin swings back
 
@@ -86,9 +97,7 @@ def test_stageii_file(tmp_path):
 def test_round_trip(tmp_path, skeleton):
     generator = torch.Generator().manual_seed(2)
     R = rotation.exp(torch.randn(7, len(skeleton), 3, generator=generator))
-    motion = Motion(
-        torch.arange(7, dtype=torch.float64) / 60, skeleton, R, torch.randn(7, 3, generator=generator)
-    )
+    motion = Motion(torch.arange(7, dtype=torch.float64) / 60, skeleton, R, torch.randn(7, 3, generator=generator))
     write_amass(motion, tmp_path / "a.npz", betas=torch.tensor([0.5, -0.5]))
     recording = read_amass(tmp_path / "a.npz")
     back = recording.motion
@@ -100,16 +109,12 @@ def test_round_trip(tmp_path, skeleton):
 
 
 def test_what_is_no_smpl_motion_is_refused(tmp_path):
-    motion = Motion(
-        torch.zeros(1, dtype=torch.float64), xsens23(), torch.eye(3).expand(1, 23, 3, 3), torch.zeros(1, 3)
-    )
+    motion = Motion(torch.zeros(1, dtype=torch.float64), xsens23(), torch.eye(3).expand(1, 23, 3, 3), torch.zeros(1, 3))
     with pytest.raises(WearcapError, match="Retarget"):
         write_amass(motion, tmp_path / "a.npz")
     body = Motion(motion.timestamps, smplx22(), torch.eye(3).expand(1, 22, 3, 3), torch.zeros(1, 3))
     with pytest.raises(WearcapError, match="NaN"):
-        write_amass(
-            dataclasses.replace(body, t_world_root=torch.full((1, 3), float("nan"))), tmp_path / "a.npz"
-        )
+        write_amass(dataclasses.replace(body, t_world_root=torch.full((1, 3), float("nan"))), tmp_path / "a.npz")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -127,7 +132,7 @@ FAULTS = {
     "objects": ({"poses": np.array([[None] * 156] * 5, dtype=object)}, "Python objects"),
     "no frames": ({"poses": np.zeros((0, 156)), "trans": np.zeros((0, 3))}, "no frames"),
     "nan shape": ({"betas": np.full(16, np.nan)}, "betas"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -39,28 +39,7 @@ def rows(n=50, **changes):
         row = dict(
             zip(
                 HEADER.split(","),
-                [
-                    "g",
-                    10_000_000 + 10_000 * i,
-                    -1,
-                    0.01 * i,
-                    0,
-                    1.6,
-                    x,
-                    y,
-                    z,
-                    w,
-                    0,
-                    0,
-                    0,
-                    0,
-                    0,
-                    0,
-                    0,
-                    0,
-                    -9.81,
-                    1.0,
-                ],
+                ["g", 10_000_000 + 10_000 * i, -1, 0.01 * i, 0, 1.6, x, y, z, w, 0, 0, 0, 0, 0, 0, 0, 0, -9.81, 1.0],
             )
         )
         row |= {key: value(i) if callable(value) else value for key, value in changes.items()}
@@ -78,9 +57,7 @@ def write(path, table, opener=open):
 def test_level_head_faces_along_its_walk(tmp_path):
     head = head_stream(read_closed_loop(write(tmp_path / "t.csv", rows())).T_world_aria, fps=60.0)
     assert head.R_world_device == pytest.approx(torch.eye(3).expand(len(head.timestamps), 3, 3), abs=1e-5)
-    assert head.timestamps.diff() == pytest.approx(
-        torch.full((len(head.timestamps) - 1,), 1 / 60, dtype=torch.float64)
-    )
+    assert head.timestamps.diff() == pytest.approx(torch.full((len(head.timestamps) - 1,), 1 / 60, dtype=torch.float64))
     assert head.timestamps[0].item() == 10.0
     speed = (head.t_world_device[-1] - head.t_world_device[0]) / (head.timestamps[-1] - head.timestamps[0])
     assert speed.tolist() == pytest.approx([1.0, 0.0, 0.0], abs=1e-4)
@@ -116,9 +93,7 @@ def test_defects_are_named(tmp_path, changes, message):
 
 
 def test_missing_column_names_the_nearest(tmp_path):
-    table = [
-        {("tz_world_devcie" if k == "tz_world_device" else k): v for k, v in row.items()} for row in rows()
-    ]
+    table = [{("tz_world_devcie" if k == "tz_world_device" else k): v for k, v in row.items()} for row in rows()]
     with pytest.raises(WearcapError, match=r"no column 'tz_world_device'.*'tz_world_devcie'"):
         read_closed_loop(write(tmp_path / "t.csv", table))
 
@@ -130,8 +105,14 @@ def test_hostile_files(tmp_path):
     whole = write(tmp_path / "whole.csv.gz", rows(2000), gzip.open).read_bytes()
     (tmp_path / "cut.csv.gz").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "false.csv.xz").write_bytes(b"no xz at all")
-    expected = {"empty.csv": "empty", "header.csv": "no rows", "binary.csv": "not a text file",
-                "cut.csv.gz": "cut short", "false.csv.xz": "damaged", "absent.csv": "no such file"}  # fmt: skip
+    expected = {
+        "empty.csv": "empty",
+        "header.csv": "no rows",
+        "binary.csv": "not a text file",
+        "cut.csv.gz": "cut short",
+        "false.csv.xz": "damaged",
+        "absent.csv": "no such file",
+    }
     for name, message in expected.items():
         with pytest.raises(WearcapError, match=message):
             read_closed_loop(tmp_path / name)
@@ -154,12 +135,7 @@ def test_y_up_world_is_turned(tmp_path):
 
 def test_points_are_kept_by_their_certainty(tmp_path):
     header = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std\n"
-    lines = [
-        "1,g,1,2,3,0.001,0.002",
-        "2,g,4,5,6,0.006,0.002",
-        "3,g,7,8,9,0.001,0.02",
-        "4,g,0,1,2,0.004,0.009",
-    ]
+    lines = ["1,g,1,2,3,0.001,0.002", "2,g,4,5,6,0.006,0.002", "3,g,7,8,9,0.001,0.02", "4,g,0,1,2,0.004,0.009"]
     (tmp_path / "p.csv").write_text(header + "\n".join(lines) + "\n")
     cloud = read_points(tmp_path / "p.csv")
     assert cloud.points_world.tolist() == [[1, 2, 3], [0, 1, 2]]
@@ -175,8 +151,7 @@ def test_points_know_when_they_were_first_seen(tmp_path, monkeypatch):
     """Rows in any order, more than one piece of the file, ids beyond 2^53; the unsure and the unseen are left out."""
     big = 2**60 + 1
     (tmp_path / "semidense_points.csv").write_text(
-        POINTS
-        + f"9,g,1,0,0,0.001,0.001\n{big},g,2,0,0,0.001,0.001\n4,g,3,0,0,0.1,0.001\n7,g,4,0,0,0.001,0.001\n"
+        POINTS + f"9,g,1,0,0,0.001,0.001\n{big},g,2,0,0,0.001,0.001\n4,g,3,0,0,0.1,0.001\n7,g,4,0,0,0.001,0.001\n"
     )
     rows = [(big, 30), (9, 50), (4, 10), (big + 1, 1), (9, 20), (big, 40), (123, 5)]
     with gzip.open(tmp_path / "semidense_observations.csv.gz", "wt") as file:
@@ -192,8 +167,13 @@ def test_points_know_when_they_were_first_seen(tmp_path, monkeypatch):
 def test_observations_of_another_recording_and_damaged_ones_are_named(tmp_path):
     points, seen = tmp_path / "p.csv", tmp_path / "seen.csv"
     points.write_text(POINTS + "9,g,1,0,0,0.001,0.001\n")
-    for rows, message in (("8,1,c,1,1\n", "names none of the points"), ("", "no rows"), ("9,x,c,1,1\n", "not a table of numbers"),
-                          ("9,1.5,c,1,1\n", "not a table of numbers"), ("9\n", "not a table of numbers")):  # fmt: skip
+    for rows, message in (
+        ("8,1,c,1,1\n", "names none of the points"),
+        ("", "no rows"),
+        ("9,x,c,1,1\n", "not a table of numbers"),
+        ("9,1.5,c,1,1\n", "not a table of numbers"),
+        ("9\n", "not a table of numbers"),
+    ):
         seen.write_text(SEEN + rows)
         with pytest.raises(WearcapError, match=message) as error:
             read_points(points, observations=seen)
@@ -246,8 +226,10 @@ def test_nominal_head_axes_fit_a_calibrated_device(real_data):
 
     cameras = json.loads((real_data / "aria_adt_sample" / "extracted" / "meta.json").read_text())["cameras"]
     R_device_aria = R_CPF_DEVICE.T @ nominal_T_aria_cpf().R.T
-    axis = {side: R_device_aria @ torch.tensor(np.array(cameras[f"camera-slam-{side}"]["T_device_camera"])[:3, 2]).float()
-            for side in ("left", "right")}  # fmt: skip
+    axis = {
+        side: R_device_aria @ torch.tensor(np.array(cameras[f"camera-slam-{side}"]["T_device_camera"])[:3, 2]).float()
+        for side in ("left", "right")
+    }
     assert axis["left"] == pytest.approx(axis["right"] * torch.tensor([1.0, -1.0, 1.0]), abs=0.03)
     assert axis["left"][0] > 0.75
     assert axis["left"][1] > 0.55

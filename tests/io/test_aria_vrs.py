@@ -14,8 +14,7 @@ from wearcap.io.devices.aria_mps import nominal_T_aria_cpf
 from wearcap.io.formats.video import read_frames
 
 needs_aria = pytest.mark.skipif(
-    importlib.util.find_spec("projectaria_tools") is None,
-    reason='needs the extra: pip install "wearcap[aria]"',
+    importlib.util.find_spec("projectaria_tools") is None, reason='needs the extra: pip install "wearcap[aria]"'
 )
 
 
@@ -119,9 +118,7 @@ def test_a_video_holds_the_pictures_of_the_time_that_is_wanted(recorder, tmp_pat
         tmp_path / "a.vrs", tmp_path / "videos" / "a.mp4", between=(5.03, 5.17), size=64, focal=35.0
     )
     assert stream.video == "videos/a.mp4"
-    assert stream.timestamps.tolist() == pytest.approx(
-        [5.033333, 5.066667, 5.1, 5.133333, 5.166667], abs=1e-5
-    )
+    assert stream.timestamps.tolist() == pytest.approx([5.033333, 5.066667, 5.1, 5.133333, 5.166667], abs=1e-5)
     assert (stream.camera.width, stream.camera.fx, stream.camera.cx) == (64, 35.0, 31.5)
     pictures = [picture for _, picture in read_frames(tmp_path / stream.video)]
     assert [round(picture[:40].mean() / 20 - 0.5) for picture in pictures] == [1, 2, 3, 4, 5]

@@ -213,7 +213,7 @@ AMC_FAULTS = {
     "later frame differs": (lambda t: t[::-1].replace("toofl", "liat", 1)[::-1], "line 21"),
     "frames backwards": (lambda t: t.replace("\n3\n", "\n1\n"), "line 16.*frame number"),
     "huge number": (lambda t: t.replace("\n3\n", "\n" + "9" * 5000 + "\n"), "line 16.*frame number"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", AMC_FAULTS)

@@ -8,15 +8,7 @@ import torch
 from hostile import fuzz, mutated_bytes
 from hypothesis import given
 from hypothesis import strategies as st
-from one_object_files import (
-    BEHAVE_NAME,
-    CORNERS,
-    behave_arrays,
-    carried,
-    frame_times,
-    standing_about,
-    write_behave,
-)
+from one_object_files import BEHAVE_NAME, CORNERS, behave_arrays, carried, frame_times, standing_about, write_behave
 
 from boxes import BOX_FACES
 from wearcap.errors import WearcapError
@@ -65,15 +57,8 @@ def test_the_mesh_is_placed_by_the_data_sets_own_rule(tmp_path):
 
 
 def test_the_registered_meshes(tmp_path):
-    names = [
-        behave_mesh_path(tmp_path, name).name for name in ("boxlarge", "monitor", "chairwood", "tablesquare")
-    ]
-    assert names == [
-        "boxlarge_f1000.ply",
-        "monitor_closed_f1000.ply",
-        "chairwood_f2500.ply",
-        "tablesquare_f2000.ply",
-    ]
+    names = [behave_mesh_path(tmp_path, name).name for name in ("boxlarge", "monitor", "chairwood", "tablesquare")]
+    assert names == ["boxlarge_f1000.ply", "monitor_closed_f1000.ply", "chairwood_f2500.ply", "tablesquare_f2000.ply"]
 
 
 def test_the_other_folder_and_betas_for_all_frames(tmp_path):
@@ -100,21 +85,26 @@ BODY = {
     "half": ({"trans": np.zeros((90, 3))}, "array 'trans' has shape"),
     "NaN betas": ({"betas": np.full((180, 10), np.nan)}, "'betas' holds NaN"),
     "other times": ({"frame_times": frame_times(181)[1:]}, "body's frame 0 is of 3.033 s, the object's of 3.000 s"),
-}  # fmt: skip
+}
 THING = {
-    "shorter": ({"angles": np.zeros((179, 3)), "trans": np.zeros((179, 3)), "frame_times": frame_times(179)},
-                "the object has 179 frames, the body 180"),
+    "shorter": (
+        {"angles": np.zeros((179, 3)), "trans": np.zeros((179, 3)), "frame_times": frame_times(179)},
+        "the object has 179 frames, the body 180",
+    ),
     "quaternions": ({"angles": np.zeros((180, 4))}, "array 'angles' has shape"),
     "NaN": ({"trans": np.full((180, 3), np.nan)}, "object_fit_all.npz: array 'trans' holds NaN"),
     "no times": ({"frame_times": None}, "frame_times is missing"),
     "numbers": ({"frame_times": np.arange(180.0)}, "frame_times is float64"),
     "words": ({"frame_times": np.array(["then"] * 180)}, "frame_times cannot be read"),
     "NaN times": ({"frame_times": np.array(["tnan"] * 180)}, "frame_times holds NaN"),
-    "a frame per second": ({"frame_times": frame_times(180, 1.0)}, "frames come at 1 per second. Expected 30 per second"),
+    "a frame per second": (
+        {"frame_times": frame_times(180, 1.0)},
+        "frames come at 1 per second. Expected 30 per second",
+    ),
     "60 Hz": ({"frame_times": frame_times(180, 1 / 60)}, "per second. Expected 30"),
     "backwards": ({"frame_times": np.r_[frame_times(180)[:90], frame_times(180)[80:170]]}, "timestamp"),
     "objects": ({"angles": np.array([None] * 180, dtype=object)}, "Python objects"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", BODY)
@@ -143,10 +133,7 @@ MESHES = {
     "kilometres": (Ply(CORNERS / 1000, None, BOX_FACES), "0.0004 m long"),
     "a cloud": (Ply(CORNERS), "no faces"),
     "empty": (Ply(CORNERS[:0]), "no vertices"),
-    "NaN": (
-        Ply(np.where(CORNERS == 0, np.nan, CORNERS).astype(np.float32), None, BOX_FACES),
-        "NaN or infinite",
-    ),
+    "NaN": (Ply(np.where(CORNERS == 0, np.nan, CORNERS).astype(np.float32), None, BOX_FACES), "NaN or infinite"),
 }
 
 
@@ -190,9 +177,7 @@ def test_missing_files_are_named(tmp_path):
 def test_damaged_files_give_a_take_or_one_clear_error(tmp_path_factory, data, file):
     root = tmp_path_factory.getbasetemp() / "behave_fuzz"
     few = slice(0, 3)
-    body, thing = (
-        {key: v[few] if v.ndim else v for key, v in part.items()} for part in behave_arrays(seconds=0.2)
-    )
+    body, thing = ({key: v[few] if v.ndim else v for key, v in part.items()} for part in behave_arrays(seconds=0.2))
     write_behave(root, body=body, thing=thing)
     path = root / "sequences" / BEHAVE_NAME / file
     path.write_bytes(data.draw(mutated_bytes(path.read_bytes())))

@@ -37,11 +37,24 @@ from wearcap.io.formats.wavefront import read_obj
 
 MIB = 1 << 20
 READERS = {
-    "a.txt": read_tum, "a.csv": read_euroc, "a.bvh": read_bvh, "a.asf": read_asf, "a.mvnx": read_mvnx, "a.npz": read_npz,
-    "a.npy": map_npy, "a.ply": read_ply, "a.pcd": read_pcd, "a.json": read_json, "a.pkl": read_pickle, "a.obj": read_obj,
-    "a.json.zip": read_smpl_json, "a.pt": read_totalcapture, "a.png": read_image, "a.mp4": video_info,
+    "a.txt": read_tum,
+    "a.csv": read_euroc,
+    "a.bvh": read_bvh,
+    "a.asf": read_asf,
+    "a.mvnx": read_mvnx,
+    "a.npz": read_npz,
+    "a.npy": map_npy,
+    "a.ply": read_ply,
+    "a.pcd": read_pcd,
+    "a.json": read_json,
+    "a.pkl": read_pickle,
+    "a.obj": read_obj,
+    "a.json.zip": read_smpl_json,
+    "a.pt": read_totalcapture,
+    "a.png": read_image,
+    "a.mp4": video_info,
     "b.mp4": lambda path: list(read_frames(path)),
-}  # fmt: skip
+}
 
 
 def packed(opener, path: Path, line: bytes, size: int) -> Path:
@@ -81,9 +94,13 @@ def little_free(monkeypatch):
 @pytest.mark.parametrize(("ending", "opener"), [(".gz", gzip.open), (".xz", lzma.open)])
 @pytest.mark.parametrize(
     ("name", "read", "line"),
-    [("a.txt", read_tum, b"0 1 2 3 0 0 0 1\n"), ("a.csv", read_euroc, b"1,0,0,0,1,0,0,0\n"), ("a.bvh", read_text, b"JOINT a {\n"),
-     ("a.mvnx", read_mvnx, b"<!-- a comment -->\n")],
-)  # fmt: skip
+    [
+        ("a.txt", read_tum, b"0 1 2 3 0 0 0 1\n"),
+        ("a.csv", read_euroc, b"1,0,0,0,1,0,0,0\n"),
+        ("a.bvh", read_text, b"JOINT a {\n"),
+        ("a.mvnx", read_mvnx, b"<!-- a comment -->\n"),
+    ],
+)
 def test_packed_bombs(little_free, tmp_path, ending, opener, name, read, line):
     path = packed(opener, tmp_path / (name + ending), line, 8 * MIB)
     told = refused(read, path, "unpacks to more than 100 times its size|without an element|broken XML")
@@ -94,9 +111,7 @@ def test_packed_bombs(little_free, tmp_path, ending, opener, name, read, line):
 def test_an_archive_of_large_arrays(little_free, tmp_path):
     np.savez_compressed(tmp_path / "a.npz", **{f"a{k}": np.zeros(MIB // 16) for k in range(4)})
     refused(read_npz, tmp_path / "a.npz", "100 times its size")
-    assert len(read_npz(tmp_path / "a.npz", ["a0"])["a0"]) == MIB // 16, (
-        "what is not asked for does not count"
-    )
+    assert len(read_npz(tmp_path / "a.npz", ["a0"])["a0"]) == MIB // 16, "what is not asked for does not count"
     assert len(read_npz(tmp_path / "a.npz", max_bytes=2 * MIB)) == 4
     with pytest.raises(WearcapError, match="larger than 1 MiB once unpacked"):
         read_npz(tmp_path / "a.npz", max_bytes=MIB)
@@ -115,9 +130,7 @@ def test_the_limit_is_lifted_by_the_user(little_free, tmp_path, monkeypatch):
     monkeypatch.setenv(bounded.VARIABLE, "1")
     assert len(read_text(path)) > 7 * MIB
     monkeypatch.setenv(bounded.VARIABLE, "0.001")
-    with pytest.raises(
-        WearcapError, match=r"larger than 1 MiB|larger than 1024 KiB|larger than 1.*once unpacked"
-    ):
+    with pytest.raises(WearcapError, match=r"larger than 1 MiB|larger than 1024 KiB|larger than 1.*once unpacked"):
         read_text(path)
     for wrong in ("much", "-1", "nan", "0"):
         monkeypatch.setenv(bounded.VARIABLE, wrong)
@@ -152,7 +165,9 @@ def exit_main(*arguments: str) -> int:
 BVH_JOINT = "JOINT j%d\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
 PLY = "ply\nformat {form} 1.0\nelement vertex {count}\nproperty float x\nproperty float y\nproperty float z\n"
 FACES = "element face {count}\nproperty list {kind} int vertex_indices\n"
-LONG_LIST = (PLY.format(form="binary_little_endian", count=0) + FACES.format(count=1, kind="uint") + "end_header\n").encode() + b"\xff" * 40  # fmt: skip
+LONG_LIST = (
+    PLY.format(form="binary_little_endian", count=0) + FACES.format(count=1, kind="uint") + "end_header\n"
+).encode() + b"\xff" * 40
 PCD = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT {count}\nWIDTH 1\nHEIGHT 1\nPOINTS {points}\nDATA {form}\n1 2 3\n"
 
 
@@ -188,7 +203,7 @@ COUNTS = {
     "rows.npy": npy_of((10**12,)),
     "product.npy": npy_of((10**9, 10**9, 10**9)),
     "negative.npy": npy_of((-1,)),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", COUNTS)
@@ -236,8 +251,13 @@ def test_deep_json(tmp_path, text):
     np.savez(tmp_path / "a.npz", wearcap=np.array(text))
     from wearcap.io.formats.motion_npz import read_motion
 
-    for read, path in ((read_json, "a.json"), (read_smpl_json, "a.json"), (read_smpl_json, "a.json.zip"),
-                       (read_photos, "."), (read_motion, "a.npz")):  # fmt: skip
+    for read, path in (
+        (read_json, "a.json"),
+        (read_smpl_json, "a.json"),
+        (read_smpl_json, "a.json.zip"),
+        (read_photos, "."),
+        (read_motion, "a.npz"),
+    ):
         refused(read, tmp_path / path, "too deeply")
 
 
@@ -249,9 +269,7 @@ def test_whole_numbers_of_json_beyond_64_bits(tmp_path):
 
 def test_yaml_that_unfolds(tmp_path):
     path = tmp_path / "config.yaml"
-    path.write_text(
-        "a0: &a0 [x, x]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 40))
-    )
+    path.write_text("a0: &a0 [x, x]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 40)))
     refused(_config, path, "refers to its own parts")
     path.write_text("a: " + "[" * 20_000)
     refused(_config, path, "YAML")
@@ -287,9 +305,7 @@ def test_a_file_that_may_not_be_read(tmp_path, name, monkeypatch):
     assert "chmod" in refused(READERS[name], tmp_path / name, "no permission")
 
 
-@pytest.mark.parametrize(
-    "name", ["a.txt", "a.bvh", "a.npz", "a.npy", "a.ply", "a.pkl", "a.json", "a.json.zip"]
-)
+@pytest.mark.parametrize("name", ["a.txt", "a.bvh", "a.npz", "a.npy", "a.ply", "a.pkl", "a.json", "a.json.zip"])
 def test_a_file_that_may_be_seen_but_not_opened(tmp_path, name, monkeypatch):
     (tmp_path / name).write_bytes(b"something")
 

@@ -76,9 +76,11 @@ def random_motion(skeleton: Skeleton, frames: int = 40, seed: int = 0) -> Motion
     generator = torch.Generator().manual_seed(seed)
     R = rotation.exp(1.2 * torch.randn(frames, len(skeleton), 3, generator=generator))
     return Motion(
-        torch.arange(frames, dtype=torch.float64) / 60, skeleton, R,
+        torch.arange(frames, dtype=torch.float64) / 60,
+        skeleton,
+        R,
         torch.randn(frames, 3, generator=generator) + torch.tensor([0.0, 0.0, 1.0]),
-    )  # fmt: skip
+    )
 
 
 def test_positions_follow_the_files_channel_orders(tmp_path):
@@ -97,9 +99,7 @@ def test_positions_follow_the_files_channel_orders(tmp_path):
         tip = toe + toe_R @ [0, 0, 12]
         ours = {"Left Leg": leg, "LeftToe": toe, "Head": head}
         for name, (x, y, z) in ours.items():
-            np.testing.assert_allclose(
-                motion.joint(name).t[k].numpy(), [z / 100, x / 100, y / 100], atol=1e-5
-            )
+            np.testing.assert_allclose(motion.joint(name).t[k].numpy(), [z / 100, x / 100, y / 100], atol=1e-5)
         site = torch.tensor(motion.skeleton.sites["left_toe_tip"].t_joint_site)
         found = (motion.joint("LeftToe")[k : k + 1] @ site)[0].numpy()
         np.testing.assert_allclose(found, np.array([tip[2], tip[0], tip[1]]) / 100, atol=1e-5)
@@ -121,8 +121,7 @@ def test_axes_and_units_are_the_callers(tmp_path):
 def test_position_channels_of_children_replace_or_add_to_the_offset(tmp_path):
     whole = read_bvh(save(tmp_path, TEXT), check=False)
     added = read_bvh(
-        save(tmp_path, TEXT.replace(" 0 -90 0 ", " 0 0 0 ").replace("OFFSET 0 0 0 ", "OFFSET 0 -90 0 ")),
-        check=False,
+        save(tmp_path, TEXT.replace(" 0 -90 0 ", " 0 0 0 ").replace("OFFSET 0 0 0 ", "OFFSET 0 -90 0 ")), check=False
     )
     torch.testing.assert_close(whole.skeleton.t_parent_joint, added.skeleton.t_parent_joint)
     stretched = TEXT.replace("45 -55 65 0 -90 0", "45 -55 65 0 -95 0")
@@ -152,9 +151,7 @@ def test_round_trip(tmp_path, unit_m):
 
 def test_gimbal_lock_survives_the_round_trip(tmp_path):
     motion = random_motion(xsens23(), 5)
-    locked = rotation.about_axis("z", torch.tensor([0.3])) @ rotation.about_axis(
-        "y", torch.tensor([np.pi / 2]).float()
-    )
+    locked = rotation.about_axis("z", torch.tensor([0.3])) @ rotation.about_axis("y", torch.tensor([np.pi / 2]).float())
     motion = dataclasses.replace(motion, R_parent_joint=locked.expand_as(motion.R_parent_joint).contiguous())
     write_bvh(motion, tmp_path / "m.bvh")
     back = read_bvh(tmp_path / "m.bvh", check=False)
@@ -165,9 +162,7 @@ def test_gimbal_lock_survives_the_round_trip(tmp_path):
 def test_gaps_are_held_so_that_nothing_shifts_in_time(tmp_path):
     motion = random_motion(xsens23(), 10)
     keep = [0, 1, 2, 3, 6, 7, 8, 9]
-    gap = Motion(
-        motion.timestamps[keep], motion.skeleton, motion.R_parent_joint[keep], motion.t_world_root[keep]
-    )
+    gap = Motion(motion.timestamps[keep], motion.skeleton, motion.R_parent_joint[keep], motion.t_world_root[keep])
     write_bvh(gap, tmp_path / "m.bvh")
     back = read_bvh(tmp_path / "m.bvh")
     assert len(back) == 10
@@ -202,21 +197,13 @@ def test_giants_and_sleepers_are_told_which_setting_mends_them(tmp_path):
 
 def test_a_leaf_without_site_gets_an_empty_end_site(tmp_path):
     skeleton = Skeleton(
-        "rod",
-        ("a", "b"),
-        (-1, 0),
-        torch.tensor([[0.0, 0, 0], [0, 0, 1]]),
-        {"tip": Site("b", (0.0, 0.0, 0.5))},
+        "rod", ("a", "b"), (-1, 0), torch.tensor([[0.0, 0, 0], [0, 0, 1]]), {"tip": Site("b", (0.0, 0.0, 0.5))}
     )
     write_bvh(random_motion(skeleton), tmp_path / "m.bvh")
-    assert read_bvh(tmp_path / "m.bvh", check=False).skeleton.sites["b_end"].t_joint_site == pytest.approx(
-        (0, 0, 0.5)
-    )
+    assert read_bvh(tmp_path / "m.bvh", check=False).skeleton.sites["b_end"].t_joint_site == pytest.approx((0, 0, 0.5))
     bare = dataclasses.replace(skeleton, sites={})
     write_bvh(random_motion(bare), tmp_path / "m.bvh")
-    assert read_bvh(tmp_path / "m.bvh", check=False).skeleton.sites["b_end"].t_joint_site == pytest.approx(
-        (0, 0, 0)
-    )
+    assert read_bvh(tmp_path / "m.bvh", check=False).skeleton.sites["b_end"].t_joint_site == pytest.approx((0, 0, 0))
 
 
 FAULTS = {
@@ -238,7 +225,7 @@ FAULTS = {
     "same name": (TEXT.replace("JOINT Head", "JOINT Spine"), "share a name"),
     "bad offset": (TEXT.replace("OFFSET 0 40 0", "OFFSET 0 40"), "line 21.*CHANNELS"),
     "joint in end site": (TEXT.replace("{ OFFSET 0 0 12 }", "{ OFFSET 0 0 12 JOINT x { } }"), "End Site holds"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -250,9 +237,7 @@ def test_hostile_bvh_is_named(tmp_path, fault):
 
 
 def test_deep_nesting_is_refused_without_recursion(tmp_path):
-    text = (
-        "HIERARCHY\nROOT a {\n" + "".join(f"JOINT j{k} {{\n" for k in range(5000)) + "}" * 5001 + "\nMOTION\n"
-    )
+    text = "HIERARCHY\nROOT a {\n" + "".join(f"JOINT j{k} {{\n" for k in range(5000)) + "}" * 5001 + "\nMOTION\n"
     with pytest.raises(WearcapError, match="more than"):
         read_bvh(save(tmp_path, text))
 

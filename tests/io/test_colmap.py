@@ -26,10 +26,7 @@ IMAGES = [  # number, qw qx qy qz tx ty tz, camera, name, points
     (7, (HALF, 0.0, 0.0, HALF, 1.0, 2.0, 3.0), 5, "b.jpg", [(10.5, 20.5, 40), (1.0, 2.0, -1)]),
     (3, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 4.0), 1, "a b.jpg", [(320.0, 240.0, 9), (30.0, 40.0, 40)]),
 ]
-POINTS = [
-    (40, (1.0, 2.0, 3.0), (1, 2, 3), [(7, 0), (3, 1)]),
-    (9, (0.0, 0.0, 1.0), (255, 0, 9), [(3, 0)]),
-]
+POINTS = [(40, (1.0, 2.0, 3.0), (1, 2, 3), [(7, 0), (3, 1)]), (9, (0.0, 0.0, 1.0), (255, 0, 9), [(3, 0)])]
 
 
 def write_text_model(folder: Path) -> None:
@@ -52,10 +49,12 @@ def write_binary_model(folder: Path) -> None:
 
     cameras = [struct.pack(f"<iiQQ{len(v)}d", n, kind, 640, 480, *v) for n, (_, kind, v) in CAMERAS.items()]
     images = [
-        struct.pack("<I7dI", n, *pose, camera) + name.encode() + b"\0"
+        struct.pack("<I7dI", n, *pose, camera)
+        + name.encode()
+        + b"\0"
         + counted([struct.pack("<ddq", *row) for row in points])
         for n, pose, camera, name, points in IMAGES
-    ]  # fmt: skip
+    ]
     points = [
         struct.pack("<Q3d3Bd", n, *xyz, *rgb, 0.5) + counted([struct.pack("<ii", *row) for row in track])
         for n, xyz, rgb, track in POINTS
@@ -76,9 +75,7 @@ def test_a_model_reads_alike_in_both_encodings(tmp_path, kind):
     assert first.file.parent == tmp_path / "pictures"
     assert first.T_world_cam.t.tolist() == [0, 0, -4]
     # the camera is turned by 90° about z: its x axis points along the world's -y
-    torch.testing.assert_close(
-        second.T_world_cam.R[:, 0], torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
-    )
+    torch.testing.assert_close(second.T_world_cam.R[:, 0], torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
     torch.testing.assert_close(second.T_world_cam.t, torch.tensor([-2.0, 1.0, -3.0], dtype=torch.float64))
     camera = second.camera
     assert (camera.model, camera.width, camera.height) == ("opencv", 640, 480)
@@ -108,10 +105,14 @@ def test_tracks_of_some_photos(tmp_path):
 @pytest.mark.parametrize(
     ("number", "model", "lens"),
     [
-        (1, "pinhole", ()), (2, "pinhole", ()), (3, "opencv", (0.1, 0, 0, 0)), (4, "opencv", (0.1, -0.02, 0, 0)),
-        (5, "opencv", (0.1, -0.02, 0.003, 0.004)), (6, "fisheye", (0.1, -0.02, 0.003, 0.004)),
+        (1, "pinhole", ()),
+        (2, "pinhole", ()),
+        (3, "opencv", (0.1, 0, 0, 0)),
+        (4, "opencv", (0.1, -0.02, 0, 0)),
+        (5, "opencv", (0.1, -0.02, 0.003, 0.004)),
+        (6, "fisheye", (0.1, -0.02, 0.003, 0.004)),
     ],
-)  # fmt: skip
+)
 def test_camera_models(tmp_path, number, model, lens):
     write_text_model(tmp_path)
     text = (tmp_path / "images.txt").read_text().replace(" 1 a b.jpg", f" {number} a b.jpg")
@@ -134,12 +135,7 @@ def test_every_truncation_is_told(tmp_path, file):
 @pytest.mark.parametrize(
     ("file", "old", "new", "match"),
     [
-        (
-            "cameras.txt",
-            "1 SIMPLE_PINHOLE",
-            "1 FOV",
-            "cameras.txt, line 2: camera model FOV is not supported",
-        ),
+        ("cameras.txt", "1 SIMPLE_PINHOLE", "1 FOV", "cameras.txt, line 2: camera model FOV is not supported"),
         ("cameras.txt", "640 480 500.0 320.0 240.0\n", "640 480 500.0 320.0\n", "3 finite numbers"),
         ("cameras.txt", "640", "wide", "CAMERA_ID MODEL"),
         ("images.txt", "1 a b.jpg", "12 a b.jpg", "names camera 12"),

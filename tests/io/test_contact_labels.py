@@ -45,21 +45,19 @@ def test_hcontact_is_read(tmp_path):
     assert contact[540:, 1].all()
     assert contact[-1, 1], "a label that is open at its end holds the last frame"
     write_contact_labels(tmp_path / "out.json", found, CLOCK)
-    assert json.loads((tmp_path / "out.json").read_text()) == contacts(
-        [[1.0, 2.5], [4.0, 5.0]], [[9.0, -1.0]]
-    )
+    assert json.loads((tmp_path / "out.json").read_text()) == contacts([[1.0, 2.5], [4.0, 5.0]], [[9.0, -1.0]])
 
 
 def test_two_hands_at_one_object_are_one_interaction():
     both = Interactions(
-        torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), torch.tensor([2.0, 3.0, 4.0], dtype=torch.float64),
-        torch.tensor([[True, False], [True, True], [False, True]]), ("sofa",) * 3, ("sliding",) * 3,
-    )  # fmt: skip
+        torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64),
+        torch.tensor([2.0, 3.0, 4.0], dtype=torch.float64),
+        torch.tensor([[True, False], [True, True], [False, True]]),
+        ("sofa",) * 3,
+        ("sliding",) * 3,
+    )
     labels = labels_of(both, CLOCK)
-    assert labels == {
-        "left": (Label(1.0, 3.0, "sofa", "sliding"),),
-        "right": (Label(2.0, 4.0, "sofa", "sliding"),),
-    }
+    assert labels == {"left": (Label(1.0, 3.0, "sofa", "sliding"),), "right": (Label(2.0, 4.0, "sofa", "sliding"),)}
     back = interactions_of(labels)
     for name in ("start_s", "stop_s", "hands"):
         assert torch.equal(getattr(back, name), getattr(both, name))
@@ -120,10 +118,12 @@ def test_impossible_labels_are_refused(content, message):
 
 def test_an_annotation_of_another_recording_is_refused():
     labels = {"left": (Label(1.0, 2.0),), "right": ()}
-    for other in (LabelClock.of("flat_2", TIMES), LabelClock.of("flat_1", TIMES + 3.0), LabelClock.of("flat_1", TIMES[1:])):  # fmt: skip
-        with pytest.raises(
-            WearcapError, match=f"labels of recording '{other.name}' with {other.frames} frames"
-        ):
+    for other in (
+        LabelClock.of("flat_2", TIMES),
+        LabelClock.of("flat_1", TIMES + 3.0),
+        LabelClock.of("flat_1", TIMES[1:]),
+    ):
+        with pytest.raises(WearcapError, match=f"labels of recording '{other.name}' with {other.frames} frames"):
             parsed(annotation_of(labels, other))
     assert parsed(annotation_of(labels, CLOCK)) == labels
 
@@ -137,9 +137,12 @@ def test_labels_a_little_outside_are_cut():
 
 def test_a_hand_holds_one_thing_at_a_time():
     two = Interactions(
-        torch.tensor([1.0, 2.0], dtype=torch.float64), torch.tensor([3.0, 4.0], dtype=torch.float64),
-        torch.tensor([[True, False], [True, False]]), ("sofa", "door"), ("sliding", "hinged"),
-    )  # fmt: skip
+        torch.tensor([1.0, 2.0], dtype=torch.float64),
+        torch.tensor([3.0, 4.0], dtype=torch.float64),
+        torch.tensor([[True, False], [True, False]]),
+        ("sofa", "door"),
+        ("sliding", "hinged"),
+    )
     with pytest.raises(WearcapError, match="flat_1: labels of left_hand overlap"):
         labels_of(two, CLOCK)
     with pytest.raises(WearcapError, match="at least two"):

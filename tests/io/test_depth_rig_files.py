@@ -20,9 +20,12 @@ def folder(tmp_path: Path) -> Path:
     images = np.random.default_rng(0).integers(800, 4000, (2, 3, 12, 16)).astype(np.uint16)
     pose = Rigid(torch.eye(3), torch.tensor([1.0, 2.0, 3.0]))
     write_depth_rig(
-        tmp_path, {"k0": (LENS, pose), "k1": (LENS, pose)}, {"k0": images[0, :1], "k1": images[1, :1]},
-        {"k0": images[0], "k1": images[1]}, np.array([0.0, 1 / 30, 2 / 30]),
-    )  # fmt: skip
+        tmp_path,
+        {"k0": (LENS, pose), "k1": (LENS, pose)},
+        {"k0": images[0, :1], "k1": images[1, :1]},
+        {"k0": images[0], "k1": images[1]},
+        np.array([0.0, 1 / 30, 2 / 30]),
+    )
     return tmp_path
 
 

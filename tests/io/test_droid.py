@@ -36,7 +36,7 @@ def reconstruction(folder: Path, *, upsampled: bool = True, **changes) -> tuple[
         "disps": (1 / depth).astype(np.float32),
         "intrinsics": np.tile([FOCAL / 8, FOCAL / 8, WIDTH / 16, HEIGHT / 16], (count, 1)).astype(np.float32),
         "images": np.zeros((count, 3, HEIGHT, WIDTH), np.uint8),
-    } | changes  # fmt: skip
+    } | changes
     folder.mkdir(exist_ok=True)
     for name, array in arrays.items():
         if array is not None:
@@ -52,7 +52,7 @@ def test_poses_are_turned_into_the_world(tmp_path, upsampled):
     np.testing.assert_allclose(track.T_world_cam.R_world_body.numpy(), R.as_matrix(), atol=1e-6)
     assert track.T_world_cam.timestamps.tolist() == pytest.approx([0, 0.4, 0.8, 1.1, 1.5, 2.0])
     scale = 1 if upsampled else 8
-    assert (track.camera.width, track.camera.fx, track.camera.cx) == (WIDTH // scale, FOCAL / scale, WIDTH / 2 / scale)  # fmt: skip
+    assert (track.camera.width, track.camera.fx, track.camera.cx) == (WIDTH // scale, FOCAL / scale, WIDTH / 2 / scale)
 
 
 def test_points_lie_on_the_wall_and_know_when_they_were_seen(tmp_path):

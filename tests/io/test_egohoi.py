@@ -31,9 +31,7 @@ ONE, SEVERAL = "SUB1_MPI_BIB_EG_sofa.06", "SUB6_TUB_2OG_multiroom.03"
 SOFA, DOOR, TABLE = "MPI_BIB_EG_sofa", "TUB_2OG_confdoor", "TUB_2OG_table"
 CENTER = np.array([12.0, -7.0, 0.4])
 HINGE = [11.5, -7.0, 0.4]
-CORNERS = (CENTER + 0.5 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])).astype(
-    np.float32
-)
+CORNERS = (CENTER + 0.5 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])).astype(np.float32)
 
 
 def pose(time, angle_deg=0.0, about=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)) -> dict:
@@ -52,8 +50,11 @@ def locations(*poses, hinge=None) -> dict:
 
 
 def contact(*rows) -> dict:
-    return {"interactions": [{"start": start, "end": end, "parts": [f"{side}_hand" for side in sides]}
-                             for start, end, *sides in rows]}  # fmt: skip
+    return {
+        "interactions": [
+            {"start": start, "end": end, "parts": [f"{side}_hand" for side in sides]} for start, end, *sides in rows
+        ]
+    }
 
 
 SLID = locations(pose(0.0), pose(1.8, 90.0, CENTER, (0.5, 0.25, 0.0)))
@@ -66,12 +67,8 @@ def write_set(root, frames=120):
     write_json(older(motion(frames, hands=False, fps=frames / 2)), root / "smpl_motions" / f"{ONE}.json")
     write_json({"betas": [0.1, 0.2], "gender": "male"}, root / "smpl_shapes" / "SUB1.json")
     write_json(SLID, root / "object_locations" / f"{ONE}.json")
-    write_json(
-        contact((0.5, 1.0, "left", "right"), (1.0, 1.5, "right")), root / "gt_contacts" / f"{ONE}.json"
-    )
-    write_zip(
-        smpl_content(motion(frames, seed=1, fps=frames / 2)), root / "smpl_motions" / f"{SEVERAL}.json.zip"
-    )
+    write_json(contact((0.5, 1.0, "left", "right"), (1.0, 1.5, "right")), root / "gt_contacts" / f"{ONE}.json")
+    write_zip(smpl_content(motion(frames, seed=1, fps=frames / 2)), root / "smpl_motions" / f"{SEVERAL}.json.zip")
     write_json(OPENED, root / "object_locations" / SEVERAL / f"{DOOR}.json")
     write_json(SLID, root / "object_locations" / SEVERAL / f"{TABLE}.json")
     write_json(contact((1.0, 1.5, "right"), (1.6, 1.7)), root / "gt_contacts" / SEVERAL / f"{DOOR}.json")
@@ -82,9 +79,7 @@ def write_set(root, frames=120):
 def posed(path) -> np.ndarray:
     """Corners by the data set's own rule, for each of a file's poses in order of time."""
     rows = sorted(json.loads(path.read_text())["locations"], key=lambda row: row["time"])
-    R = rotation.matrix_from_quat_wxyz(
-        torch.tensor([row["quaternion"] for row in rows], dtype=torch.float64)
-    ).numpy()
+    R = rotation.matrix_from_quat_wxyz(torch.tensor([row["quaternion"] for row in rows], dtype=torch.float64)).numpy()
     return np.einsum("tij,vj->tvi", R, CORNERS.astype(np.float64)) + [[row["position"]] for row in rows]
 
 
@@ -243,9 +238,7 @@ def test_the_trackers_output_is_written_in_the_scans_axes_and_read_back(tmp_path
     write_object_npz(annotated.trajectory, path, annotated.center)
     with np.load(path, allow_pickle=False) as arrays:
         assert set(arrays) == {"version", "type", "translations", "quaternions", "timestamps"}
-        np.testing.assert_allclose(
-            arrays["translations"], [row["position"] for row in SLID["locations"]], atol=1e-5
-        )
+        np.testing.assert_allclose(arrays["translations"], [row["position"] for row in SLID["locations"]], atol=1e-5)
         wanted = np.array([row["quaternion"] for row in SLID["locations"]])
         sign = np.sign((arrays["quaternions"] * wanted).sum(1, keepdims=True))
         np.testing.assert_allclose(sign * arrays["quaternions"], wanted, atol=1e-6)
@@ -278,8 +271,13 @@ def test_broken_tracker_outputs(tmp_path):
 
 def test_the_command_makes_a_data_set_with_environments(tmp_path, capsys):
     write_set(tmp_path / "set")
-    arguments = ["egohoi", f"source={tmp_path / 'set'}", f"output={tmp_path / 'out'}", "jobs=1",
-                 f"+motion_types.{TABLE}=free"]  # fmt: skip
+    arguments = [
+        "egohoi",
+        f"source={tmp_path / 'set'}",
+        f"output={tmp_path / 'out'}",
+        "jobs=1",
+        f"+motion_types.{TABLE}=free",
+    ]
     assert run_verb("prepare", arguments) == 0, capsys.readouterr().err
     store = RecordingStore.open(tmp_path / "out")
     assert store.names("test") == [ONE, SEVERAL]
@@ -288,10 +286,7 @@ def test_the_command_makes_a_data_set_with_environments(tmp_path, capsys):
     assert recording.motion is not None
     assert recording.motion.fps == pytest.approx(30.0)
     environment = read_environment(store.root / recording.environment)
-    assert [(item.name, item.freedom.kind) for item in environment.objects] == [
-        (DOOR, "hinge"),
-        (TABLE, "free"),
-    ]
+    assert [(item.name, item.freedom.kind) for item in environment.objects] == [(DOOR, "hinge"), (TABLE, "free")]
     assert set(recording.object_motion) == {DOOR, TABLE}
     model = read_ply(store.root / "scenes" / SEVERAL / "objects" / f"{DOOR}.ply")
     np.testing.assert_allclose(model.points, CORNERS - CENTER, atol=1e-6)

@@ -31,13 +31,16 @@ def every_kind() -> Environment:
     door = Freedom("hinge", pivot=(1.1, -2.7, 0.0), limits=(-math.pi / 2, math.radians(100)))
     drawer = Freedom("axis", axis=(0.0, -1.0, 0.0), limits=(0.0, 0.45))
     cloud = Mesh(TETRA, np.zeros((0, 3), np.int32), np.eye(4, 3, dtype=np.float32))
-    per_face = Mesh(
-        np.append(TETRA, [[1, 1, 1]], 0).astype(np.float32), FACES, np.eye(4, 3, dtype=np.float32)
+    per_face = Mesh(np.append(TETRA, [[1, 1, 1]], 0).astype(np.float32), FACES, np.eye(4, 3, dtype=np.float32))
+    return Environment(
+        (
+            thing(),
+            thing("door", door),
+            thing("drawer", drawer, turn=2.0),
+            thing("box", Freedom("free"), cloud),
+            thing("chair", Freedom("hinge", pivot=(1.0, -2.0, 0.0)), per_face),
+        )
     )
-    return Environment((
-        thing(), thing("door", door), thing("drawer", drawer, turn=2.0), thing("box", Freedom("free"), cloud),
-        thing("chair", Freedom("hinge", pivot=(1.0, -2.0, 0.0)), per_face),
-    ))  # fmt: skip
 
 
 def test_every_kind_survives_a_round_trip(tmp_path):
@@ -90,9 +93,13 @@ def plain_file(tmp_path) -> dict:
     (tmp_path / "objects").mkdir(exist_ok=True)
     write_ply(Ply(TETRA, faces=FACES), tmp_path / "objects" / "door.ply")
     row = {
-        "name": "door", "category": "door", "mesh": "objects/door.ply", "R_world_object": np.eye(3).tolist(),
-        "t_world_object": [4, 0, 0], "freedom": {"kind": "hinge", "pivot": [4, 0, 0], "limits_deg": [0, 90]},
-    }  # fmt: skip
+        "name": "door",
+        "category": "door",
+        "mesh": "objects/door.ply",
+        "R_world_object": np.eye(3).tolist(),
+        "t_world_object": [4, 0, 0],
+        "freedom": {"kind": "hinge", "pivot": [4, 0, 0], "limits_deg": [0, 90]},
+    }
     return {"schema_version": 1, "objects": [row]}
 
 
@@ -156,7 +163,7 @@ def freed(**changes):
         (changed(name=" "), "without a name"),
         (lambda row: row.pop("name"), "object 0: an object without a name"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_true_is_refused(tmp_path, change, message):
     content = plain_file(tmp_path)
     change(content["objects"][0])
@@ -212,9 +219,25 @@ def folder(tmp_path_factory):
 
 
 @fuzz
-@given(text=mutated(json.dumps({"schema_version": 1, "objects": [{
-    "name": "door", "category": "door", "mesh": "objects/door.ply", "R_world_object": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "t_world_object": [4, 0, 0], "freedom": {"kind": "hinge", "pivot": [4, 0, 0], "limits_deg": [0, 90]}}]})))  # fmt: skip
+@given(
+    text=mutated(
+        json.dumps(
+            {
+                "schema_version": 1,
+                "objects": [
+                    {
+                        "name": "door",
+                        "category": "door",
+                        "mesh": "objects/door.ply",
+                        "R_world_object": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+                        "t_world_object": [4, 0, 0],
+                        "freedom": {"kind": "hinge", "pivot": [4, 0, 0], "limits_deg": [0, 90]},
+                    }
+                ],
+            }
+        )
+    )
+)
 def test_damaged_files_are_read_or_refused(folder, text):
     (folder / "environment.json").write_text(text, encoding="utf-8")
     try:
@@ -224,17 +247,7 @@ def test_damaged_files_are_read_or_refused(folder, text):
     assert all(item.t_world_object.isfinite().all() for item in environment.objects)
 
 
-MOVABLE = (
-    "Chair",
-    "Sofa",
-    "KitchenTable",
-    "CoffeeTable",
-    "Trash",
-    "NightStand",
-    "ReadingDesk",
-    "Ball",
-    "ShoeRack",
-)
+MOVABLE = ("Chair", "Sofa", "KitchenTable", "CoffeeTable", "Trash", "NightStand", "ReadingDesk", "Ball", "ShoeRack")
 
 
 def furnished(folder) -> Environment:
@@ -249,7 +262,11 @@ def furnished(folder) -> Environment:
     objects = []
     for row in (row for row in layout if row["model"] in meshes):
         *xyz, roll, pitch, yaw = row["pose_xyz_rpy"]
-        R = rotation.about_axis("z", torch.tensor(yaw)) @ rotation.about_axis("y", torch.tensor(pitch)) @ rotation.about_axis("x", torch.tensor(roll))  # fmt: skip
+        R = (
+            rotation.about_axis("z", torch.tensor(yaw))
+            @ rotation.about_axis("y", torch.tensor(pitch))
+            @ rotation.about_axis("x", torch.tensor(roll))
+        )
         t, mesh, freedom = torch.tensor(xyz), meshes[row["model"]], Freedom("plane")
         if row["model"].startswith("Door"):
             edge = R @ torch.tensor([float(mesh.vertices[:, 0].min()), 0.0, 0.0]) + t
@@ -271,9 +288,7 @@ def test_a_furnished_house(real_data, tmp_path):
     same = here.object_index == back.object_index
     assert same.float().mean() > 0.999, "but for ties"
     torch.testing.assert_close(here.distance[same], back.distance[same], atol=1e-5, rtol=0)
-    alone = torch.stack(
-        [house.distance(item.name, points, item.T_world_object)[0] for item in house.objects], 1
-    )
+    alone = torch.stack([house.distance(item.name, points, item.T_world_object)[0] for item in house.objects], 1)
     nearest = alone.amin(1)
     assert ((here.object_index >= 0) == (nearest < 0.5)).all()
     reached = here.object_index >= 0

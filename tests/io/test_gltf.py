@@ -26,13 +26,15 @@ def sample(frames: int = 8, skeleton: Skeleton | None = None) -> Motion:
     skeleton = skeleton or xsens23()
     generator = torch.Generator().manual_seed(1)
     turns = 0.25 * torch.randn(frames, len(skeleton), 3, generator=generator).cumsum(0)
-    door = Trajectory(
-        torch.arange(4, dtype=torch.float64) / 10 + 99.9, rotation.exp(turns[:4, 0]), turns[:4, 1]
-    )
+    door = Trajectory(torch.arange(4, dtype=torch.float64) / 10 + 99.9, rotation.exp(turns[:4, 0]), turns[:4, 1])
     return Motion(
-        torch.arange(frames, dtype=torch.float64) / 30 + 100, skeleton, rotation.exp(turns),
-        torch.randn(frames, 3, generator=generator), object_motion={"door": door}, provenance={"pipeline": "test"},
-    )  # fmt: skip
+        torch.arange(frames, dtype=torch.float64) / 30 + 100,
+        skeleton,
+        rotation.exp(turns),
+        torch.randn(frames, 3, generator=generator),
+        object_motion={"door": door},
+        provenance={"pipeline": "test"},
+    )
 
 
 def blob(skeleton: Skeleton, vertices: int = 40) -> BodyModel:
@@ -41,11 +43,12 @@ def blob(skeleton: Skeleton, vertices: int = 40) -> BodyModel:
     weights = torch.rand(vertices, 4, generator=generator)
     weights[:, 3] = 0
     return BodyModel(
-        skeleton=skeleton, rest_vertices=torch.randn(vertices, 3, generator=generator),
+        skeleton=skeleton,
+        rest_vertices=torch.randn(vertices, 3, generator=generator),
         faces=torch.randint(0, vertices, (60, 3), generator=generator),
         skin_joints=torch.randint(0, len(skeleton), (vertices, 4), generator=generator),
         skin_weights=weights / weights.sum(-1, keepdim=True),
-    )  # fmt: skip
+    )
 
 
 class Glb:
@@ -77,9 +80,7 @@ class Glb:
         assert accessor["count"] > 0
         assert accessor["count"] * width * dtype.itemsize == view["byteLength"]
         assert view["byteOffset"] + view["byteLength"] <= self.json["buffers"][0]["byteLength"]
-        array = np.frombuffer(self.binary, dtype, accessor["count"] * width, view["byteOffset"]).reshape(
-            -1, width
-        )
+        array = np.frombuffer(self.binary, dtype, accessor["count"] * width, view["byteOffset"]).reshape(-1, width)
         if "min" in accessor:
             np.testing.assert_array_equal(accessor["min"], array.min(0))
             np.testing.assert_array_equal(accessor["max"], array.max(0))
@@ -122,14 +123,14 @@ class Glb:
         assert self.mesh["JOINTS_0"].max() < len(skin["joints"])
         self.inverse_bind = self.arrays[skin["inverseBindMatrices"]].reshape(-1, 4, 4).transpose(0, 2, 1)
         assert len(self.inverse_bind) == len(skin["joints"])
-        np.testing.assert_array_equal(
-            self.inverse_bind[:, 3], np.tile([0, 0, 0, 1], (len(self.inverse_bind), 1))
-        )
+        np.testing.assert_array_equal(self.inverse_bind[:, 3], np.tile([0, 0, 0, 1], (len(self.inverse_bind), 1)))
 
     def globals_at(self, time_s: float) -> dict[str, np.ndarray]:
         """World matrix of every node, as a viewer would show it at a time."""
-        local = [(Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])), np.array(node.get("translation", [0.0, 0, 0])))
-                 for node in self.json["nodes"]]  # fmt: skip
+        local = [
+            (Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])), np.array(node.get("translation", [0.0, 0, 0])))
+            for node in self.json["nodes"]
+        ]
         animation = self.json["animations"][0]
         for channel in animation["channels"]:
             sampler, node = animation["samplers"][channel["sampler"]], channel["target"]["node"]
@@ -138,10 +139,7 @@ class Glb:
             if channel["target"]["path"] == "rotation":
                 local[node] = (Slerp(times, Rotation.from_quat(values))(at), local[node][1])
             else:
-                local[node] = (
-                    local[node][0],
-                    np.array([np.interp(at, times, column) for column in values.T]),
-                )
+                local[node] = (local[node][0], np.array([np.interp(at, times, column) for column in values.T]))
         matrices: dict[str, np.ndarray] = {}
 
         def visit(node: int, above: np.ndarray) -> None:
@@ -180,9 +178,7 @@ def test_joints_stand_where_forward_kinematics_puts_them(tmp_path):
             expected = to_y_up(motion.T_world_joint.t[frame, joint].numpy())
             np.testing.assert_allclose(matrices[name][:3, 3], expected, atol=2e-5)
     np.testing.assert_allclose(
-        glb.globals_at(0.2)["door"][:3, 3],
-        to_y_up(motion.object_motion["door"].t_world_body[2].numpy()),
-        atol=1e-5,
+        glb.globals_at(0.2)["door"][:3, 3], to_y_up(motion.object_motion["door"].t_world_body[2].numpy()), atol=1e-5
     )
     assert glb.json["asset"]["extras"] == {"pipeline": "test"}
 
@@ -223,9 +219,7 @@ def test_trimesh_opens_it(tmp_path):
 
 def test_one_frame_and_one_joint_are_enough(tmp_path):
     rod = Skeleton("rod", ("a",), (-1,), torch.zeros(1, 3))
-    motion = Motion(
-        torch.zeros(1, dtype=torch.float64), rod, torch.eye(3).expand(1, 1, 3, 3), torch.zeros(1, 3)
-    )
+    motion = Motion(torch.zeros(1, dtype=torch.float64), rod, torch.eye(3).expand(1, 1, 3, 3), torch.zeros(1, 3))
     write_glb(motion, tmp_path / "m.glb")
     Glb((tmp_path / "m.glb").read_bytes())
 
@@ -233,9 +227,10 @@ def test_one_frame_and_one_joint_are_enough(tmp_path):
 def test_what_cannot_be_shown_is_refused_and_leaves_nothing(tmp_path):
     motion = sample()
     bad = [
-        motion.sliced(0, 0), dataclasses.replace(motion, t_world_root=motion.t_world_root * float("inf")),
+        motion.sliced(0, 0),
+        dataclasses.replace(motion, t_world_root=motion.t_world_root * float("inf")),
         dataclasses.replace(motion, timestamps=motion.timestamps * 0),
-    ]  # fmt: skip
+    ]
     for broken in bad:
         with pytest.raises(WearcapError):
             write_glb(broken, tmp_path / "m.glb")

@@ -11,13 +11,7 @@ from hypothesis import given
 
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.hcontact import (
-    activity_of,
-    hcontact_names,
-    location_of,
-    read_hcontact,
-    read_hcontact_split,
-)
+from wearcap.io.datasets.hcontact import activity_of, hcontact_names, location_of, read_hcontact, read_hcontact_split
 from wearcap.io.formats.smpl_json import read_smpl_json
 from wearcap.prepare.hcontact import hcontact_tasks
 from wearcap.prepare.splits import read_splits
@@ -183,8 +177,12 @@ def test_splits(tmp_path):
     split = read_hcontact_split(path)
     assert split.window_radius == 30
     assert (split.train, split.valid, split.test) == ((3, 1, 2), (), (9,))
-    for wrong in ([], {"window_radius": 30}, {"window_radius": 30, "train": [-1], "valid": [], "test": []},
-                  {"window_radius": True, "train": [], "valid": [], "test": []}):  # fmt: skip
+    for wrong in (
+        [],
+        {"window_radius": 30},
+        {"window_radius": 30, "train": [-1], "valid": [], "test": []},
+        {"window_radius": True, "train": [], "valid": [], "test": []},
+    ):
         write_json(wrong, path)
         with pytest.raises(WearcapError, match="not a split"):
             read_hcontact_split(path)
@@ -199,7 +197,10 @@ def test_the_command_makes_a_data_set(tmp_path, capsys):
     assert run_verb("prepare", arguments) == 0, capsys.readouterr().err
     store = RecordingStore.open(tmp_path / "out")
     assert {name: store.entries[name].split for name in store.names()} == {
-        DOOR: "test", SOFA: "test", "SUB12_TUB_2OG_sofamove.01": "train"}  # fmt: skip
+        DOOR: "test",
+        SOFA: "test",
+        "SUB12_TUB_2OG_sofamove.01": "train",
+    }
     door, sofa = (store.load(name) for name in (DOOR, SOFA))
     assert door.motion is not None
     assert door.interactions is not None

@@ -61,9 +61,7 @@ def test_unitys_turns_in_a_left_handed_world():
     """Unity: a positive turn about y (up) takes forward (z) to the right (x): in our axes the person turns right."""
     forward, up = torch.tensor([0.0, 0, 1]).double(), torch.tensor([0.0, 1, 0]).double()
     right_turn = rotations_from_unity(torch.tensor([0.0, 90, 0], dtype=torch.float64))
-    assert torch.allclose(
-        right_turn @ forward, torch.tensor([-1.0, 0, 0]).double(), atol=1e-9
-    )  # SMPL's x is left
+    assert torch.allclose(right_turn @ forward, torch.tensor([-1.0, 0, 0]).double(), atol=1e-9)  # SMPL's x is left
     nod = rotations_from_unity(torch.tensor([30.0, 0, 0], dtype=torch.float64))
     assert (nod @ forward)[1] < -0.4  # a positive turn about x looks down
     roll = rotations_from_unity(torch.tensor([0.0, 0, 30.0], dtype=torch.float64))
@@ -194,9 +192,7 @@ def test_a_lost_neighbour_does_not_pull_a_frame_that_all_but_coincides():
 
 
 def test_a_single_localised_frame_is_resampled_to_itself():
-    one = Localization(
-        torch.tensor([2.0], dtype=torch.float64), torch.eye(3)[None], torch.ones(1, 3), torch.ones(1)
-    )
+    one = Localization(torch.tensor([2.0], dtype=torch.float64), torch.eye(3)[None], torch.ones(1, 3), torch.ones(1))
     read = resampled_localization(one, 30.0)
     assert read.timestamps.tolist() == [2.0]
     assert read.confidence.tolist() == [1.0]
@@ -205,13 +201,7 @@ def test_a_single_localised_frame_is_resampled_to_itself():
 
 @pytest.mark.parametrize(
     "content",
-    [
-        '{"cam_start": 3}',
-        '{"cam_start": -1, "imu_start": 2}',
-        "[]",
-        "{",
-        '{"cam_start": "a", "imu_start": 0}',
-    ],
+    ['{"cam_start": 3}', '{"cam_start": -1, "imu_start": 2}', "[]", "{", '{"cam_start": "a", "imu_start": 0}'],
 )
 def test_hostile_starts(content, tmp_path):
     (tmp_path / "a.json").write_text(content)
@@ -220,8 +210,7 @@ def test_hostile_starts(content, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content",
-    [{}, {"betas": []}, {"betas": ["a"]}, {"betas": [float("inf")]}, {"betas": [0.1], "root_to_heel": "x"}],
+    "content", [{}, {"betas": []}, {"betas": ["a"]}, {"betas": [float("inf")]}, {"betas": [0.1], "root_to_heel": "x"}]
 )
 def test_hostile_betas(content, tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(content))
@@ -231,10 +220,14 @@ def test_hostile_betas(content, tmp_path):
 
 @pytest.mark.parametrize(
     "change",
-    [{"parameters": {}}, {"captured_videos": None}, {"parameters": {"focal_dist_xy": [871.8], "center_xy": [1, 2], "dist_coeffs": []}},
-     {"parameters": {"focal_dist_xy": [0, 0], "center_xy": [1, 2], "dist_coeffs": []}},
-     {"parameters": {"focal_dist_xy": [9, 9], "center_xy": [1, 2], "dist_coeffs": [0.1] * 14}}],
-)  # fmt: skip
+    [
+        {"parameters": {}},
+        {"captured_videos": None},
+        {"parameters": {"focal_dist_xy": [871.8], "center_xy": [1, 2], "dist_coeffs": []}},
+        {"parameters": {"focal_dist_xy": [0, 0], "center_xy": [1, 2], "dist_coeffs": []}},
+        {"parameters": {"focal_dist_xy": [9, 9], "center_xy": [1, 2], "dist_coeffs": [0.1] * 14}},
+    ],
+)
 def test_missing_intrinsics(change, tmp_path):
     (tmp_path / "cameras.json").write_text(json.dumps({"029756": hps_files.CAMERA["029756"] | change}))
     with pytest.raises(WearcapError, match="camera '029756'"):

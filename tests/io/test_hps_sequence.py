@@ -48,10 +48,14 @@ def rewritten(path: Path, change) -> None:
         (lambda scan: rewritten(scan / "info/00001-info.json", lambda info: {"cam0": info["cam0"]}), "no pose of cam1"),
         (lambda scan: rewritten(scan / "info/00001-info.json", lambda info: info | {"cam0": 3}), "cam0: no pose"),
         (lambda scan: (scan / "cam/00001-cam7.jpg").write_bytes(b""), "no pose of cam7"),
-        (lambda scan: (scan / "sensor_frame.xml").write_text(
-            (scan / "sensor_frame.xml").read_text().replace("<SensorName>cam1", "<SensorName>cam9")), "no intrinsics of cam1"),
+        (
+            lambda scan: (scan / "sensor_frame.xml").write_text(
+                (scan / "sensor_frame.xml").read_text().replace("<SensorName>cam1", "<SensorName>cam9")
+            ),
+            "no intrinsics of cam1",
+        ),
     ],
-)  # fmt: skip
+)
 def test_damaged_scan(damage, message, tmp_path):
     write_scan(tmp_path)
     damage(tmp_path)
@@ -136,15 +140,31 @@ def test_names_of_subjects_and_scans():
     [
         (lambda root: (root / f"hps_smpl/{NAME}.pkl").unlink(), "no sequence"),
         (lambda root: (root / f"hps_inits/{NAME}.json").unlink(), "no starts"),
-        (lambda root: rewritten(root / f"hps_inits/{NAME}.json", lambda s: s | {"cam_start": 4000}), "beyond the 110 localised"),
-        (lambda root: rewritten(root / f"hps_inits/{NAME}.json", lambda s: s | {"imu_start": 4000}), "beyond the suit's"),
-        (lambda root: rewritten(root / "head_camera_videos/cameras.json", lambda c: {"029756": c["029756"] | {"captured_videos": []}}),
-         "no intrinsics for the video"),
-        (lambda root: write_video(root / f"head_camera_videos/{NAME}.mp4", 3, (640, 480)), "640x480 pixels. Expected 1920x1080"),
-        (lambda root: (root / f"head_camera_videos/{NAME}.mp4").write_bytes(b"no video at all"), "not a readable video"),
+        (
+            lambda root: rewritten(root / f"hps_inits/{NAME}.json", lambda s: s | {"cam_start": 4000}),
+            "beyond the 110 localised",
+        ),
+        (
+            lambda root: rewritten(root / f"hps_inits/{NAME}.json", lambda s: s | {"imu_start": 4000}),
+            "beyond the suit's",
+        ),
+        (
+            lambda root: rewritten(
+                root / "head_camera_videos/cameras.json", lambda c: {"029756": c["029756"] | {"captured_videos": []}}
+            ),
+            "no intrinsics for the video",
+        ),
+        (
+            lambda root: write_video(root / f"head_camera_videos/{NAME}.mp4", 3, (640, 480)),
+            "640x480 pixels. Expected 1920x1080",
+        ),
+        (
+            lambda root: (root / f"head_camera_videos/{NAME}.mp4").write_bytes(b"no video at all"),
+            "not a readable video",
+        ),
         (lambda root: (root / "hps_betas/SUB4.json").write_text("{"), "not readable JSON"),
     ],
-)  # fmt: skip
+)
 def test_damaged_sequences(damage, message, tmp_path):
     write_hps(tmp_path, scan=False)
     damage(tmp_path)
@@ -162,9 +182,7 @@ def test_names_that_are_none(name, tmp_path):
 def test_a_camera_elsewhere_is_warned_of(tmp_path):
     truth = write_hps(tmp_path, scan=False)
     away = rotation.about_axis("z", torch.tensor(0.0))
-    moved = hps_files.Motion(
-        truth.timestamps, smpl24(), truth.R_parent_joint, truth.t_world_root @ away + 7.0
-    )
+    moved = hps_files.Motion(truth.timestamps, smpl24(), truth.R_parent_joint, truth.t_world_root @ away + 7.0)
     hps_files.write_localization(moved, tmp_path / f"head_camera_localizations/{NAME}.json")
     with pytest.warns(UserWarning, match="m apart"):
         read_hps_sequence(tmp_path, NAME)

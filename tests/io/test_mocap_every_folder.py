@@ -40,7 +40,7 @@ def test_everything_is_read(tmp_path):
     expected = torch.from_numpy((FIX * R).as_matrix()).float()
     assert rotation.geodesic(read.T_slam_cam.R_world_body, expected).max() < 1e-5
     assert (read.camera.width, read.camera.height, read.camera.fx) == (584, 328, 300.5)
-    assert (read.lens.width, read.lens.model, read.lens.distortion) == (320, "opencv", (-0.1, 0.02, 0.001, 0.002))  # fmt: skip
+    assert (read.lens.width, read.lens.model, read.lens.distortion) == (320, "opencv", (-0.1, 0.02, 0.001, 0.002))
     assert read.video == tmp_path / "video/ego_video.MP4"
     assert list(read.imu) == ["left_wrist", "right_wrist"]
     assert read.imu["right_wrist"].joint == "right_wrist"
@@ -80,7 +80,14 @@ def test_only_the_trajectory_must_be_there(tmp_path):
         if path.name != "cam_traj.pkl":
             path.unlink()
     read = read_mocap_every_folder(tmp_path)
-    assert (read.camera, read.lens, read.points_slam, read.video, read.board, read.imu) == (None, None, None, None, None, {})  # fmt: skip
+    assert (read.camera, read.lens, read.points_slam, read.video, read.board, read.imu) == (
+        None,
+        None,
+        None,
+        None,
+        None,
+        {},
+    )
     assert read.T_slam_cam.timestamps[0] == 0
     recording = mocap_every_recording(read)
     assert recording.camera is None
@@ -131,7 +138,7 @@ FAULTS = {
     "cloud": ("sfm/pointcloud/pcd_results.ply", b"ply\n", "pcd_results.ply"),
     "log": ("watch_sensorlog_1.csv", b"a,b\n1,2\n", "not a watch's motion log"),
     "video": ("video/ego_video.MP4", b"none", "not a readable video"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -163,8 +170,12 @@ def test_a_board_without_a_right_angle_is_refused(tmp_path):
 @given(data=st.data())
 def test_damaged_files_are_read_or_refused(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("capture")
-    write_capture(folder, leave_out=("video/ego_video.MP4", "watch_sensorlog_1.csv", "watch_sensorlog_2.csv"), seconds=4.0)  # fmt: skip
-    path = folder / data.draw(st.sampled_from(["cam_traj.pkl", "camera_calib.pkl", "config.yaml", "sfm/undistort_calib.txt"]))  # fmt: skip
+    write_capture(
+        folder, leave_out=("video/ego_video.MP4", "watch_sensorlog_1.csv", "watch_sensorlog_2.csv"), seconds=4.0
+    )
+    path = folder / data.draw(
+        st.sampled_from(["cam_traj.pkl", "camera_calib.pkl", "config.yaml", "sfm/undistort_calib.txt"])
+    )
     content = path.read_bytes()
     if path.suffix == ".pkl":
         path.write_bytes(data.draw(mutated_bytes(content)))

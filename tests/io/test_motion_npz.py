@@ -22,24 +22,32 @@ from wearcap.recording import Motion
 from wearcap.recording.interactions import Interactions
 
 HELD = Interactions(
-    torch.tensor([1e3, 1e3 + 0.1]).double(), torch.tensor([1e3 + 0.1, 1e3 + 0.2]).double(),
-    torch.tensor([[True, False], [True, True]]), ("door", ""), ("hinged", ""),
-)  # fmt: skip
+    torch.tensor([1e3, 1e3 + 0.1]).double(),
+    torch.tensor([1e3 + 0.1, 1e3 + 0.2]).double(),
+    torch.tensor([[True, False], [True, True]]),
+    ("door", ""),
+    ("hinged", ""),
+)
 
 
 def sample(frames: int = 6) -> Motion:
     generator = torch.Generator().manual_seed(3)
     door = Trajectory(
-        torch.tensor([0.0, 0.3, 0.4], dtype=torch.float64), rotation.exp(torch.randn(3, 3, generator=generator)),
+        torch.tensor([0.0, 0.3, 0.4], dtype=torch.float64),
+        rotation.exp(torch.randn(3, 3, generator=generator)),
         torch.randn(3, 3, generator=generator),
-    )  # fmt: skip
+    )
     return Motion(
-        torch.arange(frames, dtype=torch.float64) / 30 + 1e3, xsens23(),
-        rotation.exp(torch.randn(frames, 23, 3, generator=generator)), torch.randn(frames, 3, generator=generator),
-        contact_prob=torch.rand(frames, 4, generator=generator), object_motion={"door": door},
-        hand_contact_prob=torch.rand(frames, 2, generator=generator), interactions=HELD,
+        torch.arange(frames, dtype=torch.float64) / 30 + 1e3,
+        xsens23(),
+        rotation.exp(torch.randn(frames, 23, 3, generator=generator)),
+        torch.randn(frames, 3, generator=generator),
+        contact_prob=torch.rand(frames, 4, generator=generator),
+        object_motion={"door": door},
+        hand_contact_prob=torch.rand(frames, 2, generator=generator),
+        interactions=HELD,
         provenance={"pipeline": "hmd2", "config": "ä"},
-    )  # fmt: skip
+    )
 
 
 def same(a: Motion, b: Motion) -> bool:
@@ -48,9 +56,11 @@ def same(a: Motion, b: Motion) -> bool:
     parts = [(a, b), (a.object_motion["door"], b.object_motion["door"]), (a.interactions, b.interactions)]
     pairs = [(getattr(x, f.name), getattr(y, f.name)) for x, y in parts for f in dataclasses.fields(x)]
     return all(
-        x.dtype == y.dtype and torch.equal(x, y) if isinstance(x, torch.Tensor) else isinstance(x, dict | Interactions) or x == y
+        x.dtype == y.dtype and torch.equal(x, y)
+        if isinstance(x, torch.Tensor)
+        else isinstance(x, dict | Interactions) or x == y
         for x, y in pairs
-    )  # fmt: skip
+    )
 
 
 def test_round_trip_is_exact_and_bytes_repeat(tmp_path):
@@ -121,20 +131,26 @@ FAULTS = {
     "other part": (lambda p: described(p, lambda t: t["motion"].update({"$type": "Site"})), "damaged"),
     "list": (lambda p: described(p, lambda t: t.update(motion=[1])), "no motion|damaged"),
     "loose site": (
-        lambda p: described(p, lambda t: t["motion"]["skeleton"]["sites"]["crown"].update(joint="tail")), "tail"
+        lambda p: described(p, lambda t: t["motion"]["skeleton"]["sites"]["crown"].update(joint="tail")),
+        "tail",
     ),
     "three hands": (lambda p: rewritten(p, hand_contact_prob=np.zeros((6, 3), np.float32)), "hand_contact_prob"),
-    "hands of other frames": (lambda p: rewritten(p, hand_contact_prob=np.zeros((5, 2), np.float32)), "hand_contact_prob"),
+    "hands of other frames": (
+        lambda p: rewritten(p, hand_contact_prob=np.zeros((5, 2), np.float32)),
+        "hand_contact_prob",
+    ),
     "interactions of NaN": (lambda p: rewritten(p, **{"interactions.stop_s": np.full(2, np.nan)}), "stop_s"),
     "ends of other interactions": (lambda p: rewritten(p, **{"interactions.stop_s": np.zeros(3)}), "stop_s"),
     "hands that are numbers": (lambda p: rewritten(p, **{"interactions.hands": np.ones((2, 2))}), "damaged"),
     "an object too many": (
-        lambda p: described(p, lambda t: t["motion"]["interactions"]["objects"]["$tuple"].append("a")), "2 interactions"),
+        lambda p: described(p, lambda t: t["motion"]["interactions"]["objects"]["$tuple"].append("a")),
+        "2 interactions",
+    ),
     "no interactions": (lambda p: described(p, lambda t: t["motion"].update(interactions=[1])), "damaged"),
     "empty file": (lambda p: p.write_bytes(b""), "readable .npz"),
     "garbage": (lambda p: p.write_bytes(bytes(range(256)) * 30), "readable .npz"),
     "truncated": (lambda p: p.write_bytes(p.read_bytes()[:3000]), "readable .npz"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -149,9 +165,7 @@ def test_hostile_motion_is_named(tmp_path, fault):
 
 def test_an_array_larger_than_its_file_is_refused_without_allocating(tmp_path):
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 40,)}
-    )
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 40,)})
     with zipfile.ZipFile(tmp_path / "m.npz", "w") as archive:
         archive.writestr("poses.npy", header.getvalue() + b"12345678")
     with pytest.raises(WearcapError, match="poses"):

@@ -17,12 +17,27 @@ from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.recording import Motion
 
 SEGMENTS = {
-    "Pelvis": "pelvis", "L5": "l5", "L3": "l3", "T12": "t12", "T8": "t8", "Neck": "neck", "Head": "head",
-    **{side + segment: f"{side.lower()}_{joint}" for side, segments in (
-        ("Right", ("Shoulder", "UpperArm", "ForeArm", "Hand")), ("Left", ("Shoulder", "UpperArm", "ForeArm", "Hand")),
-        ("Right", ("UpperLeg", "LowerLeg", "Foot", "Toe")), ("Left", ("UpperLeg", "LowerLeg", "Foot", "Toe")),
-    ) for segment, joint in zip(segments, ("collar", "shoulder", "elbow", "wrist") if "Hand" in segments else ("hip", "knee", "ankle", "toe"))},
-}  # fmt: skip
+    "Pelvis": "pelvis",
+    "L5": "l5",
+    "L3": "l3",
+    "T12": "t12",
+    "T8": "t8",
+    "Neck": "neck",
+    "Head": "head",
+    **{
+        side + segment: f"{side.lower()}_{joint}"
+        for side, segments in (
+            ("Right", ("Shoulder", "UpperArm", "ForeArm", "Hand")),
+            ("Left", ("Shoulder", "UpperArm", "ForeArm", "Hand")),
+            ("Right", ("UpperLeg", "LowerLeg", "Foot", "Toe")),
+            ("Left", ("UpperLeg", "LowerLeg", "Foot", "Toe")),
+        )
+        for segment, joint in zip(
+            segments,
+            ("collar", "shoulder", "elbow", "wrist") if "Hand" in segments else ("hip", "knee", "ankle", "toe"),
+        )
+    },
+}
 SENSORS = ["Pelvis", "T8", "Head", "LeftForeArm", "RightForeArm", "LeftLowerLeg", "Prop1"]
 CONTACTS = ["LeftFoot_Heel", "LeftFoot_Toe", "RightFoot_Heel", "RightFoot_Toe"]
 POINTS = {
@@ -60,24 +75,31 @@ def sensors(frames: int) -> tuple[torch.Tensor, torch.Tensor]:
 def mvnx(motion: Motion, rest: str = "identity", contacts: list[str] = CONTACTS) -> str:
     order = motion.skeleton.indices(*SEGMENTS.values())
     poses, (acc, R_sensor) = motion.T_world_joint, sensors(len(motion))
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<mvnx version="4" xmlns="http://www.xsens.com/mvn/mvnx">',
-             '<mvn version="2022.0.0" build="x"/><comment/>',
-             f'<subject label="Suit" frameRate="240" segmentCount="{len(SEGMENTS)}" configuration="FullBody"><segments>']  # fmt: skip
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        '<mvnx version="4" xmlns="http://www.xsens.com/mvn/mvnx">',
+        '<mvn version="2022.0.0" build="x"/><comment/>',
+        f'<subject label="Suit" frameRate="240" segmentCount="{len(SEGMENTS)}" configuration="FullBody"><segments>',
+    ]
     for k, label in enumerate(SEGMENTS, 1):
         point = (
-            f'<point label="{POINTS[label][0]}"><pos_b>{POINTS[label][1]}</pos_b></point>'
-            if label in POINTS
-            else ""
+            f'<point label="{POINTS[label][0]}"><pos_b>{POINTS[label][1]}</pos_b></point>' if label in POINTS else ""
         )
         lines.append(f'<segment label="{label}" id="{k}"><points>{point}</points></segment>')
-    lines += ["</segments><sensors>", *(f'<sensor label="{label}"/>' for label in SENSORS), "</sensors>",
-              '<joints><joint label="jL5S1"><connector1>Pelvis/jL5S1</connector1></joint></joints><footContactDefinition>',
-              *(f'<contactDefinition label="{label}" index="{k}"/>' for k, label in enumerate(contacts)),
-              '</footContactDefinition><frames segmentCount="23" sensorCount="7" jointCount="22">']  # fmt: skip
+    lines += [
+        "</segments><sensors>",
+        *(f'<sensor label="{label}"/>' for label in SENSORS),
+        "</sensors>",
+        '<joints><joint label="jL5S1"><connector1>Pelvis/jL5S1</connector1></joint></joints><footContactDefinition>',
+        *(f'<contactDefinition label="{label}" index="{k}"/>' for k, label in enumerate(contacts)),
+        '</footContactDefinition><frames segmentCount="23" sensorCount="7" jointCount="22">',
+    ]
     rest_joints = motion.skeleton.rest_joints[order]
     if rest:
-        lines.append(f'<frame time="0" index="" tc="00:00:00:00" ms="0" type="{rest}"><orientation>{IDENTITY * 23}</orientation>'
-                     f"<position>{numbers(rest_joints)}</position></frame>")  # fmt: skip
+        lines.append(
+            f'<frame time="0" index="" tc="00:00:00:00" ms="0" type="{rest}"><orientation>{IDENTITY * 23}</orientation>'
+            f"<position>{numbers(rest_joints)}</position></frame>"
+        )
         lines.append('<frame type="tpose-isb"><orientation>what else</orientation></frame>')
     patches = ["LeftFoot_Heel", "LeftFoot_Toe", "RightFoot_Heel", "RightFoot_Toe"]
     for k in range(len(motion)):
@@ -89,7 +111,7 @@ def mvnx(motion: Motion, rest: str = "identity", contacts: list[str] = CONTACTS)
             f"<footContacts>{' '.join(str(int(c)) for c in contact)}</footContacts>"
             f"<sensorFreeAcceleration>{numbers(acc[k])}</sensorFreeAcceleration>"
             f"<sensorOrientation>{numbers(rotation.quat_wxyz_from_matrix(R_sensor[k].double()))}</sensorOrientation></frame>"
-        )  # fmt: skip
+        )
     return "\n".join([*lines, "</frames></subject></mvnx>"])
 
 
@@ -105,24 +127,16 @@ def test_pose_bones_contacts_and_sensors_come_back(tmp_path, rest):
     back = recording.motion
     assert back.skeleton.name == "xsens23"
     assert back.fps == pytest.approx(240)
-    torch.testing.assert_close(
-        back.skeleton.t_parent_joint, motion.skeleton.t_parent_joint, atol=2e-6, rtol=0
-    )
+    torch.testing.assert_close(back.skeleton.t_parent_joint, motion.skeleton.t_parent_joint, atol=2e-6, rtol=0)
     torch.testing.assert_close(back.R_parent_joint, motion.R_parent_joint, atol=1e-5, rtol=0)
     torch.testing.assert_close(back.T_world_joint.t, motion.T_world_joint.t, atol=1e-5, rtol=0)
     torch.testing.assert_close(back.contact_prob, motion.contact_prob)
     assert back.skeleton.sites["left_heel"].t_joint_site == pytest.approx((-0.06, 0, -0.05))
     assert back.skeleton.sites["crown"].t_joint_site == pytest.approx((0, 0, 0.2))
     acc, R_sensor = sensors(len(motion))
-    assert set(recording.imu) == {
-        "pelvis",
-        "t8",
-        "head",
-        "left_elbow",
-        "right_elbow",
-        "left_knee",
-        "right_knee",
-    } - {"right_knee"}
+    assert set(recording.imu) == {"pelvis", "t8", "head", "left_elbow", "right_elbow", "left_knee", "right_knee"} - {
+        "right_knee"
+    }
     torch.testing.assert_close(recording.imu["left_elbow"].acc_world, acc[:, 3], atol=1e-6, rtol=0)
     torch.testing.assert_close(recording.imu["left_elbow"].R_world_imu, R_sensor[:, 3], atol=1e-6, rtol=0)
 
@@ -174,14 +188,20 @@ FAULTS = {
     "nan": (re.sub(r"(<sensorFreeAcceleration>)\S+", r"\1nan", TEXT), "normal frame 0: not finite"),
     "nan at rest": (TEXT.replace(IDENTITY, "nan 0 0 0 ", 1), "identity frame: not finite"),
     "missing field": (re.sub(r"(?s)(.*)<footContacts>.*?</footContacts>", r"\1", TEXT), "frame 1: a frame with"),
-    "no quaternion": (TEXT.replace("<sensorOrientation>", "<sensorOrientation>7").replace("7-", "-7"), "unit quaternion"),
+    "no quaternion": (
+        TEXT.replace("<sensorOrientation>", "<sensorOrientation>7").replace("7-", "-7"),
+        "unit quaternion",
+    ),
     "rate 0": (TEXT.replace('frameRate="240"', 'frameRate="0"'), "frame rate"),
     "rate text": (TEXT.replace('frameRate="240"', 'frameRate="fast"'), "cannot be understood"),
     "no rate": (TEXT.replace('frameRate="240"', ""), "cannot be understood"),
     "frames backwards": (TEXT.replace('index="1" tc', 'index="0" tc'), "repeat or fall"),
-    "huge count": (TEXT.replace('segmentCount="23"', 'segmentCount="99999999999"').replace('index="1" tc', 'index="x" tc'), "normal frame x"),
+    "huge count": (
+        TEXT.replace('segmentCount="23"', 'segmentCount="99999999999"').replace('index="1" tc', 'index="x" tc'),
+        "normal frame x",
+    ),
     "segment without label": (TEXT.replace('<segment label="L5"', "<segment"), "cannot be understood"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

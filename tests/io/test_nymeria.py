@@ -44,8 +44,7 @@ def suit_motion(seconds=30.0):
 def planted_world(t):
     """The suit's world in the device's: a turn and shift that drift."""
     return Rigid(
-        rotation.about_axis("z", 0.7 + 0.004 * t),
-        torch.stack([3 + 0.01 * t, -1 - 0.02 * t, 0.2 + 0.002 * t], -1),
+        rotation.about_axis("z", 0.7 + 0.004 * t), torch.stack([3 + 0.01 * t, -1 - 0.02 * t, 0.2 + 0.002 * t], -1)
     )
 
 
@@ -58,12 +57,14 @@ def write_sequence(folder, *, hz_device=120, break_xdata=None):
     t, skeleton, _, T_joint = suit_motion()
     quat = rotation.quat_wxyz_from_matrix(T_joint.R)
     arrays = {
-        "timestamps_us": np.round(1e6 * (1000 + t.numpy())).astype(np.int64), "frameCount": np.array([len(t)]),
-        "frameRate": np.array([240]), "segmentCount": np.array([23]),
+        "timestamps_us": np.round(1e6 * (1000 + t.numpy())).astype(np.int64),
+        "frameCount": np.array([len(t)]),
+        "frameRate": np.array([240]),
+        "segmentCount": np.array([23]),
         "segment_tXYZ": T_joint.t.reshape(len(t), -1).numpy().astype(np.float32),
         "segment_qWXYZ": quat.reshape(len(t), -1).numpy().astype(np.float32),
         "foot_contacts": (np.arange(len(t))[:, None] // 60 % 2 == [0, 0, 1, 1]).astype(np.int8),
-    }  # fmt: skip
+    }
     (folder / "body").mkdir(parents=True)
     np.savez(folder / "body" / "xdata.npz", **(break_xdata(arrays) if break_xdata else arrays))
     step = HZ // hz_device
@@ -72,9 +73,17 @@ def write_sequence(folder, *, hz_device=120, break_xdata=None):
     wxyz = rotation.quat_wxyz_from_matrix(T_world_aria.R).numpy()
     count, slam = len(wxyz), folder / "recording_head" / "mps" / "slam"
     slam.mkdir(parents=True)
-    header = ["graph_uid", "tracking_timestamp_us", "utc_timestamp_ns", *(f"t{a}_world_device" for a in "xyz"),
-              *(f"q{a}_world_device" for a in "xyzw"), *(f"device_linear_velocity_{a}_device" for a in "xyz"),
-              *(f"angular_velocity_{a}_device" for a in "xyz"), *(f"gravity_{a}_world" for a in "xyz"), "quality_score"]  # fmt: skip
+    header = [
+        "graph_uid",
+        "tracking_timestamp_us",
+        "utc_timestamp_ns",
+        *(f"t{a}_world_device" for a in "xyz"),
+        *(f"q{a}_world_device" for a in "xyzw"),
+        *(f"device_linear_velocity_{a}_device" for a in "xyz"),
+        *(f"angular_velocity_{a}_device" for a in "xyz"),
+        *(f"gravity_{a}_world" for a in "xyz"),
+        "quality_score",
+    ]
     times = np.round(1e6 * (1000 + OFFSET_S + t[::step].numpy())).astype(np.int64)
     body = np.column_stack(
         [
@@ -94,14 +103,7 @@ def write_sequence(folder, *, hz_device=120, break_xdata=None):
             "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std\n1,g,1,2,0,0.001,0.001\n2,g,1,2,9,0.1,1\n"
         )
     (folder / "metadata.json").write_text(
-        json.dumps(
-            {
-                "fake_name": "ada_byron",
-                "location": "loc7",
-                "script": "S3-cooking",
-                "participant_height_cm": 160,
-            }
-        )
+        json.dumps({"fake_name": "ada_byron", "location": "loc7", "script": "S3-cooking", "participant_height_cm": 160})
     )
     return folder
 
@@ -198,7 +200,7 @@ def test_cleaning(tmp_path):
         (lambda a: a | {"foot_contacts": a["foot_contacts"][:, :2]}, "foot_contacts"),
         (lambda a: a | {"timestamps_us": np.cumsum(np.full(len(a["timestamps_us"]), 16667))}, "after cleaning"),
     ],
-)  # fmt: skip
+)
 def test_defects_are_named(tmp_path, damage, message):
     folder = write_sequence(tmp_path / "s", break_xdata=damage)
     with pytest.raises(WearcapError, match=message):
@@ -242,9 +244,7 @@ def test_noise_and_outliers_move_the_seat_little():
     position[600:660] += 1.0
     head = skeleton.index("head")
     suit = Trajectory(t, T_joint.R[:, head].float(), T_joint.t[:, head].float())
-    alignment = align_head(
-        suit, Trajectory(t[::4], (seen.R @ shake).float(), position.float()), T_HEAD_DEVICE.t
-    )
+    alignment = align_head(suit, Trajectory(t[::4], (seen.R @ shake).float(), position.float()), T_HEAD_DEVICE.t)
     assert (alignment.T_head_device.t - SEAT.t).norm() < 0.012
     assert rotation.geodesic(alignment.T_head_device.R, SEAT.R) < math.radians(0.5)
 
@@ -252,8 +252,14 @@ def test_noise_and_outliers_move_the_seat_little():
 def test_smpl_poses_turn_to_our_axes(tmp_path):
     """A person who stands upright and faces +y in the Aria world: SMPL's y axis up, its z axis along +y."""
     upright = rotation.log(torch.tensor([[-1.0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]])).numpy()
-    np.savez(tmp_path / "s.npz", timestamps=np.array([0, 33333]), global_orient=np.tile(upright, (2, 1)),
-             body_pose=np.zeros((2, 69)), transl=np.zeros((2, 3)), betas=np.zeros((2, 10)))  # fmt: skip
+    np.savez(
+        tmp_path / "s.npz",
+        timestamps=np.array([0, 33333]),
+        global_orient=np.tile(upright, (2, 1)),
+        body_pose=np.zeros((2, 69)),
+        transl=np.zeros((2, 3)),
+        betas=np.zeros((2, 10)),
+    )
     motion = read_smpl_neutral(tmp_path / "s.npz")
     joints = motion.T_world_joint.t[0]
     assert (joints[motion.skeleton.index("head")] - joints[motion.skeleton.index("left_ankle")])[2] > 1.2

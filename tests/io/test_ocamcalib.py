@@ -118,7 +118,7 @@ def test_damaged_text_is_named(damage, message, tmp_path):
         (lambda text: text.replace("<SensorFrame>", '<!DOCTYPE x [<!ENTITY a "b">]><SensorFrame>'), "document type"),
         (lambda text: text.replace("cam1", "cam0"), "twice"),
     ],
-)  # fmt: skip
+)
 def test_damaged_xml_is_named(damage, message, tmp_path):
     (tmp_path / "sensor_frame.xml").write_text(damage(xml_of({"cam0": lens(), "cam1": lens()})))
     with pytest.raises(WearcapError, match=message):

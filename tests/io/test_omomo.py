@@ -9,16 +9,7 @@ import torch
 from hostile import fuzz, mutated_bytes
 from hypothesis import given
 from hypothesis import strategies as st
-from one_object_files import (
-    CORNERS,
-    OMOMO_NAME,
-    SCALE,
-    carried,
-    obj_text,
-    omomo_entry,
-    standing_about,
-    write_omomo,
-)
+from one_object_files import CORNERS, OMOMO_NAME, SCALE, carried, obj_text, omomo_entry, standing_about, write_omomo
 
 from wearcap.body.skeletons import smplx22
 from wearcap.errors import WearcapError
@@ -50,17 +41,19 @@ def test_body_and_object_of_a_sequence(tmp_path):
 def test_the_mesh_is_placed_by_the_data_sets_own_rule(tmp_path):
     """scale · R · v + t."""
     entry, take = omomo_entry(), take_of(write_omomo(tmp_path))
-    wanted = SCALE * np.einsum("tij,vj->tvi", entry["obj_rot"], CORNERS / SCALE) + entry[
-        "obj_trans"
-    ].transpose(0, 2, 1)
+    wanted = SCALE * np.einsum("tij,vj->tvi", entry["obj_rot"], CORNERS / SCALE) + entry["obj_trans"].transpose(0, 2, 1)
     posed = np.asarray(take.path.T_world_body[:, None] @ torch.from_numpy(take.mesh.vertices))
     np.testing.assert_allclose(posed, wanted, atol=1e-5)
 
 
 def test_both_files_other_shapes_and_no_root_joint(tmp_path):
     entry = omomo_entry(name="sub2_largebox_001")
-    entry |= {"pose_body": entry["pose_body"].reshape(-1, 21, 3), "obj_trans": entry["obj_trans"][:, :, 0],
-              "gender": "male", "betas": entry["betas"][0]}  # fmt: skip
+    entry |= {
+        "pose_body": entry["pose_body"].reshape(-1, 21, 3),
+        "obj_trans": entry["obj_trans"][:, :, 0],
+        "gender": "male",
+        "betas": entry["betas"][0],
+    }
     trans = entry["trans"]
     del entry["trans2joint"]
     write_omomo(write_omomo(tmp_path), entry, split="train")
@@ -91,17 +84,24 @@ FAULTS = {
     "lists": ({"trans": [[0.0, 0, 0]] * 180}, "no array 'trans'"),
     "NaN": ({"root_orient": np.full((180, 3), np.nan)}, "'root_orient' holds NaN"),
     "NaN object": ({"obj_trans": np.full((180, 3, 1), np.nan)}, "'obj_trans' holds NaN"),
-    "shorter": ({key: omomo_entry()[key][:170] for key in ("obj_rot", "obj_trans", "obj_scale")},
-                "the object has 170 frames, the body 180"),
+    "shorter": (
+        {key: omomo_entry()[key][:170] for key in ("obj_rot", "obj_trans", "obj_scale")},
+        "the object has 170 frames, the body 180",
+    ),
     "quaternions": ({"obj_rot": np.zeros((180, 4))}, "array 'obj_rot' has shape"),
     "no rotation": ({"obj_rot": np.ones((180, 3, 3))}, "obj_rot of frame 0 is no rotation .180 such"),
     "no scale": ({"obj_scale": np.zeros(180)}, "nowhere positive"),
     "grows": ({"obj_scale": np.linspace(0.5, 1.0, 180)}, "obj_scale runs from 0.5 to 1"),
     "root joint": ({"trans2joint": np.zeros(4)}, "'trans2joint' has shape"),
     "NaN betas": ({"betas": np.full((1, 16), np.nan)}, "'betas' holds NaN"),
-    "no frames": ({key: omomo_entry()[key][:0] for key in (
-        "trans", "root_orient", "pose_body", "obj_rot", "obj_trans", "obj_scale")}, "at least one"),
-}  # fmt: skip
+    "no frames": (
+        {
+            key: omomo_entry()[key][:0]
+            for key in ("trans", "root_orient", "pose_body", "obj_rot", "obj_trans", "obj_scale")
+        },
+        "at least one",
+    ),
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -25,15 +25,12 @@ def assert_same(a: Ply, b: Ply):
 
 def foreign_ply(kind: str) -> bytes:
     """The cloud written by hand: doubles, an extra property, quads among the triangles."""
-    header = (f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex 4\nproperty double x\nproperty double y\n"
-              "property double z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nproperty float quality\n"
-              "element face 2\nproperty list uchar int vertex_index\nend_header\n")  # fmt: skip
-    vertices = [
-        (0, 0, 0, 1, 0, 1, 0.5),
-        (1, 0, 0, 0, 1, 0, 0.5),
-        (1, 1, 0, 1, 1, 1, 0.5),
-        (0, 1, 0, 0, 0, 0, 0.5),
-    ]
+    header = (
+        f"ply\nformat {kind} 1.0\ncomment by hand\nelement vertex 4\nproperty double x\nproperty double y\n"
+        "property double z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nproperty float quality\n"
+        "element face 2\nproperty list uchar int vertex_index\nend_header\n"
+    )
+    vertices = [(0, 0, 0, 1, 0, 1, 0.5), (1, 0, 0, 0, 1, 0, 0.5), (1, 1, 0, 1, 1, 1, 0.5), (0, 1, 0, 0, 0, 0, 0.5)]
     faces = [(3, 0, 1, 2), (4, 0, 1, 2, 3)]
     if kind == "ascii":
         return (header + "".join(" ".join(map(str, row)) + "\n" for row in vertices + faces)).encode()
@@ -57,8 +54,10 @@ def test_every_encoding_reads_alike(tmp_path, kind):
     ("name", "code"), [("uchar", "B"), ("ushort", "H"), ("uint", "I"), ("char", "b"), ("int", "i")]
 )
 def test_corners_of_every_whole_type_are_read(tmp_path, name, code):
-    header = ("ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
-              f"property float z\nelement face 1\nproperty list uchar {name} vertex_indices\nend_header\n")  # fmt: skip
+    header = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face 1\nproperty list uchar {name} vertex_indices\nend_header\n"
+    )
     for corner in (1, 3):
         face = struct.pack(f"<B3{code}", 3, 0, 2, corner)
         (tmp_path / "a.ply").write_bytes(header.encode() + struct.pack("<9f", *range(9)) + face)
@@ -71,9 +70,7 @@ def test_corners_of_every_whole_type_are_read(tmp_path, name, code):
 
 @pytest.mark.parametrize("part", ["points", "colors", "all"])
 def test_round_trip(tmp_path, part):
-    ply = Ply(
-        CLOUD.points, None if part == "points" else CLOUD.colors, CLOUD.faces if part == "all" else None
-    )
+    ply = Ply(CLOUD.points, None if part == "points" else CLOUD.colors, CLOUD.faces if part == "all" else None)
     write_ply(ply, tmp_path / "a.ply")
     assert_same(read_ply(tmp_path / "a.ply"), ply)
 
@@ -123,12 +120,7 @@ def test_damaged_files_never_crash(tmp_path_factory, data):
     """Any byte may be changed: the reader reads or refuses, it does not fall over."""
     folder = tmp_path_factory.mktemp("fuzz")
     name = data.draw(st.sampled_from(["a.ply", "b.ply", "c.pcd", "d.pcd"]))
-    kind = {
-        "a.ply": "ascii",
-        "b.ply": "binary_little_endian",
-        "c.pcd": "ascii",
-        "d.pcd": "binary_compressed",
-    }[name]
+    kind = {"a.ply": "ascii", "b.ply": "binary_little_endian", "c.pcd": "ascii", "d.pcd": "binary_compressed"}[name]
     content = bytearray(foreign_ply(kind) if name.endswith("ply") else pcd_bytes(kind))
     for _ in range(data.draw(st.integers(1, 4))):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
@@ -151,9 +143,7 @@ def pcd_bytes(kind: str) -> bytes:
     if kind == "binary":
         return header.encode() + b"".join(p.tobytes() + c.tobytes() for p, c in zip(POINTS, PACKED))
     plain = POINTS.T.tobytes() + PACKED.tobytes()
-    literal = b"".join(
-        bytes([len(part) - 1]) + part for part in (plain[i : i + 32] for i in range(0, len(plain), 32))
-    )
+    literal = b"".join(bytes([len(part) - 1]) + part for part in (plain[i : i + 32] for i in range(0, len(plain), 32)))
     return header.encode() + struct.pack("<II", len(literal), len(plain)) + literal
 
 

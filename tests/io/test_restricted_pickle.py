@@ -51,10 +51,7 @@ def test_plain_data_comes_back(tmp_path, protocol):
 
 @pytest.mark.parametrize("compress", [0, 3, ("gzip", 3), ("bz2", 3), ("xz", 3)])
 def test_joblib_files_come_back(tmp_path, compress):
-    value = {
-        0: {"trans": VALUE["poses"], "rot": VALUE["transes"], "name": "a"},
-        1: {"trans": np.ones((2, 2))},
-    }
+    value = {0: {"trans": VALUE["poses"], "rot": VALUE["transes"], "name": "a"}, 1: {"trans": np.ones((2, 2))}}
     joblib.dump(value, tmp_path / "v.p", compress=compress)
     back = read_pickle(tmp_path / "v.p")
     assert same(value[0], back[0])
@@ -140,9 +137,7 @@ def test_fuzz_gives_plain_data_or_one_clear_error(tmp_path, data, protocol):
 @fuzz
 @given(
     opcodes=st.lists(
-        st.sampled_from(
-            b"(.0123FIJKLMNPQRSTUVXabcdeghijlmopqrstu}]\x80\x81\x82\x85\x86\x87\x88\x8c\x93\x94\n19"
-        ),
+        st.sampled_from(b"(.0123FIJKLMNPQRSTUVXabcdeghijlmopqrstu}]\x80\x81\x82\x85\x86\x87\x88\x8c\x93\x94\n19"),
         max_size=40,
     )
 )

@@ -15,14 +15,7 @@ from hypothesis import strategies as st
 from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.totalcapture import (
-    DIP_IMU,
-    R_UP,
-    TOTALCAPTURE,
-    as_watches,
-    read_dip_imu,
-    read_totalcapture,
-)
+from wearcap.io.datasets.totalcapture import DIP_IMU, R_UP, TOTALCAPTURE, as_watches, read_dip_imu, read_totalcapture
 from wearcap.io.formats.smpl_axes import A
 from wearcap.recording import Motion
 from wearcap_testing import swaying_motion
@@ -37,9 +30,10 @@ def recorded(joints=TOTALCAPTURE, frames: int = 240) -> dict[str, np.ndarray]:
     ori = R_UP.T @ motion.T_world_joint.R[:, index].double() @ A
     random = np.random.default_rng(0)
     return {
-        "ori": ori.numpy().astype(np.float32), "acc": random.normal(0, 2, (frames, len(joints), 3)),
+        "ori": ori.numpy().astype(np.float32),
+        "acc": random.normal(0, 2, (frames, len(joints), 3)),
         "gt": rotation.log(R).flatten(1).numpy(),
-    }  # fmt: skip
+    }
 
 
 def dip(frames: int = 240) -> dict[str, np.ndarray]:
@@ -69,9 +63,7 @@ def test_totalcapture(tmp_path, suffix):
         assert rotation.geodesic(stream.R_world_imu, worn).max() < 1e-3
     expected = arrays["acc"][:, 4] @ R_UP.numpy().T
     np.testing.assert_allclose(read.imu["head"].acc_world.numpy(), expected, atol=1e-5)
-    assert read.imu["head"].acc_world[0, 2].item() == pytest.approx(
-        arrays["acc"][0, 4, 1], abs=1e-5
-    )  # y was up
+    assert read.imu["head"].acc_world[0, 2].item() == pytest.approx(arrays["acc"][0, 4, 1], abs=1e-5)  # y was up
 
 
 def test_the_body_is_as_it_was(tmp_path):

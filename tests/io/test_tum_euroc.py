@@ -40,7 +40,9 @@ def test_tum_scalar_comes_last(tmp_path):
 
 def test_euroc_scalar_comes_first(tmp_path):
     header = "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z [],v_x [m s^-1]\n"
-    lines = "1403636580838555648,4.6,-1.7,0.8,0.70710678,0,0,0.70710678,0.1\n1403636580843555648,4.7,-1.7,0.8,1,0,0,0,0.1\n"
+    lines = (
+        "1403636580838555648,4.6,-1.7,0.8,0.70710678,0,0,0.70710678,0.1\n1403636580843555648,4.7,-1.7,0.8,1,0,0,0,0.1\n"
+    )
     (tmp_path / "data.csv").write_text(header + lines)
     track = read_euroc(tmp_path / "data.csv")
     assert track.R_world_body[0, :, 0].tolist() == pytest.approx([0, 1, 0], abs=1e-6)
@@ -66,11 +68,7 @@ def test_tum_defects(tmp_path, text, message):
 
 
 def test_euroc_defects(tmp_path):
-    for text, message in {
-        "": "no poses",
-        "1,2,3\n": "not an EuRoC",
-        "a,b,c,d,e,f,g,h\n": "not an EuRoC",
-    }.items():
+    for text, message in {"": "no poses", "1,2,3\n": "not an EuRoC", "a,b,c,d,e,f,g,h\n": "not an EuRoC"}.items():
         (tmp_path / "e.csv").write_text(text)
         with pytest.raises(WearcapError, match=message):
             read_euroc(tmp_path / "e.csv")

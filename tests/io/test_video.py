@@ -70,9 +70,7 @@ def png(width: int, height: int) -> bytes:
     """A black picture in a few bytes per thousand pixels."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-        )
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
     head = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
     pixels = zlib.compress(bytes((width + 7) // 8 * height + height), 9)
@@ -121,8 +119,7 @@ def test_written_pictures_come_back(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("shapes", "message"),
-    [([], "no pictures"), ([(31, 48)], "48x31 pixels"), ([(32, 48), (32, 50)], "50x32 pixels")],
+    ("shapes", "message"), [([], "no pictures"), ([(31, 48)], "48x31 pixels"), ([(32, 48), (32, 50)], "50x32 pixels")]
 )
 def test_pictures_that_make_no_video_are_named(shapes, message, tmp_path):
     with pytest.raises(WearcapError, match=f"a.mp4.*{message}"):

@@ -25,7 +25,9 @@ def moved(frames: int = 120) -> ImuStream:
     return ImuStream(time, "left_wrist", R.float(), acc.float(), felt.float(), turn.float())
 
 
-def sensor_logger(watch: ImuStream, path: Path, *, android: bool = False, back: bool = False, swap: bool = False) -> Path:  # fmt: skip
+def sensor_logger(
+    watch: ImuStream, path: Path, *, android: bool = False, back: bool = False, swap: bool = False
+) -> Path:
     R = watch.R_world_imu.double()
     free = (R.mT @ watch.acc_world.double()[..., None])[..., 0]
     gravity = watch.acc_imu.double() - free
@@ -49,7 +51,7 @@ def sensor_log(watch: ImuStream, path: Path) -> Path:
     free = -(R.mT @ watch.acc_world.double()[..., None])[..., 0] / G_M_S2
     quaternion = rotation.quat_wxyz_from_matrix(R)[:, [1, 2, 3, 0]]
     names = [f"accelerometerAcceleration{axis}(G)" for axis in "XYZ"]
-    names += [f"motionUserAcceleration{axis}(G)" for axis in "XYZ"] + [f"motionQuaternion{axis}(R)" for axis in "XYZW"]  # fmt: skip
+    names += [f"motionUserAcceleration{axis}(G)" for axis in "XYZ"] + [f"motionQuaternion{axis}(R)" for axis in "XYZW"]
     table = torch.cat([-watch.acc_imu.double() / G_M_S2, free, quaternion], -1).tolist()
     rows = [
         ",".join([datetime.fromtimestamp(time, UTC).isoformat(), *(f"{value:.9f}" for value in row)])
@@ -94,9 +96,7 @@ def test_bad_logs_are_refused(tmp_path):
     refused([*lines[:5], lines[6], lines[5], *lines[7:]], "time does not grow at row 5")
     refused(lines[:2], "1 rows")
     refused([lines[0], *lines[1::5]], "10.0 rows a second")
-    refused(
-        [*lines[:3], lines[3].rpartition(",")[0] + ",nan", *lines[4:]], "quaternion of row 2 is not finite"
-    )
+    refused([*lines[:3], lines[3].rpartition(",")[0] + ",nan", *lines[4:]], "quaternion of row 2 is not finite")
     fields = lines[1].split(",")
     refused([lines[0], ",".join([*fields[:-1], "0.9"]), *lines[2:]], "attitude of length")
     refused(["time,x,y", "1,2,3"], "not a watch's motion log")
@@ -116,8 +116,7 @@ def test_a_real_watch_knows_where_up_is(real_data, name):
     # The turn rate agrees with how the attitude turns, away from gaps.
     near = torch.from_numpy(step < 0.015)
     turned = (
-        rotation.log((watch.R_world_imu[:-1].mT @ watch.R_world_imu[1:]).double())
-        / watch.timestamps.diff()[:, None]
+        rotation.log((watch.R_world_imu[:-1].mT @ watch.R_world_imu[1:]).double()) / watch.timestamps.diff()[:, None]
     )
     error = (turned - watch.gyro_imu[1:]).norm(dim=-1)[near]
     assert error.median() < 0.1 * watch.gyro_imu.norm(dim=-1).median()

@@ -18,9 +18,7 @@ _OVERSAMPLING = 2
 def rays_of(camera: Camera) -> np.ndarray:
     """Rays of all subpixels: (subpixel y, subpixel x, 3)."""
     x, y = (torch.arange(n, dtype=torch.float64) for n in (camera.width, camera.height))
-    rays = (
-        camera.unproject(torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)).nan_to_num(0.0).float().numpy()
-    )
+    rays = camera.unproject(torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)).nan_to_num(0.0).float().numpy()
     return cv2.resize(rays, None, fx=_OVERSAMPLING, fy=_OVERSAMPLING)
 
 
@@ -61,6 +59,5 @@ def pictures(
     random, rays = np.random.default_rng(seed), rays_of(camera)
     tilt = {"tilt_deg": options.pop("tilt_deg")} if "tilt_deg" in options else {}
     return [
-        (f"{k:03d}.png", picture(rays, board, *pose(random, board, **tilt), seed=k, **options))
-        for k in range(count)
+        (f"{k:03d}.png", picture(rays, board, *pose(random, board, **tilt), seed=k, **options)) for k in range(count)
     ]

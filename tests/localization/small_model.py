@@ -15,16 +15,12 @@ def camera_path(count: int) -> tuple[np.ndarray, Rotation]:
     return t, Rotation.from_rotvec(0.02 * np.arange(count)[:, None] * [[0, 1, 0]])
 
 
-def write_model(
-    folder: Path, names: list[str], *, missing: tuple[int, ...] = (), error_px: float = 0.0
-) -> np.ndarray:
+def write_model(folder: Path, names: list[str], *, missing: tuple[int, ...] = (), error_px: float = 0.0) -> np.ndarray:
     """Write cameras, images and points3D of pictures, but for those of `missing` numbers; returns the points."""
     folder.mkdir(parents=True, exist_ok=True)
     points = np.random.default_rng(0).uniform([-1, -1, 4], [4, 1, 6], (60, 3))
     t, R = camera_path(len(names))
-    (folder / "cameras.txt").write_text(
-        f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n"
-    )
+    (folder / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n")
     lines = []
     for k, name in enumerate(names):
         if k in missing:

@@ -14,14 +14,7 @@ from wearcap.cli import main as cli
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.io.formats.camera_json import read_camera, write_camera
-from wearcap.localization.checkerboard import (
-    Board,
-    View,
-    calibrate_from_pictures,
-    coverage,
-    find_board,
-    varied,
-)
+from wearcap.localization.checkerboard import Board, View, calibrate_from_pictures, coverage, find_board, varied
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +44,7 @@ def test_a_wrong_view_is_rejected(shown):
     bent = shown[3][1]
     x, y = np.meshgrid(np.arange(bent.shape[1], dtype=np.float32), np.arange(bent.shape[0], dtype=np.float32))
     bent = cv2.remap(
-        bent,
-        x + 6 * np.sin(x / 40),
-        y + 5 * np.sin(x / 55),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
+        bent, x + 6 * np.sin(x / 40), y + 5 * np.sin(x / 55), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     found = calibrate_from_pictures([*shown, ("bent.png", bent)], BOARD)
     assert "bent.png" in [view.name for view in found.rejected]
@@ -69,9 +58,12 @@ def test_corners_lie_where_the_camera_projects_them():
     view = find_board(gray, BOARD)
     assert view is not None
     expected = cv2.projectPoints(
-        BOARD.points, cv2.Rodrigues(R)[0], t,
-        np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]]), np.array(CAMERA.distortion),
-    )[0].reshape(-1, 2)  # fmt: skip
+        BOARD.points,
+        cv2.Rodrigues(R)[0],
+        t,
+        np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]]),
+        np.array(CAMERA.distortion),
+    )[0].reshape(-1, 2)
     error = min(np.abs(view.corners - way).max() for way in (expected, expected[::-1]))
     assert error < 0.35
 
@@ -80,10 +72,7 @@ def test_blurred_pictures_stand_back_for_sharp_ones(shown):
     blurred = [(f"b{name}", cv2.GaussianBlur(image, None, 2.5)) for name, image in shown[:6]]
     found = calibrate_from_pictures([*blurred, *shown], BOARD)
     assert not any(view.name.startswith("b") for view in found.views)
-    assert (
-        min(find_board(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), BOARD).blur_px for _, image in blurred[3:4])
-        > 4
-    )
+    assert min(find_board(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), BOARD).blur_px for _, image in blurred[3:4]) > 4
 
 
 def test_varied_views_are_chosen():
@@ -110,10 +99,7 @@ def test_frontal_views_leave_the_focal_length_open(tilt_deg):
 @pytest.mark.parametrize(
     ("board", "message"),
     [
-        (
-            Board(9, 6, 0.03),
-            "no board of 9x6 inner corners in 3 pictures of 480x360 .* 8x5 inner corners was found",
-        ),
+        (Board(9, 6, 0.03), "no board of 9x6 inner corners in 3 pictures of 480x360 .* 8x5 inner corners was found"),
         (Board(12, 9, 0.03), "no board of 12x9 .*Count inner corners"),
     ],
 )
@@ -185,11 +171,7 @@ def test_the_verb_on_a_video(shown, tmp_path):
 
 @pytest.mark.parametrize(
     ("source", "message"),
-    [
-        ("none.mp4", "no such file or folder"),
-        (".", "no pictures in this folder"),
-        ("bad.mp4", "not a readable video"),
-    ],
+    [("none.mp4", "no such file or folder"), (".", "no pictures in this folder"), ("bad.mp4", "not a readable video")],
 )
 def test_the_verb_says_what_is_wrong(source, message, tmp_path, capfd):
     (tmp_path / "bad.mp4").write_bytes(b"nothing of a video")

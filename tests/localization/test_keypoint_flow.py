@@ -58,7 +58,7 @@ def detections(at: dict[int, float]) -> RecordedDetections:
     )
 
 
-def followed(pictures: list[np.ndarray], detector: Detector, settings=FlowSettings()) -> tuple[np.ndarray, Cue]:  # fmt: skip
+def followed(pictures: list[np.ndarray], detector: Detector, settings=FlowSettings()) -> tuple[np.ndarray, Cue]:
     """Frames at which the wrist is seen, and its cue."""
     times = torch.arange(len(pictures), dtype=torch.float64) / 30
     cue = tracked_cues(iter(pictures), times, detector, settings)["left_wrist"]
@@ -139,9 +139,7 @@ def test_several_keypoints_at_once_are_as_one_by_one():
     np.testing.assert_allclose(spotted[-1].pixels[-1], at["still"], atol=0.1)
     for column, (name, one) in enumerate(alone.items()):
         whole = single[name] + one.finish()
-        np.testing.assert_allclose(
-            [s.pixels[column] for s in spotted], [s.pixels[0] for s in whole], atol=0.02
-        )
+        np.testing.assert_allclose([s.pixels[column] for s in spotted], [s.pixels[0] for s in whole], atol=0.02)
 
 
 def test_a_video_is_not_held_whole():
@@ -164,7 +162,7 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(WearcapError, match="after one of 320x240"):
         tracked_cues(sizes, torch.arange(2, dtype=torch.float64), detections({0: 1.0}))
     with pytest.raises(WearcapError, match="3 coordinates"):
-        RecordedDetections({"head": Cue(torch.zeros(1).double(), "head", torch.zeros(1, 3), torch.ones(1))}, 0.1)  # fmt: skip
+        RecordedDetections({"head": Cue(torch.zeros(1).double(), "head", torch.zeros(1, 3), torch.ones(1))}, 0.1)
     with pytest.raises(WearcapError, match="flow over -1 frames"):
         FlowSettings(reach=-1)
     assert isinstance(detections({0: 1.0}), Detector)

@@ -194,9 +194,7 @@ def test_wrong_use_is_explained(superpoint, lightglue):
         SuperPointExtractor(superpoint)(np.zeros((40, 20, 3), np.uint8))
     with pytest.raises(WearcapError, match="device 'abacus'"):
         SuperPointExtractor(superpoint, device="abacus")
-    sift = Features(
-        np.zeros((3, 2), np.float32), np.zeros((3, 128), np.float32), np.ones(3, np.float32), (64, 64)
-    )
+    sift = Features(np.zeros((3, 2), np.float32), np.zeros((3, 128), np.float32), np.ones(3, np.float32), (64, 64))
     with pytest.raises(WearcapError, match="descriptors of 128 numbers"):
         LightGlueMatcher(lightglue)(sift, sift)
 

@@ -187,12 +187,23 @@ def test_a_matcher_of_picture_pairs(mapper, room_map):
     image = photograph(mapper, QUERY, truth)
     assert errors(localizer(image, QUERY), truth)[1] < 0.03
     twice = replace(
-        room_map, names=room_map.names * 2, cameras=room_map.cameras * 2,
+        room_map,
+        names=room_map.names * 2,
+        cameras=room_map.cameras * 2,
         first=np.concatenate([room_map.first, room_map.first[-1] + room_map.first[1:]]),
-        **{name: np.concatenate([getattr(room_map, name)] * 2) for name in (
-            "R_world_cam", "t_world_cam", "keypoints", "descriptors", "positions", "landmark", "global_descriptors"
-        )},
-    )  # fmt: skip
+        **{
+            name: np.concatenate([getattr(room_map, name)] * 2)
+            for name in (
+                "R_world_cam",
+                "t_world_cam",
+                "keypoints",
+                "descriptors",
+                "positions",
+                "landmark",
+                "global_descriptors",
+            )
+        },
+    )
     again = Localizer(twice, EXTRACTOR, mutual, replace(settings, retrieved=20))
     # the same pictures once more tell no more
     assert again(image, QUERY).inliers == localizer(image, QUERY).inliers
@@ -210,7 +221,7 @@ def test_the_nearest_pictures_look_the_same_way(room_map):
 
 def test_photos_of_another_size_than_their_calibration(mapper, photos):
     wrong = [Photo(photos[0].file, replace(CAMERA, width=640), photos[0].T_world_cam)]
-    with pytest.raises(WearcapError, match=r"00000.png: a picture of 400x300 pixels with a calibration for 640x300"):  # fmt: skip
+    with pytest.raises(WearcapError, match=r"00000.png: a picture of 400x300 pixels with a calibration for 640x300"):
         build_map(wrong, Scan(mapper.points), EXTRACTOR, settings=SETTINGS)
 
 
@@ -250,8 +261,11 @@ def test_a_map_of_other_features(room_map):
 
 def test_an_empty_map(room_map):
     keep = slice(0, 0)
-    landmarks = replace(room_map.landmarks, points_world=room_map.landmarks.points_world[keep],
-                        descriptors=room_map.landmarks.descriptors[keep])  # fmt: skip
+    landmarks = replace(
+        room_map.landmarks,
+        points_world=room_map.landmarks.points_world[keep],
+        descriptors=room_map.landmarks.descriptors[keep],
+    )
     with pytest.raises(WearcapError, match="the map is empty"):
         Localizer(replace(room_map, landmarks=landmarks), EXTRACTOR)
 

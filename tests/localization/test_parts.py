@@ -146,11 +146,7 @@ def test_tracks_behind_the_perspective_view_lift_nothing():
     pixels, seen = wide.project(points)
     assert seen.all()
     tracks = Tracks(
-        points.numpy(),
-        np.zeros((2, 3), np.uint8),
-        np.zeros(2, np.int64),
-        np.arange(2),
-        pixels.float().numpy(),
+        points.numpy(), np.zeros((2, 3), np.uint8), np.zeros(2, np.int64), np.arange(2), pixels.float().numpy()
     )
     ahead = flat.project(points[:1])[0][0].tolist()
     direction = points[1] / points[1].norm()
@@ -270,9 +266,7 @@ def test_nearby_pairs_are_one_to_one_and_alike():
 
 def planted(camera: Camera, noise_px: float, outliers: float, seed: int, count: int = 300):
     random = np.random.default_rng(seed)
-    pose = Rigid(
-        rotation.exp(torch.from_numpy(random.normal(size=3))), torch.from_numpy(random.normal(size=3))
-    )
+    pose = Rigid(rotation.exp(torch.from_numpy(random.normal(size=3))), torch.from_numpy(random.normal(size=3)))
     pixels = random.uniform([0, 0], [camera.width - 1, camera.height - 1], (count, 2))
     rays = camera.unproject(torch.from_numpy(pixels))
     points = (pose @ (rays * torch.from_numpy(random.uniform(2, 8, (count, 1))))).numpy()
@@ -319,9 +313,7 @@ def test_the_covariance_is_that_of_many_draws():
         errors.append(pose_error(fit, pose))
         covariances.append(pose_covariance(pixels, points, LENSES[1], fit))
     square = [error @ np.linalg.solve(cov, error) for error, cov in zip(errors, covariances)]
-    assert np.mean(square) / 6 == pytest.approx(
-        1.0, abs=0.35
-    )  # 60 draws: standard deviation 0.075, robust loss more
+    assert np.mean(square) / 6 == pytest.approx(1.0, abs=0.35)  # 60 draws: standard deviation 0.075, robust loss more
 
 
 def test_few_matches_and_other_lenses():
@@ -341,6 +333,8 @@ def test_confidence_rises_with_spread_matches_only():
 
 
 def test_features_are_chosen_by_mask_and_by_number():
-    features = Features(spread := np.arange(8, dtype=np.float32).reshape(4, 2), unit_rows(4, 3), np.ones(4, np.float32), (9, 9))  # fmt: skip
+    features = Features(
+        spread := np.arange(8, dtype=np.float32).reshape(4, 2), unit_rows(4, 3), np.ones(4, np.float32), (9, 9)
+    )
     assert features.subset(np.array([3, 0])).keypoints.tolist() == spread[[3, 0]].tolist()
     assert len(features.subset(np.array([True, False, False, True]))) == 2

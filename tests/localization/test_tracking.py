@@ -57,9 +57,7 @@ def test_a_folder_of_pictures(tmp_path, mapped):
     np.testing.assert_allclose(mine.t_world_body.numpy(), t[placed], atol=1e-6)
     expected = torch.from_numpy(R[placed.numpy()].as_matrix()).float()
     assert rotation.geodesic(mine.R_world_body, expected).max() < 1e-4
-    assert found.T_world_cam.t_world_body[3].tolist() == pytest.approx(
-        (t[3] + (t[6] - t[3]) / 3).tolist(), abs=1e-5
-    )
+    assert found.T_world_cam.t_world_body[3].tolist() == pytest.approx((t[3] + (t[6] - t[3]) / 3).tolist(), abs=1e-5)
     assert found.reprojection_px < 1e-3
 
 
@@ -118,22 +116,10 @@ def test_from_a_finished_model(tmp_path, monkeypatch, capsys):
     points = write_model(tmp_path / "model", names, missing=(4, 5), error_px=1.5)
     out = tmp_path / "o"
     verb.main(
-        [
-            "--from-model",
-            str(tmp_path / "model"),
-            f"output={out}",
-            "settings.fps=10",
-            f"paths.outputs={tmp_path}",
-        ]
+        ["--from-model", str(tmp_path / "model"), f"output={out}", "settings.fps=10", f"paths.outputs={tmp_path}"]
     )
     assert "10 of 10 pictures placed" in capsys.readouterr().out
-    arguments = [
-        "--from-model",
-        str(tmp_path / "model"),
-        str(tmp_path / "in put"),
-        f"output={out}",
-        "settings.fps=10",
-    ]
+    arguments = ["--from-model", str(tmp_path / "model"), str(tmp_path / "in put"), f"output={out}", "settings.fps=10"]
     verb.main([*arguments, f"paths.outputs={tmp_path}"])
     assert "scale and axes are arbitrary" in " ".join(capsys.readouterr().out.split())
     report = json.loads((out / "report.json").read_text())
@@ -151,9 +137,7 @@ def test_a_model_of_other_pictures_or_of_several_cameras_is_refused(tmp_path):
     names = write_pictures(tmp_path / "in", 6)
     write_model(tmp_path / "model", [f"x{name}" for name in names])
     with pytest.raises(WearcapError, match="places none of 6 pictures"):
-        verb.main(
-            ["--from-model", str(tmp_path / "model"), str(tmp_path / "in"), f"paths.outputs={tmp_path}"]
-        )
+        verb.main(["--from-model", str(tmp_path / "model"), str(tmp_path / "in"), f"paths.outputs={tmp_path}"])
     write_model(tmp_path / "model", names)
     cameras = tmp_path / "model/cameras.txt"
     cameras.write_text(cameras.read_text() + f"2 PINHOLE {WIDTH} {HEIGHT} 99 99 80 60\n")
@@ -165,12 +149,11 @@ def test_a_model_of_other_pictures_or_of_several_cameras_is_refused(tmp_path):
 
 def test_cameras_as_colmap_writes_them():
     lens = (0.1, -0.02, 0.003, 0.004)
-    assert colmap_camera(Camera("pinhole", 640, 480, 500, 510, 319.5, 239.5)) == (
-        "PINHOLE",
-        "500,510,320,240",
-    )
+    assert colmap_camera(Camera("pinhole", 640, 480, 500, 510, 319.5, 239.5)) == ("PINHOLE", "500,510,320,240")
     assert colmap_camera(Camera("fisheye", 640, 480, 500, 510, 319.5, 239.5, lens)) == (
-        "OPENCV_FISHEYE", "500,510,320,240,0.1,-0.02,0.003,0.004")  # fmt: skip
+        "OPENCV_FISHEYE",
+        "500,510,320,240,0.1,-0.02,0.003,0.004",
+    )
     with pytest.raises(WearcapError, match="COLMAP has no camera 'opencv' with 5 coefficients"):
         colmap_camera(Camera("opencv", 640, 480, 500, 510, 319.5, 239.5, (*lens, 0.1)))
 
@@ -199,8 +182,13 @@ def test_real_photos_are_tracked(real_data, tmp_path):
         (tmp_path / "in" / name).symlink_to(truth[name].file)
     camera = next(iter(truth.values())).camera
     write_camera(camera, tmp_path / "camera.json")
-    arguments = [str(tmp_path / "in"), f"camera={tmp_path / 'camera.json'}", f"output={tmp_path / 'out'}",
-                 "settings.mapping.max_keypoints=2048", f"paths.outputs={tmp_path}"]  # fmt: skip
+    arguments = [
+        str(tmp_path / "in"),
+        f"camera={tmp_path / 'camera.json'}",
+        f"output={tmp_path / 'out'}",
+        "settings.mapping.max_keypoints=2048",
+        f"paths.outputs={tmp_path}",
+    ]
     verb.main(arguments)
     report = json.loads((tmp_path / "out/report.json").read_text())
     assert report["placed"] == 24

@@ -52,9 +52,7 @@ def looking(position: tuple[float, float, float], yaw: float, pitch: float = 0.0
     right = np.array([sy, -cy, 0.0])
     down = np.cross(forward, right)
     right, down = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
-    return Rigid(
-        torch.tensor(np.stack([right, down, forward], 1)), torch.tensor(position, dtype=torch.float64)
-    )
+    return Rigid(torch.tensor(np.stack([right, down, forward], 1)), torch.tensor(position, dtype=torch.float64))
 
 
 def photograph(mapper: PointMapper, camera: Camera, T_world_cam: Rigid) -> np.ndarray:
@@ -69,11 +67,12 @@ def photo_poses(count: int, seed: int = 1) -> list[Rigid]:
     random = np.random.default_rng(seed)
     return [
         looking(
-            (*random.uniform([1.0, 1.0, 1.3], SIZE - [1.0, 1.0, 0.8]),), 2 * np.pi * number / count * 2.4,
+            (*random.uniform([1.0, 1.0, 1.3], SIZE - [1.0, 1.0, 0.8]),),
+            2 * np.pi * number / count * 2.4,
             random.uniform(-0.2, 0.3),
         )
         for number in range(count)
-    ]  # fmt: skip
+    ]
 
 
 def take_photos(mapper: PointMapper, camera: Camera, poses: list[Rigid], folder: Path) -> list[Photo]:

@@ -6,12 +6,7 @@ import pytest
 import torch
 from sklearn.metrics import average_precision_score, precision_score, recall_score
 
-from wearcap.metrics.detection import (
-    average_precision,
-    calibration_error,
-    detection_scores,
-    mean_detection_scores,
-)
+from wearcap.metrics.detection import average_precision, calibration_error, detection_scores, mean_detection_scores
 
 
 @pytest.mark.parametrize("levels", [None, 5], ids=["distinct", "ties"])

@@ -16,7 +16,7 @@ def cues_of(motion, names, shift) -> dict[str, Cue]:
     times = (motion.timestamps[1:] + motion.timestamps[:-1]) / 2
     joints = motion.T_world_joint.t
     middle = (joints[1:] + joints[:-1]) / 2 + torch.tensor(shift)
-    return {name: Cue(times, name, middle[:, motion.skeleton.index(name)], torch.ones(len(times))) for name in names}  # fmt: skip
+    return {name: Cue(times, name, middle[:, motion.skeleton.index(name)], torch.ones(len(times))) for name in names}
 
 
 def test_planted_distances_come_back_at_the_keypoints_times():

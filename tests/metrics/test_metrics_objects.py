@@ -51,7 +51,9 @@ def test_rotations_are_scipys(poses):
     angle = np.rad2deg((one.inv() * two).magnitude())
     np.testing.assert_allclose(rotation_difference_deg(found, true).numpy(), angle, atol=1e-6)
     quats = [spin.as_quat(canonical=True, scalar_first=True) for spin in (one, two)]
-    np.testing.assert_allclose(quaternion_difference(found, true).numpy(), np.abs(quats[0] - quats[1]).sum(1), atol=1e-6)  # fmt: skip
+    np.testing.assert_allclose(
+        quaternion_difference(found, true).numpy(), np.abs(quats[0] - quats[1]).sum(1), atol=1e-6
+    )
 
 
 def test_nothing_is_lost_where_nothing_differs(poses):
@@ -79,9 +81,13 @@ def test_a_foot_is_down_where_one_of_its_joints_is_low():
     joints[20:30, :, 2] += 0.4
     index = motion.skeleton.index
     down = [
-        any(joints[k, index(f"{side}_{name}"), 2] - floor[k] < limit for side in ("left", "right") for name, limit in (("ankle", 0.1), ("toe", 0.05)))
+        any(
+            joints[k, index(f"{side}_{name}"), 2] - floor[k] < limit
+            for side in ("left", "right")
+            for name, limit in (("ankle", 0.1), ("toe", 0.05))
+        )
         for k in range(45)
-    ]  # fmt: skip
+    ]
     assert feet_down(motion.skeleton, joints, floor).tolist() == [bool(each) for each in down]
     assert 0 < sum(map(bool, down)) < 45
     share = foot_contact_share(motion.skeleton, joints, floor).item()

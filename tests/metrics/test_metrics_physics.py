@@ -32,9 +32,7 @@ def test_jitter_agrees_with_loops():
     for t in range(6):
         for j in range(4):
             third = [
-                (
-                    joints[t + 3, j, k] - 3 * joints[t + 2, j, k] + 3 * joints[t + 1, j, k] - joints[t, j, k]
-                ).item()
+                (joints[t + 3, j, k] - 3 * joints[t + 2, j, k] + 3 * joints[t + 1, j, k] - joints[t, j, k]).item()
                 for k in range(3)
             ]
             lengths.append(norm(third) * fps**3)
@@ -106,13 +104,10 @@ def test_foot_contact_joins_patches():
 def physicality_by_loops(root, feet, fps) -> float:
     scores, sizes = [], []
     for t in range(len(root) - 2):
-        acceleration = [
-            ((root[t + 2, k] - 2 * root[t + 1, k] + root[t, k]) * fps**2).item() for k in range(3)
-        ]
+        acceleration = [((root[t + 2, k] - 2 * root[t + 1, k] + root[t, k]) * fps**2).item() for k in range(3)]
         acceleration[2] = max(acceleration[2], 0.0)
         slower = [
-            min(norm(((feet[t + 2, f, p] - feet[t + 1, f, p]) * fps).tolist()) for p in range(2))
-            for f in range(2)
+            min(norm(((feet[t + 2, f, p] - feet[t + 1, f, p]) * fps).tolist()) for p in range(2)) for f in range(2)
         ]
         sizes.append(norm(acceleration))
         scores.append(norm(acceleration) * slower[0] * slower[1])

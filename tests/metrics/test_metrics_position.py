@@ -30,9 +30,7 @@ def test_mpjpe_agrees_with_loops(joints):
 
 def test_mpjpe_of_a_shift_is_its_length():
     true = torch.rand(4, 23, 3)
-    assert position.mpjpe_cm(true + torch.tensor([0.03, 0.0, 0.04]), true).item() == pytest.approx(
-        5, rel=1e-4
-    )
+    assert position.mpjpe_cm(true + torch.tensor([0.03, 0.0, 0.04]), true).item() == pytest.approx(5, rel=1e-4)
 
 
 def test_mpjve_agrees_with_loops_and_ignores_a_constant_shift(joints):
@@ -75,9 +73,7 @@ def test_body_parts_of_xsens():
         for name, joints in position.body_parts(skeleton).items()
     }
     assert parts["hand"] == {"left_wrist", "right_wrist"}
-    assert parts["lower"] == {
-        f"{side}_{j}" for side in ("left", "right") for j in ("hip", "knee", "ankle", "toe")
-    }
+    assert parts["lower"] == {f"{side}_{j}" for side in ("left", "right") for j in ("hip", "knee", "ankle", "toe")}
     assert parts["upper"] == set(skeleton.joint_names) - parts["lower"] - {"pelvis"}
     assert len(parts["upper"]) == 14
 

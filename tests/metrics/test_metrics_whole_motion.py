@@ -38,8 +38,7 @@ def positions(motion: Motion) -> tuple[dict[str, np.ndarray], dict[str, np.ndarr
         R[name] = R[above] * local
         t[name] = t[above] + R[above].apply(skeleton.t_parent_joint[joint].double().numpy())
     sites = {
-        patch: t[skeleton.sites[patch].joint]
-        + R[skeleton.sites[patch].joint].apply(skeleton.sites[patch].t_joint_site)
+        patch: t[skeleton.sites[patch].joint] + R[skeleton.sites[patch].joint].apply(skeleton.sites[patch].t_joint_site)
         for patch in FOOT_PATCHES
     }
     return t, sites
@@ -55,9 +54,7 @@ def physicality(t: dict) -> float:
     size = np.linalg.norm(acceleration, axis=1)
     product = size / size.max()
     for side in SIDES:
-        speeds = [
-            np.linalg.norm(np.diff(t[f"{side}_{n}"], axis=0)[1:], axis=1) * FPS for n in ("ankle", "toe")
-        ]
+        speeds = [np.linalg.norm(np.diff(t[f"{side}_{n}"], axis=0)[1:], axis=1) * FPS for n in ("ankle", "toe")]
         product = product * np.minimum(*speeds)
     return product.mean()
 
@@ -106,7 +103,7 @@ def test_every_score_of_a_motion_is_what_numpy_makes_of_it():
         "physicality": physicality(t),
         "truth_physicality": physicality(t_true),
         "floor_penetration_cm": 100 * np.maximum(floor - lowest, 0).mean(),
-    }  # fmt: skip
+    }
     assert scores["floor_penetration_cm"] > 0.01
     assert set(scores) == set(expected)
     for name, value in expected.items():
@@ -115,11 +112,7 @@ def test_every_score_of_a_motion_is_what_numpy_makes_of_it():
 
 def test_eight_repetitions_have_mean_and_sample_spread():
     random = np.random.default_rng(0)
-    frames, p95, mpjpe = (
-        np.array([100, 250, 50]),
-        random.uniform(5, 30, (8, 3)),
-        random.uniform(5, 30, (8, 3)),
-    )
+    frames, p95, mpjpe = (np.array([100, 250, 50]), random.uniform(5, 30, (8, 3)), random.uniform(5, 30, (8, 3)))
     rows = [
         Row(f"r{r}", seed, int(frames[r]), {"p95_cm": p95[seed, r], "mpjpe_cm": mpjpe[seed, r]})
         for seed in range(8)

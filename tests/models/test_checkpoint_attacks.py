@@ -68,7 +68,7 @@ TARGETED = {
     "too long a text": {"text": "x" * 2000},
     "too many values": {"list": list(range(20_000))},
     "no number": {"lr": float("nan")},
-}  # fmt: skip
+}
 FORMS = INTERPOLATED | TARGETED | {f"{name}, in a list": [value] for name, value in INTERPOLATED.items()}
 
 
@@ -109,17 +109,23 @@ def data(tmp_path_factory):
 @pytest.mark.parametrize("verb", ["export", "share", "evaluate", "capture", "train"])
 def test_no_command_runs_what_a_checkpoint_asks_for(verb, kind, data, tmp_path, capsys):
     mark = tmp_path / "mark"
-    path = checkpoint(
-        tmp_path / f"x.{kind}", model_with(INTERPOLATED["a resolver that makes a target"], mark)
-    )
+    path = checkpoint(tmp_path / f"x.{kind}", model_with(INTERPOLATED["a resolver that makes a target"], mark))
     arguments = {
         "export": ["export", f"checkpoint={path}", f"output={tmp_path}/x.onnx"],
         "share": ["export", f"checkpoint={path}", "format=safetensors", f"output={tmp_path}/y.safetensors"],
         "evaluate": ["evaluate", f"checkpoint={path}", f"dataset={data}", "baselines=false"],
         "capture": ["capture", "pipeline=hmd2", f"checkpoint={path}", f"recording={data}/r4"],
-        "train": ["train", "debug=fast", f"data.sources.simulated.root={data}", f"resume={path}", "callbacks.progress=null",
-                  "trainer.accelerator=cpu", "data.window=60", f"paths.outputs={tmp_path}/outputs"],
-    }[verb]  # fmt: skip
+        "train": [
+            "train",
+            "debug=fast",
+            f"data.sources.simulated.root={data}",
+            f"resume={path}",
+            "callbacks.progress=null",
+            "trainer.accelerator=cpu",
+            "data.window=60",
+            f"paths.outputs={tmp_path}/outputs",
+        ],
+    }[verb]
     assert exit_code([*arguments, f"hydra.run.dir={tmp_path}/run"]) == 2
     said = capsys.readouterr().err
     assert f"{path}: " in said
@@ -135,8 +141,9 @@ def test_every_part_that_a_config_may_name_is_there_and_makes_no_foreign_call():
         for name in names:
             target = getattr(home, name)
             assert isinstance(target, type) or (modules, name) in {
-                ("wearcap.body.skeleton", "xsens23"), ("wearcap.training.schedules", "warmup_cosine"),
-            }  # fmt: skip
+                ("wearcap.body.skeleton", "xsens23"),
+                ("wearcap.training.schedules", "warmup_cosine"),
+            }
             if modules.startswith("wearcap"):
                 assert target.__module__ == modules
 
@@ -188,9 +195,13 @@ def test_giant_sizes_take_no_memory(tmp_path):
     assert len(files) > 50
     limit = 8 << 30
     process = subprocess.run(
-        [sys.executable, "-c", MEMORY, *map(str, files)], capture_output=True, text=True, timeout=300, check=True,
+        [sys.executable, "-c", MEMORY, *map(str, files)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
-    )  # fmt: skip
+    )
     assert json.loads(process.stdout) < 150, "MiB"
 
 
@@ -213,8 +224,10 @@ def test_weights_that_repeat_themselves_without_memory_are_refused(tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_config_that_is_nested_or_long_without_end_is_refused(kind, tmp_path):
-    for text, message in (('{"model":' + '{"a":' * 100_000, "nested too deeply"),
-                          ('{"model":{"a":"' + "x" * (1 << 21) + '"}}', "a config of")):  # fmt: skip
+    for text, message in (
+        ('{"model":' + '{"a":' * 100_000, "nested too deeply"),
+        ('{"model":{"a":"' + "x" * (1 << 21) + '"}}', "a config of"),
+    ):
         path = tmp_path / f"x.{kind}"
         if kind == "ckpt":
             torch.save({"wearcap": {"config": text}, "state_dict": {}}, path)

@@ -17,11 +17,7 @@ from wearcap.models.checkpoint import read_checkpoint, share_checkpoint
 
 MODEL = {
     "_target_": "wearcap.systems.ireplica.training.ContactDetection",
-    "net": {
-        "_target_": "wearcap.systems.ireplica.contact_sequence.ContactSequence",
-        "_partial_": True,
-        "width": 40,
-    },
+    "net": {"_target_": "wearcap.systems.ireplica.contact_sequence.ContactSequence", "_partial_": True, "width": 40},
     "skeleton": {"_target_": "wearcap.body.skeleton.xsens23"},
     "optimizer": {"_target_": "torch.optim.AdamW", "lr": 1e-3},
     "scheduler": {"_target_": "wearcap.training.schedules.warmup_cosine", "_partial_": True},
@@ -46,10 +42,7 @@ def run_file(path: Path, state: dict | None = None, **config) -> Path:
     """A run's checkpoint, as `wearcap train` saves it."""
     torch.manual_seed(0)
     config = {"name": "toy", "model": MODEL, "paths": {"run": "/home/someone"}} | config
-    torch.save(
-        {"wearcap": {"config": json.dumps(config)}, "state_dict": state or Net().state_dict(), "epoch": 3},
-        path,
-    )
+    torch.save({"wearcap": {"config": json.dumps(config)}, "state_dict": state or Net().state_dict(), "epoch": 3}, path)
     return path
 
 
@@ -82,16 +75,12 @@ def test_folders_of_a_machine_stay_at_home(tmp_path):
 
 @pytest.mark.parametrize(("dtype", "off"), [("bfloat16", 2**-8), ("float16", 2**-11)])
 def test_weights_are_stored_in_half_the_width_and_statistics_are_not(dtype, off, tmp_path):
-    source = run_file(
-        tmp_path / "run.ckpt", {"net.weight": torch.randn(300, 200), "net.mean": torch.rand(200)}
-    )
+    source = run_file(tmp_path / "run.ckpt", {"net.weight": torch.randn(300, 200), "net.mean": torch.rand(200)})
     share_checkpoint(source, tmp_path / "whole.safetensors")
     share_checkpoint(source, tmp_path / "half.safetensors", dtype)
     sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("half", "whole")]
     assert 0.5 < sizes[0] / sizes[1] < 0.52
-    before, after = (
-        read_checkpoint(tmp_path / name)[1] for name in ("whole.safetensors", "half.safetensors")
-    )
+    before, after = (read_checkpoint(tmp_path / name)[1] for name in ("whole.safetensors", "half.safetensors"))
     assert torch.equal(after["net.mean"], before["net.mean"])
     assert after["net.weight"].dtype == torch.float32
     torch.testing.assert_close(after["net.weight"], before["net.weight"], rtol=off, atol=1e-6)
@@ -123,9 +112,7 @@ def test_a_bare_name_is_a_checkpoint_of_the_project_unless_a_file_has_it(tmp_pat
     monkeypatch.chdir(tmp_path)
     assert read_checkpoint("walker")[0]["name"] == "toy"
     assert read_checkpoint(Path("walker"))[0]["name"] == "toy"
-    with pytest.raises(
-        WearcapError, match=r"^walkr: no such checkpoint\. Expected .*Did you mean 'walker'\?$"
-    ):
+    with pytest.raises(WearcapError, match=r"^walkr: no such checkpoint\. Expected .*Did you mean 'walker'\?$"):
         read_checkpoint("walkr")
     with pytest.raises(WearcapError, match=r"Expected one of walker\."):
         read_checkpoint("zzz")
@@ -165,8 +152,13 @@ def test_files_that_are_no_checkpoints_are_named(tmp_path):
     run_file(path)  # a pickle under this name is not opened
     assert "not a readable checkpoint" in refusal(path)
     path = tmp_path / "x.ckpt"
-    for content in ({"wearcap": 3, "state_dict": {}}, {"wearcap": {"config": 3}, "state_dict": {}},
-                    {"wearcap": {"config": "{}"}}, [1, 2], torch.zeros(3)):  # fmt: skip
+    for content in (
+        {"wearcap": 3, "state_dict": {}},
+        {"wearcap": {"config": 3}, "state_dict": {}},
+        {"wearcap": {"config": "{}"}},
+        [1, 2],
+        torch.zeros(3),
+    ):
         torch.save(content, path)
         assert re.search("not of wearcap|not a readable checkpoint", refusal(path))
     path.unlink()
@@ -176,16 +168,28 @@ def test_files_that_are_no_checkpoints_are_named(tmp_path):
 
 @pytest.mark.parametrize(
     "target",
-    ["os.system", "builtins.eval", "torch.load", "torch.hub.load", "torch.optim.os.system",
-     "wearcap.models.checkpoint.torch.hub.load", "wearcap.models.checkpoint.pickle.loads", "wearcap.files.write_text",
-     "wearcap.models.checkpoint.share_checkpoint", "wearcap.training.run.record_run", "wearcap.cli.main.main",
-     "wearcap.models.checkpoint.Path", "wearcap.models.nothing.Net", "wearcap.models", "", "wearcap.models..x.Y"],
-)  # fmt: skip
+    [
+        "os.system",
+        "builtins.eval",
+        "torch.load",
+        "torch.hub.load",
+        "torch.optim.os.system",
+        "wearcap.models.checkpoint.torch.hub.load",
+        "wearcap.models.checkpoint.pickle.loads",
+        "wearcap.files.write_text",
+        "wearcap.models.checkpoint.share_checkpoint",
+        "wearcap.training.run.record_run",
+        "wearcap.cli.main.main",
+        "wearcap.models.checkpoint.Path",
+        "wearcap.models.nothing.Net",
+        "wearcap.models",
+        "",
+        "wearcap.models..x.Y",
+    ],
+)
 @pytest.mark.parametrize("kind", ["ckpt", "safetensors"])
 def test_a_config_that_asks_for_anything_but_our_models_is_refused(kind, target, tmp_path):
-    model = MODEL | {
-        "net": {"_target_": "wearcap.systems.hmd2.model.MotionDenoiser", "x": [{"_target_": target}]}
-    }
+    model = MODEL | {"net": {"_target_": "wearcap.systems.hmd2.model.MotionDenoiser", "x": [{"_target_": target}]}}
     path = tmp_path / f"bad.{kind}"
     if kind == "ckpt":
         run_file(path, model=model)

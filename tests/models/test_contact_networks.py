@@ -7,12 +7,7 @@ from torch import nn
 from wearcap.errors import WearcapError
 from wearcap.systems.ireplica.contact_network import FRAMES, REACH, fit_temperature
 from wearcap.systems.ireplica.contact_sequence import ContactSequence
-from wearcap.systems.ireplica.contact_transformer import (
-    ContactTransformer,
-    EncoderLayer,
-    load_released,
-    sinusoids,
-)
+from wearcap.systems.ireplica.contact_transformer import ContactTransformer, EncoderLayer, load_released, sinusoids
 
 
 def parameters(net: nn.Module) -> int:
@@ -44,9 +39,7 @@ def test_an_answer_depends_on_its_61_frames_alone(net):
     whole = net(pose)
     assert whole.shape == (2, 130 - 2 * REACH, 2, net.classes)
     for frame in (0, 33, 69):
-        torch.testing.assert_close(
-            net(pose[:, frame : frame + FRAMES])[:, 0], whole[:, frame], atol=1e-5, rtol=0
-        )
+        torch.testing.assert_close(net(pose[:, frame : frame + FRAMES])[:, 0], whole[:, frame], atol=1e-5, rtol=0)
     changed = pose.clone()
     changed[:, 20] += 1.0
     moved = (net(changed) - whole).abs().amax((0, 2, 3)) > 1e-6
@@ -116,9 +109,7 @@ def test_a_wrong_checkpoint_names_what_is_missing_and_unexpected(tmp_path):
     del state["model.aggregator.bias"]
     state["model.gru.weight_ih_l0"] = torch.zeros(96, 32)
     torch.save({"state_dict": state}, path)
-    with pytest.raises(
-        WearcapError, match=r"1 missing \(aggregator.bias\) and 1 unexpected \(model.gru.weight"
-    ):
+    with pytest.raises(WearcapError, match=r"1 missing \(aggregator.bias\) and 1 unexpected \(model.gru.weight"):
         load_released(path)
     state = released_state(Released(69))
     state["model.pos_encoder.pe"] = torch.zeros(61, 1, 32)

@@ -29,12 +29,7 @@ def denoise(net: MotionDenoiser, x_t, level, condition, valid) -> torch.Tensor:
 
 def inputs(time: int = 16):
     torch.manual_seed(0)
-    return (
-        torch.randn(2, time, 12),
-        torch.rand(2, 1),
-        torch.randn(2, time, 5),
-        torch.ones(2, time, dtype=torch.bool),
-    )
+    return (torch.randn(2, time, 12), torch.rand(2, 1), torch.randn(2, time, 5), torch.ones(2, time, dtype=torch.bool))
 
 
 @pytest.mark.parametrize("frames_per_token", [1, 4])
@@ -68,9 +63,7 @@ def test_level_condition_and_order_of_frames_matter():
     out = denoise(net, x_t, level, condition, valid)
     assert not torch.allclose(denoise(net, x_t, 1 - level, condition, valid), out, atol=1e-3)
     assert not torch.allclose(denoise(net, x_t, level, condition + 1, valid), out, atol=1e-3)
-    assert not torch.allclose(
-        denoise(net, x_t.flip(1), level, condition.flip(1), valid).flip(1), out, atol=1e-3
-    )
+    assert not torch.allclose(denoise(net, x_t.flip(1), level, condition.flip(1), valid).flip(1), out, atol=1e-3)
 
 
 def test_window_must_split_into_tokens():

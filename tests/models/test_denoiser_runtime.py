@@ -94,9 +94,7 @@ def worst_of_compiled(device: str, runtime: str, precision: str) -> float:
     code = COMPILED.format(folder=folder, device=device, runtime=runtime, precision=precision)
     # Compiled in that process itself: others that help would have to import PyTorch first.
     environment = os.environ | {"TORCHINDUCTOR_COMPILE_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr[-2000:]
     return float(done.stdout.split()[-1])
 
@@ -115,11 +113,7 @@ def test_on_a_gpu_it_is_compiled_in_bfloat16():
 
 @pytest.mark.parametrize(
     ("runtime", "precision", "message"),
-    [
-        ("onyx", "float32", "no runtime 'onyx'"),
-        ("eager", "float64", "no precision"),
-        ("eager", "int8", "no int8 with"),
-    ],
+    [("onyx", "float32", "no runtime 'onyx'"), ("eager", "float64", "no precision"), ("eager", "int8", "no int8 with")],
 )
 def test_what_cannot_be_is_refused(runtime, precision, message):
     with pytest.raises(WearcapError, match=message):

@@ -43,10 +43,7 @@ def test_each_modalitys_level_and_noise_reach_all_outputs(net, modality):
     other[:, 3, modality] = 1 - other[:, 3, modality]
     noised = [part.clone() for part in x_t.split(net.sizes, -1)]
     noised[modality][:, 3] += 1.0
-    for after in (
-        outputs(net, x_t, other, *conditioning),
-        outputs(net, torch.cat(noised, -1), level, *conditioning),
-    ):
+    for after in (outputs(net, x_t, other, *conditioning), outputs(net, torch.cat(noised, -1), level, *conditioning)):
         for part in (after - before).split(net.sizes, -1):
             assert part.abs().max() > 1e-6
 
@@ -88,7 +85,9 @@ def test_a_level_per_window_is_the_broadcast_case(net):
     plan = net.plan(level.expand(-1, WINDOW, -1))
     one = net.plan(level[:1].expand(-1, WINDOW, -1))
     encoded = net.encode(condition, net.object(code), has, valid)
-    torch.testing.assert_close(net.step(x_t, plan, encoded, valid), net.step(x_t, one, encoded, valid), atol=1e-5, rtol=0)  # fmt: skip
+    torch.testing.assert_close(
+        net.step(x_t, plan, encoded, valid), net.step(x_t, one, encoded, valid), atol=1e-5, rtol=0
+    )
 
 
 @nets
@@ -116,5 +115,5 @@ def test_streams_are_one_or_one_per_modality():
 
 def test_the_papers_size():
     config = compose("train", ["experiment=echo", "model=echo", "paths.run=none"])
-    count = sum(parameter.numel() for parameter in instantiate(config.model, _convert_="all").net.parameters())  # fmt: skip
+    count = sum(parameter.numel() for parameter in instantiate(config.model, _convert_="all").net.parameters())
     assert 44.9e6 <= count <= 49.7e6, f"{count / 1e6:.1f} M parameters"

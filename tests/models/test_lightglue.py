@@ -69,7 +69,7 @@ def test_the_order_of_keypoints_does_not_matter(network):
     plain = network(keypoints0, descriptors0, SIZE, keypoints1, descriptors1, SIZE)
     shuffled = network(
         keypoints0[:, order0], descriptors0[:, order0], SIZE, keypoints1[:, order1], descriptors1[:, order1], SIZE
-    )  # fmt: skip
+    )
     torch.testing.assert_close(shuffled, plain[:, order0][:, :, order1], atol=1e-5, rtol=1e-5)
     assert not torch.allclose(shuffled, plain, atol=1e-3)
 
@@ -90,9 +90,7 @@ def test_only_where_keypoints_lie_to_each_other_counts(network):
 
 def test_places_are_about_the_middle_in_halves_of_the_longer_side():
     corners = torch.tensor([[[0.0, 0.0], [640.0, 480.0], [320.0, 240.0]]])
-    torch.testing.assert_close(
-        normalized(corners, SIZE), torch.tensor([[[-1.0, -0.75], [1.0, 0.75], [0.0, 0.0]]])
-    )
+    torch.testing.assert_close(normalized(corners, SIZE), torch.tensor([[[-1.0, -0.75], [1.0, 0.75], [0.0, 0.0]]]))
 
 
 def test_self_attention_is_its_formula_in_the_published_layout():
@@ -135,9 +133,9 @@ def test_assignment_is_its_formula():
     torch.manual_seed(4)
     assignment = MatchAssignment(6).double().requires_grad_(False)
     x0, x1 = torch.randn(4, 6, dtype=torch.float64), torch.randn(3, 6, dtype=torch.float64)
-    similarity = np.array([
-        [float(assignment.final_proj(a) @ assignment.final_proj(b)) / 6**0.5 for b in x1] for a in x0
-    ])  # fmt: skip
+    similarity = np.array(
+        [[float(assignment.final_proj(a) @ assignment.final_proj(b)) / 6**0.5 for b in x1] for a in x0]
+    )
     matchable0 = [torch.sigmoid(assignment.matchability(a)).item() for a in x0]
     matchable1 = [torch.sigmoid(assignment.matchability(b)).item() for b in x1]
     found = assignment(x0[None], x1[None])[0].exp().numpy()
@@ -150,9 +148,7 @@ def test_assignment_is_its_formula():
 def test_matches_are_mutual_and_probable():
     probability = torch.tensor([[0.9, 0.2, 0.1], [0.8, 0.3, 0.1], [0.1, 0.1, 0.05]])
     partner, score = mutual_matches(probability.log()[None], 0.1)
-    assert partner.tolist() == [
-        [0, -1, -1]
-    ]  # the second row's best prefers the first; the third is no one's best
+    assert partner.tolist() == [[0, -1, -1]]  # the second row's best prefers the first; the third is no one's best
     torch.testing.assert_close(score, torch.tensor([[0.9, 0.0, 0.0]]))
     assert mutual_matches(probability.log()[None], 0.95)[0].tolist() == [[-1, -1, -1]]
 

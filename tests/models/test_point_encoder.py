@@ -35,9 +35,7 @@ def test_order_place_and_scale_do_not_change_the_feature_and_turning_does():
     torch.testing.assert_close(net(points + torch.tensor([3.0, -1.0, 7.0])), feature)
     torch.testing.assert_close(net(4.0 * points), feature)
     torch.testing.assert_close(net(points[1:2]), feature[1:2])
-    assert not torch.allclose(
-        net(points[..., [1, 0, 2]] * torch.tensor([1.0, -1.0, 1.0])), feature, atol=1e-3
-    )
+    assert not torch.allclose(net(points[..., [1, 0, 2]] * torch.tensor([1.0, -1.0, 1.0])), feature, atol=1e-3)
 
 
 def test_extents_are_told_beside_it():

@@ -64,7 +64,7 @@ def encoded(points: TrackedPoints, motion, turn=None, shift=None, floor: float =
     head = Rigid(turn @ head.R, (turn @ head.t[..., None])[..., 0] + shift)
     poses = points.poses(motion.skeleton, head, R)
     stature = torch.tensor([motion.skeleton.height_of("head")])
-    return points.encode(poses.R[None], poses.t[None], torch.full((1, len(motion)), floor), stature, motion.fps)[0]  # fmt: skip
+    return points.encode(poses.R[None], poses.t[None], torch.full((1, len(motion)), floor), stature, motion.fps)[0]
 
 
 @pytest.mark.parametrize("height", ["stature", "floor", "world"])
@@ -87,18 +87,21 @@ def test_features_are_the_points_rotation_change_position_and_velocity():
     R = rotation.about_axis("z", -rotation.yaw_of(head.R[frame]))
     step = wrist.R[frame - 1].T @ wrist.R[frame]
     expected = [
-        (R @ wrist.R[frame])[:, 0], (R @ wrist.R[frame])[:, 1], (step - torch.eye(3))[:, 0] * 60, (step - torch.eye(3))[:, 1] * 60,
-        (R @ (wrist.t[frame] - head.t[frame]))[:2], wrist.t[frame, 2:] - 0.25, R @ (wrist.t[frame] - wrist.t[frame - 1]) * 60,
-    ]  # fmt: skip
+        (R @ wrist.R[frame])[:, 0],
+        (R @ wrist.R[frame])[:, 1],
+        (step - torch.eye(3))[:, 0] * 60,
+        (step - torch.eye(3))[:, 1] * 60,
+        (R @ (wrist.t[frame] - head.t[frame]))[:2],
+        wrist.t[frame, 2:] - 0.25,
+        R @ (wrist.t[frame] - wrist.t[frame - 1]) * 60,
+    ]
     assert torch.allclose(seen, torch.cat(expected), atol=2e-3)
 
 
 def test_poses_come_back_from_their_code():
     motion = swaying_motion(20)
     head = motion.joint("head").R
-    assert torch.allclose(
-        decode_pose(encode_pose(motion.R_parent_joint, head), head), motion.R_parent_joint, atol=1e-5
-    )
+    assert torch.allclose(decode_pose(encode_pose(motion.R_parent_joint, head), head), motion.R_parent_joint, atol=1e-5)
 
 
 def test_points_that_cannot_be_are_refused():
@@ -106,4 +109,8 @@ def test_points_that_cannot_be_are_refused():
         TrackedPoints(("left_wrist",))
     with pytest.raises(WearcapError, match="no height 'ceiling'"):
         TrackedPoints(height="ceiling")
-    assert TrackedPoints(HANDS).poses(xsens23(), Rigid.identity(2), torch.eye(3).expand(2, 23, 3, 3)).t.shape == (2, 3, 3)  # fmt: skip
+    assert TrackedPoints(HANDS).poses(xsens23(), Rigid.identity(2), torch.eye(3).expand(2, 23, 3, 3)).t.shape == (
+        2,
+        3,
+        3,
+    )

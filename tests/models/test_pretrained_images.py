@@ -44,9 +44,7 @@ def packages(monkeypatch, tmp_path):
         assert (model_name, pretrained) == ("ViT-L-14-quickgelu", None)
         return Clip()
 
-    def create_timm(
-        model_name, pretrained=False, checkpoint_path="", num_classes=None, dynamic_img_size=False
-    ):
+    def create_timm(model_name, pretrained=False, checkpoint_path="", num_classes=None, dynamic_img_size=False):
         assert model_name == "vit_large_patch14_dinov2.lvd142m"
         assert (pretrained, checkpoint_path, num_classes, dynamic_img_size) == (False, "", 0, True)
         return Tower(1024)
@@ -65,9 +63,7 @@ def clip_file(path: Path) -> Clip:
     torch.manual_seed(1)
     model = Clip()
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_file(model.state_dict(), path) if path.suffix == ".safetensors" else torch.save(
-        model.state_dict(), path
-    )
+    save_file(model.state_dict(), path) if path.suffix == ".safetensors" else torch.save(model.state_dict(), path)
     return model
 
 
@@ -97,8 +93,11 @@ def test_dinov2_takes_the_original_file(packages):
 
 
 def test_a_path_goes_before_the_variable_and_that_before_the_cache(packages, monkeypatch, tmp_path):
-    paths = {"given": tmp_path / "given.pt", "variable": tmp_path / "variable.safetensors",
-             "cache": hub(packages, CLIP.hub, "open_clip_pytorch_model.bin")}  # fmt: skip
+    paths = {
+        "given": tmp_path / "given.pt",
+        "variable": tmp_path / "variable.safetensors",
+        "cache": hub(packages, CLIP.hub, "open_clip_pytorch_model.bin"),
+    }
     for index, path in enumerate(paths.values()):
         model = clip_file(path)
         tensors = {key: value + index for key, value in model.state_dict().items()}
@@ -156,8 +155,7 @@ def test_the_real_network_takes_weights_of_its_own_shapes(kind, tmp_path):
     network = kind.network(package)
     prefix = "visual." if kind is CLIP else ""
     save_file(
-        {prefix + key: value.contiguous() for key, value in network.state_dict().items()},
-        tmp_path / "w.safetensors",
+        {prefix + key: value.contiguous() for key, value in network.state_dict().items()}, tmp_path / "w.safetensors"
     )
     encoder = PretrainedEncoder(kind, tmp_path / "w.safetensors", device="cpu")
     assert encoder.embed(torch.zeros(1, 72, 96, 3, dtype=torch.uint8)).shape == (1, kind.size)

@@ -16,10 +16,12 @@ RADII = (0.15, 0.225, 0.3375, 0.50625)
 
 def norm(prefix: str, width: int) -> dict[str, torch.Tensor]:
     return {
-        f"{prefix}.weight": 0.5 + torch.rand(width), f"{prefix}.bias": torch.randn(width),
-        f"{prefix}.running_mean": torch.randn(width), f"{prefix}.running_var": 0.5 + torch.rand(width),
+        f"{prefix}.weight": 0.5 + torch.rand(width),
+        f"{prefix}.bias": torch.randn(width),
+        f"{prefix}.running_mean": torch.randn(width),
+        f"{prefix}.running_var": 0.5 + torch.rand(width),
         f"{prefix}.num_batches_tracked": torch.tensor(7),
-    }  # fmt: skip
+    }
 
 
 def openpoints(width: int = 4) -> dict[str, torch.Tensor]:
@@ -41,9 +43,7 @@ def openpoints(width: int = 4) -> dict[str, torch.Tensor]:
     for number, (given, made) in {0: (size, 512), 2: (512, 256), 4: (256, 40)}.items():
         tensors |= {f"prediction.head.{number}.0.weight": torch.randn(made, given)}
         tensors |= (
-            norm(f"prediction.head.{number}.1", made)
-            if made > 40
-            else {"prediction.head.4.0.bias": torch.zeros(40)}
+            norm(f"prediction.head.{number}.1", made) if made > 40 else {"prediction.head.4.0.bias": torch.zeros(40)}
         )
     return tensors
 
@@ -59,9 +59,7 @@ def saved(path: Path, tensors: dict) -> Path:
 def conv(t: dict, at: str, x: torch.Tensor, act: bool) -> torch.Tensor:
     """Convolution over single points, batch norm, ReLU, as OpenPoints' create_convblock2d stacks them."""
     y = F.conv2d(x, t[f"{at}.0.weight"])
-    y = F.batch_norm(
-        y, t[f"{at}.1.running_mean"], t[f"{at}.1.running_var"], t[f"{at}.1.weight"], t[f"{at}.1.bias"]
-    )
+    y = F.batch_norm(y, t[f"{at}.1.running_mean"], t[f"{at}.1.running_var"], t[f"{at}.1.weight"], t[f"{at}.1.bias"])
     return F.relu(y) if act else y
 
 
@@ -108,9 +106,10 @@ def test_the_papers_size_is_read_off_the_file(tmp_path):
     net = load_openpoints(saved(tmp_path / "w.pth", openpoints(64)))
     assert net.size == 1024
     assert sum(p.numel() for p in net.parameters()) == sum(
-        value.numel() for name, value in openpoints(64).items()
+        value.numel()
+        for name, value in openpoints(64).items()
         if name.startswith("encoder.") and "running" not in name and "num_batches" not in name
-    )  # fmt: skip
+    )
 
 
 def test_other_files_are_refused(tmp_path):

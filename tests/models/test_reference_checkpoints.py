@@ -13,9 +13,10 @@ from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 
 FOLDER = Path(__file__).parents[2] / "checkpoints"
 CONTACTS = {
-    "contact_sequence": ("sliding", "hinged"), "contact_transformer_sliding": ("sliding",),
+    "contact_sequence": ("sliding", "hinged"),
+    "contact_transformer_sliding": ("sliding",),
     "contact_transformer_hinged": ("hinged",),
-}  # fmt: skip
+}
 CARD = ("**What it is.**", "**Data and licences.**", "**Figures.**", "**How to make it.**")
 MAX_BYTES = 50_000_000
 

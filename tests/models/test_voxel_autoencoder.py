@@ -90,9 +90,13 @@ def test_other_grids():
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"layers": "deep"}, "no layers 'deep'"), ({"cells": 8, "layers": "convolutions"}, "too few"),
-     ({"cells": 4}, "128 numbers for 64 cells"), ({"clip_m": 0.2}, "half a cell")],
-)  # fmt: skip
+    [
+        ({"layers": "deep"}, "no layers 'deep'"),
+        ({"cells": 8, "layers": "convolutions"}, "too few"),
+        ({"cells": 4}, "128 numbers for 64 cells"),
+        ({"clip_m": 0.2}, "half a cell"),
+    ],
+)
 def test_what_is_refused(settings, message):
     with pytest.raises(WearcapError, match=message):
         VoxelAutoencoder(**settings)

@@ -75,9 +75,7 @@ def test_a_file_with_code_is_refused_and_not_run(tmp_path, how):
 
 
 @given(
-    st.binary(max_size=60),
-    st.sampled_from(["pth", "safetensors"]),
-    st.sampled_from([b"", b"PK\x03\x04", b"\x80\x02"]),
+    st.binary(max_size=60), st.sampled_from(["pth", "safetensors"]), st.sampled_from([b"", b"PK\x03\x04", b"\x80\x02"])
 )
 def test_any_other_bytes_are_refused(tmp_path_factory, data, suffix, head):
     path = tmp_path_factory.mktemp("junk") / f"junk.{suffix}"

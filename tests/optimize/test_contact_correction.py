@@ -7,11 +7,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.optimize.contact_correction import (
-    OffsetSettings,
-    bend_contacts,
-    offset_for,
-)
+from wearcap.optimize.contact_correction import OffsetSettings, bend_contacts, offset_for
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
 

@@ -46,17 +46,26 @@ def still_data(length: int = 8, noise: float = 0.0, seed: int = 0) -> HpsData:
     joints = len(body.skeleton)
     lowest = body.rest_vertices[patches().vertex, 2].min().double()
     start = HpsState(
-        randn(length, joints - 1, 3, scale=noise), rotation.exp(randn(length, 3, scale=noise)),
-        torch.stack([torch.zeros(2, dtype=torch.float64).new_tensor([0.3, -0.2, -lowest])] * length) + randn(length, 3, scale=noise),
-    )  # fmt: skip
+        randn(length, joints - 1, 3, scale=noise),
+        rotation.exp(randn(length, 3, scale=noise)),
+        torch.stack([torch.zeros(2, dtype=torch.float64).new_tensor([0.3, -0.2, -lowest])] * length)
+        + randn(length, 3, scale=noise),
+    )
     floor = np.random.default_rng(seed).uniform(-1, 1, (40_000, 3)) * [1, 1, 0.0005]
     one, turns = torch.ones(length, dtype=torch.float64), rotation.exp(randn(length, 3, scale=noise))
     return HpsData(
-        patches(), start, rotation.exp(randn(3, scale=0.3)), turns, one, one.clone(),
-        torch.ones(length, 4, dtype=torch.float64), randn(length - 1, 3, scale=noise),
-        rotation.exp(randn(length - 1, 3, scale=noise)), rotation.exp(randn(length - 1, 3, scale=noise)),
+        patches(),
+        start,
+        rotation.exp(randn(3, scale=0.3)),
+        turns,
+        one,
+        one.clone(),
+        torch.ones(length, 4, dtype=torch.float64),
+        randn(length - 1, 3, scale=noise),
+        rotation.exp(randn(length - 1, 3, scale=noise)),
+        rotation.exp(randn(length - 1, 3, scale=noise)),
         SurfaceIndex.build(floor.astype(np.float32)),
-    )  # fmt: skip
+    )
 
 
 def disturbed(data: HpsData, scale: float) -> HpsState:
@@ -65,9 +74,10 @@ def disturbed(data: HpsData, scale: float) -> HpsState:
     active[Stretch(HpsEnergy({}), data, data.start).columns] = 1
     theta, R, t = data.start.theta, data.start.R_world_root, data.start.t_world_root
     return HpsState(
-        theta + active * randn(*theta.shape, scale=scale), R @ rotation.exp(randn(len(t), 3, scale=scale)),
+        theta + active * randn(*theta.shape, scale=scale),
+        R @ rotation.exp(randn(len(t), 3, scale=scale)),
         t + randn(*t.shape, scale=scale),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("kind", costs.LOSSES)
@@ -87,7 +97,10 @@ def rotations(count: int) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("cost", "inputs"),
     [
-        (lambda a, b, c: costs.head_orientation(rotation.exp(a), rotation.exp(b), rotation.exp(c)), lambda: (rotations(4), rotations(1)[0], rotations(4))),
+        (
+            lambda a, b, c: costs.head_orientation(rotation.exp(a), rotation.exp(b), rotation.exp(c)),
+            lambda: (rotations(4), rotations(1)[0], rotations(4)),
+        ),
         (costs.foot_contact, lambda: (randn(3, 4, 3), randn(3, 4, 3))),
         (costs.foot_plane, lambda: (randn(3, 4, 3), randn(3, 4, 3), randn(3, 4, 3))),
         (costs.foot_slide, lambda: (randn(3, 4, 3),)),
@@ -97,7 +110,7 @@ def rotations(count: int) -> torch.Tensor:
         (costs.pose_step, lambda: (randn(4, 5, 3), randn(4, 5, 3))),
         (costs.translation_hold, lambda: (randn(4, 3), randn(4, 3))),
     ],
-)  # fmt: skip
+)
 def test_each_cost_has_the_derivative_that_autograd_says(cost, inputs):
     torch.manual_seed(1)
     assert torch.autograd.gradcheck(cost, tuple(value.requires_grad_() for value in inputs()))
@@ -105,16 +118,18 @@ def test_each_cost_has_the_derivative_that_autograd_says(cost, inputs):
 
 def test_terms_are_the_means_of_the_equations():
     data = still_data(5)
-    away = HpsState(data.start.theta, data.start.R_world_root @ rotation.exp(torch.tensor([0.0, 0, 0.1]).double()),
-                    data.start.t_world_root + torch.tensor([0.0, 0, 0.02]).double())  # fmt: skip
+    away = HpsState(
+        data.start.theta,
+        data.start.R_world_root @ rotation.exp(torch.tensor([0.0, 0, 0.1]).double()),
+        data.start.t_world_root + torch.tensor([0.0, 0, 0.02]).double(),
+    )
     data_half = still_data(5)
     data_half.contact[:, 2:] = 0.0
     terms = energy_terms(HpsEnergy(dict.fromkeys(TERMS, 2.0)), data, away)
     assert terms["hold"] == pytest.approx(2 * 0.02)
     assert terms["translation_smooth"] == pytest.approx(0.0)
     whole, half = (
-        energy_terms(HpsEnergy({"contact_plane": 1.0}), d, away)["contact_plane"].item()
-        for d in (data, data_half)
+        energy_terms(HpsEnergy({"contact_plane": 1.0}), d, away)["contact_plane"].item() for d in (data, data_half)
     )
     assert 0.015 < whole < 0.035
     assert half == pytest.approx(whole / 2, rel=0.2)  # divided by frames times parts, not by contacts
@@ -142,9 +157,7 @@ def test_compiled_energy_and_gradient_agree_with_autograd(name):
     data = still_data(7, 0.05)
     data.contact[2:4, 0] = data.contact[5, 3] = 0.0
     data.cam_confidence[3], data.hold_confidence[5] = 0.0, 0.5
-    energy = HpsEnergy(
-        {term: 1.0 + place for place, term in enumerate(TERMS) if name in (term, "all")}, MIXED
-    )
+    energy = HpsEnergy({term: 1.0 + place for place, term in enumerate(TERMS) if name in (term, "all")}, MIXED)
     state = disturbed(data, 0.05)
     stretch = Stretch(energy, data, state)
     compiled = stretch.evaluate(1e-9, look_up=True)
@@ -153,10 +166,10 @@ def test_compiled_energy_and_gradient_agree_with_autograd(name):
     terms = energy_terms(energy, data, HpsState(theta, state.R_world_root @ rotation.exp(turn), t))
     assert terms.keys() == compiled.keys() - {"total"}
     assert all(compiled[term] == pytest.approx(terms[term].item(), rel=1e-5) for term in terms)
-    by_t, by_turn, by_theta = torch.autograd.grad(sum(terms.values()), [t, turn, theta], allow_unused=True, materialize_grads=True)  # fmt: skip
-    fill_system(
-        stretch.theta, stretch.active.arrays, stretch.frames, stretch.kin, stretch.forms, *stretch.system
+    by_t, by_turn, by_theta = torch.autograd.grad(
+        sum(terms.values()), [t, turn, theta], allow_unused=True, materialize_grads=True
     )
+    fill_system(stretch.theta, stretch.active.arrays, stretch.frames, stretch.kin, stretch.forms, *stretch.system)
     blocks, _, gradient = stretch.system
     by_theta = by_theta[:, stretch.columns].numpy()
     legs = stretch.active.arrays.leg_chains.ravel() - 1
@@ -178,27 +191,36 @@ def planted() -> tuple[HpsData, HpsState]:
     far = torch.where(torch.rand(40, 1) < 0.1, 1.0, 0.02).double() * randn(40, 3)
     held = HpsState(truth.theta, truth.R_world_root, truth.t_world_root + far)
     exact = HpsData(
-        data.patches, held, torch.eye(3, dtype=torch.float64), truth.R_world_root, data.cam_confidence, data.hold_confidence,
-        data.contact, torch.zeros(39, 3, dtype=torch.float64), torch.eye(3, dtype=torch.float64).expand(39, 3, 3).clone(),
-        torch.eye(3, dtype=torch.float64).expand(39, 3, 3).clone(), data.surface,
-    )  # fmt: skip
+        data.patches,
+        held,
+        torch.eye(3, dtype=torch.float64),
+        truth.R_world_root,
+        data.cam_confidence,
+        data.hold_confidence,
+        data.contact,
+        torch.zeros(39, 3, dtype=torch.float64),
+        torch.eye(3, dtype=torch.float64).expand(39, 3, 3).clone(),
+        torch.eye(3, dtype=torch.float64).expand(39, 3, 3).clone(),
+        data.surface,
+    )
     return exact, truth
 
 
-DOCUMENT = {"self": 10.0, "contact": 300.0, "slide": 500.0, "head_smooth": 4.0, "root_smooth": 4.0, "pose": 20.0,
-            "hold": 30.0, "translation_step": 800.0}  # fmt: skip
+DOCUMENT = {
+    "self": 10.0,
+    "contact": 300.0,
+    "slide": 500.0,
+    "head_smooth": 4.0,
+    "root_smooth": 4.0,
+    "pose": 20.0,
+    "hold": 30.0,
+    "translation_step": 800.0,
+}
 
 
 def test_the_banded_solver_finds_a_planted_motion():
     data, truth = planted()
-    weights = {
-        "self": 10.0,
-        "slide": 500.0,
-        "pose": 20.0,
-        "hold": 30.0,
-        "translation_step": 800.0,
-        "root_step": 400.0,
-    }
+    weights = {"self": 10.0, "slide": 500.0, "pose": 20.0, "hold": 30.0, "translation_step": 800.0, "root_step": 400.0}
     torch.manual_seed(4)
     begin = disturbed(data, 0.05)
     solution = solve_banded(HpsEnergy(weights), data, BandedSettings(iterations=30), begin)

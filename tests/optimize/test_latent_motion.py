@@ -24,7 +24,7 @@ from wearcap.systems.mocap_every.energy import (
     place_error,
     pose_error,
     solve_latent,
-)  # fmt: skip
+)
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.visual_cues import VisualCues, at_frames
 from wearcap_testing import recording_of, swaying_motion
@@ -63,9 +63,7 @@ def test_terms_are_what_they_are_named_after():
     there = body.T_world_joint.t[:, :, WRIST]
     sure = torch.ones(1, 20)
     off = torch.tensor([0.0, 0.3, 0.4])
-    torch.testing.assert_close(
-        place_error(body, PlaceCue(WRIST, there + off, sure)), 0.5 * sure, atol=1e-4, rtol=0
-    )
+    torch.testing.assert_close(place_error(body, PlaceCue(WRIST, there + off, sure)), 0.5 * sure, atol=1e-4, rtol=0)
     camera = Camera.pinhole(640, 480, 120.0)
     seen = Seen(head, camera, Rigid(torch.eye(3), torch.tensor([0.0, 0.0, -1.0])), (), (), ())
     T_world_cam = head @ seen.T_head_cam
@@ -96,9 +94,12 @@ def test_feet_at_rest_hold_nothing_up():
     """Where nothing moves, contact has no slope: the wrist still finds its cue."""
     still = swaying_motion(1)
     motion = replace(
-        still, timestamps=torch.arange(80, dtype=torch.float64) / 30, R_parent_joint=still.R_parent_joint.expand(80, -1, -1, -1),
-        t_world_root=still.t_world_root.expand(80, -1), contact_prob=torch.ones(80, 4),
-    )  # fmt: skip
+        still,
+        timestamps=torch.arange(80, dtype=torch.float64) / 30,
+        R_parent_joint=still.R_parent_joint.expand(80, -1, -1, -1),
+        t_world_root=still.t_world_root.expand(80, -1),
+        contact_prob=torch.ones(80, 4),
+    )
     recording, places = with_place(motion, slice(30, 50))
     edited, _ = VisualCues(Straight(), LatentWeights(stay=0.1), LatentSolver(steps=120)).edit(
         motion, recording, motion.joint("head")
@@ -131,9 +132,7 @@ def test_only_windows_that_show_something_are_edited():
     assert solutions[0].history[-1]["total"] < solutions[0].history[0]["total"]
     torch.testing.assert_close(edited.joint("head").t, motion.joint("head").t, atol=1e-4, rtol=0)
     for still in (slice(0, 38), slice(122, 160)):
-        torch.testing.assert_close(
-            edited.R_parent_joint[still], motion.R_parent_joint[still], atol=1e-4, rtol=0
-        )
+        torch.testing.assert_close(edited.R_parent_joint[still], motion.R_parent_joint[still], atol=1e-4, rtol=0)
 
 
 def test_a_detectors_errors_do_not_shake_the_arm():
@@ -144,9 +143,7 @@ def test_a_detectors_errors_do_not_shake_the_arm():
     shaken = replace(recording, cues={"right_wrist": replace(cue, points=places + noise)})
     jitter, error = {}, {}
     for smooth in (0.0, 2.0):
-        editor = VisualCues(
-            Straight(), LatentWeights(stay=0.01, contact=0.0), LatentSolver(steps=60), smooth=smooth
-        )
+        editor = VisualCues(Straight(), LatentWeights(stay=0.01, contact=0.0), LatentSolver(steps=60), smooth=smooth)
         edited, _ = editor.edit(motion, shaken, motion.joint("head"))
         wrist = edited.joint("right_wrist").t[45:115]
         jitter[smooth] = jitter_m_s3(wrist[:, None], 30.0)

@@ -65,9 +65,7 @@ def drifted(path: torch.Tensor, rate: float = 0.05, turn: float = 0.4) -> torch.
 
 def example(settings: Bending, seed: int = 0):
     true, timestamps = stroll(seed=seed)
-    times = (
-        timestamps[0] + (timestamps[-1] - timestamps[0]) * torch.rand(80, dtype=torch.float64).sort().values
-    )
+    times = timestamps[0] + (timestamps[-1] - timestamps[0]) * torch.rand(80, dtype=torch.float64).sort().values
     frame = torch.searchsorted(timestamps, times).clamp(max=len(true) - 1)
     points = true[frame] + randn(80, 2, scale=0.05)
     points[20:24] += 2.0
@@ -80,9 +78,7 @@ def test_energy_by_hand():
     times, points = torch.tensor([0.5, 3.0]).double(), torch.tensor([[0.5, 1.0], [0.0, 0.0]])
     turn = torch.tensor([0.0, math.pi / 2, math.pi / 2]).double()  # right, up, up: (1, 0), (1, 1), (1, 2)
     for norm, tension in (("square", (math.pi / 2) ** 2 / 1.0), ("absolute", math.pi / 2)):
-        problem = bending_problem(
-            path, timestamps, times, points, torch.tensor([2.0, 1.0]), Bending(10, norm)
-        )
+        problem = bending_problem(path, timestamps, times, points, torch.tensor([2.0, 1.0]), Bending(10, norm))
         terms = energy_terms(problem, turn, NOWHERE)
         torch.testing.assert_close(bent(problem, turn, NOWHERE)[-1], torch.tensor([1.0, 2.0]).double())
         assert terms["control"].item() == pytest.approx(2 * 1.0 + math.hypot(1, 1.5))
@@ -117,8 +113,7 @@ def test_whole_turns_do_not_count(before, after, whole):
     heading, original = torch.tensor([before, after]).double(), torch.tensor([0.1, -0.2]).double()
     plain = heading_change(heading, original)
     torch.testing.assert_close(
-        heading_change(heading + 2 * math.pi * torch.tensor([0.0, whole]).double(), original).cos(),
-        plain.cos(),
+        heading_change(heading + 2 * math.pi * torch.tensor([0.0, whole]).double(), original).cos(), plain.cos()
     )
     assert plain.abs() <= math.pi + 1e-12
     assert wrapped(torch.tensor(3 * math.pi / 2)).item() == pytest.approx(-math.pi / 2, abs=1e-6)
@@ -149,9 +144,7 @@ def test_ours_has_no_more_energy_than_adam(name):
         terms = energy_terms(problem, solved.turn, solved.path[0] - problem.path[0])
         torch.testing.assert_close(sum(t.item() for t in terms.values()), _least(solved), rtol=1e-9, atol=0.0)
         torch.testing.assert_close(bent(problem, solved.turn, solved.path[0] - problem.path[0]), solved.path)
-        torch.testing.assert_close(
-            solved.path.diff(dim=0).norm(dim=1), problem.step.norm(dim=1), rtol=0.0, atol=1e-9
-        )
+        torch.testing.assert_close(solved.path.diff(dim=0).norm(dim=1), problem.step.norm(dim=1), rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["squares", "held", "cauchy", "huber"])
@@ -159,16 +152,11 @@ def test_ours_ends_where_the_gradient_vanishes(name):
     """Against autograd: the compiled passes find a stationary point of the energy that the document writes."""
     problem, _ = example(VARIANTS[name])
     solved = bend_banded(problem, iterations=200, tolerance=0.0)
-    turn, shift = (
-        solved.turn.clone().requires_grad_(),
-        (solved.path[0] - problem.path[0]).clone().requires_grad_(),
-    )
+    turn, shift = (solved.turn.clone().requires_grad_(), (solved.path[0] - problem.path[0]).clone().requires_grad_())
     terms = energy_terms(problem, turn, shift)
     g_turn, g_shift = torch.autograd.grad(terms["control"] + terms["bending"], (turn, shift))
     first = torch.zeros_like(turn)
-    at_start = torch.autograd.grad(
-        sum(energy_terms(problem, first.requires_grad_(), NOWHERE).values()), first
-    )[0]
+    at_start = torch.autograd.grad(sum(energy_terms(problem, first.requires_grad_(), NOWHERE).values()), first)[0]
     assert g_turn.abs().amax() < 1e-3 * at_start.abs().amax()
     if problem.settings.free_start:
         assert g_shift.norm() < 1e-3 * problem.control_weights.sum()
@@ -180,12 +168,7 @@ def test_the_planted_path_is_found():
     assert (imu - true).norm(dim=1).mean() > 1.0
     for settings in (Bending(0.01), Bending(0.01, free_start=True), Bending(0.01, norm="absolute")):
         solved = bend(
-            imu + 5.0 * settings.free_start,
-            timestamps,
-            timestamps,
-            true,
-            settings=settings,
-            solver=bend_banded,
+            imu + 5.0 * settings.free_start, timestamps, timestamps, true, settings=settings, solver=bend_banded
         )
         assert (solved.path - true).norm(dim=1).amax() < 0.01
 
@@ -209,7 +192,7 @@ def test_bursts_of_wrong_points_are_left_out_by_a_robust_loss():
             drifted(true, 0.02), timestamps, timestamps, points, settings=Bending(1.0, loss=loss), solver=bend_banded
         )
         for kind, loss in (("norm", Loss()), ("cauchy", Loss("cauchy", 0.15)))
-    }  # fmt: skip
+    }
     error = {kind: (solved.path - true).norm(dim=1).mean() for kind, solved in solve.items()}
     assert error["cauchy"] < 0.03
     assert error["cauchy"] < 0.5 * error["norm"]
@@ -221,9 +204,16 @@ def test_an_infinite_rigidity_keeps_the_shape():
     centre, turn = path.mean(0), torch.tensor([[0.6, -0.8], [0.8, 0.6]]).double()
     points = (path - centre) @ turn.T + torch.tensor([3.0, -2.0]).double() + randn(len(path), 2, scale=0.2)
     fixed, free = (
-        bend(path, timestamps, timestamps, points, settings=Bending(1e12, free_start=free, loss=Loss("square")), solver=bend_banded)
+        bend(
+            path,
+            timestamps,
+            timestamps,
+            points,
+            settings=Bending(1e12, free_start=free, loss=Loss("square")),
+            solver=bend_banded,
+        )
         for free in (False, True)
-    )  # fmt: skip
+    )
     for solved in (fixed, free):
         assert (solved.turn - solved.turn[0]).abs().amax() < 1e-6
     torch.testing.assert_close(fixed.path[0], path[0])
@@ -239,10 +229,15 @@ def test_no_rigidity_meets_the_control_points():
     points = path[chosen] + randn(4, 2, scale=0.1)
     off = {
         rigidity: (
-            bend(path, timestamps, timestamps[chosen], points, settings=Bending(rigidity), solver=bend_banded).path[chosen] - points
-        ).norm(dim=1).sum()
+            bend(path, timestamps, timestamps[chosen], points, settings=Bending(rigidity), solver=bend_banded).path[
+                chosen
+            ]
+            - points
+        )
+        .norm(dim=1)
+        .sum()
         for rigidity in (1e3, 1e-4)
-    }  # fmt: skip
+    }
     assert off[1e-4] < 1e-3
     assert off[1e3] > 10 * off[1e-4]
 
@@ -304,12 +299,15 @@ def test_degenerate_paths(solver):
         ({"timestamps": torch.arange(10).flip(0).double()}, "frame 1 .* before its predecessor"),
         ({"path": torch.zeros(1, 2), "timestamps": torch.zeros(1).double()}, "1 frames cannot be bent"),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_refused(change, message):
     known = {
-        "path": torch.rand(10, 2), "timestamps": torch.arange(10).double(), "control_times": torch.tensor([1.0, 2.0]).double(),
-        "control_points": torch.zeros(2, 2), "weights": torch.ones(2),
-    }  # fmt: skip
+        "path": torch.rand(10, 2),
+        "timestamps": torch.arange(10).double(),
+        "control_times": torch.tensor([1.0, 2.0]).double(),
+        "control_points": torch.zeros(2, 2),
+        "weights": torch.ones(2),
+    }
     with pytest.raises(WearcapError, match=message):
         bend(**(known | change), settings=Bending(), solver=bend_banded)
 

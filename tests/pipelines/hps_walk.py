@@ -12,15 +12,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.recording import (
-    CameraStream,
-    ContactTrack,
-    ImuStream,
-    Localization,
-    Motion,
-    Recording,
-    RecordingStore,
-)
+from wearcap.recording import CameraStream, ContactTrack, ImuStream, Localization, Motion, Recording, RecordingStore
 from wearcap.sensors.imu import synthesize_imu
 
 LEVEL = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -42,9 +34,7 @@ def drifting(truth: Motion, contact: torch.Tensor) -> Motion:
     R[:, 0] = turn @ R[:, 0]
     steps = (turn[1:] @ truth.t_world_root.diff(dim=0)[..., None])[..., 0]
     first = torch.tensor([[4.0, -2.0, truth.t_world_root[0, 2].item()]])
-    t = torch.cat([first, first + steps.cumsum(0)]) + 0.02 * seconds.float()[:, None] * torch.tensor(
-        [0.6, 0.8, 0.0]
-    )
+    t = torch.cat([first, first + steps.cumsum(0)]) + 0.02 * seconds.float()[:, None] * torch.tensor([0.6, 0.8, 0.0])
     return replace(truth, R_parent_joint=R, t_world_root=t, contact_prob=contact.float())
 
 
@@ -78,15 +68,28 @@ def hps_recording(name: str = "walk", seconds: float = 30.0, camera_lead_s: floa
     found = replace(found, timestamps=found.timestamps + shift)
     camera = CameraStream(found.timestamps, Camera.pinhole(64, 48, 60.0), MOUNT.R, MOUNT.t)
     return Recording(
-        name, suit=drifting(truth, contact), camera=camera, localization=found, scene="scene/pointcloud.ply",
-        imu={} if camera_lead_s is None else clapping_wrists(truth, CLAPS_S), motion=truth,
+        name,
+        suit=drifting(truth, contact),
+        camera=camera,
+        localization=found,
+        scene="scene/pointcloud.ply",
+        imu={} if camera_lead_s is None else clapping_wrists(truth, CLAPS_S),
+        motion=truth,
         contacts=ContactTrack(time, FOOT_PATCHES, contact),
-        skeleton=truth.skeleton, subject="someone", location="floor", license="MIT",
-    )  # fmt: skip
+        skeleton=truth.skeleton,
+        subject="someone",
+        location="floor",
+        license="MIT",
+    )
 
 
 def _every_second(motion: Motion) -> Motion:
-    return replace(motion, timestamps=motion.timestamps[::2], R_parent_joint=motion.R_parent_joint[::2], t_world_root=motion.t_world_root[::2])  # fmt: skip
+    return replace(
+        motion,
+        timestamps=motion.timestamps[::2],
+        R_parent_joint=motion.R_parent_joint[::2],
+        t_world_root=motion.t_world_root[::2],
+    )
 
 
 def hps_dataset(root: Path, *recordings: Recording) -> RecordingStore:

@@ -34,7 +34,7 @@ def recorded(name: str, speed: float, yaw: float = 0.0, frames: int = 150, bend:
     head = HeadStream(t, T_world_head.R.clone(), T_world_head.t.clone(), torch.eye(3), torch.zeros(3))
     return Recording(
         name, head=head, motion=motion, floor=FloorTrack(t, torch.zeros(frames)), skeleton=skeleton, subject=name
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -67,15 +67,10 @@ def test_mean_pose_is_the_mean_of_the_training_split(store):
     fitted = MeanPose.fit([store])
     knee = fitted.R_parent_joint[xsens23().index("left_knee")]
     R = torch.cat(
-        [
-            store.load(n).motion.R_parent_joint[:, xsens23().index("left_knee")]
-            for n in ("slow", "fast", "brief")
-        ]
+        [store.load(n).motion.R_parent_joint[:, xsens23().index("left_knee")] for n in ("slow", "fast", "brief")]
     )
     torch.testing.assert_close(knee, rotation.mean_rotation(R), atol=1e-5, rtol=0)
-    torch.testing.assert_close(
-        fitted.R_parent_joint[0], torch.eye(3), atol=1e-5, rtol=0
-    )  # faces where it looks
+    torch.testing.assert_close(fitted.R_parent_joint[0], torch.eye(3), atol=1e-5, rtol=0)  # faces where it looks
 
 
 def test_mean_pose_turns_with_the_head(store):

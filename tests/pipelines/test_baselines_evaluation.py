@@ -18,9 +18,7 @@ def test_baselines_are_pipelines(tmp_path):
     store = small_dataset(tmp_path)
     for baseline in (MeanPose.fit([store]), NearestWindow.fit([store])):
         rows = list(evaluate(baseline, store, store.names("test"), [0]))
-        assert [row.recording for row in rows] == sorted(
-            store.names("test"), key=lambda n: store.entries[n].frames
-        )
+        assert [row.recording for row in rows] == sorted(store.names("test"), key=lambda n: store.entries[n].frames)
         assert 0 < aggregate(rows)["mpjpe_cm"].mean < 100
 
 
@@ -44,8 +42,6 @@ def test_foot_contact_is_found_by_name_among_other_parts():
     plain = torch.zeros(120, 4, dtype=torch.bool)
     plain[:, FOOT_PATCHES.index("right_heel")] = True
     same = ContactTrack(motion.timestamps, FOOT_PATCHES, plain)
-    found = [
-        score(motion, replace(recording, contacts=t), "r", 0).scores["foot_skate_cm_s"] for t in (track, same)
-    ]
+    found = [score(motion, replace(recording, contacts=t), "r", 0).scores["foot_skate_cm_s"] for t in (track, same)]
     assert found[0] == pytest.approx(found[1])
     assert found[0] > 0

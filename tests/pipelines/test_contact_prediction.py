@@ -34,7 +34,9 @@ def published() -> ContactPredictor:
     torch.manual_seed(1)
     features = SmplAngles()
     nets = [ContactTransformer(features.size) for _ in range(2)]
-    return ContactPredictor(*(ContactDetector(net, features, (name,)) for net, name in zip(nets, ("sliding", "hinged"))))  # fmt: skip
+    return ContactPredictor(
+        *(ContactDetector(net, features, (name,)) for net, name in zip(nets, ("sliding", "hinged")))
+    )
 
 
 def test_every_frame_gets_a_probability(ours, published):
@@ -59,11 +61,7 @@ def test_long_motions_in_passes_are_those_in_one(ours, published, monkeypatch):
 
 
 def test_frame_by_frame_is_the_whole_thirty_frames_later(ours, published):
-    for predictor, frames, skeleton in (
-        (ours, 130, xsens23()),
-        (published, 70, smpl24()),
-        (ours, 12, xsens23()),
-    ):
+    for predictor, frames, skeleton in ((ours, 130, xsens23()), (published, 70, smpl24()), (ours, 12, xsens23())):
         motion = bending(frames, skeleton=skeleton)[0]
         whole, stream = predictor(motion), predictor.stream(motion.skeleton)
         answers = [stream.push(R) for R in motion.R_parent_joint]

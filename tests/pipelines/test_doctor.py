@@ -40,9 +40,7 @@ def motion(recording, **changes):
 
 
 def wrist(recording, **changes):
-    return replace(
-        recording, imu=recording.imu | {"left_wrist": replace(recording.imu["left_wrist"], **changes)}
-    )
+    return replace(recording, imu=recording.imu | {"left_wrist": replace(recording.imu["left_wrist"], **changes)})
 
 
 def every(thing, keep):
@@ -50,12 +48,7 @@ def every(thing, keep):
     tensors = {f.name: getattr(thing, f.name) for f in dataclasses.fields(thing)}
     frames = len(thing.timestamps)
     return replace(
-        thing,
-        **{
-            k: v[keep]
-            for k, v in tensors.items()
-            if isinstance(v, torch.Tensor) and v.ndim and len(v) == frames
-        },
+        thing, **{k: v[keep] for k, v in tensors.items() if isinstance(v, torch.Tensor) and v.ndim and len(v) == frames}
     )
 
 
@@ -73,9 +66,7 @@ def mirrored(recording):
     ]
     offsets = skeleton.t_parent_joint[swap]
     return motion(
-        recording,
-        R_parent_joint=recording.motion.R_parent_joint[:, swap],
-        skeleton=skeleton.with_offsets(offsets),
+        recording, R_parent_joint=recording.motion.R_parent_joint[:, swap], skeleton=skeleton.with_offsets(offsets)
     )
 
 
@@ -106,66 +97,277 @@ def jumped(tensor):
 
 
 DEFECTS = {
-    "head: world y up": (lambda r: head(r, R_world_device=Y_UP @ r.head.R_world_device, t_world_device=r.head.t_world_device @ Y_UP.T),
-                         "error", "head: up axis", r"world's \+y axis is up"),
-    "head: device axes not the head's": (lambda r: head(r, R_world_device=r.head.R_world_device @ rotation.about_axis("x", torch.tensor(-1.5708))),
-                                         "error", "head: up axis", r"body's [+-]y axis points up"),
-    "head: forward is sideways": (lambda r: head(r, R_world_device=r.head.R_world_device @ rotation.about_axis("z", torch.tensor(1.5708))),
-                                  "error", "head: forward axis", "does not point forward"),
-    "head: poses inverted": (lambda r: head(r, R_world_device=r.head.R_world_device.mT), "error", "head", "rotations are inverted|hardly agree|not point forward"),
-    "head: xyzw read as wxyz": (lambda r: head(r, R_world_device=requaternion(r.head.R_world_device, -1)), "error", "head: up axis", "wrong order"),
-    "head: wxyz read as xyzw": (lambda r: head(r, R_world_device=requaternion(r.head.R_world_device, 1)), "error", "head: up axis", "wrong order"),
-    "head: millimetres": (lambda r: head(r, t_world_device=1000 * r.head.t_world_device), "error", "head: positions", "not in metres"),
-    "head: centimetres": (lambda r: head(r, t_world_device=100 * r.head.t_world_device), "error", "head: positions", "not in metres"),
-    "head: no rotations": (lambda r: head(r, R_world_device=1.3 * r.head.R_world_device), "error", "head: rotations", "no rotations"),
-    "head: mirrored": (lambda r: head(r, R_world_device=r.head.R_world_device * torch.tensor([1.0, -1, 1])), "error", "head: rotations", "mirrored"),
-    "head: NaN": (lambda r: head(r, t_world_device=nan_at(r.head.t_world_device, 3)), "error", "head: positions", "NaN"),
-    "head: jump": (lambda r: head(r, t_world_device=jumped(r.head.t_world_device)), "warning", "head: positions", "jumps"),
-    "head: dropped frames": (lambda r: replace(r, head=every(r.head, frozen_gap())), "warning", "head: clock", "dropped frames"),
-    "head: repeated timestamps": (lambda r: head(r, timestamps=r.head.timestamps.clone().index_fill(0, torch.tensor(5), 0.05)), "error", "head: clock", "do not rise"),
+    "head: world y up": (
+        lambda r: head(r, R_world_device=Y_UP @ r.head.R_world_device, t_world_device=r.head.t_world_device @ Y_UP.T),
+        "error",
+        "head: up axis",
+        r"world's \+y axis is up",
+    ),
+    "head: device axes not the head's": (
+        lambda r: head(r, R_world_device=r.head.R_world_device @ rotation.about_axis("x", torch.tensor(-1.5708))),
+        "error",
+        "head: up axis",
+        r"body's [+-]y axis points up",
+    ),
+    "head: forward is sideways": (
+        lambda r: head(r, R_world_device=r.head.R_world_device @ rotation.about_axis("z", torch.tensor(1.5708))),
+        "error",
+        "head: forward axis",
+        "does not point forward",
+    ),
+    "head: poses inverted": (
+        lambda r: head(r, R_world_device=r.head.R_world_device.mT),
+        "error",
+        "head",
+        "rotations are inverted|hardly agree|not point forward",
+    ),
+    "head: xyzw read as wxyz": (
+        lambda r: head(r, R_world_device=requaternion(r.head.R_world_device, -1)),
+        "error",
+        "head: up axis",
+        "wrong order",
+    ),
+    "head: wxyz read as xyzw": (
+        lambda r: head(r, R_world_device=requaternion(r.head.R_world_device, 1)),
+        "error",
+        "head: up axis",
+        "wrong order",
+    ),
+    "head: millimetres": (
+        lambda r: head(r, t_world_device=1000 * r.head.t_world_device),
+        "error",
+        "head: positions",
+        "not in metres",
+    ),
+    "head: centimetres": (
+        lambda r: head(r, t_world_device=100 * r.head.t_world_device),
+        "error",
+        "head: positions",
+        "not in metres",
+    ),
+    "head: no rotations": (
+        lambda r: head(r, R_world_device=1.3 * r.head.R_world_device),
+        "error",
+        "head: rotations",
+        "no rotations",
+    ),
+    "head: mirrored": (
+        lambda r: head(r, R_world_device=r.head.R_world_device * torch.tensor([1.0, -1, 1])),
+        "error",
+        "head: rotations",
+        "mirrored",
+    ),
+    "head: NaN": (
+        lambda r: head(r, t_world_device=nan_at(r.head.t_world_device, 3)),
+        "error",
+        "head: positions",
+        "NaN",
+    ),
+    "head: jump": (
+        lambda r: head(r, t_world_device=jumped(r.head.t_world_device)),
+        "warning",
+        "head: positions",
+        "jumps",
+    ),
+    "head: dropped frames": (
+        lambda r: replace(r, head=every(r.head, frozen_gap())),
+        "warning",
+        "head: clock",
+        "dropped frames",
+    ),
+    "head: repeated timestamps": (
+        lambda r: head(r, timestamps=r.head.timestamps.clone().index_fill(0, torch.tensor(5), 0.05)),
+        "error",
+        "head: clock",
+        "do not rise",
+    ),
     "head: microseconds": (lambda r: head(r, timestamps=1e6 * r.head.timestamps), "error", "head: clock", "a rate of"),
-    "head: jittery clock": (lambda r: head(r, timestamps=r.head.timestamps + 0.004 * torch.sin(1e3 * r.head.timestamps)), "warning", "head: clock", "uneven"),
-    "head: late by 100 ms": (lambda r: head(r, timestamps=r.head.timestamps + 0.1), "error", "head against body: clock", "the head stream is late"),
-    "head: another seat": (lambda r: head(r, t_head_device=torch.tensor([0.3, 0.0, 0.1])), "warning", "head against body: seat", "stated seat"),
-    "head: another world": (lambda r: head(r, t_world_device=r.head.t_world_device @ rotation.about_axis("z", torch.tensor(0.6)).T,
-                                           R_world_device=rotation.about_axis("z", torch.tensor(0.6)) @ r.head.R_world_device),
-                            "error", "head against body: seat", "does not ride"),
-    "streams apart": (lambda r: head(r, timestamps=r.head.timestamps + 500), "error", "streams' time spans", "do not overlap"),
-    "body: world y up": (lambda r: motion(r, R_parent_joint=torch.cat([Y_UP @ r.motion.R_parent_joint[:, :1], r.motion.R_parent_joint[:, 1:]], 1),
-                                          t_world_root=r.motion.t_world_root @ Y_UP.T), "error", "motion: up axis", r"stands along \+y"),
-    "body: 170 m tall": (lambda r: motion(r, skeleton=xsens23().scaled(100.0), t_world_root=100 * r.motion.t_world_root), "error", "motion: body size", "no person's size"),
-    "body: 1.7 mm tall": (lambda r: motion(r, skeleton=xsens23().scaled(0.001)), "error", "motion: body size", "no person's size"),
-    "body: xyzw read as wxyz": (lambda r: motion(r, R_parent_joint=requaternion(r.motion.R_parent_joint, -1)), "error", "motion: joint rotations", "beyond what a body can"),
+    "head: jittery clock": (
+        lambda r: head(r, timestamps=r.head.timestamps + 0.004 * torch.sin(1e3 * r.head.timestamps)),
+        "warning",
+        "head: clock",
+        "uneven",
+    ),
+    "head: late by 100 ms": (
+        lambda r: head(r, timestamps=r.head.timestamps + 0.1),
+        "error",
+        "head against body: clock",
+        "the head stream is late",
+    ),
+    "head: another seat": (
+        lambda r: head(r, t_head_device=torch.tensor([0.3, 0.0, 0.1])),
+        "warning",
+        "head against body: seat",
+        "stated seat",
+    ),
+    "head: another world": (
+        lambda r: head(
+            r,
+            t_world_device=r.head.t_world_device @ rotation.about_axis("z", torch.tensor(0.6)).T,
+            R_world_device=rotation.about_axis("z", torch.tensor(0.6)) @ r.head.R_world_device,
+        ),
+        "error",
+        "head against body: seat",
+        "does not ride",
+    ),
+    "streams apart": (
+        lambda r: head(r, timestamps=r.head.timestamps + 500),
+        "error",
+        "streams' time spans",
+        "do not overlap",
+    ),
+    "body: world y up": (
+        lambda r: motion(
+            r,
+            R_parent_joint=torch.cat([Y_UP @ r.motion.R_parent_joint[:, :1], r.motion.R_parent_joint[:, 1:]], 1),
+            t_world_root=r.motion.t_world_root @ Y_UP.T,
+        ),
+        "error",
+        "motion: up axis",
+        r"stands along \+y",
+    ),
+    "body: 170 m tall": (
+        lambda r: motion(r, skeleton=xsens23().scaled(100.0), t_world_root=100 * r.motion.t_world_root),
+        "error",
+        "motion: body size",
+        "no person's size",
+    ),
+    "body: 1.7 mm tall": (
+        lambda r: motion(r, skeleton=xsens23().scaled(0.001)),
+        "error",
+        "motion: body size",
+        "no person's size",
+    ),
+    "body: xyzw read as wxyz": (
+        lambda r: motion(r, R_parent_joint=requaternion(r.motion.R_parent_joint, -1)),
+        "error",
+        "motion: joint rotations",
+        "beyond what a body can",
+    ),
     "body: sides exchanged": (mirrored, "error", "motion: sides", "exchanged"),
     "body: knees bend forwards": (knees_reversed, "warning", "motion: knees", "bend forwards"),
-    "body: floats": (lambda r: motion(r, t_world_root=r.motion.t_world_root + torch.tensor([0, 0, 0.25])), "warning", "motion: feet on the floor", "float above"),
-    "body: sinks": (lambda r: motion(r, t_world_root=r.motion.t_world_root - torch.tensor([0, 0, 0.2])), "warning", "motion: feet on the floor", "sink into"),
-    "body: path of twice the length": (lambda r: motion(r, t_world_root=r.motion.t_world_root * torch.tensor([2.0, 2.0, 1.0])), "warning", "motion: foot sliding", "slide"),
-    "imu: shifted by 200 ms": (lambda r: wrist(r, timestamps=r.imu["left_wrist"].timestamps + 0.2), "error", "imu left_wrist: clock offset", "late"),
-    "imu: early by 60 ms": (lambda r: wrist(r, timestamps=r.imu["left_wrist"].timestamps - 0.06), "error", "imu left_wrist: clock offset", "early"),
-    "imu: in g": (lambda r: wrist(r, acc_imu=r.imu["left_wrist"].acc_imu / 9.81), "error", "imu left_wrist: accelerometer", "is in g"),
-    "imu: reversed sign": (lambda r: wrist(r, acc_imu=-r.imu["left_wrist"].acc_imu), "error", "imu left_wrist: accelerometer", "sign is reversed"),
-    "imu: gravity left in": (lambda r: wrist(r, acc_world=r.imu["left_wrist"].acc_world + torch.tensor([0, 0, 9.81])), "error", "imu left_wrist: free acceleration", "gravity is still in it"),
-    "imu: free acceleration in g": (lambda r: wrist(r, acc_world=r.imu["left_wrist"].acc_world / 9.81), "error", "imu left_wrist: acceleration", "is in g"),
-    "imu: free acceleration negated": (lambda r: wrist(r, acc_world=-r.imu["left_wrist"].acc_world), "error", "imu left_wrist: acceleration", "opposite sign"),
-    "imu: gyroscope in degrees": (lambda r: wrist(r, gyro_imu=57.29578 * r.imu["left_wrist"].gyro_imu), "error", "imu left_wrist: gyroscope", "degrees"),
-    "imu: named for the wrong arm": (lambda r: wrist(r, joint="right_wrist"), "error", "imu left_wrist: mounting", "does not ride"),
-    "imu: gyroscope in world axes": (lambda r: wrist(r, gyro_imu=(r.imu["left_wrist"].R_world_imu @ r.imu["left_wrist"].gyro_imu[..., None])[..., 0]),
-                                     "warning", "imu left_wrist: gyroscope", "does not agree"),
-    "imu: world y up": (lambda r: wrist(r, R_world_imu=Y_UP @ r.imu["left_wrist"].R_world_imu), "error", "imu left_wrist", "along z|ride"),
-    "imu: stale mounting": (lambda r: wrist(r, R_joint_imu=MOUNT @ rotation.about_axis("x", torch.tensor(0.6))), "warning", "imu left_wrist: mounting", "stated mounting"),
-    "imu: NaN": (lambda r: wrist(r, gyro_imu=nan_at(r.imu["left_wrist"].gyro_imu, 9)), "error", "imu left_wrist: gyro_imu", "NaN"),
-    "points: millimetres": (lambda r: replace(r, points=PointCloud(1000 * r.points.points_world)), "error", "points", "not a surrounding in metres"),
-    "points: elsewhere": (lambda r: replace(r, points=PointCloud(r.points.points_world + torch.tensor([500.0, 0, 0]))), "error", "points: floor", "no points below"),
-    "points: y up": (lambda r: replace(r, points=PointCloud(r.points.points_world @ Y_UP.T)), "note", "points: floor", "no clear floor"),
-}  # fmt: skip
+    "body: floats": (
+        lambda r: motion(r, t_world_root=r.motion.t_world_root + torch.tensor([0, 0, 0.25])),
+        "warning",
+        "motion: feet on the floor",
+        "float above",
+    ),
+    "body: sinks": (
+        lambda r: motion(r, t_world_root=r.motion.t_world_root - torch.tensor([0, 0, 0.2])),
+        "warning",
+        "motion: feet on the floor",
+        "sink into",
+    ),
+    "body: path of twice the length": (
+        lambda r: motion(r, t_world_root=r.motion.t_world_root * torch.tensor([2.0, 2.0, 1.0])),
+        "warning",
+        "motion: foot sliding",
+        "slide",
+    ),
+    "imu: shifted by 200 ms": (
+        lambda r: wrist(r, timestamps=r.imu["left_wrist"].timestamps + 0.2),
+        "error",
+        "imu left_wrist: clock offset",
+        "late",
+    ),
+    "imu: early by 60 ms": (
+        lambda r: wrist(r, timestamps=r.imu["left_wrist"].timestamps - 0.06),
+        "error",
+        "imu left_wrist: clock offset",
+        "early",
+    ),
+    "imu: in g": (
+        lambda r: wrist(r, acc_imu=r.imu["left_wrist"].acc_imu / 9.81),
+        "error",
+        "imu left_wrist: accelerometer",
+        "is in g",
+    ),
+    "imu: reversed sign": (
+        lambda r: wrist(r, acc_imu=-r.imu["left_wrist"].acc_imu),
+        "error",
+        "imu left_wrist: accelerometer",
+        "sign is reversed",
+    ),
+    "imu: gravity left in": (
+        lambda r: wrist(r, acc_world=r.imu["left_wrist"].acc_world + torch.tensor([0, 0, 9.81])),
+        "error",
+        "imu left_wrist: free acceleration",
+        "gravity is still in it",
+    ),
+    "imu: free acceleration in g": (
+        lambda r: wrist(r, acc_world=r.imu["left_wrist"].acc_world / 9.81),
+        "error",
+        "imu left_wrist: acceleration",
+        "is in g",
+    ),
+    "imu: free acceleration negated": (
+        lambda r: wrist(r, acc_world=-r.imu["left_wrist"].acc_world),
+        "error",
+        "imu left_wrist: acceleration",
+        "opposite sign",
+    ),
+    "imu: gyroscope in degrees": (
+        lambda r: wrist(r, gyro_imu=57.29578 * r.imu["left_wrist"].gyro_imu),
+        "error",
+        "imu left_wrist: gyroscope",
+        "degrees",
+    ),
+    "imu: named for the wrong arm": (
+        lambda r: wrist(r, joint="right_wrist"),
+        "error",
+        "imu left_wrist: mounting",
+        "does not ride",
+    ),
+    "imu: gyroscope in world axes": (
+        lambda r: wrist(
+            r, gyro_imu=(r.imu["left_wrist"].R_world_imu @ r.imu["left_wrist"].gyro_imu[..., None])[..., 0]
+        ),
+        "warning",
+        "imu left_wrist: gyroscope",
+        "does not agree",
+    ),
+    "imu: world y up": (
+        lambda r: wrist(r, R_world_imu=Y_UP @ r.imu["left_wrist"].R_world_imu),
+        "error",
+        "imu left_wrist",
+        "along z|ride",
+    ),
+    "imu: stale mounting": (
+        lambda r: wrist(r, R_joint_imu=MOUNT @ rotation.about_axis("x", torch.tensor(0.6))),
+        "warning",
+        "imu left_wrist: mounting",
+        "stated mounting",
+    ),
+    "imu: NaN": (
+        lambda r: wrist(r, gyro_imu=nan_at(r.imu["left_wrist"].gyro_imu, 9)),
+        "error",
+        "imu left_wrist: gyro_imu",
+        "NaN",
+    ),
+    "points: millimetres": (
+        lambda r: replace(r, points=PointCloud(1000 * r.points.points_world)),
+        "error",
+        "points",
+        "not a surrounding in metres",
+    ),
+    "points: elsewhere": (
+        lambda r: replace(r, points=PointCloud(r.points.points_world + torch.tensor([500.0, 0, 0]))),
+        "error",
+        "points: floor",
+        "no points below",
+    ),
+    "points: y up": (
+        lambda r: replace(r, points=PointCloud(r.points.points_world @ Y_UP.T)),
+        "note",
+        "points: floor",
+        "no clear floor",
+    ),
+}
 
 
 def spoiled(values, random):
     """In a unit of anyone's guess, with noise."""
-    return values * 10 ** (8 * torch.rand(1, generator=random).item() - 4) + torch.randn(
-        values.shape, generator=random
-    )
+    return values * 10 ** (8 * torch.rand(1, generator=random).item() - 4) + torch.randn(values.shape, generator=random)
 
 
 def camera_stream(R_head_cam):
@@ -255,8 +457,7 @@ def test_single_files(sound, tmp_path):
     save_recording(sound, tmp_path / "walk.safetensors")
     assert examine(tmp_path / "walk.safetensors").sound
     write_tum(
-        Trajectory(sound.head.timestamps, sound.head.R_world_device, sound.head.t_world_device),
-        tmp_path / "head.txt",
+        Trajectory(sound.head.timestamps, sound.head.R_world_device, sound.head.t_world_device), tmp_path / "head.txt"
     )
     assert examine(tmp_path / "head.txt").sound
     (tmp_path / "broken.bvh").write_text("HIERARCHY\nROOT")
@@ -278,8 +479,11 @@ def test_random_numbers_never_crash():
     base = sound_recording(seconds=5.0)
     for seed in range(8):
         random = torch.Generator().manual_seed(seed)
-        wild = head(motion(base, t_world_root=spoiled(base.motion.t_world_root, random)), t_world_device=spoiled(base.head.t_world_device, random),
-                    R_world_device=rotation.exp(3 * torch.randn(len(base.head.timestamps), 3, generator=random)))  # fmt: skip
+        wild = head(
+            motion(base, t_world_root=spoiled(base.motion.t_world_root, random)),
+            t_world_device=spoiled(base.head.t_world_device, random),
+            R_world_device=rotation.exp(3 * torch.randn(len(base.head.timestamps), 3, generator=random)),
+        )
         wild = wrist(
             wild,
             acc_imu=spoiled(base.imu["left_wrist"].acc_imu, random),

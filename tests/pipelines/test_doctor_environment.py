@@ -16,9 +16,7 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 
 
-def thing(
-    name, size=(1.0, 0.6, 0.8), at=(0.0, 0.0, 0.0), freedom=Freedom("plane"), origin=0.0
-) -> SceneObject:
+def thing(name, size=(1.0, 0.6, 0.8), at=(0.0, 0.0, 0.0), freedom=Freedom("plane"), origin=0.0) -> SceneObject:
     """A box on its frame's floor; with origin 0.5 its frame is at its left end."""
     x, y, z = size
     mesh = box_mesh(((origin - 0.5) * x, -y / 2, 0.0), ((origin + 0.5) * x, y / 2, z))
@@ -27,11 +25,7 @@ def thing(
 
 def door(at=(5.0, 0.0, 0.0), **freedom) -> SceneObject:
     return thing(
-        "door_1",
-        (0.9, 0.05, 2.0),
-        at,
-        Freedom(**{"kind": "hinge", "pivot": at, "limits": (0.0, 1.6)} | freedom),
-        0.5,
+        "door_1", (0.9, 0.05, 2.0), at, Freedom(**{"kind": "hinge", "pivot": at, "limits": (0.0, 1.6)} | freedom), 0.5
     )
 
 
@@ -64,11 +58,15 @@ def test_a_sound_environment_is_listed():
         (thing("chair_9", at=(9.0, 0.0, -0.5)), "reaches below the floor", "warning"),
         (thing("box_9", at=(9.0, 0.0, -0.5), freedom=Freedom("free")), "reaches below the floor", "warning"),
         (thing("chair_9", at=(9.0, 0.0, 0.5)), "slides above the others' floor", "note"),
-        (replace(door((8.0, 0.0, 0.0), pivot=(7.7, 0.0, 0.0)), name="door_9"), "the hinge is beside the mesh", "warning"),
+        (
+            replace(door((8.0, 0.0, 0.0), pivot=(7.7, 0.0, 0.0)), name="door_9"),
+            "the hinge is beside the mesh",
+            "warning",
+        ),
         (replace(door((8.0, 0.0, 0.0), pivot=(8.4, 0.0, 0.0)), name="door_9"), "the hinge is in the middle", "note"),
         (replace(door((8.0, 0.0, 0.0), limits=None), name="door_9"), "no limits", "note"),
     ],
-)  # fmt: skip
+)
 def test_what_looks_wrong_is_named(item, what, severity):
     reported = found(*SOUND, item)
     assert [(finding.what, finding.severity) for finding in reported] == [(what, severity)]

@@ -57,8 +57,7 @@ def smaller(folder):
 def sparse(folder):
     points = room_cloud(0.12)
     write_ply(
-        Ply(points, np.random.default_rng(0).integers(0, 255, points.shape, dtype=np.uint8)),
-        folder / "pointcloud.ply",
+        Ply(points, np.random.default_rng(0).integers(0, 255, points.shape, dtype=np.uint8)), folder / "pointcloud.ply"
     )
 
 
@@ -70,8 +69,7 @@ def grey(folder):
 def y_up(folder):
     points = room_cloud()[:, [1, 2, 0]] * np.array([1, 1, 3], np.float32)
     write_ply(
-        Ply(points, np.random.default_rng(0).integers(0, 255, points.shape, dtype=np.uint8)),
-        folder / "pointcloud.ply",
+        Ply(points, np.random.default_rng(0).integers(0, 255, points.shape, dtype=np.uint8)), folder / "pointcloud.ply"
     )
 
 
@@ -79,7 +77,11 @@ SCENE_DEFECTS = {
     "millimetres": (lambda folder: write_room(folder, unit=1000), "error", "millimetres"),
     "no colour": (lambda folder: write_room(folder, colors=False), "error", "no colour"),
     "one colour": (grey, "error", "one colour"),
-    "no points": (lambda folder: write_ply(Ply(np.zeros((0, 3), np.float32)), folder / "pointcloud.ply"), "error", "no points"),
+    "no points": (
+        lambda folder: write_ply(Ply(np.zeros((0, 3), np.float32)), folder / "pointcloud.ply"),
+        "error",
+        "no points",
+    ),
     "no scan": (lambda folder: (folder / "pointcloud.ply").unlink(), "error", "the scan is missing"),
     "sparse": (sparse, "warning", "sparse"),
     "y up": (y_up, "warning", "taller than wide"),
@@ -87,10 +89,18 @@ SCENE_DEFECTS = {
     "no list": (lambda folder: (folder / "photos.json").unlink(), "error", "no photos"),
     "no intrinsics": (lambda folder: rewritten(folder / "photos.json", without_intrinsics), "error", "lacks 'fx'"),
     "a photo is missing": (lambda folder: (folder / "photos/00001-cam0.jpg").unlink(), "error", "files are missing"),
-    "a photo is damaged": (lambda folder: (folder / "photos/00001-cam0.jpg").write_bytes(b"\xff\xd8 cut"), "error", "cannot be read"),
+    "a photo is damaged": (
+        lambda folder: (folder / "photos/00001-cam0.jpg").write_bytes(b"\xff\xd8 cut"),
+        "error",
+        "cannot be read",
+    ),
     "a photo is smaller": (smaller, "error", "image size and calibration differ"),
-    "poses inverted": (lambda folder: write_photos(inverted(write_room(folder)), folder), "error", "do not see the scan"),
-}  # fmt: skip
+    "poses inverted": (
+        lambda folder: write_photos(inverted(write_room(folder)), folder),
+        "error",
+        "do not see the scan",
+    ),
+}
 
 
 @pytest.mark.parametrize("defect", SCENE_DEFECTS)
@@ -115,10 +125,7 @@ def test_a_scan_of_the_hps_data_set(tmp_path, monkeypatch):
         Image.new("RGB", (918, 690)).save(path)
     report = examine(tmp_path)
     assert any("1 calibrations" in f.evidence for f in found(report, "ok"))
-    assert {f.what for f in found(report, "error")} == {
-        "all points have one colour",
-        "photos do not see the scan",
-    }
+    assert {f.what for f in found(report, "error")} == {"all points have one colour", "photos do not see the scan"}
 
 
 def test_sequences_of_the_hps_data_set(tmp_path, monkeypatch):
@@ -131,9 +138,7 @@ def test_sequences_of_the_hps_data_set(tmp_path, monkeypatch):
     report = examine(tmp_path)
     assert list(report.findings) == [hps_files.NAME]
     (tmp_path / "head_camera_videos/cameras.json").write_text("{}")
-    assert [f.what for f in found(examine(tmp_path), "error")] == [
-        f"no intrinsics for the video of {hps_files.NAME!r}"
-    ]
+    assert [f.what for f in found(examine(tmp_path), "error")] == [f"no intrinsics for the video of {hps_files.NAME!r}"]
 
 
 # Recordings --------------------------------------------------------------------------------------------------------
@@ -148,10 +153,11 @@ def localized(shift_s: float = 0.0) -> Recording:
     R = head.R @ LEVEL @ about_axis("x", 0.003 * torch.randn(frames, generator=random))
     t = head.t + 0.01 * torch.randn(frames, 3, generator=random)
     return replace(
-        base, suit=replace(base.motion, contact_prob=base.contacts.contact.float()),
+        base,
+        suit=replace(base.motion, contact_prob=base.contacts.contact.float()),
         localization=Localization(base.motion.timestamps + shift_s, R, t, confidence),
         camera=CameraStream(base.motion.timestamps, CAMERA, LEVEL, torch.zeros(3)),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -183,16 +189,28 @@ def suit(recording: Recording, contact) -> Recording:
 
 
 DEFECTS = {
-    "never found": (lambda r: spot(r, confidence=torch.zeros_like(r.localization.confidence)), "error", "hardly any frame"),
-    "seldom found": (lambda r: spot(r, confidence=r.localization.confidence * (torch.arange(len(r.suit)) % 4 == 0)), "warning", "few frames"),
+    "never found": (
+        lambda r: spot(r, confidence=torch.zeros_like(r.localization.confidence)),
+        "error",
+        "hardly any frame",
+    ),
+    "seldom found": (
+        lambda r: spot(r, confidence=r.localization.confidence * (torch.arange(len(r.suit)) % 4 == 0)),
+        "warning",
+        "few frames",
+    ),
     "jumps": (jumping, "warning", "positions jump"),
     "no rotations": (lambda r: spot(r, R_world_cam=1.3 * r.localization.R_world_cam), "error", "no rotations"),
-    "upside down": (lambda r: spot(r, R_world_cam=r.localization.R_world_cam @ about_axis("z", torch.tensor(3.14159))), "warning", "upside down"),
+    "upside down": (
+        lambda r: spot(r, R_world_cam=r.localization.R_world_cam @ about_axis("z", torch.tensor(3.14159))),
+        "warning",
+        "upside down",
+    ),
     "late": (lambda r: localized(0.2), "error", "the camera is late"),
     "NaN": (lambda r: spot(r, t_world_cam=r.localization.t_world_cam * torch.nan), "error", "positions are NaN"),
     "no contact": (lambda r: suit(r, torch.zeros(len(r.suit), 4)), "warning", "feet never touch"),
     "no probability": (lambda r: suit(r, torch.full((len(r.suit), 4), 7.0)), "error", "no probabilities"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("defect", DEFECTS)
@@ -229,11 +247,7 @@ def filmed(recording: Recording, root, size: tuple[int, int], frames: int) -> Re
 
 @pytest.mark.parametrize(
     ("size", "cut", "message"),
-    [
-        ((64, 48), 0, ""),
-        ((80, 48), 0, "image size and calibration differ"),
-        ((64, 48), 100, "differ in number"),
-    ],
+    [((64, 48), 0, ""), ((80, 48), 0, "image size and calibration differ"), ((64, 48), 100, "differ in number")],
 )
 def test_the_video_is_looked_at(size, cut, message, sound, tmp_path):
     recording = filmed(sound, tmp_path, size, len(sound.camera.timestamps) - cut)
@@ -245,10 +259,7 @@ def test_the_video_is_looked_at(size, cut, message, sound, tmp_path):
 def test_missing_files_are_named(sound, tmp_path):
     gone = replace(sound, scene="scenes/none.ply", camera=replace(sound.camera, video="none.mp4"))
     RecordingStore(tmp_path).add(gone, split="test", config_hash="x")
-    assert {f.what for f in found(examine(tmp_path), "error")} == {
-        "the scan is missing",
-        "no such video",
-    }
+    assert {f.what for f in found(examine(tmp_path), "error")} == {"the scan is missing", "no such video"}
 
 
 # Maps --------------------------------------------------------------------------------------------------------------
@@ -261,11 +272,22 @@ def small_map(pictures: int, each: int) -> VisualMap:
     descriptors = random.integers(-9, 9, (count, 128), dtype=np.int8)
     landmarks = Landmarks(positions, descriptors)
     return VisualMap(
-        "sift", "vlad", tuple(f"{k}.jpg" for k in range(pictures)), (CAMERA,) * pictures, np.tile(np.eye(3), (pictures, 1, 1)),
-        np.zeros((pictures, 3)), np.zeros((count, 2), np.float32), descriptors, positions,
-        np.arange(pictures + 1, dtype=np.int64) * each, np.arange(count, dtype=np.int32), landmarks,
-        np.zeros((pictures, 8), np.float32), np.zeros((2, 128), np.float32), 0.02,
-    )  # fmt: skip
+        "sift",
+        "vlad",
+        tuple(f"{k}.jpg" for k in range(pictures)),
+        (CAMERA,) * pictures,
+        np.tile(np.eye(3), (pictures, 1, 1)),
+        np.zeros((pictures, 3)),
+        np.zeros((count, 2), np.float32),
+        descriptors,
+        positions,
+        np.arange(pictures + 1, dtype=np.int64) * each,
+        np.arange(count, dtype=np.int32),
+        landmarks,
+        np.zeros((pictures, 8), np.float32),
+        np.zeros((2, 128), np.float32),
+        0.02,
+    )
 
 
 @pytest.mark.parametrize(
@@ -279,9 +301,9 @@ def small_map(pictures: int, each: int) -> VisualMap:
 )
 def test_maps(pictures, each, severity, message, tmp_path):
     small_map(pictures, each).save(tmp_path / "map.safetensors")
-    assert [
-        message in f.what for f in found(examine(tmp_path / "map.safetensors"), severity) if f.check == "map"
-    ] == [True]
+    assert [message in f.what for f in found(examine(tmp_path / "map.safetensors"), severity) if f.check == "map"] == [
+        True
+    ]
 
 
 def test_a_damaged_map_is_one_error(tmp_path):

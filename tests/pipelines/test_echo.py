@@ -65,7 +65,12 @@ def test_what_is_observed_comes_out_as_it_is(frame, rewindow):
 def test_observed_frames_of_one_modality_enter_at_level_0(modality):
     recording, take = carrying(1.2), torch.tensor([4, 17, 30])
     all_of_it, times = everything(recording), recording.motion.timestamps[take]
-    motion = replace(recording.motion, timestamps=times, R_parent_joint=recording.motion.R_parent_joint[take], t_world_root=recording.motion.t_world_root[take])  # fmt: skip
+    motion = replace(
+        recording.motion,
+        timestamps=times,
+        R_parent_joint=recording.motion.R_parent_joint[take],
+        t_world_root=recording.motion.t_world_root[take],
+    )
     seen = (
         Observed(motion),
         Observed(object_motion={name: track[take] for name, track in recording.object_motion.items()}),
@@ -91,9 +96,12 @@ def test_observed_frames_of_one_modality_enter_at_level_0(modality):
         assert not observed_parts[..., [k for k in range(3) if k != modality]].any()
     pairs = [
         (found.t_world_root, plain.t_world_root, recording.motion.t_world_root),
-        (*(m.object_motion["box_1"].t_world_body for m in (found, plain)), recording.object_motion["box_1"].t_world_body),
+        (
+            *(m.object_motion["box_1"].t_world_body for m in (found, plain)),
+            recording.object_motion["box_1"].t_world_body,
+        ),
         (found.contact_prob, plain.contact_prob, all_of_it.contact[:, BODY_POINTS:]),
-    ]  # fmt: skip
+    ]
     value, without, true = pairs[modality]
     torch.testing.assert_close(value[take], true[take], atol=2e-4, rtol=0)
     assert (without[take] - true[take]).abs().max() > 0.01
@@ -105,9 +113,7 @@ def test_observed_frames_of_one_modality_enter_at_level_0(modality):
 def truth_of(echo: Echo, conditioning: Conditioning, frame: Rigid) -> torch.Tensor:
     """x0 in coordinates of the frame, from the observed values of the conditioning."""
     body = echo.features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
-    scene_object = echo.features.encode_object(
-        Rigid(conditioning.R_world_object, conditioning.t_world_object), frame
-    )
+    scene_object = echo.features.encode_object(Rigid(conditioning.R_world_object, conditioning.t_world_object), frame)
     return echo.net.motion_normalizer(torch.cat([body, scene_object, 2 * conditioning.contact - 1], -1))
 
 
@@ -134,11 +140,7 @@ def knowing(frame: str, **settings) -> Echo:
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize(
     ("make", "step"),
-    [
-        (EchoQueue, "posterior"),
-        (EchoQueue, "redraw"),
-        (lambda *given: Rewindow(*given, stride=3), "posterior"),
-    ],
+    [(EchoQueue, "posterior"), (EchoQueue, "redraw"), (lambda *given: Rewindow(*given, stride=3), "posterior")],
 )
 def test_a_perfect_denoiser_gives_the_ground_truth_in_any_frame(frame, make, step):
     """Clean frames stay the ground truth while the window's frame of reference moves."""
@@ -152,12 +154,8 @@ def test_a_perfect_denoiser_gives_the_ground_truth_in_any_frame(frame, make, ste
     torch.testing.assert_close(outputs.t_world_root, conditioning.t_world_root, atol=2e-4, rtol=0)
     torch.testing.assert_close(outputs.R_parent_joint, conditioning.R_parent_joint, atol=2e-4, rtol=0)
     there = conditioning.has_object
-    torch.testing.assert_close(
-        outputs.t_world_object[there], conditioning.t_world_object[there], atol=2e-4, rtol=0
-    )
-    torch.testing.assert_close(
-        outputs.R_world_object[there], conditioning.R_world_object[there], atol=2e-4, rtol=0
-    )
+    torch.testing.assert_close(outputs.t_world_object[there], conditioning.t_world_object[there], atol=2e-4, rtol=0)
+    torch.testing.assert_close(outputs.R_world_object[there], conditioning.R_world_object[there], atol=2e-4, rtol=0)
     assert max(part.max() for part in queue.seen) < 5e-3, "clean frames are the ground truth"
 
 
@@ -165,13 +163,8 @@ def test_noised_frames_are_re_expressed_when_the_window_advances():
     """z' = A z + √ᾱ b equals encoding in the new frame with rotated noise."""
     echo = drawn_echo("window")
     queue, recording = EchoQueue(echo, [echo.skeleton], [0]), carrying(1.6)
-    conditioning = batch_item(
-        echo, scenario_of(recording, margin_s=5.0, observed=everything(recording))
-    ).conditioning
-    before, queue.conditioning = (
-        conditioning.frames(slice(0, WINDOW)),
-        conditioning.frames(slice(5, 5 + WINDOW)),
-    )
+    conditioning = batch_item(echo, scenario_of(recording, margin_s=5.0, observed=everything(recording))).conditioning
+    before, queue.conditioning = (conditioning.frames(slice(0, WINDOW)), conditioning.frames(slice(5, 5 + WINDOW)))
     old, new = (echo.features.canonical(part.points) for part in (before, queue.conditioning))
     queue.conveyor.age = torch.arange(WINDOW).flip(0)
     queue.conveyor.level = torch.rand(1, WINDOW, 3)
@@ -241,7 +234,12 @@ def test_the_body_is_anchored_to_the_measured_head():
 def test_an_observed_body_is_not_anchored():
     recording = carrying(1.0)
     truth, device = recording.motion, recording.head
-    seen = replace(truth, timestamps=truth.timestamps[9:10], R_parent_joint=truth.R_parent_joint[9:10], t_world_root=truth.t_world_root[9:10])  # fmt: skip
+    seen = replace(
+        truth,
+        timestamps=truth.timestamps[9:10],
+        R_parent_joint=truth.R_parent_joint[9:10],
+        t_world_root=truth.t_world_root[9:10],
+    )
     off = replace(recording, head=replace(device, t_world_device=device.t_world_device + 0.02))
     motion = drawn_echo().capture_scenarios([scenario_of(off, observed=Observed(seen))], [0])[0]
     torch.testing.assert_close(motion.T_world_joint.t[9:10], seen.T_world_joint.t, atol=1e-4, rtol=0)
@@ -270,7 +268,15 @@ def test_objects_are_static_between_the_times_they_are_active():
 def with_gap(recording, first: int, stop: int):
     head = recording.head
     keep = [k for k in range(len(head.timestamps)) if not first <= k < stop]
-    return replace(recording, head=replace(head, timestamps=head.timestamps[keep], R_world_device=head.R_world_device[keep], t_world_device=head.t_world_device[keep]))  # fmt: skip
+    return replace(
+        recording,
+        head=replace(
+            head,
+            timestamps=head.timestamps[keep],
+            R_world_device=head.R_world_device[keep],
+            t_world_device=head.t_world_device[keep],
+        ),
+    )
 
 
 def test_after_a_gap_of_the_head_the_capture_restarts():
@@ -280,7 +286,15 @@ def test_after_a_gap_of_the_head_the_capture_restarts():
     motion = echo.capture([broken], [5])[0]
     assert len(motion) == 75
     assert (motion.R_parent_joint[25:55, 1] == motion.R_parent_joint[24, 1]).all(), "as before"
-    cut = replace(whole, head=replace(whole.head, timestamps=whole.head.timestamps[:25], R_world_device=whole.head.R_world_device[:25], t_world_device=whole.head.t_world_device[:25]))  # fmt: skip
+    cut = replace(
+        whole,
+        head=replace(
+            whole.head,
+            timestamps=whole.head.timestamps[:25],
+            R_world_device=whole.head.R_world_device[:25],
+            t_world_device=whole.head.t_world_device[:25],
+        ),
+    )
     first = echo.capture([cut], [5])[0]
     torch.testing.assert_close(motion.R_parent_joint[:25], first.R_parent_joint, atol=1e-4, rtol=0)
 
@@ -288,10 +302,7 @@ def test_after_a_gap_of_the_head_the_capture_restarts():
 def test_the_latency_is_the_ramp():
     echo, recording = drawn_echo(), carrying(1.0)
     assert echo.latency_s == pytest.approx(7 / FPS)
-    queue, conditioning = (
-        EchoQueue(echo, [echo.skeleton], [0]),
-        batch_item(echo, scenario_of(recording)).conditioning,
-    )
+    queue, conditioning = (EchoQueue(echo, [echo.skeleton], [0]), batch_item(echo, scenario_of(recording)).conditioning)
     given = [queue.push(conditioning.frames(slice(k, k + 1))) is not None for k in range(30)]
     assert given == [False] * 7 + [True] * 23
 
@@ -309,7 +320,7 @@ def test_a_queues_memory_is_bounded():
 
 def test_acts_may_be_listed():
     recording, environment = carrying(1.5), boxes()
-    acts = [{"object": "box_1", "start_s": 0.9, "stop_s": 1.2}, {"object": "box_1", "start_s": 0.2, "stop_s": 0.4}]  # fmt: skip
+    acts = [{"object": "box_1", "start_s": 0.9, "stop_s": 1.2}, {"object": "box_1", "start_s": 0.2, "stop_s": 0.4}]
     found = drawn_echo(acts=acts).scenario(recording, environment).acts
     assert [act.start_s for act in found] == [0.2, 0.9]
     assert drawn_echo(acts="none").scenario(recording, environment).acts == ()
@@ -323,9 +334,7 @@ def test_interactions_name_the_active_object_without_its_poses():
     assert drawn_echo().scenario(replace(recording, interactions=None), boxes()).acts == ()
 
 
-@pytest.mark.parametrize(
-    "wrong", ["guess", [{"object": "a"}], [{"object": "a", "start_s": 0.0, "end_s": 1.0}]]
-)
+@pytest.mark.parametrize("wrong", ["guess", [{"object": "a"}], [{"object": "a", "start_s": 0.0, "end_s": 1.0}]])
 def test_invalid_acts_are_refused(wrong):
     with pytest.raises(WearcapError, match="acts.*Expected .*a list of {object, start_s, stop_s}"):
         drawn_echo(acts=wrong)
@@ -344,7 +353,10 @@ def tracked(recording, **changes):
 def test_wrists_of_controllers_are_as_good_as_true_ones():
     recording = carrying(1.0)
     echo = drawn_echo()
-    one, two = (batch_item(echo, scenario_of(each)).conditioning for each in (recording, replace(tracked(recording), motion=None)))  # fmt: skip
+    one, two = (
+        batch_item(echo, scenario_of(each)).conditioning
+        for each in (recording, replace(tracked(recording), motion=None))
+    )
     torch.testing.assert_close(one.t_world_point, two.t_world_point, atol=1e-4, rtol=0)
     torch.testing.assert_close(one.R_world_point, two.R_world_point, atol=1e-4, rtol=0)
 
@@ -352,8 +364,15 @@ def test_wrists_of_controllers_are_as_good_as_true_ones():
 def test_observations_may_be_in_double_precision():
     recording = carrying(1.0, carried=TWO)
     seen = everything(recording)
-    motion = replace(recording.motion, R_parent_joint=recording.motion.R_parent_joint.double(), t_world_root=recording.motion.t_world_root.double())  # fmt: skip
-    tracks = {name: Trajectory(track.timestamps, track.R_world_body.double(), track.t_world_body.double()) for name, track in recording.object_motion.items()}  # fmt: skip
+    motion = replace(
+        recording.motion,
+        R_parent_joint=recording.motion.R_parent_joint.double(),
+        t_world_root=recording.motion.t_world_root.double(),
+    )
+    tracks = {
+        name: Trajectory(track.timestamps, track.R_world_body.double(), track.t_world_body.double())
+        for name, track in recording.object_motion.items()
+    }
     echo = drawn_echo(anchor=False)
     one, two = (
         batch_item(echo, scenario_of(recording, TWO, observed=each)).conditioning

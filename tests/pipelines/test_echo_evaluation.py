@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from carried_box import (
-    GRIP,
-    WINDOW,
-    boxes,
-    carried_dataset,
-    carrying,
-    drawn_echo,
-    scenario_of,
-    small_features,
-)
+from carried_box import GRIP, WINDOW, boxes, carried_dataset, carrying, drawn_echo, scenario_of, small_features
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
@@ -48,27 +39,17 @@ def truth(scenario):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> EchoDataset:
     root = carried_dataset(tmp_path_factory.mktemp("carried"))
-    return EchoDataset([Source(root)], "train", features=small_features(), encoder=None, window=WINDOW, stride=4)  # fmt: skip
+    return EchoDataset([Source(root)], "train", features=small_features(), encoder=None, window=WINDOW, stride=4)
 
 
 def perfect(truth):
-    return replace(
-        truth.motion, object_motion=RECORDING.object_motion, body_contact_prob=truth.touch.float(),
-    )  # fmt: skip
+    return replace(truth.motion, object_motion=RECORDING.object_motion, body_contact_prob=truth.touch.float())
 
 
 def test_the_truth_is_perfect(truth):
     scores = score_echo(perfect(truth), truth, "a", 0).scores
     assert set(MEASURES) <= set(scores)
-    for name in (
-        "mpjpe_mm",
-        "mpjve_mm",
-        "v2v_cm",
-        "center_cm",
-        "rotation_deg",
-        "quaternion",
-        "busy_mpjpe_mm",
-    ):
+    for name in ("mpjpe_mm", "mpjve_mm", "v2v_cm", "center_cm", "rotation_deg", "quaternion", "busy_mpjpe_mm"):
         assert scores[name] == pytest.approx(0.0, abs=0.05), name
     assert scores["touch_f1"] == 1.0
     assert scores["foot_contact"] == scores["true_foot_contact"] > 0
@@ -78,7 +59,7 @@ def test_the_truth_is_perfect(truth):
 def test_what_is_wrong_is_wrong_by_as_much(truth):
     motion = perfect(truth)
     track = RECORDING.object_motion["box_1"]
-    shifted = Trajectory(track.timestamps, track.R_world_body, track.t_world_body + torch.tensor([0.03, 0.0, 0.04]))  # fmt: skip
+    shifted = Trajectory(track.timestamps, track.R_world_body, track.t_world_body + torch.tensor([0.03, 0.0, 0.04]))
     moved = replace(motion, t_world_root=motion.t_world_root + 0.1, object_motion={"box_1": shifted})
     scores = score_echo(moved, truth, "a", 0).scores
     assert scores["mpjpe_mm"] == pytest.approx(100 * 3**0.5, rel=1e-3)
@@ -93,7 +74,7 @@ def test_objects_count_while_they_are_active_alone(truth):
     assert busy.any()
     assert not busy.all()
     away = torch.where(busy[:, None], track.t_world_body, 9.0)
-    moved = replace(perfect(truth), object_motion={"box_1": Trajectory(track.timestamps, track.R_world_body, away)})  # fmt: skip
+    moved = replace(perfect(truth), object_motion={"box_1": Trajectory(track.timestamps, track.R_world_body, away)})
     assert score_echo(moved, truth, "a", 0).scores["v2v_cm"] == pytest.approx(0.0, abs=0.05)
 
 
@@ -109,7 +90,7 @@ def test_truth_is_read_at_a_captures_own_times(truth, scenario):
     fine = torch.arange(0.0, 1.2, 0.01, dtype=torch.float64)
     other = truth_of(scenario, fine, drawn_echo().reader())
     assert len(other.motion) == len(fine) == len(other.touch)
-    torch.testing.assert_close(other.T_world_object[0].t[::10], truth.T_world_object[0].t[:36:3], atol=1e-4, rtol=0)  # fmt: skip
+    torch.testing.assert_close(other.T_world_object[0].t[::10], truth.T_world_object[0].t[:36:3], atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("missing", ["motion", "object_motion"])
@@ -124,14 +105,12 @@ def test_without_a_truth_there_is_nothing_to_compare_with(scenario, missing):
 def test_a_share_of_the_truth_is_observed(truth, scenario, modality, share):
     seen = observed_share(truth, modality, share, seed=1)
     echo = drawn_echo()
-    item = batch_item_of(replace(scenario, observed=seen), head_path(RECORDING, echo.skeleton, echo.fps), echo.reader())  # fmt: skip
+    item = batch_item_of(replace(scenario, observed=seen), head_path(RECORDING, echo.skeleton, echo.fps), echo.reader())
     observed_parts, place = item.conditioning.is_observed[0], MODALITIES.index(modality)
     assert not observed_parts[:, [k for k in range(3) if k != place]].any()
     if share == 1.0:
         active = item.conditioning.has_object[0]
-        assert torch.equal(
-            observed_parts[:, place], active if modality == "object" else torch.ones_like(active)
-        )
+        assert torch.equal(observed_parts[:, place], active if modality == "object" else torch.ones_like(active))
     elif modality != "object":
         assert observed_parts[:, place].sum() == round(share * len(TIMES))
     other = observed_share(truth, modality, share, seed=1)

@@ -86,8 +86,7 @@ def test_bad_packets_change_nothing(echo, recording, undisturbed, stream):
     assert_equal(whole(session, recording, happen), undisturbed)
     activated = 5
     counts = {
-        key: sum(n for reason, n in session.refused.items() if reason.startswith(key))
-        for key in (stream, "activate")
+        key: sum(n for reason, n in session.refused.items() if reason.startswith(key)) for key in (stream, "activate")
     }
     assert counts == {stream: len(TIMES) + len(bad), "activate": activated}
     assert session.dropped == (counts["head"] if stream == "head" else 0)
@@ -102,10 +101,7 @@ def test_where_the_clock_moves_it_goes_on(echo, recording, shift):
     for frame in range(FRAMES):
         late += feed(session, recording, frame, 1.2 + shift)
         expected += feed(fresh, recording, frame, 1.2 + shift, frame >= AGREEING - 1)
-    late, expected = (
-        joined(before + late + remaining_poses(session)),
-        joined(expected + remaining_poses(fresh)),
-    )
+    late, expected = (joined(before + late + remaining_poses(session)), joined(expected + remaining_poses(fresh)))
     assert len(late) == 40 + FRAMES
     new = slice(40, None)
     assert torch.allclose(late.timestamps[new], expected.timestamps, atol=1e-6)
@@ -154,9 +150,7 @@ def test_whatever_comes_it_goes_on(echo, recording, seed):
     for k in range(30):  # the devices are well again
         motions += feed(session, recording, k, 4.0)
     motions = [
-        motion
-        for motion in (*motions, *remaining_poses(session), *remaining_poses(session))
-        if motion is not None
+        motion for motion in (*motions, *remaining_poses(session), *remaining_poses(session)) if motion is not None
     ]
     assert max(motion.timestamps[-1].item() for motion in motions) >= 4.9
     for motion in motions:
@@ -164,12 +158,6 @@ def test_whatever_comes_it_goes_on(echo, recording, seed):
         assert motion.t_world_root.isfinite().all()
         for track in (motion.object_motion or {}).values():
             assert track.t_world_body.isfinite().all()
-    sizes = (
-        session._chunks,
-        session._finished,
-        session._track._poses,
-        session._pending,
-        *session._wrists.values(),
-    )
+    sizes = (session._chunks, session._finished, session._track._poses, session._pending, *session._wrists.values())
     assert max(map(len, sizes)) < 100
     assert len(session._acts) + len(session._seen) < 300

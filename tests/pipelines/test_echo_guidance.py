@@ -24,7 +24,11 @@ def scene_of(frame: str = "own", shift=(0.0, 0.0, 0.0), lift: float = 0.0, conta
     feet."""
     recording, echo = carrying(0.6), drawn_echo(frame)
     motion = recording.motion
-    batch_item = batch_item_of(scenario_of(recording, margin_s=9.0, observed=Observed(motion, recording.object_motion)), head_path(recording, echo.skeleton, echo.fps), echo.reader())  # fmt: skip
+    batch_item = batch_item_of(
+        scenario_of(recording, margin_s=9.0, observed=Observed(motion, recording.object_motion)),
+        head_path(recording, echo.skeleton, echo.fps),
+        echo.reader(),
+    )
     conditioning = batch_item.conditioning.frames(slice(0, FRAMES))
     at = echo.features.canonical(conditioning.points)
     body = Body(conditioning.R_parent_joint, conditioning.t_world_root + torch.tensor([0.0, 0.0, lift]))
@@ -33,7 +37,9 @@ def scene_of(frame: str = "own", shift=(0.0, 0.0, 0.0), lift: float = 0.0, conta
         contact = torch.full((1, FRAMES, BODY_POINTS + 4), -0.9)
         contact[..., LEFT_HAND] = contact[..., BODY_POINTS:] = 0.9
     raw = torch.cat([echo.features.encode_body(body, at), echo.features.encode_object(box, at), contact], -1)
-    scene = GuidedScene(echo.net, echo.features, conditioning, at, *pulled_by([motion.skeleton], [{}], [batch_item.objects]))  # fmt: skip
+    scene = GuidedScene(
+        echo.net, echo.features, conditioning, at, *pulled_by([motion.skeleton], [{}], [batch_item.objects])
+    )
     return scene, echo.net.motion_normalizer(raw)
 
 
@@ -104,9 +110,10 @@ def test_gradients_are_those_of_finite_differences(frame):
     scene, x = scene_of(frame, shift=(0.2, 0.05, -0.2), lift=0.05)
     double = lambda part: part.double() if part.is_floating_point() else part  # noqa: E731
     scene = replace(
-        scene, conditioning=type(scene.conditioning)(*(double(part) for part in scene.conditioning)),
+        scene,
+        conditioning=type(scene.conditioning)(*(double(part) for part in scene.conditioning)),
         frame=Rigid(scene.frame.R.double(), scene.frame.t.double()),
-    )  # fmt: skip
+    )
     x, step = x.double(), 1e-6
     x.requires_grad_(True)
     for cost in (0, 1):
@@ -116,17 +123,22 @@ def test_gradients_are_those_of_finite_differences(frame):
             direction = torch.randn(x.shape, generator=random, dtype=torch.float64)
             direction[..., scene.net.sizes[0] + OBJECT_SIZE :] = 0.0
             there, back = (scene.costs(x.detach() + sign * step * direction, 0.5)[cost] for sign in (1, -1))
-            assert (gradient * direction).sum().item() == pytest.approx(((there - back) / (2 * step)).item(), rel=1e-4, abs=1e-8)  # fmt: skip
+            assert (gradient * direction).sum().item() == pytest.approx(
+                ((there - back) / (2 * step)).item(), rel=1e-4, abs=1e-8
+            )
 
 
 def test_batch_items_have_their_own_bodies_and_objects():
     one, x = scene_of(shift=(0.1, 0.05, -0.1))
     two, y = scene_of(shift=(-0.1, 0.0, 0.2))
     both = GuidedScene(
-        one.net, one.features, type(one.conditioning)(*(torch.cat(parts) for parts in zip(one.conditioning, two.conditioning))),
+        one.net,
+        one.features,
+        type(one.conditioning)(*(torch.cat(parts) for parts in zip(one.conditioning, two.conditioning))),
         Rigid(torch.cat([one.frame.R, two.frame.R]), torch.cat([one.frame.t, two.frame.t])),
-        [*one.surfaces, *two.surfaces], [*one.objects, *two.objects],
-    )  # fmt: skip
+        [*one.surfaces, *two.surfaces],
+        [*one.objects, *two.objects],
+    )
     together = Guidance().corrected(torch.cat([x, y]), both)
     for part, alone in zip(together.split(1), (Guidance().corrected(x, one), Guidance().corrected(y, two))):
         torch.testing.assert_close(part, alone, atol=1e-6, rtol=0)
@@ -153,7 +165,9 @@ def test_a_network_without_contacts_is_not_guided():
     assert without.guided_by is None
     assert without.settings()["guidance"] == "None"
     recording = carrying(0.8)
-    plain, asked = (one.capture_scenarios([scenario_of(recording)], [0])[0] for one in (replace(without, guidance=None), without))  # fmt: skip
+    plain, asked = (
+        one.capture_scenarios([scenario_of(recording)], [0])[0] for one in (replace(without, guidance=None), without)
+    )
     assert torch.equal(plain.t_world_root, asked.t_world_root)
 
 
@@ -165,5 +179,5 @@ def test_each_batch_item_is_guided_by_its_own_objects():
     together = echo.capture_scenarios(scenarios, [0, 0])
     for scenario, motion in zip(scenarios, together):
         alone = echo.capture_scenarios([scenario], [0])[0].object_motion["box_1"]
-        torch.testing.assert_close(motion.object_motion["box_1"].t_world_body, alone.t_world_body, atol=2e-3, rtol=0)  # fmt: skip
+        torch.testing.assert_close(motion.object_motion["box_1"].t_world_body, alone.t_world_body, atol=2e-3, rtol=0)
     assert len(boxes().objects) == 1

@@ -33,9 +33,20 @@ def frames(active=ACTS, touched=TOUCHED, observed=()) -> tuple[Conditioning, Out
     observed_parts = torch.zeros(1, count, 3, dtype=torch.bool)
     observed_parts[0, list(observed), 1] = True
     conditioning = Conditioning(
-        eye[:, :, None].repeat(1, 1, 3, 1, 1), zeros[:, :, None].repeat(1, 1, 3, 1), zeros[..., 0], number >= 0, zeros[..., :1],
-        number, number > -2, eye[:, :, None], zeros, eye, zeros, contact, observed_parts,
-    )  # fmt: skip
+        eye[:, :, None].repeat(1, 1, 3, 1, 1),
+        zeros[:, :, None].repeat(1, 1, 3, 1),
+        zeros[..., 0],
+        number >= 0,
+        zeros[..., :1],
+        number,
+        number > -2,
+        eye[:, :, None],
+        zeros,
+        eye,
+        zeros,
+        contact,
+        observed_parts,
+    )
     path = torch.arange(count, dtype=torch.float32)
     turn = rotation.exp(torch.stack([0 * path, 0 * path, 0.1 * path], -1))
     return conditioning, Outputs(
@@ -44,9 +55,7 @@ def frames(active=ACTS, touched=TOUCHED, observed=()) -> tuple[Conditioning, Out
 
 
 def places(outputs: Outputs) -> list[int]:
-    assert torch.equal(
-        outputs.R_world_object, frames()[1].R_world_object[:, outputs.t_world_object[0, :, 0].long()]
-    )
+    assert torch.equal(outputs.R_world_object, frames()[1].R_world_object[:, outputs.t_world_object[0, :, 0].long()])
     return outputs.t_world_object[0, :, 0].long().tolist()
 
 
@@ -178,9 +187,7 @@ def test_frame_by_frame_it_is_the_same_from_the_first_contact_on():
     for k in range(len(ACTS)):
         one = slice(k, k + 1)
         path.append(
-            step(conditioning.frames(one), Outputs(*(field[:, one] for field in outputs))).t_world_object[
-                0, 0, 0
-            ]
+            step(conditioning.frames(one), Outputs(*(field[:, one] for field in outputs))).t_world_object[0, 0, 0]
         )
     assert [int(x) for x in path] == [0, 1, 2, *MOVED[3:7], 7, 8, 9, *MOVED[10:15], 4], (
         "the last is touched, and still left"

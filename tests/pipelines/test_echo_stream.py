@@ -22,7 +22,7 @@ NAN = Rigid(torch.full((3, 3), torch.nan), torch.zeros(3))
 
 def wearer(recording, **changes) -> EchoWearer:
     head = recording.head
-    return EchoWearer(recording.skeleton, {}, head.R_head_device, head.t_head_device, **{"floor_m": 0.0} | changes)  # fmt: skip
+    return EchoWearer(recording.skeleton, {}, head.R_head_device, head.t_head_device, **{"floor_m": 0.0} | changes)
 
 
 def feed(session: EchoSession, recording, frame: int, wrists=WRISTS) -> None:
@@ -33,9 +33,7 @@ def feed(session: EchoSession, recording, frame: int, wrists=WRISTS) -> None:
         session.wrist(joint, time, recording.motion.joint(joint)[frame])
 
 
-def streamed(
-    session: EchoSession, recording, before=None, frames=None, wrists=WRISTS
-) -> tuple[Motion, list[int]]:
+def streamed(session: EchoSession, recording, before=None, frames=None, wrists=WRISTS) -> tuple[Motion, list[int]]:
     """The joined poses, and how many had come out after each frame; `before(frame)` happens first."""
     parts, counts = [], []
     for frame in frames or range(len(recording.motion)):
@@ -120,7 +118,9 @@ def test_an_object_may_be_activated_until_its_frames_are_final(late):
     recording, echo = carrying(1.4), drawn_echo()
     session = EchoSession(echo, wearer(recording), boxes(), seed=3)
     start = recording.motion.timestamps[20].item()
-    motion, _ = streamed(session, recording, lambda frame: session.activate("box_1", start) if frame == 21 + late else None)  # fmt: skip
+    motion, _ = streamed(
+        session, recording, lambda frame: session.activate("box_1", start) if frame == 21 + late else None
+    )
     track = motion.object_motion["box_1"]
     assert track.timestamps[0].item() == pytest.approx(start, abs=1e-6)
     assert len(track) == len(motion) - 20
@@ -130,7 +130,7 @@ def test_an_object_may_be_activated_until_its_frames_are_final(late):
 def test_what_is_final_stays_as_it_was():
     recording, echo = carrying(1.4), drawn_echo()
     session = EchoSession(echo, wearer(recording), boxes(), seed=3)
-    motion, _ = streamed(session, recording, lambda frame: session.activate("box_1", 0.0) if frame == 25 else None)  # fmt: skip
+    motion, _ = streamed(session, recording, lambda frame: session.activate("box_1", 0.0) if frame == 25 else None)
     alone = echo.capture([recording], [3])[0]
     torch.testing.assert_close(motion.T_world_joint.t[:18], alone.T_world_joint.t[:18], atol=1e-3, rtol=0)
     assert motion.object_motion["box_1"].timestamps[0].item() == pytest.approx(18 / 30, abs=1e-6)
@@ -264,7 +264,15 @@ def test_after_a_gap_it_restarts_as_the_whole_capture_does():
     recording, echo = carrying(3.0), drawn_echo()
     keep = [*range(30), *range(60, 90)]
     head = recording.head
-    observed = replace(recording, head=replace(head, timestamps=head.timestamps[keep], R_world_device=head.R_world_device[keep], t_world_device=head.t_world_device[keep]))  # fmt: skip
+    observed = replace(
+        recording,
+        head=replace(
+            head,
+            timestamps=head.timestamps[keep],
+            R_world_device=head.R_world_device[keep],
+            t_world_device=head.t_world_device[keep],
+        ),
+    )
     session = EchoSession(echo, wearer(recording), seed=5)
     parts = []
     for frame in range(90):
@@ -311,7 +319,15 @@ def test_a_streams_memory_is_bounded():
                 session.activate("box_1" if frame % 20 else None, time)
                 session.see_object("box_1", time, recording.object_motion["box_1"].T_world_body[frame])
             session.poses()
-        sizes.append((*(len(part) for part in session._wrists.values()), len(session._acts), len(session._seen), len(session._pending), len(session._chunks)))  # fmt: skip
+        sizes.append(
+            (
+                *(len(part) for part in session._wrists.values()),
+                len(session._acts),
+                len(session._seen),
+                len(session._pending),
+                len(session._chunks),
+            )
+        )
     assert sizes[3] == sizes[1]
 
 
@@ -319,7 +335,11 @@ def test_the_floor_follows_from_a_standing_wearer():
     recording = carrying(0.6)
     session = EchoSession(drawn_echo(), wearer(recording, floor_m=None), seed=0)
     streamed(session, recording)
-    floor = session._queue.conditioning.floor_height if session._queue else session._frame(1.0, recording.motion.joint("head")[:1]).floor_height  # fmt: skip
+    floor = (
+        session._queue.conditioning.floor_height
+        if session._queue
+        else session._frame(1.0, recording.motion.joint("head")[:1]).floor_height
+    )
     assert floor[0, -1].item() == pytest.approx(0.0, abs=0.1)
 
 
@@ -335,10 +355,7 @@ def test_the_floor_is_found_after_sitting_and_standing_up():
 
 def test_unknown_names_are_refused():
     session = EchoSession(drawn_echo(), EchoWearer(carrying(0.6).skeleton), boxes())
-    for call in (
-        lambda: session.activate("ghost", 0.0),
-        lambda: session.see_object("ghost", 0.0, Rigid.identity()),
-    ):
+    for call in (lambda: session.activate("ghost", 0.0), lambda: session.see_object("ghost", 0.0, Rigid.identity())):
         with pytest.raises(WearcapError, match="no object 'ghost'. Expected one of box_1"):
             call()
     with pytest.raises(WearcapError, match="no tracked joint 'nose'. Expected left_wrist or right_wrist"):

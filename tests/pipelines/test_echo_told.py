@@ -24,14 +24,16 @@ TIMES = RECORDING.motion.timestamps
 
 def conditioning(scenario):
     echo = drawn_echo()
-    return batch_item_of(
-        scenario, head_path(scenario.recording, echo.skeleton, echo.fps), echo.reader()
-    ).conditioning
+    return batch_item_of(scenario, head_path(scenario.recording, echo.skeleton, echo.fps), echo.reader()).conditioning
 
 
 def with_mesh(vertices=None, faces=None, category: str = "box"):
     mesh = box_mesh()
-    given = Mesh(mesh.vertices if vertices is None else vertices.astype(np.float32), mesh.faces if faces is None else faces, mesh.color)  # fmt: skip
+    given = Mesh(
+        mesh.vertices if vertices is None else vertices.astype(np.float32),
+        mesh.faces if faces is None else faces,
+        mesh.color,
+    )
     return replace(scenario_of(RECORDING), environment=Environment((scene_object("box_1", category, given),)))
 
 
@@ -76,37 +78,77 @@ def broken_motion():
 
 BOX = RECORDING.object_motion["box_1"]
 FAULTS = {
-    "a mesh in millimetres": (lambda: with_mesh(box_mesh().vertices * 1000), "object 'box_1' of carry: .*looks like millimetres"),
-    "a mesh that is not centred": (lambda: with_mesh(box_mesh().vertices + 3), "object 'box_1' of carry: .*not centred"),
+    "a mesh in millimetres": (
+        lambda: with_mesh(box_mesh().vertices * 1000),
+        "object 'box_1' of carry: .*looks like millimetres",
+    ),
+    "a mesh that is not centred": (
+        lambda: with_mesh(box_mesh().vertices + 3),
+        "object 'box_1' of carry: .*not centred",
+    ),
     "a mesh with NaN": (lambda: with_mesh(spoiled()), "object 'box_1' of carry: 1 vertices .* NaN"),
-    "a mesh without faces": (lambda: with_mesh(faces=np.zeros((0, 3), np.int32)), "object 'box_1' of carry: .*no faces"),
-    "an unknown class": (lambda: with_mesh(category="piano"), "object 'box_1' of carry: .*no object class 'piano'. Expected one of box, chair"),
+    "a mesh without faces": (
+        lambda: with_mesh(faces=np.zeros((0, 3), np.int32)),
+        "object 'box_1' of carry: .*no faces",
+    ),
+    "an unknown class": (
+        lambda: with_mesh(category="piano"),
+        "object 'box_1' of carry: .*no object class 'piano'. Expected one of box, chair",
+    ),
     "an act of an unknown object": (
-        lambda: replace(scenario_of(RECORDING), acts=(Act("ghost", 0.0, 1.0),)), "object 'ghost' of carry: no object 'ghost'. Expected one of box_1"),
-    "acts, but no objects": (lambda: replace(scenario_of(RECORDING), environment=None), "carry: acts of 'box_1', but no objects"),
+        lambda: replace(scenario_of(RECORDING), acts=(Act("ghost", 0.0, 1.0),)),
+        "object 'ghost' of carry: no object 'ghost'. Expected one of box_1",
+    ),
+    "acts, but no objects": (
+        lambda: replace(scenario_of(RECORDING), environment=None),
+        "carry: acts of 'box_1', but no objects",
+    ),
     "wrists swapped": (swapped, "carry: the left wrist is .* cm to the right of the right one.*Swap the two trackers"),
     "no wrists": (
-        lambda: scenario_of(replace(RECORDING, motion=None)), "carry: this recording has no tracked wrists.*Expected `tracked` poses of left_wrist and"),
+        lambda: scenario_of(replace(RECORDING, motion=None)),
+        "carry: this recording has no tracked wrists.*Expected `tracked` poses of left_wrist and",
+    ),
     "one wrist": (
-        lambda: scenario_of(replace(RECORDING, tracked={"left_wrist": track()})), "carry: only left_wrist is tracked. Expected `tracked` poses of left_wrist and"),
+        lambda: scenario_of(replace(RECORDING, tracked={"left_wrist": track()})),
+        "carry: only left_wrist is tracked. Expected `tracked` poses of left_wrist and",
+    ),
     "wrists with NaN": (lambda: tracked(left_wrist=track(broken=True)), "carry: poses of wrists that are NaN"),
     "a wrist for a part of the time": (
-        lambda: tracked(left_wrist=track(slice(0, 10))), "carry: tracking of left_wrist from 0.00 to 0.30 s. Expected all of 0.00 to 0.97 s"),
+        lambda: tracked(left_wrist=track(slice(0, 10))),
+        "carry: tracking of left_wrist from 0.00 to 0.30 s. Expected all of 0.00 to 0.97 s",
+    ),
     "a wrist of another clock": (lambda: tracked(left_wrist=track(shift=60.0)), "tracking of left_wrist from 60.00"),
     "a wrist at a single time": (lambda: tracked(left_wrist=track(slice(0, 1))), "tracking of left_wrist at 1 times"),
-    "a wrist whose times fall": (lambda: tracked(left_wrist=track(torch.arange(30).flip(0))), "30 times that do not increase"),
-    "a body observed too late": (lambda: observing(motion=late_motion()), "carry: an observation at 1.* beyond the recording.*Expected times from 0.00 to 0.97"),
+    "a wrist whose times fall": (
+        lambda: tracked(left_wrist=track(torch.arange(30).flip(0))),
+        "30 times that do not increase",
+    ),
+    "a body observed too late": (
+        lambda: observing(motion=late_motion()),
+        "carry: an observation at 1.* beyond the recording.*Expected times from 0.00 to 0.97",
+    ),
     "an object observed too late": (
-        lambda: observing(object_motion={"box_1": replace(BOX, timestamps=BOX.timestamps + 2.0)}), "carry: an observation at 2.* s, beyond"),
+        lambda: observing(object_motion={"box_1": replace(BOX, timestamps=BOX.timestamps + 2.0)}),
+        "carry: an observation at 2.* s, beyond",
+    ),
     "contacts observed too early": (
-        lambda: observing(contact_times=torch.tensor([-3.0]).double(), contact=torch.zeros(1, CONTACTS)), "carry: an observation at -3.00 s"),
+        lambda: observing(contact_times=torch.tensor([-3.0]).double(), contact=torch.zeros(1, CONTACTS)),
+        "carry: an observation at -3.00 s",
+    ),
     "observed at no time": (
-        lambda: observing(contact_times=torch.tensor([torch.nan]).double(), contact=torch.zeros(1, CONTACTS)), "carry: an observation at nan s"),
-    "an unknown object observed": (lambda: observing(object_motion={"ghost": BOX}), "carry: an observed object 'ghost'. Expected one of box_1"),
+        lambda: observing(contact_times=torch.tensor([torch.nan]).double(), contact=torch.zeros(1, CONTACTS)),
+        "carry: an observation at nan s",
+    ),
+    "an unknown object observed": (
+        lambda: observing(object_motion={"ghost": BOX}),
+        "carry: an observed object 'ghost'. Expected one of box_1",
+    ),
     "too few contacts": (
-        lambda: observing(contact_times=TIMES[:1], contact=torch.zeros(1, 4)), "carry: observed contacts of 4 points. Expected 64 of the body"),
+        lambda: observing(contact_times=TIMES[:1], contact=torch.zeros(1, 4)),
+        "carry: observed contacts of 4 points. Expected 64 of the body",
+    ),
     "an observed body with NaN": (lambda: observing(motion=broken_motion()), "carry: observations that are NaN"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -171,7 +213,10 @@ def test_an_object_begins_where_its_environment_has_it():
     middle = torch.tensor([1.0, 2.0, 0.5]) + turn @ torch.tensor(MIDDLE, dtype=torch.float32)
     torch.testing.assert_close(seen.t_world_object[0, 3], middle)
     elsewhere = replace(scenario, observed=Observed(object_motion={"box_1": BOX}))
-    torch.testing.assert_close(conditioning(elsewhere).t_world_object[0, 3], conditioning(replace(elsewhere, placed=False)).t_world_object[0, 3])  # fmt: skip
+    torch.testing.assert_close(
+        conditioning(elsewhere).t_world_object[0, 3],
+        conditioning(replace(elsewhere, placed=False)).t_world_object[0, 3],
+    )
 
 
 def test_objects_are_read_once_however_often_they_are_active():

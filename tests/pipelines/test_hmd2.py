@@ -26,9 +26,18 @@ def pipeline(frame: str = "heading", **changes) -> HMD2:
     torch.manual_seed(0)
     features, places = HeadFeatures(frame, contacts=True), VoxelAutoencoder()
     net = MotionDenoiser(
-        features.motion_size, features.condition_size, 60, 32, 1, 4, 64, 0.0, 4,
-        points_size=places.size, image_size=IMAGE_SIZE,
-    )  # fmt: skip
+        features.motion_size,
+        features.condition_size,
+        60,
+        32,
+        1,
+        4,
+        64,
+        0.0,
+        4,
+        points_size=places.size,
+        image_size=IMAGE_SIZE,
+    )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
     settings = {"place_encoder": places.eval(), "image_encoder": "toy", "steps": 3, "stride": 40}
@@ -43,9 +52,13 @@ def seeing_recording(frames: int = 150, seed: int = 0) -> Recording:
     points = 3 * torch.rand(4000, 3, generator=random) - 1.5 + torch.tensor([0.0, 0.0, 1.0])
     first_seen = times[0] + (times[-1] - times[0]) * torch.rand(4000, generator=random).double()
     camera = CameraStream(
-        times[::2], Camera("pinhole", 8, 6, 4.0, 4.0, 3.5, 2.5), torch.eye(3), torch.zeros(3),
-        embedding=torch.randn(len(times[::2]), IMAGE_SIZE, generator=random).half(), embedding_name="toy",
-    )  # fmt: skip
+        times[::2],
+        Camera("pinhole", 8, 6, 4.0, 4.0, 3.5, 2.5),
+        torch.eye(3),
+        torch.zeros(3),
+        embedding=torch.randn(len(times[::2]), IMAGE_SIZE, generator=random).half(),
+        embedding_name="toy",
+    )
     return replace(recording, points=PointCloud(points, None, first_seen), camera=camera)
 
 
@@ -124,9 +137,10 @@ def test_what_is_seen_later_changes_nothing_before():
     observed = cloud.first_seen < half
     later = torch.where(camera.timestamps >= half, torch.nan, 1.0)[:, None].half()
     first = replace(
-        recording, points=PointCloud(cloud.points_world[observed], None, cloud.first_seen[observed]),
+        recording,
+        points=PointCloud(cloud.points_world[observed], None, cloud.first_seen[observed]),
         camera=replace(camera, embedding=camera.embedding * later),
-    )  # fmt: skip
+    )
     whole, part = (pipeline(stride=25, live=True, lookahead=0)(r).R_parent_joint for r in (recording, first))
     assert torch.allclose(whole[:75], part[:75], atol=1e-5)
     assert not torch.allclose(whole[75:], part[75:], atol=1e-3)
@@ -164,10 +178,15 @@ def test_an_empty_or_broken_cloud_is_survived():
 def without(recording: Recording, frames: torch.Tensor) -> Recording:
     """The recording with some head poses missing."""
     head = recording.head
-    return replace(recording, head=replace(
-        head, timestamps=head.timestamps[frames], R_world_device=head.R_world_device[frames],
-        t_world_device=head.t_world_device[frames],
-    ))  # fmt: skip
+    return replace(
+        recording,
+        head=replace(
+            head,
+            timestamps=head.timestamps[frames],
+            R_world_device=head.R_world_device[frames],
+            t_world_device=head.t_world_device[frames],
+        ),
+    )
 
 
 def test_behind_a_gap_the_capture_begins_anew():

@@ -31,15 +31,23 @@ def hmd2():
     torch.manual_seed(1)
     places, features = VoxelAutoencoder().eval(), HeadFeatures(contacts=True, body=True)
     net = MotionDenoiser(
-        features.motion_size, features.condition_size, WINDOW, 32, 1, 4, 64, 0.0, 4, blend=5,
-        points_size=places.size, image_size=IMAGE,
-    )  # fmt: skip
+        features.motion_size,
+        features.condition_size,
+        WINDOW,
+        32,
+        1,
+        4,
+        64,
+        0.0,
+        4,
+        blend=5,
+        points_size=places.size,
+        image_size=IMAGE,
+    )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
     given = {"place_encoder": places, "image_encoder": "eyes", "live": True, "fade": 6, "lookahead": 0}
-    return HMD2(
-        net, features, CosineSchedule(), wearer(surrounded(4)).skeleton, 60.0, stride=10, steps=2, **given
-    )
+    return HMD2(net, features, CosineSchedule(), wearer(surrounded(4)).skeleton, 60.0, stride=10, steps=2, **given)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +85,11 @@ def test_bad_packets_of_one_wearer_change_nothing_for_anybody(hmd2, recording, u
     bad = [Sensed(time, good) for time in TIMES.values()]
     bad += [Sensed(before + 1e-4 * k, pose) for k, pose in enumerate(bad_poses(good).values())]
     bad += [Sensed(before, None, points_world=points) for points in VECTORS.values() if points is not None]
-    bad += [Sensed(before, None, floor_height=height) for name, height in TIMES.items() if height is not None and name != "ahead" and name != "far"]  # fmt: skip
+    bad += [
+        Sensed(before, None, floor_height=height)
+        for name, height in TIMES.items()
+        if height is not None and name != "ahead" and name != "far"
+    ]
     bad += [Sensed(before, None, floor_height=1e9), None, "packet", (before, good)]
     predicted = [[], []]
     for frame, moment in enumerate(conditions):
@@ -123,12 +135,8 @@ def test_where_the_clock_moves_it_goes_on(hmd2, recording, shift):
     """Back: exactly as a session that is new."""
     session, fresh, conditions = opened(hmd2, recording), opened(hmd2, recording), moments(recording)
     before = run(session, conditions[:75])
-    left = run(session, conditions, 75 / 60 + shift) + [
-        motion for motion in session.flush()[:1] if motion is not None
-    ]
-    expected = run(fresh, conditions, 75 / 60 + shift) + [
-        motion for motion in fresh.flush()[:1] if motion is not None
-    ]
+    left = run(session, conditions, 75 / 60 + shift) + [motion for motion in session.flush()[:1] if motion is not None]
+    expected = run(fresh, conditions, 75 / 60 + shift) + [motion for motion in fresh.flush()[:1] if motion is not None]
     assert all((motion.timestamps.diff() > 0).all() for motion in before + left)
     assert sum(map(len, before + left)) == 75 + FRAMES
     late, expected = _joined(left, FRAMES), _joined(expected, FRAMES)
@@ -181,10 +189,12 @@ def test_whatever_comes_it_goes_on(hmd2, recording, seed):
     for k in range(240):
         good = conditions[k % FRAMES]
         bad = Sensed(
-            draw.time(k / 60), draw.pose(good.T_world_device),
-            draw.one(VECTORS) if draw.bad() else good.points_world, draw.one(EMBEDDINGS) if draw.bad() and k else good.embedding,
+            draw.time(k / 60),
+            draw.pose(good.T_world_device),
+            draw.one(VECTORS) if draw.bad() else good.points_world,
+            draw.one(EMBEDDINGS) if draw.bad() and k else good.embedding,
             draw.one(TIMES) if draw.bad() else None,
-        )  # fmt: skip
+        )
         neighbour = [conditions[k]] if k < FRAMES else []
         for motion in (predicted := push(session, [bad], neighbour)):
             assert motion is None or motion.R_parent_joint.isfinite().all()

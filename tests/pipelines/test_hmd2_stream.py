@@ -39,14 +39,29 @@ def pipeline(places):
         torch.manual_seed(seed)
         features = HeadFeatures(contacts=True, body=True)
         net = MotionDenoiser(
-            features.motion_size, features.condition_size, WINDOW, 32, 1, 4, 64, 0.0, 4, blend=5,
-            points_size=places.size if points else 0, image_size=IMAGE if points else 0,
-        )  # fmt: skip
+            features.motion_size,
+            features.condition_size,
+            WINDOW,
+            32,
+            1,
+            4,
+            64,
+            0.0,
+            4,
+            blend=5,
+            points_size=places.size if points else 0,
+            image_size=IMAGE if points else 0,
+        )
         for parameter in net.parameters():
             torch.nn.init.normal_(parameter, std=0.05)
         conditions = {
-            "steps": STEPS, "place_encoder": places, "image_encoder": "eyes", "live": True, "fade": 6, "lookahead": 0,
-        } | changes  # fmt: skip
+            "steps": STEPS,
+            "place_encoder": places,
+            "image_encoder": "eyes",
+            "live": True,
+            "fade": 6,
+            "lookahead": 0,
+        } | changes
         return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, stride=stride, **conditions)
 
     return make
@@ -64,9 +79,13 @@ def surrounded(frames: int, seed: int = 0) -> Recording:
     first_seen[0] = times[0]
     shown = times[::2]
     camera = CameraStream(
-        shown, Camera.pinhole(32, 32, 90.0), torch.eye(3), torch.zeros(3),
-        embedding=torch.randn(len(shown), IMAGE, generator=random), embedding_name="eyes",
-    )  # fmt: skip
+        shown,
+        Camera.pinhole(32, 32, 90.0),
+        torch.eye(3),
+        torch.zeros(3),
+        embedding=torch.randn(len(shown), IMAGE, generator=random),
+        embedding_name="eyes",
+    )
     return replace(recording, points=PointCloud(points, first_seen=first_seen), camera=camera)
 
 
@@ -77,9 +96,7 @@ def moments(recording: Recording) -> list[Sensed]:
     for i, time in enumerate(head.timestamps.tolist()):
         new = points.points_world[points.first_seen == time] if points is not None else None
         shown = camera is not None and i % 2 == 0
-        conditions.append(
-            Sensed(time, head.T_world_device[i], new, camera.embedding[i // 2] if shown else None)
-        )
+        conditions.append(Sensed(time, head.T_world_device[i], new, camera.embedding[i // 2] if shown else None))
     return conditions
 
 
@@ -100,11 +117,12 @@ def stream(session: Session, *conditions: list[Sensed], ended: bool = True) -> l
 
 def together(parts: list[Motion]) -> Motion:
     return replace(
-        parts[0], timestamps=torch.cat([part.timestamps for part in parts]),
+        parts[0],
+        timestamps=torch.cat([part.timestamps for part in parts]),
         R_parent_joint=torch.cat([part.R_parent_joint for part in parts]),
         t_world_root=torch.cat([part.t_world_root for part in parts]),
         contact_prob=torch.cat([part.contact_prob for part in parts]),
-    )  # fmt: skip
+    )
 
 
 def rounding(frames: int) -> float:
@@ -148,8 +166,10 @@ def test_poses_wait_for_what_they_look_ahead_to(pipeline):
     session = Session(pipeline(lookahead=13), [Wearer(xsens23())], [0])
     predicted = [session.push([[moment]])[0] for moment in moments(surrounded(45))]
     assert [(i, len(motion)) for i, motion in enumerate(predicted) if motion is not None] == [
-        (19, 7), (29, 10), (39, 10),
-    ]  # fmt: skip
+        (19, 7),
+        (29, 10),
+        (39, 10),
+    ]
     rest = session.flush()[0]
     assert len(rest) == 18
     times = torch.cat([motion.timestamps for motion in [*predicted, rest] if motion is not None])
@@ -207,8 +227,7 @@ def test_a_session_is_loaded_with_its_own_pipeline_alone(pipeline, tmp_path):
 def test_missing_poses_within_a_chunk_are_interpolated(pipeline, missing):
     recording, hmd2 = surrounded(75), pipeline(points=False)
     conditions = [
-        moment._replace(T_world_device=None) if i in missing else moment
-        for i, moment in enumerate(moments(recording))
+        moment._replace(T_world_device=None) if i in missing else moment for i, moment in enumerate(moments(recording))
     ]
     keep = [i for i in range(75) if i not in missing]
     observed = replace(recording, head=head_of(recording, keep))
@@ -247,9 +266,7 @@ def test_moments_out_of_order_are_sorted_in_and_late_ones_dropped(pipeline):
 def test_other_rates_are_brought_to_the_pipelines(pipeline, fps):
     motion = swaying_motion(120, fps=fps)
     recording, hmd2 = recording_of(motion, "a"), pipeline(points=False)
-    assert_same(
-        stream(Session(hmd2, [wearer(recording)], [1]), moments(recording))[0], hmd2(recording, seed=1)
-    )
+    assert_same(stream(Session(hmd2, [wearer(recording)], [1]), moments(recording))[0], hmd2(recording, seed=1))
 
 
 @pytest.mark.parametrize("broken", ["gap", "jump"])
@@ -261,17 +278,19 @@ def test_after_gaps_and_jumps_it_begins_anew_as_offline(pipeline, broken, lookah
     head = head_of(recording, keep)
     if broken == "jump":
         head = replace(
-            head,
-            t_world_device=head.t_world_device + torch.tensor([3.0, 0, 0]) * (head.timestamps > 0.8)[:, None],
+            head, t_world_device=head.t_world_device + torch.tensor([3.0, 0, 0]) * (head.timestamps > 0.8)[:, None]
         )
     recording = replace(recording, head=head, points=None, camera=None)
     whole = hmd2(recording, seed=7)
     motion = stream(Session(hmd2, [wearer(recording)], [7]), moments(recording))[0]
     predicted = torch.tensor([i for i in range(150) if broken == "jump" or not 44 <= i < 90])
     kept = replace(
-        whole, timestamps=whole.timestamps[predicted], R_parent_joint=whole.R_parent_joint[predicted],
-        t_world_root=whole.t_world_root[predicted], contact_prob=whole.contact_prob[predicted],
-    )  # fmt: skip
+        whole,
+        timestamps=whole.timestamps[predicted],
+        R_parent_joint=whole.R_parent_joint[predicted],
+        t_world_root=whole.t_world_root[predicted],
+        contact_prob=whole.contact_prob[predicted],
+    )
     assert_same(motion, kept)
 
 
@@ -293,18 +312,14 @@ def test_what_is_not_finite_counts_as_missing(pipeline):
 
 def test_embeddings_of_another_length_are_refused(pipeline):
     with pytest.raises(WearcapError, match="an embedding of 9 features at 0.500 s"):
-        Session(pipeline(), [Wearer(xsens23())], [0]).push(
-            [[Sensed(0.5, Rigid.identity(), None, torch.zeros(9))]]
-        )
+        Session(pipeline(), [Wearer(xsens23())], [0]).push([[Sensed(0.5, Rigid.identity(), None, torch.zeros(9))]])
 
 
 def test_a_floor_that_is_told_is_believed(pipeline):
     recording = surrounded(40)
     session = Session(pipeline(), [wearer(recording)], [0])
     stream(session, [moment._replace(floor_height=0.01 * i) for i, moment in enumerate(moments(recording))])
-    assert torch.allclose(
-        session._wearers[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5
-    )
+    assert torch.allclose(session._wearers[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5)
 
 
 def test_points_beyond_the_memory_are_forgotten(pipeline):
@@ -335,6 +350,8 @@ def test_a_long_stream_needs_no_more_than_a_short_one(pipeline, tmp_path):
 def head_of(recording: Recording, take):
     head = recording.head
     return replace(
-        head, timestamps=head.timestamps[take], R_world_device=head.R_world_device[take],
+        head,
+        timestamps=head.timestamps[take],
+        R_world_device=head.R_world_device[take],
         t_world_device=head.t_world_device[take],
-    )  # fmt: skip
+    )

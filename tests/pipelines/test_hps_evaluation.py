@@ -94,8 +94,7 @@ def test_contacts_are_those_asked_for(truth: HpsTruth):
 
 def test_chamfer_grows_with_the_shift_up_to_all_of_it(truth: HpsTruth):
     near, far = (
-        interval_chamfer(moved(truth.motion, 0.0, 0.0, shift), truth.body, truth.visits[1])
-        for shift in (0.05, 10.0)
+        interval_chamfer(moved(truth.motion, 0.0, 0.0, shift), truth.body, truth.visits[1]) for shift in (0.05, 10.0)
     )
     for literal, surface in (near, far):
         assert surface.cloud_to_body_cm <= literal.cloud_to_body_cm + 1e-9
@@ -125,7 +124,7 @@ def test_a_captured_turn_leaves_the_root_where_it_is_and_moves_the_joints(truth:
 
 
 def test_the_slope_counts_way_and_not_time():
-    distance = torch.cat([torch.linspace(0, 100, 500), torch.full((5000,), 100.0), torch.linspace(100, 400, 1500)])  # fmt: skip
+    distance = torch.cat([torch.linspace(0, 100, 500), torch.full((5000,), 100.0), torch.linspace(100, 400, 1500)])
     grown = drift(distance.double(), (3.0 + 0.02 * distance).double())
     assert grown.slope_cm_per_100m == pytest.approx(2.0, abs=0.15)
     assert len(grown.distance_m) == 20
@@ -137,7 +136,9 @@ def test_the_slope_counts_way_and_not_time():
 
 def test_the_way_is_that_over_the_ground():
     motion = gliding(1.0)
-    up = replace(motion, t_world_root=motion.t_world_root + torch.linspace(0, 3, 120)[:, None] * torch.tensor([0, 0, 1]))  # fmt: skip
+    up = replace(
+        motion, t_world_root=motion.t_world_root + torch.linspace(0, 3, 120)[:, None] * torch.tensor([0, 0, 1])
+    )
     assert travelled_m(up)[-1].item() == pytest.approx(119 / 60, abs=1e-4)
 
 
@@ -187,9 +188,7 @@ def test_an_order_has_no_ties():
     assert not in_order([6.0, 7.0])
 
 
-def test_captures_of_another_length_and_recordings_without_truth_are_refused(
-    truth: HpsTruth, recording: Recording
-):
+def test_captures_of_another_length_and_recordings_without_truth_are_refused(truth: HpsTruth, recording: Recording):
     with pytest.raises(WearcapError, match="the same timestamps"):
         score_hps(truth.motion.sliced(0, 40), truth)
     with pytest.raises(WearcapError, match="nothing to measure a capture against"):

@@ -41,10 +41,11 @@ def parts() -> list[Recording]:
 def shifted(piece: Recording, by_s: float) -> Recording:
     suit, seen = piece.suit, piece.localization
     return replace(
-        piece, suit=replace(suit, timestamps=suit.timestamps + by_s),
+        piece,
+        suit=replace(suit, timestamps=suit.timestamps + by_s),
         localization=replace(seen, timestamps=seen.timestamps + by_s),
         camera=replace(piece.camera, timestamps=piece.camera.timestamps + by_s),
-    )  # fmt: skip
+    )
 
 
 def bad_suits(suit: Motion) -> dict:
@@ -52,27 +53,41 @@ def bad_suits(suit: Motion) -> dict:
     hole = t.clone()
     hole[7, 1] = math.nan
     return {
-        "nan": broken(suit, t_world_root=hole), "large": broken(suit, t_world_root=t + 1e30),
-        "short": broken(suit, t_world_root=t[:-1]), "integer": broken(suit, t_world_root=t.long()),
-        "none": broken(suit, t_world_root=None), "joints": broken(suit, R_parent_joint=R[:, :-1]),
-        "scaled": broken(suit, R_parent_joint=2 * R), "infinite": broken(suit, R_parent_joint=R / 0),
-        "backwards": broken(suit, timestamps=times.flip(0)), "repeated": broken(suit, timestamps=0 * times),
-        "no time": broken(suit, timestamps=times * math.nan), "far": broken(suit, timestamps=times + 1e18),
+        "nan": broken(suit, t_world_root=hole),
+        "large": broken(suit, t_world_root=t + 1e30),
+        "short": broken(suit, t_world_root=t[:-1]),
+        "integer": broken(suit, t_world_root=t.long()),
+        "none": broken(suit, t_world_root=None),
+        "joints": broken(suit, R_parent_joint=R[:, :-1]),
+        "scaled": broken(suit, R_parent_joint=2 * R),
+        "infinite": broken(suit, R_parent_joint=R / 0),
+        "backwards": broken(suit, timestamps=times.flip(0)),
+        "repeated": broken(suit, timestamps=0 * times),
+        "no time": broken(suit, timestamps=times * math.nan),
+        "far": broken(suit, timestamps=times + 1e18),
         "one far": broken(suit, timestamps=torch.cat([times[:-1], times[-1:] + 1e9])),
-        "no contact": broken(suit, contact_prob=None), "contact": broken(suit, contact_prob=suit.contact_prob + 9),
-        "few contacts": broken(suit, contact_prob=suit.contact_prob[:3]), "nothing": None, "text": "suit",
-    }  # fmt: skip
+        "no contact": broken(suit, contact_prob=None),
+        "contact": broken(suit, contact_prob=suit.contact_prob + 9),
+        "few contacts": broken(suit, contact_prob=suit.contact_prob[:3]),
+        "nothing": None,
+        "text": "suit",
+    }
 
 
 def bad_localizations(seen) -> dict:
     R, t, times = seen.R_world_cam, seen.t_world_cam, seen.timestamps
     return {
-        "nan": broken(seen, t_world_cam=t * math.nan), "large": broken(seen, t_world_cam=t + 1e30),
-        "scaled": broken(seen, R_world_cam=3 * R), "short": broken(seen, R_world_cam=R[:-1]),
-        "none": broken(seen, R_world_cam=None), "backwards": broken(seen, timestamps=times.flip(0)),
-        "confidence": broken(seen, confidence=seen.confidence * math.nan), "ahead": broken(seen, timestamps=times + 60),
-        "again": broken(seen, timestamps=times - 2.0), "text": "seen",
-    }  # fmt: skip
+        "nan": broken(seen, t_world_cam=t * math.nan),
+        "large": broken(seen, t_world_cam=t + 1e30),
+        "scaled": broken(seen, R_world_cam=3 * R),
+        "short": broken(seen, R_world_cam=R[:-1]),
+        "none": broken(seen, R_world_cam=None),
+        "backwards": broken(seen, timestamps=times.flip(0)),
+        "confidence": broken(seen, confidence=seen.confidence * math.nan),
+        "ahead": broken(seen, timestamps=times + 60),
+        "again": broken(seen, timestamps=times - 2.0),
+        "text": "seen",
+    }
 
 
 def run(stream: HpsStream, parts: list[Recording]) -> list[Motion]:
@@ -137,9 +152,7 @@ def test_where_the_clock_moves_a_new_stretch_begins(hps, parts, undisturbed, by_
 
 
 def test_where_every_piece_is_bad_it_says_so(hps, parts):
-    told = [
-        broken(part, suit=broken(part.suit, t_world_root=part.suit.t_world_root * math.nan)) for part in parts
-    ]
+    told = [broken(part, suit=broken(part.suit, t_world_root=part.suit.t_world_root * math.nan)) for part in parts]
     with pytest.raises(WearcapError, match="no piece can be used .suit: not finite."):
         list(follow(hps, told, None, settings=SETTINGS))
 
@@ -150,9 +163,7 @@ def test_pieces_without_a_suit_or_a_readable_file_are_passed_over(hps, parts, tm
     close_pieces(tmp_path)
     piece_path(tmp_path, 5).write_bytes(b"nothing")
     refused = Counter()
-    found = list(
-        follow(hps, follow_pieces(tmp_path, refused=refused), None, settings=SETTINGS, refused=refused)
-    )
+    found = list(follow(hps, follow_pieces(tmp_path, refused=refused), None, settings=SETTINGS, refused=refused))
     assert refused == {"piece: damaged file": 1, "suit: wrong type or shape": 1}
     assert times_of(found)[-1] > SECONDS - 0.1
     with pytest.raises(WearcapError):

@@ -31,12 +31,27 @@ from wearcap.systems.hps.published import HpsBaseline
 from wearcap.systems.ireplica.bent_suit import BentSuit
 
 ENERGY = HpsEnergy(
-    {"self": 220.0, "hold": 9.0, "translation_step": 1e4, "root_step": 1e5, "head_step": 6e4, "pose": 400.0,
-     "slide": 9e3, "contact_plane": 4.4e3},
-    {"self": Loss("cauchy", 0.1), "hold": Loss("cauchy", 0.1), "slide": Loss("huber", 0.01),
-     "contact_plane": Loss("cauchy", 0.02), "translation_step": Loss("square"), "root_step": Loss("square"),
-     "head_step": Loss("square"), "pose": Loss("square")},
-)  # fmt: skip
+    {
+        "self": 220.0,
+        "hold": 9.0,
+        "translation_step": 1e4,
+        "root_step": 1e5,
+        "head_step": 6e4,
+        "pose": 400.0,
+        "slide": 9e3,
+        "contact_plane": 4.4e3,
+    },
+    {
+        "self": Loss("cauchy", 0.1),
+        "hold": Loss("cauchy", 0.1),
+        "slide": Loss("huber", 0.01),
+        "contact_plane": Loss("cauchy", 0.02),
+        "translation_step": Loss("square"),
+        "root_step": Loss("square"),
+        "head_step": Loss("square"),
+        "pose": Loss("square"),
+    },
+)
 SOLVER = functools.partial(solve_banded, settings=BandedSettings(iterations=4, relaxation=1.0))
 PIPELINE = HPS(ENERGY, SOLVER)
 CLAPPING = Synchronization("auto", camera_claps_s=list(CLAPS_S))
@@ -58,9 +73,7 @@ def test_planted_errors_of_suit_and_clock_go():
     recording = hps_recording(camera_lead_s=1.7)
     capture = StagedCapture(replace(PIPELINE, synchronization=CLAPPING), Path(), scene=None)
     scanned = replace(recording, scene=None)
-    with pytest.raises(
-        WearcapError, match="no scan of the scene, which the energy's term contact_plane needs"
-    ):
+    with pytest.raises(WearcapError, match="no scan of the scene, which the energy's term contact_plane needs"):
         capture.run(scanned)
     pipeline = replace(PIPELINE, synchronization=CLAPPING)
     motion = pipeline(recording, Scan(floor_points()))
@@ -113,21 +126,25 @@ def test_a_killed_capture_goes_on_to_the_same_motion(walk, tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("changed", "stale"),
     [
-        (lambda r, root: (r, replace(PIPELINE, solver=functools.partial(SOLVER, settings=BandedSettings(iterations=2)))), ["optimize"]),
+        (
+            lambda r, root: (
+                r,
+                replace(PIPELINE, solver=functools.partial(SOLVER, settings=BandedSettings(iterations=2))),
+            ),
+            ["optimize"],
+        ),
         (lambda r, root: (r, replace(PIPELINE, name="other")), []),
         (lambda r, root: (replace(r, motion=None), PIPELINE), []),
         (lambda r, root: (replace(r, suit=r.suit.sliced(0, 600)), PIPELINE), ["align", "initialize", "optimize"]),
         (lambda r, root: (rescanned(r, root), PIPELINE), ["optimize"]),
     ],
     ids=["solver", "name", "truth", "suit", "scan"],
-)  # fmt: skip
+)
 def test_only_what_follows_a_change_is_made_again(changed, stale, walk, tmp_path):
     hps_dataset(tmp_path / "data", walk)
     StagedCapture(PIPELINE, tmp_path / "data", cache=tmp_path / "cache").run(walk)
     recording, pipeline = changed(walk, tmp_path / "data")
-    runs = (
-        StagedCapture(pipeline, tmp_path / "data", cache=tmp_path / "cache").run(recording).report["stages"]
-    )
+    runs = StagedCapture(pipeline, tmp_path / "data", cache=tmp_path / "cache").run(recording).report["stages"]
     assert [run["stage"] for run in runs if not run["reused"]] == stale
 
 
@@ -150,8 +167,7 @@ def test_a_baseline_shares_the_first_stages(walk, tmp_path):
 def test_it_is_scored_in_the_world_and_hung(walk, tmp_path):
     store = hps_dataset(tmp_path, walk)
     imu, ours = (
-        next(evaluate(StagedCapture(p, tmp_path), store, ["walk"], [0])).scores
-        for p in (HpsBaseline("imu"), PIPELINE)
+        next(evaluate(StagedCapture(p, tmp_path), store, ["walk"], [0])).scores for p in (HpsBaseline("imu"), PIPELINE)
     )
     assert ours["world_root_cm"] < imu["world_root_cm"]
     assert ours["mpjpe_cm"] < 5
@@ -162,8 +178,7 @@ def test_a_path_bent_to_the_camera_is_nearer_than_the_suits_own(walk, tmp_path):
     store = hps_dataset(tmp_path, walk)
     bent = BentSuit(functools.partial(bend, settings=Bending(100.0, free_start=True), solver=bend_banded))
     imu, ours = (
-        next(evaluate(StagedCapture(p, tmp_path), store, ["walk"], [0])).scores
-        for p in (HpsBaseline("imu"), bent)
+        next(evaluate(StagedCapture(p, tmp_path), store, ["walk"], [0])).scores for p in (HpsBaseline("imu"), bent)
     )
     assert ours["world_root_cm"] < imu["world_root_cm"]
     assert bent(walk).provenance["pipeline"] == "bent_suit"
@@ -173,9 +188,12 @@ def test_rarely_localised_orientations_are_carried_by_the_suit(walk):
     head = walk.motion.joint("head")
     motion, found = walk.motion, walk.localization
     rare = replace(
-        found, timestamps=found.timestamps[::9], R_world_cam=found.R_world_cam[::9],
-        t_world_cam=found.t_world_cam[::9], confidence=found.confidence[::9],
-    )  # fmt: skip
+        found,
+        timestamps=found.timestamps[::9],
+        R_world_cam=found.R_world_cam[::9],
+        t_world_cam=found.t_world_cam[::9],
+        confidence=found.confidence[::9],
+    )
     R_cam, sure = at_frames(rare, motion)
     inside = motion.timestamps < rare.timestamps[-1] + 0.1
     assert (sure[inside] == 1).all()
@@ -233,7 +251,7 @@ def test_another_map_is_another_result(filmed, tmp_path):
     cache = tmp_path / "cache"
     capture = StagedCapture(
         replace(PIPELINE, localization=MapLocalization(RootSift(400), every=3)), root, scene=root / "0.ply", cache=cache
-    )  # fmt: skip
+    )
     (root / "0.ply").write_bytes(b"")
     assert not capture.run(recording, until="localize").report["stages"][1]["reused"]
     assert capture.run(recording, until="localize").report["stages"][1]["reused"]
@@ -250,13 +268,32 @@ FAULTS = {
     "no suit": (lambda r: replace(r, suit=None), PIPELINE, "walk: no suit in this recording"),
     "no camera": (lambda r: replace(r, camera=None), PIPELINE, "walk: no camera in this recording"),
     "no poses": (lambda r: replace(r, localization=None), PIPELINE, "no localisation in this recording, and no map"),
-    "no map": (lambda r: r, replace(PIPELINE, localization=MapLocalization(map="none.safetensors")), "none.safetensors: no such map"),
-    "no pictures": (lambda r: r, replace(PIPELINE, localization=MapLocalization(map=__file__)), "no pictures of the head camera"),
-    "no clap": (lambda r: hps_recording(seconds=12.0), replace(PIPELINE, synchronization=Synchronization("claps", [1.0])),
-                "no clap found"),
-    "silent video": (lambda r: r, replace(PIPELINE, synchronization=Synchronization("claps")), "a camera without a video"),
-    "no contacts": (lambda r: replace(r, suit=replace(r.suit, contact_prob=None)), PIPELINE, "no foot contacts for 360 frames"),
-}  # fmt: skip
+    "no map": (
+        lambda r: r,
+        replace(PIPELINE, localization=MapLocalization(map="none.safetensors")),
+        "none.safetensors: no such map",
+    ),
+    "no pictures": (
+        lambda r: r,
+        replace(PIPELINE, localization=MapLocalization(map=__file__)),
+        "no pictures of the head camera",
+    ),
+    "no clap": (
+        lambda r: hps_recording(seconds=12.0),
+        replace(PIPELINE, synchronization=Synchronization("claps", [1.0])),
+        "no clap found",
+    ),
+    "silent video": (
+        lambda r: r,
+        replace(PIPELINE, synchronization=Synchronization("claps")),
+        "a camera without a video",
+    ),
+    "no contacts": (
+        lambda r: replace(r, suit=replace(r.suit, contact_prob=None)),
+        PIPELINE,
+        "no foot contacts for 360 frames",
+    ),
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -23,9 +23,7 @@ def hps(*overrides: str) -> HPS:
     return instantiate(config.pipeline, _convert_="all")
 
 
-def pieces(
-    recording: Recording, seconds: float = 1.0, lost: tuple[float, float] = (0.0, 0.0)
-) -> list[Recording]:
+def pieces(recording: Recording, seconds: float = 1.0, lost: tuple[float, float] = (0.0, 0.0)) -> list[Recording]:
     """The recording cut into pieces; between the times `lost` no frame is localised."""
     suit, seen, camera, parts = recording.suit, recording.localization, recording.camera, []
     assert suit is not None and seen is not None and camera is not None  # noqa: PT018
@@ -34,11 +32,22 @@ def pieces(
         first, stop = (int(torch.searchsorted(suit.timestamps, start + t)) for t in (0.0, seconds))
         here = (seen.timestamps >= start) & (seen.timestamps < start + seconds)
         cut = replace(
-            seen, timestamps=seen.timestamps[here], R_world_cam=seen.R_world_cam[here],
-            t_world_cam=seen.t_world_cam[here], confidence=confidence[here],
-        )  # fmt: skip
-        parts.append(replace(recording, suit=suit.sliced(first, stop), localization=cut, motion=None, contacts=None,
-                             camera=replace(camera, timestamps=camera.timestamps[here])))  # fmt: skip
+            seen,
+            timestamps=seen.timestamps[here],
+            R_world_cam=seen.R_world_cam[here],
+            t_world_cam=seen.t_world_cam[here],
+            confidence=confidence[here],
+        )
+        parts.append(
+            replace(
+                recording,
+                suit=suit.sliced(first, stop),
+                localization=cut,
+                motion=None,
+                contacts=None,
+                camera=replace(camera, timestamps=camera.timestamps[here]),
+            )
+        )
     return parts
 
 
@@ -47,9 +56,7 @@ def root_error_cm(motions: list, recording: Recording) -> torch.Tensor:
     assert recording.motion is not None
     assert torch.allclose(times.diff(), torch.tensor(1 / 30, dtype=torch.float64), atol=1e-6)
     frame = torch.searchsorted(recording.motion.timestamps, times - 1e-6)
-    return 100 * (torch.cat([m.t_world_root for m in motions]) - recording.motion.t_world_root[frame]).norm(
-        dim=-1
-    )
+    return 100 * (torch.cat([m.t_world_root for m in motions]) - recording.motion.t_world_root[frame]).norm(dim=-1)
 
 
 @pytest.fixture(scope="module")
@@ -75,17 +82,12 @@ def test_every_frame_comes_once_and_in_order_nearly_as_good_as_offline(streamed)
     assert sum(map(len, online)) == len(offline)
     assert len(online) > 10
     late = slice(120, None)
-    assert (
-        root_error_cm(online, recording)[late].mean()
-        < 1.6 * root_error_cm([offline], recording)[late].mean() + 0.5
-    )
+    assert root_error_cm(online, recording)[late].mean() < 1.6 * root_error_cm([offline], recording)[late].mean() + 0.5
 
 
 def test_lost_localisation_is_bridged_by_the_suit():
     recording = hps_recording(seconds=24.0)
-    motions = list(
-        follow(hps(), pieces(recording, lost=(8.0, 16.0)), Scan(floor_points()), settings=SETTINGS)
-    )
+    motions = list(follow(hps(), pieces(recording, lost=(8.0, 16.0)), Scan(floor_points()), settings=SETTINGS))
     error = root_error_cm(motions, recording)
     assert error[8 * 30 : 16 * 30].max() < 40.0  # the suit alone is 16 cm off by then, and turned by 2°
     assert error[-60:].mean() < 6.0
@@ -127,9 +129,7 @@ def test_what_cannot_be_followed_says_why():
     with pytest.raises(WearcapError, match="clock=shared"):
         list(follow(hps(), pieces(clapping), None))
     parts = pieces(hps_recording(seconds=4.0))
-    with pytest.raises(
-        WearcapError, match="no scan of the scene, which the energy's term contact_plane needs"
-    ):
+    with pytest.raises(WearcapError, match="no scan of the scene, which the energy's term contact_plane needs"):
         list(follow(hps(), parts, None))
     never = pieces(hps_recording(seconds=3.0), lost=(0.0, 9.0))
     with pytest.raises(WearcapError, match="never localised"):

@@ -39,17 +39,13 @@ FACES = np.array([f for a, b, c, d in QUADS for f in ((a, b, c), (a, c, d))], np
 
 
 def cube(name: str, place: torch.Tensor, freedom: Freedom) -> SceneObject:
-    return SceneObject(
-        name, "box", Mesh(CUBE, FACES, np.ones(3, np.float32)), torch.eye(3), place.float(), freedom
-    )
+    return SceneObject(name, "box", Mesh(CUBE, FACES, np.ones(3, np.float32)), torch.eye(3), place.float(), freedom)
 
 
 def walked(way: torch.Tensor) -> Motion:
     """Someone in a T-pose who is moved along x."""
     skeleton = xsens23()
-    root = torch.tensor([0.0, 0.0, skeleton.root_height]) + torch.nn.functional.pad(
-        way[:, None].float(), (0, 2)
-    )
+    root = torch.tensor([0.0, 0.0, skeleton.root_height]) + torch.nn.functional.pad(way[:, None].float(), (0, 2))
     times = torch.arange(len(way), dtype=torch.float64) / FPS
     return Motion(times, skeleton, torch.eye(3).repeat(len(way), len(skeleton), 1, 1), root)
 
@@ -69,11 +65,7 @@ def scene(way) -> tuple[Motion, Environment]:
     things = (
         cube("near", left + beside, Freedom("plane")),
         cube("far", left + 5 * beside, Freedom("plane")),
-        cube(
-            "door",
-            right + beside,
-            Freedom("hinge", pivot=tuple((right + 4 * beside).tolist()), limits=(-2.0, 2.0)),
-        ),
+        cube("door", right + beside, Freedom("hinge", pivot=tuple((right + 4 * beside).tolist()), limits=(-2.0, 2.0))),
     )
     return motion, Environment(things)
 
@@ -195,8 +187,13 @@ def test_handlings_outside_of_the_capture_spoil_no_mean(scene, way):
     motion, environment = scene
     track = Trajectory(motion.timestamps, torch.eye(3).repeat(FRAMES, 1, 1), torch.zeros(FRAMES, 3))
     spans = torch.tensor([[0.1, 0.3], [2.0, 3.0]]).double()
-    held = Interactions(spans[:, 0].contiguous(), spans[:, 1].contiguous(), torch.tensor([[True, False]] * 2),
-                        ("far", "near"), ("sliding",) * 2)  # fmt: skip
+    held = Interactions(
+        spans[:, 0].contiguous(),
+        spans[:, 1].contiguous(),
+        torch.tensor([[True, False]] * 2),
+        ("far", "near"),
+        ("sliding",) * 2,
+    )
     truth = Recording("r", motion=motion, interactions=held, object_motion={"near": track})
     late = static_objects(motion.sliced(60, FRAMES), environment)
     far = late.object_motion["far"]  # pyright: ignore[reportOptionalSubscript]
@@ -225,9 +222,7 @@ class Registered:
 
 def test_objects_are_tracked_again_when_a_mesh_changes_wherever_it_lies(scene, tmp_path):
     motion, environment = scene
-    pipeline = IReplica(
-        Registered(), dict, tracker(), environment=tmp_path
-    )  # the folder, too, names the file
+    pipeline = IReplica(Registered(), dict, tracker(), environment=tmp_path)  # the folder, too, names the file
     keys = []
     for size in (1.0, 2.0):
         near, *others = environment.objects
@@ -244,11 +239,14 @@ def test_scores_tell_the_perfect_capture_from_the_static_one(scene, way):
     motion, environment = scene
     contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
     captured = tracker()(motion, contacts, environment)
-    held = Interactions(torch.tensor([TAKE / FPS]).double(), torch.tensor([LEAVE / FPS]).double(),
-                        torch.tensor([[True, False]]), ("near",), ("sliding",))  # fmt: skip
-    truth = Recording(
-        "r", motion=motion, interactions=held, object_motion={"near": objects_of(captured)["near"]}
+    held = Interactions(
+        torch.tensor([TAKE / FPS]).double(),
+        torch.tensor([LEAVE / FPS]).double(),
+        torch.tensor([[True, False]]),
+        ("near",),
+        ("sliding",),
     )
+    truth = Recording("r", motion=motion, interactions=held, object_motion={"near": objects_of(captured)["near"]})
     perfect = score_interactions(captured, truth, environment)
     assert perfect.handlings[0].end_cm == pytest.approx(0.0, abs=1e-3)
     assert perfect.handlings[0].hand_object_cm < 0.1
@@ -256,9 +254,7 @@ def test_scores_tell_the_perfect_capture_from_the_static_one(scene, way):
     assert still.handlings[0].end_cm == pytest.approx(100.0, abs=0.5)
     assert still.handlings[0].hand_cm == pytest.approx(0.0, abs=1e-3)
     assert still.object_chamfer_cm > 5 > perfect.object_chamfer_cm
-    line = score_interactions(
-        interpolated_objects(motion, environment, held, truth.object_motion), truth, environment
-    )
+    line = score_interactions(interpolated_objects(motion, environment, held, truth.object_motion), truth, environment)
     assert line.handlings[0].end_cm < 0.1
     assert line.handlings[0].hand_object_cm > 2 * perfect.handlings[0].hand_object_cm
     near = score_interactions(held_when_near(tracker(), motion, environment), truth, environment)
@@ -268,9 +264,7 @@ def test_scores_tell_the_perfect_capture_from_the_static_one(scene, way):
 def test_objects_keep_their_own_clock(scene, way):
     motion, environment = scene
     track = Trajectory(motion.timestamps[[0, -1]], torch.eye(3).repeat(2, 1, 1), torch.zeros(2, 3))
-    held = Interactions(
-        torch.zeros(0).double(), torch.zeros(0).double(), torch.zeros(0, 2, dtype=torch.bool), (), ()
-    )
+    held = Interactions(torch.zeros(0).double(), torch.zeros(0).double(), torch.zeros(0, 2, dtype=torch.bool), (), ())
     truth = Recording("r", motion=motion, interactions=held, object_motion={"near": track})
     scores = score_interactions(static_objects(motion, environment), truth, environment)
     assert scores.handlings == ()
@@ -313,9 +307,7 @@ def test_the_papers_correction_runs_on_the_same_contacts(scene):
     motion, environment = scene
     off = replace(motion, t_world_root=motion.t_world_root + torch.tensor([0.0, -0.25, 0.0]))
     contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
-    correction = BendCorrection(
-        partial(bend, settings=Bending(rigidity=1.0, clamped_ends=True), solver=bend_banded)
-    )
+    correction = BendCorrection(partial(bend, settings=Bending(rigidity=1.0, clamped_ends=True), solver=bend_banded))
     captured = replace(tracker(), correction=correction)(off, contacts, environment)
     assert held_of(captured).objects == ("near",)
     assert captured.t_world_root.isfinite().all()

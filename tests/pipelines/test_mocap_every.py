@@ -49,9 +49,7 @@ def test_where_a_walk_begins_and_where_it_leads_changes_nothing(recording):
     }
     pipeline = drawn_pipeline(floor="fixed")
     here, there = pipeline(recording), pipeline(replace(recording, head=moved_head, imu=imu))
-    torch.testing.assert_close(
-        here.T_world_joint.t @ turn.mT + shift, there.T_world_joint.t, atol=2e-3, rtol=0
-    )
+    torch.testing.assert_close(here.T_world_joint.t @ turn.mT + shift, there.T_world_joint.t, atol=2e-3, rtol=0)
 
 
 def test_asked_in_a_mirror_left_and_right_are_treated_alike(recording):
@@ -64,20 +62,19 @@ def test_asked_in_a_mirror_left_and_right_are_treated_alike(recording):
     for joint, twin in (("left_wrist", "right_wrist"), ("right_wrist", "left_wrist")):
         other = recording.imu[twin]
         imu[joint] = replace(
-            other, joint=joint, R_world_imu=other.R_world_imu @ other.R_joint_imu.mT * turn, acc_world=other.acc_world * flip,
+            other,
+            joint=joint,
+            R_world_imu=other.R_world_imu @ other.R_joint_imu.mT * turn,
+            acc_world=other.acc_world * flip,
             R_joint_imu=None,
-        )  # fmt: skip
+        )
     seen = replace(recording, head=seen_head, imu=imu)
     pipeline = drawn_pipeline(floor="fixed", mirror_average=True)
     here, there = pipeline(recording), pipeline(seen)
     twins = [here.skeleton.index(mirrored_name(name)) for name in here.skeleton.joint_names]
-    torch.testing.assert_close(
-        here.T_world_joint.t * flip, there.T_world_joint.t[:, twins], atol=2e-3, rtol=0
-    )
+    torch.testing.assert_close(here.T_world_joint.t * flip, there.T_world_joint.t[:, twins], atol=2e-3, rtol=0)
     plain = drawn_pipeline(floor="fixed")
-    assert not torch.allclose(
-        plain(recording).T_world_joint.t * flip, plain(seen).T_world_joint.t[:, twins], atol=2e-3
-    )
+    assert not torch.allclose(plain(recording).T_world_joint.t * flip, plain(seen).T_world_joint.t[:, twins], atol=2e-3)
 
 
 @pytest.mark.parametrize("stride", [1, 4, WINDOW])
@@ -91,9 +88,15 @@ def test_a_recording_shorter_than_a_window(recording):
     count = WINDOW // 2
     head = recording.head
     short = replace(
-        recording, head=HeadStream(head.timestamps[:count], head.R_world_device[:count], head.t_world_device[:count],
-                                   head.R_head_device, head.t_head_device),
-    )  # fmt: skip
+        recording,
+        head=HeadStream(
+            head.timestamps[:count],
+            head.R_world_device[:count],
+            head.t_world_device[:count],
+            head.R_head_device,
+            head.t_head_device,
+        ),
+    )
     with pytest.raises(WearcapError, match="at least"):
         drawn_pipeline()(short)
 
@@ -101,8 +104,16 @@ def test_a_recording_shorter_than_a_window(recording):
 def test_a_gap_in_tracking_begins_anew(recording):
     head = recording.head
     kept = (head.timestamps < 1.5) | (head.timestamps > 2.5)
-    gapped = replace(recording, head=HeadStream(head.timestamps[kept], head.R_world_device[kept], head.t_world_device[kept],
-                                                head.R_head_device, head.t_head_device))  # fmt: skip
+    gapped = replace(
+        recording,
+        head=HeadStream(
+            head.timestamps[kept],
+            head.R_world_device[kept],
+            head.t_world_device[kept],
+            head.R_head_device,
+            head.t_head_device,
+        ),
+    )
     motion = drawn_pipeline()(gapped)
     assert len(motion) == len(head.timestamps)
     assert motion.R_parent_joint.isfinite().all()
@@ -132,7 +143,9 @@ def test_the_last_frames_estimator(recording):
     assert len(pipeline(recording)) == len(recording.head.timestamps)
 
 
-@pytest.mark.parametrize("wrong", [{"stride": 0}, {"stride": WINDOW + 1}, {"lookahead": WINDOW}, {"floor": "water"}, {"runtime": "fast"}])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong", [{"stride": 0}, {"stride": WINDOW + 1}, {"lookahead": WINDOW}, {"floor": "water"}, {"runtime": "fast"}]
+)
 def test_settings_that_cannot_be(wrong):
     with pytest.raises(WearcapError):
         drawn_pipeline(**wrong)
@@ -145,16 +158,11 @@ def test_scores_in_the_world_are_not_aligned(recording):
     assert here["r_mpjpe_cm"] == pytest.approx(there["r_mpjpe_cm"], rel=1e-3)
     truth = score_in_world(recording.motion, recording, "walk", 0).scores
     assert truth["mpjpe_cm"] == pytest.approx(0.0, abs=1e-3)
-    shifted = replace(
-        recording.motion, t_world_root=recording.motion.t_world_root + torch.tensor([1.0, 0.0, 0.0])
-    )
+    shifted = replace(recording.motion, t_world_root=recording.motion.t_world_root + torch.tensor([1.0, 0.0, 0.0]))
     assert score_in_world(shifted, recording, "walk", 0).scores["mpjpe_cm"] == pytest.approx(100.0, rel=1e-3)
 
 
 def test_onnx_says_the_same(recording):
     pytest.importorskip("onnxruntime")
-    eager, fast = (
-        drawn_pipeline(floor="fixed")(recording),
-        drawn_pipeline(floor="fixed", runtime="onnx")(recording),
-    )
+    eager, fast = (drawn_pipeline(floor="fixed")(recording), drawn_pipeline(floor="fixed", runtime="onnx")(recording))
     torch.testing.assert_close(eager.T_world_joint.t, fast.T_world_joint.t, atol=1e-4, rtol=0)

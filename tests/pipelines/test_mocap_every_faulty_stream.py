@@ -32,9 +32,7 @@ def pipeline():
 
 def opened(pipeline, recording) -> MocapEverySession:
     head, mounts = recording.head, {joint: stream.R_joint_imu for joint, stream in recording.imu.items()}
-    return MocapEverySession(
-        pipeline, Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts, 0.0)
-    )
+    return MocapEverySession(pipeline, Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts, 0.0))
 
 
 def feed(session, recording, frame: int, shift: float = 0.0, watched: bool = True) -> list[Motion]:
@@ -44,9 +42,7 @@ def feed(session, recording, frame: int, shift: float = 0.0, watched: bool = Tru
     for joint, stream in recording.imu.items():
         new = (stream.timestamps <= time + 1e-6) & (stream.timestamps > time - 1 / 30 + 1e-6)
         if watched:
-            rows = zip(
-                (stream.timestamps[new] + shift).tolist(), stream.R_world_imu[new], stream.acc_world[new]
-            )
+            rows = zip((stream.timestamps[new] + shift).tolist(), stream.R_world_imu[new], stream.acc_world[new])
             session.watch(joint, [WatchSample(*row) for row in rows])
     return given(session)
 
@@ -99,11 +95,7 @@ def test_bad_watch_samples_change_nothing(pipeline, recording, undisturbed):
     bad += [good._replace(acc_world=value) for value in VECTORS.values()]
     bad += [None, "sample", (time, torch.eye(3), torch.zeros(3))]
     session = disturbed(
-        pipeline,
-        recording,
-        undisturbed,
-        lambda session: unchecked(session.watch)("left_wrist", bad),
-        ["left_wrist"],
+        pipeline, recording, undisturbed, lambda session: unchecked(session.watch)("left_wrist", bad), ["left_wrist"]
     )
     assert sum(session.refused.values()) == len(bad)
     assert session.dropped == session.silent == 0
@@ -111,12 +103,7 @@ def test_bad_watch_samples_change_nothing(pipeline, recording, undisturbed):
 
 def test_bad_points_are_left_out(pipeline, recording, undisturbed):
     def happen(session):
-        for points in (
-            *VECTORS.values(),
-            torch.full((4, 3), math.nan),
-            torch.full((4, 3), 1e30),
-            torch.zeros(4, 2),
-        ):
+        for points in (*VECTORS.values(), torch.full((4, 3), math.nan), torch.full((4, 3), 1e30), torch.zeros(4, 2)):
             unchecked(session.head)((FAULT - 1) / 30, None, points)
 
     disturbed(pipeline, recording, undisturbed, happen, ["points"])
@@ -124,9 +111,7 @@ def test_bad_points_are_left_out(pipeline, recording, undisturbed):
 
 def test_a_sample_that_comes_twice_is_left_out_however_late(pipeline, recording, undisturbed):
     stream = recording.imu["left_wrist"]
-    late = [
-        WatchSample(*row) for row in zip(stream.timestamps.tolist(), stream.R_world_imu, stream.acc_world)
-    ][:105]
+    late = [WatchSample(*row) for row in zip(stream.timestamps.tolist(), stream.R_world_imu, stream.acc_world)][:105]
     disturbed(pipeline, recording, undisturbed, lambda session: session.watch("left_wrist", late[95:]), [])
 
 

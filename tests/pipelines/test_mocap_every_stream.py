@@ -20,14 +20,10 @@ def wearing(recording) -> Wearing:
 
 
 def samples(stream):
-    return [
-        WatchSample(*row) for row in zip(stream.timestamps.tolist(), stream.R_world_imu, stream.acc_world)
-    ]
+    return [WatchSample(*row) for row in zip(stream.timestamps.tolist(), stream.R_world_imu, stream.acc_world)]
 
 
-def streamed(
-    pipeline, recording, late_s: float = 0.0, without: str | None = None
-) -> tuple[Motion, MocapEverySession]:
+def streamed(pipeline, recording, late_s: float = 0.0, without: str | None = None) -> tuple[Motion, MocapEverySession]:
     """Poses of a session that is fed moment by moment, the watches `late_s` behind the camera."""
     session, head = MocapEverySession(pipeline, wearing(recording)), recording.head
     waiting = {joint: samples(stream) for joint, stream in recording.imu.items()}

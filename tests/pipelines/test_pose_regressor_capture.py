@@ -21,7 +21,7 @@ def pipeline(points: tuple[str, ...] = ("head",), **changes) -> PoseRegressorCap
     tracked = TrackedPoints(points, "world")  # a floor told by the whole path would say what comes
     net = PoseRegressor(tracked.size, 138, 40, 32, 2, 4, 64, frames_per_token=4)
     # Bends of some degrees about the rest pose, as a trained one tells them.
-    net.motion_normalizer.set(encode_pose(torch.eye(3).expand(23, 3, 3), torch.eye(3)), torch.full((138,), 0.2))  # fmt: skip
+    net.motion_normalizer.set(encode_pose(torch.eye(3).expand(23, 3, 3), torch.eye(3)), torch.full((138,), 0.2))
     return PoseRegressorCapture(net, tracked, xsens23(), 60.0, **changes)
 
 
@@ -33,7 +33,7 @@ def test_the_head_is_where_it_was_measured_and_so_are_tracked_hands(points):
     assert torch.allclose(motion.joint("head").t, truth.joint("head").t, atol=1e-4)
     assert torch.allclose(motion.joint("head").R, truth.joint("head").R, atol=1e-4)
     off = (motion.joint("left_wrist").t - truth.joint("left_wrist").t).norm(dim=-1)
-    raw = (pipeline(points, reach=False)(recording).joint("left_wrist").t - truth.joint("left_wrist").t).norm(dim=-1)  # fmt: skip
+    raw = (pipeline(points, reach=False)(recording).joint("left_wrist").t - truth.joint("left_wrist").t).norm(dim=-1)
     if points == HANDS:
         assert off.mean() < 0.3 * raw.mean()
     else:
@@ -77,6 +77,11 @@ def test_hands_need_a_true_motion_and_the_head_does_not():
 def test_the_true_motion_may_keep_another_clock():
     recording = recording_of(swaying_motion(120), "r")
     slow = recording.motion
-    half = replace(slow, timestamps=slow.timestamps[::2].clone(), R_parent_joint=slow.R_parent_joint[::2], t_world_root=slow.t_world_root[::2])  # fmt: skip
+    half = replace(
+        slow,
+        timestamps=slow.timestamps[::2].clone(),
+        R_parent_joint=slow.R_parent_joint[::2],
+        t_world_root=slow.t_world_root[::2],
+    )
     whole, resampled = pipeline(HANDS)(recording), pipeline(HANDS)(replace(recording, motion=half))
     assert (whole.R_parent_joint - resampled.R_parent_joint)[:110].abs().max() < 0.1

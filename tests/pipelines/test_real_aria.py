@@ -116,7 +116,10 @@ def test_a_true_skeleton_rides_with_the_real_head(real_data):
     assert place.std(0).max() < 1e-3
     assert place.mean(0)[0] < -0.1, "behind the pupils"
     assert (place.mean(0) + head.t_head_device).norm() < 0.1, "the assumed seat is near"
-    late = {name: type(cue)(cue.timestamps + 60, cue.joint, cue.points, cue.confidence) for name, cue in recording.cues.items()}  # fmt: skip
+    late = {
+        name: type(cue)(cue.timestamps + 60, cue.joint, cue.points, cue.confidence)
+        for name, cue in recording.cues.items()
+    }
     findings = examine(Recording("late", head=head, cues=late)).findings["late"]
     assert [f.severity for f in findings if f.check == "head against cues"] == ["error"]
 
@@ -157,16 +160,18 @@ def test_true_joints_lie_on_the_wearers_arm_in_the_real_frames(real_data):
     for frame in frames:
         time = torch.tensor([frame["timestamp_ns"] * 1e-9], dtype=torch.float64)
         T_cam_world = (resample(T_world_aria, time).T_world_body[0] @ T_aria_cam).inverse()
-        joints = [interpolate(cues[name].timestamps, cues[name].points, time)[0] for name in ("left_elbow", "left_wrist")]  # fmt: skip
+        joints = [
+            interpolate(cues[name].timestamps, cues[name].points, time)[0] for name in ("left_elbow", "left_wrist")
+        ]
         pixels, valid = camera.project(torch.stack([T_cam_world @ joint for joint in joints]))
         assert valid.all()
         along = torch.linspace(0.1, 0.9, 30)[:, None]
         sleeve = (1 - along) * pixels[0] + along * pixels[1]
-        across = torch.nn.functional.normalize(
-            (pixels[1] - pixels[0]).flip(0) * torch.tensor([1.0, -1.0]), dim=0
-        )
+        across = torch.nn.functional.normalize((pixels[1] - pixels[0]).flip(0) * torch.tensor([1.0, -1.0]), dim=0)
         picture = np.asarray(Image.open(folder / "extracted" / frame["image"]).convert("L"))
-        shades = [picture[tuple((sleeve + shift * across).round().long().flip(1).T.numpy())].mean() for shift in (0, 60, -60)]  # fmt: skip
+        shades = [
+            picture[tuple((sleeve + shift * across).round().long().flip(1).T.numpy())].mean() for shift in (0, 60, -60)
+        ]
         assert shades[0] < 30, "a black sleeve"
         assert min(shades[1:]) > 1.3 * shades[0], "and something else beside it"
 
@@ -176,12 +181,12 @@ def hmd2() -> HMD2:
     """The whole pipeline with random weights that listens to head and points."""
     torch.manual_seed(0)
     features, places = HeadFeatures(), VoxelAutoencoder()
-    net = MotionDenoiser(features.motion_size, features.condition_size, 60, 32, 1, 4, 64, 0.0, 4, points_size=places.size)  # fmt: skip
+    net = MotionDenoiser(
+        features.motion_size, features.condition_size, 60, 32, 1, 4, 64, 0.0, 4, points_size=places.size
+    )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
-    return HMD2(
-        net, features, CosineSchedule(), xsens23(), 60.0, place_encoder=places.eval(), steps=2, stride=40
-    )
+    return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, place_encoder=places.eval(), steps=2, stride=40)
 
 
 @pytest.mark.real
@@ -189,14 +194,10 @@ def test_a_real_recording_is_captured_with_its_points(living_room, hmd2, tmp_pat
     recording, head, _ = living_room
     motion = hmd2(recording)
     assert torch.equal(motion.timestamps, head.timestamps)
-    assert torch.allclose(motion.joint("head").t, head.T_world_head.t, atol=1e-4), (
-        "no drift of body from head"
-    )
+    assert torch.allclose(motion.joint("head").t, head.T_world_head.t, atol=1e-4), "no drift of body from head"
     assert torch.allclose(motion.joint("head").R, head.T_world_head.R, atol=1e-4)
     blind = hmd2(replace(recording, points=None))
-    assert not torch.allclose(motion.R_parent_joint, blind.R_parent_joint, atol=1e-3), (
-        "points are listened to"
-    )
+    assert not torch.allclose(motion.R_parent_joint, blind.R_parent_joint, atol=1e-3), "points are listened to"
     sheet = contact_sheet({"capture": motion}, [0, 300, 683], size=(120, 100))
     assert np.asarray(sheet).std() > 5, "a body is drawn"
 

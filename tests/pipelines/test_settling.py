@@ -38,16 +38,16 @@ def test_no_more_than_the_limit_is_cut_and_nothing_with_zero():
 
 def test_hands_that_join_and_leave_are_one_hold():
     spans = [
-        (ContactInterval(10, 14, LEFT), "sliding"), (ContactInterval(14, 80, BOTH), "sliding"),
-        (ContactInterval(60, 90, RIGHT), "hinged"), (ContactInterval(80, 84, RIGHT), "sliding"),
+        (ContactInterval(10, 14, LEFT), "sliding"),
+        (ContactInterval(14, 80, BOTH), "sliding"),
+        (ContactInterval(60, 90, RIGHT), "hinged"),
+        (ContactInterval(80, 84, RIGHT), "sliding"),
         (ContactInterval(84, 99, LEFT), "sliding"),
-    ]  # fmt: skip
+    ]
     assert [len(chain) for chain in chains(spans)] == [3, 1, 1]
     palms = way((20, 0.9), (4, 0.0), (44, 0.3), (4, 0.0), (60, 0.9))
     held = [row for row in settled(spans[:4], palms, times(palms), 0.4) if row[1] == "sliding"]
-    assert [contact.hands for contact, _ in held] == [
-        BOTH
-    ]  # one hand alone came before and after the hold itself
+    assert [contact.hands for contact, _ in held] == [BOTH]  # one hand alone came before and after the hold itself
     assert 19 <= held[0][0].start <= 24
     assert held[0][0].stop <= 73
 

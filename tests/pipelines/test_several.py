@@ -53,7 +53,7 @@ def wrong(recording: Recording) -> Motion:
 
 def arms_off_deg(motion: Motion, truth: Motion) -> float:
     arms = motion.skeleton.indices("left_shoulder", "right_shoulder")
-    return rotation.geodesic(motion.R_parent_joint[:, arms], truth.R_parent_joint[:, arms]).rad2deg().mean().item()  # fmt: skip
+    return rotation.geodesic(motion.R_parent_joint[:, arms], truth.R_parent_joint[:, arms]).rad2deg().mean().item()
 
 
 def test_the_others_views_lower_a_planted_error(pair, cues):

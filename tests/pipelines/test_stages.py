@@ -149,8 +149,28 @@ def test_digests_follow_content(tmp_path):
     file = tmp_path / "a.bin"
     file.write_bytes(b"a")
     part = functools.partial(run, settings=Settings())
-    values = [1, 1.0, True, "1", None, [1], [[1]], {"a": 1}, torch.ones(2), torch.ones(2, 1), torch.ones(2).double(),
-              np.ones(2), Settings(), Settings(gain=3.0), file, part, run, nn.Linear(2, 1), torch.float32, torch.float64]  # fmt: skip
+    values = [
+        1,
+        1.0,
+        True,
+        "1",
+        None,
+        [1],
+        [[1]],
+        {"a": 1},
+        torch.ones(2),
+        torch.ones(2, 1),
+        torch.ones(2).double(),
+        np.ones(2),
+        Settings(),
+        Settings(gain=3.0),
+        file,
+        part,
+        run,
+        nn.Linear(2, 1),
+        torch.float32,
+        torch.float64,
+    ]
     seen = [digest(value) for value in values]
     assert len(set(seen)) == len(values)
     assert seen == [digest(value) for value in values]
@@ -170,9 +190,12 @@ def test_the_code_of_a_stage_is_all_that_its_module_imports(tmp_path, monkeypatc
     """A change of any module that is imported, however far below, changes the digest; another one does not."""
     package = tmp_path / "wearcap"
     sources = {
-        "top": "from wearcap.middle import run", "middle": "import wearcap.deep.bottom", "deep/__init__": "",
-        "deep/bottom": "VALUE = 1", "aside": "",
-    }  # fmt: skip
+        "top": "from wearcap.middle import run",
+        "middle": "import wearcap.deep.bottom",
+        "deep/__init__": "",
+        "deep/bottom": "VALUE = 1",
+        "aside": "",
+    }
     for name, text in sources.items():
         (package / name).parent.mkdir(parents=True, exist_ok=True)
         (package / f"{name}.py").write_text(text)

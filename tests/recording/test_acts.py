@@ -85,7 +85,7 @@ def test_an_act_of_an_unknown_object_is_named(names, expected):
 
 def test_acts_of_a_recording_are_its_interactions():
     recording = carrying(2.0, carried=(("box_1", "left", 0.4, 0.8), ("box_2", "right", 1.2, 1.6)))
-    assert spans(true_acts(recording, 0.1)) == [("box_1", 0.4 - 0.1, 0.8 + 0.1), ("box_2", 1.2 - 0.1, 1.6 + 0.1)]  # fmt: skip
+    assert spans(true_acts(recording, 0.1)) == [("box_1", 0.4 - 0.1, 0.8 + 0.1), ("box_2", 1.2 - 0.1, 1.6 + 0.1)]
 
 
 def test_interactions_with_what_is_not_known_tell_nothing():

@@ -42,11 +42,25 @@ def test_a_flipped_bit_is_one_error(verb, dataset, memory, tmp_path, capsys):
         flip(path)
     arguments = {
         "doctor": ["doctor", str(dataset / "r4")],
-        "capture": ["capture", "pipeline=hmd2", "checkpoint=hmd2", f"recording={dataset}/r4", f"hydra.run.dir={tmp_path}/c"],
+        "capture": [
+            "capture",
+            "pipeline=hmd2",
+            "checkpoint=hmd2",
+            f"recording={dataset}/r4",
+            f"hydra.run.dir={tmp_path}/c",
+        ],
         "render": ["render", str(dataset / "r4"), "--out", str(tmp_path / "x.png")],
-        "train": ["train", "debug=fast", f"data.sources.simulated.root={dataset}", "trainer.accelerator=cpu",
-                  "data.window=60", "callbacks.progress=null", f"paths.outputs={tmp_path}/o", f"hydra.run.dir={tmp_path}/r"],
-    }[verb]  # fmt: skip
+        "train": [
+            "train",
+            "debug=fast",
+            f"data.sources.simulated.root={dataset}",
+            "trainer.accelerator=cpu",
+            "data.window=60",
+            "callbacks.progress=null",
+            f"paths.outputs={tmp_path}/o",
+            f"hydra.run.dir={tmp_path}/r",
+        ],
+    }[verb]
     assert exit_code(arguments) == (1 if verb == "doctor" else 2)
     said = capsys.readouterr()
     assert "checksum differs from the manifest's" in " ".join((said.out + said.err).split())

@@ -50,29 +50,47 @@ def full_recording(name: str = "all") -> Recording:
     times = torch.arange(FRAMES, dtype=torch.float64) / 60
     skeleton = xsens23()
     track = Trajectory(times, rotations(FRAMES), torch.randn(FRAMES, 3))
-    motion = Motion(times, skeleton, rotations(FRAMES, len(skeleton)), torch.randn(FRAMES, 3),
-                    contact_prob=torch.rand(FRAMES, 4), object_motion={"door": track},
-                    provenance={"source": "a test"})  # fmt: skip
+    motion = Motion(
+        times,
+        skeleton,
+        rotations(FRAMES, len(skeleton)),
+        torch.randn(FRAMES, 3),
+        contact_prob=torch.rand(FRAMES, 4),
+        object_motion={"door": track},
+        provenance={"source": "a test"},
+    )
     camera = Camera("pinhole", 640, 480, 500.0, 500.0, 320.0, 240.0)
     held = Interactions(
         times[:2], times[1:3], torch.tensor([[True, False], [True, True]]), ("door", ""), ("hinged", "")
     )
     motion = replace(motion, hand_contact_prob=torch.rand(FRAMES, 2), interactions=held)
     return Recording(
-        name, head=HeadStream(times, rotations(FRAMES), torch.randn(FRAMES, 3), torch.eye(3), torch.zeros(3)),
+        name,
+        head=HeadStream(times, rotations(FRAMES), torch.randn(FRAMES, 3), torch.eye(3), torch.zeros(3)),
         imu={"left": ImuStream(times, "left_wrist", gyro_imu=torch.randn(FRAMES, 3), R_joint_imu=torch.eye(3))},
-        suit=motion, camera=CameraStream(times, camera, torch.eye(3), torch.zeros(3), image_files=("a.jpg", "b.jpg")),
+        suit=motion,
+        camera=CameraStream(times, camera, torch.eye(3), torch.zeros(3), image_files=("a.jpg", "b.jpg")),
         localization=Localization(times, rotations(FRAMES), torch.randn(FRAMES, 3), torch.rand(FRAMES)),
         points=PointCloud(torch.randn(50, 3), torch.rand(50), torch.rand(50, dtype=torch.float64)),
         cues={"wrist": Cue(times, "left_wrist", torch.randn(FRAMES, 2), torch.rand(FRAMES))},
-        tracked={"left_wrist": track}, scene="room.ply",
-        environment="environment.json", interactions=held,
-        motion=motion, contacts=ContactTrack(times, FOOT_PATCHES, torch.rand(FRAMES, 4) > 0.5),
-        object_motion={"door": track}, floor=FloorTrack(times, torch.zeros(FRAMES)),
-        intervals=Intervals(times[:2], times[1:3], torch.zeros(2), ("stand", "move")), skeleton=skeleton,
-        shape={"height": 1.8}, subject="s1", location="flat", activity="walk", source="test", license="MIT",
+        tracked={"left_wrist": track},
+        scene="room.ply",
+        environment="environment.json",
+        interactions=held,
+        motion=motion,
+        contacts=ContactTrack(times, FOOT_PATCHES, torch.rand(FRAMES, 4) > 0.5),
+        object_motion={"door": track},
+        floor=FloorTrack(times, torch.zeros(FRAMES)),
+        intervals=Intervals(times[:2], times[1:3], torch.zeros(2), ("stand", "move")),
+        skeleton=skeleton,
+        shape={"height": 1.8},
+        subject="s1",
+        location="flat",
+        activity="walk",
+        source="test",
+        license="MIT",
         session="pair",
-    )  # fmt: skip
+    )
 
 
 def assert_same(first, second) -> None:
@@ -127,8 +145,10 @@ def test_a_window_reads_nothing_but_itself(tmp_path):
     rows = 2 * 2**30 // 12
     path = tmp_path / "large.safetensors"
     description = json.dumps({"schema_version": 1, "recording": {"$type": "Recording", "name": "large"}})
-    header = {"points.points_world": {"dtype": "F32", "shape": [rows, 3], "data_offsets": [0, rows * 12]},
-              "__metadata__": {"wearcap": description}}  # fmt: skip
+    header = {
+        "points.points_world": {"dtype": "F32", "shape": [rows, 3], "data_offsets": [0, rows * 12]},
+        "__metadata__": {"wearcap": description},
+    }
     text = json.dumps(header).encode()
     with open(path, "wb") as file:
         file.write(struct.pack("<Q", len(text)) + text)
@@ -158,12 +178,19 @@ def test_the_manifest_says_what_the_file_is(store):
 
 
 HOSTILE = {
-    "more frames than bytes": ("frames", 10**12), "no frames": ("frames", -1), "frames as text": ("frames", "90"),
-    "a rate as text": ("fps", "60"), "a rate without end": ("fps", float("inf")), "no rate": ("fps", None),
-    "bytes as text": ("bytes", "1"), "a duration that is none": ("duration_s", float("nan")),
-    "another folder": ("file", "../other.safetensors"), "a split of its own": ("split", "every"), "true": ("frames", True),
+    "more frames than bytes": ("frames", 10**12),
+    "no frames": ("frames", -1),
+    "frames as text": ("frames", "90"),
+    "a rate as text": ("fps", "60"),
+    "a rate without end": ("fps", float("inf")),
+    "no rate": ("fps", None),
+    "bytes as text": ("bytes", "1"),
+    "a duration that is none": ("duration_s", float("nan")),
+    "another folder": ("file", "../other.safetensors"),
+    "a split of its own": ("split", "every"),
+    "true": ("frames", True),
     "a list": ("subject", ["s1"]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("change", HOSTILE)
@@ -246,9 +273,18 @@ def test_a_damaged_file_is_named_and_the_rest_stays_usable(store):
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{", "[]", "null", '{"schema_version": 1}', '{"schema_version": 1, "recordings": {"a": {}}}',
-     '{"schema_version": 1, "recordings": []}', '{"schema_version": 1, "recordings": {"a": 3}}', "\0\0"],
-)  # fmt: skip
+    [
+        "",
+        "{",
+        "[]",
+        "null",
+        '{"schema_version": 1}',
+        '{"schema_version": 1, "recordings": {"a": {}}}',
+        '{"schema_version": 1, "recordings": []}',
+        '{"schema_version": 1, "recordings": {"a": 3}}',
+        "\0\0",
+    ],
+)
 def test_a_broken_manifest_is_refused(tmp_path, text):
     (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(WearcapError, match=r"manifest\.json"):
@@ -279,16 +315,28 @@ def foreign(path: Path, description: str | None) -> Path:
 @pytest.mark.parametrize(
     "recording",
     [
-        None, 3, [], "x", {}, {"$type": "Recording"}, {"$type": "Popen", "args": "ls"},
-        {"$type": "Motion"}, {"$type": "Recording", "name": "a", "surprise": 1},
+        None,
+        3,
+        [],
+        "x",
+        {},
+        {"$type": "Recording"},
+        {"$type": "Popen", "args": "ls"},
+        {"$type": "Motion"},
+        {"$type": "Recording", "name": "a", "surprise": 1},
         {"$type": "Recording", "name": "a", "motion": {"$tensor": "not there"}},
         {"$type": "Recording", "name": "a", "motion": {"$tensor": 5}},
         {"$type": "Recording", "name": "a", "skeleton": {"$tuple": 3}},
         {"$type": ["Recording"], "name": "a"},
-        {"$type": "Skeleton", "name": "a", "joint_names": {"$tuple": ["a", "a"]}, "parents": {"$tuple": [-1, 0]},
-         "t_parent_joint": {"$tensor": "motion.timestamps"}},
+        {
+            "$type": "Skeleton",
+            "name": "a",
+            "joint_names": {"$tuple": ["a", "a"]},
+            "parents": {"$tuple": [-1, 0]},
+            "t_parent_joint": {"$tensor": "motion.timestamps"},
+        },
     ],
-)  # fmt: skip
+)
 def test_a_hostile_description_is_refused(tmp_path, recording):
     path = foreign(tmp_path / "x.safetensors", json.dumps({"schema_version": 1, "recording": recording}))
     with pytest.raises(WearcapError):
@@ -305,9 +353,16 @@ def test_a_foreign_file_is_refused_when_opened(tmp_path, description):
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"abc", struct.pack("<Q", 2**62) + b"{}", struct.pack("<Q", 2) + b"[]", struct.pack("<Q", 8) + b"{\"a\":[1}",
-     b"PK\x03\x04" + bytes(64), b"\x80\x04cos\nsystem\n."],
-)  # fmt: skip
+    [
+        b"",
+        b"abc",
+        struct.pack("<Q", 2**62) + b"{}",
+        struct.pack("<Q", 2) + b"[]",
+        struct.pack("<Q", 8) + b'{"a":[1}',
+        b"PK\x03\x04" + bytes(64),
+        b"\x80\x04cos\nsystem\n.",
+    ],
+)
 def test_a_file_of_another_kind_is_refused(tmp_path, content):
     (tmp_path / "x.safetensors").write_bytes(content)
     with pytest.raises(WearcapError, match="not a readable recording"):
@@ -348,9 +403,7 @@ def _without_empty(value):
     if not isinstance(value, dict):
         return value
     items = {key: _without_empty(item) for key, item in value.items()}
-    empty = [
-        key for key, item in value.items() if item is None or (isinstance(item, dict | str) and not item)
-    ]
+    empty = [key for key, item in value.items() if item is None or (isinstance(item, dict | str) and not item)]
     return {key: item for key, item in items.items() if key not in empty}
 
 

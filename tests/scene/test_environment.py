@@ -31,11 +31,7 @@ def thing(name, mesh, x=0.0, y=0.0, turn=0.0, freedom=Freedom("plane")) -> Scene
 def random_mesh(rng, faces) -> Mesh:
     start = rng.uniform(-0.5, 0.5, (faces, 1, 3))
     corners = (start + rng.normal(0, 0.1, (faces, 3, 3))).reshape(-1, 3)
-    return Mesh(
-        corners.astype(np.float32),
-        np.arange(3 * faces, dtype=np.int32).reshape(-1, 3),
-        np.ones(3, np.float32),
-    )
+    return Mesh(corners.astype(np.float32), np.arange(3 * faces, dtype=np.int32).reshape(-1, 3), np.ones(3, np.float32))
 
 
 def cloud(rng, points) -> Mesh:
@@ -60,9 +56,7 @@ def plain_closest(point, mesh, T):
     candidates = list(vertices)
     for a, b, c in vertices[mesh.faces]:
         for start, stop in ((a, b), (b, c), (c, a)):
-            share = np.clip(
-                np.dot(point - start, stop - start) / max(np.dot(stop - start, stop - start), 1e-30), 0, 1
-            )
+            share = np.clip(np.dot(point - start, stop - start) / max(np.dot(stop - start, stop - start), 1e-30), 0, 1)
             candidates.append(start + share * (stop - start))
         st, *_ = np.linalg.lstsq(np.stack([b - a, c - a], 1), point - a, rcond=None)
         if st.min() >= 0 and st.sum() <= 1:
@@ -108,10 +102,7 @@ def test_distance_over_time_agrees_with_nearest_frame_by_frame():
     mesh = random_mesh(rng, 60)
     environment = Environment((thing("a", mesh), thing("b", cloud(rng, 40), x=1.0)))
     frames = 30
-    T = Rigid(
-        rotation.exp(torch.tensor(rng.normal(0, 1, (frames, 3)))),
-        torch.tensor(rng.normal(0, 0.5, (frames, 3))),
-    )
+    T = Rigid(rotation.exp(torch.tensor(rng.normal(0, 1, (frames, 3)))), torch.tensor(rng.normal(0, 0.5, (frames, 3))))
     points = torch.tensor(rng.normal(0, 0.5, (frames, 3)))
     for name in ("a", "b"):
         alone = Environment((environment.by_name(name),))
@@ -134,19 +125,12 @@ def test_distances_of_a_box():
 
 
 def test_a_moved_object_is_found_where_it_is_and_others_where_they_began():
-    environment = Environment(
-        (thing("near", box((1.0, 1.0, 1.0))), thing("far", box((1.0, 1.0, 1.0)), x=5.0))
-    )
+    environment = Environment((thing("near", box((1.0, 1.0, 1.0))), thing("far", box((1.0, 1.0, 1.0)), x=5.0)))
     hand = torch.tensor([[0.0, 0.7, 0.5]])
     assert environment.nearest(hand).object_index.tolist() == [0]
-    swapped = {
-        "near": Rigid(torch.eye(3), torch.tensor([5.0, 0, 0])),
-        "far": Rigid(torch.eye(3), torch.zeros(3)),
-    }
+    swapped = {"near": Rigid(torch.eye(3), torch.tensor([5.0, 0, 0])), "far": Rigid(torch.eye(3), torch.zeros(3))}
     assert environment.nearest(hand, swapped).object_index.tolist() == [1]
-    gone = environment.nearest(
-        hand, {"near": Rigid(torch.eye(3), torch.tensor([0.0, 9.0, 0.0]))}, reach_m=0.5
-    )
+    gone = environment.nearest(hand, {"near": Rigid(torch.eye(3), torch.tensor([0.0, 9.0, 0.0]))}, reach_m=0.5)
     assert gone.object_index.tolist() == [-1]
 
 

@@ -20,12 +20,7 @@ def flat_room(seed=0, floor=-0.4):
     )
     stray = np.column_stack([rng.uniform(0, 6, (60, 2)), rng.uniform(floor - 1.5, floor - 0.1, 60)])
     return np.concatenate(
-        [
-            surface(rng, (0, 0), (6, 5), floor, 1500),
-            surface(rng, (2, 2), (3.5, 3), floor + 0.74, 3000),
-            walls,
-            stray,
-        ]
+        [surface(rng, (0, 0), (6, 5), floor, 1500), surface(rng, (2, 2), (3.5, 3), floor + 0.74, 3000), walls, stray]
     )
 
 
@@ -33,9 +28,7 @@ def stairs(seed=0, steps=16, rise=0.17, tread=0.28):
     """Ground floor, 16 steps up along +x, upper floor; and the head path of one who climbs them."""
     rng = np.random.default_rng(seed)
     parts = [surface(rng, (-4, -1), (0, 1), 0.0, 2500)]
-    parts += [
-        surface(rng, (i * tread, -0.6), ((i + 1) * tread, 0.6), (i + 1) * rise, 150) for i in range(steps)
-    ]
+    parts += [surface(rng, (i * tread, -0.6), ((i + 1) * tread, 0.6), (i + 1) * rise, 150) for i in range(steps)]
     parts += [surface(rng, (steps * tread, -1), (steps * tread + 4, 1), steps * rise, 2500)]
     x = np.linspace(-3, steps * tread + 3, 900)
     floor = np.clip(np.floor(x / tread) + 1, 0, steps) * rise
@@ -79,9 +72,7 @@ def test_ceiling_of_the_storey_below_is_no_floor():
     points, head, floor = stairs()
     rng = np.random.default_rng(1)
     ceiling = surface(rng, (16 * 0.28, -1), (16 * 0.28 + 4, 1), 16 * 0.17 - 0.15, 5000)
-    error = estimate_floor(as_tensor(np.concatenate([points, ceiling])), as_tensor(head)).height - as_tensor(
-        floor
-    )
+    error = estimate_floor(as_tensor(np.concatenate([points, ceiling])), as_tensor(head)).height - as_tensor(floor)
     assert error[head[:, 0] > 16 * 0.28 + 0.8].abs().max() < 0.03
 
 

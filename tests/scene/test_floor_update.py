@@ -118,9 +118,7 @@ def test_slopes_are_followed_without_lag(slope, chunk):
 def test_feet_correct_a_wrong_beginning():
     floors = walk(FloorFollow(0.4, SOLE, 30.0), torch.zeros(300))
     assert floors[-1].abs() < 0.01
-    assert walk(FloorFollow(0.4, SOLE, 30.0), torch.zeros(300), seen=False)[-1] == pytest.approx(
-        0.4, abs=0.01
-    )
+    assert walk(FloorFollow(0.4, SOLE, 30.0), torch.zeros(300), seen=False)[-1] == pytest.approx(0.4, abs=0.01)
 
 
 def test_sitting_down_is_no_way_down():

@@ -30,11 +30,14 @@ FAULTS = {
     "no faces": (mesh(faces=NONE), "the object's mesh has no faces"),
     "no vertices": (mesh(CORNERS[:0], NONE), "the object's mesh has no vertices"),
     "other faces": (mesh(faces=FACES + 5), "names vertex 12, there are 8"),
-    "millimetres": (mesh(CORNERS * 1000), "400 m long. Expected 0.01 to 5 m. It looks like millimetres: divide by 1000"),
+    "millimetres": (
+        mesh(CORNERS * 1000),
+        "400 m long. Expected 0.01 to 5 m. It looks like millimetres: divide by 1000",
+    ),
     "a house": (mesh(CORNERS * 1e5), "4e[+]04 m long.*Bring it to metres"),
     "a crumb": (mesh(CORNERS / 100), "0.004 m long.*Bring it to metres"),
     "off centre": (mesh(CORNERS + 1), "not centred: its origin lies 1.4. m outside"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -69,14 +69,10 @@ def test_a_drawer_follows_its_axis_alone():
     drawer = thing(Freedom("axis", axis=axis, limits=(0.0, 0.4)))
     palms = torch.zeros(60, 2, 3).double()
     way = torch.linspace(0, 0.6, 60).double()
-    palms[:, 1] = (
-        way[:, None] * torch.tensor(axis).double() + torch.tensor([0.0, 0.0, 0.05]) * way[:, None].sin()
-    )
+    palms[:, 1] = way[:, None] * torch.tensor(axis).double() + torch.tensor([0.0, 0.0, 0.05]) * way[:, None].sin()
     found, value = follow_hands(drawer, ObjectState(drawer.T_world_object), palms, RIGHT)
     torch.testing.assert_close(value, way.clamp(max=0.4))
-    torch.testing.assert_close(
-        found.t[-1], torch.tensor([1.0, 2.0, 0.0]).double() + 0.4 * torch.tensor(axis).double()
-    )
+    torch.testing.assert_close(found.t[-1], torch.tensor([1.0, 2.0, 0.0]).double() + 0.4 * torch.tensor(axis).double())
 
 
 def test_hands_that_meet_keep_the_last_angle():

@@ -16,9 +16,7 @@ FLIP = torch.tensor([1.0, -1.0, 1.0])
 
 def room(count: int, seed: int = 0) -> torch.Tensor:
     """Points in 5 x 4 x 2.5 m, a quarter of them on the floor."""
-    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor(
-        [5.0, 4.0, 2.5]
-    )
+    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor([5.0, 4.0, 2.5])
     points[::4, 2] *= 0.01
     return points - torch.tensor([2.5, 2.0, 0.0])
 
@@ -42,11 +40,7 @@ def plainly(points, pose: Rigid, grid: VoxelGrid, seen=None, now=None) -> torch.
         box = (points.double() - pose.t[frame].double()) @ yaw + torch.tensor([0.0, 0.0, grid.below_m])
         inside = (box.abs() <= 0.5 * grid.size_m).all(-1)
         inside &= torch.ones_like(inside) if seen is None else seen <= now[frame]
-        distance = (
-            torch.cdist(centers.reshape(-1, 3), box[inside])
-            if inside.any()
-            else torch.ones(len(along) ** 3, 1)
-        )
+        distance = torch.cdist(centers.reshape(-1, 3), box[inside]) if inside.any() else torch.ones(len(along) ** 3, 1)
         result.append(distance.amin(1).clamp_max(grid.clip_m).reshape(centers.shape[:3]))
     return torch.stack(result).float()
 
@@ -99,18 +93,14 @@ def test_a_wall_ahead_stands_ahead_and_the_hand_side_is_left():
 def test_mirror():
     points, pose = room(5000), walk(20)
     flipped = Rigid(pose.R * torch.outer(FLIP, FLIP), pose.t * FLIP)
-    torch.testing.assert_close(
-        voxelize(points * FLIP, flipped), mirrored(voxelize(points, pose)), atol=1e-6, rtol=0
-    )
+    torch.testing.assert_close(voxelize(points * FLIP, flipped), mirrored(voxelize(points, pose)), atol=1e-6, rtol=0)
 
 
 def test_moving_the_world_changes_nothing():
     points, pose = room(5000), walk(20)
     turn, shift = rotation.about_axis("z", torch.tensor(2.0)), torch.tensor([64.0, -32.0, 8.0])
     moved = Rigid(turn @ pose.R, pose.t @ turn.T + shift)
-    torch.testing.assert_close(
-        voxelize(points @ turn.T + shift, moved), voxelize(points, pose), atol=1e-4, rtol=0
-    )
+    torch.testing.assert_close(voxelize(points @ turn.T + shift, moved), voxelize(points, pose), atol=1e-4, rtol=0)
 
 
 def test_hostile_points():
@@ -118,18 +108,14 @@ def test_hostile_points():
     assert torch.equal(voxelize(torch.zeros(0, 3), pose), empty)
     points = room(3000)
     wild = points.clone()
-    wild[::3] = torch.tensor(
-        [[math.nan, 0, 0], [math.inf, 1, 1], [1e7, -1e7, 1e7], [3e38, 3e38, -3e38]]
-    ).repeat(250, 1)
+    wild[::3] = torch.tensor([[math.nan, 0, 0], [math.inf, 1, 1], [1e7, -1e7, 1e7], [3e38, 3e38, -3e38]]).repeat(250, 1)
     everything = VoxelMap()
     everything.add(wild)
     assert (everything.dropped, len(everything)) == (500, 2500)
     kept = torch.ones(3000, dtype=torch.bool)
     kept[::3] = False
     assert torch.equal(everything.voxelize(pose), voxelize(points[kept], pose))
-    one = voxelize(
-        torch.tensor([[0.0, 0.0, 1.0]]), Rigid(torch.eye(3)[None], torch.tensor([[0.03, 0.0, 2.02]]))
-    )
+    one = voxelize(torch.tensor([[0.0, 0.0, 1.0]]), Rigid(torch.eye(3)[None], torch.tensor([[0.03, 0.0, 2.02]])))
     assert one.shape == (1, 10, 10, 10)
     never = torch.full((3000,), math.nan, dtype=torch.float64)
     assert torch.equal(voxelize(points, pose, first_seen=never), empty)

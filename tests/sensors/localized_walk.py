@@ -62,19 +62,11 @@ def localized(
     R = cam.R @ rotation.exp(np.deg2rad(noise.angle_deg) / 3**0.5 * white[0])
     t = cam.t + noise.position_m / 3**0.5 * white[1]
     length = max(round(noise.burst_s * fps), 1)
-    wrong = torch.from_numpy(rng.uniform(size=count // length + 1) < noise.outlier_share).repeat_interleave(
-        length
-    )[:count]
-    places = (
-        torch.from_numpy(rng.uniform(-8, 8, (count // length + 1, 3)))
-        .float()
-        .repeat_interleave(length, 0)[:count]
-    )
-    turns = (
-        torch.from_numpy(rng.standard_normal((count // length + 1, 3)))
-        .float()
-        .repeat_interleave(length, 0)[:count]
-    )
+    wrong = torch.from_numpy(rng.uniform(size=count // length + 1) < noise.outlier_share).repeat_interleave(length)[
+        :count
+    ]
+    places = torch.from_numpy(rng.uniform(-8, 8, (count // length + 1, 3))).float().repeat_interleave(length, 0)[:count]
+    turns = torch.from_numpy(rng.standard_normal((count // length + 1, 3))).float().repeat_interleave(length, 0)[:count]
     t = torch.where(wrong[:, None], t + places, t)
     R = torch.where(wrong[:, None, None], rotation.exp(turns) @ R, R)
     confidence = torch.from_numpy(rng.uniform(0.5, 1.0, count)).float()

@@ -8,13 +8,7 @@ from planted_session import SEEDS, session
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
-from wearcap.sensors.arm_swings import (
-    SwingSettings,
-    fit_swing_clock,
-    forearm_elevation,
-    swing_checks,
-    swing_peaks,
-)
+from wearcap.sensors.arm_swings import SwingSettings, fit_swing_clock, forearm_elevation, swing_checks, swing_peaks
 from wearcap.sensors.stillness import require
 from wearcap.sensors.watch_calibration import calibrate_watches
 from wearcap.simulation.calibration_session import SWINGS_S
@@ -77,7 +71,9 @@ def test_tops_lie_between_samples():
 
 def test_the_sign_of_the_forearm_is_found():
     stream = swinging()
-    turned = ImuStream(stream.timestamps, stream.joint, stream.R_world_imu @ rotation.about_axis("z", torch.tensor(np.pi)).float())  # fmt: skip
+    turned = ImuStream(
+        stream.timestamps, stream.joint, stream.R_world_imu @ rotation.about_axis("z", torch.tensor(np.pi)).float()
+    )
     torch.testing.assert_close(forearm_elevation(turned), forearm_elevation(stream), atol=1e-4, rtol=0)
 
 
@@ -108,7 +104,5 @@ def test_what_is_no_swing_is_said():
     even = times(np.arange(10.0))
     with pytest.raises(WearcapError, match="several ways.*swings at uneven intervals"):
         fit_swing_clock(even + 2.0, torch.cat([even, times([10.0, 11.0])]), 1 / 30)
-    with pytest.raises(
-        WearcapError, match="arm swings, left_wrist: seen by both clocks: 2. Expected at least 5"
-    ):
+    with pytest.raises(WearcapError, match="arm swings, left_wrist: seen by both clocks: 2. Expected at least 5"):
         require(swing_checks(fit_swing_clock(times([1.0, 2.3]), times([1.0, 2.3]), 1 / 30), "left_wrist"))

@@ -68,9 +68,7 @@ def test_what_is_measured_wrongly_shows_in_the_checks():
     still = (torch.zeros(4, dtype=torch.float64), [0.0] * 4)
     spread = align_by_marks(marks, (0.5, 0.44), 0.8)
     assert spread.scale_spread == pytest.approx(0.095, abs=0.002)
-    with pytest.raises(
-        WearcapError, match=r"scales by the two distances differ: 9.5. %. Expected at most 3 %"
-    ):
+    with pytest.raises(WearcapError, match=r"scales by the two distances differ: 9.5. %. Expected at most 3 %"):
         require(mark_checks(spread, *still))
     askew = marks.clone()
     askew[3] += (marks[1] - marks[0]) * 0.1
@@ -80,9 +78,7 @@ def test_what_is_measured_wrongly_shows_in_the_checks():
         require(mark_checks(align_by_marks(marks, DISTANCES), torch.tensor([0.0, 0.02, 0, 0]), [0.0] * 4))
     lifted = marks.clone()
     lifted[0] += torch.linalg.cross(marks[1] - marks[0], marks[3] - marks[2]) * scale * 0.5  # by 10 cm
-    with pytest.raises(
-        WearcapError, match="camera on the board: residual: 0.0[0-9]+ m. Expected at most 0.01"
-    ):
+    with pytest.raises(WearcapError, match="camera on the board: residual: 0.0[0-9]+ m. Expected at most 0.01"):
         require(mark_checks(align_by_marks(lifted, DISTANCES, 0.8), *still)[-1:])
 
 

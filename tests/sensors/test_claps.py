@@ -52,9 +52,7 @@ def test_claps_are_found_below_a_sample(rate, rms_s):
 
 @pytest.mark.parametrize(("swing", "cadence"), [(4.0, 0.9), (30.0, 1.4), (60.0, 2.5)])
 def test_walking_running_and_shaking_arms_are_no_claps(swing, cadence):
-    with pytest.raises(
-        WearcapError, match="no clap found.*left_wrist and right_wrist|left_wrist.*no clap found"
-    ):
+    with pytest.raises(WearcapError, match="no clap found.*left_wrist and right_wrist|left_wrist.*no clap found"):
         detect_claps(*arms(60.0, 120.0, [], swing=swing, cadence=cadence))
 
 
@@ -71,9 +69,7 @@ def test_a_knock_of_one_hand_counts_with_one_wrist_only():
     np.testing.assert_allclose(detect_claps(knock).numpy(), [7.0], atol=0.002)
     with pytest.raises(WearcapError, match="no clap found"):
         detect_claps(knock, right)
-    late = stream(
-        time, right.acc_world.numpy() + pulse(time, 7.1, 50.0, 0.02)[:, None] * ACROSS, "right_wrist"
-    )
+    late = stream(time, right.acc_world.numpy() + pulse(time, 7.1, 50.0, 0.02)[:, None] * ACROSS, "right_wrist")
     with pytest.raises(WearcapError, match="no clap found"):
         detect_claps(knock, late)
 
@@ -82,9 +78,13 @@ def test_a_landing_pushes_both_hands_alike_and_is_no_clap():
     pair = arms(20.0, 120.0, [])
     time = pair[0].timestamps.numpy()
     landed = [
-        replace(w, acc_world=w.acc_world + torch.from_numpy(pulse(time, 9.0, 45.0, 0.03))[:, None].float() * torch.tensor([0.1, 0.0, 1.0]))
+        replace(
+            w,
+            acc_world=w.acc_world
+            + torch.from_numpy(pulse(time, 9.0, 45.0, 0.03))[:, None].float() * torch.tensor([0.1, 0.0, 1.0]),
+        )
         for w in pair
-    ]  # fmt: skip
+    ]
     with pytest.raises(WearcapError, match="no clap found"):
         detect_claps(*landed)
 
@@ -95,9 +95,7 @@ def test_raw_sensors_with_and_without_orientation():
     turn = rotation.exp(torch.tensor([0.4, 1.0, -0.3])).expand(len(plain[0].timestamps), 3, 3)
     up = torch.tensor([0.0, 0.0, 9.81])
     raw = [
-        ImuStream(
-            w.timestamps, w.joint, R_world_imu=turn, acc_imu=(turn.mT @ (w.acc_world + up)[..., None])[..., 0]
-        )
+        ImuStream(w.timestamps, w.joint, R_world_imu=turn, acc_imu=(turn.mT @ (w.acc_world + up)[..., None])[..., 0])
         for w in plain
     ]
     np.testing.assert_allclose(detect_claps(*raw).numpy(), detect_claps(*plain).numpy(), atol=1e-3)

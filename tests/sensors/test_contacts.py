@@ -20,9 +20,7 @@ from wearcap.simulation.wearer import simulate_motion
 @pytest.fixture(scope="module")
 def walked():
     rng = np.random.default_rng(0)
-    return simulate_motion(
-        world_of("val", 0), person_of("val", 0), rng, 40.0, 60.0, ["walk", "stand", "walk"]
-    )
+    return simulate_motion(world_of("val", 0), person_of("val", 0), rng, 40.0, 60.0, ["walk", "stand", "walk"])
 
 
 def precision_recall(found, truth):
@@ -40,8 +38,7 @@ def test_contacts_of_a_worn_suits_pose(walked):
 def test_contacts_from_sensors_on_the_feet(walked):
     rng = np.random.default_rng(1)
     feet = [
-        synthesize_imu(walked.motion, f"{side}_ankle", noise=ImuNoise(), rng=rng, n=2)
-        for side in ("left", "right")
+        synthesize_imu(walked.motion, f"{side}_ankle", noise=ImuNoise(), rng=rng, n=2) for side in ("left", "right")
     ]
     precision, recall = precision_recall(contacts_from_imu(*feet), walked.contact)
     assert precision > 0.84

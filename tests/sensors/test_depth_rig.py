@@ -123,10 +123,14 @@ def scene() -> Scene:
     builder = WorldBuilder("room")
     builder.add_surface("floor", [[0, 0], [6, 0], [6, 5], [0, 5]], (0.6, 0.5, 0.4), thickness=0.05)
     for center, size in (
-        ((3, -0.05, 1.2), (6, 0.1, 2.4)), ((3, 5.05, 1.2), (6, 0.1, 2.4)), ((-0.05, 2.5, 1.2), (0.1, 5, 2.4)),
-        ((6.05, 2.5, 1.2), (0.1, 5, 2.4)), ((0.5, 0.4, 0.4), (0.9, 0.7, 0.8)), ((5.4, 4.3, 0.9), (0.8, 0.4, 1.8)),
+        ((3, -0.05, 1.2), (6, 0.1, 2.4)),
+        ((3, 5.05, 1.2), (6, 0.1, 2.4)),
+        ((-0.05, 2.5, 1.2), (0.1, 5, 2.4)),
+        ((6.05, 2.5, 1.2), (0.1, 5, 2.4)),
+        ((0.5, 0.4, 0.4), (0.9, 0.7, 0.8)),
+        ((5.4, 4.3, 0.9), (0.8, 0.4, 1.8)),
         ((5.6, 1.0, 0.35), (0.6, 1.4, 0.7)),
-    ):  # fmt: skip
+    ):
         builder.add_block("block", center, size, (0.7, 0.7, 0.7))
     world = builder.finish(0.1)
     spot = np.array([2.8, 2.4, 0.0])
@@ -140,9 +144,7 @@ def scene() -> Scene:
     person = Mesh(vertices.numpy(), body.faces.numpy().astype(np.int32), np.ones(3, np.float32))
     camera = KINECT.scaled(320, 288)
     rig = simulate_rig([world.mesh], [person], place_rig(world, spot), rng, camera=camera, stills=8)
-    return Scene(
-        rig, sampled(world.mesh, 0.015, rng), vertices, body.faces, approximate(rig.T_world_cam, rng)
-    )
+    return Scene(rig, sampled(world.mesh, 0.015, rng), vertices, body.faces, approximate(rig.T_world_cam, rng))
 
 
 @pytest.fixture(scope="module")
@@ -162,9 +164,7 @@ def views(scene: Scene) -> list[DepthView]:
     return found
 
 
-def test_the_persons_cloud_lies_on_the_true_body_and_tells_a_shifted_one(
-    scene: Scene, views: list[DepthView]
-):
+def test_the_persons_cloud_lies_on_the_true_body_and_tells_a_shifted_one(scene: Scene, views: list[DepthView]):
     """The metric's floor: what a perfect capture scores."""
     cloud = torch.from_numpy(person_cloud(list(scene.rig.depth_mm[:, 0]), views))
     assert len(cloud) > 10_000
@@ -206,9 +206,7 @@ def test_walls_are_registered_from_the_side_that_is_seen(scene: Scene):
 
 def test_with_unregistered_cameras_the_cloud_is_off(scene: Scene, views: list[DepthView]):
     rough = [DepthView(v.camera, scene.rough[i], v.background) for i, v in enumerate(views)]
-    good, bad = (
-        torch.from_numpy(person_cloud(list(scene.rig.depth_mm[:, 0]), rig)) for rig in (views, rough)
-    )
+    good, bad = (torch.from_numpy(person_cloud(list(scene.rig.depth_mm[:, 0]), rig)) for rig in (views, rough))
     assert chamfer(scene.vertices, bad).mean_cm > 2 * chamfer(scene.vertices, good).mean_cm
 
 

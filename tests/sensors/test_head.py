@@ -38,10 +38,7 @@ def test_drift_grows_with_the_way_travelled():
     noise = SlamNoise(jitter_m=0.0, jitter_deg=0.0, drift_share=0.02)
     exact = head_stream(motion, SEAT).t_world_device
     ends = torch.stack(
-        [
-            head_stream(motion, SEAT, noise, np.random.default_rng(s)).t_world_device[-1] - exact[-1]
-            for s in range(60)
-        ]
+        [head_stream(motion, SEAT, noise, np.random.default_rng(s)).t_world_device[-1] - exact[-1] for s in range(60)]
     )
     assert ends.std(0).mean() == pytest.approx(0.02 * way.sqrt().item(), rel=0.2)
 

@@ -35,21 +35,18 @@ def test_going_round_measures_the_centripetal_acceleration_and_the_rate():
     expected = torch.tensor([-(rate**2) * radius, 0.0, GRAVITY]).expand(581, 3)
     # (2 / h²)(1 − cos ωh) against ω²: below 0.03 % at h = 4 / 60 s; single precision costs the rest.
     torch.testing.assert_close(stream.acc_imu[inner], expected, atol=2e-3, rtol=0)
-    torch.testing.assert_close(
-        stream.gyro_imu, torch.tensor([0.0, 0.0, rate]).expand(601, 3), atol=2e-4, rtol=0
-    )
+    torch.testing.assert_close(stream.gyro_imu, torch.tensor([0.0, 0.0, rate]).expand(601, 3), atol=2e-4, rtol=0)
     torch.testing.assert_close(
         (stream.R_world_imu @ stream.acc_imu[..., None])[..., 0],
         stream.acc_world + torch.tensor([0.0, 0.0, GRAVITY]),
-        atol=1e-5, rtol=0,
-    )  # fmt: skip
+        atol=1e-5,
+        rtol=0,
+    )
 
 
 def test_a_lever_arm_is_felt():
     rate, radius, arm = 0.8, 1.5, 0.5
-    stream = synthesize_imu(
-        carousel(rate=rate, radius=radius), "pelvis", t_joint_imu=torch.tensor([arm, 0.0, 0.0])
-    )
+    stream = synthesize_imu(carousel(rate=rate, radius=radius), "pelvis", t_joint_imu=torch.tensor([arm, 0.0, 0.0]))
     assert stream.acc_imu[20:-20, 0].mean() == pytest.approx(-(rate**2) * (radius + arm), abs=2e-3)
 
 
@@ -85,9 +82,7 @@ def still(frames: int) -> Motion:
 
 def test_zero_noise_changes_nothing():
     motion = swaying_motion(200)
-    exact, same = (
-        synthesize_imu(motion, "head", noise=n, rng=np.random.default_rng(0)) for n in (None, NONE)
-    )
+    exact, same = (synthesize_imu(motion, "head", noise=n, rng=np.random.default_rng(0)) for n in (None, NONE))
     for name in ("R_world_imu", "acc_world", "acc_imu", "gyro_imu"):
         torch.testing.assert_close(getattr(same, name), getattr(exact, name), atol=1e-4, rtol=1e-4)
 
@@ -106,9 +101,7 @@ def test_white_noise_and_bias_are_as_large_as_asked():
 def test_attitude_and_heading_errors_are_as_large_as_asked():
     motion = still(36_000)
     exact = synthesize_imu(motion, "head")
-    stream = synthesize_imu(
-        motion, "head", noise=replace(NONE, attitude_deg=1.5), rng=np.random.default_rng(0)
-    )
+    stream = synthesize_imu(motion, "head", noise=replace(NONE, attitude_deg=1.5), rng=np.random.default_rng(0))
     off = rotation.geodesic(exact.R_world_imu, stream.R_world_imu).rad2deg()
     assert off.square().mean().sqrt() == pytest.approx(1.5, rel=0.2)
     ends = []
@@ -122,9 +115,7 @@ def test_attitude_and_heading_errors_are_as_large_as_asked():
 def test_a_clock_that_is_off_shifts_the_signal():
     motion = swaying_motion(600)
     exact = synthesize_imu(motion, "left_wrist")
-    stream = synthesize_imu(
-        motion, "left_wrist", noise=replace(NONE, clock_offset_s=0.3), rng=np.random.default_rng(4)
-    )
+    stream = synthesize_imu(motion, "left_wrist", noise=replace(NONE, clock_offset_s=0.3), rng=np.random.default_rng(4))
     assert torch.equal(stream.timestamps, exact.timestamps)
     lags = range(-20, 21)
     error = [(stream.gyro_imu[50:-50] - exact.gyro_imu.roll(k, 0)[50:-50]).square().mean() for k in lags]

@@ -133,5 +133,5 @@ def test_what_cannot_be_started_is_refused():
     alone = (lonely.confidence > 0).nonzero()[:1, 0]
     alone = Localization(
         lonely.timestamps[alone] + 0.001, lonely.R_world_cam[alone], lonely.t_world_cam[alone], lonely.confidence[alone]
-    )  # fmt: skip
+    )
     assert initialize(motion, alone, MOUNT.R, MOUNT.t).valid.any()

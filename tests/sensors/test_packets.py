@@ -31,17 +31,28 @@ def test_rotations_of_little_precision_are_fine(rotvec):
     for each in (R, R.double(), R.half(), (100 * R).round() / 100):
         assert packets.rotation_fault(each) is None
     assert packets.rotations_fault(R[None], (1, 3, 3)) is None
-    assert packets.rotation_fault(1.1 * R) == packets.rotations_fault(1.1 * R[None], (1, 3, 3)) == packets.NOT_A_ROTATION  # fmt: skip
+    assert (
+        packets.rotation_fault(1.1 * R) == packets.rotations_fault(1.1 * R[None], (1, 3, 3)) == packets.NOT_A_ROTATION
+    )
 
 
 @pytest.mark.parametrize(
     ("value", "fault"),
     [
-        (0.5, None), (3, None), (np.float32(2.0), None), (-1e9, None), (math.nan, "not finite"),
-        (-math.inf, "not finite"), (1e18, "out of range"), (10**400, "out of range"), (None, "wrong type or shape"),
-        ("1", "wrong type or shape"), (1j, "wrong type or shape"), (torch.zeros(2), "wrong type or shape"),
+        (0.5, None),
+        (3, None),
+        (np.float32(2.0), None),
+        (-1e9, None),
+        (math.nan, "not finite"),
+        (-math.inf, "not finite"),
+        (1e18, "out of range"),
+        (10**400, "out of range"),
+        (None, "wrong type or shape"),
+        ("1", "wrong type or shape"),
+        (1j, "wrong type or shape"),
+        (torch.zeros(2), "wrong type or shape"),
     ],
-)  # fmt: skip
+)
 def test_times(value, fault):
     assert packets.time_fault(value) == fault
 
@@ -51,13 +62,7 @@ def test_points_that_can_be_used_are_kept():
     kept, fault = packets.usable_points(points)
     assert kept.tolist() == [[1.0, 2.0, 3.0]]
     assert fault == "not finite"
-    for bad in (
-        torch.zeros(3),
-        torch.zeros(2, 4),
-        torch.zeros(2, 3, dtype=torch.int32),
-        np.zeros((2, 3)),
-        [1],
-    ):
+    for bad in (torch.zeros(3), torch.zeros(2, 4), torch.zeros(2, 3, dtype=torch.int32), np.zeros((2, 3)), [1]):
         assert packets.usable_points(bad) == (None, "wrong type or shape")
 
 
@@ -74,9 +79,7 @@ def test_bad_poses_are_counted_and_good_ones_copied(name):
 def test_a_lone_pose_far_away_is_refused_and_several_are_believed():
     head_input = HeadInput()
     here, there = Rigid.identity(), Rigid(torch.eye(3), torch.tensor([500.0, 0.0, 0.0]))
-    found = [
-        head_input.pose(pose) is not None for pose in (here, there, here, *[there] * (AGREEING + 1), here)
-    ]
+    found = [head_input.pose(pose) is not None for pose in (here, there, here, *[there] * (AGREEING + 1), here)]
     assert found == [True, False, True, *[False] * (AGREEING - 1), True, True, False]
 
 

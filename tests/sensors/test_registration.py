@@ -17,10 +17,13 @@ def room(points: int, seed: int) -> np.ndarray:
     u, v = random.uniform(0, 1, (2, points))
     zero = np.zeros(points)
     faces = [
-        np.stack([4 * u, 3 * v, zero], 1), np.stack([4 * u, zero, 2.5 * v], 1), np.stack([zero, 3 * u, 2.5 * v], 1),
-        np.stack([1.5 + u, 1 + v, zero + 0.7], 1), np.stack([1.5 + u, zero + 1, 0.7 * v], 1),
+        np.stack([4 * u, 3 * v, zero], 1),
+        np.stack([4 * u, zero, 2.5 * v], 1),
+        np.stack([zero, 3 * u, 2.5 * v], 1),
+        np.stack([1.5 + u, 1 + v, zero + 0.7], 1),
+        np.stack([1.5 + u, zero + 1, 0.7 * v], 1),
         np.stack([zero + 2.5, 1 + u, 0.7 * v], 1),
-    ]  # fmt: skip
+    ]
     return np.concatenate(faces) + 0.003 * random.normal(size=(6 * points, 3))
 
 
@@ -30,9 +33,7 @@ def turned(degrees: float, shift: float, seed: int) -> Rigid:
     return Rigid(rotation.exp(axis / axis.norm() * np.deg2rad(degrees)), way / way.norm() * shift)
 
 
-POSE = Rigid(
-    rotation.about_axis("z", torch.tensor(0.7, dtype=torch.float64)), torch.tensor([1.0, 1.5, 1.2]).double()
-)
+POSE = Rigid(rotation.about_axis("z", torch.tensor(0.7, dtype=torch.float64)), torch.tensor([1.0, 1.5, 1.2]).double())
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +48,7 @@ def cloud() -> np.ndarray:
 
 
 @pytest.mark.parametrize(("degrees", "shift", "seed"), [(3, 0.1, 0), (3, 0.1, 1), (8, 0.3, 2), (8, 0.3, 3)])
-def test_a_planted_pose_comes_back(
-    scene: np.ndarray, cloud: np.ndarray, degrees: float, shift: float, seed: int
-):
+def test_a_planted_pose_comes_back(scene: np.ndarray, cloud: np.ndarray, degrees: float, shift: float, seed: int):
     off = turned(degrees, shift, seed)
     result = register(cloud, scene, Rigid(off.R @ POSE.R, POSE.t + off.t))
     assert (result.T_scene_cloud.t - POSE.t).norm() < 0.002
@@ -62,9 +61,7 @@ def test_a_planted_pose_comes_back(
 
 
 def test_a_bare_floor_may_slide_and_says_so(scene: np.ndarray):
-    floor = scene[
-        (np.abs(scene[:, 2]) < 0.01) & (scene[:, :2] > 0.5).all(1) & (scene[:, :2] < [1.4, 2.5]).all(1)
-    ]
+    floor = scene[(np.abs(scene[:, 2]) < 0.01) & (scene[:, :2] > 0.5).all(1) & (scene[:, :2] < [1.4, 2.5]).all(1)]
     result = register(floor[::3], scene, Rigid.identity(dtype=torch.float64))
     assert result.least_seen < 0.01
     assert "slide" in result.summary
@@ -90,8 +87,7 @@ def test_two_real_scans_of_a_room_meet(real_data):
     """From a robot's odometry, 0.7 m and 2° off; the way back and other starts end at the same place."""
     first, second = (read_pcd(real_data / f"pcl_room_scan/tutorials/room_scan{n}.pcd").points for n in (1, 2))
     odometry = Rigid(
-        rotation.about_axis("z", torch.tensor(0.6931).double()),
-        torch.tensor([1.79387, 0.720047, 0.0]).double(),
+        rotation.about_axis("z", torch.tensor(0.6931).double()), torch.tensor([1.79387, 0.720047, 0.0]).double()
     )
     there = register(second, first, odometry)
     back = register(first, second, odometry.inverse())

@@ -86,9 +86,7 @@ def test_noise_and_misses_are_as_asked_for(motion, path):
 
 
 def test_what_lies_behind_is_not_seen(motion, path):
-    assert not seen_joints(
-        motion, path, ACTION_CAMERA, ["head", "neck"], 1.0, 0.0, np.random.default_rng(0)
-    )  # fmt: skip
+    assert not seen_joints(motion, path, ACTION_CAMERA, ["head", "neck"], 1.0, 0.0, np.random.default_rng(0))
     fisheye = Camera("fisheye", 1000, 1000, 180.0, 180.0, 499.5, 499.5, (0.0,) * 4)
     wide = seen_joints(motion, path, fisheye, ["left_toe"], 1.0, 0.0, np.random.default_rng(0))
     assert wide["left_toe"].points.shape[1] == 2

@@ -10,14 +10,7 @@ from boxes import BOX_FACES, box_corners
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.recording import HeadStream
-from wearcap.sensors.slam import (
-    CAMERA,
-    R_DEVICE_CAM,
-    SlamPoints,
-    keyframes,
-    semidense_points,
-    textured_points,
-)
+from wearcap.sensors.slam import CAMERA, R_DEVICE_CAM, SlamPoints, keyframes, semidense_points, textured_points
 
 EXACT = SlamPoints(noise_at_2m=0.0, outliers=0.0)
 
@@ -35,9 +28,7 @@ WALL, SHELF, HIDDEN = ((2, -4, 0), (2.1, 4, 3)), ((1.5, -1, 1), (1.7, 1, 2)), ((
 def looking(yaws: torch.Tensor, x: torch.Tensor | None = None) -> HeadStream:
     """A head at 1.6 m that turns about the vertical."""
     count = len(yaws)
-    t = torch.stack(
-        [torch.zeros(count) if x is None else x, torch.zeros(count), torch.full((count,), 1.6)], -1
-    )
+    t = torch.stack([torch.zeros(count) if x is None else x, torch.zeros(count), torch.full((count,), 1.6)], -1)
     time = torch.arange(count, dtype=torch.float64) / 60
     return HeadStream(time, rotation.about_axis("z", yaws), t, torch.eye(3), torch.zeros(3))
 
@@ -89,9 +80,7 @@ def test_each_point_was_in_sight_when_it_was_first_seen(mesh):
 
 def test_who_looks_away_sees_nothing(mesh):
     head = looking(torch.full((60,), float(np.pi)))
-    assert (
-        len(semidense_points(mesh, texture(30, 200, 100), head, np.random.default_rng(0)).points_world) == 0
-    )
+    assert len(semidense_points(mesh, texture(30, 200, 100), head, np.random.default_rng(0)).points_world) == 0
 
 
 def test_depth_noise_grows_with_the_square_of_distance():

@@ -58,7 +58,7 @@ def test_next_to_an_end_one_good_frame_may_fall_too(frame):
 def test_a_burst_falls_as_a_whole(length):
     """Whether its positions are shifted alike, or each to a place of its own."""
     track, frames = running(), torch.arange(200, 200 + length)
-    for by in (torch.tensor([0.4, 0.0, 0.3]), torch.randn(length, 3, generator=torch.Generator().manual_seed(1))):  # fmt: skip
+    for by in (torch.tensor([0.4, 0.0, 0.3]), torch.randn(length, 3, generator=torch.Generator().manual_seed(1))):
         valid, jumps = acceleration_outliers(moved(track, frames, by))
         assert (~valid).nonzero()[:, 0].tolist() == frames.tolist()
         assert not len(jumps)

@@ -45,9 +45,7 @@ def test_a_perfect_suit_tells_the_truth():
 def test_drift_after_a_walk(length_m, expected_m):
     motion = walk(length_m)
     poses = replace(SuitNoise(), fixed_deg=0.0, slow_deg=0.0)
-    off = [
-        (worn(motion, poses, seed).t_world_root - motion.t_world_root)[-1, :2].norm() for seed in range(60)
-    ]
+    off = [(worn(motion, poses, seed).t_world_root - motion.t_world_root)[-1, :2].norm() for seed in range(60)]
     assert torch.stack(off).square().mean().sqrt() == pytest.approx(expected_m, rel=0.25)
 
 
@@ -74,9 +72,7 @@ def test_contacts_come_late_and_some_are_wrong():
     late, wrong = [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        flags = (
-            suit_motion(motion, truth, replace(SuitNoise(), contact_wrong=(0.0, 0.0)), rng).contact_prob > 0.5
-        )
+        flags = suit_motion(motion, truth, replace(SuitNoise(), contact_wrong=(0.0, 0.0)), rng).contact_prob > 0.5
         late.append((flags != truth).float().sum() / (truth[1:] != truth[:-1]).sum() / 240.0)
         still = replace(SuitNoise(), contact_delay_s=(0.0, 0.0))
         flags = suit_motion(motion, truth, still, np.random.default_rng(seed)).contact_prob > 0.5

@@ -40,11 +40,13 @@ def exact(joint: str, *, on_board=None, posed=None, shaken: tuple[float, float] 
     times = torch.arange(0, 30, 0.02, dtype=torch.float64)
     R_joint_imu = axis("z", 90.0)
     hanging = axis("x", -90.0 if joint == "left_wrist" else 90.0)
-    keys = torch.stack([
-        torch.eye(3) if on_board is None else on_board,
-        (torch.eye(3) if posed is None else posed) @ axis("z", 90.0) @ R_joint_imu,
-        axis("z", 90.0) @ hanging @ R_joint_imu,
-    ])  # fmt: skip
+    keys = torch.stack(
+        [
+            torch.eye(3) if on_board is None else on_board,
+            (torch.eye(3) if posed is None else posed) @ axis("z", 90.0) @ R_joint_imu,
+            axis("z", 90.0) @ hanging @ R_joint_imu,
+        ]
+    )
     step = (times >= 5).long() + (times >= 10).long()
     amount = torch.tensor([*shaken, 0.0])[step] * torch.sin(20 * times).float()
     R = axis("z", -40.0) @ keys[step] @ rotation.about_axis("x", torch.deg2rad(amount))
@@ -82,14 +84,18 @@ def test_crowns_may_point_to_the_hand_or_to_the_elbow():
     ("wrong", "step", "match"),
     [
         ({"shaken": (5.0, 0.0)}, "board, right_wrist", "not still: 3.5.*at most 1 °.*Let go of the watches"),
-        ({"on_board": axis("x", 8.0)}, "board, right_wrist", "tilt of its z against gravity: 8 °.*at most 3.*level table"),
+        (
+            {"on_board": axis("x", 8.0)},
+            "board, right_wrist",
+            "tilt of its z against gravity: 8 °.*at most 3.*level table",
+        ),
         ({"shaken": (0.0, 12.0)}, "T-pose, right_wrist", "not still: 8.*at most 4.*Hold the pose"),
         ({"posed": axis("x", 70.0)}, "T-pose, right_wrist", "face of the watch looks away from up: 70.*palms down"),
         ({"posed": axis("y", 30.0)}, "T-pose, right_wrist", "slope of the forearm: 30.*height of the shoulders"),
         ({"posed": axis("z", 40.0)}, "T-pose, right_wrist", "away from the wearer's side: 40.*Face the board's y"),
         ({"posed": axis("z", 20.0)}, "T-pose, both", "lines disagree: 20.*at most 15.*one line"),
     ],
-)  # fmt: skip
+)
 def test_a_step_done_wrongly_is_named(wrong, step, match):
     with pytest.raises(WearcapError, match=match) as caught:
         calibrate_watches(both(**wrong), BOARD, T_POSE)

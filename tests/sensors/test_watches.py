@@ -42,9 +42,7 @@ def test_any_rate_gives_the_same(rate):
 def test_orientation_turns_evenly_between_samples():
     times = torch.tensor([0.0, 1.0], dtype=torch.float64)
     turn = about_axis("x", torch.tensor([-1.4, -1.4]))
-    stream = ImuStream(
-        times, "left_wrist", turn @ about_axis("z", torch.tensor([0.0, 1.0])), torch.zeros(2, 3)
-    )
+    stream = ImuStream(times, "left_wrist", turn @ about_axis("z", torch.tensor([0.0, 1.0])), torch.zeros(2, 3))
     quarter = torch.tensor([0.25], dtype=torch.float64)
     R, _ = filtered([stream], quarter, quarter.expand(7), 1 / 30)
     expected = turn[:1] @ about_axis("z", torch.tensor([0.25]))
@@ -53,10 +51,7 @@ def test_orientation_turns_evenly_between_samples():
 
 def test_a_spike_is_spread_over_seven_frames():
     streams = both(30.0)
-    spiked = {
-        joint: replace(stream, acc_world=torch.zeros_like(stream.acc_world))
-        for joint, stream in streams.items()
-    }
+    spiked = {joint: replace(stream, acc_world=torch.zeros_like(stream.acc_world)) for joint, stream in streams.items()}
     spiked["left_wrist"].acc_world[60, 0] = 7.0
     _, acc = watches_at(spiked, CLOCK, "here")
     assert acc[:, 0, 0].sum() == pytest.approx(7.0, rel=1e-3)
@@ -71,23 +66,27 @@ def test_mounting_is_taken_off():
         joint: replace(stream, R_world_imu=stream.R_world_imu @ mount, R_joint_imu=mount)
         for joint, stream in plain.items()
     }
-    torch.testing.assert_close(
-        watches_at(plain, CLOCK, "a")[0], watches_at(mounted, CLOCK, "a")[0], atol=1e-5, rtol=0
-    )
+    torch.testing.assert_close(watches_at(plain, CLOCK, "a")[0], watches_at(mounted, CLOCK, "a")[0], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda s: {"left_wrist": s["left_wrist"]}, "no watch on right_wrist"),
-        (lambda s: s | {"left_wrist": replace(s["left_wrist"], acc_world=None)}, "without orientation or free acceleration"),
+        (
+            lambda s: s | {"left_wrist": replace(s["left_wrist"], acc_world=None)},
+            "without orientation or free acceleration",
+        ),
         (lambda s: both(100.0, start=2.0), "logged from 2.00 s"),
         (lambda s: both(100.0, stop=3.0), "logged from 0.00 s to"),
         (lambda s: {"left_wrist": s["right_wrist"], "right_wrist": s["left_wrist"]}, "seem to be swapped"),
         (lambda s: s | {"left_wrist": jumping(s["left_wrist"])}, "clock jumps, for 1.0"),
-        (lambda s: s | {"left_wrist": replace(s["left_wrist"], timestamps=s["left_wrist"].timestamps.flip(0))}, "do not grow"),
+        (
+            lambda s: s | {"left_wrist": replace(s["left_wrist"], timestamps=s["left_wrist"].timestamps.flip(0))},
+            "do not grow",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_refused(change, message):
     with pytest.raises(WearcapError, match=message):
         watches_at(change(both(100.0)), CLOCK, "here")

@@ -68,8 +68,7 @@ def assert_natural(simulated: SimulatedMotion) -> None:
     assert feet[..., 2].min() > -0.005
     for side in SIDES:
         elbow, wrist = (
-            motion.R_parent_joint[:, skeleton.index(f"{side}_{joint}")].double()
-            for joint in ("elbow", "wrist")
+            motion.R_parent_joint[:, skeleton.index(f"{side}_{joint}")].double() for joint in ("elbow", "wrist")
         )
         axis = torch.tensor([0.0, 1.0 if side == "left" else -1.0, 0.0], dtype=torch.float64)
         forearm = elbow @ axis

@@ -64,9 +64,7 @@ def test_one_thing_after_the_other(floor, person):
     rng = np.random.default_rng(4)
     plan = plan_at(person, floor, 0.0, 0.0, 0.0)
     for x, touch in ((0.35, 1.5), (0.5, 2.6)):
-        plan.grip(
-            "right", Grip(UP, still(floor_pose(np.array([x, -0.2, 0.3]), 1.0)), touch, touch + 0.5, 0.6)
-        )
+        plan.grip("right", Grip(UP, still(floor_pose(np.array([x, -0.2, 0.3]), 1.0)), touch, touch + 0.5, 0.6))
     with pytest.raises(ValueError, match="holds another"):
         plan.grip("right", Grip(UP, still(floor_pose(np.zeros(3))), 3.2, 4.0))
     plan.time = 4.0

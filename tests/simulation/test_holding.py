@@ -70,9 +70,17 @@ def handled(floor, category, seed, hands=None):
 
 @pytest.mark.parametrize(
     ("category", "seed", "hands"),
-    [("suitcase", 1, 1), ("backpack", 0, 1), ("backpack", 2, 2), ("bottle", 2, 1), ("tool", 5, 1), ("tool", 4, 1),
-     ("tool", 3, 1), ("ball", 0, 2)],
-)  # fmt: skip
+    [
+        ("suitcase", 1, 1),
+        ("backpack", 0, 1),
+        ("backpack", 2, 2),
+        ("bottle", 2, 1),
+        ("tool", 5, 1),
+        ("tool", 4, 1),
+        ("tool", 3, 1),
+        ("ball", 0, 2),
+    ],
+)
 def test_a_thing_is_lifted_used_carried_and_put_down(floor, category, seed, hands):
     plan, held, handling, simulated, track = handled(floor, category, seed, hands)
     assert palm_errors(plan, simulated.motion).max() < 0.01

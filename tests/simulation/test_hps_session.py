@@ -39,8 +39,9 @@ def test_the_recording_is_complete_and_can_be_stored(simulated):
     tree, tensors = flatten(recording)
     again = unflatten(tree, tensors.__getitem__)
     assert again.intervals.names == recording.intervals.names == ("stand", "move", "stand", "move")
-    assert torch.equal(again.object_motion[HEAD_CAMERA_TRUTH].t_world_body,
-                       recording.object_motion[HEAD_CAMERA_TRUTH].t_world_body)  # fmt: skip
+    assert torch.equal(
+        again.object_motion[HEAD_CAMERA_TRUTH].t_world_body, recording.object_motion[HEAD_CAMERA_TRUTH].t_world_body
+    )
     assert len(recording.localization.timestamps) == len(recording.camera.timestamps)
     assert set(recording.imu) == {"left_wrist", "right_wrist"}
 
@@ -53,9 +54,7 @@ def test_the_wearer_is_back_at_the_spot_when_due(simulated, site):
     assert float(distance[0]) < 1.0
     assert float(distance[2]) == pytest.approx(45.0, abs=6.0)
     times = recording.motion.timestamps
-    for start, stop, name in zip(
-        recording.intervals.start_s, recording.intervals.stop_s, recording.intervals.names
-    ):
+    for start, stop, name in zip(recording.intervals.start_s, recording.intervals.stop_s, recording.intervals.names):
         inside = (times >= start) & (times <= stop)
         place = recording.motion.t_world_root[inside][:, :2] - torch.tensor(spot.position[:2])
         assert place.norm(dim=-1).max() < (0.5 if name == "stand" else 0.75 * spot.size)
@@ -73,9 +72,7 @@ def test_an_a_pose_is_stood(simulated):
     start, stop = recording.intervals.start_s[0], recording.intervals.stop_s[0]
     inside = (recording.motion.timestamps >= start) & (recording.motion.timestamps <= stop)
     for side in ("left", "right"):
-        arm = (recording.motion.joint(f"{side}_wrist").t - recording.motion.joint(f"{side}_shoulder").t)[
-            inside
-        ]
+        arm = (recording.motion.joint(f"{side}_wrist").t - recording.motion.joint(f"{side}_shoulder").t)[inside]
         off = torch.acos((-arm[:, 2] / arm.norm(dim=-1)).clamp(-1, 1)).rad2deg()
         assert ((off > 15) & (off < 50)).all()
 
@@ -147,10 +144,16 @@ def test_localisation_errs_as_the_model_says(long_path, seed):
 
 
 def test_errors_last_while_the_view_does(long_path):
-    still = Trajectory(long_path.timestamps[:300], long_path.R_world_body[:1].expand(300, 3, 3).clone(),
-                       long_path.t_world_body[:1].expand(300, 3).clone())  # fmt: skip
+    still = Trajectory(
+        long_path.timestamps[:300],
+        long_path.R_world_body[:1].expand(300, 3, 3).clone(),
+        long_path.t_world_body[:1].expand(300, 3).clone(),
+    )
     noise = LocalizationNoise(outliers=(0.0, 0.0), lost=(0.0, 0.0))
-    offsets = [localize_statistically(still, noise, np.random.default_rng(s)).t_world_cam - still.t_world_body for s in range(20)]  # fmt: skip
+    offsets = [
+        localize_statistically(still, noise, np.random.default_rng(s)).t_world_cam - still.t_world_body
+        for s in range(20)
+    ]
     means = torch.stack([offset.mean(0) for offset in offsets])
     spread = torch.stack([offset.std(0) for offset in offsets])
     assert 0.01 < float(means.std()) < 0.06
@@ -162,10 +165,7 @@ def test_outages_come_where_there_is_little_to_see(long_path):
     texture[:9000] = 1.0 + torch.rand(9000, generator=torch.Generator().manual_seed(0))
     noise = LocalizationNoise(lost=(0.05, 0.05), outage_s=(1.0, 8.0))
     lost = torch.stack(
-        [
-            localize_statistically(long_path, noise, np.random.default_rng(s), texture).confidence == 0
-            for s in range(12)
-        ]
+        [localize_statistically(long_path, noise, np.random.default_rng(s), texture).confidence == 0 for s in range(12)]
     )
     assert lost[:, 9000:].double().mean() > 1.3 * lost[:, :9000].double().mean()
 

@@ -8,13 +8,7 @@ import torch
 
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
-from wearcap.simulation.interaction_session import (
-    FLATS,
-    InteractionConfig,
-    flat_number,
-    flat_of,
-    simulate_interactions,
-)
+from wearcap.simulation.interaction_session import FLATS, InteractionConfig, flat_number, flat_of, simulate_interactions
 from wearcap.simulation.outline import distance_to_convex
 
 CONFIG = InteractionConfig(minutes=1.0)

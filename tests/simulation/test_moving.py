@@ -54,9 +54,7 @@ def test_a_thing_goes_where_it_should_with_the_hands_on_it(floor, category, targ
     half_deep, half_wide = choice.movable.half_size
     for frame in range(0, len(track), 5):
         x, y, _ = track.t_world_body[frame].tolist()
-        outline = rectangle(
-            (x, y), (2 * half_deep, 2 * half_wide), float(rotation.yaw_of(track.R_world_body[frame]))
-        )
+        outline = rectangle((x, y), (2 * half_deep, 2 * half_wide), float(rotation.yaw_of(track.R_world_body[frame])))
         pelvis = simulated.motion.t_world_root[frame : frame + 1, :2].double().numpy()
         assert distance_to_convex(pelvis, outline).min() > 0.2
 
@@ -76,8 +74,11 @@ def test_one_hand_only_translates(floor):
 def test_rows_are_split_where_the_hands_change():
     rows = hand_rows([("left", 1.0, 4.0), ("right", 2.0, 6.0), ("left", 7.0, 8.0)])
     assert rows == [
-        (1.0, 2.0, (True, False)), (2.0, 4.0, (True, True)), (4.0, 6.0, (False, True)), (7.0, 8.0, (True, False)),
-    ]  # fmt: skip
+        (1.0, 2.0, (True, False)),
+        (2.0, 4.0, (True, True)),
+        (4.0, 6.0, (False, True)),
+        (7.0, 8.0, (True, False)),
+    ]
 
 
 def test_a_box_is_lifted_carried_and_put_down(floor):

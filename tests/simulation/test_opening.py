@@ -48,9 +48,7 @@ def test_the_palm_stays_on_the_handle(case):
     assert rows.objects == (item.name,) * 2
     assert set(rows.classes) == {"hinged" if item.category != "drawer" else "sliding"}
     palms = site_positions(motion.skeleton, motion.T_world_joint, ("left_palm", "right_palm")).double()
-    point = (
-        track.T_world_body.R.double().numpy() @ np.array(item.handles[handle].point)
-    ) + track.t_world_body.numpy()
+    point = (track.T_world_body.R.double().numpy() @ np.array(item.handles[handle].point)) + track.t_world_body.numpy()
     held = rows.hand_contact(motion.timestamps).numpy()
     assert held.sum(1).max() == 1
     for side in range(len(HANDS)):

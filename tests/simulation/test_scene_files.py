@@ -123,9 +123,7 @@ def glance(scenery):
 def test_a_video_has_a_frame_per_time_and_the_claps_sound(scenery, glance, tmp_path):
     times = glance.timestamps[::6]
     rng = np.random.default_rng(0)
-    write_head_video(
-        tmp_path / "head.mp4", scenery, SMALL, glance, times, Filming(), rng, claps_s=(7.61, 8.4)
-    )
+    write_head_video(tmp_path / "head.mp4", scenery, SMALL, glance, times, Filming(), rng, claps_s=(7.61, 8.4))
     with av.open(str(tmp_path / "head.mp4")) as video:
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     assert len(frames) == len(times)
@@ -133,8 +131,9 @@ def test_a_video_has_a_frame_per_time_and_the_claps_sound(scenery, glance, tmp_p
     shown = [np.abs(frame.astype(float) - clean).mean() for frame in frames]
     assert int(np.argmin(shown)) == 5
     stream = CameraStream(times, SMALL, torch.eye(3), torch.zeros(3), video="head.mp4")
-    torch.testing.assert_close(camera_claps(stream, tmp_path), torch.tensor([7.61, 8.4], dtype=torch.float64),
-                               atol=0.003, rtol=0)  # fmt: skip
+    torch.testing.assert_close(
+        camera_claps(stream, tmp_path), torch.tensor([7.61, 8.4], dtype=torch.float64), atol=0.003, rtol=0
+    )
 
 
 def test_turning_blurs_and_glare_blinds(scenery, glance):

@@ -60,9 +60,7 @@ def test_parts_can_be_left_out():
     assert recording.points is None
     assert recording.suit is None
     assert recording.imu == {}
-    torch.testing.assert_close(
-        recording.head.T_world_head.t, recording.motion.joint("head").t, atol=2e-6, rtol=0
-    )
+    torch.testing.assert_close(recording.head.T_world_head.t, recording.motion.joint("head").t, atol=2e-6, rtol=0)
 
 
 def test_three_in_ten_recordings_are_outdoors_unless_a_world_is_asked_for(monkeypatch):

@@ -54,9 +54,7 @@ def test_approximate_poses_are_as_far_off_as_asked():
     poses = look_at(np.array([[2.0, 1.0, 1.5], [-1.0, 0.5, 1.0]]), np.zeros(3))
     rough = approximate(poses, np.random.default_rng(0))
     assert torch.allclose((rough.t - poses.t).norm(dim=-1), torch.full((2,), 0.1).double(), atol=1e-9)
-    assert torch.allclose(
-        rotation.geodesic(rough.R, poses.R), torch.full((2,), np.deg2rad(3.0)).double(), atol=1e-4
-    )
+    assert torch.allclose(rotation.geodesic(rough.R, poses.R), torch.full((2,), np.deg2rad(3.0)).double(), atol=1e-4)
 
 
 def test_the_rig_stands_on_free_floor_and_sees_from_feet_to_crown(stairs_flat: World):

@@ -19,9 +19,14 @@ SEEDS = range(2)
 
 
 MOTIONS = {
-    "walk": captured.walk(3.0), "run": captured.walk(5.0, 4.0), "jump": captured.jump(),
-    "sit": captured.sit(0.5), "perch": captured.sit(0.8), "step": captured.climb(0.15), "climb": captured.climb(0.7),
-}  # fmt: skip
+    "walk": captured.walk(3.0),
+    "run": captured.walk(5.0, 4.0),
+    "jump": captured.jump(),
+    "sit": captured.sit(0.5),
+    "perch": captured.sit(0.8),
+    "step": captured.climb(0.15),
+    "climb": captured.climb(0.7),
+}
 
 
 @cache

@@ -36,9 +36,7 @@ def pose(scenery: Scenery, yaw: float, pitch: float = 0.1, shift=(0.0, 0.0)) -> 
 def test_depth_is_the_renderers(scenery, camera):
     T = pose(scenery, 0.7)
     ours = view_depth(scenery, camera, T)
-    grid = torch.stack(
-        torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy"), -1
-    )
+    grid = torch.stack(torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy"), -1)
     rays = camera.unproject(grid.double())
     pinhole = render(PINHOLE, T, [scenery.world.mesh]).depth
     points = torch.from_numpy(ours).double()[..., None] * rays
@@ -77,10 +75,7 @@ def test_a_small_picture_is_the_mean_of_a_large_one(scenery):
 
 
 def test_walls_are_blank_and_prints_are_not(scenery):
-    faces, rng = (
-        scenery.world.mesh.vertices[scenery.world.mesh.faces].astype(np.float64),
-        np.random.default_rng(0),
-    )
+    faces, rng = (scenery.world.mesh.vertices[scenery.world.mesh.faces].astype(np.float64), np.random.default_rng(0))
     spread = {}
     for material in (kernels.PLASTER, kernels.POSTER, kernels.BOOKS, kernels.BRICK):
         face = rng.choice(np.flatnonzero(scenery.paint.materials == material), 400)

@@ -74,13 +74,7 @@ def test_nothing_jumps(everything):
     motion = everything.motion
     position = motion.T_world_joint.t.double()
     acceleration = (position.diff(n=2, dim=0) * FPS**2).norm(dim=-1)
-    for name, limit in (
-        ("pelvis", 25),
-        ("head", 25),
-        ("left_ankle", 160),
-        ("left_knee", 300),
-        ("left_wrist", 120),
-    ):
+    for name, limit in (("pelvis", 25), ("head", 25), ("left_ankle", 160), ("left_knee", 300), ("left_wrist", 120)):
         assert acceleration[:, motion.skeleton.index(name)].max() < limit, name
     R = motion.R_parent_joint.double()
     rate = rotation.log(R[:-1].transpose(-1, -2) @ R[1:]).norm(dim=-1) * FPS

@@ -80,9 +80,7 @@ def test_every_seat_and_target_can_be_reached(flat):
     assert flat.reach_targets
     rng = np.random.default_rng(0)
     start = flat.sample_floor(rng, 1)[0]
-    for point in [seat.standing_point() for seat in flat.seats] + [
-        np.array(t.stand) for t in flat.reach_targets
-    ]:
+    for point in [seat.standing_point() for seat in flat.seats] + [np.array(t.stand) for t in flat.reach_targets]:
         assert flat.plan_path(start, point, rng) is not None
 
 

@@ -31,10 +31,17 @@ def data(tmp_path_factory) -> Path:
 
 def arguments(data: Path, run: Path, experiment: str, *more: str) -> list[str]:
     return [
-        f"experiment={experiment}", f"data.sources.simulated.root={data}", f"hydra.run.dir={run}",
-        f"paths.outputs={run.parent}", "trainer.accelerator=cpu", "trainer.log_every_n_steps=1",
-        "trainer.enable_progress_bar=false", "callbacks.progress=null", "logger.csv.flush_logs_every_n_steps=1", *more,
-    ]  # fmt: skip
+        f"experiment={experiment}",
+        f"data.sources.simulated.root={data}",
+        f"hydra.run.dir={run}",
+        f"paths.outputs={run.parent}",
+        "trainer.accelerator=cpu",
+        "trainer.log_every_n_steps=1",
+        "trainer.enable_progress_bar=false",
+        "callbacks.progress=null",
+        "logger.csv.flush_logs_every_n_steps=1",
+        *more,
+    ]
 
 
 def fast(data: Path, run: Path, experiment: str, *more: str) -> Path:
@@ -67,9 +74,15 @@ def learned(people, tmp_path_factory) -> Path:
     """Ours, for long enough to tell bent elbows."""
     run = tmp_path_factory.mktemp("runs") / "run"
     more = [
-        "trainer.max_steps=120", "data.steps_per_epoch=60", "data.batch_size=8", "data.window=120", "data.stride=30",
-        "callbacks.average.decay=0.9", "optimizer.scheduler.warmup=10", "optimizer.optimizer.lr=0.01",
-    ]  # fmt: skip
+        "trainer.max_steps=120",
+        "data.steps_per_epoch=60",
+        "data.batch_size=8",
+        "data.window=120",
+        "data.stride=30",
+        "callbacks.average.decay=0.9",
+        "optimizer.scheduler.warmup=10",
+        "optimizer.optimizer.lr=0.01",
+    ]
     train.main(arguments(people, run, "contact_sequence", *more))
     return run / "checkpoints" / "last.ckpt"
 
@@ -93,7 +106,13 @@ def test_the_checkpoint_carries_its_temperatures(learned):
 
 
 def test_resumed_equals_straight_through(data, tmp_path):
-    more = ["data.steps_per_epoch=2", "data.batch_size=2", "data.window=90", "data.val_windows=4", "optimizer.scheduler.total=6"]  # fmt: skip
+    more = [
+        "data.steps_per_epoch=2",
+        "data.batch_size=2",
+        "data.window=90",
+        "data.val_windows=4",
+        "optimizer.scheduler.total=6",
+    ]
     straight, first, second = (tmp_path / name for name in ("straight", "first", "second"))
     train.main(arguments(data, straight, "contact_sequence", *more, "trainer.max_steps=6"))
     train.main(arguments(data, first, "contact_sequence", *more, "trainer.max_steps=4"))
@@ -126,7 +145,7 @@ def tables(learned, data, tmp_path_factory) -> dict[str, Path]:
     folder, source = tmp_path_factory.mktemp("exported"), RecordingStore.open(data).path_of("b3")
     models = {format: folder / format / f"contact.{format}" for format in FORMATS}
     for format, model in models.items():
-        export.main([f"checkpoint={learned}", f"format={format}", f"output={model}", f"hydra.run.dir={folder}/x"])  # fmt: skip
+        export.main([f"checkpoint={learned}", f"format={format}", f"output={model}", f"hydra.run.dir={folder}/x"])
         assert json.loads(model.with_suffix(".json").read_text())["model"]["max_abs_error"] < 1e-5
     subprocess.run([sys.executable, "-c", RUN, source, *models.values()], check=True)
     return {format: Path(f"{model}.csv") for format, model in models.items()}

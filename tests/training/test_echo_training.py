@@ -29,11 +29,17 @@ from wearcap_testing import small_dataset
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
 EXPERIMENTS = sorted(
-    path.stem
-    for kind in ("echo", "bodiffusion")
-    for path in (conf_dir() / "experiment").glob(f"{kind}*.yaml")
+    path.stem for kind in ("echo", "bodiffusion") for path in (conf_dir() / "experiment").glob(f"{kind}*.yaml")
 )
-WEIGHTS = {"human": 1.0, "object": 1.0, "contact": 1.0, "object_vertices": 1.0, "joints": 2.0, "velocity": 0.1, "skate": 0.05}  # fmt: skip
+WEIGHTS = {
+    "human": 1.0,
+    "object": 1.0,
+    "contact": 1.0,
+    "object_vertices": 1.0,
+    "joints": 2.0,
+    "velocity": 0.1,
+    "skate": 0.05,
+}
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +64,7 @@ def batch(features, *roots: str, count: int = 8) -> EchoWindow:
 
 def learner(net=None, frame: str = "own", **changes) -> EchoDiffusion:
     features = small_features(frame)
-    make = net or partial(EchoDenoiser, window=WINDOW, width=32, layers=1, heads=2, feedforward=32, dropout=0.0)  # fmt: skip
+    make = net or partial(EchoDenoiser, window=WINDOW, width=32, layers=1, heads=2, feedforward=32, dropout=0.0)
     given = {"loss_weights": WEIGHTS, "levels": LevelMix(ramp=(4, 16)), "optimizer": torch.optim.AdamW}
     return EchoDiffusion(make, features, CosineSchedule(), xsens23(), **given | changes)
 
@@ -107,7 +113,7 @@ def test_the_vertex_term_is_the_mean_over_the_points(data, frame):
     at = system.features.canonical(windows.points)
     outputs = system._truth(windows, at)
     turn = rotation.exp(0.7 * torch.randn(*windows.valid.shape, 3))
-    R, t = turn @ windows.R_world_object, windows.t_world_object + 0.2 * torch.randn_like(windows.t_world_object)  # fmt: skip
+    R, t = turn @ windows.R_world_object, windows.t_world_object + 0.2 * torch.randn_like(windows.t_world_object)
     first = system.net.sizes[0]
     outputs[..., first : first + OBJECT_SIZE] = system.features.encode_object(type(at)(R, t), at)
     value = system._vertices(outputs, windows, at)
@@ -209,13 +215,30 @@ def test_one_batch_is_learned(data, people):
 def arguments(experiment: str, data: str, people: str, run: Path, *more: str) -> list[str]:
     human = [] if experiment == "echo_without_people" else [f"data.sources.cmu.root={people}"]
     return [
-        f"experiment={experiment}", f"data.sources.objects.root={data}", f"data.val_sources.objects.root={data}", *human,
-        "debug=fast", f"hydra.run.dir={run}", f"paths.outputs={run.parent}", f"data.window={WINDOW}", "data.workers=0",
-        "data.encoder=null", "model.encoder=null", "features.shape_size=0", "model.net.width=32", "model.net.layers=1",
-        "model.net.heads=4", "model.net.feedforward=32", "trainer.accelerator=cpu", "trainer.precision=32-true",
-        "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "callbacks.progress=null",
-        "logger.csv.flush_logs_every_n_steps=1", *more,
-    ]  # fmt: skip
+        f"experiment={experiment}",
+        f"data.sources.objects.root={data}",
+        f"data.val_sources.objects.root={data}",
+        *human,
+        "debug=fast",
+        f"hydra.run.dir={run}",
+        f"paths.outputs={run.parent}",
+        f"data.window={WINDOW}",
+        "data.workers=0",
+        "data.encoder=null",
+        "model.encoder=null",
+        "features.shape_size=0",
+        "model.net.width=32",
+        "model.net.layers=1",
+        "model.net.heads=4",
+        "model.net.feedforward=32",
+        "trainer.accelerator=cpu",
+        "trainer.precision=32-true",
+        "trainer.log_every_n_steps=1",
+        "trainer.enable_progress_bar=false",
+        "callbacks.progress=null",
+        "logger.csv.flush_logs_every_n_steps=1",
+        *more,
+    ]
 
 
 def losses_of(run: Path) -> dict[int, str]:
@@ -235,7 +258,12 @@ def test_every_experiment_runs(experiment, data, people, tmp_path):
 @pytest.mark.slow
 def test_stopped_and_resumed_equals_straight_through(data, people, tmp_path):
     """Batches, noise, levels and dropout are functions of seed and step."""
-    more = ("data.steps_per_epoch=2", "model.net.dropout=0.3", "optimizer.scheduler.total=6", "optimizer.scheduler.warmup=1")  # fmt: skip
+    more = (
+        "data.steps_per_epoch=2",
+        "model.net.dropout=0.3",
+        "optimizer.scheduler.total=6",
+        "optimizer.scheduler.warmup=1",
+    )
     runs = {name: tmp_path / name / "run" for name in ("straight", "half", "resumed")}
     train.main(arguments("echo", data, people, runs["straight"], "trainer.max_steps=6", *more))
     train.main(arguments("echo", data, people, runs["half"], "trainer.max_steps=2", *more))
@@ -249,19 +277,36 @@ def test_stopped_and_resumed_equals_straight_through(data, people, tmp_path):
 def test_with_the_encoder_it_trains_is_evaluated_and_captures(data, people, tmp_path):
     """The whole way with the objects' shapes, as the configs have it."""
     run = tmp_path / "run"
-    given = [row for row in arguments("echo", data, people, run) if "encoder=null" not in row and "shape_size" not in row]  # fmt: skip
+    given = [
+        row for row in arguments("echo", data, people, run) if "encoder=null" not in row and "shape_size" not in row
+    ]
     train.main(given)
     checkpoint = run / "checkpoints" / "last.ckpt"
     assert load_system(checkpoint)[0].features.shape_size == 256
     common = [f"checkpoint={checkpoint}", "pipeline=echo_online", "pipeline.context=12"]
-    evaluate.main([
-        *common, f"dataset={data}", "baselines=false", "seeds=[0]", f"output={tmp_path}/table.json", f"hydra.run.dir={tmp_path}/e",
-    ])  # fmt: skip
+    evaluate.main(
+        [
+            *common,
+            f"dataset={data}",
+            "baselines=false",
+            "seeds=[0]",
+            f"output={tmp_path}/table.json",
+            f"hydra.run.dir={tmp_path}/e",
+        ]
+    )
     scores = json.loads((tmp_path / "table.json").read_text())["methods"]["wearcap"]
     assert {"mpjpe_mm", "v2v_cm", "center_cm", "rotation_deg", "touch_f1"} <= set(scores)
-    capture.main([
-        *common, "pipeline.runtime=eager", f"recording={data}/c2", "video=false", "body=false", f"output={tmp_path}/c", f"hydra.run.dir={tmp_path}/c",
-    ])  # fmt: skip
+    capture.main(
+        [
+            *common,
+            "pipeline.runtime=eager",
+            f"recording={data}/c2",
+            "video=false",
+            "body=false",
+            f"output={tmp_path}/c",
+            f"hydra.run.dir={tmp_path}/c",
+        ]
+    )
     motion = read_motion(tmp_path / "c" / "motion.npz")
     assert len(motion) == len(carrying(2.0).motion)
     assert set(motion.object_motion) == {"box_1"}

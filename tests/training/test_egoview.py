@@ -34,7 +34,9 @@ def arms_before_the_body(frames: int, seed: int) -> Motion:
     R, time = torch.eye(3).repeat(frames, len(motion.skeleton), 1, 1), motion.timestamps.float()
     for side, sign in (("left", 1.0), ("right", -1.0)):
         phase = 3 * seed + sign
-        turn = torch.stack([0.9 * torch.sin(1.3 * time + phase), 0 * time, -sign * (0.6 + 1.0 * torch.sin(1.9 * time + phase))], -1)  # fmt: skip
+        turn = torch.stack(
+            [0.9 * torch.sin(1.3 * time + phase), 0 * time, -sign * (0.6 + 1.0 * torch.sin(1.9 * time + phase))], -1
+        )
         R[:, motion.skeleton.index(f"{side}_shoulder")] = rotation.exp(turn)
     return replace(motion, R_parent_joint=R)
 
@@ -44,11 +46,7 @@ def filmed(root: Path, name: str, seed: int, frames: int = 180) -> Recording:
     motion = arms_before_the_body(frames, seed)
     tilt = rotation.about_axis("y", torch.tensor(0.5))
     camera = CameraStream(
-        motion.timestamps[::2],
-        CAMERA,
-        tilt @ R_DEVICE_CAM,
-        torch.tensor([0.09, 0.0, 0.05]),
-        video=f"videos/{name}.mp4",
+        motion.timestamps[::2], CAMERA, tilt @ R_DEVICE_CAM, torch.tensor([0.09, 0.0, 0.05]), video=f"videos/{name}.mp4"
     )
     points, visible = limb_points(motion, camera)
     pixels = CAMERA.project(points)[0].round().long()
@@ -79,10 +77,19 @@ def data(tmp_path_factory) -> Path:
 
 def arguments(data: Path, run: Path, *more: str) -> list[str]:
     return [
-        "experiment=egoview", f"data.sources.simulated.root={data}", "data.sources.cmu=null", f"hydra.run.dir={run}", f"paths.outputs={run.parent}",
-        "data.every=2", "trainer.accelerator=cpu", "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false",
-        "callbacks.progress=null", "logger.csv.flush_logs_every_n_steps=1", *more,
-    ]  # fmt: skip
+        "experiment=egoview",
+        f"data.sources.simulated.root={data}",
+        "data.sources.cmu=null",
+        f"hydra.run.dir={run}",
+        f"paths.outputs={run.parent}",
+        "data.every=2",
+        "trainer.accelerator=cpu",
+        "trainer.log_every_n_steps=1",
+        "trainer.enable_progress_bar=false",
+        "callbacks.progress=null",
+        "logger.csv.flush_logs_every_n_steps=1",
+        *more,
+    ]
 
 
 def logged(run: Path, name: str) -> dict[int, str]:
@@ -199,14 +206,27 @@ def test_scores_of_a_known_guess():
 @pytest.fixture(scope="module")
 def learned(data, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "run"
-    train.main(arguments(data, run, "trainer.max_steps=40", "data.steps_per_epoch=40", "data.batch_size=32", "model.net.channels=[16,24,32]",
-                         "callbacks.average.decay=0.8", "optimizer.scheduler.warmup=5", "optimizer.optimizer.lr=0.005"))  # fmt: skip
+    train.main(
+        arguments(
+            data,
+            run,
+            "trainer.max_steps=40",
+            "data.steps_per_epoch=40",
+            "data.batch_size=32",
+            "model.net.channels=[16,24,32]",
+            "callbacks.average.decay=0.8",
+            "optimizer.scheduler.warmup=5",
+            "optimizer.optimizer.lr=0.005",
+        )
+    )
     return run
 
 
 def test_hands_are_learned_from_pictures(learned):
-    value = {name: float(next(iter(logged(learned, f"val/{name}").values()))) for name in
-             ("hand_average_precision", "hand_share", "hand_error_cm", "hand_error_cm_of_mean")}  # fmt: skip
+    value = {
+        name: float(next(iter(logged(learned, f"val/{name}").values())))
+        for name in ("hand_average_precision", "hand_share", "hand_error_cm", "hand_error_cm_of_mean")
+    }
     assert value["hand_average_precision"] > max(0.8, value["hand_share"] + 0.1)
     assert value["hand_error_cm"] < 0.8 * value["hand_error_cm_of_mean"]
 
@@ -222,8 +242,13 @@ def test_the_encoder_comes_out_of_the_checkpoint(learned, data):
 
 
 def test_resumed_equals_straight_through(data, tmp_path):
-    more = ["data.steps_per_epoch=2", "data.batch_size=4", "data.val_windows=8", "optimizer.scheduler.total=6",
-            "model.net.channels=[8,8,8]"]  # fmt: skip
+    more = [
+        "data.steps_per_epoch=2",
+        "data.batch_size=4",
+        "data.val_windows=8",
+        "optimizer.scheduler.total=6",
+        "model.net.channels=[8,8,8]",
+    ]
     straight, first, second = (tmp_path / name for name in ("straight", "first", "second"))
     train.main(arguments(data, straight, *more, "trainer.max_steps=6"))
     train.main(arguments(data, first, *more, "trainer.max_steps=4"))

@@ -27,15 +27,18 @@ def seeing(seed: int) -> Recording:
     """A recording with a floor, a wall and embeddings of 30 pictures a second."""
     recording = recording_of(swaying_motion(150, seed), f"r{seed}")
     random = torch.Generator().manual_seed(seed)
-    points = torch.rand(3000, 3, generator=random) * torch.tensor([6.0, 6.0, 2.0]) - torch.tensor(
-        [3.0, 3.0, 0.0]
-    )
+    points = torch.rand(3000, 3, generator=random) * torch.tensor([6.0, 6.0, 2.0]) - torch.tensor([3.0, 3.0, 0.0])
     points[::2, 2], points[1::2, 0] = 0.0, 1.5
     shown = torch.randn(75, SIZE, generator=random).half()
     camera = CameraStream(
-        recording.head.timestamps[::2], Camera("pinhole", 8, 6, 4.0, 4.0, 3.5, 2.5), torch.eye(3), torch.zeros(3),
-        embedding=shown, embedding_mirrored=-shown, embedding_name="egoview-01234567",
-    )  # fmt: skip
+        recording.head.timestamps[::2],
+        Camera("pinhole", 8, 6, 4.0, 4.0, 3.5, 2.5),
+        torch.eye(3),
+        torch.zeros(3),
+        embedding=shown,
+        embedding_mirrored=-shown,
+        embedding_name="egoview-01234567",
+    )
     return dataclasses.replace(recording, points=PointCloud(points), camera=camera)
 
 
@@ -48,29 +51,56 @@ def data(tmp_path_factory) -> Path:
 
 
 QUIET = (
-    "trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "callbacks.progress=null",
-    "trainer.log_every_n_steps=1", "logger.csv.flush_logs_every_n_steps=1",
-)  # fmt: skip
+    "trainer.accelerator=cpu",
+    "trainer.enable_progress_bar=false",
+    "callbacks.progress=null",
+    "trainer.log_every_n_steps=1",
+    "logger.csv.flush_logs_every_n_steps=1",
+)
 
 
 @pytest.fixture(scope="module")
 def places(data, tmp_path_factory) -> Path:
     """A voxel autoencoder of two steps."""
     run = tmp_path_factory.mktemp("places") / "run"
-    train.main([
-        "experiment=voxel_autoencoder", f"data.sources.simulated.root={data}", "data.sources.cmu=null", f"hydra.run.dir={run}", "trainer.max_steps=2",
-        f"paths.outputs={run.parent}", "data.window=20", "data.frames=4", "data.batch_size=4", "data.steps_per_epoch=2", *QUIET,
-    ])  # fmt: skip
+    train.main(
+        [
+            "experiment=voxel_autoencoder",
+            f"data.sources.simulated.root={data}",
+            "data.sources.cmu=null",
+            f"hydra.run.dir={run}",
+            "trainer.max_steps=2",
+            f"paths.outputs={run.parent}",
+            "data.window=20",
+            "data.frames=4",
+            "data.batch_size=4",
+            "data.steps_per_epoch=2",
+            *QUIET,
+        ]
+    )
     return run / "checkpoints" / "last.ckpt"
 
 
 def trained(experiment: str, data: Path, places: Path | None, run: Path, *more: str) -> Path:
-    train.main([
-        f"experiment={experiment}", f"data.sources.simulated.root={data}", "data.sources.cmu=null", "debug=fast",
-        f"hydra.run.dir={run}", f"paths.outputs={run.parent}", "data.window=60", "trainer.precision=32-true",
-        *([] if places is None else [f"surroundings.places.checkpoint={places}"]), "model.net.width=32", "model.net.layers=1", "model.net.heads=4",
-        "model.net.feedforward=32", *QUIET, *more,
-    ])  # fmt: skip
+    train.main(
+        [
+            f"experiment={experiment}",
+            f"data.sources.simulated.root={data}",
+            "data.sources.cmu=null",
+            "debug=fast",
+            f"hydra.run.dir={run}",
+            f"paths.outputs={run.parent}",
+            "data.window=60",
+            "trainer.precision=32-true",
+            *([] if places is None else [f"surroundings.places.checkpoint={places}"]),
+            "model.net.width=32",
+            "model.net.layers=1",
+            "model.net.heads=4",
+            "model.net.feedforward=32",
+            *QUIET,
+            *more,
+        ]
+    )
     return run / "checkpoints" / "last.ckpt"
 
 
@@ -99,19 +129,34 @@ def test_the_checkpoint_carries_the_place_encoder_and_its_statistics(checkpoint,
 
 @pytest.mark.parametrize("use", ["[]", "[points]", "[images]", "[points,images]"])
 def test_one_checkpoint_is_scored_with_any_of_its_senses(checkpoint, data, tmp_path, use):
-    evaluate.main([
-        f"checkpoint={checkpoint}", f"dataset={data}", f"pipeline.use={use}", "pipeline.steps=2", "seeds=[0]", "baselines=false",
-        f"hydra.run.dir={tmp_path}", f"output={tmp_path}/table.json",
-    ])  # fmt: skip
+    evaluate.main(
+        [
+            f"checkpoint={checkpoint}",
+            f"dataset={data}",
+            f"pipeline.use={use}",
+            "pipeline.steps=2",
+            "seeds=[0]",
+            "baselines=false",
+            f"hydra.run.dir={tmp_path}",
+            f"output={tmp_path}/table.json",
+        ]
+    )
     table = json.loads((tmp_path / "table.json").read_text())
     assert table["methods"]["wearcap"]["mpjpe_cm"]["mean"] > 1
 
 
 def test_a_capture_says_what_it_listened_to(checkpoint, data, tmp_path):
-    capture.main([
-        f"checkpoint={checkpoint}", f"recording={data}/r3", f"hydra.run.dir={tmp_path}", "pipeline.steps=2", "video=false",
-        "body=false", "samples=2",
-    ])  # fmt: skip
+    capture.main(
+        [
+            f"checkpoint={checkpoint}",
+            f"recording={data}/r3",
+            f"hydra.run.dir={tmp_path}",
+            "pipeline.steps=2",
+            "video=false",
+            "body=false",
+            "samples=2",
+        ]
+    )
     first, second = (read_motion(tmp_path / f"sample-{number}.npz") for number in range(2))
     assert torch.equal(read_motion(tmp_path / "motion.npz").R_parent_joint, first.R_parent_joint)
     assert not torch.allclose(second.R_parent_joint, first.R_parent_joint), "another draw"
@@ -130,6 +175,4 @@ def test_rows_of_the_ablation_train_by_themselves(surroundings, data, places, tm
     system = load_system(run)[0]
     sizes = (system.net.points_size > 0, system.net.image_size > 0)
     assert sizes == (surroundings == "points", surroundings == "images")
-    assert system.image_encoder == ("egoview-01234567" if surroundings == "images" else None), (
-        "as the data names it"
-    )
+    assert system.image_encoder == ("egoview-01234567" if surroundings == "images" else None), "as the data names it"

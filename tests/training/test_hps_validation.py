@@ -19,10 +19,21 @@ from wearcap.systems.hps.training import HpsValidation
 
 SQUARES = ("self", "hold", "translation_step", "root_step", "head_step", "pose", "slide", "contact_plane")
 PIPELINE = HPS(
-    HpsEnergy({"self": 220.0, "hold": 9.0, "translation_step": 1e4, "root_step": 1e5, "head_step": 6e4, "pose": 400.0,
-               "slide": 9e3, "contact_plane": 4.4e3}, {name: Loss("square") for name in SQUARES}),
+    HpsEnergy(
+        {
+            "self": 220.0,
+            "hold": 9.0,
+            "translation_step": 1e4,
+            "root_step": 1e5,
+            "head_step": 6e4,
+            "pose": 400.0,
+            "slide": 9e3,
+            "contact_plane": 4.4e3,
+        },
+        {name: Loss("square") for name in SQUARES},
+    ),
     functools.partial(solve_banded, settings=BandedSettings(iterations=2, relaxation=1.0)),
-)  # fmt: skip
+)
 
 
 class Offset(lightning.LightningModule):
@@ -57,9 +68,7 @@ class Shifted:
         assert not self.module.training
         found = recording.localization
         assert found is not None
-        return replace(
-            found, t_world_cam=found.t_world_cam + torch.tensor([1.0, 0.0, 0.0]) * self.module.east
-        )
+        return replace(found, t_world_cam=found.t_world_cam + torch.tensor([1.0, 0.0, 0.0]) * self.module.east)
 
     def reads(self, recording: Recording, folder: Path) -> list:
         return []
@@ -84,9 +93,15 @@ def test_the_weights_of_each_epoch_are_captured(data):
 
     callback = HpsValidation(PIPELINE, Shifted, [f"{data}/walk"], every_n_epochs=2)
     trainer = lightning.Trainer(
-        accelerator="cpu", max_epochs=4, callbacks=[callback, Watch()], logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False, num_sanity_val_steps=1,
-    )  # fmt: skip
+        accelerator="cpu",
+        max_epochs=4,
+        callbacks=[callback, Watch()],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=1,
+    )
     module = Offset()
     trainer.fit(module)
     assert [bool(metrics) for metrics in seen[-4:]] == [False, True, True, True]

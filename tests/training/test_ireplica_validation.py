@@ -53,24 +53,28 @@ def equipped(root: Path, recording: Recording) -> Recording:
     assert motion is not None
     head, times = motion.joint("head"), motion.timestamps
     place = site_positions(motion.skeleton, motion.T_world_joint, PALMS)[0, 0]
-    mesh = Mesh(np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32), np.zeros((0, 3), np.int32), np.ones(3, np.float32))  # fmt: skip
+    mesh = Mesh(
+        np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32),
+        np.zeros((0, 3), np.int32),
+        np.ones(3, np.float32),
+    )
     thing = SceneObject("thing", "table", mesh, torch.eye(3), place, Freedom("plane"))
     write_environment(Environment((thing,)), root / "scene")
     (root / "scene/pointcloud.ply").touch()
     return replace(
-        recording, camera=CameraStream(times, Camera.pinhole(64, 48, 60.0), torch.eye(3), torch.zeros(3)),
-        localization=Localization(times, head.R, head.t, torch.ones(len(times))), scene="scene/pointcloud.ply",
+        recording,
+        camera=CameraStream(times, Camera.pinhole(64, 48, 60.0), torch.eye(3), torch.zeros(3)),
+        localization=Localization(times, head.R, head.t, torch.ones(len(times))),
+        scene="scene/pointcloud.ply",
         object_motion={"thing": Trajectory(times[[0, -1]], torch.eye(3).repeat(2, 1, 1), place.repeat(2, 1))},
         environment="scene/environment.json",
-    )  # fmt: skip
+    )
 
 
 def validated(root: Path, registration: TrueMotion) -> dict:
     features = HandViews()
     torch.manual_seed(0)
-    module = ContactDetection(
-        partial(ContactSequence, width=8), features, list(CLASSES), 60.0, torch.optim.Adam
-    )
+    module = ContactDetection(partial(ContactSequence, width=8), features, list(CLASSES), 60.0, torch.optim.Adam)
     data = ContactWindows(
         {"s": {"root": str(root), "weight": 1.0}}, features, list(CLASSES), 120, 120, 60.0, 4, stream="suit"
     )
@@ -79,9 +83,13 @@ def validated(root: Path, registration: TrueMotion) -> dict:
         partial(IReplica, registration=registration, tracker=ObjectTracker(None)), every_n_epochs=1
     )
     trainer = lightning.Trainer(
-        accelerator="cpu", callbacks=[callback], logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False,
-    )  # fmt: skip
+        accelerator="cpu",
+        callbacks=[callback],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
     trainer.validate(module, datamodule=data, verbose=False)
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
 
@@ -101,9 +109,7 @@ def test_recordings_with_objects_are_tracked_and_others_left_out(known, tmp_path
     assert all(np.isfinite(value) for name, value in logged.items() if name.startswith("ireplica/"))
 
 
-@pytest.mark.parametrize(
-    "missing", ["camera", "environment", "suit", "interactions", "scene", "localization"]
-)
+@pytest.mark.parametrize("missing", ["camera", "environment", "suit", "interactions", "scene", "localization"])
 def test_what_lacks_a_part_is_not_fit(missing, tmp_path):
     full = equipped(tmp_path, bending_recording(240, "full"))
     assert fit(full, tmp_path)

@@ -24,11 +24,21 @@ def data(tmp_path_factory) -> Path:
 
 def arguments(data: Path, run: Path, *more: str) -> list[str]:
     return [
-        "experiment=motion_autoencoder", f"data.sources.simulated.root={data}", "data.sources.cmu=null", "data.window=72",
-        f"hydra.run.dir={run}", f"paths.outputs={run.parent}", "model.net.channels=[16,16,16]", "model.net.latent=8",
-        "trainer.accelerator=cpu", "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false",
-        "callbacks.progress=null", "logger.csv.flush_logs_every_n_steps=1", *more,
-    ]  # fmt: skip
+        "experiment=motion_autoencoder",
+        f"data.sources.simulated.root={data}",
+        "data.sources.cmu=null",
+        "data.window=72",
+        f"hydra.run.dir={run}",
+        f"paths.outputs={run.parent}",
+        "model.net.channels=[16,16,16]",
+        "model.net.latent=8",
+        "trainer.accelerator=cpu",
+        "trainer.log_every_n_steps=1",
+        "trainer.enable_progress_bar=false",
+        "callbacks.progress=null",
+        "logger.csv.flush_logs_every_n_steps=1",
+        *more,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -66,22 +76,39 @@ def test_its_checkpoint_measures_realism_and_nothing_else(checkpoint):
 
 def test_evaluation_shows_it_beside_the_other_scores(checkpoint, data, tmp_path, capsys):
     run = tmp_path / "regressor"
-    train.main([
-        "experiment=pose_regressor_head", f"data.sources.simulated.root={data}", "data.window=60", "debug=fast",
-        f"hydra.run.dir={run}", f"paths.outputs={tmp_path}", "trainer.accelerator=cpu", "trainer.precision=32-true",
-        "trainer.enable_progress_bar=false", "callbacks.progress=null", "~callbacks.capture", "model.net.width=32",
-        "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32",
-    ])  # fmt: skip
-    evaluate.main([
-        f"checkpoint={run}/checkpoints/last.ckpt", "pipeline=pose_regressor", f"realism={checkpoint}", "seeds=[0,1]",
-        f"hydra.run.dir={tmp_path}/e", f"output={tmp_path}/table.json",
-    ])  # fmt: skip
+    train.main(
+        [
+            "experiment=pose_regressor_head",
+            f"data.sources.simulated.root={data}",
+            "data.window=60",
+            "debug=fast",
+            f"hydra.run.dir={run}",
+            f"paths.outputs={tmp_path}",
+            "trainer.accelerator=cpu",
+            "trainer.precision=32-true",
+            "trainer.enable_progress_bar=false",
+            "callbacks.progress=null",
+            "~callbacks.capture",
+            "model.net.width=32",
+            "model.net.layers=1",
+            "model.net.heads=4",
+            "model.net.feedforward=32",
+        ]
+    )
+    evaluate.main(
+        [
+            f"checkpoint={run}/checkpoints/last.ckpt",
+            "pipeline=pose_regressor",
+            f"realism={checkpoint}",
+            "seeds=[0,1]",
+            f"hydra.run.dir={tmp_path}/e",
+            f"output={tmp_path}/table.json",
+        ]
+    )
     methods = json.loads((tmp_path / "table.json").read_text())["methods"]
     for scores in methods.values():
         assert scores["mpjpe_cm"]["mean"] > 0
-        assert (
-            scores["fid"]["mean"] is scores["diversity"]["mean"] is scores["truth_diversity"]["mean"] is None
-        )
+        assert scores["fid"]["mean"] is scores["diversity"]["mean"] is scores["truth_diversity"]["mean"] is None
     assert methods["wearcap"]["fid"]["seeds"] == 2
     told = " ".join(capsys.readouterr().out.split())
     assert "mean pose: 8 windows are too few for FID and Diversity (at least 2000)" in told

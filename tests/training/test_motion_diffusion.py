@@ -38,8 +38,9 @@ def system(batch, level_tilt: float) -> MotionDiffusion:
         return Spy(plain, features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact))
 
     weights = {"motion": 1.0, "joints": 1.0, "velocity": 1.0}
-    return MotionDiffusion(net, features, CosineSchedule(), xsens23(), 60.0, weights, torch.optim.AdamW,
-                           level_tilt=level_tilt)  # fmt: skip
+    return MotionDiffusion(
+        net, features, CosineSchedule(), xsens23(), 60.0, weights, torch.optim.AdamW, level_tilt=level_tilt
+    )
 
 
 def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_path):

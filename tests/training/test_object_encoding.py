@@ -23,12 +23,26 @@ def data(tmp_path_factory) -> Path:
 
 
 def trained(experiment: str, data: Path, run: Path, *more: str) -> Path:
-    train.main([
-        f"experiment={experiment}", f"paths.datasets={data}", f"hydra.run.dir={run}", f"paths.outputs={run.parent}",
-        "data.classes=[box,chair,bottle]", "data.per_class=8", "data.val_per_class=3", "data.points=120",
-        "data.batch_size=6", "model.net.encoder.width=4", "trainer.accelerator=cpu", "trainer.log_every_n_steps=1",
-        "trainer.enable_progress_bar=false", "callbacks.progress=null", "logger.csv.flush_logs_every_n_steps=1", *more,
-    ])  # fmt: skip
+    train.main(
+        [
+            f"experiment={experiment}",
+            f"paths.datasets={data}",
+            f"hydra.run.dir={run}",
+            f"paths.outputs={run.parent}",
+            "data.classes=[box,chair,bottle]",
+            "data.per_class=8",
+            "data.val_per_class=3",
+            "data.points=120",
+            "data.batch_size=6",
+            "model.net.encoder.width=4",
+            "trainer.accelerator=cpu",
+            "trainer.log_every_n_steps=1",
+            "trainer.enable_progress_bar=false",
+            "callbacks.progress=null",
+            "logger.csv.flush_logs_every_n_steps=1",
+            *more,
+        ]
+    )
     return run / "checkpoints" / "last.ckpt"
 
 
@@ -46,9 +60,14 @@ def test_it_learns_and_its_checkpoint_encodes(experiment, data, tmp_path):
     assert isinstance(system, ObjectEncoding)
     assert system.net.classes == ("box", "chair", "bottle")
     export.main(
-        [f"checkpoint={checkpoint}", "dtype=bfloat16", "format=safetensors", f"output={tmp_path}/e.safetensors",
-         f"hydra.run.dir={tmp_path}/x"]
-    )  # fmt: skip
+        [
+            f"checkpoint={checkpoint}",
+            "dtype=bfloat16",
+            "format=safetensors",
+            f"output={tmp_path}/e.safetensors",
+            f"hydra.run.dir={tmp_path}/x",
+        ]
+    )
     encoder = load_object_encoder(tmp_path / "e.safetensors")
     assert not encoder.training
     points = torch.rand(2, 150, 3)
@@ -63,9 +82,7 @@ def test_resuming_equals_training_straight_through(data, tmp_path, capsys):
     short = ("data.steps_per_epoch=3", "optimizer.scheduler.total=6", "optimizer.scheduler.warmup=2")
     straight = trained("object_encoder", data, tmp_path / "straight", "trainer.max_steps=6", *short)
     half = trained("object_encoder", data, tmp_path / "half", "trainer.max_steps=3", *short)
-    resumed = trained(
-        "object_encoder", data, tmp_path / "resumed", "trainer.max_steps=6", *short, f"resume={half}"
-    )
+    resumed = trained("object_encoder", data, tmp_path / "resumed", "trainer.max_steps=6", *short, f"resume={half}")
     one, other = (load_object_encoder(path).state_dict() for path in (straight, resumed))
     assert all(torch.equal(one[name], other[name]) for name in one)
     capsys.readouterr()

@@ -34,18 +34,35 @@ def data(tmp_path_factory):
 
 def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
     return [
-        f"experiment={experiment}", f"data.sources.simulated.root={data}", "debug=fast", "~callbacks.capture", f"hydra.run.dir={run}",
-        f"paths.outputs={run.parent}", "trainer.accelerator=cpu", "trainer.precision=32-true", "data.workers=0", "data.window=60",
-        "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "callbacks.progress=null", *SMALL, *more,
-    ]  # fmt: skip
+        f"experiment={experiment}",
+        f"data.sources.simulated.root={data}",
+        "debug=fast",
+        "~callbacks.capture",
+        f"hydra.run.dir={run}",
+        f"paths.outputs={run.parent}",
+        "trainer.accelerator=cpu",
+        "trainer.precision=32-true",
+        "data.workers=0",
+        "data.window=60",
+        "trainer.log_every_n_steps=1",
+        "trainer.enable_progress_bar=false",
+        "callbacks.progress=null",
+        *SMALL,
+        *more,
+    ]
 
 
 def system(points: tuple[str, ...] = HANDS, net=PoseRegressor) -> PoseRegression:
     weights = {"root": 0.05, "rotation": 1.0, "joints": 1.0, "velocity": 0.05}
     return PoseRegression(
         lambda **sizes: net(**sizes, window=20, width=32, layers=1, heads=4, feedforward=32, dropout=0.0),
-        TrackedPoints(points), xsens23(), 60.0, weights, torch.optim.AdamW, pairs=2,
-    )  # fmt: skip
+        TrackedPoints(points),
+        xsens23(),
+        60.0,
+        weights,
+        torch.optim.AdamW,
+        pairs=2,
+    )
 
 
 def batch(data: Path, split: str = "train", mirror: bool = False):
@@ -98,9 +115,7 @@ def test_it_learns_and_hands_help(data):
     for points in (("head",), HANDS):
         torch.manual_seed(0)
         module, windows = system(points), batch(data, mirror=True)
-        module.set_statistics(
-            WindowDataset([Source(str(data))], "train", window=60, stride=30, fps=60.0), limit=16
-        )
+        module.set_statistics(WindowDataset([Source(str(data))], "train", window=60, stride=30, fps=60.0), limit=16)
         optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
         before = module.eval().terms(windows)["joints"].item()
         for _ in range(40):
@@ -132,7 +147,9 @@ def test_trained_evaluated_and_refused(data, tmp_path):
         evaluate.main([*common, "pipeline=hmd2"])
 
 
-@pytest.mark.parametrize(("experiment", "inputs"), [("pose_regressor_head_full", 18), ("pose_regressor_hands_full", 54)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("experiment", "inputs"), [("pose_regressor_head_full", 18), ("pose_regressor_hands_full", 54)]
+)
 def test_the_full_size_is_avatarposers(experiment, inputs):
     """4.12 M parameters (Jiang et al. 2022), with their 22 joints for our 23."""
     config = compose("train", [f"experiment={experiment}", "paths.run=x", "trainer.max_steps=4"])
@@ -145,10 +162,26 @@ def test_the_full_size_is_avatarposers(experiment, inputs):
 @pytest.mark.parametrize("experiment", ["pose_regressor_head", "egoego_style"])
 def test_the_other_experiments_take_a_step(experiment, data, tmp_path):
     run = tmp_path / "run"
-    more = ["data.batch_size=2"] if experiment == "pose_regressor_head" else ["data.batch_size=2", "optimizer.scheduler.warmup=1"]  # fmt: skip
+    more = (
+        ["data.batch_size=2"]
+        if experiment == "pose_regressor_head"
+        else ["data.batch_size=2", "optimizer.scheduler.warmup=1"]
+    )
     command = arguments(experiment, data, run, *more)
     train.main(command)
-    pipeline = ["pipeline=pose_regressor"] if experiment != "egoego_style" else ["pipeline=egoego_style", "pipeline.steps=2", "pipeline.stride=50"]  # fmt: skip
-    evaluate.main([f"checkpoint={run}/checkpoints/last.ckpt", f"hydra.run.dir={tmp_path}/e", "seeds=[0]",
-                   "baselines=false", *pipeline, f"output={tmp_path}/table.json"])  # fmt: skip
+    pipeline = (
+        ["pipeline=pose_regressor"]
+        if experiment != "egoego_style"
+        else ["pipeline=egoego_style", "pipeline.steps=2", "pipeline.stride=50"]
+    )
+    evaluate.main(
+        [
+            f"checkpoint={run}/checkpoints/last.ckpt",
+            f"hydra.run.dir={tmp_path}/e",
+            "seeds=[0]",
+            "baselines=false",
+            *pipeline,
+            f"output={tmp_path}/table.json",
+        ]
+    )
     assert json.loads((tmp_path / "table.json").read_text())["methods"]["wearcap"]["mpjpe_cm"]["mean"] > 0

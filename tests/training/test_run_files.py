@@ -34,9 +34,7 @@ def test_a_checkpoint_is_the_old_one_or_the_new_one_whenever_its_writer_is_kille
     path, other = tmp_path / "last.ckpt", Path("/dev/shm")
     environment = os.environ | ({"TMPDIR": str(other)} if other.is_dir() else {})
     for wait_s in (0.004, 0.02):
-        writer = subprocess.Popen(
-            [sys.executable, "-c", SAVES, str(path)], env=environment, stdout=subprocess.PIPE
-        )
+        writer = subprocess.Popen([sys.executable, "-c", SAVES, str(path)], env=environment, stdout=subprocess.PIPE)
         assert writer.stdout is not None
         saved = int(writer.stdout.readline())
         time.sleep(wait_s)

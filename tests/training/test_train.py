@@ -20,9 +20,18 @@ from wearcap_testing import small_dataset
 
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("motion_diffusion*.yaml"))
 KINDS = (
-    "motion_", "contact_", "pose_regressor_", "egoego_", "egoview", "voxel_autoencoder", "hmd2", "mocap_every", "object_encoder",
-    "echo", "bodiffusion_object",
-)  # fmt: skip
+    "motion_",
+    "contact_",
+    "pose_regressor_",
+    "egoego_",
+    "egoview",
+    "voxel_autoencoder",
+    "hmd2",
+    "mocap_every",
+    "object_encoder",
+    "echo",
+    "bodiffusion_object",
+)
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 
 
@@ -33,10 +42,20 @@ def data(tmp_path_factory):
 
 def arguments(data: Path, run: Path, *more: str) -> list[str]:
     return [
-        "experiment=motion_diffusion_head", f"data.sources.simulated.root={data}", "debug=fast", f"hydra.run.dir={run}",
-        f"paths.outputs={run.parent}", "data.window=60", "trainer.accelerator=cpu", "logger.csv.flush_logs_every_n_steps=1",
-        "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "callbacks.progress=null", *SMALL, *more,
-    ]  # fmt: skip
+        "experiment=motion_diffusion_head",
+        f"data.sources.simulated.root={data}",
+        "debug=fast",
+        f"hydra.run.dir={run}",
+        f"paths.outputs={run.parent}",
+        "data.window=60",
+        "trainer.accelerator=cpu",
+        "logger.csv.flush_logs_every_n_steps=1",
+        "trainer.log_every_n_steps=1",
+        "trainer.enable_progress_bar=false",
+        "callbacks.progress=null",
+        *SMALL,
+        *more,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -75,9 +94,7 @@ def test_a_run_leaves_its_record(checkpoint):
 def test_the_checkpoint_rebuilds_the_system(checkpoint):
     system, config = load_system(checkpoint)
     assert config["name"] == "debug_fast"
-    assert not torch.equal(
-        system.net.motion_normalizer.scale, torch.ones_like(system.net.motion_normalizer.scale)
-    )
+    assert not torch.equal(system.net.motion_normalizer.scale, torch.ones_like(system.net.motion_normalizer.scale))
 
 
 def losses(run: Path, name: str = "train/loss") -> dict[int, str]:
@@ -91,9 +108,7 @@ def test_killed_and_resumed_equals_straight_through(data, tmp_path):
     more = ["trainer.max_steps=12", "data.steps_per_epoch=3", "callbacks.capture=null", "name=kill"]
     train.main(arguments(data, tmp_path / "straight/run", *more))
     killed = tmp_path / "killed/train/kill/first"
-    command = arguments(
-        data, killed, *more, f"paths.outputs={tmp_path / 'killed'}", "trainer.max_steps=100000"
-    )
+    command = arguments(data, killed, *more, f"paths.outputs={tmp_path / 'killed'}", "trainer.max_steps=100000")
     command = [a for a in command if a != "trainer.max_steps=12"] + ["optimizer.scheduler.total=12"]
     process = subprocess.Popen([sys.executable, "-m", "wearcap.cli.main", "train", *command])
     deadline = time.monotonic() + 120
@@ -106,11 +121,7 @@ def test_killed_and_resumed_equals_straight_through(data, tmp_path):
     resumed = tmp_path / "killed/train/kill/second"
     train.main(
         arguments(
-            data,
-            resumed,
-            *more,
-            f"paths.outputs={tmp_path / 'killed'}",
-            f"resume={killed}/checkpoints/last.ckpt",
+            data, resumed, *more, f"paths.outputs={tmp_path / 'killed'}", f"resume={killed}/checkpoints/last.ckpt"
         )
     )
     straight, after = losses(tmp_path / "straight/run"), losses(resumed)
@@ -144,14 +155,23 @@ def test_a_run_resumed_in_its_folder_goes_on_with_its_log(data, tmp_path):
 @pytest.mark.slow
 def test_a_sweep_of_two_jobs_runs(data, tmp_path):
     """The documented multirun through the joblib launcher: each job trains in a process and a folder of its own."""
-    command = [
-        argument for argument in arguments(data, tmp_path / "run") if not argument.startswith("hydra.run")
-    ]
+    command = [argument for argument in arguments(data, tmp_path / "run") if not argument.startswith("hydra.run")]
     script = Path(__file__).parents[2] / "train.py"
     subprocess.run(
-        [sys.executable, script, "-m", *command, f"hydra.sweep.dir={tmp_path}/sweep", "seed=0,1",
-         "callbacks.capture=null", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], check=True, cwd=tmp_path,
-    )  # fmt: skip
+        [
+            sys.executable,
+            script,
+            "-m",
+            *command,
+            f"hydra.sweep.dir={tmp_path}/sweep",
+            "seed=0,1",
+            "callbacks.capture=null",
+            "hydra/launcher=joblib",
+            "hydra.launcher.n_jobs=2",
+        ],
+        check=True,
+        cwd=tmp_path,
+    )
     trained = [losses(tmp_path / "sweep" / job) for job in ("0", "1")]
     assert len(trained[0]) == len(trained[1]) == 4
     assert trained[0] != trained[1]
@@ -163,8 +183,17 @@ def _safe_losses(run: Path) -> dict[int, str]:
 
 def test_overfits_one_batch(data, tmp_path):
     run = tmp_path / "run"
-    more = ["debug=overfit", "trainer.max_steps=60", "model.net.dropout=0", "data.batch_size=2", "data.steps_per_epoch=1",
-            "optimizer.optimizer.lr=0.01", "optimizer.scheduler.warmup=5", "data.workers=0", "callbacks.capture=null"]  # fmt: skip
+    more = [
+        "debug=overfit",
+        "trainer.max_steps=60",
+        "model.net.dropout=0",
+        "data.batch_size=2",
+        "data.steps_per_epoch=1",
+        "optimizer.optimizer.lr=0.01",
+        "optimizer.scheduler.warmup=5",
+        "data.workers=0",
+        "callbacks.capture=null",
+    ]
     train.main([a for a in arguments(data, run, *more) if a != "debug=fast"])
     values = [float(loss) for loss in losses(run).values()]
     assert values[-1] < 0.5 * values[0]
@@ -176,9 +205,7 @@ def test_evaluate_capture_and_export(checkpoint, data, tmp_path):
     table = json.loads((tmp_path / "table.json").read_text())
     assert set(table["methods"]) == {"wearcap", "mean pose", "nearest window"}
     assert table["methods"]["wearcap"]["mpjpe_cm"]["seeds"] == 2
-    capture.main(
-        [*common, f"recording={data}/r4", f"hydra.run.dir={tmp_path}/c", "video=false", "body=false"]
-    )
+    capture.main([*common, f"recording={data}/r4", f"hydra.run.dir={tmp_path}/c", "video=false", "body=false"])
     assert {p.name for p in (tmp_path / "c").iterdir()} >= {"motion.npz", "motion.bvh", "motion.glb"}
     export.main([*common, f"hydra.run.dir={tmp_path}/x", f"output={tmp_path}/d.pt2", "format=pt2"])
     assert (tmp_path / "d.pt2").is_file()
@@ -186,11 +213,7 @@ def test_evaluate_capture_and_export(checkpoint, data, tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [
-        (b"", "not a readable checkpoint"),
-        (b"garbage" * 100, "not a readable checkpoint"),
-        (None, "no such checkpoint"),
-    ],
+    [(b"", "not a readable checkpoint"), (b"garbage" * 100, "not a readable checkpoint"), (None, "no such checkpoint")],
 )
 def test_broken_checkpoints_are_named(content, message, tmp_path):
     path = tmp_path / "bad.ckpt"
@@ -224,9 +247,7 @@ def test_a_checkpoint_of_another_model_is_named(checkpoint, tmp_path):
         load_system(tmp_path / "other.ckpt")
 
 
-@pytest.mark.parametrize(
-    "group", ["data", "features", "model", "optimizer", "trainer", "callbacks", "logger", "debug"]
-)
+@pytest.mark.parametrize("group", ["data", "features", "model", "optimizer", "trainer", "callbacks", "logger", "debug"])
 def test_every_choice_of_every_group_composes(group):
     for path in sorted((conf_dir() / group).glob("*.yaml")):
         assert compose("train", [f"{group}={path.stem}", "paths.run=x"])

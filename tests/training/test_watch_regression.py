@@ -28,14 +28,24 @@ from wearcap_testing import small_dataset
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
 EXPERIMENTS = (
-    "mocap_every", "mocap_every_paper", "mocap_every_one_stage", "mocap_every_neither", "mocap_every_hands",
+    "mocap_every",
+    "mocap_every_paper",
+    "mocap_every_one_stage",
+    "mocap_every_neither",
+    "mocap_every_hands",
     "mocap_every_avatarposer",
-)  # fmt: skip
+)
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 WEIGHTS = {
-    "root": 1.0, "rotation": 1.0, "position": 10.0, "mid": 5.0, "consistency": 2.0, "contact": 0.5,
-    "foot_velocity": 0.2, "velocity": 1.0,
-}  # fmt: skip
+    "root": 1.0,
+    "rotation": 1.0,
+    "position": 10.0,
+    "mid": 5.0,
+    "consistency": 2.0,
+    "contact": 0.5,
+    "foot_velocity": 0.2,
+    "velocity": 1.0,
+}
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +55,21 @@ def data(tmp_path_factory):
 
 def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
     return [
-        f"experiment={experiment}", f"data.sources.cmu.root={data}", "data.sources.simulated=null", f"data.val_sources.cmu.root={data}",
-        "debug=fast", f"hydra.run.dir={run}", f"paths.outputs={run.parent}", "trainer.accelerator=cpu", "trainer.precision=32-true",
-        "data.workers=0", "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "callbacks.progress=null", *more,
-    ]  # fmt: skip
+        f"experiment={experiment}",
+        f"data.sources.cmu.root={data}",
+        "data.sources.simulated=null",
+        f"data.val_sources.cmu.root={data}",
+        "debug=fast",
+        f"hydra.run.dir={run}",
+        f"paths.outputs={run.parent}",
+        "trainer.accelerator=cpu",
+        "trainer.precision=32-true",
+        "data.workers=0",
+        "trainer.log_every_n_steps=1",
+        "trainer.enable_progress_bar=false",
+        "callbacks.progress=null",
+        *more,
+    ]
 
 
 def batch(data: Path):
@@ -58,7 +79,11 @@ def batch(data: Path):
 
 def system(net=None, **features) -> WatchRegression:
     estimated = WatchFeatures(**features)
-    make = net or (lambda **sizes: TwoStageEstimator(**sizes, window=40, width=32, layers=1, heads=2, feedforward=32, hidden=32, dropout=0.0, frames_per_token=2))  # fmt: skip
+    make = net or (
+        lambda **sizes: TwoStageEstimator(
+            **sizes, window=40, width=32, layers=1, heads=2, feedforward=32, hidden=32, dropout=0.0, frames_per_token=2
+        )
+    )
     return WatchRegression(make, estimated, xsens23(), 30.0, WEIGHTS, torch.optim.AdamW, end_weight=2.0)
 
 
@@ -75,9 +100,7 @@ class Oracle(nn.Module):
         return self.output
 
 
-@pytest.mark.parametrize(
-    "features", [{}, {"frame": "own"}, {"frame": "head", "root": "window"}, {"frame": "world"}]
-)
+@pytest.mark.parametrize("features", [{}, {"frame": "own"}, {"frame": "head", "root": "window"}, {"frame": "world"}])
 def test_the_truth_costs_nothing(data, features):
     windows, oracle = batch(data), system(Oracle, **features)
     _, true, canonical = oracle._inputs(windows)
@@ -166,17 +189,30 @@ def test_a_trained_estimator_is_evaluated_and_edits_by_cues(data, tmp_path):
     train.main(arguments("motion_manifold", data, manifold, "model.net.channels=8", "model.net.width=5"))
     found = tmp_path / "table.json"
     evaluate.main(
-        [f"checkpoint={run}/checkpoints/last.ckpt", "pipeline=mocap_every", f"dataset={data}", "baselines=false", "seeds=[0]",
-         f"output={found}", f"hydra.run.dir={tmp_path / 'evaluate'}"],
-    )  # fmt: skip
-    scores = json.loads(found.read_text())["methods"]["wearcap"]
-    assert {"r_mpjpe_cm", "mpjpe_cm", "mpjve_cm_s", "root_cm", "jitter_ratio", "right_hand_pe_cm"} <= set(
-        scores
+        [
+            f"checkpoint={run}/checkpoints/last.ckpt",
+            "pipeline=mocap_every",
+            f"dataset={data}",
+            "baselines=false",
+            "seeds=[0]",
+            f"output={found}",
+            f"hydra.run.dir={tmp_path / 'evaluate'}",
+        ]
     )
+    scores = json.loads(found.read_text())["methods"]["wearcap"]
+    assert {"r_mpjpe_cm", "mpjpe_cm", "mpjve_cm_s", "root_cm", "jitter_ratio", "right_hand_pe_cm"} <= set(scores)
     capture.main(
-        [f"checkpoint={run}/checkpoints/last.ckpt", "pipeline=mocap_every", f"recording={data}/r4", "smpl=true", "video=false",
-         "body=false", f"output={tmp_path / 'capture'}", f"hydra.run.dir={tmp_path / 'capture'}"],
-    )  # fmt: skip
+        [
+            f"checkpoint={run}/checkpoints/last.ckpt",
+            "pipeline=mocap_every",
+            f"recording={data}/r4",
+            "smpl=true",
+            "video=false",
+            "body=false",
+            f"output={tmp_path / 'capture'}",
+            f"hydra.run.dir={tmp_path / 'capture'}",
+        ]
+    )
     motion = read_motion(tmp_path / "capture" / "motion.npz")
     smpl = read_amass(tmp_path / "capture" / "motion_smplh.npz").motion
     assert motion.fps == pytest.approx(30.0)
@@ -192,9 +228,7 @@ def test_a_trained_estimator_is_evaluated_and_edits_by_cues(data, tmp_path):
 
 def manifold_system() -> ManifoldTraining:
     weights = {"contact": 0.2, "root": 1.0, "rotation": 2.0, "position": 10.0, "velocity": 0.5}
-    return ManifoldTraining(
-        lambda size: MotionManifold(size, 16, 5, 3), xsens23(), 30.0, weights, torch.optim.AdamW
-    )
+    return ManifoldTraining(lambda size: MotionManifold(size, 16, 5, 3), xsens23(), 30.0, weights, torch.optim.AdamW)
 
 
 def test_the_manifold_keeps_time_and_learns(data):

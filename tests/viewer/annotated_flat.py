@@ -26,8 +26,13 @@ CLOCK = LabelClock.of("r0", TIMES)
 
 def held(start: list[float], stop: list[float], hands: list[list[bool]], thing: str = "") -> Interactions:
     kind = "sliding" if thing else ""
-    return Interactions(torch.tensor(start).double(), torch.tensor(stop).double(),
-                        torch.tensor(hands, dtype=torch.bool).reshape(-1, 2), (thing,) * len(start), (kind,) * len(start))  # fmt: skip
+    return Interactions(
+        torch.tensor(start).double(),
+        torch.tensor(stop).double(),
+        torch.tensor(hands, dtype=torch.bool).reshape(-1, 2),
+        (thing,) * len(start),
+        (kind,) * len(start),
+    )
 
 
 def a_film(path: Path, seconds: float = 10.0, fps: int = 30) -> Path:
@@ -47,8 +52,9 @@ def write_flat(root: Path) -> Path:
     store = RecordingStore(root)
     a_film(root / "r0.mp4")
     stamps = torch.arange(300, dtype=torch.float64) / 30
-    camera = CameraStream(stamps, Camera("pinhole", 160, 120, 100.0, 100.0, 79.5, 59.5), torch.eye(3), torch.zeros(3),
-                          video="r0.mp4")  # fmt: skip
+    camera = CameraStream(
+        stamps, Camera("pinhole", 160, 120, 100.0, 100.0, 79.5, 59.5), torch.eye(3), torch.zeros(3), video="r0.mp4"
+    )
     for number in range(2):
         recording = recording_of(swaying_motion(FRAMES, number, FPS), f"r{number}")
         if number == 0:
@@ -83,6 +89,4 @@ def ask(server: AnnotationServer, method: str, path: str, body: object = None, *
 
 
 def labels(left=(), right=(), clock: LabelClock = CLOCK) -> dict:
-    return annotation_of(
-        {"left": tuple(Label(*s) for s in left), "right": tuple(Label(*s) for s in right)}, clock
-    )
+    return annotation_of({"left": tuple(Label(*s) for s in left), "right": tuple(Label(*s) for s in right)}, clock)

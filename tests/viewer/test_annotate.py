@@ -34,14 +34,25 @@ def dataset(tmp_path_factory) -> Path:
 def test_the_page_gets_its_files_and_a_recordings_numbers(dataset, tmp_path):
     motion = swaying_motion(FRAMES, 0, FPS)
     with served(dataset, tmp_path) as server:
-        for name in ("", "annotator.js", "annotator.css", "labels.js", "player.js", "saver.js", "skeleton.js", "take.js", "timeline.js"):  # fmt: skip
+        for name in (
+            "",
+            "annotator.js",
+            "annotator.css",
+            "labels.js",
+            "player.js",
+            "saver.js",
+            "skeleton.js",
+            "take.js",
+            "timeline.js",
+        ):
             status, headers, data = ask(server, "GET", f"/{name}")
             assert status == 200
             assert b"http:" not in data.replace(b"http://www.w3.org/2000/svg", b""), "nothing from elsewhere"
             assert headers["Content-Type"].split(";")[0] in ("text/html", "text/javascript", "text/css")
         assert json.loads(ask(server, "GET", "/recordings")[2]) == [
-            {"name": "r0", "annotated": False}, {"name": "r1", "annotated": False},
-        ]  # fmt: skip
+            {"name": "r0", "annotated": False},
+            {"name": "r1", "annotated": False},
+        ]
         header = json.loads(ask(server, "GET", "/recordings/0")[2])
         assert (header["frames"], header["start_s"], header["stop_s"]) == (600, 0.0, pytest.approx(10.0))
         assert header["objects"] == {"sofa": "sliding"}
@@ -52,13 +63,7 @@ def test_the_page_gets_its_files_and_a_recordings_numbers(dataset, tmp_path):
         wrist = points[:, header["points"].index("left_wrist")]
         np.testing.assert_allclose(wrist, motion.joint("left_wrist").t, atol=1e-6)
         assert header["points"][header["hands"]["left"]] == "left_palm"
-        for path in (
-            "/nothing",
-            "/..%2fannotate.py",
-            "/../annotate.py",
-            "/recordings/7",
-            "/recordings/1/video",
-        ):
+        for path in ("/nothing", "/..%2fannotate.py", "/../annotate.py", "/recordings/7", "/recordings/1/video"):
             assert ask(server, "GET", path)[0] == 404
 
 
@@ -73,14 +78,24 @@ def test_video_in_ranges(dataset, tmp_path):
         assert ask(server, "GET", "/recordings/0/video", Range=f"bytes={len(film)}-")[0] == 416
         status, headers, data = ask(server, "HEAD", "/recordings/0/video")
         assert (status, headers["Content-Length"], data) == (200, str(len(film)), b"")
-    for header, wanted in (("bytes=5-", (5, 9, True)), ("bytes=2-99", (2, 9, True)), ("bytes=-99", (0, 9, True)), ("bytes=9-", None),
-                           ("", (0, 9, False)), ("lines=1-2", (0, 9, False)), ("bytes=4-2", (0, 9, False)), ("bytes=-", (0, 9, False))):  # fmt: skip
+    for header, wanted in (
+        ("bytes=5-", (5, 9, True)),
+        ("bytes=2-99", (2, 9, True)),
+        ("bytes=-99", (0, 9, True)),
+        ("bytes=9-", None),
+        ("", (0, 9, False)),
+        ("lines=1-2", (0, 9, False)),
+        ("bytes=4-2", (0, 9, False)),
+        ("bytes=-", (0, 9, False)),
+    ):
         assert byte_range(header, 9) == wanted
 
 
 def test_a_save_is_checked_written_and_given_back(dataset, tmp_path):
     with served(dataset, tmp_path) as server:
-        status, _, data = ask(server, "POST", "/recordings/0/labels", {"labels": labels([(1.0, 2.0)]), "base": "", "client": "a"})  # fmt: skip
+        status, _, data = ask(
+            server, "POST", "/recordings/0/labels", {"labels": labels([(1.0, 2.0)]), "base": "", "client": "a"}
+        )
         assert status == 200
         header = json.loads(ask(server, "GET", "/recordings/0")[2])
         assert header["labels"]["contacts"] == {"left_hand": [[1.0, 2.0]], "right_hand": []}
@@ -97,9 +112,13 @@ def test_saves_that_must_not_be(dataset, tmp_path):
     with served(dataset, tmp_path) as server:
         overlap = {"contacts": {"left_hand": [[1, 3], [2, 4]], "right_hand": []}}
         for body, status, message in (
-            (good | {"labels": overlap}, 422, "overlap"), (good | {"labels": labels(clock=replace(CLOCK, name="r7"))}, 422, "'r7'"),
-            ("{", 400, "not a save"), ({"labels": {}}, 400, "not a save"), ([], 400, "not a save"), (good | {"labels": 3}, 422, "no contact labels"),
-        ):  # fmt: skip
+            (good | {"labels": overlap}, 422, "overlap"),
+            (good | {"labels": labels(clock=replace(CLOCK, name="r7"))}, 422, "'r7'"),
+            ("{", 400, "not a save"),
+            ({"labels": {}}, 400, "not a save"),
+            ([], 400, "not a save"),
+            (good | {"labels": 3}, 422, "no contact labels"),
+        ):
             told, _, data = ask(server, "POST", "/recordings/0/labels", body)
             assert told == status
             assert message in json.loads(data)["error"]
@@ -115,9 +134,7 @@ def test_nothing_is_lost_when_two_write(tmp_path):
     file = AnnotationFile(tmp_path, CLOCK)
     first = file.save(labels([(1.0, 2.0)]), "", client="a")
     second = file.save(labels([(1.0, 3.0)]), "", client="a")  # its own reply was lost: no conflict
-    assert (
-        file.save(labels([(1.0, 3.0)]), first, client="b") == second
-    )  # the same labels: nothing to fight about
+    assert file.save(labels([(1.0, 3.0)]), first, client="b") == second  # the same labels: nothing to fight about
     with pytest.raises(Conflict, match="another window"):
         file.save(labels([(5.0, 6.0)]), first, client="b")
     assert file.read()[0]["left"] == (Label(1.0, 3.0),)
@@ -187,17 +204,16 @@ def test_labels_to_start_from(dataset, tmp_path, monkeypatch):
 def test_recordings_that_cannot_be_annotated(dataset, tmp_path):
     worm = Skeleton("worm", ("a", "b"), (-1, 0), torch.tensor([[0.0, 0, 0], [0, 0, 1]]))
     still = Motion(TIMES[:2], worm, torch.eye(3).expand(2, 2, 3, 3), torch.zeros(2, 3))
-    for recording, message in (
-        (Recording("bare"), "no motion"),
-        (Recording("worm", motion=still), "left_wrist"),
-    ):
+    for recording, message in ((Recording("bare"), "no motion"), (Recording("worm", motion=still), "left_wrist")):
         with pytest.raises(WearcapError, match=message):
             take_of(recording, tmp_path)
     for arguments, message in (
-        ([str(dataset), "--video", str(dataset / "r0.mp4")], "several recordings"), ([str(dataset / "r9")], "r9"),
-        ([str(dataset / "r0"), "--video", "none.mp4"], "no such video"), ([str(dataset / "r0"), "--port", "0"], "port"),
+        ([str(dataset), "--video", str(dataset / "r0.mp4")], "several recordings"),
+        ([str(dataset / "r9")], "r9"),
+        ([str(dataset / "r0"), "--video", "none.mp4"], "no such video"),
+        ([str(dataset / "r0"), "--port", "0"], "port"),
         ([str(dataset / "r0"), "--video-start", "1"], "--video FILE"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(WearcapError, match=message):
             annotate([*arguments, "--no-browser", "--output", str(tmp_path)])
     r0 = RecordingStore.open(dataset).load("r0")
@@ -208,9 +224,7 @@ def test_recordings_that_cannot_be_annotated(dataset, tmp_path):
 
 def test_objects_of_the_environment_can_be_named(tmp_path):
     triangle = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), np.full(3, 0.5, np.float32))
-    door = SceneObject(
-        "door_1", "door", triangle, torch.eye(3), torch.zeros(3), Freedom("hinge", (0.0, 0.0, 0.0))
-    )
+    door = SceneObject("door_1", "door", triangle, torch.eye(3), torch.zeros(3), Freedom("hinge", (0.0, 0.0, 0.0)))
     write_environment(Environment((door,)), tmp_path / "environment.json")
     recording = replace(recording_of(swaying_motion(30), "r"), environment="environment.json")
     seen = replace(recording, interactions=held([0.1], [0.2], [[True, False]], "sofa"))

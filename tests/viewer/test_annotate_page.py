@@ -32,9 +32,9 @@ def opened(
 
 def settled(browser: Chromium) -> None:
     """The page is open and, where there is a video, it shows its first picture."""
-    browser.poll(lambda: browser.evaluate(
-        "window.annotator?.ready && (annotator.player.usable || !annotator.take.header.video)"
-    ))  # fmt: skip
+    browser.poll(
+        lambda: browser.evaluate("window.annotator?.ready && (annotator.player.usable || !annotator.take.header.video)")
+    )
 
 
 def spans(browser: Chromium, hand: str) -> list[list[float]]:
@@ -55,9 +55,7 @@ def shown_time(browser: Chromium) -> float:
 
 def click_hand(browser: Chromium, hand: str) -> None:
     """Where the hand is once the frame that was asked for is drawn."""
-    browser.poll(
-        lambda: browser.evaluate("annotator.view.frame === annotator.player.frame && !annotator.view.stale")
-    )
+    browser.poll(lambda: browser.evaluate("annotator.view.frame === annotator.player.frame && !annotator.view.stale"))
     browser.click(*browser.evaluate(f"annotator.handPosition('{hand}')"))
 
 
@@ -81,7 +79,7 @@ def test_contacts_are_marked_while_the_video_plays_and_are_there_after_a_reload(
         browser.poll(lambda: shown_time(browser) > 2.0)
         assert abs(shown_time(browser) - (time.monotonic() - begin)) < 1.0, "about real time"
         browser.key(" ")
-        (start, stop), = spans(browser, "left")  # fmt: skip
+        ((start, stop),) = spans(browser, "left")
         assert 1.0 <= start < 2.0
         assert stop == pytest.approx(10.0), "open until it is ended"
 
@@ -150,7 +148,7 @@ def test_editing_by_keys_and_mouse(dataset, tmp_path):
         # A start is not dragged beyond the contact's own end, nor an end over the next start.
         grip = browser.evaluate("annotator.lanePosition('left', 5.0)")
         browser.drag([tuple(grip), tuple(browser.evaluate("annotator.lanePosition('left', 9.0)"))])
-        (start, stop), = spans(browser, "left")  # fmt: skip
+        ((start, stop),) = spans(browser, "left")
         assert stop - start == pytest.approx(1 / FPS)
         browser.key("z")
         x, y = browser.evaluate("annotator.lanePosition('left', 6.0)")
@@ -198,9 +196,7 @@ def test_labels_outlive_a_server_that_is_away_and_another_window(dataset, tmp_pa
             browser.click(*browser.element("document.getElementById('mine')"))
             assert saved(browser)
             assert len(on_disk(tmp_path, "right")) == 1
-            kept = [
-                json.loads(p.read_text())["contacts"]["left_hand"] for p in (tmp_path / "backups").iterdir()
-            ]
+            kept = [json.loads(p.read_text())["contacts"]["left_hand"] for p in (tmp_path / "backups").iterdir()]
             assert [[1.0, 2.0]] in kept
             assert browser.exceptions == []
         finally:

@@ -52,14 +52,17 @@ def a_recording() -> Recording:
     """The crate is held throughout; the other one stands on the floor."""
     motion = carrying()
     held = Interactions(
-        motion.timestamps[:1], motion.timestamps[-1:] + 1.0, torch.tensor([[True, False]]), ("carried",),
-        ("sliding",),
-    )  # fmt: skip
+        motion.timestamps[:1], motion.timestamps[-1:] + 1.0, torch.tensor([[True, False]]), ("carried",), ("sliding",)
+    )
     assert motion.object_motion is not None
     return Recording(
-        "walk", motion=replace(motion, object_motion=None), object_motion=motion.object_motion,
-        interactions=held, skeleton=motion.skeleton, license="MIT",
-    )  # fmt: skip
+        "walk",
+        motion=replace(motion, object_motion=None),
+        object_motion=motion.object_motion,
+        interactions=held,
+        skeleton=motion.skeleton,
+        license="MIT",
+    )
 
 
 def touching(motion: Motion, prob: float = 0.9, count: int = 20) -> Motion:
@@ -180,9 +183,7 @@ def test_motions_beside_each_other_cover_none(page):
             placed = page.bodies[name]
             motion, offset = placed.body.motion, placed.body.offset[1]
             skin = anny_body(motion.skeleton).vertices(motion.T_world_joint[frame])[:, 1]
-            box = motion.object_motion["carried"].T_world_body[frame] @ torch.from_numpy(
-                HOUSE.objects[0].mesh.vertices
-            )
+            box = motion.object_motion["carried"].T_world_body[frame] @ torch.from_numpy(HOUSE.objects[0].mesh.vertices)
             y = torch.cat([skin, box[:, 1]]) + offset
             lows.append(float(y.min()))
             highs.append(float(y.max()))
@@ -223,9 +224,20 @@ def test_verbs_take_several_motions(tmp_path, monkeypatch):
     view([f"{store.root}/walk", "--motion", *files, "--port", "18075"])
     assert list(pages[0].bodies) == ["truth", "sample-0", "sample-1"]
     render_verb.main(
-        [f"{store.root}/walk", "--motion", files[0], "--motion", files[1], "--frames", "2", "--size", "60x80",
-         "--out", str(tmp_path / "s.png")]
-    )  # fmt: skip
+        [
+            f"{store.root}/walk",
+            "--motion",
+            files[0],
+            "--motion",
+            files[1],
+            "--frames",
+            "2",
+            "--size",
+            "60x80",
+            "--out",
+            str(tmp_path / "s.png"),
+        ]
+    )
     assert Image.open(tmp_path / "s.png").size == (120, 240)
 
 

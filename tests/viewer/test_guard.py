@@ -40,9 +40,20 @@ from wearcap_testing import recording_of, swaying_motion
 
 FOREIGN = "http://elsewhere.net"
 BAD_HOSTS = (
-    "elsewhere.net", "elsewhere.net:{port}", "[::", "[::]:{port}", "user@127.0.0.1:{port}", "127.0.0.1:{port}:1", "127.0.0.1:port",
-    "127.0.0.1.elsewhere.net:{port}", "0.0.0.0:{port}", "10.0.0.7:{port}", "", "localhost:{port}/", "127.0.0.1, elsewhere.net",
-)  # fmt: skip
+    "elsewhere.net",
+    "elsewhere.net:{port}",
+    "[::",
+    "[::]:{port}",
+    "user@127.0.0.1:{port}",
+    "127.0.0.1:{port}:1",
+    "127.0.0.1:port",
+    "127.0.0.1.elsewhere.net:{port}",
+    "0.0.0.0:{port}",
+    "10.0.0.7:{port}",
+    "",
+    "localhost:{port}/",
+    "127.0.0.1, elsewhere.net",
+)
 
 
 def a_scan() -> Scan:
@@ -103,19 +114,20 @@ def with_token(page) -> str:
 
 def status(page, target: str, *headers: str, method: str = "GET") -> int:
     """Status of the answer to a request, written by hand; `Host` is the page's unless there is one."""
-    host = (
-        () if any(header.startswith("Host:") for header in headers) else (f"Host: 127.0.0.1:{port_of(page)}",)
-    )
+    host = () if any(header.startswith("Host:") for header in headers) else (f"Host: 127.0.0.1:{port_of(page)}",)
     with socket.create_connection(("127.0.0.1", port_of(page)), timeout=20) as client:
-        client.sendall(
-            "\r\n".join([f"{method} {target} HTTP/1.1", *host, *headers, "", ""]).encode("latin-1")
-        )
+        client.sendall("\r\n".join([f"{method} {target} HTTP/1.1", *host, *headers, "", ""]).encode("latin-1"))
         line = client.makefile("rb").readline()
     return int(line.split()[1])
 
 
-UPGRADE = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13",
-           "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", f"Sec-WebSocket-Protocol: viser-v{viser.__version__}")  # fmt: skip
+UPGRADE = (
+    "Upgrade: websocket",
+    "Connection: Upgrade",
+    "Sec-WebSocket-Version: 13",
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+    f"Sec-WebSocket-Protocol: viser-v{viser.__version__}",
+)
 
 
 def check_refusals(page, right: int, *headers: str) -> None:
@@ -125,14 +137,33 @@ def check_refusals(page, right: int, *headers: str) -> None:
     assert status(page, target, *own) == right
     cookie = f"Cookie: other=1; wearcap_token_{port}={page.guard.token}"
     assert status(page, "/", *own, cookie) == right
-    for wrong in ("/", "/?token=", "/?token=wrong", f"/?token={page.guard.token[:-1]}", f"/?token={page.guard.token}x",
-                  "/?token=%C3%A9", f"/?other={page.guard.token}", f"/{page.guard.token}"):  # fmt: skip
+    for wrong in (
+        "/",
+        "/?token=",
+        "/?token=wrong",
+        f"/?token={page.guard.token[:-1]}",
+        f"/?token={page.guard.token}x",
+        "/?token=%C3%A9",
+        f"/?other={page.guard.token}",
+        f"/{page.guard.token}",
+    ):
         assert status(page, wrong, *own) == 403, wrong
-    for wrong in (f"wearcap_token_{port}=wrong", f"wearcap_token_{port + 1}={page.guard.token}", f"wearcap_token_{port}=\xe9",
-                  "wearcap_token"):  # fmt: skip
+    for wrong in (
+        f"wearcap_token_{port}=wrong",
+        f"wearcap_token_{port + 1}={page.guard.token}",
+        f"wearcap_token_{port}=\xe9",
+        "wearcap_token",
+    ):
         assert status(page, "/", *own, f"Cookie: {wrong}") == 403, wrong
-    for origin in (FOREIGN, f"{FOREIGN}:{port}", f"http://127.0.0.1:{port + 1}", f"http://localhost:{port}", "null", "",
-                   f"http://127.0.0.1:{port}.elsewhere.net"):  # fmt: skip
+    for origin in (
+        FOREIGN,
+        f"{FOREIGN}:{port}",
+        f"http://127.0.0.1:{port + 1}",
+        f"http://localhost:{port}",
+        "null",
+        "",
+        f"http://127.0.0.1:{port}.elsewhere.net",
+    ):
         assert status(page, target, f"Origin: {origin}", *headers) == 403, origin
         assert status(page, "/", f"Origin: {origin}", cookie, *headers) == 403, origin
     for host in BAD_HOSTS:
@@ -164,9 +195,13 @@ def test_saves_are_only_taken_from_the_page_itself(tmp_path):
     path, token = "/recordings/0/labels", f"?token={page.guard.token}"
     try:
         for target, *headers in (
-            (path,), (f"{path}?token=wrong",), (path + token, f"Origin: {FOREIGN}"), (path + token, "Origin: null"),
-            (path + token, "Host: elsewhere.net"), (path + token, "Host: [::"),
-        ):  # fmt: skip
+            (path,),
+            (f"{path}?token=wrong",),
+            (path + token, f"Origin: {FOREIGN}"),
+            (path + token, "Origin: null"),
+            (path + token, "Host: elsewhere.net"),
+            (path + token, "Host: [::"),
+        ):
             assert status(page, target, *headers, *kind, "", body, method="POST") == 403
         assert not list(tmp_path.glob("*.json"))
         own = f"Origin: http://127.0.0.1:{page.port}"
@@ -225,8 +260,11 @@ def test_another_sites_websocket_presses_no_button_of_the_scene_editor(tmp_path)
         port, token = port_of(page), f"wearcap_token_{port_of(page)}={page.guard.token}"
         place = f"ws://127.0.0.1:{port}"
         for options in (
-            {"origin": FOREIGN}, {"origin": FOREIGN, "additional_headers": {"Cookie": token}}, {"origin": f"http://127.0.0.1:{port}"}, {},
-        ):  # fmt: skip
+            {"origin": FOREIGN},
+            {"origin": FOREIGN, "additional_headers": {"Cookie": token}},
+            {"origin": f"http://127.0.0.1:{port}"},
+            {},
+        ):
             with pytest.raises(InvalidStatus, match="403"):
                 press(place, delete, **options)
         page.run(1.0)
@@ -252,8 +290,7 @@ def test_hosts_that_a_page_is_served_on():
     for host in ("127.0.0.1", "::1", "localhost", "192.168.1.5", "Desk.lan", "fe80::2"):
         assert all(answers(host, name) for name in ("127.0.0.1:1", "localhost", "[::1]:80"))
         assert not any(
-            answers(host, name)
-            for name in ("10.1.1.1:80", "elsewhere.net", "[fe80::1]", socket.gethostname() + "x")
+            answers(host, name) for name in ("10.1.1.1:80", "elsewhere.net", "[fe80::1]", socket.gethostname() + "x")
         )
     assert answers("192.168.1.5", "192.168.1.5:8080")
     assert answers("Desk.lan", "desk.lan:8080")
@@ -261,9 +298,7 @@ def test_hosts_that_a_page_is_served_on():
     for host in ("0.0.0.0", "::", ""):
         own = ("10.1.1.1:80", "[fe80::1]", f"{socket.gethostname()}:8080", "localhost")
         assert all(answers(host, name) for name in own)
-        assert not any(
-            answers(host, name) for name in ("elsewhere.net", "10.1.1.1.nip.io", "127.1", "[::", "fe80::1")
-        )
+        assert not any(answers(host, name) for name in ("elsewhere.net", "10.1.1.1.nip.io", "127.1", "[::", "fe80::1"))
     addresses = (
         ("127.0.0.1", "127.0.0.1"),
         ("::1", "[::1]"),
@@ -299,9 +334,7 @@ def test_a_host_that_is_not_this_machines_is_said():
 
 def test_all_pages_start_their_server_guarded():
     source = Path(annotate_server.__file__).parents[1]
-    starts = [
-        file.name for file in source.rglob("*.py") if "ViserServer(" in file.read_text(encoding="utf-8")
-    ]
+    starts = [file.name for file in source.rglob("*.py") if "ViserServer(" in file.read_text(encoding="utf-8")]
     assert starts == ["page_server.py"]
 
 
@@ -390,9 +423,7 @@ def test_too_many_connections_at_work_are_told_so(tmp_path, monkeypatch):
     monkeypatch.setattr(annotate_server, "MAX_CONNECTIONS", 2)
     page = an_annotator(tmp_path)
     going, done = threading.Barrier(3), threading.Event()
-    monkeypatch.setattr(
-        annotate_server._Handler, "_listing", lambda self: (going.wait(20), done.wait(20), [])[2]
-    )
+    monkeypatch.setattr(annotate_server._Handler, "_listing", lambda self: (going.wait(20), done.wait(20), [])[2])
     target = f"/recordings?token={page.guard.token}"
     threads = [threading.Thread(target=status, args=(page, target)) for _ in range(2)]
     try:

@@ -41,11 +41,13 @@ def a_recording(**parts) -> Recording:
     contact[:30, 0] = True
     head = motion.joint("head")
     return Recording(
-        name="walk", motion=motion, activity="walking",
+        name="walk",
+        motion=motion,
+        activity="walking",
         head=HeadStream(motion.timestamps, head.R, head.t, torch.eye(3), torch.zeros(3)),
         contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, contact),
         points=PointCloud(torch.rand(500, 3) * 4 - 2),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture
@@ -199,9 +201,7 @@ def test_chromium_draws_the_page(page, tmp_path):
         assert browser.evaluate("document.querySelectorAll('canvas').length") >= 1
         browser.poll(lambda: like(browser.screenshot(), CAPTURE_COLOR) > 1000)
         page.jump(1.5)
-        browser.poll(
-            lambda: browser.evaluate("[...document.querySelectorAll('input')].some(i => i.value == '1.5')")
-        )
+        browser.poll(lambda: browser.evaluate("[...document.querySelectorAll('input')].some(i => i.value == '1.5')"))
         page.arrange("truth")
         browser.poll(lambda: like(browser.screenshot(), CAPTURE_COLOR) < 100)
         assert not browser.exceptions

@@ -39,11 +39,7 @@ def test_sheet_has_a_row_per_motion_and_a_body_in_every_panel():
 
 
 def test_frames_beyond_the_columns_continue_below():
-    assert contact_sheet({"a": swaying_motion(30)}, [0, 5, 10, 15, 20], columns=2, size=(40, 50)).shape == (
-        150,
-        80,
-        3,
-    )
+    assert contact_sheet({"a": swaying_motion(30)}, [0, 5, 10, 15, 20], columns=2, size=(40, 50)).shape == (150, 80, 3)
 
 
 def test_motions_of_two_rates_are_shown_at_the_same_moments():

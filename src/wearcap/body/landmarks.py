@@ -11,14 +11,26 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 
 _LEGS = (
-    ("hip", "knee", "ankle"), ("femur", "tibia", "foot"), ("upleg", "leg", "foot"), ("thigh", "shin", "foot"),
-    ("thigh", "calf", "foot"), ("upperleg", "lowerleg", "foot"), ("hip", "knee", "foot"), ("upleg", "lowleg", "foot"),
-)  # fmt: skip
+    ("hip", "knee", "ankle"),
+    ("femur", "tibia", "foot"),
+    ("upleg", "leg", "foot"),
+    ("thigh", "shin", "foot"),
+    ("thigh", "calf", "foot"),
+    ("upperleg", "lowerleg", "foot"),
+    ("hip", "knee", "foot"),
+    ("upleg", "lowleg", "foot"),
+)
 _ARMS = (
-    ("humerus", "radius", "hand"), ("shoulder", "elbow", "wrist"), ("arm", "forearm", "fingerbase"),
-    ("arm", "forearm", "hand"), ("upperarm", "forearm", "hand"), ("upperarm", "lowerarm", "hand"),
-    ("shldr", "forearm", "hand"), ("uparm", "loarm", "hand"), ("shoulder", "elbow", "hand"),
-)  # fmt: skip
+    ("humerus", "radius", "hand"),
+    ("shoulder", "elbow", "wrist"),
+    ("arm", "forearm", "fingerbase"),
+    ("arm", "forearm", "hand"),
+    ("upperarm", "forearm", "hand"),
+    ("upperarm", "lowerarm", "hand"),
+    ("shldr", "forearm", "hand"),
+    ("uparm", "loarm", "hand"),
+    ("shoulder", "elbow", "hand"),
+)
 """Names of (hip, knee, ankle) and (shoulder, elbow, wrist) in use: xsens and SMPL, CMU, Mixamo, Poser, Unreal …
 
 CMU's `lwrist` is the middle of the forearm (its only freedom is the forearm's twist); `lhand` is the wrist.
@@ -85,8 +97,10 @@ def landmarks(skeleton: Skeleton) -> Landmarks:
     for joint, name in enumerate(skeleton.joint_names):
         by_name.setdefault(_plain(name), joint)
     if "head" not in by_name:
-        raise WearcapError(f"skeleton {skeleton.name!r} has no joint named head",
-                           fix=f"It has {', '.join(skeleton.joint_names)}; rename one.")  # fmt: skip
+        raise WearcapError(
+            f"skeleton {skeleton.name!r} has no joint named head",
+            fix=f"It has {', '.join(skeleton.joint_names)}; rename one.",
+        )
     head = by_name["head"]
     limb, collar, toe, forearm = {}, {}, {}, {}
     for side in ("left", "right"):
@@ -101,8 +115,6 @@ def landmarks(skeleton: Skeleton) -> Landmarks:
         collar[side] = above if above not in above_head else None
     spine = _ancestors(skeleton, top)[-2::-1]
     if not spine:
-        raise WearcapError(
-            f"skeleton {skeleton.name!r} has no spine", expected="a joint between root and arms"
-        )
+        raise WearcapError(f"skeleton {skeleton.name!r} has no spine", expected="a joint between root and arms")
     neck = above_head[1 : above_head.index(top)][::-1]
     return Landmarks(0, tuple(spine), tuple(neck), head, limb, collar, toe, forearm)

@@ -5,18 +5,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def swing_between(
-    a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]
-) -> Float[Tensor, "*batch 3 3"]:
+def swing_between(a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The smallest rotation that turns direction a onto direction b (any lengths; opposite ones: half a turn)."""
     a, b = torch.broadcast_tensors(a, b)
     a, b = torch.nn.functional.normalize(a, dim=-1), torch.nn.functional.normalize(b, dim=-1)
     cos = (a * b).sum(-1)[..., None, None]
     v = torch.linalg.cross(a, b)
     zero = torch.zeros_like(v[..., 0])
-    K = torch.stack(
-        [zero, -v[..., 2], v[..., 1], v[..., 2], zero, -v[..., 0], -v[..., 1], v[..., 0], zero], -1
-    )
+    K = torch.stack([zero, -v[..., 2], v[..., 1], v[..., 2], zero, -v[..., 0], -v[..., 1], v[..., 0], zero], -1)
     K = K.unflatten(-1, (3, 3))
     eye = torch.eye(3, dtype=a.dtype, device=a.device)
     swing = eye + K + K @ K / (1 + cos).clamp_min(1e-6)

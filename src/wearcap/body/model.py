@@ -35,9 +35,7 @@ class BodyModel:
         Raises WearcapError for an unknown region.
         """
         if region is not None and region not in self.regions:
-            raise WearcapError(
-                f"the body has no region {region!r}", expected=f"one of {', '.join(self.regions)}"
-            )
+            raise WearcapError(f"the body has no region {region!r}", expected=f"one of {', '.join(self.regions)}")
         rows = slice(None) if region is None else self.regions[region].to(self.rest_vertices.device)
         rest, weight = self.rest_vertices[rows].to(T_world_joint.t), self._weights[rows].to(T_world_joint.t)
         joints = self.skeleton.rest_joints.to(T_world_joint.t)
@@ -63,9 +61,7 @@ class BodyModel:
         return float((torch.linalg.cross(a, b) * c).sum() / 6)
 
 
-def four_weights(
-    weights: Float[Tensor, "vertex joint"],
-) -> tuple[Int64[Tensor, "vertex 4"], Float[Tensor, "vertex 4"]]:
+def four_weights(weights: Float[Tensor, "vertex joint"]) -> tuple[Int64[Tensor, "vertex 4"], Float[Tensor, "vertex 4"]]:
     """The four joints with the largest weights on each vertex, and these weights, normalised to sum to 1."""
     top = weights.topk(4, dim=1)
     return top.indices, top.values / top.values.sum(1, keepdim=True).clamp_min(1e-12)

@@ -11,8 +11,11 @@ SOLE_HEIGHT = 0.025
 """Largest height (m) of a sole's vertices above the foot's lowest vertex."""
 
 FOOT_REGIONS = {
-    "left_heel": "left_heel", "left_toe_tip": "left_toes", "right_heel": "right_heel", "right_toe_tip": "right_toes",
-}  # fmt: skip
+    "left_heel": "left_heel",
+    "left_toe_tip": "left_toes",
+    "right_heel": "right_heel",
+    "right_toe_tip": "right_toes",
+}
 """Surface region of each of `FOOT_PATCHES`, in their order."""
 
 
@@ -47,9 +50,7 @@ def contact_regions(
     return regions
 
 
-def vertex_normals(
-    vertices: Float[Tensor, "vertex 3"], faces: Int64[Tensor, "face 3"]
-) -> Float[Tensor, "vertex 3"]:
+def vertex_normals(vertices: Float[Tensor, "vertex 3"], faces: Int64[Tensor, "face 3"]) -> Float[Tensor, "vertex 3"]:
     """Unit normals, the faces' weighted by area."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     face = torch.linalg.cross(b - a, c - a)
@@ -59,9 +60,7 @@ def vertex_normals(
     return torch.nn.functional.normalize(total, dim=-1)
 
 
-def _carried_by(
-    skeleton: Skeleton, weights: Float[Tensor, "vertex joint"], joint: int
-) -> Bool[Tensor, "vertex"]:
+def _carried_by(skeleton: Skeleton, weights: Float[Tensor, "vertex joint"], joint: int) -> Bool[Tensor, "vertex"]:
     """Vertices whose skinning weights on a joint and its descendants sum to more than one half."""
     below = [joint]
     below += [j for j in range(joint + 1, len(skeleton)) if _descends(skeleton, j, joint)]

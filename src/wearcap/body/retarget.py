@@ -24,9 +24,7 @@ _SIDES = ("left", "right")
 # ------------------------------------------------------------------------------------------------ rotations
 
 
-def _overlaps(
-    source: Float[Tensor, "knot_s"], target: Float[Tensor, "knot_t"]
-) -> Float[Tensor, "seg_t seg_s"]:
+def _overlaps(source: Float[Tensor, "knot_s"], target: Float[Tensor, "knot_t"]) -> Float[Tensor, "seg_t seg_s"]:
     """Share of each target segment that overlaps each source segment, both chains scaled to length 1."""
     source, target = source / source[-1].clamp_min(1e-9), target / target[-1].clamp_min(1e-9)
     low = torch.maximum(target[:-1, None], source[None, :-1])
@@ -65,9 +63,7 @@ def _carry(
             given.update(zip(joints_t, _spread(turn[..., list(joints_s), :, :], share).unbind(-3)))
 
     top_s, top_t = from_s.spine[-1], to.spine[-1]
-    chain(
-        from_s.spine[:-1] or (top_s,), top_s if len(from_s.spine) > 1 else from_s.head, to.spine[:-1], top_t
-    )
+    chain(from_s.spine[:-1] or (top_s,), top_s if len(from_s.spine) > 1 else from_s.head, to.spine[:-1], top_t)
     given[top_t] = turn[..., top_s, :, :]
     chain(from_s.neck or (top_s,), from_s.head, to.neck, to.head)
     for side in _SIDES:
@@ -216,9 +212,7 @@ def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
     return places
 
 
-def _fitted_sites(
-    source: Skeleton, target: Skeleton, pose_s: TPose, pose_t: TPose, scale: float
-) -> dict[str, Site]:
+def _fitted_sites(source: Skeleton, target: Skeleton, pose_s: TPose, pose_t: TPose, scale: float) -> dict[str, Site]:
     """The target's sites on the fitted body: scaled, the feet's copied where the source has them.
 
     Crowns and fingertips are never copied: files end those bones anywhere (CMU's head at its markers).

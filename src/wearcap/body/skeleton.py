@@ -22,10 +22,13 @@ MIRROR = (1.0, -1.0, 1.0)
 """Factors that mirror a position left to right: y changes its sign."""
 
 _ALIASES = {
-    "left_toe": "left_foot", "right_toe": "right_foot",
-    "left_foot": "left_toe", "right_foot": "right_toe",
-    "left_collar": "left_clavicle", "right_collar": "right_clavicle",
-}  # fmt: skip
+    "left_toe": "left_foot",
+    "right_toe": "right_foot",
+    "left_foot": "left_toe",
+    "right_foot": "right_toe",
+    "left_collar": "left_clavicle",
+    "right_collar": "right_clavicle",
+}
 """Aliases of joint names: other skeletons' names for the same joint, used if the first name is absent."""
 
 
@@ -102,9 +105,7 @@ class Skeleton:
         depth = [0] * len(self)
         for joint in range(1, len(self)):
             depth[joint] = depth[self.parents[joint]] + 1
-        return tuple(
-            tuple(j for j in range(len(self)) if depth[j] == level) for level in range(max(depth) + 1)
-        )
+        return tuple(tuple(j for j in range(len(self)) if depth[j] == level) for level in range(max(depth) + 1))
 
     @cached_property
     def rest_joints(self) -> Float[Tensor, "joint 3"]:
@@ -137,8 +138,7 @@ class Skeleton:
         old = self.t_parent_joint.norm(dim=-1).sum()
         scale = (t_parent_joint.norm(dim=-1).sum() / old).item()
         sites = {
-            name: Site(site.joint, tuple(scale * v for v in site.t_joint_site))
-            for name, site in self.sites.items()
+            name: Site(site.joint, tuple(scale * v for v in site.t_joint_site)) for name, site in self.sites.items()
         }
         return replace(self, t_parent_joint=t_parent_joint, sites=sites)
 

@@ -73,10 +73,7 @@ def smplx22() -> Skeleton:
 
 def smpl24() -> Skeleton:
     """SMPL's 24 joints."""
-    hands = [
-        ("left_hand", "left_wrist", (0.0, 0.080, 0.0)),
-        ("right_hand", "right_wrist", (0.0, -0.080, 0.0)),
-    ]
+    hands = [("left_hand", "left_wrist", (0.0, 0.080, 0.0)), ("right_hand", "right_wrist", (0.0, -0.080, 0.0))]
     return build_skeleton("smpl24", [*_SMPL_BODY, *hands], list(_SMPL_SITES))
 
 

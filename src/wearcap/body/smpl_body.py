@@ -39,9 +39,7 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
     """
     count = len(arrays.parents)
     if count not in _SKELETON_OF:
-        raise WearcapError(
-            f"a body model of {count} joints", expected="24 (SMPL), 52 (SMPL+H) or 55 (SMPL-X)"
-        )
+        raise WearcapError(f"a body model of {count} joints", expected="24 (SMPL), 52 (SMPL+H) or 55 (SMPL-X)")
     available = arrays.shape_directions.shape[-1]
     if betas is not None and len(betas) > available:
         raise WearcapError(f"{len(betas)} shape coefficients", expected=f"at most this file's {available}")
@@ -52,9 +50,7 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
     vertices, joints = ((points - joints[0]) @ _WORLD_MODEL.to(points).T for points in (vertices, joints))
     named = skeleton_by_name(_SKELETON_OF[count])
     carrier = _carriers(arrays.parents, len(named))
-    weights = arrays.weights.new_zeros(len(vertices), len(named)).index_add_(
-        1, torch.tensor(carrier), arrays.weights
-    )
+    weights = arrays.weights.new_zeros(len(vertices), len(named)).index_add_(1, torch.tensor(carrier), arrays.weights)
     if arrays.parents[: len(named)] != named.parents:
         raise WearcapError(f"a joint tree other than {named.name}'s", expected="an SMPL family file")
     offsets = joints[: len(named)] - joints[[max(parent, 0) for parent in named.parents]]
@@ -65,9 +61,7 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
     blend = None
     if arrays.pose_directions is not None:
         blend = _pose_blend(arrays.pose_directions, len(named)).float()
-    return BodyModel(
-        skeleton, vertices.float(), arrays.faces, skin_joints, skin_weights.float(), regions, blend
-    )
+    return BodyModel(skeleton, vertices.float(), arrays.faces, skin_joints, skin_weights.float(), regions, blend)
 
 
 def _carriers(parents: tuple[int, ...], kept: int) -> list[int]:
@@ -95,9 +89,7 @@ def _surface_sites(
     return sites
 
 
-def _pose_blend(
-    directions: Float[Tensor, "vertex 3 feature"], kept: int
-) -> Float[Tensor, "feature_kept vertex 3"]:
+def _pose_blend(directions: Float[Tensor, "vertex 3 feature"], kept: int) -> Float[Tensor, "feature_kept vertex 3"]:
     """Pose offsets in our axes, per entry of our (R_parent_joint - I), of the joints that the skeleton keeps."""
     P = _WORLD_MODEL.to(directions)
     entries = directions.unflatten(-1, (-1, 3, 3))[..., : kept - 1, :, :]

@@ -37,9 +37,7 @@ def t_pose(skeleton: Skeleton) -> TPose:
     feet = {}
     for name, (first, second, third) in marks.limb.items():
         y = 1.0 if name.startswith("left") else -1.0
-        direction = torch.tensor(
-            [0.0, 0.0, -1.0] if name.endswith("leg") else [0.0, y, 0.0], dtype=rest.dtype
-        )
+        direction = torch.tensor([0.0, 0.0, -1.0] if name.endswith("leg") else [0.0, y, 0.0], dtype=rest.dtype)
         aim[first] = (rest[second] - rest[first], direction)
         aim[second] = (rest[third] - rest[second], direction)
         if name.endswith("leg"):

@@ -26,18 +26,20 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--output", type=Path, help=_OUTPUT)
     parser.add_argument("--video", type=Path, help="video to show (default: that of the recording's camera)")
     parser.add_argument(
-        "--video-start", type=float, metavar="SECONDS",
+        "--video-start",
+        type=float,
+        metavar="SECONDS",
         help="time of the recording at which the video begins (default: its first frame)",
-    )  # fmt: skip
+    )
     parser.add_argument("--motion", help="captured motion (.npz that `wearcap capture` wrote) to look at")
     parser.add_argument(
-        "--from", dest="start", metavar="FILE",
+        "--from",
+        dest="start",
+        metavar="FILE",
         help="labels to start from, where there are none yet: contacts of a captured motion (.npz), a label file "
         "(.json), or `recording` for the recording's own",
-    )  # fmt: skip
-    parser.add_argument(
-        "--port", type=int, default=8090, help="port of the page (default 8090, else the next free)"
     )
+    parser.add_argument("--port", type=int, default=8090, help="port of the page (default 8090, else the next free)")
     parser.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
     options = parser.parse_args(arguments)
     if not 0 < options.port < 65536:
@@ -59,8 +61,10 @@ def _annotate(options: argparse.Namespace) -> None:
     if options.start:
         _start_from(desk, options.start)
     server = AnnotationServer(desk, options.port)
-    print(f"{desk.names[0] if len(desk.names) == 1 else f'{len(desk.names)} recordings'}: open {server.url} "
-          f"(Ctrl+C ends); labels go to {desk.output}")  # fmt: skip
+    print(
+        f"{desk.names[0] if len(desk.names) == 1 else f'{len(desk.names)} recordings'}: open {server.url} "
+        f"(Ctrl+C ends); labels go to {desk.output}"
+    )
     if not options.no_browser:
         webbrowser.open(server.url)
     try:
@@ -79,8 +83,11 @@ def _start_from(desk: "Desk", source: str) -> None:
     for index in range(len(desk.names)):
         file = desk.file(index)
         if file.path.exists():
-            raise WearcapError("there are labels already, which are never replaced", where=file.path,
-                               fix="Leave out --from to go on with them, or give another --output.")  # fmt: skip
+            raise WearcapError(
+                "there are labels already, which are never replaced",
+                where=file.path,
+                fix="Leave out --from to go on with them, or give another --output.",
+            )
         labels = starting_labels(source, desk.recording(index), file.clock)
         file.save(annotation_of(labels, file.clock), "")
 
@@ -94,9 +101,7 @@ def _export(arguments: list[str]) -> None:
     )
     parser.add_argument("recording", help=_RECORDING)
     parser.add_argument("--output", type=Path, help=_OUTPUT)
-    parser.add_argument(
-        "--to", type=Path, help="file, or folder for several recordings (default: NAME.json here)"
-    )
+    parser.add_argument("--to", type=Path, help="file, or folder for several recordings (default: NAME.json here)")
     options = parser.parse_args(arguments)
 
     from wearcap.files import write_text
@@ -107,8 +112,12 @@ def _export(arguments: list[str]) -> None:
     several = len(desk.names) > 1
     annotated = [k for k, name in enumerate(desk.names) if desk.path(name).is_file()]
     if not annotated:
-        raise WearcapError("no labels to export", where=desk.output, expected=f"{desk.path(desk.names[0]).name}",
-                           fix=f"Make them with `wearcap annotate {options.recording}`.")  # fmt: skip
+        raise WearcapError(
+            "no labels to export",
+            where=desk.output,
+            expected=f"{desk.path(desk.names[0]).name}",
+            fix=f"Make them with `wearcap annotate {options.recording}`.",
+        )
     for index in annotated:
         labels, _ = desk.file(index).read()
         target = Path(f"{desk.names[index]}.json")
@@ -117,6 +126,4 @@ def _export(arguments: list[str]) -> None:
         if target.resolve() == desk.path(desk.names[index]).resolve():
             raise WearcapError("the export would replace the labels it comes from", where=target)
         write_text(target, hcontact_text(labels, desk.file(index).clock))
-        print(
-            f"wrote {target}: {len(labels['left'])} contacts of the left hand, {len(labels['right'])} of the right"
-        )
+        print(f"wrote {target}: {len(labels['left'])} contacts of the left hand, {len(labels['right'])} of the right")

@@ -36,26 +36,35 @@ def run(config: DictConfig) -> Calibration:
 
 
 def _about(found: Calibration, board: Board, source: str) -> dict:
-    views = [{"name": view.name, "rms_px": round(view.rms_px, 4), "used": used}
-             for used, group in ((True, found.views), (False, found.rejected)) for view in group]  # fmt: skip
+    views = [
+        {"name": view.name, "rms_px": round(view.rms_px, 4), "used": used}
+        for used, group in ((True, found.views), (False, found.rejected))
+        for view in group
+    ]
     return {
-        "source": Path(source).name, "board": asdict(board), "rms_px": found.rms_px, "focal_std_px": found.focal_std_px,
-        "coverage": found.coverage, "pictures_examined": found.examined, "pictures_with_board": found.seen, "views": views,
-    }  # fmt: skip
+        "source": Path(source).name,
+        "board": asdict(board),
+        "rms_px": found.rms_px,
+        "focal_std_px": found.focal_std_px,
+        "coverage": found.coverage,
+        "pictures_examined": found.examined,
+        "pictures_with_board": found.seen,
+        "views": views,
+    }
 
 
 def _show_report(found: Calibration) -> None:
     camera = found.camera
-    table = Table(title=f"{len(found.views)} views used, {len(found.rejected)} rejected, of {found.seen} with the board in "
-                        f"{found.examined} pictures", title_justify="left")  # fmt: skip
+    table = Table(
+        title=f"{len(found.views)} views used, {len(found.rejected)} rejected, of {found.seen} with the board in "
+        f"{found.examined} pictures",
+        title_justify="left",
+    )
     for column in ("view", "residual (px)", "edge blur (px)", ""):
         table.add_column(column, justify="left" if column in ("view", "") else "right")
     for view in sorted((*found.views, *found.rejected), key=lambda view: -view.rms_px)[:8]:
         table.add_row(
-            view.name,
-            f"{view.rms_px:.3f}",
-            f"{view.blur_px:.1f}",
-            "rejected" if view in found.rejected else "",
+            view.name, f"{view.rms_px:.3f}", f"{view.blur_px:.1f}", "rejected" if view in found.rejected else ""
         )
     show(table)
     show(
@@ -67,9 +76,7 @@ def _show_report(found: Calibration) -> None:
         f"{100 * found.coverage:.0f} % of the picture"
     )
     if found.coverage < ENOUGH:
-        show(
-            "[yellow]note: hold the board into the picture's corners too; distortion there is extrapolated[/]"
-        )
+        show("[yellow]note: hold the board into the picture's corners too; distortion there is extrapolated[/]")
 
 
 def main(arguments: list[str]) -> None:

@@ -43,11 +43,11 @@ STEPS = {
     "board": "Lay both watches on the board for 3 s: backs down, 12 o'clock along the board's y axis. Touch nothing.",
     "tpose": "Put them on, stand in a T-pose that faces the board's y for 3 s: arms level, palms down.",
     "marks": "Put the camera on C1 and C2 (y axis), then C3 and C4 (x axis), for 3 s each, and measure |C1 C2| and |C3 C4|"
-             " (distances_m=[…,…]) and the camera's height over the floor (mark_height_m=…).",
+    " (distances_m=[…,…]) and the camera's height over the floor (mark_height_m=…).",
     "standing": "Put the camera on, stand upright for 10 s with hanging arms and look ahead along the board's y.",
     "swings": "Swing the stretched arms from hanging to before the camera and back, ten times, at uneven intervals; note the"
-              " times of the frames in which the hands are nearest.",
-}  # fmt: skip
+    " times of the frames in which the hands are nearest.",
+}
 OF_CAMERA = ("marks", "standing", "swings")
 STAND_S = 8.0
 
@@ -78,8 +78,11 @@ def run(config: DictConfig) -> WornCalibration | None:
     if config.guide:
         return None
     if missing:
-        raise WearcapError(f"no {', '.join(missing)}", expected="every step's stretch, as listed above",
-                           fix="Give them as " + " ".join(f"{key}=[…]" for key in missing) + ".")  # fmt: skip
+        raise WearcapError(
+            f"no {', '.join(missing)}",
+            expected="every step's stretch, as listed above",
+            fix="Give them as " + " ".join(f"{key}=[…]" for key in missing) + ".",
+        )
     recording = None if config.recording is None else _base(Path(config.recording))
     found, checks = _measured(config, logs)
     _show_report(checks)
@@ -135,20 +138,23 @@ def _measured(config: DictConfig, logs: Logs) -> tuple[WornCalibration, list[Ste
         camera, head, more = _camera(config, logs.slam, logs.camera_zero)
         checks += more
         if config.swings is not None:
-            clocks = {joint: _clock(config, logs, watches[joint].apply(stream), t_pose) for joint, stream in logs.watches.items()}  # fmt: skip
+            clocks = {
+                joint: _clock(config, logs, watches[joint].apply(stream), t_pose)
+                for joint, stream in logs.watches.items()
+            }
             checks += [check for joint, clock in clocks.items() for check in swing_checks(clock, joint)]
     return WornCalibration(watches, clocks, camera, head), checks
 
 
-def _camera(config: DictConfig, slam: Trajectory, zero: float) -> tuple[SlamAlignment, HeadMount, list[StepCheck]]:  # fmt: skip
+def _camera(config: DictConfig, slam: Trajectory, zero: float) -> tuple[SlamAlignment, HeadMount, list[StepCheck]]:
     limits = instantiate(config.camera_limits)
     stretches = [_stretch(config, "marks", zero, place) for place in range(len(config.marks))]
     marks, moved, turned = mark_positions(slam, stretches)
     first, second = _numbers(config, "distances_m", 2)
     camera = align_by_marks(marks, (first, second), config.mark_height_m)
     x, y, z = _numbers(config, "t_head_cam", 3)
-    head = mount_by_standing(camera.apply(slam), _stretch(config, "standing", zero), config.facing_deg, (x, y, z))  # fmt: skip
-    return camera, head, mark_checks(camera, camera.scale * moved, turned, limits) + mount_checks(head, limits)  # fmt: skip
+    head = mount_by_standing(camera.apply(slam), _stretch(config, "standing", zero), config.facing_deg, (x, y, z))
+    return camera, head, mark_checks(camera, camera.scale * moved, turned, limits) + mount_checks(head, limits)
 
 
 def _clock(config: DictConfig, logs: Logs, watch: ImuStream, t_pose: Stretch) -> SwingClock:
@@ -159,13 +165,26 @@ def _clock(config: DictConfig, logs: Logs, watch: ImuStream, t_pose: Stretch) ->
     peaks = swing_peaks(watch, (start, stop)) - logs.watch_zero
     seen = torch.tensor(_numbers(config, "swings"), dtype=torch.float64)
     found = fit_swing_clock(seen, peaks, 1 / config.camera_fps)
-    clock = replace(found.clock, camera_s=found.clock.camera_s + logs.camera_zero, suit_s=found.clock.suit_s + logs.watch_zero)  # fmt: skip
+    clock = replace(
+        found.clock, camera_s=found.clock.camera_s + logs.camera_zero, suit_s=found.clock.suit_s + logs.watch_zero
+    )
     return SwingClock(clock, found.std_s)
 
 
 def _about(config: DictConfig) -> dict[str, Any]:
     """Provenance of the calibration: its input files and settings."""
-    keys = ("board", "tpose", "swings_in", "marks", "distances_m", "mark_height_m", "standing", "facing_deg", "swings", "camera_fps")  # fmt: skip
+    keys = (
+        "board",
+        "tpose",
+        "swings_in",
+        "marks",
+        "distances_m",
+        "mark_height_m",
+        "standing",
+        "facing_deg",
+        "swings",
+        "camera_fps",
+    )
     given = OmegaConf.to_container(OmegaConf.masked_copy(config, [*keys]))
     assert isinstance(given, dict)
     files = {key: Path(config[key]).name for key in ("left", "right", "camera") if config[key] is not None}
@@ -185,7 +204,7 @@ def _store(found: WornCalibration, logs: Logs, recording: Recording, where: Path
     for joint, stream in logs.watches.items():
         imu[joint] = found.watches[joint].apply(stream)
         if joint in found.clocks:
-            imu[joint] = replace(imu[joint], timestamps=found.clocks[joint].clock.to_camera(stream.timestamps))  # fmt: skip
+            imu[joint] = replace(imu[joint], timestamps=found.clocks[joint].clock.to_camera(stream.timestamps))
     if not found.clocks:
         show("[yellow]note: without arm swings the watches stay on their own clock[/]")
     recording = replace(recording, imu=recording.imu | imu)
@@ -243,9 +262,7 @@ def _proposed(logs: Logs) -> dict[str, str]:
         still = still_intervals(logs.slam.timestamps, logs.slam.R_world_body, min_s=1.5, still_deg=1.0)
         steady = still_intervals(logs.slam.timestamps, logs.slam.R_world_body, STAND_S)
         if len(still) >= 4:
-            found["marks"] = (
-                "[" + ",".join(_written(stretch, logs.camera_zero) for stretch in still[:4]) + "]"
-            )
+            found["marks"] = "[" + ",".join(_written(stretch, logs.camera_zero) for stretch in still[:4]) + "]"
             steady = [stretch for stretch in steady if stretch[0] > still[3][1]]
         if steady:
             found["standing"] = _written(steady[0], logs.camera_zero)
@@ -257,4 +274,6 @@ def _written(stretch: Stretch, zero: float) -> str:
 
 
 def main(arguments: list[str]) -> None:
-    hydra_main("calibrate_watches", run, ["guide=true" if argument == "--guide" else argument for argument in arguments])  # fmt: skip
+    hydra_main(
+        "calibrate_watches", run, ["guide=true" if argument == "--guide" else argument for argument in arguments]
+    )

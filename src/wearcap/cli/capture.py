@@ -50,7 +50,9 @@ def run(config: DictConfig) -> Motion | None:
         if config.samples < 1:
             raise WearcapError(f"samples={config.samples}", expected="at least 1")
         if config.until is not None or config.cache is not None:
-            raise WearcapError(f"until={config.until} cache={config.cache}", expected="a pipeline with stages, such as pipeline=hps")  # fmt: skip
+            raise WearcapError(
+                f"until={config.until} cache={config.cache}", expected="a pipeline with stages, such as pipeline=hps"
+            )
         seeds = range(config.seed, config.seed + config.samples)
         capturing = pipeline
         if isinstance(pipeline, Echo):
@@ -60,9 +62,7 @@ def run(config: DictConfig) -> Motion | None:
         if len(draws) > 1:
             _write_samples(draws, recording, folder, config)
     else:
-        captured = staged(pipeline, config, config.recording, Console(stderr=True)).run(
-            recording, config.until
-        )
+        captured = staged(pipeline, config, config.recording, Console(stderr=True)).run(recording, config.until)
         write_text(folder / "report.json", json.dumps(captured.report, indent=1) + "\n")
         motion = captured.motion
     if motion is not None:
@@ -89,9 +89,11 @@ def _write(motion: Motion, recording: Recording, folder: Path, config: DictConfi
         truth = with_objects(recording, environment)
         shown = {"truth": truth} if truth is not None else {}
         write_video(
-            folder / "motion.mp4", shown | {"capture": motion}, environment=environment,
+            folder / "motion.mp4",
+            shown | {"capture": motion},
+            environment=environment,
             max_seconds=config.video_seconds,
-        )  # fmt: skip
+        )
 
 
 def _write_samples(draws: list[Motion], recording: Recording, folder: Path, config: DictConfig) -> None:
@@ -102,9 +104,7 @@ def _write_samples(draws: list[Motion], recording: Recording, folder: Path, conf
     environment = _objects(draws[0], recording, config)
     truth = with_objects(recording, environment)
     body = anny_body(draws[0].skeleton, recording.shape or None)
-    sheet = contact_sheet(
-        ({} if truth is None else {"truth": truth}) | shown, body=body, environment=environment
-    )
+    sheet = contact_sheet(({} if truth is None else {"truth": truth}) | shown, body=body, environment=environment)
     save_png(folder / "samples.png", sheet)
 
 
@@ -121,9 +121,7 @@ def _live(pipeline: object, config: DictConfig, folder: Path) -> None:
         raise WearcapError("this pipeline cannot follow a growing recording", expected="pipeline=hps")
     source = Path(config.recording)
     if not source.is_dir():
-        raise WearcapError(
-            "no such folder", where=source, expected="a growing recording: piece-000000.safetensors, …"
-        )
+        raise WearcapError("no such folder", where=source, expected="a growing recording: piece-000000.safetensors, …")
     scan = None
     if config.scene is not None:
         scan = read_scan(cloud_file(config.scene), metres_per_unit=config.metres_per_unit)

@@ -129,25 +129,28 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
     if isinstance(error, MissingConfigException):
         return _missing_choice(error)
     if isinstance(error, OverrideParseException):
-        return WearcapError(f"cannot read the override {error.override!r}", expected="key=value",
-                            fix=f"({str(error).splitlines()[0]})")  # fmt: skip
+        return WearcapError(
+            f"cannot read the override {error.override!r}", expected="key=value", fix=f"({str(error).splitlines()[0]})"
+        )
     if missing := re.search(r"Missing mandatory value: (\S+)", str(error)):
         key = missing.group(1).rstrip(".")
         return WearcapError(f"{key} has no value", fix=f"Give it on the command line: {key}=…")
-    key = re.search(
-        r"(?:Could not override|Could not delete from config\.|Could not append) '([^']+)'", str(error)
-    )
+    key = re.search(r"(?:Could not override|Could not delete from config\.|Could not append) '([^']+)'", str(error))
     key = key or re.search(r"key '?([\w./@-]+)'? (?:is not in|not found)", str(error), re.IGNORECASE)
     if isinstance(error, InstantiationException):
         return _refused(error)
     if key is None and not isinstance(error, ConfigCompositionException):
-        return WearcapError(str(error).strip().splitlines()[0], where=f"config {config_name!r}",
-                            fix="Run again with --debug for the whole story.")  # fmt: skip
+        return WearcapError(
+            str(error).strip().splitlines()[0],
+            where=f"config {config_name!r}",
+            fix="Run again with --debug for the whole story.",
+        )
     if key is None:
         return WearcapError(" ".join(str(error).split()), where=f"config {config_name!r}")
     wrong = key.group(1).split("@")[0]
-    return WearcapError(f"config {config_name!r} has no key {wrong!r}",
-                        fix=nearest(wrong, _valid_keys(config_name, arguments, wrong)))  # fmt: skip
+    return WearcapError(
+        f"config {config_name!r} has no key {wrong!r}", fix=nearest(wrong, _valid_keys(config_name, arguments, wrong))
+    )
 
 
 def _refused(error: InstantiationException) -> WearcapError:
@@ -156,8 +159,10 @@ def _refused(error: InstantiationException) -> WearcapError:
     while cause.__cause__ is not None:
         cause = cause.__cause__
     place = re.search(r"full_key: (\S+)", str(error))
-    return WearcapError(f"cannot build {place.group(1) if place else 'what the config names'}: "
-                        + " ".join(str(cause).split()[:60]), fix="--debug shows where.")  # fmt: skip
+    return WearcapError(
+        f"cannot build {place.group(1) if place else 'what the config names'}: " + " ".join(str(cause).split()[:60]),
+        fix="--debug shows where.",
+    )
 
 
 def _missing_choice(error: MissingConfigException) -> WearcapError:
@@ -174,9 +179,7 @@ def _missing_choice(error: MissingConfigException) -> WearcapError:
 
 def _groups() -> list[str]:
     root = conf_dir()
-    return sorted(
-        {path.parent.relative_to(root).as_posix() for path in root.rglob("*.yaml")} - {".", "hydra"}
-    )
+    return sorted({path.parent.relative_to(root).as_posix() for path in root.rglob("*.yaml")} - {".", "hydra"})
 
 
 def _valid_keys(config_name: str, arguments: list[str], wrong: str) -> set[str]:

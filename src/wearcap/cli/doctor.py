@@ -32,9 +32,7 @@ def main(arguments: list[str]) -> None:
         console = Console()
         with Progress(console=Console(stderr=True), transient=True) as progress:
             task = progress.add_task("examining", total=None)
-            report = examine(
-                options.path, lambda done, total: progress.update(task, completed=done, total=total)
-            )
+            report = examine(options.path, lambda done, total: progress.update(task, completed=done, total=total))
         console.print(_table(report, options.quiet))
         console.print(_summary(report))
     if not report.sound:
@@ -55,9 +53,7 @@ def _table(report: Report, quiet: bool) -> Table:
         cell.append(f"\n{finding.evidence}" if finding.evidence else "", style="dim")
         cell.append(f"\n→ {finding.fix}" if finding.fix else "", style="bold")
         if several:
-            cell.append(
-                f"\n{len(names)}: {', '.join(names[:3])}{' …' if len(names) > 3 else ''}", style="italic"
-            )
+            cell.append(f"\n{len(names)}: {', '.join(names[:3])}{' …' if len(names) > 3 else ''}", style="italic")
         table.add_row(Text(finding.severity, style=color), Text(finding.check), cell)
     return table
 

@@ -46,7 +46,7 @@ def run(config: DictConfig) -> Scores:
             measure = with_interactions(pipeline, store.root) if isinstance(pipeline, IReplica) else score
             rows = _rows(capture, store, list(config.seeds)[:1], config, progress, pipeline.name, measure)
             scores = {pipeline.name: aggregate(list(rows))}
-    about = {"dataset": str(store.root), "split": config.split, "checkpoint": ", ".join(map(str, checkpoints))}  # fmt: skip
+    about = {"dataset": str(store.root), "split": config.split, "checkpoint": ", ".join(map(str, checkpoints))}
     show(rich_table(f"{store.root.name}, {config.split} split", scores))
     write_scores(config.output, scores, about)
     show(f"table: {config.output}")

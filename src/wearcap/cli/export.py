@@ -41,7 +41,11 @@ def run(config: DictConfig) -> dict[str, ExportReport]:
         elif isinstance(pipeline, Echo):
             reports = {"network": export_echo(pipeline, config.output, config.format)}
         else:
-            raise WearcapError("this pipeline has no network to export", where=config.checkpoint, expected="HMD²'s, MocapEvery's or ECHO's: pipeline=hmd2, pipeline=mocap_every, pipeline=echo")  # fmt: skip
+            raise WearcapError(
+                "this pipeline has no network to export",
+                where=config.checkpoint,
+                expected="HMD²'s, MocapEvery's or ECHO's: pipeline=hmd2, pipeline=mocap_every, pipeline=echo",
+            )
     for name, report in reports.items():
         show(f"exported {name}: {report.path}\n{report}")
     return reports

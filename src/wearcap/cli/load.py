@@ -63,7 +63,9 @@ def load_system(checkpoint: str | Path) -> tuple[System, dict[str, Any]]:
     config, state = read_checkpoint(checkpoint)
     system = build(config["model"], state, checkpoint)
     if not isinstance(system, System):
-        raise WearcapError(f"a checkpoint of {type(system).__name__} alone", where=checkpoint, expected="one of `wearcap train`")  # fmt: skip
+        raise WearcapError(
+            f"a checkpoint of {type(system).__name__} alone", where=checkpoint, expected="one of `wearcap train`"
+        )
     return system, config
 
 
@@ -78,18 +80,29 @@ def load_pipeline(
     learned, name = bool(pipeline.get("_partial_")), pipeline._target_.rpartition(".")[2]
     given = [checkpoint] if isinstance(checkpoint, str | Path) else list(checkpoint or ())
     if not learned and given:
-        raise WearcapError(f"a checkpoint, but {name} has no network", where=given[0], fix="Leave checkpoint=… out, or choose another pipeline=….")  # fmt: skip
+        raise WearcapError(
+            f"a checkpoint, but {name} has no network",
+            where=given[0],
+            fix="Leave checkpoint=… out, or choose another pipeline=….",
+        )
     made = instantiate(pipeline, _convert_="all")
     if not learned:
         return made
     if not given:
-        raise WearcapError(f"no checkpoint, but {name} needs a trained network", fix="Give checkpoint=…, or a pipeline without one, such as pipeline=hps.")  # fmt: skip
+        raise WearcapError(
+            f"no checkpoint, but {name} needs a trained network",
+            fix="Give checkpoint=…, or a pipeline without one, such as pipeline=hps.",
+        )
     if name == "IReplica":
         return made(predictor=ContactPredictor.load(*given))
     system, _ = load_system(given[0])
     kind, experiment = NETWORKS[name]
     if not isinstance(system, kind):
-        raise WearcapError(f"{name} cannot run {type(system).__name__}'s network", where=given[0], expected=f"a checkpoint of {experiment}")  # fmt: skip
+        raise WearcapError(
+            f"{name} cannot run {type(system).__name__}'s network",
+            where=given[0],
+            expected=f"a checkpoint of {experiment}",
+        )
     return made(**system.pipeline_parts(), device=device)
 
 
@@ -102,7 +115,9 @@ def load_visual_cues(
     """An editor in the manifold of a checkpoint of experiment=motion_manifold; see `VisualCues` for the settings."""
     system, _ = load_system(manifold)
     if not isinstance(system, ManifoldTraining):
-        raise WearcapError("cues need a motion manifold", where=manifold, expected="a checkpoint of experiment=motion_manifold")  # fmt: skip
+        raise WearcapError(
+            "cues need a motion manifold", where=manifold, expected="a checkpoint of experiment=motion_manifold"
+        )
     return VisualCues(system.net, weights or LatentWeights(), solver or LatentSolver(), **settings)
 
 
@@ -110,7 +125,11 @@ def load_realism(checkpoint: str | Path, stride_s: float = 1.0) -> Realism:
     """Collector of FID and Diversity in the latent space of a motion autoencoder, over windows at a fixed stride."""
     system, _ = load_system(checkpoint)
     if not isinstance(system, MotionEncoding):
-        raise WearcapError("realism needs a motion autoencoder", where=checkpoint, expected="a checkpoint of experiment=motion_autoencoder")  # fmt: skip
+        raise WearcapError(
+            "realism needs a motion autoencoder",
+            where=checkpoint,
+            expected="a checkpoint of experiment=motion_autoencoder",
+        )
     return Realism(system.net, system.features, stride_s)
 
 
@@ -127,8 +146,11 @@ def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:
     """
     data = read_checkpoint(checkpoint)[0].get("data", {})
     if not data.get("sources"):
-        raise WearcapError("this checkpoint does not name the data it was trained on", where=checkpoint,
-                           fix="Give dataset=DIR and baselines=false.")  # fmt: skip
+        raise WearcapError(
+            "this checkpoint does not name the data it was trained on",
+            where=checkpoint,
+            fix="Give dataset=DIR and baselines=false.",
+        )
     sources = [source["root"] for source in data["sources"].values() if source]
     validated = [source["root"] for source in (data.get("val_sources") or data["sources"]).values() if source]
     return sources, validated[0]

@@ -12,9 +12,20 @@ from wearcap.errors import WearcapError, nearest
 from wearcap.io.formats.bounded import VARIABLE, gib_bytes
 
 VERBS = (
-    "train", "evaluate", "capture", "export", "prepare", "view", "render", "annotate", "scene", "calibrate",
-    "track", "doctor", "demo",
-)  # fmt: skip
+    "train",
+    "evaluate",
+    "capture",
+    "export",
+    "prepare",
+    "view",
+    "render",
+    "annotate",
+    "scene",
+    "calibrate",
+    "track",
+    "doctor",
+    "demo",
+)
 """Verbs in the order of the help; a verb is available if its module exists."""
 
 USER_ERROR, INTERRUPTED = 2, 130

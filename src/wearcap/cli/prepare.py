@@ -19,8 +19,11 @@ def run(config: DictConfig) -> Report:
     """Run the config's preparation: recordings by `tasks`, or by `rework` a change of an existing data set."""
     if "rework" in config:
         if "output" not in config.rework and Path(config.output) != Path(config.dataset):
-            raise WearcapError(f"output={config.output}, but this source rewrites the recordings of its data set",
-                               where=config.dataset, fix="Leave output=… out, or copy the data set first.")  # fmt: skip
+            raise WearcapError(
+                f"output={config.output}, but this source rewrites the recordings of its data set",
+                where=config.dataset,
+                fix="Leave output=… out, or copy the data set first.",
+            )
         report = instantiate(config.rework, _convert_="all")
         _show_report(report, RecordingStore.open(config.output))
         return report
@@ -28,9 +31,13 @@ def run(config: DictConfig) -> Report:
     splits = read_splits(listed if listed.is_file() else Path(config.splits))
     tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits)
     report = prepare(
-        tasks, config.output, jobs=config.jobs, backend=config.backend, scheduler=config.scheduler,
+        tasks,
+        config.output,
+        jobs=config.jobs,
+        backend=config.backend,
+        scheduler=config.scheduler,
         overwrite=config.overwrite,
-    )  # fmt: skip
+    )
     _show_report(report, RecordingStore.open(config.output))
     return report
 
@@ -43,9 +50,7 @@ def _show_report(report: Report, store: RecordingStore) -> None:
     ours = {*report.written, *report.current}
     if others := [name for name in store.names() if name not in ours]:
         print(f"{len(others)} recordings of earlier runs lie here too, {others[0]} among them")
-    print(
-        f"{store.root}: {len(report.written)} written, {len(report.current)} current, {len(report.failed)} failed"
-    )
+    print(f"{store.root}: {len(report.written)} written, {len(report.current)} current, {len(report.failed)} failed")
     for split in SPLITS:
         entries = [store.entries[name] for name in store.names(split)]
         minutes = sum(entry.duration_s for entry in entries) / 60
@@ -62,8 +67,11 @@ def usage() -> str:
     """Help text that lists the sources."""
     lines = ["usage: wearcap prepare SOURCE [key=value …]     wearcap prepare SOURCE --help", ""]
     for name, path in sources().items():
-        about = next(line[2:] for line in path.read_text(encoding="utf-8").splitlines()
-                     if line.startswith("# ") and not line.startswith("# @"))  # fmt: skip
+        about = next(
+            line[2:]
+            for line in path.read_text(encoding="utf-8").splitlines()
+            if line.startswith("# ") and not line.startswith("# @")
+        )
         lines.append(f"  {name:10} {about}")
     return "\n".join([*lines, "", (conf_dir() / "prepare.yaml").read_text(encoding="utf-8").split("\n\n")[1]])
 

@@ -21,17 +21,17 @@ HELP = "pictures without a screen: wearcap render DATASET/NAME --out sheet.png|m
 
 
 def main(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(
-        prog="wearcap render", description="Draw a recording to a PNG or an MP4."
-    )
+    parser = argparse.ArgumentParser(prog="wearcap render", description="Draw a recording to a PNG or an MP4.")
     parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
     parser.add_argument(
-        "--motion", nargs="+", action="extend", default=[], metavar="FILE",
+        "--motion",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FILE",
         help="captured motions (.npz that `wearcap capture` wrote) to draw with it",
-    )  # fmt: skip
-    parser.add_argument(
-        "--out", type=Path, help=".png for a contact sheet, .mp4 for a video (default: NAME.png)"
     )
+    parser.add_argument("--out", type=Path, help=".png for a contact sheet, .mp4 for a video (default: NAME.png)")
     parser.add_argument("--start", type=float, default=0.0, help="from this second of the recording on")
     parser.add_argument("--stop", type=float, help="up to this second")
     parser.add_argument("--frames", type=int, default=12, help="pictures in a contact sheet (default 12)")
@@ -72,9 +72,7 @@ def _between(motion: Motion, start_s: float, stop_s: float | None) -> Motion:
     first = int(np.searchsorted(since, start_s))
     stop = len(since) if stop_s is None else int(np.searchsorted(since, stop_s, side="right"))
     if stop <= first:
-        raise WearcapError(
-            f"no frames from {start_s} s to {stop_s} s", expected=f"times from 0 to {since[-1]:.1f} s"
-        )
+        raise WearcapError(f"no frames from {start_s} s to {stop_s} s", expected=f"times from 0 to {since[-1]:.1f} s")
     return motion.sliced(first, stop)
 
 

@@ -31,7 +31,9 @@ HELP = "the visual map of a scene: wearcap scene scene=FOLDER output=map.safeten
 def run(config: DictConfig) -> VisualMap:
     """Build or extend the config's map, report on it, and save it."""
     if config.every < 1 or config.check < 0:
-        raise WearcapError(f"every={config.every} check={config.check}", expected="every=1 (all photos) or more, check=0 or more")  # fmt: skip
+        raise WearcapError(
+            f"every={config.every} check={config.check}", expected="every=1 (all photos) or more, check=0 or more"
+        )
     photos, source = read_scene(config.scene, config.images, config.metres_per_unit)
     extractor, matcher, descriptor = (
         instantiate(config.localization[part]) for part in ("extractor", "matcher", "descriptor")
@@ -39,9 +41,7 @@ def run(config: DictConfig) -> VisualMap:
     options = {"descriptor": descriptor, "settings": instantiate(config.settings), "progress": True}
     taken = np.arange(0, len(photos), config.every)
     held_out = (
-        taken[:: len(taken) // config.check][: config.check]
-        if 0 < config.check <= len(taken) // 4
-        else taken[:0]
+        taken[:: len(taken) // config.check][: config.check] if 0 < config.check <= len(taken) // 4 else taken[:0]
     )
     rest = np.setdiff1d(taken, held_out)
     if config.extend is None:
@@ -58,7 +58,7 @@ def run(config: DictConfig) -> VisualMap:
     return made
 
 
-def _part(photos: list[Photo], source: Scan | Tracks, chosen: np.ndarray) -> tuple[list[Photo], Scan | Tracks]:  # fmt: skip
+def _part(photos: list[Photo], source: Scan | Tracks, chosen: np.ndarray) -> tuple[list[Photo], Scan | Tracks]:
     part = source.of_photos(chosen) if isinstance(source, Tracks) else source
     return [photos[number] for number in chosen], part
 
@@ -68,7 +68,9 @@ def _show_report(made: VisualMap) -> None:
     low, high = (reduce(made.t_world_cam, 0) for reduce in (np.min, np.max))
     table = Table(show_header=False)
     table.add_row("pictures", f"{len(made)}")
-    table.add_row("keypoints with a 3D position", f"{len(made.keypoints)} ({np.median(counts):.0f} in the median picture)")  # fmt: skip
+    table.add_row(
+        "keypoints with a 3D position", f"{len(made.keypoints)} ({np.median(counts):.0f} in the median picture)"
+    )
     table.add_row("landmarks", f"{len(made.landmarks.points_world)}")
     table.add_row("features", f"{made.extractor}, {made.descriptor}")
     table.add_row("cameras from", " ".join(f"{value:.2f}" for value in low))

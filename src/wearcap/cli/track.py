@@ -26,18 +26,7 @@ from wearcap.localization.tracking import (
 )
 
 HELP = "a camera's path and points from its video: wearcap track VIDEO, or wearcap track --from-model COLMAP_MODEL"
-_WITH_VALUE = (
-    "--cfg",
-    "-c",
-    "--info",
-    "-i",
-    "--package",
-    "-p",
-    "--config-name",
-    "-cn",
-    "--config-dir",
-    "-cd",
-)
+_WITH_VALUE = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd")
 """Hydra's options that take a value."""
 
 
@@ -63,7 +52,7 @@ def run(config: DictConfig) -> Track:
 
 def _from_model(config: DictConfig, settings: TrackSettings) -> Track:
     model = read_colmap(config.from_model, config.source)
-    pictures = model_row(model, settings.fps) if config.source is None else picture_row(config.source, settings.fps)  # fmt: skip
+    pictures = model_row(model, settings.fps) if config.source is None else picture_row(config.source, settings.fps)
     return track_of_model(model, pictures, settings.max_gap_s, where=config.from_model)
 
 
@@ -81,10 +70,12 @@ def _progress() -> Iterator[Advance]:
 
 
 def _show_report(found: Track, output: Path) -> None:
-    show(f"{found.placed} of {found.pictures} pictures placed, {len(found.points_world)} points, reprojection "
-         f"{found.reprojection_px:.2f} px; scale and axes are arbitrary")  # fmt: skip
+    show(
+        f"{found.placed} of {found.pictures} pictures placed, {len(found.points_world)} points, reprojection "
+        f"{found.reprojection_px:.2f} px; scale and axes are arbitrary"
+    )
     for start, stop, bridged in found.gaps_s:
-        show(f"[yellow]no place from {start:.2f} s to {stop:.2f} s: {'interpolated' if bridged else 'left out'}[/]")  # fmt: skip
+        show(f"[yellow]no place from {start:.2f} s to {stop:.2f} s: {'interpolated' if bridged else 'left out'}[/]")
     show(f"trajectory.txt, points.ply, camera.json, report.json: {output}")
 
 

@@ -12,15 +12,15 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="wearcap view", description="Show a recording in the browser.")
     parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
     parser.add_argument(
-        "--motion", nargs="+", action="extend", default=[], metavar="FILE",
+        "--motion",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FILE",
         help="captured motions (.npz that `wearcap capture` wrote) to show with it; several stand side by side",
-    )  # fmt: skip
-    parser.add_argument(
-        "--port", type=int, default=8080, help="port of the page (default 8080, else the next free)"
     )
-    parser.add_argument(
-        "--host", default="127.0.0.1", help="address to serve on (default: this machine only)"
-    )
+    parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080, else the next free)")
+    parser.add_argument("--host", default="127.0.0.1", help="address to serve on (default: this machine only)")
     parser.add_argument("--environment", help="objects to show (default: what the recording names)")
     options = parser.parse_args(arguments)
     if not 0 < options.port < 65536:
@@ -35,10 +35,13 @@ def main(arguments: list[str]) -> None:
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     recording = load_recording(options.recording)
     page = Page(
-        recording, read_motions(options.motion), folder=dataset_folder(options.recording),
-        host=options.host, port=options.port,
+        recording,
+        read_motions(options.motion),
+        folder=dataset_folder(options.recording),
+        host=options.host,
+        port=options.port,
         environment=environment_of(recording, options.recording, options.environment),
-    )  # fmt: skip
+    )
     print(f"{recording.name}: open {page.url} (Ctrl+C ends; space plays, J and L jump by a second)")
     try:
         page.run()

@@ -69,11 +69,16 @@ class SeededWindows(lightning.LightningDataModule):
 
     def _loader(self, dataset: Drawn, sampler) -> DataLoader:
         return DataLoader(
-            dataset, self.batch_size, sampler=sampler, num_workers=self.workers, collate_fn=collate,
+            dataset,
+            self.batch_size,
+            sampler=sampler,
+            num_workers=self.workers,
+            collate_fn=collate,
             persistent_workers=self.workers > 0,
             # A forked worker can inherit a held lock of the main process's threads and hang.
-            multiprocessing_context="forkserver" if self.workers else None, pin_memory=self.trainer is not None and self._on_gpu(),
-        )  # fmt: skip
+            multiprocessing_context="forkserver" if self.workers else None,
+            pin_memory=self.trainer is not None and self._on_gpu(),
+        )
 
     def _on_gpu(self) -> bool:
         return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
@@ -114,7 +119,13 @@ class MotionWindows(SeededWindows):
                 store = RecordingStore.open(source.root)
                 self.surroundings.places.prepare(store, store.names(split))
         return WindowDataset(
-            sources, split, window=self.window, stride=self.stride, fps=self.fps, mirror=self.augment and train,
-            balance=self.balance if train else 1.0, surroundings=self.surroundings,
+            sources,
+            split,
+            window=self.window,
+            stride=self.stride,
+            fps=self.fps,
+            mirror=self.augment and train,
+            balance=self.balance if train else 1.0,
+            surroundings=self.surroundings,
             beginnings=self.beginnings if train else 0.0,
-        )  # fmt: skip
+        )

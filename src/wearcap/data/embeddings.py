@@ -27,9 +27,7 @@ def embedding_name(encoder: ImageEncoder) -> str:
     return f"{encoder.name}-{encoder.fingerprint}"
 
 
-def embed_camera(
-    camera: CameraStream, folder: Path, encoder: ImageEncoder, cache: Path | None = None
-) -> CameraStream:
+def embed_camera(camera: CameraStream, folder: Path, encoder: ImageEncoder, cache: Path | None = None) -> CameraStream:
     """The stream with `embedding`, `embedding_mirrored` (float16) and `embedding_name`.
 
     `folder` is the data set's. Embeddings are kept in `cache` (default: `folder`/cache) below
@@ -46,9 +44,12 @@ def embed_camera(
             temporary.write_bytes(save(embeddings))  # save_file would leave a file of its own when killed
     count = len(embeddings["embedding"])
     if count != len(camera.timestamps):
-        raise WearcapError(f"{count} pictures for {len(camera.timestamps)} timestamps", where=files[0],
-                           expected="a picture for each timestamp of the camera",
-                           fix="The video was cut or belongs to another recording: prepare the data set again.")  # fmt: skip
+        raise WearcapError(
+            f"{count} pictures for {len(camera.timestamps)} timestamps",
+            where=files[0],
+            expected="a picture for each timestamp of the camera",
+            fix="The video was cut or belongs to another recording: prepare the data set again.",
+        )
     return replace(camera, **embeddings, embedding_name=name)
 
 
@@ -65,14 +66,19 @@ def _files(camera: CameraStream, folder: Path) -> list[Path]:
     """The video, or the image files. Raises WearcapError where there is none, or one is missing."""
     names = [camera.video] if camera.video is not None else list(camera.image_files or ())
     if not names:
-        raise WearcapError("this camera stream has no pictures", where=folder, expected="a video or image files",
-                           fix="Prepare the data set with its camera.")  # fmt: skip
+        raise WearcapError(
+            "this camera stream has no pictures",
+            where=folder,
+            expected="a video or image files",
+            fix="Prepare the data set with its camera.",
+        )
     files = [folder / name for name in names]
     if missing := [file for file in files if not file.is_file()]:
         raise WearcapError(
             "no such video" if camera.video is not None else f"{len(missing)} of {len(files)} pictures are missing",
-            where=missing[0], expected="the files that the recording names, below the data set's folder",
-        )  # fmt: skip
+            where=missing[0],
+            expected="the files that the recording names, below the data set's folder",
+        )
     return files
 
 
@@ -94,16 +100,13 @@ def _embed(
     frames: Iterator[UInt8[np.ndarray, "height width 3"]], encoder: ImageEncoder
 ) -> dict[str, Float[Tensor, "time feature"]]:
     parts = [
-        torch.stack([encoder.embed(batch), encoder.embed(batch.flip(2))]).half().cpu()
-        for batch in _batches(frames)
+        torch.stack([encoder.embed(batch), encoder.embed(batch.flip(2))]).half().cpu() for batch in _batches(frames)
     ]
     both = torch.cat(parts, 1) if parts else torch.zeros(2, 0, encoder.size).half()
     return dict(zip(_KEYS, both.contiguous().unbind()))
 
 
-def _batches(
-    frames: Iterator[UInt8[np.ndarray, "height width 3"]],
-) -> Iterator[UInt8[Tensor, "batch height width 3"]]:
+def _batches(frames: Iterator[UInt8[np.ndarray, "height width 3"]]) -> Iterator[UInt8[Tensor, "batch height width 3"]]:
     """Batches of successive frames of equal size."""
     batch: list[np.ndarray] = []
     for frame in frames:

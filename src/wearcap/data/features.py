@@ -19,8 +19,7 @@ LIMBS = {
 def body_size(skeleton: Skeleton) -> Float[Tensor, "limb"]:
     """`LIMBS` of a skeleton (m): height of the head joint in the rest pose, length of leg, arm and trunk."""
     lengths = [
-        sum(float(skeleton.t_parent_joint[skeleton.index(name)].norm()) for name in names)
-        for names in LIMBS.values()
+        sum(float(skeleton.t_parent_joint[skeleton.index(name)].norm()) for name in names) for names in LIMBS.values()
     ]
     return torch.tensor([skeleton.height_of("head"), *lengths[1:]])
 

@@ -60,10 +60,13 @@ class MotionFeatures:
         Raises WearcapError for a motion of other joints, or at another rate than `fps`.
         """
         if motion.skeleton.joint_names != self.skeleton.joint_names:
-            raise WearcapError(f"a motion of skeleton {motion.skeleton.name!r}", expected=f"the joints of {self.skeleton.name!r}")  # fmt: skip
+            raise WearcapError(
+                f"a motion of skeleton {motion.skeleton.name!r}", expected=f"the joints of {self.skeleton.name!r}"
+            )
         if len(motion) > 1 and abs(motion.fps - self.fps) > 0.01 * self.fps:
-            raise WearcapError(f"a motion of {motion.fps:.2f} frames per second", expected=f"{self.fps}",
-                               fix="Resample it first.")  # fmt: skip
+            raise WearcapError(
+                f"a motion of {motion.fps:.2f} frames per second", expected=f"{self.fps}", fix="Resample it first."
+            )
         seen = slice(None, None, self.every)
         R = motion.R_parent_joint[seen]
         joints = forward_kinematics(motion.skeleton, R, motion.t_world_root[seen]).t
@@ -96,9 +99,7 @@ class MotionFeatures:
         found = [(height[..., joint] < top) & (speed[..., joint] < CONTACT_SPEED_M_S) for joint, top in feet]
         return torch.stack(found, -1).to(height.dtype)
 
-    def joints(
-        self, features: Float[Tensor, "window frame feature"]
-    ) -> Float[Tensor, "window frame joint 3"]:
+    def joints(self, features: Float[Tensor, "window frame feature"]) -> Float[Tensor, "window frame joint 3"]:
         """Joint positions (m) decoded from features, in the heading frame with origin on the floor below the root."""
         others = features[..., 4 : 1 + 3 * len(self.skeleton)].unflatten(-1, (-1, 3))
         root = torch.cat([torch.zeros_like(features[..., :2]), features[..., 3:4]], -1)

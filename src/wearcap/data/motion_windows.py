@@ -23,9 +23,16 @@ class MovementDataset(Dataset):
     """
 
     def __init__(
-        self, sources: list[Source], split: str, *, features: MotionFeatures, window: int, stride: int,
-        augment: bool = False, balance: float = 1.0,
-    ):  # fmt: skip
+        self,
+        sources: list[Source],
+        split: str,
+        *,
+        features: MotionFeatures,
+        window: int,
+        stride: int,
+        augment: bool = False,
+        balance: float = 1.0,
+    ):
         """`augment` shifts windows by up to a stride and mirrors half of them; `balance`: see `WindowDataset`."""
         self.features, self.length, self.augment = features, window // features.every, augment
         self.stride = stride
@@ -58,8 +65,7 @@ def mirror(movement: Movement, skeleton: Skeleton) -> Movement:
     flip = movement.joints.new_tensor(MIRROR)
     twins = joint_twins(skeleton)
     return movement._replace(
-        joints=movement.joints[..., twins, :] * flip,
-        R_world_root=movement.R_world_root * torch.outer(flip, flip),
+        joints=movement.joints[..., twins, :] * flip, R_world_root=movement.R_world_root * torch.outer(flip, flip)
     )
 
 
@@ -67,10 +73,20 @@ class MovementWindows(SeededWindows):
     """Windows of true motion for Lightning."""
 
     def __init__(
-        self, sources: dict[str, dict | None], features: MotionFeatures, window: int, stride: int, batch_size: int,
-        steps_per_epoch: int | None = None, val_windows: int | None = None, workers: int = 0, seed: int = 0,
-        augment: bool = True, balance: float = 1.0, val_sources: dict[str, dict | None] | None = None,
-    ):  # fmt: skip
+        self,
+        sources: dict[str, dict | None],
+        features: MotionFeatures,
+        window: int,
+        stride: int,
+        batch_size: int,
+        steps_per_epoch: int | None = None,
+        val_windows: int | None = None,
+        workers: int = 0,
+        seed: int = 0,
+        augment: bool = True,
+        balance: float = 1.0,
+        val_sources: dict[str, dict | None] | None = None,
+    ):
         """See `SeededWindows` and `MovementDataset`; `augment` and `balance` are for training alone."""
         super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
         self.features, self.window, self.stride = features, window, stride
@@ -79,6 +95,11 @@ class MovementWindows(SeededWindows):
     def dataset(self, split: str) -> MovementDataset:
         train = split == "train"
         return MovementDataset(
-            self.sources if train else self.val_sources, split, features=self.features, window=self.window,
-            stride=self.stride, augment=self.augment and train, balance=self.balance if train else 1.0,
-        )  # fmt: skip
+            self.sources if train else self.val_sources,
+            split,
+            features=self.features,
+            window=self.window,
+            stride=self.stride,
+            augment=self.augment and train,
+            balance=self.balance if train else 1.0,
+        )

@@ -3,10 +3,32 @@
 from wearcap.errors import WearcapError, nearest
 
 OBJECT_CLASSES: tuple[str, ...] = (
-    "backpack", "ball", "bottle", "box", "cabinet_door", "chair", "clothesstand", "container", "door", "drawer",
-    "floorlamp", "keyboard", "monitor", "mop", "sofa", "stool", "suitcase", "table", "tool", "toolbox", "trashcan",
-    "tripod", "vacuum", "window", "yogamat",
-)  # fmt: skip
+    "backpack",
+    "ball",
+    "bottle",
+    "box",
+    "cabinet_door",
+    "chair",
+    "clothesstand",
+    "container",
+    "door",
+    "drawer",
+    "floorlamp",
+    "keyboard",
+    "monitor",
+    "mop",
+    "sofa",
+    "stool",
+    "suitcase",
+    "table",
+    "tool",
+    "toolbox",
+    "trashcan",
+    "tripod",
+    "vacuum",
+    "window",
+    "yogamat",
+)
 """All classes in alphabetical order; a class's index is its position here."""
 
 _OTHER_NAMES = {
@@ -32,6 +54,9 @@ def object_class(name: str) -> str:
     if name not in _CLASS_OF:
         near = nearest(name, _CLASS_OF)
         hint = near if near.startswith("Did you mean") else ""
-        raise WearcapError(f"no class for the object {name!r}", expected=f"one of {', '.join(sorted(_CLASS_OF))}",
-                           fix=f"{hint} A new name belongs into data/object_classes.py.".strip())  # fmt: skip
+        raise WearcapError(
+            f"no class for the object {name!r}",
+            expected=f"one of {', '.join(sorted(_CLASS_OF))}",
+            fix=f"{hint} A new name belongs into data/object_classes.py.".strip(),
+        )
     return _CLASS_OF[name]

@@ -60,9 +60,7 @@ class PlaceCodes:
     def prepare(self, store: RecordingStore, names: Iterable[str]) -> None:
         """Compute the missing codes of recordings."""
         folder = store.root / "cache" / f"places-{self.fingerprint}"
-        todo = [
-            name for name in names if not (folder / f"{store.entries[name].sha256}.safetensors").is_file()
-        ]
+        todo = [name for name in names if not (folder / f"{store.entries[name].sha256}.safetensors").is_file()]
         for name in track(todo, f"points of {store.root.name}", disable=not todo):
             self.file_of(store.root, store.entries[name])
 

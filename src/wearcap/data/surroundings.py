@@ -43,9 +43,7 @@ class Surroundings:
         """
         return 0 if self.images is None else embeddings_of(self.images, stores)[1]
 
-    def read(
-        self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int
-    ) -> Seen:
+    def read(self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int) -> Seen:
         """Frames start…stop-1 of the head stream; with `mirrored`, those of the surroundings mirrored left to right.
 
         Raises WearcapError as `PlaceCodes.file_of` does.
@@ -84,18 +82,17 @@ def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]
     for file in (_open(store.path_of(name)) for store in stores for name in store.names()):
         full = _pictured(file.path)
         if full is not None and not _ENCODER_NAME.fullmatch(full):
-            raise WearcapError(
-                f"embeddings of {full[:80]!r}", where=file.path, expected="the plain name of an encoder"
-            )
+            raise WearcapError(f"embeddings of {full[:80]!r}", where=file.path, expected="the plain name of an encoder")
         if full is not None and (full == encoder or full.startswith(f"{encoder}-")):
             kinds.add((full, file.tensor("camera.embedding").shape[1]))
     if len(kinds) != 1:
         found = ", ".join(f"{name} with {size} features" for name, size in sorted(kinds))
         raise WearcapError(
             f"embeddings of several kinds: {found}" if kinds else f"no recording has embeddings of {encoder!r}",
-            where=", ".join(str(store.root) for store in stores), expected=f"embeddings of one {encoder!r}",
+            where=", ".join(str(store.root) for store in stores),
+            expected=f"embeddings of one {encoder!r}",
             fix=f"Run: wearcap prepare embeddings dataset=DIR encoder={encoder.split('-')[0]}",
-        )  # fmt: skip
+        )
     return kinds.pop()
 
 

@@ -94,8 +94,11 @@ def share_out(
             weights += [source.weight * count ** (balance - 1) / total] * count
             recordings.append((store, name))
     if not starts:
-        raise WearcapError(f"no windows in split {split!r}", where=", ".join(s.root for s in sources),
-                           expected=f"recordings of at least {min_frames} frames")  # fmt: skip
+        raise WearcapError(
+            f"no windows in split {split!r}",
+            where=", ".join(s.root for s in sources),
+            expected=f"recordings of at least {min_frames} frames",
+        )
     return recordings, torch.tensor(starts), torch.tensor(weights, dtype=torch.float64)
 
 
@@ -103,8 +106,12 @@ def _usable(store: RecordingStore, split: str, fps: float, min_frames: int) -> I
     for name in store.names(split):
         entry = store.entries[name]
         if abs(entry.fps - fps) > 0.01 * fps:
-            raise WearcapError(f"recording {name!r} has {entry.fps} frames per second", where=store.root,
-                               expected=f"{fps}", fix="Prepare the data set at that rate.")  # fmt: skip
+            raise WearcapError(
+                f"recording {name!r} has {entry.fps} frames per second",
+                where=store.root,
+                expected=f"{fps}",
+                fix="Prepare the data set at that rate.",
+            )
         if entry.frames >= min_frames:
             yield name
 
@@ -160,13 +167,7 @@ class WindowDataset(Dataset):
         return self._read(*self.recordings[recording], start, length, self.mirror and mirrored < 0.5, random)
 
     def _read(
-        self,
-        store: RecordingStore,
-        name: str,
-        start: int,
-        length: int,
-        mirrored: bool,
-        random: torch.Generator,
+        self, store: RecordingStore, name: str, start: int, length: int, mirrored: bool, random: torch.Generator
     ) -> Window:
         """Frames start…start+length-1 of a recording, padded to a whole window by the last frame."""
         file = _open(store.path_of(name))
@@ -180,12 +181,20 @@ class WindowDataset(Dataset):
         seen = self.surroundings.read(store, name, start, stop, mirrored, self.image_size)
         joints = len(constants.skeleton)
         window = Window(
-            file.window("motion.R_parent_joint", start, stop)[take], T_world_head.R, T_world_head.t,
-            constants.floor_height[start:stop][take], constants.floor_from_head[start:stop][take], torch.arange(self.window) < stop - start,
-            constants.skeleton.t_parent_joint, constants.size, constants.foot_contact[start:stop][take],
-            *(part[take] for part in seen), torch.randn(self.window, 6 * joints + FEET, generator=random),
-            torch.rand(1, generator=random), torch.rand(3, generator=random),
-        )  # fmt: skip
+            file.window("motion.R_parent_joint", start, stop)[take],
+            T_world_head.R,
+            T_world_head.t,
+            constants.floor_height[start:stop][take],
+            constants.floor_from_head[start:stop][take],
+            torch.arange(self.window) < stop - start,
+            constants.skeleton.t_parent_joint,
+            constants.size,
+            constants.foot_contact[start:stop][take],
+            *(part[take] for part in seen),
+            torch.randn(self.window, 6 * joints + FEET, generator=random),
+            torch.rand(1, generator=random),
+            torch.rand(3, generator=random),
+        )
         return mirror_window(window, constants.skeleton) if mirrored else window
 
 
@@ -211,8 +220,12 @@ class _Constants:
 def _constants(path: Path) -> _Constants:
     file = _open(path)
     if file.length("head.timestamps") != file.length("motion.timestamps"):
-        raise WearcapError("head and motion have different lengths", where=path,
-                           expected="both on one clock", fix="Prepare the recording again.")  # fmt: skip
+        raise WearcapError(
+            "head and motion have different lengths",
+            where=path,
+            expected="both on one clock",
+            fix="Prepare the recording again.",
+        )
     recording = file.load()
     head, motion = recording.head, recording.motion
     assert head is not None
@@ -222,9 +235,13 @@ def _constants(path: Path) -> _Constants:
     from_points = floor_from_points(recording.points, t_world_head, stature)
     mount = Rigid(head.R_head_device, head.t_head_device)
     return _Constants(
-        motion.skeleton, mount.inverse(), body_size(motion.skeleton),
-        from_path if from_points is None else from_points, from_path, true_foot_contact(recording).float(),
-    )  # fmt: skip
+        motion.skeleton,
+        mount.inverse(),
+        body_size(motion.skeleton),
+        from_path if from_points is None else from_points,
+        from_path,
+        true_foot_contact(recording).float(),
+    )
 
 
 def true_foot_contact(recording: Recording) -> Bool[Tensor, "time foot"]:

@@ -16,8 +16,7 @@ from wearcap.errors import WearcapError
 
 STEPS = ("posterior", "redraw")
 Denoise = Callable[
-    [Float[Tensor, "batch frame feature"], Float[Tensor, "batch frame modality"]],
-    Float[Tensor, "batch frame feature"],
+    [Float[Tensor, "batch frame feature"], Float[Tensor, "batch frame modality"]], Float[Tensor, "batch frame feature"]
 ]
 """x̂0 from x_t and its noise levels, for all frames on the conveyor."""
 
@@ -102,8 +101,7 @@ class Conveyor:
         denoise: Denoise,
         observation: Observation,
         noise: Float[Tensor, "step batch frame feature"],
-        correct: Callable[[Float[Tensor, "batch frame feature"]], Float[Tensor, "batch frame feature"]]
-        | None = None,
+        correct: Callable[[Float[Tensor, "batch frame feature"]], Float[Tensor, "batch frame feature"]] | None = None,
     ) -> None:
         """Take the steps between two frames; `noise` has the noise of each, `correct` changes every x̂0 (guidance).
 
@@ -117,10 +115,7 @@ class Conveyor:
         self.level = torch.where(observation.is_observed, 0.0, torch.where(gone, 1.0, self.level))
         for fresh in noise:
             due = self.rolling.levels(self.age + 1)[:, None].expand_as(self.level)
-            level, then = (
-                self.level,
-                torch.where(observation.is_absent, self.level, torch.minimum(due, self.level)),
-            )
+            level, then = (self.level, torch.where(observation.is_absent, self.level, torch.minimum(due, self.level)))
             self.x = torch.where(observed, observation.observed, self.x)
             x0_hat = denoise(self.x, level)
             if correct is not None:

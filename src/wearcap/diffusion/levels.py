@@ -39,8 +39,10 @@ class LevelMix:
             or self.independent + self.conveyor > 1 + 1e-9
             or not 0 <= self.whole < 1
         ):
-            raise WearcapError(f"shares {self.independent} and {self.conveyor}, {self.whole} of windows fully observed, ramps of {low} to {high} frames",
-                               expected="shares that add up to no more than 1, less than 1 fully observed, and a rising pair of 1 or more frames")  # fmt: skip
+            raise WearcapError(
+                f"shares {self.independent} and {self.conveyor}, {self.whole} of windows fully observed, ramps of {low} to {high} frames",
+                expected="shares that add up to no more than 1, less than 1 fully observed, and a rising pair of 1 or more frames",
+            )
 
     def levels(
         self, frames: Float[Tensor, "batch time draw"], draws: Float[Tensor, "batch 9"]
@@ -58,9 +60,7 @@ class LevelMix:
         single = draws[:, None, -1:] if self.together else draws[:, None, -count:]
         single = single.expand(-1, time, count)
         levels = torch.where(
-            kind < self.independent,
-            frames,
-            torch.where(kind < self.independent + self.conveyor, grows, single),
+            kind < self.independent, frames, torch.where(kind < self.independent + self.conveyor, grows, single)
         )
         modality = torch.arange(count, device=frames.device) == (which * count).long()
         # The share of observed frames is the cube of a uniform number, so that few are as frequent as many.

@@ -43,9 +43,7 @@ def posterior_step(
     variance = noise_left / noise_now * (1 - now / after)
     spread = eta * variance.clamp_min(0).sqrt()
     epsilon_hat = (x_t - now.sqrt() * x0_hat) / noise_now.sqrt()
-    x_next = (
-        after.sqrt() * x0_hat + (noise_left - spread**2).clamp_min(0).sqrt() * epsilon_hat + spread * noise
-    )
+    x_next = after.sqrt() * x0_hat + (noise_left - spread**2).clamp_min(0).sqrt() * epsilon_hat + spread * noise
     x_next = torch.where(level_next == 0, x0_hat, x_next)
     return torch.where(level == level_next, x_t, x_next)
 

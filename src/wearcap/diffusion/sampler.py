@@ -9,9 +9,7 @@ from torch import Tensor
 from wearcap.diffusion.process import posterior_step
 from wearcap.diffusion.schedule import Schedule
 
-Denoise = Callable[
-    [Float[Tensor, "batch time feature"], Float[Tensor, "batch 1"]], Float[Tensor, "batch time feature"]
-]
+Denoise = Callable[[Float[Tensor, "batch time feature"], Float[Tensor, "batch 1"]], Float[Tensor, "batch time feature"]]
 """x̂0 from x_t and its noise level."""
 
 

@@ -21,15 +21,11 @@ def check_head_against_body(head: HeadStream, motion: Motion) -> list[Finding]:
     body = Trajectory(motion.timestamps, joint.R, joint.t)
     device = Trajectory(head.timestamps, head.R_world_device, head.t_world_device)
     findings = []
-    lag = lag_between(
-        body.timestamps, spin_of(body).norm(dim=-1), device.timestamps, spin_of(device).norm(dim=-1)
-    )
+    lag = lag_between(body.timestamps, spin_of(body).norm(dim=-1), device.timestamps, spin_of(device).norm(dim=-1))
     offset = offset_finding(lag, "the head stream")
     if offset:
         findings.append(
-            Finding(
-                offset.severity, "head against body: clock offset", offset.what, offset.evidence, offset.fix
-            )
+            Finding(offset.severity, "head against body: clock offset", offset.what, offset.evidence, offset.fix)
         )
     inside = (body.timestamps >= device.timestamps[0]) & (body.timestamps <= device.timestamps[-1])
     if inside.sum() < 10:
@@ -45,7 +41,8 @@ def check_head_against_body(head: HeadStream, motion: Motion) -> list[Finding]:
         ]
     at = resample(device, body.timestamps[inside])
     T_head_device = Rigid(body.R_world_body[inside].double(), body.t_world_body[inside].double()).inverse() @ Rigid(
-        at.R_world_body.double(), at.t_world_body.double())  # fmt: skip
+        at.R_world_body.double(), at.t_world_body.double()
+    )
     return [*findings, _check_mounting(T_head_device, head)]
 
 
@@ -58,17 +55,32 @@ def _check_mounting(T_head_device: Rigid, head: HeadStream) -> Finding:
         f"90 % of the time within {100 * shift:.1f} cm and {turn:.1f}° of a constant seat",
     )
     if shift > 0.3 or turn > 30:
-        return Finding("error", check, "the device does not ride on the head", evidence,
-                       "Head and body are in different worlds (align them), on different clocks, or of different people.")  # fmt: skip
+        return Finding(
+            "error",
+            check,
+            "the device does not ride on the head",
+            evidence,
+            "Head and body are in different worlds (align them), on different clocks, or of different people.",
+        )
     off_m = (mean_t - head.t_head_device.double()).norm().item()
     off_deg = math.degrees(rotation.geodesic(mean_R, head.R_head_device.double()).item())
     evidence += f"; mean {100 * off_m:.1f} cm and {off_deg:.1f}° from the stated one"
     if off_m > 0.08 or off_deg > 15:
-        return Finding("warning", check, "the stated seat of the device is off", evidence,
-                       f"t_head_device = ({', '.join(f'{v:.3f}' for v in mean_t.tolist())}) m fits this recording.")  # fmt: skip
+        return Finding(
+            "warning",
+            check,
+            "the stated seat of the device is off",
+            evidence,
+            f"t_head_device = ({', '.join(f'{v:.3f}' for v in mean_t.tolist())}) m fits this recording.",
+        )
     severity = "warning" if shift > 0.06 or turn > 12 else "ok"
-    return Finding(severity, check, "the device moves on the head" if severity == "warning" else "constant", evidence,
-                   "A drifting alignment or a slipping device." if severity == "warning" else "")  # fmt: skip
+    return Finding(
+        severity,
+        check,
+        "the device moves on the head" if severity == "warning" else "constant",
+        evidence,
+        "A drifting alignment or a slipping device." if severity == "warning" else "",
+    )
 
 
 def check_head_cue(head: HeadStream, cue: Cue) -> list[Finding]:
@@ -77,17 +89,34 @@ def check_head_cue(head: HeadStream, cue: Cue) -> list[Finding]:
     inside = (cue.timestamps >= head.timestamps[0]) & (cue.timestamps <= head.timestamps[-1])
     inside &= (cue.confidence > 0) & cue.points.isfinite().all(-1)
     if cue.points.shape[-1] != 3 or inside.sum() < 2:
-        return [Finding("error", check, "hardly overlap in time", f"{int(inside.sum())} shared keypoints", "Bring both to one clock.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                "hardly overlap in time",
+                f"{int(inside.sum())} shared keypoints",
+                "Bring both to one clock.",
+            )
+        ]
     track = Trajectory(head.timestamps, head.R_world_device, head.t_world_device)
     at = resample(track, cue.timestamps[inside])
     t_device_joint = (at.R_world_body.mT @ (cue.points[inside] - at.t_world_body)[..., None])[..., 0]
     mean = t_device_joint.median(0).values
     shift = quantile((t_device_joint - mean).norm(dim=-1), 0.9)
-    evidence = (f"90 % of the time within {100 * shift:.2g} cm of a constant place, "
-                f"({', '.join(f'{v:.3f}' for v in mean.tolist())}) m of the device")  # fmt: skip
+    evidence = (
+        f"90 % of the time within {100 * shift:.2g} cm of a constant place, "
+        f"({', '.join(f'{v:.3f}' for v in mean.tolist())}) m of the device"
+    )
     if shift > 0.1 or mean.norm() > 0.4:
-        return [Finding("error", check, "the tracked head does not ride with the device", evidence,
-                        "They are in different worlds, on different clocks, or of different people.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                "the tracked head does not ride with the device",
+                evidence,
+                "They are in different worlds, on different clocks, or of different people.",
+            )
+        ]
     return [Finding("ok", check, "the tracked head rides with the device", evidence)]
 
 
@@ -117,9 +146,7 @@ def check_points(points: PointCloud, head: HeadStream | None) -> list[Finding]:
     spread = quantile((cloud - cloud.median(0).values).norm(dim=-1), 0.5)
     evidence = f"{len(cloud)} points, half of them within {spread:.3g} m"
     if not 0.2 < spread < 200:
-        return [
-            Finding("error", "points", "not a surrounding in metres", evidence, "Check the cloud's unit.")
-        ]
+        return [Finding("error", "points", "not a surrounding in metres", evidence, "Check the cloud's unit.")]
     findings = [Finding("ok", "points", "a surrounding in metres", evidence)]
     return findings if head is None else [*findings, _floor_below(points, head)]
 
@@ -184,9 +211,7 @@ def check_camera(stream: CameraStream) -> list[Finding]:
             )
         )
     view, down = stream.R_head_cam[:, 2], stream.R_head_cam[:, 1]
-    evidence = (
-        f"view {100 * view[0]:.0f} % forward, image's down {-100 * down[2]:.0f} % downward in head axes"
-    )
+    evidence = f"view {100 * view[0]:.0f} % forward, image's down {-100 * down[2]:.0f} % downward in head axes"
     if view[0] < 0.3:
         findings.append(
             Finding(
@@ -200,11 +225,7 @@ def check_camera(stream: CameraStream) -> list[Finding]:
     elif down[2] > -0.5:
         findings.append(
             Finding(
-                "note",
-                "camera: axes",
-                "the camera is rolled",
-                evidence,
-                "Turn the images upright, or keep it in mind.",
+                "note", "camera: axes", "the camera is rolled", evidence, "Turn the images upright, or keep it in mind."
             )
         )
     else:

@@ -22,9 +22,7 @@ from wearcap.recording import FloorTrack, Motion
 def check_motion(stream: str, motion: Motion, floor: FloorTrack | None) -> list[Finding]:
     """All checks of one motion whose timestamps rise."""
     findings = check_rotations(stream, motion.R_parent_joint)
-    findings += check_speed(
-        stream, Trajectory(motion.timestamps, motion.R_parent_joint[:, 0], motion.t_world_root)
-    )
+    findings += check_speed(stream, Trajectory(motion.timestamps, motion.R_parent_joint[:, 0], motion.t_world_root))
     findings += check_size(stream, motion.skeleton)
     if any(finding.severity == "error" for finding in findings):
         return findings
@@ -32,10 +30,7 @@ def check_motion(stream: str, motion: Motion, floor: FloorTrack | None) -> list[
     try:
         parts = landmarks(motion.skeleton)
     except WearcapError as error:
-        return [
-            *findings,
-            Finding("note", f"{stream}: skeleton", "limbs are not recognised by name", str(error)),
-        ]
+        return [*findings, Finding("note", f"{stream}: skeleton", "limbs are not recognised by name", str(error))]
     findings += check_posture(stream, motion, parts)
     if any(finding.severity == "error" for finding in findings):
         return findings
@@ -53,22 +48,25 @@ def check_size(stream: str, skeleton: Skeleton) -> list[Finding]:
     evidence = f"about {height:.3g} m tall by its bones"
     if not HEIGHT_M[0] < height < HEIGHT_M[1]:
         unit = min(UNITS_M, key=lambda name: abs(height * UNITS_M[name] - 1.7))
-        fix = (
-            f"In {unit} it would be {height * UNITS_M[unit]:.2f} m: multiply lengths by {UNITS_M[unit]:.4g}."
-        )
+        fix = f"In {unit} it would be {height * UNITS_M[unit]:.2f} m: multiply lengths by {UNITS_M[unit]:.4g}."
         return [Finding("error", check, "no person's size", evidence, fix)]
     lengths = skeleton.t_parent_joint.norm(dim=-1)
-    pairs = [
-        (name, name.replace("left", "right")) for name in skeleton.joint_names if name.startswith("left")
-    ]
+    pairs = [(name, name.replace("left", "right")) for name in skeleton.joint_names if name.startswith("left")]
     uneven = [
         left
         for left, right in pairs
         if right in skeleton and _differ(lengths[skeleton.index(left)], lengths[skeleton.index(right)])
     ]
     if uneven:
-        return [Finding("warning", check, "bones differ left from right", f"{evidence}; {', '.join(uneven)}",
-                        "Check the subject's measured bone lengths.")]  # fmt: skip
+        return [
+            Finding(
+                "warning",
+                check,
+                "bones differ left from right",
+                f"{evidence}; {', '.join(uneven)}",
+                "Check the subject's measured bone lengths.",
+            )
+        ]
     return [Finding("ok", check, "a person's size", evidence)]
 
 
@@ -100,9 +98,15 @@ def check_joint_angles(stream: str, motion: Motion) -> list[Finding]:
         if flips.any():
             names = [motion.skeleton.joint_names[1 + int(joint)] for joint in flips.any(0).nonzero()]
             share = flips.any(1).double().mean().item()
-            return [Finding("warning" if share > 0.01 else "note", check, "joints flip within a frame",
-                            f"{int(flips.any(1).sum())} frames above 60 rad/s ({', '.join(names[:4])}); {evidence}",
-                            "Euler angles that wrap or a lost marker: filter these frames.")]  # fmt: skip
+            return [
+                Finding(
+                    "warning" if share > 0.01 else "note",
+                    check,
+                    "joints flip within a frame",
+                    f"{int(flips.any(1).sum())} frames above 60 rad/s ({', '.join(names[:4])}); {evidence}",
+                    "Euler angles that wrap or a lost marker: filter these frames.",
+                )
+            ]
     return [Finding("ok", check, "plausible", evidence)]
 
 
@@ -113,9 +117,7 @@ def check_posture(stream: str, motion: Motion, parts: Landmarks) -> list[Finding
     upward = position[:, parts.head] - position[:, [left_ankle, right_ankle]].mean(1)
     upward = torch.nn.functional.normalize(upward, dim=-1)
     mean, check = upward.mean(0), f"{stream}: up axis"
-    evidence = (
-        "from feet to head: (" + ", ".join(f"{v:+.2f}" for v in mean.tolist()) + ") of the world, on average"
-    )
+    evidence = "from feet to head: (" + ", ".join(f"{v:+.2f}" for v in mean.tolist()) + ") of the world, on average"
     if mean[2] < 0.5:
         axis = int(mean.abs().argmax())
         name = ("-" if mean[axis] < 0 else "+") + "xyz"[axis]
@@ -128,24 +130,23 @@ def check_posture(stream: str, motion: Motion, parts: Landmarks) -> list[Finding
         severity = "error" if clear else "warning"
         return [
             Finding(
-                severity,
-                check,
-                f"the body stands along {name}" if clear else "the body is not upright",
-                evidence,
-                fix,
+                severity, check, f"the body stands along {name}" if clear else "the body is not upright", evidence, fix
             )
         ]
     findings = [Finding("ok", check, "z is up", evidence)]
     forward = torch.linalg.cross(position[:, left_hip] - position[:, right_hip], upward)
     toes = [(parts.limb[f"{side}_leg"][2], parts.toe[side]) for side in ("left", "right")]
-    ahead = [
-        (forward * (position[:, toe] - position[:, ankle])).sum(-1) > 0
-        for ankle, toe in toes
-        if toe is not None
-    ]
+    ahead = [(forward * (position[:, toe] - position[:, ankle])).sum(-1) > 0 for ankle, toe in toes if toe is not None]
     if ahead and torch.stack(ahead).double().mean() < 0.3:
-        findings.append(Finding("error", f"{stream}: sides", "left and right are exchanged", "the toes point backwards as seen from the hips",
-                                "Exchange left and right joints, or undo a mirrored axis."))  # fmt: skip
+        findings.append(
+            Finding(
+                "error",
+                f"{stream}: sides",
+                "left and right are exchanged",
+                "the toes point backwards as seen from the hips",
+                "Exchange left and right joints, or undo a mirrored axis.",
+            )
+        )
     return findings
 
 
@@ -158,9 +159,7 @@ def check_knees(stream: str, motion: Motion, parts: Landmarks) -> list[Finding]:
         thigh, shank = (torch.nn.functional.normalize(v, dim=-1) for v in (knee - hip, ankle - knee))
         bent = (thigh * shank).sum(-1) < math.cos(math.radians(25))
         # Flexion rotates the shank about the axis to the left, so thigh × shank points to the right of the body.
-        wrong = (torch.linalg.cross(thigh, shank) * torch.nn.functional.normalize(across, dim=-1)).sum(
-            -1
-        ) < -0.2
+        wrong = (torch.linalg.cross(thigh, shank) * torch.nn.functional.normalize(across, dim=-1)).sum(-1) < -0.2
         if bent.sum() > 10 and (wrong & bent).sum() > 0.3 * bent.sum():
             bad.append(f"{side} ({100 * (wrong & bent).sum() / bent.sum():.0f} % of bent frames)")
     if bad:
@@ -182,27 +181,21 @@ def check_feet(stream: str, motion: Motion, parts: Landmarks, floor: FloorTrack 
     height = feet[..., 2] - _floor_at(floor, motion)[:, None]
     check, lowest = f"{stream}: feet on the floor", height.amin(1)
     low, usual = quantile(lowest, 0.1), quantile(lowest, 0.5)
-    evidence = f"the lowest foot point is at {100 * low:+.1f} cm in its lowest tenth, {100 * usual:+.1f} cm in the median"
+    evidence = (
+        f"the lowest foot point is at {100 * low:+.1f} cm in its lowest tenth, {100 * usual:+.1f} cm in the median"
+    )
     findings = []
     if floor is None and (abs(usual) > 0.1 or low < -0.1):
         findings.append(
             Finding(
-                "note",
-                check,
-                "the floor is not at z = 0",
-                evidence,
-                "Give the recording a floor, or move the world.",
+                "note", check, "the floor is not at z = 0", evidence, "Give the recording a floor, or move the world."
             )
         )
     elif abs(usual) > 0.1 or low < -0.1:
         where = "sink into" if low < -0.1 else "float above" if usual > 0.1 else "are below"
         findings.append(
             Finding(
-                "warning",
-                check,
-                f"feet {where} the floor",
-                evidence,
-                "Check the floor's height and the foot's size.",
+                "warning", check, f"feet {where} the floor", evidence, "Check the floor's height and the foot's size."
             )
         )
     else:
@@ -212,8 +205,15 @@ def check_feet(stream: str, motion: Motion, parts: Landmarks, floor: FloorTrack 
     slide = _sliding_cm_s(motion, feet, lowest)
     pace = 100 * quantile(linear_velocity(_root(motion))[:, :2].norm(dim=-1), 0.5)
     if slide is not None and slide > max(20.0, 0.15 * pace):
-        findings.append(Finding("warning", f"{stream}: foot sliding", "standing feet slide", f"{slide:.0f} cm/s while within 3 cm of the floor (half of the frames)",
-                                "Frame rate, unit of the root's path, or legs' lengths may be wrong."))  # fmt: skip
+        findings.append(
+            Finding(
+                "warning",
+                f"{stream}: foot sliding",
+                "standing feet slide",
+                f"{slide:.0f} cm/s while within 3 cm of the floor (half of the frames)",
+                "Frame rate, unit of the root's path, or legs' lengths may be wrong.",
+            )
+        )
     elif slide is not None:
         findings.append(
             Finding("ok", f"{stream}: foot sliding", "standing feet stand", f"{slide:.1f} cm/s in the median")

@@ -41,13 +41,7 @@ def check_environment(environment: Environment) -> list[Finding]:
     objects = environment.objects
     if not objects:
         return [
-            Finding(
-                "warning",
-                "environment",
-                "no objects",
-                "nothing in it can be moved",
-                "Add some: wearcap scene.",
-            )
+            Finding("warning", "environment", "no objects", "nothing in it can be moved", "Add some: wearcap scene.")
         ]
     kinds = [item.freedom.kind for item in objects]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
@@ -65,8 +59,12 @@ def _about(item: SceneObject) -> Finding:
     place = ", ".join(f"{v:.2f}" for v in item.t_world_object.tolist())
     triangles = len(item.mesh.faces)
     shape = f"{triangles} triangles" if triangles else f"a cloud of {len(item.mesh.vertices)} points"
-    return Finding("ok", f"object {item.name}", f"{item.category or 'object'}: {_moves(item)}",
-                   f"{size} m, {shape}, at ({place}) m")  # fmt: skip
+    return Finding(
+        "ok",
+        f"object {item.name}",
+        f"{item.category or 'object'}: {_moves(item)}",
+        f"{size} m, {shape}, at ({place}) m",
+    )
 
 
 def _moves(item: SceneObject) -> str:
@@ -91,11 +89,25 @@ def _moves(item: SceneObject) -> str:
 def _size(item: SceneObject) -> list[Finding]:
     longest = float(np.ptp(box_in_world(item), axis=0).max())
     if longest < TINY_M:
-        return [Finding("warning", f"object {item.name}: size", "the mesh is tiny", f"{100 * longest:.2g} cm at most",
-                        "Is it in another unit? Meshes are in metres.")]  # fmt: skip
+        return [
+            Finding(
+                "warning",
+                f"object {item.name}: size",
+                "the mesh is tiny",
+                f"{100 * longest:.2g} cm at most",
+                "Is it in another unit? Meshes are in metres.",
+            )
+        ]
     if longest > HUGE_M:
-        return [Finding("warning", f"object {item.name}: size", "the mesh is larger than an object", f"{longest:.3g} m",
-                        "Is it in millimetres, or the whole scan?")]  # fmt: skip
+        return [
+            Finding(
+                "warning",
+                f"object {item.name}: size",
+                "the mesh is larger than an object",
+                f"{longest:.3g} m",
+                "Is it in millimetres, or the whole scan?",
+            )
+        ]
     return []
 
 
@@ -107,20 +119,28 @@ def _freedom(item: SceneObject) -> list[Finding]:
         side = int((high - low).argmax())
         along = (item.freedom.pivot[side] - low[side]) / max(high[side] - low[side], 1e-9)
         if gap > HINGE_GAP_M:
-            found.append(Finding("warning", check, "the hinge is beside the mesh", f"{100 * gap:.0f} cm from its box, from above",
-                                 "Put the pivot at the hinge."))  # fmt: skip
+            found.append(
+                Finding(
+                    "warning",
+                    check,
+                    "the hinge is beside the mesh",
+                    f"{100 * gap:.0f} cm from its box, from above",
+                    "Put the pivot at the hinge.",
+                )
+            )
         elif 0.3 < along < 0.7:
-            found.append(Finding("note", check, "the hinge is in the middle", f"at {100 * along:.0f} % of its longest side",
-                                 "Doors turn about an edge."))  # fmt: skip
+            found.append(
+                Finding(
+                    "note",
+                    check,
+                    "the hinge is in the middle",
+                    f"at {100 * along:.0f} % of its longest side",
+                    "Doors turn about an edge.",
+                )
+            )
     if item.freedom.kind in ("hinge", "axis") and item.freedom.limits is None:
         found.append(
-            Finding(
-                "note",
-                check,
-                "no limits",
-                "it may turn or slide without end",
-                "Set limits where they are known.",
-            )
+            Finding("note", check, "no limits", "it may turn or slide without end", "Set limits where they are known.")
         )
     return found
 
@@ -135,11 +155,25 @@ def _floor(objects: tuple[SceneObject, ...]) -> list[Finding]:
     for item in objects:
         height = lowest[item.name] - floor
         if height < -FLOOR_M:
-            found.append(Finding("warning", f"object {item.name}: floor", "reaches below the floor", f"{-100 * height:.0f} cm below what slides",
-                                 "Lift it, or cut the floor's points off its mesh."))  # fmt: skip
+            found.append(
+                Finding(
+                    "warning",
+                    f"object {item.name}: floor",
+                    "reaches below the floor",
+                    f"{-100 * height:.0f} cm below what slides",
+                    "Lift it, or cut the floor's points off its mesh.",
+                )
+            )
         elif height > FLOOR_M and item.freedom.kind == "plane":
-            found.append(Finding("note", f"object {item.name}: floor", "slides above the others' floor", f"{100 * height:.0f} cm above it",
-                                 "Another storey, or not an object that slides on the floor."))  # fmt: skip
+            found.append(
+                Finding(
+                    "note",
+                    f"object {item.name}: floor",
+                    "slides above the others' floor",
+                    f"{100 * height:.0f} cm above it",
+                    "Another storey, or not an object that slides on the floor.",
+                )
+            )
     return found
 
 
@@ -158,11 +192,25 @@ def _overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
         same = _share_at(objects[inner], objects[outer])
         inside = float(shared[a, b] / volume[inner])
         if same > _SAME_SHARE:
-            found.append(Finding("warning", f"objects {names}", "are at the same place", f"{100 * same:.0f} % of the first's surface is within 2 cm of the second's",
-                                 "Was one object cut out twice? Remove one of them."))  # fmt: skip
+            found.append(
+                Finding(
+                    "warning",
+                    f"objects {names}",
+                    "are at the same place",
+                    f"{100 * same:.0f} % of the first's surface is within 2 cm of the second's",
+                    "Was one object cut out twice? Remove one of them.",
+                )
+            )
         elif inside > _INSIDE_SHARE:
-            found.append(Finding("note", f"objects {names}", "the first stands within the second's box", f"{100 * min(inside, 1):.0f} % of its own box",
-                                 "A chair under a table does; a sofa in a wardrobe does not."))  # fmt: skip
+            found.append(
+                Finding(
+                    "note",
+                    f"objects {names}",
+                    "the first stands within the second's box",
+                    f"{100 * min(inside, 1):.0f} % of its own box",
+                    "A chair under a table does; a sofa in a wardrobe does not.",
+                )
+            )
     return found
 
 

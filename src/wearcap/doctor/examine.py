@@ -6,13 +6,7 @@ from pathlib import Path
 from jaxtyping import Float64
 from torch import Tensor
 
-from wearcap.doctor.agreement import (
-    check_camera,
-    check_head_against_body,
-    check_head_cue,
-    check_points,
-    floor_below,
-)
+from wearcap.doctor.agreement import check_camera, check_head_against_body, check_head_cue, check_points, floor_below
 from wearcap.doctor.body import check_motion
 from wearcap.doctor.inertial import check_imu
 from wearcap.doctor.load import Patient, patients
@@ -73,8 +67,13 @@ def examine_recording(recording: Recording) -> list[Finding]:
 
 
 def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:
-    streams = {"head": recording.head, "motion": recording.motion, "suit": recording.suit,
-               "camera": recording.camera, "localization": recording.localization}  # fmt: skip
+    streams = {
+        "head": recording.head,
+        "motion": recording.motion,
+        "suit": recording.suit,
+        "camera": recording.camera,
+        "localization": recording.localization,
+    }
     streams |= {f"imu {name}": imu for name, imu in recording.imu.items()}
     return {name: stream.timestamps for name, stream in streams.items() if stream is not None}
 

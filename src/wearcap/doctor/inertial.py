@@ -64,15 +64,9 @@ def _specific_force(check: str, acc_imu: Tensor, R_world_imu: Tensor | None) -> 
     if not 0.8 * GRAVITY < usual < 1.25 * GRAVITY:
         unit = min(_ACC_UNITS, key=lambda name: abs(math.log(max(usual, 1e-9) * _ACC_UNITS[name] / GRAVITY)))
         if abs(math.log(max(usual, 1e-9) * _ACC_UNITS[unit] / GRAVITY)) < 0.25:
-            return Finding(
-                "error", check, f"is in {unit}, not m/s²", evidence, f"Multiply by {_ACC_UNITS[unit]:.5g}."
-            )
+            return Finding("error", check, f"is in {unit}, not m/s²", evidence, f"Multiply by {_ACC_UNITS[unit]:.5g}.")
         return Finding(
-            "error",
-            check,
-            "does not measure gravity",
-            evidence,
-            "If gravity was removed, it belongs into acc_world.",
+            "error", check, "does not measure gravity", evidence, "If gravity was removed, it belongs into acc_world."
         )
     if R_world_imu is None:
         return Finding("ok", check, "measures gravity", evidence)
@@ -81,9 +75,7 @@ def _specific_force(check: str, acc_imu: Tensor, R_world_imu: Tensor | None) -> 
     if up[2] > 0.85:
         return Finding("ok", check, "measures gravity, upwards", evidence)
     if up[2] < -0.85:
-        return Finding(
-            "error", check, "its sign is reversed", evidence, "Negate it: at rest specific force points up."
-        )
+        return Finding("error", check, "its sign is reversed", evidence, "Negate it: at rest specific force points up.")
     return Finding(
         "error",
         check,
@@ -120,22 +112,14 @@ def check_gyroscope(stream: str, imu: ImuStream) -> list[Finding]:
             (imu.R_world_imu.double() @ gyro[..., None])[..., 0].flatten() * 0 + spin.flatten(),
             (imu.R_world_imu.double().mT @ gyro[..., None]).flatten(),
         )[1]
-        hint = (
-            "It is in world axes: turn it by R_world_imu⁻¹."
-            if flipped > 0.8
-            else "Check its axes, sign and clock."
-        )
+        hint = "It is in world axes: turn it by R_world_imu⁻¹." if flipped > 0.8 else "Check its axes, sign and clock."
         return [Finding("warning", check, "does not agree with the orientation", evidence, hint)]
     if 40 < scale < 75:
         return [Finding("error", check, "is in degrees per second", evidence, "Multiply by π/180.")]
     if not 0.7 < scale < 1.4:
         return [
             Finding(
-                "warning",
-                check,
-                "has another scale than the orientation",
-                evidence,
-                "Check its unit and frame rate.",
+                "warning", check, "has another scale than the orientation", evidence, "Check its unit and frame rate."
             )
         ]
     return [Finding("ok", check, "agrees with the orientation", evidence)]
@@ -165,17 +149,11 @@ def check_against_motion(stream: str, imu: ImuStream, joint: Trajectory) -> list
         )
     if imu.acc_world is not None:
         findings.append(
-            _acceleration(
-                f"{stream}: acceleration", imu.acc_world[inside].double(), joint, imu.timestamps[inside]
-            )
+            _acceleration(f"{stream}: acceleration", imu.acc_world[inside].double(), joint, imu.timestamps[inside])
         )
     return [
         Finding(
-            f.severity,
-            f"{stream}: clock offset" if f.check == "clock offset" else f.check,
-            f.what,
-            f.evidence,
-            f.fix,
+            f.severity, f"{stream}: clock offset" if f.check == "clock offset" else f.check, f.what, f.evidence, f.fix
         )
         for f in findings
     ]
@@ -186,23 +164,18 @@ def _clock_offset(imu: ImuStream, joint: Trajectory) -> Finding | None:
     if imu.gyro_imu is not None:
         measured = imu.gyro_imu.double().norm(dim=-1)
     elif imu.R_world_imu is not None:
-        measured = spin_of(
-            Trajectory(imu.timestamps, imu.R_world_imu, torch.zeros(len(imu.timestamps), 3))
-        ).norm(dim=-1)
+        measured = spin_of(Trajectory(imu.timestamps, imu.R_world_imu, torch.zeros(len(imu.timestamps), 3))).norm(
+            dim=-1
+        )
     elif imu.acc_world is not None:
         return offset_finding(
             lag_between(
-                joint.timestamps,
-                acceleration_of(joint).norm(dim=-1),
-                imu.timestamps,
-                imu.acc_world.norm(dim=-1),
+                joint.timestamps, acceleration_of(joint).norm(dim=-1), imu.timestamps, imu.acc_world.norm(dim=-1)
             )
         )
     else:
         return None
-    return offset_finding(
-        lag_between(joint.timestamps, spin_of(joint).norm(dim=-1), imu.timestamps, measured)
-    )
+    return offset_finding(lag_between(joint.timestamps, spin_of(joint).norm(dim=-1), imu.timestamps, measured))
 
 
 def offset_finding(lag: tuple[float, float, float] | None, who: str = "the sensor") -> Finding | None:
@@ -223,11 +196,7 @@ def offset_finding(lag: tuple[float, float, float] | None, who: str = "the senso
         severity = "error" if abs(seconds) > 0.05 else "warning"
         late = "late" if seconds > 0 else "early"
         return Finding(
-            severity,
-            "clock offset",
-            f"{who} is {late}",
-            evidence,
-            f"Add {-seconds:+.3f} s to its timestamps.",
+            severity, "clock offset", f"{who} is {late}", evidence, f"Add {-seconds:+.3f} s to its timestamps."
         )
     return Finding("ok", "clock offset", "in time with the motion", evidence)
 
@@ -242,8 +211,11 @@ def _mounting(check: str, imu: ImuStream, R_world_imu: Tensor, R_world_joint: Te
         other = math.degrees(
             quantile(rotation.geodesic(inverse, rotation.mean_rotation(inverse).expand_as(inverse)), 0.9)
         )
-        fix = "Its orientation is inverted: use the sensor's pose in the world." if other < 15 else (
-            "Check the joint it is named for, quaternion order, heading drift, clock.")  # fmt: skip
+        fix = (
+            "Its orientation is inverted: use the sensor's pose in the world."
+            if other < 15
+            else ("Check the joint it is named for, quaternion order, heading drift, clock.")
+        )
         return Finding("error", check, "the sensor does not ride on its joint", evidence, fix)
     if imu.R_joint_imu is not None:
         off = math.degrees(rotation.geodesic(mean, imu.R_joint_imu.double()).item())
@@ -256,16 +228,19 @@ def _mounting(check: str, imu: ImuStream, R_world_imu: Tensor, R_world_joint: Te
                 "Calibrate again.",
             )
     severity = "warning" if spread > 12 else "ok"
-    return Finding(severity, check, "drifts against its joint" if spread > 12 else "constant", evidence,
-                   "Heading drift or a loose strap." if spread > 12 else "")  # fmt: skip
+    return Finding(
+        severity,
+        check,
+        "drifts against its joint" if spread > 12 else "constant",
+        evidence,
+        "Heading drift or a loose strap." if spread > 12 else "",
+    )
 
 
 def _acceleration(check: str, acc_world: Tensor, joint: Trajectory, timestamps: Tensor) -> Finding:
     """Free acceleration against the second difference of the joint's path (MocapEvery eq. 8)."""
     expected = interpolate(joint.timestamps, acceleration_of(joint), timestamps)
-    window = (
-        2 * round(0.033 / timestamps.diff().median().item()) + 1
-    )  # approximately the span that eq. 8 averages over
+    window = 2 * round(0.033 / timestamps.diff().median().item()) + 1  # approximately the span that eq. 8 averages over
     scale, agreement = _fit(expected.flatten(), mean_filter(acc_world, window).flatten())
     evidence = f"{scale:.2g} × the motion's, correlation {agreement:.2f}"
     if quantile(expected.norm(dim=-1), 0.9) < 0.5:
@@ -293,6 +268,4 @@ def _fit(reference: Tensor, measured: Tensor) -> tuple[float, float]:
     """Least-squares scale of measured = scale · reference, and their correlation through the origin."""
     square = reference.square().sum().clamp(min=1e-12)
     product = (reference * measured).sum()
-    return (product / square).item(), (
-        product / (square * measured.square().sum().clamp(min=1e-12)).sqrt()
-    ).item()
+    return (product / square).item(), (product / (square * measured.square().sum().clamp(min=1e-12)).sqrt()).item()

@@ -53,9 +53,7 @@ def patients(path: Path) -> list[Patient]:
         raise WearcapError("no such file or folder", where=path)
     if path.is_file():
         if _kind(path) is None:
-            raise WearcapError(
-                "a kind of file that the doctor does not know", where=path, expected=", ".join(_READERS)
-            )
+            raise WearcapError("a kind of file that the doctor does not know", where=path, expected=", ".join(_READERS))
         return [Patient(path.name, partial(_read_file, path))]
     if (path / "manifest.json").is_file():
         store = RecordingStore.open(path)
@@ -67,8 +65,11 @@ def patients(path: Path) -> list[Patient]:
         return [Patient(name, partial(_read_hps, path, name)) for name in hps_names(path)]
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) in _MOTIONS]
     if not files:
-        raise WearcapError("nothing to examine here", where=path,
-                           expected=f"a data set (manifest.json), an MPS, Nymeria, ADT or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), or files like {', '.join(_MOTIONS)}")  # fmt: skip
+        raise WearcapError(
+            "nothing to examine here",
+            where=path,
+            expected=f"a data set (manifest.json), an MPS, Nymeria, ADT or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), or files like {', '.join(_MOTIONS)}",
+        )
     return [Patient(file.relative_to(path).as_posix(), partial(_read_file, file)) for file in files]
 
 
@@ -89,8 +90,14 @@ def _read_file(path: Path) -> Loaded:
         return Recording(name=name, motion=content, skeleton=content.skeleton), []
     if isinstance(content, Trajectory):
         return Recording(name=name, head=_as_head(content)), [
-            Finding("note", "head: axes", "taken as the head's own pose", "a trajectory file does not name its axes",
-                    "x forward, y left, z up is assumed.")]  # fmt: skip
+            Finding(
+                "note",
+                "head: axes",
+                "taken as the head's own pose",
+                "a trajectory file does not name its axes",
+                "x forward, y left, z up is assumed.",
+            )
+        ]
     return Recording(name=name, points=PointCloud(torch.from_numpy(content.points))), []
 
 
@@ -125,9 +132,13 @@ def _read_mps(folder: Path) -> Loaded:
     quality = raw.quality.median().item()
     low = (raw.quality < 0.5).float().mean().item()
     findings.append(
-        Finding("warning" if low > 0.1 else "ok", "closed-loop file: quality",
-                "MPS trusts its poses little" if low > 0.1 else "MPS trusts its poses",
-                f"median score {quality:.2f}, {100 * low:.0f} % below 0.5"))  # fmt: skip
+        Finding(
+            "warning" if low > 0.1 else "ok",
+            "closed-loop file: quality",
+            "MPS trusts its poses little" if low > 0.1 else "MPS trusts its poses",
+            f"median score {quality:.2f}, {100 * low:.0f} % below 0.5",
+        )
+    )
     findings.append(Finding("ok", "closed-loop file: gravity", "points along -z", "9.81 m/s²"))
     return read_mps(folder), [*findings, *_mps_summary(folder)]
 
@@ -141,19 +152,11 @@ def _mps_summary(folder: Path) -> list[Finding]:
     except WearcapError as error:
         return [Finding("warning", "MPS summary", "cannot be read", str(error))]
     failed = [
-        name
-        for name, part in parts.items()
-        if isinstance(part, dict) and part.get("status", "SUCCESS") != "SUCCESS"
+        name for name, part in parts.items() if isinstance(part, dict) and part.get("status", "SUCCESS") != "SUCCESS"
     ]
     if failed:
-        return [
-            Finding("error", "MPS summary", "MPS reports failures", ", ".join(failed), "Request MPS again.")
-        ]
-    return [
-        Finding(
-            "ok", "MPS summary", "MPS reports success", ", ".join(name for name in parts if name != "version")
-        )
-    ]
+        return [Finding("error", "MPS summary", "MPS reports failures", ", ".join(failed), "Request MPS again.")]
+    return [Finding("ok", "MPS summary", "MPS reports success", ", ".join(name for name in parts if name != "version"))]
 
 
 def _read_recording(path: Path) -> Recording | Loaded:
@@ -193,6 +196,12 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Loaded]], ...] = 
 )
 _MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _read_npz}
 _READERS: dict[str, Callable] = {
-    **_MOTIONS, ".safetensors": _read_recording, ".csv": _read_csv, ".txt": read_tum, ".tum": read_tum,
-    ".ply": read_ply, ".pcd": read_pcd, ".json": read_environment_file,
-}  # fmt: skip
+    **_MOTIONS,
+    ".safetensors": _read_recording,
+    ".csv": _read_csv,
+    ".txt": read_tum,
+    ".tum": read_tum,
+    ".ply": read_ply,
+    ".pcd": read_pcd,
+    ".json": read_environment_file,
+}

@@ -24,13 +24,30 @@ def check_localization(found: Localization, body: Motion | None) -> list[Finding
     share = known.float().mean().item()
     evidence = f"{100 * share:.0f} % of {len(known)} frames, longest outage {_longest_outage_s(found):.1f} s"
     if int(known.sum()) < 2:
-        return [Finding("error", "localization", "hardly any frame was found", evidence,
-                        "Check that map, camera intrinsics and video belong together.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                "localization",
+                "hardly any frame was found",
+                evidence,
+                "Check that map, camera intrinsics and video belong together.",
+            )
+        ]
     severity = "warning" if share < 0.5 else "note" if _longest_outage_s(found) > LONG_OUTAGE_S else "ok"
-    findings = [Finding(severity, "localization", "few frames were found" if share < 0.5 else "the camera was found", evidence,
-                        "Add database photos where the wearer walked." if severity != "ok" else "")]  # fmt: skip
+    findings = [
+        Finding(
+            severity,
+            "localization",
+            "few frames were found" if share < 0.5 else "the camera was found",
+            evidence,
+            "Add database photos where the wearer walked." if severity != "ok" else "",
+        )
+    ]
     if not found.t_world_cam[known].isfinite().all():
-        return [*findings, Finding("error", "localization", "found positions are NaN", "", "Their confidence should be 0.")]  # fmt: skip
+        return [
+            *findings,
+            Finding("error", "localization", "found positions are NaN", "", "Their confidence should be 0."),
+        ]
     track = Trajectory(found.timestamps[known], found.R_world_cam[known], found.t_world_cam[known])
     turned = check_rotations("localization", track.R_world_body)
     findings += turned
@@ -39,13 +56,24 @@ def check_localization(found: Localization, body: Motion | None) -> list[Finding
     good = outlier_mask(track, MAX_SPEED)
     wrong = 1 - good.float().mean().item()
     findings.append(
-        Finding("warning" if wrong > 0.1 else "ok", "localization: speed",
-                "positions jump" if wrong > 0.1 else "a path that a head takes",
-                f"{100 * wrong:.1f} % lie further off than {MAX_SPEED:g} m/s allow",
-                "Raise the number of inliers that a pose needs." if wrong > 0.1 else ""))  # fmt: skip
+        Finding(
+            "warning" if wrong > 0.1 else "ok",
+            "localization: speed",
+            "positions jump" if wrong > 0.1 else "a path that a head takes",
+            f"{100 * wrong:.1f} % lie further off than {MAX_SPEED:g} m/s allow",
+            "Raise the number of inliers that a pose needs." if wrong > 0.1 else "",
+        )
+    )
     if track.R_world_body[:, 2, 1].median() > 0:  # an OpenCV camera's y axis points down
-        findings.append(Finding("warning", "localization: axes", "the camera is mounted upside down", "its y axis points up in the world",
-                                "Poses are of OpenCV's camera in the world (x right, y down, z forward), the world's z up."))  # fmt: skip
+        findings.append(
+            Finding(
+                "warning",
+                "localization: axes",
+                "the camera is mounted upside down",
+                "its y axis points up in the world",
+                "Poses are of OpenCV's camera in the world (x right, y down, z forward), the world's z up.",
+            )
+        )
     return findings + _clock(track[good], share, body)
 
 
@@ -78,16 +106,37 @@ def check_contact_prob(stream: str, motion: Motion) -> list[Finding]:
         return []
     if len(contact) != len(motion):
         short = "shorter" if len(contact) < len(motion) else "longer"
-        return [Finding("error", check, f"contacts are {short} than poses", f"{len(contact)} rows for {len(motion)} poses",
-                        "Cut or resample both together.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                f"contacts are {short} than poses",
+                f"{len(contact)} rows for {len(motion)} poses",
+                "Cut or resample both together.",
+            )
+        ]
     if not ((contact >= 0) & (contact <= 1)).all():
-        return [Finding("error", check, "contacts are no probabilities", f"{contact.min():.3g} … {contact.max():.3g}",
-                        "Values from 0 to 1.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                "contacts are no probabilities",
+                f"{contact.min():.3g} … {contact.max():.3g}",
+                "Values from 0 to 1.",
+            )
+        ]
     share = (contact > 0.5).float().mean().item()
     evidence = f"a part of a foot touches the ground {100 * share:.0f} % of the time"
     if not 0.02 < share < 0.98:
-        return [Finding("warning", check, "feet never touch" if share < 0.5 else "feet never lift", evidence,
-                        "Check the contacts' columns: heel and toe of the left, then of the right foot.")]  # fmt: skip
+        return [
+            Finding(
+                "warning",
+                check,
+                "feet never touch" if share < 0.5 else "feet never lift",
+                evidence,
+                "Check the contacts' columns: heel and toe of the left, then of the right foot.",
+            )
+        ]
     return [Finding("ok", check, "feet touch and lift", evidence)]
 
 
@@ -106,11 +155,16 @@ def check_claps(recording: Recording) -> list[Finding]:
     try:
         claps = detect_claps(*wrists)
     except WearcapError as error:
-        return [Finding("note", "claps", error.what, str(error.where or ""),
-                        "Where camera and suit are not on one clock already, give the clap's time by hand.")]  # fmt: skip
-    return [
-        Finding("ok", "claps", f"{len(claps)} found", ", ".join(f"{t:.2f} s" for t in claps[:5].tolist()))
-    ]
+        return [
+            Finding(
+                "note",
+                "claps",
+                error.what,
+                str(error.where or ""),
+                "Where camera and suit are not on one clock already, give the clap's time by hand.",
+            )
+        ]
+    return [Finding("ok", "claps", f"{len(claps)} found", ", ".join(f"{t:.2f} s" for t in claps[:5].tolist()))]
 
 
 def check_files(recording: Recording, root: Path) -> list[Finding]:
@@ -118,12 +172,17 @@ def check_files(recording: Recording, root: Path) -> list[Finding]:
     findings = []
     stream = recording.camera
     if stream is not None and stream.video:
-        findings += _video(
-            root / stream.video, len(stream.timestamps), (stream.camera.width, stream.camera.height)
-        )
+        findings += _video(root / stream.video, len(stream.timestamps), (stream.camera.width, stream.camera.height))
     if recording.scene and not (root / recording.scene).is_file():
-        findings.append(Finding("error", "scene: file", "the scan is missing", str(root / recording.scene),
-                                "Put it there, or prepare the data set again."))  # fmt: skip
+        findings.append(
+            Finding(
+                "error",
+                "scene: file",
+                "the scan is missing",
+                str(root / recording.scene),
+                "Put it there, or prepare the data set again.",
+            )
+        )
     return findings
 
 
@@ -134,9 +193,23 @@ def _video(path: Path, frames: int, size: tuple[int, int]) -> list[Finding]:
     except WearcapError as error:
         return [refusal(error, check)]
     if (video.width, video.height) != size:
-        return [Finding("error", check, "image size and calibration differ",
-                        f"{video.width}x{video.height} pixels, calibrated at {size[0]}x{size[1]}",
-                        "Calibrate at the video's size (wearcap calibrate), or scale the intrinsics (Camera.scaled).")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                "image size and calibration differ",
+                f"{video.width}x{video.height} pixels, calibrated at {size[0]}x{size[1]}",
+                "Calibrate at the video's size (wearcap calibrate), or scale the intrinsics (Camera.scaled).",
+            )
+        ]
     if video.frames and abs(video.frames - frames) > 1:
-        return [Finding("error", check, "frames and timestamps differ in number", f"{video.frames} and {frames}", "Pair them again.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                "frames and timestamps differ in number",
+                f"{video.frames} and {frames}",
+                "Pair them again.",
+            )
+        ]
     return [Finding("ok", check, "fits its calibration", f"{video.frames} frames of {size[0]}x{size[1]}")]

@@ -26,20 +26,30 @@ def check_rotations(stream: str, R: Float[Tensor, "*batch 3 3"]) -> list[Finding
     if bad.any():
         return [
             Finding(
-                "error",
-                check,
-                "rotations are NaN",
-                f"{int(bad.sum())} of {len(flat)}",
-                "Drop or fill these frames.",
+                "error", check, "rotations are NaN", f"{int(bad.sum())} of {len(flat)}", "Drop or fill these frames."
             )
         ]
     error = (flat.mT @ flat - torch.eye(3, dtype=torch.float64)).abs().amax((-1, -2))
     if (error > 1e-2).any():
-        return [Finding("error", check, "matrices that are no rotations", f"{int((error > 1e-2).sum())} of {len(flat)}, off by up to {error.max():.2g}",
-                        "Normalise quaternions before converting; check which columns hold them.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                "matrices that are no rotations",
+                f"{int((error > 1e-2).sum())} of {len(flat)}, off by up to {error.max():.2g}",
+                "Normalise quaternions before converting; check which columns hold them.",
+            )
+        ]
     if (torch.linalg.det(flat) < 0).any():
-        return [Finding("error", check, "mirrored (left-handed) axes", "determinant -1",
-                        "Turn axes by rotations only; negate an axis in pairs.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                "mirrored (left-handed) axes",
+                "determinant -1",
+                "Turn axes by rotations only; negate an axis in pairs.",
+            )
+        ]
     return []
 
 
@@ -63,25 +73,34 @@ def check_speed(stream: str, track: Trajectory) -> list[Finding]:
     evidence = f"90 % of frames below {usual:.3g} m/s, path {path:.4g} m"
     if usual > FASTEST_M_S:
         unit = min(_UNITS, key=lambda name: abs(math.log(usual * _UNITS[name] / 1.2)))
-        return [Finding("error", check, "positions are not in metres", evidence,
-                        f"In {unit} it would be {usual * _UNITS[unit]:.2f} m/s: multiply positions by {_UNITS[unit]:.4g}.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                "positions are not in metres",
+                evidence,
+                f"In {unit} it would be {usual * _UNITS[unit]:.2f} m/s: multiply positions by {_UNITS[unit]:.4g}.",
+            )
+        ]
     if len(speed) > 2 and track.timestamps[-1] - track.timestamps[0] > 10 and path < 0.01:
         return [
             Finding(
-                "warning",
-                check,
-                "nothing moves",
-                evidence,
-                "Check the unit, and that this stream recorded at all.",
+                "warning", check, "nothing moves", evidence, "Check the unit, and that this stream recorded at all."
             )
         ]
     jumps = speed > FASTEST_M_S
     if jumps.any():
         worst = int(speed.argmax())
-        return [Finding("warning", check, "jumps",
-                        f"{int(jumps.sum())} steps faster than {FASTEST_M_S:g} m/s, the worst {moved[worst]:.2f} m at "
-                        f"{track.timestamps[worst + 1] - track.timestamps[0]:.2f} s",
-                        "Tracking was lost there: mask these frames (geometry.trajectory.outlier_mask).")]  # fmt: skip
+        return [
+            Finding(
+                "warning",
+                check,
+                "jumps",
+                f"{int(jumps.sum())} steps faster than {FASTEST_M_S:g} m/s, the worst {moved[worst]:.2f} m at "
+                f"{track.timestamps[worst + 1] - track.timestamps[0]:.2f} s",
+                "Tracking was lost there: mask these frames (geometry.trajectory.outlier_mask).",
+            )
+        ]
     return [Finding("ok", check, "in metres, without jumps", evidence)]
 
 
@@ -97,16 +116,37 @@ def check_upright(stream: str, track: Trajectory) -> list[Finding]:
     order = _quaternion_order(R)
     consistent = up_world.norm() > 0.8
     if order and not (consistent and vertical in (0, 1)):
-        return [Finding("error", check, "quaternions are read in the wrong order", f"{evidence}; read as {order} it is upright",
-                        f"Read the quaternions as {order}.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                "quaternions are read in the wrong order",
+                f"{evidence}; read as {order} it is upright",
+                f"Read the quaternions as {order}.",
+            )
+        ]
     if consistent and vertical != 2 and up_world.abs().max() > 0.7:
         name = _axis_name(up_world)
-        return [Finding("error", check, f"the world's {name} axis is up, not z", evidence,
-                        f"Turn the world so that {name} becomes z (reader option up, or {name} → z for poses and points alike).")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                f"the world's {name} axis is up, not z",
+                evidence,
+                f"Turn the world so that {name} becomes z (reader option up, or {name} → z for poses and points alike).",
+            )
+        ]
     if up_body.norm() > 0.8 and up_body.abs().max() > 0.7:
         name = _axis_name(up_body)
-        return [Finding("error", check, f"the body's {name} axis points up, not z", f"{evidence}; its {name} axis does",
-                        "Turn the device's own axes to x forward, y left, z up (R_world_device @ R_device_head axes).")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                f"the body's {name} axis points up, not z",
+                f"{evidence}; its {name} axis does",
+                "Turn the device's own axes to x forward, y left, z up (R_world_device @ R_device_head axes).",
+            )
+        ]
     severity = "error" if up_world[2] < 0.3 else "warning"
     return [
         Finding(
@@ -135,8 +175,15 @@ def check_facing(stream: str, track: Trajectory) -> list[Finding]:
         return [Finding("ok", check, "x is forward", evidence)]
     inverse_offset, inverse_strength = _mean_angle(rotation.yaw_of(R.mT)[walking] - course)
     if inverse_strength > max(0.8, strength) and abs(inverse_offset) < math.radians(45):
-        return [Finding("error", check, "rotations are inverted", f"{evidence}; transposed they fit ({inverse_strength:.2f})",
-                        "Store the pose of the body in the world (R_world_body), not its inverse.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                check,
+                "rotations are inverted",
+                f"{evidence}; transposed they fit ({inverse_strength:.2f})",
+                "Store the pose of the body in the world (R_world_body), not its inverse.",
+            )
+        ]
     if strength < 0.5:
         return [
             Finding(
@@ -148,8 +195,15 @@ def check_facing(stream: str, track: Trajectory) -> list[Finding]:
             )
         ]
     severity = "warning" if walked_s < 15 or abs(offset) < math.radians(75) else "error"
-    return [Finding(severity, check, "x does not point forward", evidence,
-                    f"Turn the body's axes by {-math.degrees(offset):+.0f}° about z, if the wearer did walk ahead.")]  # fmt: skip
+    return [
+        Finding(
+            severity,
+            check,
+            "x does not point forward",
+            evidence,
+            f"Turn the body's axes by {-math.degrees(offset):+.0f}° about z, if the wearer did walk ahead.",
+        )
+    ]
 
 
 def _mean_angle(angle: Tensor) -> tuple[float, float]:

@@ -29,8 +29,13 @@ _MARGIN_M = 1.0
 _POINTS = 50_000
 """Number of points of the scan that are projected into photos."""
 
-NO_PHOTOS = Finding("error", "photos", "no photos", "a map of this scene would be empty",
-                    "List pictures with their cameras and poses in photos.json.")  # fmt: skip
+NO_PHOTOS = Finding(
+    "error",
+    "photos",
+    "no photos",
+    "a map of this scene would be empty",
+    "List pictures with their cameras and poses in photos.json.",
+)
 
 
 def is_scene(folder: Path) -> bool:
@@ -79,18 +84,29 @@ def read_map(path: Path) -> tuple[Recording, list[Finding]]:
     points, pictures = visual_map.landmarks.points_world, len(visual_map)
     if not len(points) or not pictures:
         return Recording(path.name), [
-            Finding("error", "map", "the map is empty", f"{pictures} pictures, {len(points)} landmarks",
-                    "Build it from photos that show the scene: wearcap scene.")]  # fmt: skip
+            Finding(
+                "error",
+                "map",
+                "the map is empty",
+                f"{pictures} pictures, {len(points)} landmarks",
+                "Build it from photos that show the scene: wearcap scene.",
+            )
+        ]
     seen = np.diff(visual_map.first)
-    evidence = f"{pictures} pictures, {len(points)} landmarks, {np.median(seen):.0f} keypoints in half of the pictures or more"
+    evidence = (
+        f"{pictures} pictures, {len(points)} landmarks, {np.median(seen):.0f} keypoints in half of the pictures or more"
+    )
     bare = float((seen < _FEW_KEYPOINTS).mean())
     found = Finding("ok", "map", "holds landmarks", evidence)
     if bare > 0.3:
-        found = Finding("warning", "map", "pictures with hardly a keypoint", f"{100 * bare:.0f} % of them; {evidence}",
-                        "Pictures of bare walls help nobody: take others, or larger ones.")  # fmt: skip
-    return Recording(path.name, points=PointCloud(torch.from_numpy(_thinned(points.astype(np.float32))))), [
-        found
-    ]
+        found = Finding(
+            "warning",
+            "map",
+            "pictures with hardly a keypoint",
+            f"{100 * bare:.0f} % of them; {evidence}",
+            "Pictures of bare walls help nobody: take others, or larger ones.",
+        )
+    return Recording(path.name, points=PointCloud(torch.from_numpy(_thinned(points.astype(np.float32))))), [found]
 
 
 def check_scan(scan: Scan) -> list[Finding]:
@@ -99,21 +115,49 @@ def check_scan(scan: Scan) -> list[Finding]:
     size = " x ".join(f"{side:.1f}" for side in extent)
     findings = [Finding("ok", "scan", "in metres", f"{len(scan.points)} points, {size} m")]
     if scan.colors is None:
-        findings.append(Finding("error", "scan: colour", "the scan has no colour", f"{len(scan.points)} points",
-                                "Export it with red, green, blue: pictures are drawn from it."))  # fmt: skip
+        findings.append(
+            Finding(
+                "error",
+                "scan: colour",
+                "the scan has no colour",
+                f"{len(scan.points)} points",
+                "Export it with red, green, blue: pictures are drawn from it.",
+            )
+        )
     elif scan.colors.std() < 1:
-        findings.append(Finding("error", "scan: colour", "all points have one colour", f"{scan.colors[0].tolist()}",
-                                "Export it with the scanner's colours: nothing can be recognised in it."))  # fmt: skip
+        findings.append(
+            Finding(
+                "error",
+                "scan: colour",
+                "all points have one colour",
+                f"{scan.colors[0].tolist()}",
+                "Export it with the scanner's colours: nothing can be recognised in it.",
+            )
+        )
     spacing = _spacing_m(scan.points)
     evidence = f"points about {100 * spacing:.1f} cm apart"
     if spacing > SPARSE_M:
-        findings.append(Finding("warning", "scan: density", "the scan is sparse", evidence,
-                                "Pictures drawn from it have holes: export it at 1 cm or less."))  # fmt: skip
+        findings.append(
+            Finding(
+                "warning",
+                "scan: density",
+                "the scan is sparse",
+                evidence,
+                "Pictures drawn from it have holes: export it at 1 cm or less.",
+            )
+        )
     else:
         findings.append(Finding("ok", "scan: density", "dense", evidence))
     if extent[2] > 1.5 * extent[:2].max():
-        findings.append(Finding("warning", "scan: up axis", "the scan is taller than wide", f"{size} m",
-                                "z should point up: turn the scan and its photos' poses together."))  # fmt: skip
+        findings.append(
+            Finding(
+                "warning",
+                "scan: up axis",
+                "the scan is taller than wide",
+                f"{size} m",
+                "z should point up: turn the scan and its photos' poses together.",
+            )
+        )
     return findings
 
 
@@ -121,18 +165,19 @@ def check_photos(photos: list[Photo], scan: Scan | None) -> list[Finding]:
     """Photos exist, have their calibration's size, and see the scan."""
     if not photos:
         return [
-            Finding(
-                "error",
-                "photos",
-                "no photos",
-                "a map of this scene would be empty",
-                "List them in photos.json.",
-            )
+            Finding("error", "photos", "no photos", "a map of this scene would be empty", "List them in photos.json.")
         ]
     missing = [photo.file.name for photo in photos if not photo.file.is_file()]
     if missing:
-        return [Finding("error", "photos", "image files are missing", f"{len(missing)} of {len(photos)}, as {missing[:3]}",
-                        "Put them at the paths in photos.json.")]  # fmt: skip
+        return [
+            Finding(
+                "error",
+                "photos",
+                "image files are missing",
+                f"{len(missing)} of {len(photos)}, as {missing[:3]}",
+                "Put them at the paths in photos.json.",
+            )
+        ]
     cameras = len({photo.camera for photo in photos})
     findings = [Finding("ok", "photos", f"{len(photos)} photos", f"{cameras} calibrations")]
     findings += _sizes(photos[:: -(-len(photos) // _LOOKED_AT)])
@@ -145,11 +190,25 @@ def _sizes(photos: list[Photo]) -> list[Finding]:
             with open_image(photo.file) as image:
                 size = image.size
         except WearcapError as error:
-            return [Finding("error", "photos: files", "a photo cannot be read", f"{photo.file.name}: {error.what}", "Fetch it again.")]  # fmt: skip
+            return [
+                Finding(
+                    "error",
+                    "photos: files",
+                    "a photo cannot be read",
+                    f"{photo.file.name}: {error.what}",
+                    "Fetch it again.",
+                )
+            ]
         if size != (photo.camera.width, photo.camera.height):
-            return [Finding("error", "photos: size", "image size and calibration differ",
-                            f"{photo.file.name} has {size[0]}x{size[1]} pixels, its camera {photo.camera.width}x{photo.camera.height}",
-                            "Use the pictures that were calibrated, or scale the intrinsics (Camera.scaled).")]  # fmt: skip
+            return [
+                Finding(
+                    "error",
+                    "photos: size",
+                    "image size and calibration differ",
+                    f"{photo.file.name} has {size[0]}x{size[1]} pixels, its camera {photo.camera.width}x{photo.camera.height}",
+                    "Use the pictures that were calibrated, or scale the intrinsics (Camera.scaled).",
+                )
+            ]
     return [Finding("ok", "photos: size", "as calibrated", f"{len(photos)} opened")]
 
 
@@ -165,13 +224,25 @@ def _sight(photos: list[Photo], scan: Scan) -> Finding:
         if len(near) > 20:
             shares[k] = photo.camera.project(photo.T_world_cam.inverse() @ near)[1].float().mean()
     blind = int((shares < 0.01).sum())
-    evidence = f"half of {len(photos)} photos have at least {100 * shares.median():.0f} % of the points within 10 m in view"
+    evidence = (
+        f"half of {len(photos)} photos have at least {100 * shares.median():.0f} % of the points within 10 m in view"
+    )
     if blind > len(photos) / 2:
-        return Finding("error", "photos: poses", "photos do not see the scan", f"{blind} of {len(photos)} were taken outside it, or have none of it in view",
-                       "Poses are of OpenCV's camera in the scan's world, in metres; perhaps they are inverted.")  # fmt: skip
+        return Finding(
+            "error",
+            "photos: poses",
+            "photos do not see the scan",
+            f"{blind} of {len(photos)} were taken outside it, or have none of it in view",
+            "Poses are of OpenCV's camera in the scan's world, in metres; perhaps they are inverted.",
+        )
     if blind > len(photos) / 10:
-        return Finding("warning", "photos: poses", "some photos do not see the scan", f"{blind} of {len(photos)}",
-                       "They add nothing to a map.")  # fmt: skip
+        return Finding(
+            "warning",
+            "photos: poses",
+            "some photos do not see the scan",
+            f"{blind} of {len(photos)}",
+            "They add nothing to a map.",
+        )
     return Finding("ok", "photos: poses", "photos see the scan", evidence)
 
 

@@ -52,10 +52,7 @@ def lag_between(
     if stop - start < 4.0:
         return None
     grid = torch.arange(start, stop, 1 / LAG_RATE_HZ, dtype=torch.float64)[: int(600 * LAG_RATE_HZ)]
-    a, b = (
-        interpolate(reference_times, reference.double(), grid),
-        interpolate(other_times, other.double(), grid),
-    )
+    a, b = (interpolate(reference_times, reference.double(), grid), interpolate(other_times, other.double(), grid))
     if a.std() < 1e-6 or b.std() < 1e-6:
         return None
     shifts, score = correlate_shifts(a.numpy(), b.numpy(), 0.7)

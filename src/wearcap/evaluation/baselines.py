@@ -97,11 +97,7 @@ class NearestWindow(_Baseline):
 
     @classmethod
     def fit(
-        cls,
-        stores: Sequence[RecordingStore],
-        window_s: float = 1.0,
-        stride_s: float = 0.05,
-        sample_s: float = 0.1,
+        cls, stores: Sequence[RecordingStore], window_s: float = 1.0, stride_s: float = 0.05, sample_s: float = 0.1
     ) -> "NearestWindow":
         """Describe the training splits' windows, `stride_s` apart. Raises WearcapError as `MeanPose.fit` does.
 
@@ -125,16 +121,14 @@ class NearestWindow(_Baseline):
         descriptor = ((raw - mean) / scale).flatten(1)
         return cls(
             names, fps, window, sample, mean, scale, descriptor, torch.cat(first), torch.cat(last), torch.cat(poses)
-        )  # fmt: skip
+        )
 
     def __call__(self, recording: Recording) -> Motion:
         """The pasted motion anchored to the recording's head."""
         path = _query_path(recording, self.joint_names, self.fps)
         count = len(path.timestamps)
         end = max(count - self.window, 0)
-        starts = torch.unique(
-            torch.cat([torch.arange(0, end, max(1, self.window // 2)), torch.tensor([end])])
-        )
+        starts = torch.unique(torch.cat([torch.arange(0, end, max(1, self.window // 2)), torch.tensor([end])]))
         found = self._nearest(_describe(path, starts, self.window, self.sample))
         pose = self._pasted(starts, found, count)
         return _anchored(path, rotation.matrix_from_rot6d(pose.unflatten(-1, (-1, 6))), "nearest_window")
@@ -142,9 +136,7 @@ class NearestWindow(_Baseline):
     def _nearest(self, raw: Float[Tensor, "query sample channel"]) -> Int64[Tensor, "query"]:
         query = ((raw - self.mean) / self.scale).flatten(1)
         half_squares = 0.5 * self.descriptor.square().sum(-1)
-        return torch.cat(
-            [(part @ self.descriptor.T - half_squares).argmax(-1) for part in query.split(QUERY_BATCH)]
-        )
+        return torch.cat([(part @ self.descriptor.T - half_squares).argmax(-1) for part in query.split(QUERY_BATCH)])
 
     def _pasted(
         self, starts: Int64[Tensor, "query"], found: Int64[Tensor, "query"], count: int
@@ -154,9 +146,7 @@ class NearestWindow(_Baseline):
         source = torch.minimum(self.first_frame[found, None] + offset, self.last_frame[found, None])
         target = starts[:, None] + offset
         inside = target < count
-        weight = (torch.minimum(offset + 1, self.window - offset).float() / self.window).expand_as(target)[
-            inside
-        ]
+        weight = (torch.minimum(offset + 1, self.window - offset).float() / self.window).expand_as(target)[inside]
         total = torch.zeros(count).index_add(0, target[inside], weight)
         blended = torch.zeros(count, self.pose.shape[1]).index_add(
             0, target[inside], self.pose[source[inside]].float() * weight[:, None]
@@ -190,15 +180,18 @@ def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPa
             first = first or kind
             if kind != first or len(path.timestamps) != len(recording.motion):
                 raise WearcapError(
-                    f"recording {name!r} does not fit the others", where=store.root,
+                    f"recording {name!r} does not fit the others",
+                    where=store.root,
                     expected=f"the joints of the first at {first[1]} Hz, head and motion on one clock",
                     fix="Prepare the data sets alike.",
-                )  # fmt: skip
+                )
             yield path, recording.motion.R_parent_joint
     if first is None:
-        raise WearcapError("no training recordings with head and motion",
-                           where=", ".join(str(store.root) for store in stores),
-                           expected="a training split of recordings with both")  # fmt: skip
+        raise WearcapError(
+            "no training recordings with head and motion",
+            where=", ".join(str(store.root) for store in stores),
+            expected="a training split of recordings with both",
+        )
 
 
 def _read(store: RecordingStore, name: str) -> Recording:
@@ -214,12 +207,13 @@ def _fps_of(path: HeadPath) -> float:
 
 
 def _query_path(recording: Recording, joint_names: tuple[str, ...], fps: float) -> HeadPath:
-    skeleton: Skeleton | None = recording.skeleton or (
-        recording.motion.skeleton if recording.motion else None
-    )
+    skeleton: Skeleton | None = recording.skeleton or (recording.motion.skeleton if recording.motion else None)
     if skeleton is None or skeleton.joint_names != joint_names:
-        raise WearcapError("its skeleton is not the one of the training data", where=recording.name,
-                           expected=f"joints {', '.join(joint_names)}")  # fmt: skip
+        raise WearcapError(
+            "its skeleton is not the one of the training data",
+            where=recording.name,
+            expected=f"joints {', '.join(joint_names)}",
+        )
     return head_path(recording, skeleton, fps)
 
 
@@ -239,9 +233,7 @@ def _describe(
     features = HeadFeatures(frame="window", height="stature")
     stature = torch.full((len(starts), 1), path.stature)
     T_world_head = path.T_world_head[frames]
-    channels = features.condition(
-        T_world_head.R, T_world_head.t, path.floor_height[frames], stature, _fps_of(path)
-    )
+    channels = features.condition(T_world_head.R, T_world_head.t, path.floor_height[frames], stature, _fps_of(path))
     return channels[:, ::sample]
 
 
@@ -254,9 +246,7 @@ def _anchored(path: HeadPath, R_heading: Float[Tensor, "time joint 3 3"], name: 
     return anchored_to_head(motion, path.T_world_head)
 
 
-def _save(
-    path: str | Path, kind: str, joint_names: tuple[str, ...], fps: float, tensors: dict[str, Tensor]
-) -> None:
+def _save(path: str | Path, kind: str, joint_names: tuple[str, ...], fps: float, tensors: dict[str, Tensor]) -> None:
     about = json.dumps({"kind": kind, "joint_names": joint_names, "fps": fps}, sort_keys=True)
     content = save({name: value.contiguous() for name, value in tensors.items()}, {"baseline": about})
     with atomic_path(path) as temporary:
@@ -269,7 +259,9 @@ def _load(path: str | Path, kind: str) -> tuple[tuple[str, ...], float, dict[str
             about = parse_json((file.metadata() or {}).get("baseline", "{}"), path)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (OSError, safetensors.SafetensorError) as error:
-        raise WearcapError(f"not a readable baseline ({error})", where=path, expected="what `save` of one wrote") from error  # fmt: skip
+        raise WearcapError(
+            f"not a readable baseline ({error})", where=path, expected="what `save` of one wrote"
+        ) from error
     if about.get("kind") != kind:
         raise WearcapError(f"holds {about.get('kind', 'no baseline')}", where=path, expected=kind)
     return tuple(about["joint_names"]), about["fps"], tensors

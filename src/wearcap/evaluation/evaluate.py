@@ -16,9 +16,13 @@ class Pipeline(Protocol):
 
 
 def evaluate(
-    pipeline: Pipeline, store: RecordingStore, names: Iterable[str], seeds: Sequence[int], batch_size: int = 16,
+    pipeline: Pipeline,
+    store: RecordingStore,
+    names: Iterable[str],
+    seeds: Sequence[int],
+    batch_size: int = 16,
     measure: Measure | None = None,
-) -> Iterator[Row]:  # fmt: skip
+) -> Iterator[Row]:
     """Capture every recording with every seed, anchor the body to the true head, and score it.
 
     `batch_size` recordings share a batch; `measure` replaces `score`. Raises WearcapError when a recording has no true

@@ -56,9 +56,7 @@ def _check_json(content: Any, path: str | Path) -> None:
             raise _refused("pickled objects", path)
         if key == "expr_str" and not (isinstance(value, str) and _EXPRESSION.fullmatch(value)):
             raise _refused(f"the size {str(value)[:80]!r}", path)
-        if key == "guards_code" and not (
-            isinstance(value, list) and all(_is_guard(guard) for guard in value)
-        ):
+        if key == "guards_code" and not (isinstance(value, list) and all(_is_guard(guard) for guard in value)):
             raise _refused(f"the guards {str(value)[:80]!r}", path)
         if key == "nodes" and not (isinstance(value, list) and all(_is_node(node) for node in value)):
             raise _refused("calls of other functions than tensor operations", path)
@@ -70,9 +68,11 @@ def _is_guard(guard: Any) -> bool:
 
 def _is_node(node: Any) -> bool:
     return (
-        isinstance(node, dict) and isinstance(node.get("target"), str) and _TARGET.fullmatch(node["target"]) is not None
+        isinstance(node, dict)
+        and isinstance(node.get("target"), str)
+        and _TARGET.fullmatch(node["target"]) is not None
         and set(node.get("metadata") or {}) <= set(_METADATA)
-    )  # fmt: skip
+    )
 
 
 def _members(content: Any) -> Iterator[tuple[str, Any]]:

@@ -15,9 +15,7 @@ def parser(name: str, about: str | None, recording: str, output: str) -> argpars
     describe the required inputs and the result in the help text.
     """
     found = argparse.ArgumentParser(prog=f"python -m wearcap.export.{name}", description=about)
-    found.add_argument(
-        "model", type=Path, help="exported .onnx or .pt2 file, with the files written beside it"
-    )
+    found.add_argument("model", type=Path, help="exported .onnx or .pt2 file, with the files written beside it")
     found.add_argument("recording", type=Path, help=f"recording (.safetensors) with {recording}")
     found.add_argument("output", type=Path, help=f"where to write {output}")
     return found

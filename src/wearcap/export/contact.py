@@ -41,9 +41,13 @@ def export_contact(detector: ContactDetector, path: str | Path, format: str) -> 
     report = export_network(_MiddleFrame(detector.net), example, path, format, MAX_ERROR)
     about = {
         "features": {"name": type(detector.features).__name__, **asdict(detector.features)},
-        "feature_size": detector.features.size, "skeleton": list(skeleton.joint_names), "frames": FRAMES,
-        "fps": detector.fps, "classes": list(detector.classes), "hands": list(HANDS),
-    }  # fmt: skip
+        "feature_size": detector.features.size,
+        "skeleton": list(skeleton.joint_names),
+        "frames": FRAMES,
+        "fps": detector.fps,
+        "classes": list(detector.classes),
+        "hands": list(HANDS),
+    }
     write_sidecar(path, header("contact", report) | about)
     return report
 
@@ -70,6 +74,8 @@ def load_exported_contact(path: str | Path) -> ContactDetector:
     run, about = open_exported(path), read_sidecar(path, "contact")
     features = dict(about["features"])
     return ContactDetector(
-        ExportedContact(run, len(about["classes"])), FEATURES[features.pop("name")](**features),
-        tuple(about["classes"]), about["fps"],
-    )  # fmt: skip
+        ExportedContact(run, len(about["classes"])),
+        FEATURES[features.pop("name")](**features),
+        tuple(about["classes"]),
+        about["fps"],
+    )

@@ -19,16 +19,13 @@ from wearcap.systems.ireplica.features import pose_frames
 
 def main(arguments: list[str]) -> None:
     """Predict hand contact in one recording with an exported model and write it as a table."""
-    parser = command.parser(
-        "contact_runner", main.__doc__, "a suit, or a motion", "times and probabilities (.csv)"
-    )
+    parser = command.parser("contact_runner", main.__doc__, "a suit, or a motion", "times and probabilities (.csv)")
     options = parser.parse_args(arguments)
     detector = load_exported_contact(options.model)
     recording = RecordingFile(options.recording).load()
     motion = recording.suit or recording.motion
     if motion is None:
-        raise WearcapError("this recording has no poses", where=options.recording,
-                           expected="a suit, or a motion")  # fmt: skip
+        raise WearcapError("this recording has no poses", where=options.recording, expected="a suit, or a motion")
     times, R = pose_frames(motion, detector.features.skeleton, detector.fps)
     stream = ContactStream((detector,), detector.features.skeleton)
     predictions = [found for frame in R if (found := stream.push(frame)) is not None] + stream.finish()
@@ -36,7 +33,7 @@ def main(arguments: list[str]) -> None:
     rows = [
         [f"{time:.6f}", *(f"{p:.7f}" for p in torch.cat([found[name] for name in detector.classes]).tolist())]
         for time, found in zip(times.tolist(), predictions)
-    ]  # fmt: skip
+    ]
     write_text(options.output, "".join(",".join(row) + "\n" for row in [header, *rows]))
     print(f"{len(rows)} frames at {detector.fps:.0f} Hz: {options.output}")
 

@@ -65,9 +65,7 @@ class _DenoiserGraph(nn.Module):
         x_t: Float[Tensor, "batch time feature"],
         level: Float[Tensor, "batch time modality"],
     ) -> Float[Tensor, "batch time feature"]:
-        return self.net(
-            x_t, level, self.net.encode(condition, self.net.object(object_code), has_object, valid), valid
-        )
+        return self.net(x_t, level, self.net.encode(condition, self.net.object(object_code), has_object, valid), valid)
 
 
 def export_echo(pipeline: Echo, path: str | Path, format: str) -> ExportReport:
@@ -80,21 +78,33 @@ def export_echo(pipeline: Echo, path: str | Path, format: str) -> ExportReport:
     if isinstance(net, ExportedEchoDenoiser):
         raise WearcapError("a network that is exported already", where=path, expected="one of a checkpoint")
     if type(schedule).__name__ not in SCHEDULES:
-        raise WearcapError(f"schedule {type(schedule).__name__} cannot be exported", expected=f"one of {', '.join(SCHEDULES)}")  # fmt: skip
+        raise WearcapError(
+            f"schedule {type(schedule).__name__} cannot be exported", expected=f"one of {', '.join(SCHEDULES)}"
+        )
     report = export_network(_DenoiserGraph(net), _example(net, features), path, format, MAX_ERROR)
     guidance = pipeline.guidance
     about = {
-        "features": asdict(features), "window": net.window, "fps": pipeline.fps, "sizes": dict(zip(MODALITIES, net.sizes)),
+        "features": asdict(features),
+        "window": net.window,
+        "fps": pipeline.fps,
+        "sizes": dict(zip(MODALITIES, net.sizes)),
         "condition_channels": condition_channels(features),
-        "object_channels": [*(f"class.{name}" for name in features.classes), *(f"half_extent_{axis}" for axis in "xyz"),
-                            *(f"middle_{axis}" for axis in "xyz"), *(f"shape.{k}" for k in range(features.shape_size))],
+        "object_channels": [
+            *(f"class.{name}" for name in features.classes),
+            *(f"half_extent_{axis}" for axis in "xyz"),
+            *(f"middle_{axis}" for axis in "xyz"),
+            *(f"shape.{k}" for k in range(features.shape_size)),
+        ],
         "motion_channels": motion_channels(pipeline.skeleton),
-        "motion_mean": net.motion_normalizer.mean.tolist(), "motion_scale": net.motion_normalizer.scale.tolist(),
-        "schedule": {"name": type(schedule).__name__, **vars(schedule)}, "contacts": pipeline.contacts,
+        "motion_mean": net.motion_normalizer.mean.tolist(),
+        "motion_scale": net.motion_normalizer.scale.tolist(),
+        "schedule": {"name": type(schedule).__name__, **vars(schedule)},
+        "contacts": pipeline.contacts,
         "conveyor": {name: getattr(pipeline, name) for name in _CONVEYOR},
-        "guidance": None if guidance is None else asdict(guidance), "skeleton": skeleton_to_json(pipeline.skeleton),
+        "guidance": None if guidance is None else asdict(guidance),
+        "skeleton": skeleton_to_json(pipeline.skeleton),
         "encoder": _write_encoder(pipeline.encoder, path),
-    }  # fmt: skip
+    }
     write_sidecar(path, header("echo", report) | about)
     return report
 
@@ -121,17 +131,22 @@ def condition_channels(features: EchoFeatures) -> list[str]:
         *(f"{point}.{entry}" for point in POINTS for entry in ROT6D),
         *(f"{point}.turn.{entry}" for point in POINTS for entry in ROT6D),
         *(f"{point}.place_{axis}" for point in POINTS for axis in "xyz"),
-        *(f"{point}.velocity_{axis}" for point in POINTS for axis in "xyz"), *heading, *wearer,
-    ]  # fmt: skip
+        *(f"{point}.velocity_{axis}" for point in POINTS for axis in "xyz"),
+        *heading,
+        *wearer,
+    ]
 
 
 def motion_channels(skeleton: Skeleton) -> list[str]:
     """Names of a frame's output channels in order; normalised by `motion_mean` and `motion_scale`."""
     return [
-        *(f"root_{axis}" for axis in "xyz"), *(f"{joint}.{entry}" for joint in skeleton.joint_names for entry in ROT6D),
-        *(f"object_{axis}" for axis in "xyz"), *(f"object.{entry}" for entry in ROT6D),
-        *(f"point_{k}.contact" for k in range(BODY_POINTS)), *(f"{patch}.contact" for patch in FOOT_PATCHES),
-    ]  # fmt: skip
+        *(f"root_{axis}" for axis in "xyz"),
+        *(f"{joint}.{entry}" for joint in skeleton.joint_names for entry in ROT6D),
+        *(f"object_{axis}" for axis in "xyz"),
+        *(f"object.{entry}" for entry in ROT6D),
+        *(f"point_{k}.contact" for k in range(BODY_POINTS)),
+        *(f"{patch}.contact" for patch in FOOT_PATCHES),
+    ]
 
 
 def encoder_path(path: str | Path) -> Path:
@@ -154,7 +169,7 @@ def _read_encoder(about: dict[str, Any] | None, path: str | Path) -> PointNeXt |
         return None
     file = encoder_path(path)
     if not file.is_file():
-        raise WearcapError("a part of the exported model is missing", where=file, fix="Copy all files of the export.")  # fmt: skip
+        raise WearcapError("a part of the exported model is missing", where=file, fix="Copy all files of the export.")
     if about["sha256"] != sha256_of(file):
         raise WearcapError("it belongs to another exported model", where=file, fix="Export the model again.")
     encoder = PointNeXt(**about["settings"])
@@ -200,13 +215,15 @@ class ExportedEchoDenoiser(EchoDenoiser):
         condition, object_code, has_object = encoded.split(self._input_sizes, -1)
         level = plan.worth[0].expand(batch, -1, -1)
         inputs = {
-            "condition": condition, "object_code": object_code, "has_object": has_object[..., 0] > 0, "valid": valid,
-            "x_t": x_t, "level": level,
-        }  # fmt: skip
-        missing = self.window - count
-        whole = {
-            name: F.pad(value, (0, 0) * (value.ndim - 2) + (0, missing)) for name, value in inputs.items()
+            "condition": condition,
+            "object_code": object_code,
+            "has_object": has_object[..., 0] > 0,
+            "valid": valid,
+            "x_t": x_t,
+            "level": level,
         }
+        missing = self.window - count
+        whole = {name: F.pad(value, (0, 0) * (value.ndim - 2) + (0, missing)) for name, value in inputs.items()}
         return self._run[0](**whole)[:, :count]
 
 
@@ -218,11 +235,15 @@ def load_exported_echo(path: str | Path) -> Echo:
     run, about = open_exported(path), read_sidecar(path, "echo")
     schedule, guidance = dict(about["schedule"]), about["guidance"]
     return Echo(
-        ExportedEchoDenoiser(run, about), EchoFeatures(**about["features"]),
-        SCHEDULES[schedule.pop("name")](**schedule), skeleton_from_json(about["skeleton"]),
-        _read_encoder(about["encoder"], path), about["contacts"], **about["conveyor"],
+        ExportedEchoDenoiser(run, about),
+        EchoFeatures(**about["features"]),
+        SCHEDULES[schedule.pop("name")](**schedule),
+        skeleton_from_json(about["skeleton"]),
+        _read_encoder(about["encoder"], path),
+        about["contacts"],
+        **about["conveyor"],
         guidance=None if guidance is None else Guidance(**guidance),
-    )  # fmt: skip
+    )
 
 
 def main(arguments: list[str]) -> None:

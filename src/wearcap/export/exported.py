@@ -19,17 +19,14 @@ def open_onnx(path: str | Path) -> Run:
     try:
         import onnxruntime
     except ImportError as error:
-        raise WearcapError("running ONNX files needs onnxruntime",
-                           fix='Run: pip install "wearcap[export]"') from error  # fmt: skip
+        raise WearcapError("running ONNX files needs onnxruntime", fix='Run: pip install "wearcap[export]"') from error
     _require_file(path)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions share no base of their own
-        raise WearcapError(
-            f"not a readable ONNX file ({_first_line(error)})", where=path, fix=_AGAIN
-        ) from error
+        raise WearcapError(f"not a readable ONNX file ({_first_line(error)})", where=path, fix=_AGAIN) from error
 
     def run(**inputs: Tensor) -> Tensor:
         arrays = {name: value.contiguous().numpy() for name, value in inputs.items()}
@@ -49,9 +46,7 @@ def open_pt2(path: str | Path) -> Run:
     except WearcapError:
         raise
     except Exception as error:  # PyTorch raises arbitrary exceptions on a graph that it did not write
-        raise WearcapError(
-            f"not a readable .pt2 archive ({_first_line(error)})", where=path, fix=_AGAIN
-        ) from error
+        raise WearcapError(f"not a readable .pt2 archive ({_first_line(error)})", where=path, fix=_AGAIN) from error
     return lambda **inputs: module(**inputs)
 
 

@@ -59,9 +59,12 @@ class ConditionGraph(nn.Module):
     ) -> Float[Tensor, "batch token width"]:
         none = head[..., :0]
         conditions = Conditions(
-            head, none if points is None else points, valid if points_valid is None else points_valid,
-            none if image is None else image, valid if image_valid is None else image_valid,
-        )  # fmt: skip
+            head,
+            none if points is None else points,
+            valid if points_valid is None else points_valid,
+            none if image is None else image,
+            valid if image_valid is None else image_valid,
+        )
         return self.net.encode(conditions, valid)
 
 
@@ -96,9 +99,11 @@ def export_hmd2(pipeline: HMD2, path: str | Path, format: str) -> dict[str, Expo
     tokens, width = net.window // net.frames_per_token, net.motion_encoder.linear.out_features
     x_t, last = torch.randn(2, *shape, net.motion_size, generator=random)
     step = {
-        "x_t": x_t, "level": torch.rand(2, 1, generator=random),
-        "encoded": torch.randn(2, tokens, width, generator=random), "valid": valid,
-    }  # fmt: skip
+        "x_t": x_t,
+        "level": torch.rand(2, 1, generator=random),
+        "encoded": torch.randn(2, tokens, width, generator=random),
+        "valid": valid,
+    }
     graphs = {
         "step": (net, step | ({"last": last} if net.self_conditioning else {})),
         "conditions": (ConditionGraph(net), inputs),
@@ -108,9 +113,7 @@ def export_hmd2(pipeline: HMD2, path: str | Path, format: str) -> dict[str, Expo
         grids = grid.clip_m * torch.rand(2, *[grid.cells] * 3, generator=random)
         graphs["places"] = (PlaceGraph(pipeline.place_encoder), {"grids": grids})
     reports = {
-        name: export_network(
-            graph, example, path if name == "step" else part_path(path, name), format, MAX_ERROR
-        )
+        name: export_network(graph, example, path if name == "step" else part_path(path, name), format, MAX_ERROR)
         for name, (graph, example) in graphs.items()
     }
     write_sidecar(path, describe(pipeline, reports))
@@ -121,8 +124,9 @@ def describe(pipeline: HMD2, reports: dict[str, ExportReport]) -> dict:
     """The sidecar: everything that running the networks needs. Rotations of the motion are 6D in `features.frame`."""
     net, features, schedule = pipeline.net, pipeline.features, pipeline.schedule
     if type(schedule).__name__ not in SCHEDULES:
-        raise WearcapError(f"schedule {type(schedule).__name__} cannot be exported",
-                           expected=f"one of {', '.join(SCHEDULES)}")  # fmt: skip
+        raise WearcapError(
+            f"schedule {type(schedule).__name__} cannot be exported", expected=f"one of {', '.join(SCHEDULES)}"
+        )
     return {
         **header("denoiser", reports["step"]),
         "parts": {name: file_entry(report) for name, report in reports.items() if name != "step"},
@@ -160,10 +164,13 @@ def condition_channels(features: HeadFeatures) -> list[str]:
     """Names of the head's channels in order; they enter the network unnormalised."""
     horizontal = ["offset_x", "offset_y"] if features.frame == "window" else []
     return [
-        *horizontal, f"height_{features.height}", *(f"head.{entry}" for entry in ROT6D),
-        *(f"velocity_{axis}" for axis in "xyz"), *(f"angular_velocity_{axis}" for axis in "xyz"),
+        *horizontal,
+        f"height_{features.height}",
+        *(f"head.{entry}" for entry in ROT6D),
+        *(f"velocity_{axis}" for axis in "xyz"),
+        *(f"angular_velocity_{axis}" for axis in "xyz"),
         *(f"size.{limb}" for limb in LIMBS if features.body),
-    ]  # fmt: skip
+    ]
 
 
 def motion_channels(features: HeadFeatures, skeleton: Skeleton) -> list[str]:
@@ -186,9 +193,7 @@ class ExportedDenoiser(MotionDenoiser):
         self.motion_normalizer = Normalizer(self.motion_size)
         self.motion_normalizer.set(torch.tensor(about["motion_mean"]), torch.tensor(about["motion_scale"]))
 
-    def encode(
-        self, conditions: Conditions, valid: Bool[Tensor, "batch time"]
-    ) -> Float[Tensor, "batch token width"]:
+    def encode(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch token width"]:
         inputs = {"head": conditions.head, "valid": valid}
         if self.points_size:
             inputs |= {"points": conditions.points, "points_valid": conditions.points_valid}
@@ -208,12 +213,7 @@ class ExportedDenoiser(MotionDenoiser):
         valid: Bool[Tensor, "batch time"],
         last: Float[Tensor, "batch time motion"] | None = None,
     ) -> Float[Tensor, "batch time motion"]:
-        inputs = {
-            "x_t": x_t,
-            "level": plan.worth[..., 0].expand(len(x_t), 1),
-            "encoded": encoded,
-            "valid": valid,
-        }
+        inputs = {"x_t": x_t, "level": plan.worth[..., 0].expand(len(x_t), 1), "encoded": encoded, "valid": valid}
         if self.self_conditioning:
             inputs["last"] = torch.zeros_like(x_t) if last is None else last
         return self._run[0](**inputs)

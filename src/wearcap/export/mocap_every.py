@@ -33,9 +33,7 @@ class _Joined(nn.Module):
         super().__init__()
         self.net = net
 
-    def forward(
-        self, features: Float[Tensor, "batch window feature"]
-    ) -> Float[Tensor, "batch predicted value"]:
+    def forward(self, features: Float[Tensor, "batch window feature"]) -> Float[Tensor, "batch predicted value"]:
         output = self.net(features)
         return torch.cat([output.motion, output.contact_logit], -1)
 
@@ -54,10 +52,17 @@ def export_mocap_every(pipeline: MocapEvery, path: str | Path, format: str) -> E
     example = {"features": normalizer.mean.cpu() + normalizer.scale.cpu() * noise}
     report = export_network(_Joined(net), example, path, format, MAX_ERROR)
     about = {
-        "features": asdict(features), "feature_size": features.size, "motion_size": features.motion_size,
-        "window": net.window, "fps": pipeline.fps, "skeleton": skeleton_to_json(pipeline.skeleton),
-        "stride": pipeline.stride, "lookahead": pipeline.lookahead, "floor": pipeline.floor, "anchor": pipeline.anchor,
-    }  # fmt: skip
+        "features": asdict(features),
+        "feature_size": features.size,
+        "motion_size": features.motion_size,
+        "window": net.window,
+        "fps": pipeline.fps,
+        "skeleton": skeleton_to_json(pipeline.skeleton),
+        "stride": pipeline.stride,
+        "lookahead": pipeline.lookahead,
+        "floor": pipeline.floor,
+        "anchor": pipeline.anchor,
+    }
     write_sidecar(path, header("mocap_every", report) | about)
     return report
 
@@ -81,16 +86,20 @@ def load_exported_mocap_every(path: str | Path) -> MocapEvery:
     """
     run, about = open_exported(path), read_sidecar(path, "mocap_every")
     return MocapEvery(
-        ExportedEstimator(run, about["window"]), WatchFeatures(**about["features"]), skeleton_from_json(about["skeleton"]),
-        about["fps"], about["stride"], about["lookahead"], about["floor"], about["anchor"],
-    )  # fmt: skip
+        ExportedEstimator(run, about["window"]),
+        WatchFeatures(**about["features"]),
+        skeleton_from_json(about["skeleton"]),
+        about["fps"],
+        about["stride"],
+        about["lookahead"],
+        about["floor"],
+        about["anchor"],
+    )
 
 
 def main(arguments: list[str]) -> None:
     """Capture one recording with an exported model."""
-    parser = command.parser(
-        "mocap_every", main.__doc__, "a head and two watches", "the motion (.safetensors)"
-    )
+    parser = command.parser("mocap_every", main.__doc__, "a head and two watches", "the motion (.safetensors)")
     options = parser.parse_args(arguments)
     recording = RecordingFile(options.recording).load()
     motion = load_exported_mocap_every(options.model)(recording)

@@ -45,8 +45,11 @@ def export_network(
     _require_libraries(format)
     path, net = Path(path), copy.deepcopy(net).cpu().eval()
     if path.suffix != f".{format}":
-        raise WearcapError(f"a file of format {format} cannot end in {path.suffix!r}", where=path,
-                           expected=f"a name that ends in .{format}")  # fmt: skip
+        raise WearcapError(
+            f"a file of format {format} cannot end in {path.suffix!r}",
+            where=path,
+            expected=f"a name that ends in .{format}",
+        )
     dynamic = {name: {0: torch.export.Dim("batch", min=1)} for name in example}
     with atomic_path(path) as temporary, torch.inference_mode(), quiet():
         program = torch.export.export(net, (), example, dynamic_shapes=dynamic)
@@ -59,9 +62,11 @@ def export_network(
         error = max(_difference(net, run, example, batch) for batch in (1, 3))
         if not error < max_error:
             raise WearcapError(
-                f"the exported network differs from the eager one by {error:.2e}", where=path,
-                expected=f"less than {max_error:.0e}", fix="Try the other format and report this model.",
-            )  # fmt: skip
+                f"the exported network differs from the eager one by {error:.2e}",
+                where=path,
+                expected=f"less than {max_error:.0e}",
+                fix="Try the other format and report this model.",
+            )
         window = _batch_of(example, 1)
         latency, eager = _milliseconds(run, window), _milliseconds(lambda **inputs: net(**inputs), window)
         size = temporary.stat().st_size
@@ -74,9 +79,7 @@ def _require_libraries(format: str) -> None:
     needed = ("onnx", "onnxscript", "onnxruntime") if format == "onnx" else ()
     missing = [name for name in needed if importlib.util.find_spec(name) is None]
     if missing:
-        raise WearcapError(
-            f"export to ONNX needs {', '.join(missing)}", fix='Run: pip install "wearcap[export]"'
-        )
+        raise WearcapError(f"export to ONNX needs {', '.join(missing)}", fix='Run: pip install "wearcap[export]"')
 
 
 def _batch_of(example: dict[str, Tensor], batch: int) -> dict[str, Tensor]:

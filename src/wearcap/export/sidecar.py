@@ -56,7 +56,7 @@ def skeleton_from_json(tree: dict) -> Skeleton:
     sites = {name: Site(joint, (x, y, z)) for name, (joint, x, y, z) in tree["sites"].items()}
     return Skeleton(
         tree["name"], tuple(tree["joint_names"]), tuple(tree["parents"]), torch.tensor(tree["t_parent_joint"]), sites
-    )  # fmt: skip
+    )
 
 
 def read_sidecar(path: str | Path, network: str) -> dict:
@@ -65,19 +65,23 @@ def read_sidecar(path: str | Path, network: str) -> dict:
     try:
         tree = parse_json(sidecar.read_bytes(), sidecar)
     except FileNotFoundError as error:
-        raise WearcapError("no such sidecar", where=sidecar, expected="the .json file that `wearcap export` wrote "
-                           "beside the model", fix="Copy both files.") from error  # fmt: skip
+        raise WearcapError(
+            "no such sidecar",
+            where=sidecar,
+            expected="the .json file that `wearcap export` wrote beside the model",
+            fix="Copy both files.",
+        ) from error
     if not isinstance(tree, dict) or tree.get("wearcap_export") != VERSION:
         raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
     # The first sidecars had no "network" entry: all were denoisers'.
     if (kind := tree.get("network", "denoiser")) != network:
         raise WearcapError(f"a {kind} network", where=path, expected=f"a {network} network")
-    files = {Path(path): tree["model"]} | {
-        part_path(path, name): part for name, part in tree.get("parts", {}).items()
-    }
+    files = {Path(path): tree["model"]} | {part_path(path, name): part for name, part in tree.get("parts", {}).items()}
     for file, part in files.items():
         if not file.is_file():
-            raise WearcapError("a part of the exported model is missing", where=file, fix="Copy all files of the export.")  # fmt: skip
+            raise WearcapError(
+                "a part of the exported model is missing", where=file, fix="Copy all files of the export."
+            )
         if part["sha256"] != sha256_of(file):
-            raise WearcapError("its sidecar belongs to another model file", where=file, fix="Export the model again.")  # fmt: skip
+            raise WearcapError("its sidecar belongs to another model file", where=file, fix="Export the model again.")
     return tree

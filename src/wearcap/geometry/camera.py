@@ -36,14 +36,10 @@ class Camera:
 
     def __post_init__(self):
         if self.model not in _COEFFICIENTS:
-            raise WearcapError(
-                f"no camera model {self.model!r}", expected=f"one of {', '.join(_COEFFICIENTS)}"
-            )
+            raise WearcapError(f"no camera model {self.model!r}", expected=f"one of {', '.join(_COEFFICIENTS)}")
         if len(self.distortion) not in _COEFFICIENTS[self.model]:
             counts = " or ".join(map(str, _COEFFICIENTS[self.model]))
-            raise WearcapError(
-                f"camera model {self.model!r} with {len(self.distortion)} coefficients", expected=counts
-            )
+            raise WearcapError(f"camera model {self.model!r} with {len(self.distortion)} coefficients", expected=counts)
         if not (self.width > 0 and self.height > 0 and self.fx > 0 and self.fy > 0):
             raise WearcapError(
                 f"camera of {self.width}x{self.height} pixels with focal lengths {self.fx}, {self.fy}",
@@ -65,9 +61,14 @@ class Camera:
         """The camera for images resized to width x height pixels."""
         x, y = width / self.width, height / self.height
         return replace(
-            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y,
-            cx=(self.cx + 0.5) * x - 0.5, cy=(self.cy + 0.5) * y - 0.5,
-        )  # fmt: skip
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * x,
+            fy=self.fy * y,
+            cx=(self.cx + 0.5) * x - 0.5,
+            cy=(self.cy + 0.5) * y - 0.5,
+        )
 
     def project(
         self, points_cam: Float[Tensor, "*batch 3"]
@@ -129,9 +130,7 @@ class Camera:
         if self.model == "ocam":
             (c, d, e), powers = self.distortion[:3], self.distortion[3:]
             bent, d_bent = _radial_odd_and_even(plane, powers)
-            affine = plane.new_tensor(
-                [[1.0, e], [d, c]]
-            )  # OCamCalib counts rows first, we count columns first
+            affine = plane.new_tensor([[1.0, e], [d, c]])  # OCamCalib counts rows first, we count columns first
             return bent @ affine.T, affine @ d_bent
         radial, (first, second), prism = self._terms
         bent, d_bent = _radial(plane, radial)

@@ -44,11 +44,7 @@ class Mesh:
         a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
         face = np.cross(b - a, c - a)
         total = np.stack(
-            [
-                np.bincount(self.faces.ravel(), np.repeat(face[:, axis], 3), len(self.vertices))
-                for axis in range(3)
-            ],
-            -1,
+            [np.bincount(self.faces.ravel(), np.repeat(face[:, axis], 3), len(self.vertices)) for axis in range(3)], -1
         )
         return (total / np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-20)).astype(np.float32)
 
@@ -59,15 +55,15 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
     colors = []
     for mesh in meshes:
         if mesh.color.ndim == 2 and len(mesh.color) != len(mesh.vertices):
-            raise WearcapError(
-                "meshes coloured per face cannot be merged", expected="one colour or one per vertex"
-            )
+            raise WearcapError("meshes coloured per face cannot be merged", expected="one colour or one per vertex")
         colors.append(np.broadcast_to(mesh.color, mesh.vertices.shape))
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first)]).astype(np.int32),
-        np.concatenate(colors), meshes[0].smooth, meshes[0].casts_shadow,
-    )  # fmt: skip
+        np.concatenate(colors),
+        meshes[0].smooth,
+        meshes[0].casts_shadow,
+    )
 
 
 def capsules(
@@ -89,9 +85,7 @@ def capsules(
     rise = np.linspace(0, np.pi / 2, segments // 4 + 1)
     latitude = np.concatenate([rise - np.pi / 2, rise])[:, None]  # the equator twice: the stick between them
     turn = np.arange(segments) * 2 * np.pi / segments
-    unit = np.stack(
-        [np.cos(latitude) * np.cos(turn), np.cos(latitude) * np.sin(turn), np.sin(latitude) + 0 * turn], -1
-    )
+    unit = np.stack([np.cos(latitude) * np.cos(turn), np.cos(latitude) * np.sin(turn), np.sin(latitude) + 0 * turn], -1)
     upper = (np.arange(len(latitude)) >= len(rise))[:, None, None]
     radius = np.where(upper, radius_end[:, None, None, None], radius_start[:, None, None, None])
     center = np.where(upper, end[:, None, None], start[:, None, None])
@@ -100,16 +94,15 @@ def capsules(
     cell = np.arange((len(latitude) - 1) * segments)
     below, right = cell, cell - cell % segments + (cell + 1) % segments
     one = np.concatenate(
-        [
-            np.stack([below, right, right + segments], -1),
-            np.stack([below, right + segments, below + segments], -1),
-        ]
+        [np.stack([below, right, right + segments], -1), np.stack([below, right + segments, below + segments], -1)]
     )
     faces = (one + per_solid * np.arange(count)[:, None, None]).reshape(-1, 3)
     return Mesh(
-        points.reshape(-1, 3).astype(np.float32), faces.astype(np.int32),
-        np.repeat(color, per_solid, axis=0).astype(np.float32), smooth=True,
-    )  # fmt: skip
+        points.reshape(-1, 3).astype(np.float32),
+        faces.astype(np.int32),
+        np.repeat(color, per_solid, axis=0).astype(np.float32),
+        smooth=True,
+    )
 
 
 def checker_floor(
@@ -122,9 +115,7 @@ def checker_floor(
     """A horizontal chequered square around a point (m), its tiles fixed in the world; it fades at the rim."""
     first = np.floor((center[:2] - half_size) / tile).astype(int)
     count = int(2 * half_size / tile) + 2
-    column, row = (
-        grid.ravel() for grid in np.meshgrid(first[0] + np.arange(count), first[1] + np.arange(count))
-    )
+    column, row = (grid.ravel() for grid in np.meshgrid(first[0] + np.arange(count), first[1] + np.arange(count)))
     corner = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     xy = tile * (np.stack([column, row], -1)[:, None] + corner)
     fade = np.clip(np.linalg.norm(xy - center[:2], axis=-1) / half_size, 0, 1)[..., None] ** 2
@@ -133,6 +124,8 @@ def checker_floor(
     quad = np.array([[0, 1, 2], [0, 2, 3]])
     faces = (4 * np.arange(len(xy))[:, None, None] + quad).reshape(-1, 3)
     return Mesh(
-        vertices.reshape(-1, 3).astype(np.float32), faces.astype(np.int32),
-        color.reshape(-1, 3).astype(np.float32), casts_shadow=False,
-    )  # fmt: skip
+        vertices.reshape(-1, 3).astype(np.float32),
+        faces.astype(np.int32),
+        color.reshape(-1, 3).astype(np.float32),
+        casts_shadow=False,
+    )

@@ -16,7 +16,7 @@ class PointIndex:
             raise WearcapError(
                 f"cannot search {len(points)} points" + (" with NaN or infinity among them" if len(points) else ""),
                 expected="at least one point, all finite",
-            )  # fmt: skip
+            )
         self.points = points
         self._tree = KDTree(points.detach().cpu().double().numpy())
 

@@ -64,9 +64,19 @@ def draw_pinhole(vertices, faces, fx, fy, cx, cy, near, nearness, index):
                 count += 1
         for last in range(2, count):
             fill_triangle(
-                px[0], py[0], pw[0], px[last - 1], py[last - 1], pw[last - 1], px[last], py[last], pw[last],
-                number, nearness, index,
-            )  # fmt: skip
+                px[0],
+                py[0],
+                pw[0],
+                px[last - 1],
+                py[last - 1],
+                pw[last - 1],
+                px[last],
+                py[last],
+                pw[last],
+                number,
+                nearness,
+                index,
+            )
 
 
 @compiled
@@ -76,9 +86,19 @@ def draw_projected(pixels, vertex_nearness, valid, faces, nearness, index):
         a, b, c = faces[number, 0], faces[number, 1], faces[number, 2]
         if valid[a] and valid[b] and valid[c]:
             fill_triangle(
-                pixels[a, 0], pixels[a, 1], vertex_nearness[a], pixels[b, 0], pixels[b, 1], vertex_nearness[b],
-                pixels[c, 0], pixels[c, 1], vertex_nearness[c], number, nearness, index,
-            )  # fmt: skip
+                pixels[a, 0],
+                pixels[a, 1],
+                vertex_nearness[a],
+                pixels[b, 0],
+                pixels[b, 1],
+                vertex_nearness[b],
+                pixels[c, 0],
+                pixels[c, 1],
+                vertex_nearness[c],
+                number,
+                nearness,
+                index,
+            )
 
 
 _BULGE = 4.0
@@ -173,9 +193,11 @@ def draw_splats(points, first, centers, radii, pose, planes, lens, radius, metri
             depth = 0.0
             for row in range(3):
                 depth += planes[plane, row] * (
-                    pose[row, 0] * centers[block, 0] + pose[row, 1] * centers[block, 1]
-                    + pose[row, 2] * centers[block, 2] + pose[row, 3]
-                )  # fmt: skip
+                    pose[row, 0] * centers[block, 0]
+                    + pose[row, 1] * centers[block, 1]
+                    + pose[row, 2] * centers[block, 2]
+                    + pose[row, 3]
+                )
             outside = outside or depth < -radii[block]
         if outside:
             continue
@@ -187,9 +209,7 @@ def draw_splats(points, first, centers, radii, pose, planes, lens, radius, metri
             z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
             u, v, w = project_point(x, y, z, lens)
             if w > 0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
-                _disc(
-                    u, v, radius * focal * w if metric else radius, w, bulge, offset + number, nearness, index
-                )
+                _disc(u, v, radius * focal * w if metric else radius, w, bulge, offset + number, nearness, index)
     return projected
 
 
@@ -275,9 +295,33 @@ def _seen_normal(face, a, b, c, second, third, rx, ry, rz, vertices, normals, sm
 
 
 @compiled
-def resolve(nearness, index, rays, samples, pose, vertices, faces, normals, smooth, casts, colors, color_rows,
-            point_colors, light, axes, scale, shadow, shadow_high, shadow_low, contact, fade,
-            background, color, depth, number):  # fmt: skip
+def resolve(
+    nearness,
+    index,
+    rays,
+    samples,
+    pose,
+    vertices,
+    faces,
+    normals,
+    smooth,
+    casts,
+    colors,
+    color_rows,
+    point_colors,
+    light,
+    axes,
+    scale,
+    shadow,
+    shadow_high,
+    shadow_low,
+    contact,
+    fade,
+    background,
+    color,
+    depth,
+    number,
+):
     """Shade the visible samples and average `samples` x `samples` of them into each pixel of the picture.
 
     `light`: direction to the key light (3), its strength, the ambient light from below and from above. A
@@ -318,8 +362,9 @@ def resolve(nearness, index, rays, samples, pose, vertices, faces, normals, smoo
                     y = pose[1, 0] * rx * z + pose[1, 1] * ry * z + pose[1, 2] * rz * z + pose[1, 3]
                     z = pose[2, 0] * rx * z + pose[2, 1] * ry * z + pose[2, 2] * rz * z + pose[2, 3]
                     if key > 0:
-                        key *= _key_visibility(x + 0.015 * wx, y + 0.015 * wy, z + 0.015 * wz, axes, scale,
-                                               shadow, shadow_high, shadow_low)  # fmt: skip
+                        key *= _key_visibility(
+                            x + 0.015 * wx, y + 0.015 * wy, z + 0.015 * wz, axes, scale, shadow, shadow_high, shadow_low
+                        )
                     if wz > 0.3 and not casts[face]:
                         hidden = _contact_shade(x, y, z, axes, scale, contact, fade)
                         ambient *= 1.0 - 0.75 * hidden

@@ -84,9 +84,7 @@ def render(
     nearness = np.full((fine.height, fine.width), -np.inf, np.float32)
     index = np.full((fine.height, fine.width), -1, np.int32)
     if fine.model == "pinhole":
-        raster.draw_pinhole(
-            vertices_cam, scene.faces, fine.fx, fine.fy, fine.cx, fine.cy, NEAR_M, nearness, index
-        )
+        raster.draw_pinhole(vertices_cam, scene.faces, fine.fx, fine.fy, fine.cx, fine.cy, NEAR_M, nearness, index)
     else:
         pixels, near, valid = _project(fine, vertices_cam)
         raster.draw_projected(pixels, near, valid, scene.faces, nearness, index)
@@ -94,9 +92,17 @@ def render(
     for cloud in splats:
         one_block = np.array([0, len(cloud.points)]), np.zeros((1, 3)), np.full(1, np.inf)
         raster.draw_splats(
-            cloud.points, *one_block, camera_from_world(T_world_cam), np.zeros((0, 3)), lens_numbers(fine),
-            cloud.radius * (1.0 if cloud.metric else supersample), cloud.metric, offset, nearness, index,
-        )  # fmt: skip
+            cloud.points,
+            *one_block,
+            camera_from_world(T_world_cam),
+            np.zeros((0, 3)),
+            lens_numbers(fine),
+            cloud.radius * (1.0 if cloud.metric else supersample),
+            cloud.metric,
+            offset,
+            nearness,
+            index,
+        )
         offset += len(cloud.points)
     colors = _point_colors(splats)
     frame = _resolve(camera, fine, R, t, vertices_cam, scene, colors, light, background, nearness, index)
@@ -175,9 +181,15 @@ def _point_colors(splats: Sequence[Splats]) -> np.ndarray:
 def _project(camera: Camera, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels and nearness of points, and a mask of drawable ones, including a margin outside the image."""
     wide = Camera(
-        camera.model, 3 * camera.width, 3 * camera.height, camera.fx, camera.fy,
-        camera.cx + camera.width, camera.cy + camera.height, camera.distortion,
-    )  # fmt: skip
+        camera.model,
+        3 * camera.width,
+        3 * camera.height,
+        camera.fx,
+        camera.fy,
+        camera.cx + camera.width,
+        camera.cy + camera.height,
+        camera.distortion,
+    )
     pixels, valid = wide.project(torch.from_numpy(points_cam))
     pixels = pixels - torch.tensor([camera.width, camera.height])
     depth = np.linalg.norm(points_cam, axis=-1) if camera.is_fisheye else points_cam[:, 2]
@@ -221,9 +233,7 @@ def _shadow_maps(scene: _Scene, light: Light) -> tuple:
     return np.concatenate([key_axes, down_axes]), scale, shadow, high, low, contact
 
 
-def _resolve(
-    camera, fine, R, t, vertices_cam, scene, point_colors, light, background, nearness, index
-) -> Frame:
+def _resolve(camera, fine, R, t, vertices_cam, scene, point_colors, light, background, nearness, index) -> Frame:
     """Shade the z-buffer's samples at the image's own size."""
     to_light = np.asarray(light.to_light, float) / np.linalg.norm(light.to_light)
     shine = np.array([*to_light, light.key, light.ambient_below, light.ambient_above])
@@ -234,8 +244,27 @@ def _resolve(
     depth = np.empty((camera.height, camera.width), np.float32)
     number = np.empty((camera.height, camera.width), np.int32)
     raster.resolve(
-        nearness, index, _pixel_rays(fine), fine.width // camera.width, pose, vertices_cam, scene.faces,
-        (scene.normals @ R).astype(np.float32), scene.smooth, scene.casts, scene.colors, scene.color_rows,
-        point_colors, shine, axes, scale, *maps, _CONTACT_FADE, np.ascontiguousarray(back), color, depth, number,
-    )  # fmt: skip
+        nearness,
+        index,
+        _pixel_rays(fine),
+        fine.width // camera.width,
+        pose,
+        vertices_cam,
+        scene.faces,
+        (scene.normals @ R).astype(np.float32),
+        scene.smooth,
+        scene.casts,
+        scene.colors,
+        scene.color_rows,
+        point_colors,
+        shine,
+        axes,
+        scale,
+        *maps,
+        _CONTACT_FADE,
+        np.ascontiguousarray(back),
+        color,
+        depth,
+        number,
+    )
     return Frame(color, depth, number, len(scene.faces))

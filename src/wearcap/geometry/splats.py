@@ -49,9 +49,7 @@ class SplatCloud:
         start = first[:-1]
         lowest, highest = np.minimum.reduceat(points, start), np.maximum.reduceat(points, start)
         centers = 0.5 * (lowest.astype(np.float64) + highest)
-        return cls(
-            points, order, first, centers, 0.5 * np.linalg.norm(highest.astype(np.float64) - lowest, axis=1)
-        )
+        return cls(points, order, first, centers, 0.5 * np.linalg.norm(highest.astype(np.float64) - lowest, axis=1))
 
     def draw(
         self, camera: Camera, T_world_cam: Rigid, radius_m: float
@@ -65,9 +63,19 @@ class SplatCloud:
         index = np.full((camera.height, camera.width), -1, np.int32)
         pose = camera_from_world(T_world_cam)
         raster.draw_splats(
-            self.points, self.first, self.centers, self.radii + radius_m, pose, view_planes(camera),
-            lens_numbers(camera), radius_m, True, 0, nearness, index,
-        )  # fmt: skip
+            self.points,
+            self.first,
+            self.centers,
+            self.radii + radius_m,
+            pose,
+            view_planes(camera),
+            lens_numbers(camera),
+            radius_m,
+            True,
+            0,
+            nearness,
+            index,
+        )
         depth = point_depths(self.points, index, pose, camera.is_fisheye)
         seen = index >= 0
         index[seen] = self.order[index[seen]]
@@ -111,9 +119,17 @@ def lens_numbers(camera: Camera) -> Float64[np.ndarray, "number"]:
     elif camera.model == "ocam":
         radial, affine = d[3:], (d[2], d[1], d[0])
     head = (
-        float(camera.is_fisheye), camera.fx, camera.fy, camera.cx, camera.cy, NEAR_M, camera._fold,
-        float(len(radial)), float(camera.model == "ocam"), float(camera.model == "opencv"),
-    )  # fmt: skip
+        float(camera.is_fisheye),
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        NEAR_M,
+        camera._fold,
+        float(len(radial)),
+        float(camera.model == "ocam"),
+        float(camera.model == "opencv"),
+    )
     return np.array([*head, *tangential, *prism, *affine, *radial], np.float64)
 
 

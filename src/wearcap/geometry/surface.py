@@ -90,8 +90,11 @@ def _pack(points: np.ndarray, origin: np.ndarray, cell_m: float) -> Int64[np.nda
     """One integer for the three coordinates of each point's cell."""
     cell = np.floor((points - origin) / cell_m).astype(np.int64)
     if cell.max(initial=0) >= 1 << 20:
-        raise WearcapError(f"the cloud extends over {np.ptp(points, axis=0).max():.0f} m",
-                           expected="a scene in metres", fix="Divide by 1000 if it is in millimetres.")  # fmt: skip
+        raise WearcapError(
+            f"the cloud extends over {np.ptp(points, axis=0).max():.0f} m",
+            expected="a scene in metres",
+            fix="Divide by 1000 if it is in millimetres.",
+        )
     return (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
 
 
@@ -167,9 +170,7 @@ def _plane_all(queries, radius, reach, points, cell_m, origin, keys, first, coun
         )
         plane_origin[q], normal[q] = np.nan, np.nan
         if row >= 0:
-            fit_plane(
-                points[row], radius, points, cell_m, origin, keys, first, count, plane_origin[q], normal[q]
-            )
+            fit_plane(points[row], radius, points, cell_m, origin, keys, first, count, plane_origin[q], normal[q])
 
 
 @compiled

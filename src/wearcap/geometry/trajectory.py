@@ -56,14 +56,13 @@ def require_rising(timestamps: Float64[Tensor, "time"]) -> None:
             frame = int(bad.nonzero()[0])
             raise WearcapError(
                 f"the timestamp of frame {frame} ({timestamps[frame].item():.6f} s) {word}",
-                expected="strictly rising timestamps in seconds", fix="Sort the frames and drop duplicates.",
-            )  # fmt: skip
+                expected="strictly rising timestamps in seconds",
+                fix="Sort the frames and drop duplicates.",
+            )
 
 
 def interpolate(
-    timestamps: Float64[Tensor, "time"],
-    value: Float[Tensor, "time *rest"],
-    at: Float64[Tensor, "new_time"],
+    timestamps: Float64[Tensor, "time"], value: Float[Tensor, "time *rest"], at: Float64[Tensor, "new_time"]
 ) -> Float[Tensor, "new_time *rest"]:
     """Values at other times, by linear interpolation. Raises WearcapError for times outside, as `resample`."""
     before, after, blend = _brackets(timestamps, at)
@@ -82,9 +81,7 @@ def interpolate_clamped(
     return value[right - 1] + share.to(value.dtype) * (value[right] - value[right - 1])
 
 
-def nearest_frames(
-    timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "new_time"]
-) -> Int64[Tensor, "new_time"]:
+def nearest_frames(timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "new_time"]) -> Int64[Tensor, "new_time"]:
     """Index of the frame nearest to each time, at any distance."""
     return torch.searchsorted((timestamps[1:] + timestamps[:-1]) / 2, at.contiguous())
 
@@ -103,9 +100,7 @@ def _resampled(trajectory: Trajectory, timestamps: Tensor, brackets: tuple) -> T
     R, t = trajectory.R_world_body, trajectory.t_world_body
     blend = blend.to(t.dtype)[:, None]
     turn = rotation.log(R[before].mT @ R[after])
-    return Trajectory(
-        timestamps, R[before] @ rotation.exp(blend * turn), torch.lerp(t[before], t[after], blend)
-    )
+    return Trajectory(timestamps, R[before] @ rotation.exp(blend * turn), torch.lerp(t[before], t[after], blend))
 
 
 def _brackets(timestamps: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -27,9 +27,7 @@ class TriangleIndex:
     """First and last + 1 of a node's faces, and its left child (the right one follows it), 0 at leaves."""
 
     @classmethod
-    def build(
-        cls, vertices: Float64[np.ndarray, "vertex 3"], faces: Int64[np.ndarray, "face 3"]
-    ) -> "TriangleIndex":
+    def build(cls, vertices: Float64[np.ndarray, "vertex 3"], faces: Int64[np.ndarray, "face 3"]) -> "TriangleIndex":
         """Halve the faces along their boxes' longest sides. Raises WearcapError without faces or with NaN."""
         if not len(faces):
             raise WearcapError("a mesh without faces has no surface", expected="at least one triangle")
@@ -58,11 +56,7 @@ class TriangleIndex:
         return distance, point
 
     def _search(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        distance, face, point = (
-            np.empty(len(queries)),
-            np.empty(len(queries), np.int64),
-            np.empty((len(queries), 3)),
-        )
+        distance, face, point = (np.empty(len(queries)), np.empty(len(queries), np.int64), np.empty((len(queries), 3)))
         _nearest_all(queries, self.corners, self.low, self.high, self.span, distance, face, point)
         return distance, self.order[face], point
 
@@ -79,9 +73,7 @@ class BodiesIndex:
     """First node of each body's tree; bodies of one shape share it."""
 
     @classmethod
-    def build(
-        cls, shapes: Sequence[TriangleIndex], shape_of_body: Int64[np.ndarray, "body"]
-    ) -> "BodiesIndex":
+    def build(cls, shapes: Sequence[TriangleIndex], shape_of_body: Int64[np.ndarray, "body"]) -> "BodiesIndex":
         """Join the shapes' trees. Raises ValueError without a shape."""
         first_face = np.cumsum([0, *(len(shape.corners) for shape in shapes)])
         first_node = np.cumsum([0, *(len(shape.span) for shape in shapes)])
@@ -90,9 +82,12 @@ class BodiesIndex:
             child = np.where(shape.span[:, 2:] > 0, shape.span[:, 2:] + node, 0)
             spans.append(np.concatenate([shape.span[:, :2] + face, child], 1))
         return cls(
-            np.concatenate([shape.corners for shape in shapes]), np.concatenate([shape.low for shape in shapes]),
-            np.concatenate([shape.high for shape in shapes]), np.concatenate(spans), first_node[shape_of_body],
-        )  # fmt: skip
+            np.concatenate([shape.corners for shape in shapes]),
+            np.concatenate([shape.low for shape in shapes]),
+            np.concatenate([shape.high for shape in shapes]),
+            np.concatenate(spans),
+            first_node[shape_of_body],
+        )
 
     def nearest(
         self,
@@ -107,9 +102,19 @@ class BodiesIndex:
         count = len(queries)
         body, distance, point = np.empty(count, np.int64), np.empty(count), np.empty((count, 3))
         _nearest_bodies(
-            queries, R_world_body, t_world_body, self.roots[bodies], reach_m, self.corners, self.low, self.high,
-            self.span, body, distance, point,
-        )  # fmt: skip
+            queries,
+            R_world_body,
+            t_world_body,
+            self.roots[bodies],
+            reach_m,
+            self.corners,
+            self.low,
+            self.high,
+            self.span,
+            body,
+            distance,
+            point,
+        )
         return np.append(bodies, -1)[body], distance, point
 
 

@@ -58,8 +58,13 @@ def ransac_pose(
     """P3P in LO-RANSAC over matches with outliers; None where no pose is found."""
     if len(pixels) < 4:
         return None
-    options = {"max_reproj_error": max_error_px, "max_iterations": max_iterations, "min_iterations": 50,
-               "success_prob": 0.9999, "seed": seed}  # fmt: skip
+    options = {
+        "max_reproj_error": max_error_px,
+        "max_iterations": max_iterations,
+        "min_iterations": 50,
+        "success_prob": 0.9999,
+        "seed": seed,
+    }
     pose, report = poselib.estimate_absolute_pose(
         pixels.astype(np.float64), points_world.astype(np.float64), lens_of(camera), options, {}
     )
@@ -85,8 +90,12 @@ def refined_pose(
     for _ in range(2):
         options = {"loss_type": "CAUCHY", "loss_scale": 0.5 * max_error_px, "max_iterations": 50}
         pose, _ = poselib.refine_absolute_pose(
-            pixels[inlier].astype(np.float64), points_world[inlier].astype(np.float64), initial, lens_of(camera), options
-        )  # fmt: skip
+            pixels[inlier].astype(np.float64),
+            points_world[inlier].astype(np.float64),
+            initial,
+            lens_of(camera),
+            options,
+        )
         fit = _fit(pose, inlier)
         inlier = reprojection_errors(pixels, points_world, camera, fit) < max_error_px
         if inlier.sum() < 4:
@@ -108,10 +117,7 @@ def project(points_world: np.ndarray, camera: Camera, fit: Fit) -> tuple[np.ndar
 
 
 def reprojection_errors(
-    pixels: Float32[np.ndarray, "match 2"],
-    points_world: Float32[np.ndarray, "match 3"],
-    camera: Camera,
-    fit: Fit,
+    pixels: Float32[np.ndarray, "match 2"], points_world: Float32[np.ndarray, "match 3"], camera: Camera, fit: Fit
 ) -> Float64[np.ndarray, "match"]:
     """Distance (px) between each keypoint and its point's projection; infinite where that is not in view."""
     seen, valid = project(points_world, camera, fit)

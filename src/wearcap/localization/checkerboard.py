@@ -30,8 +30,10 @@ class Board:
 
     def __post_init__(self):
         if min(self.columns, self.rows) < 3 or not self.square_m > 0:
-            raise WearcapError(f"a board of {self.columns}x{self.rows} inner corners and squares of {self.square_m} m",
-                               expected="at least 3x3 inner corners, and a positive size in metres")  # fmt: skip
+            raise WearcapError(
+                f"a board of {self.columns}x{self.rows} inner corners and squares of {self.square_m} m",
+                expected="at least 3x3 inner corners, and a positive size in metres",
+            )
 
     @property
     def points(self) -> Float32[np.ndarray, "point 3"]:
@@ -113,8 +115,12 @@ def calibrate_from_pictures(
         examined += 1
         size = size or (picture.shape[1], picture.shape[0])
         if (picture.shape[1], picture.shape[0]) != size:
-            raise WearcapError(f"{picture.shape[1]}x{picture.shape[0]} pixels", where=name, expected=f"{size[0]}x{size[1]}, as the pictures before",
-                               fix="Calibrate each resolution by itself.")  # fmt: skip
+            raise WearcapError(
+                f"{picture.shape[1]}x{picture.shape[0]} pixels",
+                where=name,
+                expected=f"{size[0]}x{size[1]}, as the pictures before",
+                fix="Calibrate each resolution by itself.",
+            )
         gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
         view = find_board(gray, board, name)
         if view is not None:
@@ -132,11 +138,7 @@ def calibrate_from_pictures(
 def find_board(gray: UInt8[np.ndarray, "height width"], board: Board, name: str = "") -> View | None:
     """Corners of the whole board in a grey picture, refined to a fraction of a pixel; None where it is not seen."""
     shrink = max(1.0, gray.shape[1] / _SEARCH_WIDTH)
-    small = (
-        gray
-        if shrink == 1
-        else cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-    )
+    small = gray if shrink == 1 else cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
     pattern = (board.columns, board.rows)
     found, corners = cv2.findChessboardCornersSB(small, pattern, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not found:
@@ -146,9 +148,7 @@ def find_board(gray: UInt8[np.ndarray, "height width"], board: Board, name: str 
     step = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
     reach = int(np.clip(step / 3, 2, 11))  # the window must not reach into the next corner
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
-    corners = cv2.cornerSubPix(
-        gray, corners.astype(np.float32).reshape(-1, 1, 2), (reach, reach), (-1, -1), stop
-    )
+    corners = cv2.cornerSubPix(gray, corners.astype(np.float32).reshape(-1, 1, 2), (reach, reach), (-1, -1), stop)
     blur = cv2.estimateChessboardSharpness(gray, pattern, corners)[0][0]
     return View(name, corners.reshape(-1, 2), float(blur))
 
@@ -169,9 +169,7 @@ def varied(views: Sequence[View], size: tuple[int, int], count: int) -> list[Vie
     return [views[k] for k in sorted(chosen)]
 
 
-def _appearance(
-    corners: Float32[np.ndarray, "point 2"], size: tuple[int, int]
-) -> Float64[np.ndarray, "feature"]:
+def _appearance(corners: Float32[np.ndarray, "point 2"], size: tuple[int, int]) -> Float64[np.ndarray, "feature"]:
     """Place (shares of the picture), size (log of its share), and the projective part of the view: how it is tilted."""
     side = float(max(size))
     centred = (corners.astype(np.float64) - corners.mean(0)) / side
@@ -181,16 +179,16 @@ def _appearance(
     return np.array([*(corners.mean(0) / size), np.log(spread), shape[1] / shape[0], *(3 * skew)])
 
 
-def _calibrated(
-    views: list[View], board: Board, size: tuple[int, int], settings: CalibrationSettings
-) -> Calibration:
+def _calibrated(views: list[View], board: Board, size: tuple[int, int], settings: CalibrationSettings) -> Calibration:
     """Calibrate, reject views with large residuals, calibrate again, until all agree."""
     rejected: list[View] = []
     while True:
         if len(views) < settings.min_views:
-            raise WearcapError(f"{len(views)} good views of the {board} board ({len(rejected)} rejected for their residuals)",
-                               expected=f"at least {settings.min_views}",
-                               fix="Film it slowly, from near and far, tilted to all sides, into the picture's corners.")  # fmt: skip
+            raise WearcapError(
+                f"{len(views)} good views of the {board} board ({len(rejected)} rejected for their residuals)",
+                expected=f"at least {settings.min_views}",
+                fix="Film it slowly, from near and far, tilted to all sides, into the picture's corners.",
+            )
         points = [view.corners.reshape(-1, 1, 2) for view in views]
         rms, K, bent, turns, _, spread, _, residuals = cv2.calibrateCameraExtended(
             [board.points] * len(views), points, size, None, None, flags=cv2.CALIB_FIX_K3
@@ -205,9 +203,11 @@ def _calibrated(
     focal_std, tilt_deg = float(max(spread[0, 0], spread[1, 0])), _tilt_deg(turns)
     open_focal = focal_std > settings.max_focal_spread * K[0, 0] or tilt_deg < settings.min_tilt_deg
     if not np.isfinite(K).all() or open_focal:
-        raise WearcapError(f"the views leave the focal length open ({K[0, 0]:.0f} ± {focal_std:.1f} px, boards tilted by {tilt_deg:.1f}°)",
-                           expected=f"a deviation below {100 * settings.max_focal_spread:g} %, tilts of {settings.min_tilt_deg:g}°",
-                           fix="Tilt the board: views from straight ahead do not tell focal length from distance.")  # fmt: skip
+        raise WearcapError(
+            f"the views leave the focal length open ({K[0, 0]:.0f} ± {focal_std:.1f} px, boards tilted by {tilt_deg:.1f}°)",
+            expected=f"a deviation below {100 * settings.max_focal_spread:g} %, tilts of {settings.min_tilt_deg:g}°",
+            fix="Tilt the board: views from straight ahead do not tell focal length from distance.",
+        )
     lens = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     camera = Camera("opencv", *size, *lens, tuple(map(float, bent.ravel()[:4])))
     return Calibration(camera, float(rms), focal_std, coverage(views, size), tuple(views), tuple(rejected))
@@ -230,16 +230,21 @@ def coverage(views: Sequence[View], size: tuple[int, int]) -> float:
 
 def _not_found(board: Board, size: tuple[int, int], examined: int, missed: list[np.ndarray]) -> WearcapError:
     """Error for a missing board; its fix suggests another count of corners if that one is found."""
-    others = [(board.columns - 1, board.rows - 1), (board.columns + 1, board.rows + 1),
-              (board.columns - 1, board.rows), (board.columns, board.rows - 1)]  # fmt: skip
-    fix = (
-        "Count inner corners, not squares; show the whole board with a white margin, evenly lit and in focus."
-    )
+    others = [
+        (board.columns - 1, board.rows - 1),
+        (board.columns + 1, board.rows + 1),
+        (board.columns - 1, board.rows),
+        (board.columns, board.rows - 1),
+    ]
+    fix = "Count inner corners, not squares; show the whole board with a white margin, evenly lit and in focus."
     for columns, rows in others:
         if min(columns, rows) >= 3 and any(
             find_board(gray, replace(board, columns=columns, rows=rows)) for gray in missed
         ):
             fix = f"A board of {columns}x{rows} inner corners was found: give columns={columns} rows={rows}."
             break
-    return WearcapError(f"no board of {board} inner corners in {examined} pictures of {size[0]}x{size[1]} pixels",
-                        expected="a checkerboard, seen as a whole", fix=fix)  # fmt: skip
+    return WearcapError(
+        f"no board of {board} inner corners in {examined} pictures of {size[0]}x{size[1]} pixels",
+        expected="a checkerboard, seen as a whole",
+        fix=fix,
+    )

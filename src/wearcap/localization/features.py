@@ -67,28 +67,20 @@ class RootSift:
 
     name = "rootsift"
 
-    def __init__(
-        self, max_keypoints: int = 2048, contrast_threshold: float = 0.02, max_side: int | None = None
-    ):
+    def __init__(self, max_keypoints: int = 2048, contrast_threshold: float = 0.02, max_side: int | None = None):
         if max_keypoints < 1 or contrast_threshold < 0 or (max_side is not None and max_side < 32):
             raise WearcapError(
                 f"SIFT with {max_keypoints} keypoints, contrast threshold {contrast_threshold}, side {max_side}",
                 expected="at least one keypoint, a threshold of 0 or more, at least 32 pixels",
             )
-        self.max_keypoints, self.contrast_threshold, self.max_side = (
-            max_keypoints,
-            contrast_threshold,
-            max_side,
-        )
+        self.max_keypoints, self.contrast_threshold, self.max_side = (max_keypoints, contrast_threshold, max_side)
 
     def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Features:
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         height, width = gray.shape
         shrink = 1.0 if self.max_side is None else min(1.0, self.max_side / max(height, width))
         if shrink < 1:
-            gray = cv2.resize(
-                gray, (round(width * shrink), round(height * shrink)), interpolation=cv2.INTER_AREA
-            )
+            gray = cv2.resize(gray, (round(width * shrink), round(height * shrink)), interpolation=cv2.INTER_AREA)
         # precise upscaling: without it every keypoint lies a quarter of a pixel off
         sift = cv2.SIFT.create(
             self.max_keypoints, contrastThreshold=self.contrast_threshold, enable_precise_upscale=True

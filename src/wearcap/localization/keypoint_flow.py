@@ -42,8 +42,10 @@ class FlowSettings:
 
     def __post_init__(self):
         if self.reach < 0 or self.window_px < 3 or self.levels < 0:
-            raise WearcapError(f"flow over {self.reach} frames in windows of {self.window_px} px with {self.levels} levels",
-                               expected="0 frames or more, 3 px or more, 0 levels or more")  # fmt: skip
+            raise WearcapError(
+                f"flow over {self.reach} frames in windows of {self.window_px} px with {self.levels} levels",
+                expected="0 frames or more, 3 px or more, 0 levels or more",
+            )
 
 
 class Spotted(NamedTuple):
@@ -71,10 +73,12 @@ class _Track:
 
     def where(self, chosen: Bool[np.ndarray, "keypoint"], other: "_Track") -> "_Track":
         """The chosen keypoints of this track, the rest of another."""
-        return _Track(*(
-            np.where(chosen.reshape(-1, *[1] * (mine.ndim - 1)), mine, theirs)
-            for mine, theirs in zip(vars(self).values(), vars(other).values())
-        ))  # fmt: skip
+        return _Track(
+            *(
+                np.where(chosen.reshape(-1, *[1] * (mine.ndim - 1)), mine, theirs)
+                for mine, theirs in zip(vars(self).values(), vars(other).values())
+            )
+        )
 
 
 @dataclass(eq=False)
@@ -93,11 +97,9 @@ class KeypointFlow:
         self._frames: deque[_Frame] = deque()
         count, side = len(self.joints), settings.window_px
         none = np.full(count, np.nan, np.float32)
-        self._nowhere = _Track(np.stack([none, none], -1), none, none, np.zeros((count, side, side), np.float32))  # fmt: skip
+        self._nowhere = _Track(np.stack([none, none], -1), none, none, np.zeros((count, side, side), np.float32))
 
-    def advance(
-        self, picture: UInt8[np.ndarray, "height width 3"], found: Mapping[str, Keypoint]
-    ) -> list[Spotted]:
+    def advance(self, picture: UInt8[np.ndarray, "height width 3"], found: Mapping[str, Keypoint]) -> list[Spotted]:
         """Frames that are final now, none to one."""
         grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
         detected = self._detected(grey, found)
@@ -107,8 +109,9 @@ class KeypointFlow:
             if grey.shape != last.grey.shape:
                 raise WearcapError(
                     f"a picture of {grey.shape[1]}x{grey.shape[0]} pixels after one of "
-                    f"{last.grey.shape[1]}x{last.grey.shape[0]}", expected="a video of one size",
-                )  # fmt: skip
+                    f"{last.grey.shape[1]}x{last.grey.shape[0]}",
+                    expected="a video of one size",
+                )
             forward = _followed(_without(last.forward, detected.there), last.grey, grey, self.settings)
         forward = detected.where(detected.there, forward)
         self._frames.append(_Frame(grey, detected.there, forward, self._nowhere))
@@ -162,8 +165,10 @@ def tracked_cues(
         spotted += flow.advance(picture, detector(picture, times[count - 1]))
     spotted += flow.finish()
     if count != len(times):
-        raise WearcapError(f"{'more' if count > len(times) else count} pictures for {len(times)} timestamps",
-                           expected="a picture for each timestamp of the camera")  # fmt: skip
+        raise WearcapError(
+            f"{'more' if count > len(times) else count} pictures for {len(times)} timestamps",
+            expected="a picture for each timestamp of the camera",
+        )
     if not spotted:
         return {}
     pixels, confidence = (torch.from_numpy(np.stack(part, 1)) for part in zip(*spotted))
@@ -199,8 +204,13 @@ def _flow(
 ) -> tuple[Float32[np.ndarray, "keypoint 2"], Bool[np.ndarray, "keypoint"]]:
     side = settings.window_px
     end, status, _ = cv2.calcOpticalFlowPyrLK(
-        before, after, start[:, None], None, winSize=(side, side), maxLevel=settings.levels  # type: ignore[call-overload]
-    )  # fmt: skip
+        before,
+        after,
+        start[:, None],
+        None,
+        winSize=(side, side),
+        maxLevel=settings.levels,  # type: ignore[call-overload]
+    )
     return end[:, 0], status[:, 0] == 1
 
 
@@ -211,7 +221,9 @@ def _patches(
     if not len(pixels):
         return np.zeros((0, side, side), np.float32)
     offset = np.arange(side, dtype=np.float32) - (side - 1) / 2
-    y, x = (pixels[:, axis, None, None] + grid for axis, grid in zip((1, 0), np.meshgrid(offset, offset, indexing="ij")))  # fmt: skip
+    y, x = (
+        pixels[:, axis, None, None] + grid for axis, grid in zip((1, 0), np.meshgrid(offset, offset, indexing="ij"))
+    )
     maps = (part.reshape(-1, side).astype(np.float32) for part in (x, y))
     found = cv2.remap(grey, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return found.reshape(-1, side, side).astype(np.float32)
@@ -235,12 +247,8 @@ def _blended(frame: _Frame, settings: FlowSettings) -> Spotted:
     share = there / np.maximum(age, 1e-6)
     share = share / np.maximum(share.sum(0), 1e-9)
     where = np.where(there[..., None], np.stack([track.pixels for track in tracks]), 0.0)
-    sure = np.where(
-        there, np.stack([track.trust for track in tracks]) * (1 - age / (settings.reach + 1)), 0.0
-    )
+    sure = np.where(there, np.stack([track.trust for track in tracks]) * (1 - age / (settings.reach + 1)), 0.0)
     apart = np.where(there.all(0), np.linalg.norm(where[0] - where[1], axis=-1), 0.0)
     confidence = (share * sure).sum(0) / (1 + (apart / settings.apart_px) ** 2)
     confidence[apart > APART_AT_MOST * settings.apart_px] = 0.0
-    return Spotted(
-        (share[..., None] * where).sum(0).astype(np.float32), confidence.clip(0, 1).astype(np.float32)
-    )
+    return Spotted((share[..., None] * where).sum(0).astype(np.float32), confidence.clip(0, 1).astype(np.float32))

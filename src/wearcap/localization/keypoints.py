@@ -43,9 +43,7 @@ class RecordedDetections:
         """
         for cue in cues.values():
             if cue.points.shape[-1] != 2:
-                raise WearcapError(
-                    f"{cue.joint!r} has {cue.points.shape[-1]} coordinates", expected="2: pixels"
-                )
+                raise WearcapError(f"{cue.joint!r} has {cue.points.shape[-1]} coordinates", expected="2: pixels")
         self._within_s = within_s
         self._cues = {
             cue.joint: (cue.timestamps.numpy(), cue.points.numpy(), cue.confidence.numpy())

@@ -78,5 +78,5 @@ def _cosine(descriptors: np.ndarray, a: np.ndarray, b: np.ndarray, chunk: int = 
     parts = [
         np.einsum("nd,nd->n", from_bytes(descriptors[a[k : k + chunk]]), from_bytes(descriptors[b[k : k + chunk]]))
         for k in range(0, len(a), chunk)
-    ]  # fmt: skip
+    ]
     return np.concatenate([np.zeros(0, np.float32), *parts])

@@ -92,8 +92,11 @@ class Localizer:
         descriptor: GlobalDescriptor | None = None,
     ):
         if not len(visual_map) or not len(visual_map.landmarks.points_world):
-            raise WearcapError("the map is empty: nothing can be localised in it", expected="pictures with landmarks",
-                               fix="Build it from photos that show the scene: wearcap scene.")  # fmt: skip
+            raise WearcapError(
+                "the map is empty: nothing can be localised in it",
+                expected="pictures with landmarks",
+                fix="Build it from photos that show the scene: wearcap scene.",
+            )
         require_same_features(visual_map, extractor, descriptor)
         self.map, self.extractor, self.matcher, self.settings = visual_map, extractor, matcher, settings
         self.descriptor: GlobalDescriptor = descriptor or Vlad(visual_map.vocabulary)
@@ -101,10 +104,7 @@ class Localizer:
         self._same_m = max(2.5 * visual_map.cell_m, 0.002 * float(extent))
 
     def __call__(
-        self,
-        image: UInt8[np.ndarray, "height width 3"],
-        camera: Camera | None,
-        prior: Rigid | None = None,
+        self, image: UInt8[np.ndarray, "height width 3"], camera: Camera | None, prior: Rigid | None = None
     ) -> CameraPose | None:
         """Pose of the picture's camera, or None where none is found.
 
@@ -119,8 +119,11 @@ class Localizer:
         Raises WearcapError without intrinsics or for a picture of another size than they are for.
         """
         if camera is None:
-            raise WearcapError("no intrinsics of the camera", expected="a calibrated camera",
-                               fix="Calibrate it from a checkerboard video: wearcap calibrate.")  # fmt: skip
+            raise WearcapError(
+                "no intrinsics of the camera",
+                expected="a calibrated camera",
+                fix="Calibrate it from a checkerboard video: wearcap calibrate.",
+            )
         check_size(image, camera, "localization")
         image, camera, valid = flat_picture(image, camera, self.settings.horizontal_fov_deg)
         features = features_within(self.extractor(image), valid)
@@ -140,9 +143,7 @@ class Localizer:
         images = most_similar(picture.summary, self.map.global_descriptors, self.settings.retrieved)
         return self._pose(picture, images, self.settings.max_landmarks)
 
-    def _pose(
-        self, picture: Described, images: Int64[np.ndarray, "chosen"], max_landmarks: int
-    ) -> CameraPose | None:
+    def _pose(self, picture: Described, images: Int64[np.ndarray, "chosen"], max_landmarks: int) -> CameraPose | None:
         """Pose from the landmarks of chosen database pictures."""
         camera, features = picture.camera, picture.features
         scale = camera.width / 1000
@@ -173,9 +174,12 @@ class Localizer:
             return None
         covariance = pose_covariance(pixels, matched, camera, fit)
         return CameraPose(
-            torch.from_numpy(fit.R_world_cam).float(), torch.from_numpy(fit.t_world_cam).float(),
-            int(fit.inlier.sum()), confidence(agreeing, camera), torch.from_numpy(covariance).float(),
-        )  # fmt: skip
+            torch.from_numpy(fit.R_world_cam).float(),
+            torch.from_numpy(fit.t_world_cam).float(),
+            int(fit.inlier.sum()),
+            confidence(agreeing, camera),
+            torch.from_numpy(covariance).float(),
+        )
 
     def _landmarks_of(self, images: Int64[np.ndarray, "chosen"], count: int) -> Int64[np.ndarray, "landmark"]:
         """Landmarks that the pictures observe; of too many, those observed most."""
@@ -200,9 +204,11 @@ class Localizer:
             camera = self.map.cameras[image]
             count = part.stop - part.start
             other = Features(
-                self.map.keypoints[part], from_bytes(self.map.descriptors[part]), np.ones(count, np.float32),
+                self.map.keypoints[part],
+                from_bytes(self.map.descriptors[part]),
+                np.ones(count, np.float32),
                 (camera.width, camera.height),
-            )  # fmt: skip
+            )
             pairs = self.matcher(features, other)
             found.append(np.stack([pairs[:, 0], self.map.landmark[part][pairs[:, 1]].astype(np.int64)], 1))
         keypoint, landmark = np.unique(np.concatenate(found), axis=0).T
@@ -219,9 +225,7 @@ def confidence(agreeing: Float32[np.ndarray, "match 2"], camera: Camera) -> floa
     return float(1 - 2.0 ** (-max(int(np.minimum(counts, 6).sum()) - 6, 0) / 8))
 
 
-def nearest_pictures(
-    visual_map: VisualMap, prior: Rigid, count: int
-) -> Int64[np.ndarray, "chosen"]:  # fmt: skip
+def nearest_pictures(visual_map: VisualMap, prior: Rigid, count: int) -> Int64[np.ndarray, "chosen"]:
     """Database pictures taken near a pose and in its direction: 1 m counts as much as 30°."""
     t, forward = prior.t.double().cpu().numpy(), prior.R[:, 2].double().cpu().numpy()
     distance = np.linalg.norm(visual_map.t_world_cam - t, axis=1)
@@ -242,7 +246,7 @@ def _near_pairs(
     number = np.flatnonzero(valid)
     if not len(number):
         return np.zeros((0, 2), np.int64)
-    distance, place = KDTree(seen[number]).query(keypoints, k=min(8, len(number)), distance_upper_bound=reach_px)  # fmt: skip
+    distance, place = KDTree(seen[number]).query(keypoints, k=min(8, len(number)), distance_upper_bound=reach_px)
     distance, place = distance.reshape(len(keypoints), -1), place.reshape(len(keypoints), -1)
     row, column = np.nonzero(np.isfinite(distance))
     return np.stack([row, number[place[row, column]]], 1)
@@ -267,9 +271,11 @@ def localize_video(
     last: tuple[float, CameraPose] | None = None
     times: Sequence[float] = timestamps.tolist()
     described = _one_ahead(lambda image: localizer.describe(image, camera), frames)
-    for picture in track(described, "localization", total=len(times), console=Console(stderr=True), disable=not progress):  # fmt: skip
+    for picture in track(
+        described, "localization", total=len(times), console=Console(stderr=True), disable=not progress
+    ):
         if len(poses) == len(times):
-            raise WearcapError(f"more frames than the {len(times)} timestamps", expected="one timestamp per frame")  # fmt: skip
+            raise WearcapError(f"more frames than the {len(times)} timestamps", expected="one timestamp per frame")
         now = times[len(poses)]
         prior = None
         if use_prior and last is not None and now - last[0] <= prior_age_s:
@@ -278,11 +284,11 @@ def localize_video(
         last = last if pose is None else (now, pose)
         poses.append(pose)
     if len(poses) != len(times):
-        raise WearcapError(f"{len(poses)} frames with {len(times)} timestamps", expected="one timestamp per frame")  # fmt: skip
+        raise WearcapError(f"{len(poses)} frames with {len(times)} timestamps", expected="one timestamp per frame")
     return _as_localization(timestamps, poses)
 
 
-def _one_ahead(describe: Callable[[np.ndarray], Described], frames: Iterable[np.ndarray]) -> Iterator[Described]:  # fmt: skip
+def _one_ahead(describe: Callable[[np.ndarray], Described], frames: Iterable[np.ndarray]) -> Iterator[Described]:
     """Describe frames in a second thread, one frame ahead of the consumer."""
     with ThreadPoolExecutor(1) as pool:
         pending: Future[Described] | None = None
@@ -299,8 +305,13 @@ def _as_localization(timestamps: Float64[Tensor, "time"], poses: list[CameraPose
     found = [pose for pose in poses if pose is not None]
     if not found:
         count = len(poses)
-        return Localization(timestamps, torch.eye(3).repeat(count, 1, 1), torch.zeros(count, 3),
-                            torch.zeros(count), torch.eye(6).repeat(count, 1, 1) * _UNKNOWN)  # fmt: skip
+        return Localization(
+            timestamps,
+            torch.eye(3).repeat(count, 1, 1),
+            torch.zeros(count, 3),
+            torch.zeros(count),
+            torch.eye(6).repeat(count, 1, 1) * _UNKNOWN,
+        )
     last, filled = found[0], []
     for pose in poses:
         last = pose or last
@@ -308,9 +319,12 @@ def _as_localization(timestamps: Float64[Tensor, "time"], poses: list[CameraPose
     sure = torch.tensor([0.0 if pose is None else pose.confidence for pose in poses])
     covariance = torch.stack([torch.eye(6) * _UNKNOWN if pose is None else pose.covariance for pose in poses])
     return Localization(
-        timestamps, torch.stack([pose.R_world_cam for pose in filled]), torch.stack([pose.t_world_cam for pose in filled]),
-        sure, covariance,
-    )  # fmt: skip
+        timestamps,
+        torch.stack([pose.R_world_cam for pose in filled]),
+        torch.stack([pose.t_world_cam for pose in filled]),
+        sure,
+        covariance,
+    )
 
 
 _UNKNOWN = 1e4

@@ -99,30 +99,34 @@ def extended(
     joined = {
         name: np.concatenate([getattr(visual_map, name), getattr(more, name)])
         for name in ("R_world_cam", "t_world_cam", "keypoints", "descriptors", "positions", "global_descriptors")
-    }  # fmt: skip
+    }
     landmarks, landmark = merge(joined["positions"], joined["descriptors"], visual_map.cell_m)
     return replace(
-        visual_map, names=visual_map.names + more.names, cameras=visual_map.cameras + more.cameras,
+        visual_map,
+        names=visual_map.names + more.names,
+        cameras=visual_map.cameras + more.cameras,
         first=np.concatenate([visual_map.first, visual_map.first[-1] + more.first[1:]]),
-        landmark=landmark, landmarks=landmarks, **joined,
-    )  # fmt: skip
+        landmark=landmark,
+        landmarks=landmarks,
+        **joined,
+    )
 
 
-def require_same_features(
-    visual_map: VisualMap, extractor: Extractor, descriptor: GlobalDescriptor | None
-) -> None:
+def require_same_features(visual_map: VisualMap, extractor: Extractor, descriptor: GlobalDescriptor | None) -> None:
     """Raises WearcapError when a map was made with another extractor or another global descriptor."""
     if extractor.name != visual_map.extractor:
         raise WearcapError(
             f"the map was made with {visual_map.extractor!r} features, not {extractor.name!r}",
-            expected="the same features in map and picture", fix="Build the map again, or choose its extractor.",
-        )  # fmt: skip
+            expected="the same features in map and picture",
+            fix="Build the map again, or choose its extractor.",
+        )
     name = descriptor.name if descriptor is not None else Vlad(visual_map.vocabulary).name
     if name != visual_map.descriptor:
         raise WearcapError(
             f"the map was made with the global descriptor {visual_map.descriptor!r}, not {name!r}",
-            expected="the same descriptor in map and picture", fix="Build the map again, or choose its descriptor.",
-        )  # fmt: skip
+            expected="the same descriptor in map and picture",
+            fix="Build the map again, or choose its descriptor.",
+        )
 
 
 def _pictures(photos, source, extractor, descriptor, settings: MapSettings, progress: bool) -> list[_Picture]:
@@ -146,15 +150,14 @@ def _pictures(photos, source, extractor, descriptor, settings: MapSettings, prog
 
     with ThreadPoolExecutor(settings.jobs) as pool:
         done: Iterable[_Picture] = pool.map(one, range(len(photos)))
-        pictures = list(
-            track(done, "photos", total=len(photos), console=Console(stderr=True), disable=not progress)
-        )
+        pictures = list(track(done, "photos", total=len(photos), console=Console(stderr=True), disable=not progress))
     if not any(picture.valid.any() for picture in pictures):
         found = sum(len(picture.keypoints) for picture in pictures)
         raise WearcapError(
             f"the map would be empty: none of {found} keypoints in {len(photos)} photos lies on the scene",
-            expected="photos that show the scanned scene", fix=_why_empty(photos, source),
-        )  # fmt: skip
+            expected="photos that show the scanned scene",
+            fix=_why_empty(photos, source),
+        )
     return pictures
 
 
@@ -198,21 +201,31 @@ def _vocabulary(pictures: list[_Picture], words: int, sample: int = 60_000) -> n
     return train_vocabulary(from_bytes(np.concatenate(chosen)), words)
 
 
-def _assemble(photos, pictures: list[_Picture], extractor: str, descriptor, vlad: Vlad | None, cell_m: float) -> VisualMap:  # fmt: skip
+def _assemble(
+    photos, pictures: list[_Picture], extractor: str, descriptor, vlad: Vlad | None, cell_m: float
+) -> VisualMap:
     positions = np.concatenate([p.positions[p.valid] for p in pictures]).astype(np.float32)
     descriptors = np.concatenate([p.descriptors[p.valid] for p in pictures])
     landmarks, landmark = merge(positions, descriptors, cell_m)
     counts = [int(p.valid.sum()) for p in pictures]
     summaries = [vlad.aggregate(from_bytes(p.descriptors)) if vlad else p.global_descriptor for p in pictures]
     return VisualMap(
-        extractor, descriptor.name, tuple(photo.file.name for photo in photos),
+        extractor,
+        descriptor.name,
+        tuple(photo.file.name for photo in photos),
         tuple(picture.camera for picture in pictures),
         np.stack([photo.T_world_cam.R.double().numpy() for photo in photos]),
         np.stack([photo.T_world_cam.t.double().numpy() for photo in photos]),
-        np.concatenate([p.keypoints[p.valid] for p in pictures]), descriptors, positions,
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), landmark, landmarks, np.stack(summaries),
-        vlad.vocabulary if vlad else np.zeros((0, descriptors.shape[1]), np.float32), cell_m,
-    )  # fmt: skip
+        np.concatenate([p.keypoints[p.valid] for p in pictures]),
+        descriptors,
+        positions,
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        landmark,
+        landmarks,
+        np.stack(summaries),
+        vlad.vocabulary if vlad else np.zeros((0, descriptors.shape[1]), np.float32),
+        cell_m,
+    )
 
 
 def _why_empty(photos: Sequence[Photo], source: Scan | Tracks) -> str:

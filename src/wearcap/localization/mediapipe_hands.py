@@ -50,19 +50,24 @@ class MediaPipeHands:
         vision, path = self._mediapipe.tasks.vision, find_model(model)
         options = vision.HandLandmarkerOptions(
             base_options=self._mediapipe.tasks.BaseOptions(model_asset_path=str(path)),
-            running_mode=vision.RunningMode.VIDEO, num_hands=2, min_hand_detection_confidence=min_confidence,
-            min_hand_presence_confidence=min_confidence, min_tracking_confidence=min_confidence,
-        )  # fmt: skip
+            running_mode=vision.RunningMode.VIDEO,
+            num_hands=2,
+            min_hand_detection_confidence=min_confidence,
+            min_hand_presence_confidence=min_confidence,
+            min_tracking_confidence=min_confidence,
+        )
         try:
             self._landmarker: Any = vision.HandLandmarker.create_from_options(options)
         except (ValueError, RuntimeError, OSError) as error:
-            raise WearcapError(f"not a model that MediaPipe can run ({' '.join(str(error).split())[:200]})", where=path,
-                               expected="hand_landmarker.task", fix="Download it again.") from error  # fmt: skip
+            raise WearcapError(
+                f"not a model that MediaPipe can run ({' '.join(str(error).split())[:200]})",
+                where=path,
+                expected="hand_landmarker.task",
+                fix="Download it again.",
+            ) from error
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"], time_s: float) -> dict[str, Keypoint]:
-        image = self._mediapipe.Image(
-            image_format=self._mediapipe.ImageFormat.SRGB, data=np.ascontiguousarray(picture)
-        )
+        image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=np.ascontiguousarray(picture))
         result = self._landmarker.detect_for_video(image, round(1000 * time_s))
         hands = [
             Hand(marks[WRIST].x, marks[WRIST].y, _left(side[0].category_name, side[0].score))
@@ -96,10 +101,12 @@ def find_model(given: str | Path | None) -> Path:
     named = given or os.environ.get(MODEL_VARIABLE)
     if not named or not Path(named).expanduser().is_file():
         raise WearcapError(
-            "there is no model of MediaPipe's hands", where=named or f"${MODEL_VARIABLE}", expected="hand_landmarker.task",
+            "there is no model of MediaPipe's hands",
+            where=named or f"${MODEL_VARIABLE}",
+            expected="hand_landmarker.task",
             fix="Download it from https://ai.google.dev/edge/mediapipe/solutions/vision/hand_landmarker and give "
-                f"model=PATH or set {MODEL_VARIABLE}, or take detector=recorded.",
-        )  # fmt: skip
+            f"model=PATH or set {MODEL_VARIABLE}, or take detector=recorded.",
+        )
     return Path(named).expanduser()
 
 
@@ -107,8 +114,10 @@ def _package() -> ModuleType:
     try:
         return importlib.import_module("mediapipe")
     except ModuleNotFoundError as error:
-        raise WearcapError(f"MediaPipe's hands need the package {error.name!r}",
-                           fix='pip install "wearcap[hands]", or take detector=recorded, which needs none.') from error  # fmt: skip
+        raise WearcapError(
+            f"MediaPipe's hands need the package {error.name!r}",
+            fix='pip install "wearcap[hands]", or take detector=recorded, which needs none.',
+        ) from error
 
 
 def _left(name: str, score: float) -> float:

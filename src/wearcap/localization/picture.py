@@ -25,9 +25,7 @@ def features_within(features: Features, valid: Bool[np.ndarray, "height width"] 
     if valid is None:
         return features
     column, row = np.rint(features.keypoints).astype(np.int64).T
-    return features.subset(
-        valid[row.clip(0, valid.shape[0] - 1), column.clip(0, valid.shape[1] - 1)].astype(bool)
-    )
+    return features.subset(valid[row.clip(0, valid.shape[0] - 1), column.clip(0, valid.shape[1] - 1)].astype(bool))
 
 
 def _well_inside(valid: np.ndarray, margin: int = 6) -> np.ndarray:
@@ -39,6 +37,8 @@ def check_size(image: UInt8[np.ndarray, "height width 3"], camera: Camera, where
     if image.shape[:2] != (camera.height, camera.width):
         raise WearcapError(
             f"a picture of {image.shape[1]}x{image.shape[0]} pixels with a calibration for "
-            f"{camera.width}x{camera.height}", where=where, expected="the size that the camera was calibrated at",
+            f"{camera.width}x{camera.height}",
+            where=where,
+            expected="the size that the camera was calibrated at",
             fix="Resize the calibration with it (Camera.scaled), or take the original pictures.",
-        )  # fmt: skip
+        )

@@ -92,8 +92,10 @@ class PointMapper:
     def color_picture(self, point_map: PointMap) -> UInt8[np.ndarray, "height width 3"]:
         """The scan's colours as the camera sees them, black where nothing is. Raises WearcapError without colours."""
         if self.colors is None:
-            raise WearcapError("the scan has no colours, so no picture of it can be drawn",
-                               expected="a coloured point cloud (point maps need none)")  # fmt: skip
+            raise WearcapError(
+                "the scan has no colours, so no picture of it can be drawn",
+                expected="a coloured point cloud (point maps need none)",
+            )
         seen = point_map.index >= 0
         return np.where(seen[..., None], self.colors[np.where(seen, point_map.index, 0)], 0).astype(np.uint8)
 
@@ -137,9 +139,7 @@ def undistortion(camera: Camera, horizontal_fov_deg: float = 100.0) -> Undistort
     width, height = camera.width, camera.height
     focal = width / 2 / math.tan(math.radians(horizontal_fov_deg) / 2)
     flat = Camera("pinhole", width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-    grid = torch.stack(
-        torch.meshgrid(*(torch.arange(n).double() for n in (width, height)), indexing="xy"), -1
-    )
+    grid = torch.stack(torch.meshgrid(*(torch.arange(n).double() for n in (width, height)), indexing="xy"), -1)
     pixels, seen = camera.project(flat.unproject(grid))
     # Half a pixel around the picture counts as seen: the outermost pixels' centres are taken for it.
     pixels = torch.minimum(pixels.clamp(min=0), pixels.new_tensor([width - 1, height - 1]))

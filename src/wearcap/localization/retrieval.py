@@ -17,9 +17,10 @@ def train_vocabulary(
     """
     if len(descriptors) < words:
         raise WearcapError(
-            f"{len(descriptors)} descriptors for a vocabulary of {words} words", expected="many more than words",
+            f"{len(descriptors)} descriptors for a vocabulary of {words} words",
+            expected="many more than words",
             fix="Give more photos, photos with more texture, or fewer words.",
-        )  # fmt: skip
+        )
     random = torch.Generator().manual_seed(seed)
     samples = torch.from_numpy(descriptors)
     norms = (samples**2).sum(1)
@@ -50,9 +51,7 @@ class Vlad:
     and Zisserman 2013); `signed_root`: each number is replaced by its signed square root. Both are ours to choose.
     """
 
-    def __init__(
-        self, vocabulary: Float32[np.ndarray, "word feature"], intra: bool = True, signed_root: bool = False
-    ):
+    def __init__(self, vocabulary: Float32[np.ndarray, "word feature"], intra: bool = True, signed_root: bool = False):
         self.vocabulary, self.intra, self.signed_root = vocabulary, intra, signed_root
         self.name = f"vlad{len(vocabulary)}{'-intra' if intra else ''}{'-root' if signed_root else ''}"
 
@@ -62,9 +61,7 @@ class Vlad:
         """Global descriptor; `image` is not used. Zeros for an image without features."""
         return self.aggregate(features.descriptors)
 
-    def aggregate(
-        self, descriptors: Float32[np.ndarray, "keypoint feature"]
-    ) -> Float32[np.ndarray, "global"]:
+    def aggregate(self, descriptors: Float32[np.ndarray, "keypoint feature"]) -> Float32[np.ndarray, "global"]:
         centers, local = torch.from_numpy(self.vocabulary), torch.from_numpy(descriptors)
         word = _nearest_word(local, centers)
         total = torch.zeros_like(centers).index_add_(0, word, local - centers[word])

@@ -39,7 +39,7 @@ class MappingSettings:
 
 def map_pictures(
     names: Sequence[str], images: Path, folder: Path, camera: Camera | None, settings: MappingSettings, advance: Advance
-) -> Path:  # fmt: skip
+) -> Path:
     """Map pictures `images`/NAME in their order; returns the folder of the largest model, which io/colmap reads.
 
     A given camera is kept as it is; otherwise one that all pictures share is calibrated meanwhile. Unit and axes are
@@ -62,9 +62,11 @@ def colmap_camera(camera: Camera) -> tuple[str, str]:
     """COLMAP's name of a camera's model, and its parameters (pixel centres at .5) as COLMAP writes them."""
     name = _LENSES.get((camera.model, len(camera.distortion)))
     if name is None:
-        raise WearcapError(f"COLMAP has no camera {camera.model!r} with {len(camera.distortion)} coefficients",
-                           expected="pinhole, opencv (4) or fisheye (4)",
-                           fix="Undistort the video, or leave the camera to be calibrated.")  # fmt: skip
+        raise WearcapError(
+            f"COLMAP has no camera {camera.model!r} with {len(camera.distortion)} coefficients",
+            expected="pinhole, opencv (4) or fisheye (4)",
+            fix="Undistort the video, or leave the camera to be calibrated.",
+        )
     values = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, *camera.distortion)
     return name, ",".join(f"{value:.12g}" for value in values)
 
@@ -73,16 +75,23 @@ def _pycolmap() -> Any:
     try:
         colmap = importlib.import_module("pycolmap")
     except ImportError as error:
-        raise WearcapError("structure from motion needs the package pycolmap",
-                           fix='Run: pip install "wearcap[track]", or give a finished COLMAP model: from_model=DIR.') from error  # fmt: skip
+        raise WearcapError(
+            "structure from motion needs the package pycolmap",
+            fix='Run: pip install "wearcap[track]", or give a finished COLMAP model: from_model=DIR.',
+        ) from error
     colmap.logging.minloglevel = 2  # its errors come as exceptions, we report its progress
     return colmap
 
 
 def _extract(
-    colmap: Any, names: Sequence[str], images: Path, database: Path, lens: tuple[str, str] | None,
-    settings: MappingSettings, advance: Advance,
-) -> None:  # fmt: skip
+    colmap: Any,
+    names: Sequence[str],
+    images: Path,
+    database: Path,
+    lens: tuple[str, str] | None,
+    settings: MappingSettings,
+    advance: Advance,
+) -> None:
     """Extract the features of all images, a few at a time; existing ones stay, and all share the database's camera."""
     reader, options = colmap.ImageReaderOptions(), colmap.FeatureExtractionOptions()
     reader.camera_model, reader.camera_params = lens or (settings.lens, "")
@@ -98,8 +107,15 @@ def _extract(
         first = _CHUNK if start or reader.existing_camera_id >= 0 else 1
         for part in (names[start : start + first], names[start + first : start + _CHUNK]):
             if part:
-                _run_step(colmap.extract_features, database, images, image_names=list(part), reader_options=reader,
-                      camera_mode=colmap.CameraMode.SINGLE, extraction_options=options)  # fmt: skip
+                _run_step(
+                    colmap.extract_features,
+                    database,
+                    images,
+                    image_names=list(part),
+                    reader_options=reader,
+                    camera_mode=colmap.CameraMode.SINGLE,
+                    extraction_options=options,
+                )
                 with colmap.Database.open(database) as opened:
                     reader.existing_camera_id = opened.read_all_cameras()[0].camera_id
     advance("features", len(names), len(names))
@@ -108,13 +124,13 @@ def _extract(
 def _match(colmap: Any, database: Path, settings: MappingSettings) -> None:
     """Match each picture with those that follow; pairs that are in the database are not matched again."""
     pairing, matching = colmap.SequentialPairingOptions(), colmap.FeatureMatchingOptions()
-    pairing.overlap, pairing.num_threads, matching.num_threads = settings.overlap, settings.threads, settings.threads  # fmt: skip
+    pairing.overlap, pairing.num_threads, matching.num_threads = settings.overlap, settings.threads, settings.threads
     _run_step(colmap.match_sequential, database, matching_options=matching, pairing_options=pairing)
 
 
 def _map(
     colmap: Any, count: int, images: Path, folder: Path, calibrated: bool, settings: MappingSettings, advance: Advance
-) -> Path:  # fmt: skip
+) -> Path:
     """Incremental mapping; the model with most images is moved into place when it is complete."""
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.min_model_size = settings.threads, settings.seed, 3
@@ -131,13 +147,22 @@ def _map(
     advance("mapping", 0, count)
     shutil.rmtree(folder / "sparse", ignore_errors=True)
     (folder / "sparse").mkdir()
-    models = _run_step(colmap.incremental_mapping, folder / "database.db", images, folder / "sparse", options=options,
-                   next_image_callback=one_more)  # fmt: skip
+    models = _run_step(
+        colmap.incremental_mapping,
+        folder / "database.db",
+        images,
+        folder / "sparse",
+        options=options,
+        next_image_callback=one_more,
+    )
     advance("mapping", count, count)
     if not models:
-        raise WearcapError(f"no two of {count} pictures could be put together", where=images,
-                           expected="a textured, still scene, seen from places some way apart",
-                           fix="Move the camera instead of turning it on the spot, or take more pictures a second (fps=…).")  # fmt: skip
+        raise WearcapError(
+            f"no two of {count} pictures could be put together",
+            where=images,
+            expected="a textured, still scene, seen from places some way apart",
+            fix="Move the camera instead of turning it on the spot, or take more pictures a second (fps=…).",
+        )
     best = max(models.values(), key=lambda model: model.num_reg_images())
     written = folder / "sparse" / "best"  # removed with the folder by the next run, if this one is killed
     written.mkdir()
@@ -154,5 +179,8 @@ def _run_step(step: Callable, database: Path, *arguments: Any, **options: Any) -
     try:
         return step(database, *arguments, **options)
     except (RuntimeError, ValueError) as error:
-        raise WearcapError(f"COLMAP stopped ({' '.join(str(error).split())})"[:300], where=database,
-                           fix="Remove the folder and run again.") from error  # fmt: skip
+        raise WearcapError(
+            f"COLMAP stopped ({' '.join(str(error).split())})"[:300],
+            where=database,
+            fix="Remove the folder and run again.",
+        ) from error

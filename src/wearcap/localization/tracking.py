@@ -71,7 +71,7 @@ class Track:
 
 def track_pictures(
     source: str | Path, output: str | Path, settings: TrackSettings, camera: Camera | None, advance: Advance
-) -> Track:  # fmt: skip
+) -> Track:
     """Track the camera of a video or of a folder of pictures; `output` keeps intermediate results.
 
     A run that was stopped goes on, a finished reconstruction is taken as it is. Raises WearcapError when `output`
@@ -79,13 +79,13 @@ def track_pictures(
     """
     source, output = Path(source), Path(output)
     if not source.exists():
-        raise WearcapError(
-            "no such file or folder", where=source, expected="a video, or a folder of pictures"
-        )
+        raise WearcapError("no such file or folder", where=source, expected="a video, or a folder of pictures")
     _claim(source, output, settings, camera)
-    pictures = picture_row(source, settings.fps) if source.is_dir() else _frames(source, output, settings.fps, advance)  # fmt: skip
+    pictures = picture_row(source, settings.fps) if source.is_dir() else _frames(source, output, settings.fps, advance)
     if len(pictures.names) < 3:
-        raise WearcapError(f"{len(pictures.names)} pictures", where=source, expected="at least 3", fix="Take more a second: fps=…")  # fmt: skip
+        raise WearcapError(
+            f"{len(pictures.names)} pictures", where=source, expected="at least 3", fix="Take more a second: fps=…"
+        )
     if camera is not None:
         check_size(read_image(pictures.folder / pictures.names[0]), camera, pictures.names[0])
     model = map_pictures(pictures.names, pictures.folder, output, camera, settings.mapping, advance)
@@ -116,12 +116,19 @@ def track_of_model(model: ColmapModel, pictures: Pictures, max_gap_s: float, whe
     number = {name: index for index, name in enumerate(pictures.names)}
     photos = {number[photo.file.name]: photo for photo in model.photos if photo.file.name in number}
     if not photos:
-        raise WearcapError(f"the model places none of {len(pictures.names)} pictures", where=where,
-                           expected=f"names such as {pictures.names[0]}" if pictures.names else "photos")  # fmt: skip
+        raise WearcapError(
+            f"the model places none of {len(pictures.names)} pictures",
+            where=where,
+            expected=f"names such as {pictures.names[0]}" if pictures.names else "photos",
+        )
     cameras = {photo.camera for photo in photos.values()}
     if len(cameras) > 1:
-        raise WearcapError(f"{len(cameras)} cameras", where=where, expected="pictures of one camera",
-                           fix="Map the video as taken with a single camera.")  # fmt: skip
+        raise WearcapError(
+            f"{len(cameras)} cameras",
+            where=where,
+            expected="pictures of one camera",
+            fix="Map the video as taken with a single camera.",
+        )
     placed = torch.zeros(len(pictures.names), dtype=torch.bool)
     placed[list(photos)] = True
     R, t = torch.eye(3).repeat(len(placed), 1, 1), torch.zeros(len(placed), 3)
@@ -130,9 +137,15 @@ def track_of_model(model: ColmapModel, pictures: Pictures, max_gap_s: float, whe
     whole = filled(Trajectory(pictures.timestamps, R, t), placed)
     gaps, kept = _gaps(placed, pictures.timestamps, max_gap_s)
     return Track(
-        whole[kept], next(iter(cameras)), model.tracks.points_world, model.tracks.colors, len(placed),
-        int(placed.sum()), gaps, reprojection_error(model),
-    )  # fmt: skip
+        whole[kept],
+        next(iter(cameras)),
+        model.tracks.points_world,
+        model.tracks.colors,
+        len(placed),
+        int(placed.sum()),
+        gaps,
+        reprojection_error(model),
+    )
 
 
 def reprojection_error(model: ColmapModel) -> float:
@@ -157,12 +170,16 @@ def write_track(track: Track, output: str | Path, source: str) -> None:
     error = None if np.isnan(track.reprojection_px) else round(track.reprojection_px, 4)
     write_camera(track.camera, output / "camera.json", {"source": source, "reprojection_px": error})
     report = {
-        "source": source, "scale": "arbitrary: no metres, no gravity", "pictures": track.pictures, "placed": track.placed,
+        "source": source,
+        "scale": "arbitrary: no metres, no gravity",
+        "pictures": track.pictures,
+        "placed": track.placed,
         "placed_share": round(track.placed / track.pictures, 4),
-        "interpolated": len(track.T_world_cam) - track.placed, "points": len(track.points_world),
+        "interpolated": len(track.T_world_cam) - track.placed,
+        "points": len(track.points_world),
         "reprojection_px": error,
         "gaps": [{"start_s": start, "stop_s": stop, "interpolated": bridged} for start, stop, bridged in track.gaps_s],
-    }  # fmt: skip
+    }
     write_text(output / "report.json", json.dumps(report, indent=1) + "\n")
 
 
@@ -187,14 +204,21 @@ def _claim(source: Path, output: Path, settings: TrackSettings, camera: Camera |
     """Record source and settings in the folder. Raises WearcapError when it holds another track."""
     about = source.stat()
     mine = {
-        "source": str(source.resolve()), "bytes": about.st_size if source.is_file() else len(_listed(source)),
-        "fps": float(settings.fps), "mapping": asdict(settings.mapping), "camera": None if camera is None else camera_row(camera),
-    }  # fmt: skip
+        "source": str(source.resolve()),
+        "bytes": about.st_size if source.is_file() else len(_listed(source)),
+        "fps": float(settings.fps),
+        "mapping": asdict(settings.mapping),
+        "camera": None if camera is None else camera_row(camera),
+    }
     mine["mapping"].pop("threads")
     if (output / STATE).is_file():
         if read_json(output / STATE) != mine:
-            raise WearcapError("this folder holds the track of another source, or of other settings", where=output,
-                               expected=str(output / STATE), fix="Choose another: output=DIR.")  # fmt: skip
+            raise WearcapError(
+                "this folder holds the track of another source, or of other settings",
+                where=output,
+                expected=str(output / STATE),
+                fix="Choose another: output=DIR.",
+            )
         return
     write_text(output / STATE, json.dumps(mine, indent=1) + "\n")
 

@@ -19,9 +19,16 @@ from wearcap.localization.landmarks import Landmarks
 
 SCHEMA_VERSION = 1
 _ARRAYS = (
-    "R_world_cam", "t_world_cam", "keypoints", "descriptors", "positions", "first", "landmark",
-    "global_descriptors", "vocabulary",
-)  # fmt: skip
+    "R_world_cam",
+    "t_world_cam",
+    "keypoints",
+    "descriptors",
+    "positions",
+    "first",
+    "landmark",
+    "global_descriptors",
+    "vocabulary",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,17 +77,20 @@ class VisualMap:
     def landmark_views(self, images: Int64[np.ndarray, "chosen"]) -> Int64[np.ndarray, "landmark"]:
         """How often each landmark is observed by the given pictures."""
         seen = [self.landmark[self.observations(image)] for image in images.tolist()]
-        return np.bincount(np.concatenate([np.zeros(0, np.int32), *seen]), minlength=len(self.landmarks.points_world))  # fmt: skip
+        return np.bincount(np.concatenate([np.zeros(0, np.int32), *seen]), minlength=len(self.landmarks.points_world))
 
     def save(self, path: str | Path) -> None:
         """Write one .safetensors file, atomically."""
         header = {
-            "schema_version": SCHEMA_VERSION, "extractor": self.extractor, "descriptor": self.descriptor,
-            "names": self.names, "cameras": [dataclasses.asdict(camera) for camera in self.cameras],
+            "schema_version": SCHEMA_VERSION,
+            "extractor": self.extractor,
+            "descriptor": self.descriptor,
+            "names": self.names,
+            "cameras": [dataclasses.asdict(camera) for camera in self.cameras],
             "cell_m": self.cell_m,
-        }  # fmt: skip
+        }
         tensors = {name: np.ascontiguousarray(getattr(self, name)) for name in _ARRAYS}
-        tensors |= {f"landmarks.{f.name}": getattr(self.landmarks, f.name) for f in dataclasses.fields(Landmarks)}  # fmt: skip
+        tensors |= {f"landmarks.{f.name}": getattr(self.landmarks, f.name) for f in dataclasses.fields(Landmarks)}
         with atomic_path(path) as temporary:
             temporary.write_bytes(save(tensors, {"wearcap_map": json.dumps(header, sort_keys=True)}))
 
@@ -94,44 +104,57 @@ class VisualMap:
         except FileNotFoundError as error:
             raise WearcapError("no such map", where=path, fix="Build it: wearcap scene.") from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
-            raise WearcapError("not a readable map", where=path, expected="a complete .safetensors file",
-                               fix="Build it again: wearcap scene.") from error  # fmt: skip
+            raise WearcapError(
+                "not a readable map",
+                where=path,
+                expected="a complete .safetensors file",
+                fix="Build it again: wearcap scene.",
+            ) from error
         if "wearcap_map" not in metadata:
-            raise WearcapError("a .safetensors file, but not a visual map", where=path,
-                               expected="one that `wearcap scene` wrote")  # fmt: skip
+            raise WearcapError(
+                "a .safetensors file, but not a visual map", where=path, expected="one that `wearcap scene` wrote"
+            )
         try:
             header = parse_json(metadata["wearcap_map"], path)
             if header["schema_version"] != SCHEMA_VERSION:
-                raise WearcapError(f"a map of version {header['schema_version']}", where=path,
-                                   expected=f"version {SCHEMA_VERSION}", fix="Build it again: wearcap scene.")  # fmt: skip
-            landmarks = Landmarks(**{f.name: tensors[f"landmarks.{f.name}"] for f in dataclasses.fields(Landmarks)})  # fmt: skip
+                raise WearcapError(
+                    f"a map of version {header['schema_version']}",
+                    where=path,
+                    expected=f"version {SCHEMA_VERSION}",
+                    fix="Build it again: wearcap scene.",
+                )
+            landmarks = Landmarks(**{f.name: tensors[f"landmarks.{f.name}"] for f in dataclasses.fields(Landmarks)})
             cameras = tuple(
                 Camera(**camera | {"distortion": tuple(camera["distortion"])}) for camera in header["cameras"]
             )
             loaded = cls(
-                header["extractor"], header["descriptor"], tuple(header["names"]), cameras, landmarks=landmarks,
-                cell_m=float(header["cell_m"]), **{name: tensors[name] for name in _ARRAYS},
-            )  # fmt: skip
+                header["extractor"],
+                header["descriptor"],
+                tuple(header["names"]),
+                cameras,
+                landmarks=landmarks,
+                cell_m=float(header["cell_m"]),
+                **{name: tensors[name] for name in _ARRAYS},
+            )
             loaded.check()
         except (KeyError, TypeError, ValueError) as error:
-            raise WearcapError(f"a damaged map ({error})", where=path, fix="Build it again: wearcap scene.") from error  # fmt: skip
+            raise WearcapError(f"a damaged map ({error})", where=path, fix="Build it again: wearcap scene.") from error
         return loaded
 
     def check(self) -> None:
         """Raises ValueError when the parts do not fit together."""
-        images, observations, landmarks = (
-            len(self.names),
-            len(self.keypoints),
-            len(self.landmarks.points_world),
-        )
+        images, observations, landmarks = (len(self.names), len(self.keypoints), len(self.landmarks.points_world))
         sizes = {
-            "cameras": (len(self.cameras), images), "poses": (len(self.R_world_cam), images),
+            "cameras": (len(self.cameras), images),
+            "poses": (len(self.R_world_cam), images),
             "positions of pictures": (len(self.t_world_cam), images),
-            "global descriptors": (len(self.global_descriptors), images), "edges": (len(self.first), images + 1),
-            "descriptors": (len(self.descriptors), observations), "positions": (len(self.positions), observations),
+            "global descriptors": (len(self.global_descriptors), images),
+            "edges": (len(self.first), images + 1),
+            "descriptors": (len(self.descriptors), observations),
+            "positions": (len(self.positions), observations),
             "numbers of landmarks": (len(self.landmark), observations),
             "descriptors of landmarks": (len(self.landmarks.descriptors), landmarks),
-        }  # fmt: skip
+        }
         for name, (count, expected) in sizes.items():
             if count != expected:
                 raise ValueError(f"{count} {name} instead of {expected}")

@@ -65,16 +65,12 @@ def chamfer(
 
 
 def seen_vertices(
-    vertices: Float[Tensor, "vertex 3"],
-    faces: Int64[Tensor, "face 3"],
-    cameras: list[Camera],
-    T_world_cam: Rigid,
+    vertices: Float[Tensor, "vertex 3"], faces: Int64[Tensor, "face 3"], cameras: list[Camera], T_world_cam: Rigid
 ) -> Bool[Tensor, "vertex"]:
     """Vertices of faces visible to any of the cameras (poses "camera"), with occlusion by the body only (ours)."""
     mesh = Mesh(
-        vertices.detach().cpu().numpy().astype(np.float32), faces.cpu().numpy().astype(np.int32),
-        np.ones(3, np.float32),
-    )  # fmt: skip
+        vertices.detach().cpu().numpy().astype(np.float32), faces.cpu().numpy().astype(np.int32), np.ones(3, np.float32)
+    )
     seen = torch.zeros(len(vertices), dtype=torch.bool)
     for number, camera in enumerate(cameras):
         visible = np.unique(render(camera, T_world_cam[number], [mesh]).index)

@@ -26,11 +26,10 @@ def cue_errors_cm(motion: Motion, cues: Mapping[str, Cue]) -> dict[str, Float[Te
         usable = (cue.timestamps >= motion.timestamps[0]) & (cue.timestamps <= motion.timestamps[-1])
         usable &= (cue.confidence > 0) & cue.points.isfinite().all(-1)
         if usable.any():
-            at = interpolate(
-                motion.timestamps, joints[:, motion.skeleton.index(name)], cue.timestamps[usable]
-            )
+            at = interpolate(motion.timestamps, joints[:, motion.skeleton.index(name)], cue.timestamps[usable])
             errors[name] = joint_error_cm(at, cue.points[usable])
     if not errors:
-        raise WearcapError("no keypoint to compare this motion with",
-                           expected="3D cues named like its joints, on its clock")  # fmt: skip
+        raise WearcapError(
+            "no keypoint to compare this motion with", expected="3D cues named like its joints, on its clock"
+        )
     return errors

@@ -44,9 +44,7 @@ def diversity(
     WearcapError for fewer than 2 · `size` samples.
     """
     if len(latent) < 2 * size:
-        raise WearcapError(
-            f"{len(latent)} samples for two subsets of {size}", expected=f"{2 * size} at least"
-        )
+        raise WearcapError(f"{len(latent)} samples for two subsets of {size}", expected=f"{2 * size} at least")
     order = torch.randperm(len(latent), generator=torch.Generator().manual_seed(seed))
     first, second = latent[order[: 2 * size].to(latent.device)].double().chunk(2)
     return (first - second).norm(dim=-1).mean()

@@ -72,9 +72,11 @@ def contact_mean(value: Float[Tensor, "time hand"], contact: Bool[Tensor, "time 
 
 
 def handlings(
-    start_s: Float[Tensor, "interval"], stop_s: Float[Tensor, "interval"], objects: tuple[str, ...],
+    start_s: Float[Tensor, "interval"],
+    stop_s: Float[Tensor, "interval"],
+    objects: tuple[str, ...],
     pause_s: float = PAUSE_S,
-) -> list[tuple[str, float, float]]:  # fmt: skip
+) -> list[tuple[str, float, float]]:
     """(object, start, stop) of every handling: intervals of one object with pauses of at most `pause_s` (s)."""
     merged: list[tuple[str, float, float]] = []
     for name in sorted(set(objects)):

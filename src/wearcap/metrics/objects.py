@@ -15,17 +15,13 @@ ANKLE_M, TOE_M = 0.10, 0.05
 """Heights (m) above the floor below which an ankle and a toe joint are in contact (ECHO §9)."""
 
 
-def vertex_error_cm(
-    T_found: Rigid, T_true: Rigid, vertices: Float[Tensor, "vertex 3"]
-) -> Float[Tensor, "*batch"]:
+def vertex_error_cm(T_found: Rigid, T_true: Rigid, vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "*batch"]:
     """E_v2v (eq. 16): mean position error (cm) of an object's vertices, which are given in its own axes."""
     turn, shift = T_found.R - T_true.R, T_found.t - T_true.t
     return 100 * (vertices @ turn.mT + shift[..., None, :]).norm(dim=-1).mean(-1)
 
 
-def center_error_cm(
-    T_found: Rigid, T_true: Rigid, vertices: Float[Tensor, "vertex 3"]
-) -> Float[Tensor, "*batch"]:
+def center_error_cm(T_found: Rigid, T_true: Rigid, vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "*batch"]:
     """E_c (eq. 17): position error (cm) of the vertices' mean."""
     center = vertices.mean(0)
     return 100 * (T_found @ center - T_true @ center).norm(dim=-1)  # pyright: ignore[reportOperatorIssue]

@@ -25,7 +25,7 @@ def occupied_distance_mae_cm(
 
 def occupancy_iou(
     grids: Float[Tensor, "*batch"], grids_true: Float[Tensor, "*batch"], clip_m: float, border_m: float | None = None
-) -> Float[Tensor, ""]:  # fmt: skip
+) -> Float[Tensor, ""]:
     """Intersection over union of occupied cells over all grids together (1 if no cell is occupied).
 
     A reconstructed cell is occupied below `border_m`; default: `clip_m`.

@@ -100,8 +100,6 @@ def local_floor(
     return -max_pool1d(-lowest[None, None], 2 * radius + 1, stride=1, padding=radius)[0, 0]
 
 
-def floor_penetration_cm(
-    joints: Float[Tensor, "time joint 3"], floor: Float[Tensor, "time"]
-) -> Float[Tensor, ""]:
+def floor_penetration_cm(joints: Float[Tensor, "time joint 3"], floor: Float[Tensor, "time"]) -> Float[Tensor, ""]:
     """Mean over frames of the depth (cm) of the lowest joint below the local floor, 0 where it is above."""
     return (floor - joints[..., 2].amin(-1)).clamp(min=0).mean() * 100.0

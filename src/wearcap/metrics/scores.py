@@ -58,9 +58,7 @@ def comparable(
     return anchored_to_head(motion, truth.joint("head")), truth, contact
 
 
-def truth_at(
-    motion: Motion, recording: Recording, name: str
-) -> tuple[Motion, Bool[Tensor, "time patch"] | None]:
+def truth_at(motion: Motion, recording: Recording, name: str) -> tuple[Motion, Bool[Tensor, "time patch"] | None]:
     """The true motion at the capture's frames, and true foot contact.
 
     Raises WearcapError when the recording has no true motion.
@@ -76,9 +74,7 @@ def truth_at(
 
 def _within(motion: Motion, truth: Motion) -> bool:
     """Whether a motion has other timestamps than the truth, all of them within its time span."""
-    same = len(motion) == len(truth) and torch.allclose(
-        motion.timestamps, truth.timestamps, rtol=0, atol=1e-6
-    )
+    same = len(motion) == len(truth) and torch.allclose(motion.timestamps, truth.timestamps, rtol=0, atol=1e-6)
     ends = truth.timestamps[[0, -1]] if len(truth) > 1 and len(motion) > 1 else None
     return (
         not same

@@ -66,8 +66,9 @@ def foot_vertices(
     Raises WearcapError when contacts and poses differ in length.
     """
     if len(contact) != len(T_world_joint.t):
-        raise WearcapError(f"contacts of {len(contact)} frames for poses of {len(T_world_joint.t)}",
-                           expected="as many of either")  # fmt: skip
+        raise WearcapError(
+            f"contacts of {len(contact)} frames for poses of {len(T_world_joint.t)}", expected="as many of either"
+        )
     vertices = [body.vertices(T_world_joint, FOOT_REGIONS[patch]) for patch in FOOT_PATCHES]
     touching = [contact[:, i, None].expand(-1, part.shape[1]) for i, part in enumerate(vertices)]
     return torch.cat(vertices, 1), torch.cat(touching, 1)

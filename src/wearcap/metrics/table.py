@@ -55,8 +55,10 @@ def evaluate_motion(
     """
     _require_comparable(prediction, truth)
     if contact is not None and len(contact) != len(truth):
-        raise WearcapError(f"{len(contact)} frames of contact for {len(truth)} frames of motion",
-                           expected="true contact at the truth's frames")  # fmt: skip
+        raise WearcapError(
+            f"{len(contact)} frames of contact for {len(truth)} frames of motion",
+            expected="true contact at the truth's frames",
+        )
     fps = truth.fps
     pose, pose_true = _double_pose(prediction), _double_pose(truth)
     joints, joints_true = pose.t, pose_true.t
@@ -100,20 +102,21 @@ def _require_comparable(prediction: Motion, truth: Motion) -> None:
     if prediction.skeleton.joint_names != truth.skeleton.joint_names:
         raise WearcapError(
             f"captured on skeleton {prediction.skeleton.name!r}, true on {truth.skeleton.name!r}",
-            expected="the same joints", fix="Retarget one of them first.",
-        )  # fmt: skip
-    if len(truth) < 2:
-        raise WearcapError(
-            f"a motion of {len(truth)} frames cannot be scored", expected="at least two frames"
+            expected="the same joints",
+            fix="Retarget one of them first.",
         )
+    if len(truth) < 2:
+        raise WearcapError(f"a motion of {len(truth)} frames cannot be scored", expected="at least two frames")
     same_clock = len(prediction) == len(truth) and torch.allclose(
         prediction.timestamps, truth.timestamps, rtol=0.0, atol=1e-6
     )
     if not same_clock:
         raise WearcapError(
             f"captured motion has {len(prediction)} frames from {_span(prediction)}, the truth {len(truth)} from "
-            f"{_span(truth)}", expected="the same timestamps", fix="Resample the captured motion first.",
-        )  # fmt: skip
+            f"{_span(truth)}",
+            expected="the same timestamps",
+            fix="Resample the captured motion first.",
+        )
     for name, motion in (("captured", prediction), ("true", truth)):
         finite = motion.R_parent_joint.isfinite().all((1, 2, 3)) & motion.t_world_root.isfinite().all(1)
         if not finite.all():
@@ -140,13 +143,10 @@ def aggregate(rows: list[Row]) -> dict[str, Summary]:
         by_seed[row.seed][row.recording] = row
     seen = {frozenset(recordings) for recordings in by_seed.values()}
     if len(seen) != 1:
-        raise WearcapError(
-            "the seeds were not scored on the same recordings" if seen else "nothing was scored"
-        )
+        raise WearcapError("the seeds were not scored on the same recordings" if seen else "nothing was scored")
     names = list(rows[0].scores)
     per_seed = {
-        name: [_weighted_mean(name, list(recordings.values())) for recordings in by_seed.values()]
-        for name in names
+        name: [_weighted_mean(name, list(recordings.values())) for recordings in by_seed.values()] for name in names
     }
     return {name: summarize(values) for name, values in per_seed.items()}
 
@@ -200,9 +200,7 @@ def rich_table(title: str, methods: Scores, metrics: tuple[str, ...] | None = No
     return table
 
 
-def write_scores(
-    path: str | Path, methods: Scores, about: dict[str, str | int | float] | None = None
-) -> None:
+def write_scores(path: str | Path, methods: Scores, about: dict[str, str | int | float] | None = None) -> None:
     """Write a table as JSON, atomically: {"about", "methods": {method: {metric: {mean, std, seeds}}}}; values that
     are not finite become null."""
     tree = {

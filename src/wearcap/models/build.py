@@ -51,12 +51,32 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.hmd2.point_codes_training": ("VoxelReconstruction",),
     "wearcap.systems.mocap_every.training": ("WatchRegression",),
     "prodigyopt": ("Prodigy",),
-    "torch.optim": ("ASGD", "Adadelta", "Adagrad", "Adam", "AdamW", "Adamax", "LBFGS", "NAdam", "RAdam", "RMSprop", "SGD"),
-    "torch.optim.lr_scheduler": (
-        "ConstantLR", "CosineAnnealingLR", "CosineAnnealingWarmRestarts", "CyclicLR", "ExponentialLR", "LinearLR",
-        "MultiStepLR", "OneCycleLR", "PolynomialLR", "StepLR",
+    "torch.optim": (
+        "ASGD",
+        "Adadelta",
+        "Adagrad",
+        "Adam",
+        "AdamW",
+        "Adamax",
+        "LBFGS",
+        "NAdam",
+        "RAdam",
+        "RMSprop",
+        "SGD",
     ),
-}  # fmt: skip
+    "torch.optim.lr_scheduler": (
+        "ConstantLR",
+        "CosineAnnealingLR",
+        "CosineAnnealingWarmRestarts",
+        "CyclicLR",
+        "ExponentialLR",
+        "LinearLR",
+        "MultiStepLR",
+        "OneCycleLR",
+        "PolynomialLR",
+        "StepLR",
+    ),
+}
 """Classes (and functions that return plain objects) that a model's config may name, by their modules."""
 
 _BY_NAME = {f"{module}.{name}": (module, name) for module, names in TARGETS.items() for name in names}
@@ -101,8 +121,9 @@ def _check_keys(part: dict[str, Any], where: str | Path) -> None:
     if _TARGET in part and part[_TARGET] not in (_BY_NAME if isinstance(part[_TARGET], str) else ()):
         raise WearcapError(
             f"the model is to be made of {str(part[_TARGET])[:80]!r}, which is no part of wearcap's models",
-            where=where, expected="networks, features and optimisers of wearcap and PyTorch alone",
-        )  # fmt: skip
+            where=where,
+            expected="networks, features and optimisers of wearcap and PyTorch alone",
+        )
 
 
 def _check_value(key: str, value: Any, where: str | Path) -> None:
@@ -116,14 +137,13 @@ def _check_value(key: str, value: Any, where: str | Path) -> None:
 
 def _refused(what: str, where: str | Path) -> WearcapError:
     return WearcapError(
-        f"the model's config has {what}", where=where,
+        f"the model's config has {what}",
+        where=where,
         expected="plain values: numbers, text without ${…}, lists, and parts of wearcap's models",
-    )  # fmt: skip
+    )
 
 
-def build(
-    config: dict[str, Any], state: Mapping[str, Tensor], where: str | Path, *, prefix: str = ""
-) -> nn.Module:
+def build(config: dict[str, Any], state: Mapping[str, Tensor], where: str | Path, *, prefix: str = "") -> nn.Module:
     """The module that a config describes, with the weights of a file, in evaluation mode.
 
     `prefix`: only weights whose names start with it belong to the module ("net."). Raises WearcapError for a config that
@@ -152,9 +172,10 @@ def build(
 
 def _unbuildable(error: Exception, where: str | Path) -> WearcapError:
     return WearcapError(
-        f"its model cannot be built ({' '.join(str(error).split())[:200] or type(error).__name__})", where=where,
+        f"its model cannot be built ({' '.join(str(error).split())[:200] or type(error).__name__})",
+        where=where,
         expected="a checkpoint of this version of wearcap",
-    )  # fmt: skip
+    )
 
 
 def check_weights(own: Mapping[str, Tensor], state: Mapping[str, Tensor], where: str | Path) -> None:
@@ -162,9 +183,11 @@ def check_weights(own: Mapping[str, Tensor], state: Mapping[str, Tensor], where:
     wrong = sorted(set(own) ^ set(state)) or [name for name in own if own[name].shape != state[name].shape]
     if wrong:
         raise WearcapError(
-            f"{len(wrong)} weights do not fit this model, such as {wrong[0][:80]!r}", where=where,
-            expected="a checkpoint of the same model", fix="Check which model it was trained for.",
-        )  # fmt: skip
+            f"{len(wrong)} weights do not fit this model, such as {wrong[0][:80]!r}",
+            where=where,
+            expected="a checkpoint of the same model",
+            fix="Check which model it was trained for.",
+        )
 
 
 def _made(value: Any) -> Any:

@@ -50,8 +50,12 @@ def checkpoint_file(path: str | Path) -> Path:
         return path
     shared = shared_checkpoints()
     if path.name not in shared:
-        raise WearcapError("no such checkpoint", where=path.name,
-                           expected="a file, or the name of a checkpoint that comes with wearcap", fix=nearest(path.name, shared))  # fmt: skip
+        raise WearcapError(
+            "no such checkpoint",
+            where=path.name,
+            expected="a file, or the name of a checkpoint that comes with wearcap",
+            fix=nearest(path.name, shared),
+        )
     return shared[path.name]
 
 
@@ -67,12 +71,10 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
         raise WearcapError("no such checkpoint", where=path)
     text, state = _read_shared(path) if path.suffix == _SUFFIX else _read_run(path)
     if len(text) > MAX_CONFIG_BYTES:
-        raise WearcapError(
-            f"a config of {len(text)} bytes", where=path, expected=f"{MAX_CONFIG_BYTES} at most"
-        )
+        raise WearcapError(f"a config of {len(text)} bytes", where=path, expected=f"{MAX_CONFIG_BYTES} at most")
     config = parse_json(text, path)
     if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
-        raise WearcapError("a checkpoint without its model's config", where=path, expected="JSON with a key 'model'")  # fmt: skip
+        raise WearcapError("a checkpoint without its model's config", where=path, expected="JSON with a key 'model'")
     if (digest := config.pop(_DIGEST, None)) is not None and digest != _digest(config, state):
         raise WearcapError("its checksum differs from its content", where=path, fix="Fetch the file again.")
     check_config(config["model"], path)
@@ -98,12 +100,26 @@ def read_run_file(path: str | Path) -> dict[str, Any]:
         return saved
     except PermissionError as error:
         raise WearcapError("no permission to read it", where=path) from error
-    except (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, NotImplementedError, RuntimeError, EOFError,
-            OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, MemoryError) as error:  # fmt: skip
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        pickle.UnpicklingError,
+        NotImplementedError,
+        RuntimeError,
+        EOFError,
+        OSError,
+        ValueError,
+        KeyError,
+        IndexError,
+        TypeError,
+        AttributeError,
+        MemoryError,
+    ) as error:
         raise WearcapError(
-            f"not a readable checkpoint ({' '.join(str(error).split())[:120] or type(error).__name__})", where=path,
+            f"not a readable checkpoint ({' '.join(str(error).split())[:120] or type(error).__name__})",
+            where=path,
             expected="a complete .ckpt file of `wearcap train`, with tensors and plain values only",
-        ) from error  # fmt: skip
+        ) from error
 
 
 def _read_run(path: Path) -> tuple[str, dict[str, Tensor]]:
@@ -120,14 +136,19 @@ def _read_run(path: Path) -> tuple[str, dict[str, Tensor]]:
 def _is_plain(name: Any, value: Any) -> bool:
     """Whether a weight is a tensor whose memory is in the file, not an expansion of a few numbers to any size."""
     return (
-        isinstance(name, str) and isinstance(value, Tensor) and value.device.type == "cpu"
-        and value.layout == torch.strided and not value.is_quantized
+        isinstance(name, str)
+        and isinstance(value, Tensor)
+        and value.device.type == "cpu"
+        and value.layout == torch.strided
+        and not value.is_quantized
         and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
-    )  # fmt: skip
+    )
 
 
 def _foreign(path: Path) -> WearcapError:
-    return WearcapError("a checkpoint, but not of wearcap", where=path, expected="a .ckpt file that `wearcap train` wrote")  # fmt: skip
+    return WearcapError(
+        "a checkpoint, but not of wearcap", where=path, expected="a .ckpt file that `wearcap train` wrote"
+    )
 
 
 def _read_shared(path: Path) -> tuple[str, dict[str, Tensor]]:
@@ -138,12 +159,13 @@ def _read_shared(path: Path) -> tuple[str, dict[str, Tensor]]:
     except PermissionError as error:
         raise WearcapError("no permission to read it", where=path) from error
     except (safetensors.SafetensorError, OSError, RuntimeError, ValueError, KeyError) as error:
-        raise WearcapError(
-            "not a readable checkpoint", where=path, expected="a complete .safetensors file"
-        ) from error
+        raise WearcapError("not a readable checkpoint", where=path, expected="a complete .safetensors file") from error
     if _KEY not in metadata:
-        raise WearcapError("a .safetensors file, but not a checkpoint of wearcap", where=path,
-                           expected="one that `wearcap export format=safetensors` wrote")  # fmt: skip
+        raise WearcapError(
+            "a .safetensors file, but not a checkpoint of wearcap",
+            where=path,
+            expected="one that `wearcap export format=safetensors` wrote",
+        )
     return metadata[_KEY], state
 
 
@@ -168,11 +190,12 @@ def load_network(path: str | Path, kind: type[Network], experiment: str, *, part
         found = found.get(key) if isinstance(found, dict) else None
     target = found.get("_target_") if isinstance(found, dict) else None
     if target != f"{kind.__module__}.{kind.__qualname__}":
-        raise WearcapError(f"a checkpoint of {target or 'another model'}, not of {kind.__qualname__}", where=path,
-                           expected=f"one of `wearcap train experiment={experiment}`")  # fmt: skip
-    network = build(
-        {key: value for key, value in found.items() if key != "_partial_"}, state, path, prefix=f"{part}."
-    )
+        raise WearcapError(
+            f"a checkpoint of {target or 'another model'}, not of {kind.__qualname__}",
+            where=path,
+            expected=f"one of `wearcap train experiment={experiment}`",
+        )
+    network = build({key: value for key, value in found.items() if key != "_partial_"}, state, path, prefix=f"{part}.")
     assert isinstance(network, kind)
     return network
 
@@ -185,13 +208,9 @@ def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float
     that is no `.safetensors` file, and weights that are not finite in that type.
     """
     if Path(target).suffix != _SUFFIX:
-        raise WearcapError(
-            "cannot share a checkpoint in this format", where=target, expected=f"NAME{_SUFFIX}"
-        )
+        raise WearcapError("cannot share a checkpoint in this format", where=target, expected=f"NAME{_SUFFIX}")
     if dtype not in DTYPES:
-        raise WearcapError(
-            f"no dtype {dtype!r}", expected=f"one of {', '.join(DTYPES)}", fix=nearest(dtype, DTYPES)
-        )
+        raise WearcapError(f"no dtype {dtype!r}", expected=f"one of {', '.join(DTYPES)}", fix=nearest(dtype, DTYPES))
     config, state = read_checkpoint(source)
     narrow = {
         name: value.to(DTYPES[dtype]) if value.dtype == torch.float32 and value.ndim > 1 else value
@@ -199,8 +218,12 @@ def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float
     }
     for name, value in narrow.items():
         if value.is_floating_point() and not value.isfinite().all():
-            raise WearcapError(f"weight {name!r} is not finite as {str(value.dtype).removeprefix('torch.')}", where=source,
-                               expected="a trained model", fix="Choose dtype=float32, or another checkpoint.")  # fmt: skip
+            raise WearcapError(
+                f"weight {name!r} is not finite as {str(value.dtype).removeprefix('torch.')}",
+                where=source,
+                expected="a trained model",
+                fix="Choose dtype=float32, or another checkpoint.",
+            )
     shared = _shareable(config)
     about = json.dumps(shared | {_DIGEST: _digest(shared, narrow)}, sort_keys=True)
     with atomic_path(target) as temporary:

@@ -33,7 +33,7 @@ class ImageEncoder(Protocol):
 
 def letterboxed(
     frames: UInt8[Tensor, "batch height width 3"], width: int, height: int, mean: Sequence[float], std: Sequence[float]
-) -> Float[Tensor, "batch 3 new_height new_width"]:  # fmt: skip
+) -> Float[Tensor, "batch 3 new_height new_width"]:
     """Images normalised per channel (`mean`, `std` of values in 0…1), resized without cropping or distortion, and
     centred in width x height pixels; the margins are 0."""
     x = frames.movedim(-1, 1).float()
@@ -81,15 +81,24 @@ class EgoViewEncoder(nn.Module):
     mean, std = (0.45, 0.45, 0.45), (0.25, 0.25, 0.25)
 
     def __init__(
-        self, size: int = 64, width: int = 96, height: int = 72, channels: tuple[int, ...] | list[int] = (24, 48, 96),
+        self,
+        size: int = 64,
+        width: int = 96,
+        height: int = 72,
+        channels: tuple[int, ...] | list[int] = (24, 48, 96),
         squeezed: int = 24,
-    ):  # fmt: skip
+    ):
         super().__init__()
         self.size, self.width, self.height = size, width, height
         stages: list[nn.Module] = []
         inputs = 12  # 2x2 pixels side by side
         for outputs in channels:
-            stages += [nn.Conv2d(inputs, outputs, 3, 2, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(), _Block(outputs)]  # fmt: skip
+            stages += [
+                nn.Conv2d(inputs, outputs, 3, 2, 1, bias=False),
+                nn.BatchNorm2d(outputs),
+                nn.ReLU(),
+                _Block(outputs),
+            ]
             inputs = outputs
         self.stages = nn.Sequential(*stages, nn.Conv2d(inputs, squeezed, 1), nn.ReLU())
         reduction = 2 ** (1 + len(channels))

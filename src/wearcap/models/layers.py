@@ -68,9 +68,7 @@ def attention_mask(valid: Bool[Tensor, "batch token"]) -> Bool[Tensor, "batch 1 
 class AdaptiveBlock(nn.Module):
     """A DiT block (Peebles & Xie 2023): attention and MLP, each scaled, shifted and gated by the level."""
 
-    def __init__(
-        self, width: int, heads: int, feedforward: int, max_tokens: int, dropout: float, streams: int = 1
-    ):
+    def __init__(self, width: int, heads: int, feedforward: int, max_tokens: int, dropout: float, streams: int = 1):
         super().__init__()
         self.norm_attention = nn.LayerNorm(width, elementwise_affine=False)
         self.norm_mlp = nn.LayerNorm(width, elementwise_affine=False)

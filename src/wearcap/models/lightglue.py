@@ -46,10 +46,7 @@ class RotaryPosition(nn.Module):
 def _feedforward(width: int) -> nn.Sequential:
     """MLP of a token concatenated with its message."""
     return nn.Sequential(
-        nn.Linear(2 * width, 2 * width),
-        nn.LayerNorm(2 * width),
-        nn.GELU(),
-        nn.Linear(2 * width, width),
+        nn.Linear(2 * width, 2 * width), nn.LayerNorm(2 * width), nn.GELU(), nn.Linear(2 * width, width)
     )
 
 
@@ -171,13 +168,7 @@ class LightGlue(nn.Module):
     None runs all layers, which export needs. The paper's pruning of keypoints is not implemented.
     """
 
-    def __init__(
-        self,
-        width: int = 256,
-        layers: int = 9,
-        heads: int = 4,
-        stop_confidence: float | None = 0.95,
-    ):
+    def __init__(self, width: int = 256, layers: int = 9, heads: int = 4, stop_confidence: float | None = 0.95):
         super().__init__()
         self.width, self.stop_confidence = width, stop_confidence
         self.posenc = RotaryPosition(width // heads)
@@ -186,10 +177,7 @@ class LightGlue(nn.Module):
         self.token_confidence = nn.ModuleList(TokenConfidence(width) for _ in range(layers - 1))
 
     def _settled(
-        self,
-        layer: int,
-        x0: Float[Tensor, "batch keypoint0 width"],
-        x1: Float[Tensor, "batch keypoint1 width"],
+        self, layer: int, x0: Float[Tensor, "batch keypoint0 width"], x1: Float[Tensor, "batch keypoint1 width"]
     ) -> bool:
         if self.stop_confidence is None or layer == len(self.token_confidence):
             return False

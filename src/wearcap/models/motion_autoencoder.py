@@ -19,7 +19,7 @@ class MotionAutoencoder(nn.Module):
 
     def __init__(
         self, size: int, frames: int = 80, channels: tuple[int, ...] | list[int] = (128, 192, 192), latent: int = 64
-    ):  # fmt: skip
+    ):
         """`size` features per frame; every convolution halves `frames`. Raises ValueError if they are not divisible."""
         super().__init__()
         if frames % 2 ** len(channels):
@@ -28,17 +28,18 @@ class MotionAutoencoder(nn.Module):
         self.normalizer = Normalizer(size)
         short, widths = frames // 2 ** len(channels), (size, *channels)
         down = [(nn.Conv1d(a, b, 4, 2, 1), nn.LeakyReLU(0.2)) for a, b in pairwise(widths)]
-        up = [
-            (nn.LeakyReLU(0.2), nn.ConvTranspose1d(b, a, 4, 2, 1)) for a, b in reversed([*pairwise(widths)])
-        ]
+        up = [(nn.LeakyReLU(0.2), nn.ConvTranspose1d(b, a, 4, 2, 1)) for a, b in reversed([*pairwise(widths)])]
         self.encoder = nn.Sequential(
-            *(layer for block in down for layer in block), nn.Flatten(),
-            nn.Linear(short * channels[-1], latent), nn.BatchNorm1d(latent, momentum=0.01, affine=False),
-        )  # fmt: skip
+            *(layer for block in down for layer in block),
+            nn.Flatten(),
+            nn.Linear(short * channels[-1], latent),
+            nn.BatchNorm1d(latent, momentum=0.01, affine=False),
+        )
         self.decoder = nn.Sequential(
-            nn.Linear(latent, short * channels[-1]), nn.Unflatten(1, (channels[-1], short)),
+            nn.Linear(latent, short * channels[-1]),
+            nn.Unflatten(1, (channels[-1], short)),
             *(layer for block in up for layer in block),
-        )  # fmt: skip
+        )
 
     def encode(self, features: Float[Tensor, "window frame feature"]) -> Float[Tensor, "window latent"]:
         """Latent vector of every window, from features that are not normalised."""
@@ -48,8 +49,6 @@ class MotionAutoencoder(nn.Module):
         """Normalised features of every window."""
         return self.decoder(latent).transpose(1, 2)
 
-    def forward(
-        self, features: Float[Tensor, "window frame feature"]
-    ) -> Float[Tensor, "window frame feature"]:
+    def forward(self, features: Float[Tensor, "window frame feature"]) -> Float[Tensor, "window frame feature"]:
         """Reconstructed windows in normalised features."""
         return self.decode(self.encode(features))

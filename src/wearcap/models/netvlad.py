@@ -53,9 +53,7 @@ class NetVLAD(nn.Module):
         self.WPCA = nn.Sequential(nn.Conv2d(clusters * 512, whitened, 1)) if whitened else None
         # ImageNet's colours, in which VGG16 was trained.
         for name, values in (("mean", (0.485, 0.456, 0.406)), ("scale", (0.229, 0.224, 0.225))):
-            self.register_buffer(
-                name, self.pool.centroids.new_tensor(values)[:, None, None], persistent=False
-            )
+            self.register_buffer(name, self.pool.centroids.new_tensor(values)[:, None, None], persistent=False)
 
     def forward(self, image: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch feature"]:
         """Unit descriptors of RGB images in [0, 1]."""

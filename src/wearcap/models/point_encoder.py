@@ -16,9 +16,7 @@ from wearcap.models.point_sampling import ball_query, rows_at, spread_first
 _LEAST_M = 1e-9
 
 
-def bounds(
-    points: Float[Tensor, "batch point 3"],
-) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"]]:
+def bounds(points: Float[Tensor, "batch point 3"]) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"]]:
     """Half extents and centre of clouds' bounding boxes, in the points' unit."""
     low, high = points.amin(1), points.amax(1)
     return (high - low) / 2, (high + low) / 2
@@ -70,9 +68,16 @@ class PointNeXt(nn.Module):
             )
         self.size, self.strides, self.y_up = width << len(strides), tuple(strides), y_up
         self.settings = {
-            "width": width, "strides": list(strides), "blocks": list(blocks), "neighbours": list(neighbours), "radius": radius,
-            "radius_scaling": radius_scaling, "expansion": expansion, "normalized": normalized, "y_up": y_up,
-        }  # fmt: skip
+            "width": width,
+            "strides": list(strides),
+            "blocks": list(blocks),
+            "neighbours": list(neighbours),
+            "radius": radius,
+            "radius_scaling": radius_scaling,
+            "expansion": expansion,
+            "normalized": normalized,
+            "y_up": y_up,
+        }
         """Constructor arguments that make another encoder of the same kind."""
         self.stem = nn.Linear(3, width)
         stages = []

@@ -36,10 +36,7 @@ def spread_first(points: Float[Tensor, "batch point 3"], count: int) -> Int64[Te
 
 @torch.no_grad()
 def ball_query(
-    centers: Float[Tensor, "batch center 3"],
-    points: Float[Tensor, "batch point 3"],
-    radius: float,
-    neighbours: int,
+    centers: Float[Tensor, "batch center 3"], points: Float[Tensor, "batch point 3"], radius: float, neighbours: int
 ) -> Int64[Tensor, "batch center neighbour"]:
     """Indices of the `neighbours` points nearest to each centre within a radius, filled up by the nearest one.
 

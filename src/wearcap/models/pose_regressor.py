@@ -58,8 +58,7 @@ class PoseRegressor(nn.Module):
         self.layers = nn.ModuleList(_Layer(width, heads, feedforward, dropout) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
         self.root, self.joints = (
-            nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size))
-            for size in (6, motion_size - 6)
+            nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size)) for size in (6, motion_size - 6)
         )
 
     def forward(

@@ -61,9 +61,7 @@ def _visual_part(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _dinov2(timm: ModuleType) -> nn.Module:
-    return timm.create_model(
-        "vit_large_patch14_dinov2.lvd142m", pretrained=False, num_classes=0, dynamic_img_size=True
-    )
+    return timm.create_model("vit_large_patch14_dinov2.lvd142m", pretrained=False, num_classes=0, dynamic_img_size=True)
 
 
 def _without_mask(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -72,17 +70,35 @@ def _without_mask(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 CLIP = Pretrained(
-    "clip-vit-l14", "CLIP ViT-L/14", "open_clip", "open_clip_torch", _clip_visual, _visual_part, 768,
-    (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711), "WEARCAP_CLIP_WEIGHTS",
-    "timm/vit_large_patch14_clip_224.openai", ("open_clip_model.safetensors", "open_clip_pytorch_model.bin"),
+    "clip-vit-l14",
+    "CLIP ViT-L/14",
+    "open_clip",
+    "open_clip_torch",
+    _clip_visual,
+    _visual_part,
+    768,
+    (0.48145466, 0.4578275, 0.40821073),
+    (0.26862954, 0.26130258, 0.27577711),
+    "WEARCAP_CLIP_WEIGHTS",
+    "timm/vit_large_patch14_clip_224.openai",
+    ("open_clip_model.safetensors", "open_clip_pytorch_model.bin"),
     ("clip/ViT-L-14.pt",),
-)  # fmt: skip
+)
 DINOV2 = Pretrained(
-    "dinov2-vit-l14", "DINOv2 ViT-L/14", "timm", "timm", _dinov2, _without_mask, 1024,
-    (0.485, 0.456, 0.406), (0.229, 0.224, 0.225), "WEARCAP_DINOV2_WEIGHTS",
-    "timm/vit_large_patch14_dinov2.lvd142m", ("model.safetensors", "pytorch_model.bin"),
+    "dinov2-vit-l14",
+    "DINOv2 ViT-L/14",
+    "timm",
+    "timm",
+    _dinov2,
+    _without_mask,
+    1024,
+    (0.485, 0.456, 0.406),
+    (0.229, 0.224, 0.225),
+    "WEARCAP_DINOV2_WEIGHTS",
+    "timm/vit_large_patch14_dinov2.lvd142m",
+    ("model.safetensors", "pytorch_model.bin"),
     ("torch/hub/checkpoints/dinov2_vitl14_pretrain.pth",),
-)  # fmt: skip
+)
 
 
 class PretrainedEncoder:
@@ -132,8 +148,11 @@ def find_weights(kind: Pretrained, given: str | Path | None) -> Path:
     if named:
         path = Path(named).expanduser()
         if not path.is_file():
-            raise WearcapError(f"no such file of weights of {kind.title}", where=path,
-                               fix="Check weights=…" if given else f"Check the variable {kind.variable}.")  # fmt: skip
+            raise WearcapError(
+                f"no such file of weights of {kind.title}",
+                where=path,
+                fix="Check weights=…" if given else f"Check the variable {kind.variable}.",
+            )
         return path
     home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
     hugging_face = Path(os.environ.get("HF_HOME") or home / "huggingface").expanduser()
@@ -145,18 +164,22 @@ def find_weights(kind: Pretrained, given: str | Path | None) -> Path:
         return found[0]
     places = [f"${kind.variable}", str(snapshots), *(str(home / place) for place in kind.elsewhere)]
     raise WearcapError(
-        f"no weights of {kind.title} on this machine", where=", ".join(places), expected="a file at one of these places",
+        f"no weights of {kind.title} on this machine",
+        where=", ".join(places),
+        expected="a file at one of these places",
         fix=f"Nothing is downloaded by itself: fetch {kind.files[0]} from https://huggingface.co/{kind.hub} and give "
-            "weights=PATH, or take encoder=egoview, which needs none.",
-    )  # fmt: skip
+        "weights=PATH, or take encoder=egoview, which needs none.",
+    )
 
 
 def _package(kind: Pretrained) -> ModuleType:
     try:
         return importlib.import_module(kind.package)
     except ModuleNotFoundError as error:
-        raise WearcapError(f"{kind.title} needs the package {error.name!r}",
-                           fix=f"pip install {kind.install}, or take encoder=egoview, which needs none.") from error  # fmt: skip
+        raise WearcapError(
+            f"{kind.title} needs the package {error.name!r}",
+            fix=f"pip install {kind.install}, or take encoder=egoview, which needs none.",
+        ) from error
 
 
 def _read(path: Path) -> dict[str, Tensor]:
@@ -164,9 +187,10 @@ def _read(path: Path) -> dict[str, Tensor]:
         with zipfile.ZipFile(path) as archive:
             if any("code" in Path(name).parts for name in archive.namelist()):
                 raise WearcapError(
-                    "a TorchScript archive, which holds code beside its weights and is not opened", where=path,
+                    "a TorchScript archive, which holds code beside its weights and is not opened",
+                    where=path,
                     expected="a .safetensors file, or a state_dict",
                     fix="If you trust its origin: torch.save(torch.jit.load(PATH, 'cpu').state_dict(), 'weights.pt'), "
-                        "then weights=weights.pt.",
-                )  # fmt: skip
+                    "then weights=weights.pt.",
+                )
     return read_weights(path)

@@ -30,16 +30,15 @@ def load_openpoints(path: str | Path, normalized: bool = True) -> PointNeXt:
     the ModelNet40 file's `normalize_xyz` means nothing in newer OpenPoints. Raises WearcapError for a file of another
     format or with code in it, and for weights of another network.
     """
-    tensors = {
-        _own_name(name): value for name, value in read_weights(path).items() if not name.startswith(_HEAD)
-    }
+    tensors = {_own_name(name): value for name, value in read_weights(path).items() if not name.startswith(_HEAD)}
     stem = tensors.get("stem.weight")
     if stem is None or stem.ndim < 2 or stem.shape[1] != 3:
         given = "a tensor of other axes" if stem is not None else "nothing"
         raise WearcapError(
-            f"these are not the weights of PointNeXt-S: encoder.encoder.0.0.convs.0.0.weight is {given}", where=path,
+            f"these are not the weights of PointNeXt-S: encoder.encoder.0.0.convs.0.0.weight is {given}",
+            where=path,
             expected="a checkpoint of OpenPoints' cfgs/modelnet40ply2048/pointnext-s.yaml (in_channels: 3)",
-        )  # fmt: skip
+        )
     encoder = PointNeXt(width=len(stem), normalized=normalized, y_up=True)
     own = {name: _flat(value) for name, value in tensors.items()}
     load_weights(encoder, own, name="PointNeXt-S (ModelNet40)", where=path)
@@ -57,9 +56,7 @@ def _own_name(name: str) -> str:
     if int(stage) == 0:
         return f"stem.{tensor}"
     place = (
-        f"whole.{number}"
-        if int(stage) == _LAST
-        else f"stages.{int(stage) - 1}.0.{('first', 'second')[number == '1']}"
+        f"whole.{number}" if int(stage) == _LAST else f"stages.{int(stage) - 1}.0.{('first', 'second')[number == '1']}"
     )
     return f"{place}.{_LAYER[layer or '0']}.{tensor}"
 

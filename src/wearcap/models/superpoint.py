@@ -99,11 +99,7 @@ class SuperPoint(nn.Module):
 
     def forward(
         self, image: Float[Tensor, "batch 1 height width"]
-    ) -> tuple[
-        Float[Tensor, "batch keypoint 2"],
-        Float[Tensor, "batch keypoint 256"],
-        Float[Tensor, "batch keypoint"],
-    ]:
+    ) -> tuple[Float[Tensor, "batch keypoint 2"], Float[Tensor, "batch keypoint 256"], Float[Tensor, "batch keypoint"]]:
         """Keypoints (x, y) in pixels, unit descriptors and scores, best first, of grey pictures in [0, 1].
 
         The number of keypoints is fixed by the picture's size, for export; those below a threshold, the caller drops.

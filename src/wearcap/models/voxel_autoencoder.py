@@ -72,9 +72,7 @@ class ConvolutionLayers(nn.Module):
         super().__init__()
         left = cells - _KERNELS
         if left < 1:
-            raise WearcapError(
-                f"{cells} cells are too few for four convolutions", expected=f"at least {_KERNELS + 1}"
-            )
+            raise WearcapError(f"{cells} cells are too few for four convolutions", expected=f"at least {_KERNELS + 1}")
         widths = [1, *(max(1, size >> shift) for shift in (3, 2, 1, 0))]
         down, up = [], []
         for narrow, wide in pairwise(widths):

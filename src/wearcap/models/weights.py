@@ -13,11 +13,7 @@ from torch import Tensor, nn
 from wearcap.errors import WearcapError
 
 _SHOWN = 4
-_NESTED = (
-    "state_dict",
-    "model_state_dict",
-    "model",
-)  # keys of the weights in the files of training scripts
+_NESTED = ("state_dict", "model_state_dict", "model")  # keys of the weights in the files of training scripts
 # A score beside the weights, as training scripts save it, is a NumPy number: plain data, but unknown to torch.load.
 _SCALAR = np.float64(0).__reduce__()[0]
 _NUMBERS = [
@@ -102,8 +98,7 @@ def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], *, name: str
     if shapes:
         more = f"; and {len(shapes) - _SHOWN} more" if len(shapes) > _SHOWN else ""
         raise WearcapError(
-            f"the weights are those of another size of {name}: {'; '.join(shapes[:_SHOWN])}{more}",
-            where=where,
+            f"the weights are those of another size of {name}: {'; '.join(shapes[:_SHOWN])}{more}", where=where
         )
     network.load_state_dict(dict(tensors))
 

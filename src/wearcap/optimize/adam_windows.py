@@ -28,8 +28,10 @@ class AdamSettings:
 
     def __post_init__(self):
         if not 0 < self.advance < self.window:
-            raise WearcapError(f"windows of {self.window} frames that advance by {self.advance}",
-                               expected="less than a window: neighbours share a frame")  # fmt: skip
+            raise WearcapError(
+                f"windows of {self.window} frames that advance by {self.advance}",
+                expected="less than a window: neighbours share a frame",
+            )
 
 
 def solve_adam_windows(
@@ -57,13 +59,8 @@ def solve_adam_windows(
         if stop == len(data):
             break
         begin += settings.advance
-    mean = [
-        {name: sum(step[name] for step in steps) / len(steps) for name in steps[0]}
-        for steps in zip(*histories)
-    ]
-    return Solution(
-        HpsState(theta.double(), R.double(), t.double()), mean, f"{settings.steps} steps per window"
-    )
+    mean = [{name: sum(step[name] for step in steps) / len(steps) for name in steps[0]} for steps in zip(*histories)]
+    return Solution(HpsState(theta.double(), R.double(), t.double()), mean, f"{settings.steps} steps per window")
 
 
 def _solve_window(

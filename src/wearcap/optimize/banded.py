@@ -12,16 +12,7 @@ import numpy as np
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.optimize.banded_assembly import (
-    LEGS,
-    Body,
-    Forms,
-    Frames,
-    Kinematics,
-    Weights,
-    gather,
-    update_kinematics,
-)
+from wearcap.optimize.banded_assembly import LEGS, Body, Forms, Frames, Kinematics, Weights, gather, update_kinematics
 from wearcap.optimize.banded_kernels import factor_and_solve
 from wearcap.optimize.banded_mapping import apply_step, fill_system
 from wearcap.optimize.costs import LOSSES
@@ -81,9 +72,7 @@ class ActiveBody:
         offsets = skeleton.t_parent_joint[list(joints)].double().numpy()
         head_chain = np.array([number[joint] for joint in head])
         leg_chains = np.array([[number[joint] for joint in leg] for leg in legs])
-        arrays = Body(
-            parents, offsets, head_chain, leg_chains, *_patch_skinning(patches, legs), patches.patch.numpy()
-        )
+        arrays = Body(parents, offsets, head_chain, leg_chains, *_patch_skinning(patches, legs), patches.patch.numpy())
         return cls(joints, arrays)
 
     @property
@@ -96,26 +85,23 @@ def _patch_skinning(patches: FootPatches, legs: list[list[int]]) -> tuple[np.nda
     """Patch vertices in the axes of their leg's last two joints (vertex, 2, 3; m), and their weights (vertex, 2)."""
     body, rows = patches.body, patches.vertex
     if body.pose_blend is not None:
-        raise WearcapError(
-            "this body's feet change shape with the pose", fix="Use the solver adam_windows for it."
-        )
+        raise WearcapError("this body's feet change shape with the pose", fix="Use the solver adam_windows for it.")
     rest, joints = body.rest_vertices[rows].double(), body.skeleton.rest_joints.double()
     weights = torch.zeros(len(rows), len(body.skeleton), dtype=torch.float64)
     weights.scatter_add_(1, body.skin_joints[rows], body.skin_weights[rows].double())
     last_two = torch.tensor([legs[int(patch) // 2][-2:] for patch in patches.patch])
     shares = weights.gather(1, last_two)
     if (shares.sum(1) < 0.99).any():
-        raise WearcapError("vertices of the foot patches are skinned to joints other than ankle and toe",
-                           expected="a body whose soles follow the feet")  # fmt: skip
+        raise WearcapError(
+            "vertices of the foot patches are skinned to joints other than ankle and toe",
+            expected="a body whose soles follow the feet",
+        )
     arms = rest[:, None] - joints[last_two]
     return arms.numpy(), (shares / shares.sum(1, keepdim=True)).numpy()
 
 
 def solve_banded(
-    energy: HpsEnergy,
-    data: HpsData,
-    settings: BandedSettings = DEFAULTS,
-    start: HpsState | None = None,
+    energy: HpsEnergy, data: HpsData, settings: BandedSettings = DEFAULTS, start: HpsState | None = None
 ) -> Solution:
     """Minimise an energy over all frames of `data` at once.
 
@@ -154,9 +140,15 @@ class Stretch:
         shapes = ((joints, 3, 3), (joints, 3), (joints, 3, 3), (len(body.patch), 3), (2, 12, leg))
         self.kin = Kinematics(*(np.empty((length, *shape)) for shape in shapes))
         self.forms = Forms(
-            np.empty((length, 3)), np.empty((pairs, 3, 3, 3)), np.empty((length, 3, 3)),
-            np.empty((length, 2, 12, 12)), np.empty((pairs, 2, 12, 12)), np.empty((length, 2, 12)), np.empty(length), np.empty(pairs),
-        )  # fmt: skip
+            np.empty((length, 3)),
+            np.empty((pairs, 3, 3, 3)),
+            np.empty((length, 3, 3)),
+            np.empty((length, 2, 12, 12)),
+            np.empty((pairs, 2, 12, 12)),
+            np.empty((length, 2, 12)),
+            np.empty(length),
+            np.empty(pairs),
+        )
         self.system = np.empty((length, n, n)), np.empty((pairs, n, n)), np.empty((length, n))
 
     def evaluate(self, smooth: float, look_up: bool) -> dict[str, float]:
@@ -177,8 +169,7 @@ class Stretch:
         fill_system(self.theta, body, self.frames, self.kin, self.forms, *self.system)
         if not (np.einsum("tii->ti", self.system[0]) > 0).all():
             raise WearcapError(
-                "the energy does not determine the motion",
-                expected="weights of pose, hold and steps above zero",
+                "the energy does not determine the motion", expected="weights of pose, hold and steps above zero"
             )
         factor_and_solve(*self.system, damping)
         apply_step(self.system[2], relaxation, self.theta, self.R_root, self.t, body, self.frames, self.kin)
@@ -204,11 +195,21 @@ def _frames(data: HpsData, columns: list[int]) -> Frames:
     size = torch.bincount(data.patches.patch, minlength=data.contact.shape[1])
     vertices = (len(data), len(data.patches.vertex))
     arrays = (
-        data.start.theta[:, columns], data.R_world_cam @ data.R_head_cam.T, data.cam_confidence, data.start.t_world_root,
-        data.hold_confidence, data.contact / size / 4, data.contact[1:] * data.contact[:-1] / size / 4,
-        data.t_step, data.R_root_step, data.R_head_step, torch.zeros(*vertices, 3), torch.zeros(*vertices, 3),
-        torch.zeros(*vertices, 3), torch.zeros(vertices),
-    )  # fmt: skip
+        data.start.theta[:, columns],
+        data.R_world_cam @ data.R_head_cam.T,
+        data.cam_confidence,
+        data.start.t_world_root,
+        data.hold_confidence,
+        data.contact / size / 4,
+        data.contact[1:] * data.contact[:-1] / size / 4,
+        data.t_step,
+        data.R_root_step,
+        data.R_head_step,
+        torch.zeros(*vertices, 3),
+        torch.zeros(*vertices, 3),
+        torch.zeros(*vertices, 3),
+        torch.zeros(vertices),
+    )
     return Frames(*(np.ascontiguousarray(array.double().numpy()) for array in arrays))
 
 
@@ -217,6 +218,7 @@ def _weights(energy: HpsEnergy, length: int, smooth: float) -> Weights:
     losses = [energy.loss(name) for name in TERMS]
     return Weights(
         np.array([energy.weight(name) for name in TERMS]) / counts,
-        np.array([LOSSES.index(loss.kind) for loss in losses]), np.array([loss.delta for loss in losses]),
+        np.array([LOSSES.index(loss.kind) for loss in losses]),
+        np.array([loss.delta for loss in losses]),
         smooth,
-    )  # fmt: skip
+    )

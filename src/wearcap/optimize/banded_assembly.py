@@ -12,19 +12,23 @@ from typing import NamedTuple
 import numpy as np
 
 from wearcap.geometry.compiled import compiled
-from wearcap.optimize.banded_kernels import (
-    foot_map,
-    patch_points,
-    pose_all,
-    reweight,
-    turn_between,
-    vertex_twist,
-)
+from wearcap.optimize.banded_kernels import foot_map, patch_points, pose_all, reweight, turn_between, vertex_twist
 
 (
-    SELF, CONTACT, CONTACT_PLANE, SLIDE, TRANSLATION_SMOOTH, ROOT_SMOOTH, HEAD_SMOOTH, POSE, HOLD,
-    TRANSLATION_STEP, ROOT_STEP, HEAD_STEP, POSE_STEP,
-) = range(13)  # fmt: skip
+    SELF,
+    CONTACT,
+    CONTACT_PLANE,
+    SLIDE,
+    TRANSLATION_SMOOTH,
+    ROOT_SMOOTH,
+    HEAD_SMOOTH,
+    POSE,
+    HOLD,
+    TRANSLATION_STEP,
+    ROOT_STEP,
+    HEAD_STEP,
+    POSE_STEP,
+) = range(13)
 """Indices into `hps.TERMS`."""
 
 HEAD = 6
@@ -175,8 +179,12 @@ def _gather_steps(j, t, body, frames, weights, kin, forms, energy):
             w = _rho(term, r @ r, 1.0, weights, energy)
             _add_step(j, 0, w, np.eye(3), r, forms)
     r = np.empty(3)
-    for term, group, joint in ((ROOT_SMOOTH, 1, 0), (ROOT_STEP, 1, 0), (HEAD_SMOOTH, 2, body.head_chain[-1]),
-                               (HEAD_STEP, 2, body.head_chain[-1])):  # fmt: skip
+    for term, group, joint in (
+        (ROOT_SMOOTH, 1, 0),
+        (ROOT_STEP, 1, 0),
+        (HEAD_SMOOTH, 2, body.head_chain[-1]),
+        (HEAD_STEP, 2, body.head_chain[-1]),
+    ):
         if weights.weight[term] > 0:
             step = np.eye(3)
             if term == ROOT_STEP:

@@ -36,11 +36,7 @@ def exp_and_jacobian(v, R, J):
         a, b, c = 1.0 - square / 6, 0.5 - square / 24, 1.0 / 6 - square / 120
     else:
         angle = np.sqrt(square)
-        a, b, c = (
-            np.sin(angle) / angle,
-            (1 - np.cos(angle)) / square,
-            (angle - np.sin(angle)) / (square * angle),
-        )
+        a, b, c = (np.sin(angle) / angle, (1 - np.cos(angle)) / square, (angle - np.sin(angle)) / (square * angle))
     for i in range(3):
         for k in range(3):
             outer = v[i] * v[k]

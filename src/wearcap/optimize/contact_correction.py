@@ -41,7 +41,9 @@ class OffsetSettings:
 
     def __post_init__(self):
         if not (self.transition_s > 0 and self.hold > 0):
-            raise WearcapError(f"a transition of {self.transition_s} s, a hold of {self.hold}", expected="positive numbers")  # fmt: skip
+            raise WearcapError(
+                f"a transition of {self.transition_s} s, a hold of {self.hold}", expected="positive numbers"
+            )
 
     @property
     def stiffness(self) -> float:
@@ -66,15 +68,15 @@ def offset_for(
         raise WearcapError("a target of negative weight", expected="zero or more")
     bad = (weights > 0) & ~targets.isfinite().all(1)
     if bad.any():
-        raise WearcapError(f"the target of frame {int(bad.nonzero()[0])} is not a number",
-                           expected="finite metres where the weight is above zero")  # fmt: skip
+        raise WearcapError(
+            f"the target of frame {int(bad.nonzero()[0])} is not a number",
+            expected="finite metres where the weight is above zero",
+        )
     pull = settings.hold * weights.double().numpy()
     wanted = torch.where(weights[:, None] > 0, targets, 0.0).double().numpy()
     if len(targets) < 3:
         return torch.from_numpy(wanted)
-    return torch.from_numpy(
-        solveh_banded(_form(timestamps.numpy(), pull, settings.stiffness), pull[:, None] * wanted)
-    )
+    return torch.from_numpy(solveh_banded(_form(timestamps.numpy(), pull, settings.stiffness), pull[:, None] * wanted))
 
 
 def _form(times: np.ndarray, pull: np.ndarray, stiffness: float) -> np.ndarray:

@@ -45,9 +45,7 @@ class Loss:
 
 
 def head_orientation(
-    R_world_head: Float[Tensor, "time 3 3"],
-    R_head_cam: Float[Tensor, "3 3"],
-    R_world_cam: Float[Tensor, "time 3 3"],
+    R_world_head: Float[Tensor, "time 3 3"], R_head_cam: Float[Tensor, "3 3"], R_world_cam: Float[Tensor, "time 3 3"]
 ) -> Float[Tensor, "time 3"]:
     """Rotation (rad, world axes) from the body's camera R^H(θ) R_HC to the localised one (thesis eq. 4.2–4.4)."""
     return _turn(R_world_head @ R_head_cam, R_world_cam)
@@ -107,9 +105,7 @@ def pose_step(
     return pose_prior(theta, theta_imu).diff(dim=0)
 
 
-def translation_hold(
-    t_world_root: Float[Tensor, "time 3"], target: Float[Tensor, "time 3"]
-) -> Float[Tensor, "time 3"]:
+def translation_hold(t_world_root: Float[Tensor, "time 3"], target: Float[Tensor, "time 3"]) -> Float[Tensor, "time 3"]:
     """Offset (m) of the root from its camera-based initial position (released code; no equation)."""
     return t_world_root - target
 

@@ -59,9 +59,13 @@ class FootPatches:
         whole = self.body
         blend = None if whole.pose_blend is None else whole.pose_blend[:, self.vertex]
         return BodyModel(
-            whole.skeleton, whole.rest_vertices[self.vertex], whole.faces[:0],
-            whole.skin_joints[self.vertex], whole.skin_weights[self.vertex], pose_blend=blend,
-        )  # fmt: skip
+            whole.skeleton,
+            whole.rest_vertices[self.vertex],
+            whole.faces[:0],
+            whole.skin_joints[self.vertex],
+            whole.skin_weights[self.vertex],
+            pose_blend=blend,
+        )
 
 
 def chain_to(skeleton: Skeleton, joint: int) -> list[int]:

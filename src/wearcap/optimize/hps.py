@@ -16,9 +16,20 @@ from wearcap.optimize.costs import Loss
 from wearcap.optimize.feet import FootPatches
 
 TERMS = (
-    "self", "contact", "contact_plane", "slide", "translation_smooth", "root_smooth", "head_smooth", "pose",
-    "hold", "translation_step", "root_step", "head_step", "pose_step",
-)  # fmt: skip
+    "self",
+    "contact",
+    "contact_plane",
+    "slide",
+    "translation_smooth",
+    "root_smooth",
+    "head_smooth",
+    "pose",
+    "hold",
+    "translation_step",
+    "root_step",
+    "head_step",
+    "pose_step",
+)
 """Names of the terms, as configs weight them; each is a function of `costs`."""
 
 SURFACE_REACH_M = 0.5
@@ -104,18 +115,21 @@ class HpsData:
         begin, stop, _ = frames.indices(len(self))
         pairs = slice(begin, max(stop - 1, begin))
         return replace(
-            self, start=self.start[frames], R_world_cam=self.R_world_cam[frames],
-            cam_confidence=self.cam_confidence[frames], hold_confidence=self.hold_confidence[frames],
-            contact=self.contact[frames], t_step=self.t_step[pairs], R_root_step=self.R_root_step[pairs],
+            self,
+            start=self.start[frames],
+            R_world_cam=self.R_world_cam[frames],
+            cam_confidence=self.cam_confidence[frames],
+            hold_confidence=self.hold_confidence[frames],
+            contact=self.contact[frames],
+            t_step=self.t_step[pairs],
+            R_root_step=self.R_root_step[pairs],
             R_head_step=self.R_head_step[pairs],
-        )  # fmt: skip
+        )
 
     def to(self, dtype: torch.dtype) -> "HpsData":
         """All tensors in another precision; the surface is unchanged."""
         tensors = {name: value.to(dtype) for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(
-            self, start=HpsState(*(part.to(dtype) for part in vars(self.start).values())), **tensors
-        )
+        return replace(self, start=HpsState(*(part.to(dtype) for part in vars(self.start).values())), **tensors)
 
     def pose(self, state: HpsState) -> Rigid:
         """World poses of all joints in a state."""
@@ -152,9 +166,7 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
     if energy.weight("contact_plane"):
         where, up = (torch.zeros(*stands.shape, 3, dtype=torch.float64) for _ in range(2))
         queries = data.patches.middles(points)[stands].numpy()
-        where[stands], up[stands] = map(
-            torch.from_numpy, data.surface.plane(queries, reach_m=SURFACE_REACH_M)
-        )
+        where[stands], up[stands] = map(torch.from_numpy, data.surface.plane(queries, reach_m=SURFACE_REACH_M))
         origin, normal = where[:, patch], up[:, patch]
         found *= normal[..., 2] > LEAST_UPRIGHT  # False where no plane was found (NaN)
     parts = (point.nan_to_num(), origin.nan_to_num(), normal.nan_to_num(), found)
@@ -193,7 +205,7 @@ def energy_terms(
         "root_step": lambda: (costs.rotation_step(R_root, data.R_root_step), None),
         "head_step": lambda: (costs.rotation_step(R_head, data.R_head_step), None),
         "pose_step": lambda: (costs.pose_step(state.theta[:, legs], data.start.theta[:, legs]), None),
-    }  # fmt: skip
+    }
     terms = {}
     for name, weight in energy.weights.items():
         if weight == 0:

@@ -35,9 +35,7 @@ def solve_in_stretches(
     length = max(len(s.history) for s in solved)
     history = []
     for step in range(length):
-        entries = [
-            (s.history[min(step, len(s.history) - 1)], b - a) for s, (_, a, b, _) in zip(solved, spans)
-        ]
+        entries = [(s.history[min(step, len(s.history) - 1)], b - a) for s, (_, a, b, _) in zip(solved, spans)]
         history.append({name: sum(e[name] * n for e, n in entries) / len(data) for name in entries[0][0]})
     return Solution(
         HpsState(*(torch.cat(part) for part in parts)), history, "; ".join(sorted({s.reason for s in solved}))

@@ -43,9 +43,7 @@ class Bending:
         if not (self.rigidity > 0 and math.isfinite(self.rigidity)):
             raise WearcapError(f"a rigidity of {self.rigidity}", expected="a positive number")
         if self.norm not in NORMS:
-            raise WearcapError(
-                f"no norm {self.norm!r} of heading rates", expected=f"one of {', '.join(NORMS)}"
-            )
+            raise WearcapError(f"no norm {self.norm!r} of heading rates", expected=f"one of {', '.join(NORMS)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,26 +129,34 @@ def bending_problem(
     if len(path) < 2:
         raise WearcapError(f"a path of {len(path)} frames cannot be bent", expected="at least two")
     for what, value in (
-        ("path", path), ("control times", control_times[:, None]), ("control points", control_points),
+        ("path", path),
+        ("control times", control_times[:, None]),
+        ("control points", control_points),
         ("weights", weights[:, None]),
-    ):  # fmt: skip
+    ):
         bad = ~value.isfinite().all(1)
         if bad.any():
-            raise WearcapError(f"{what}: entry {int(bad.nonzero()[0])} is not a number", expected="finite numbers",
-                               fix="Leave out frames that were not localised.")  # fmt: skip
+            raise WearcapError(
+                f"{what}: entry {int(bad.nonzero()[0])} is not a number",
+                expected="finite numbers",
+                fix="Leave out frames that were not localised.",
+            )
     if (weights < 0).any():
         raise WearcapError("a control point of negative weight", expected="zero or more")
     falls = control_times.diff() < 0
     if falls.any():
         number = int(falls.nonzero()[0]) + 1
-        raise WearcapError(f"control point {number} ({control_times[number].item():.3f} s) lies before its predecessor",
-                           expected="control times in order", fix="Sort the control points by time.")  # fmt: skip
+        raise WearcapError(
+            f"control point {number} ({control_times[number].item():.3f} s) lies before its predecessor",
+            expected="control times in order",
+            fix="Sort the control points by time.",
+        )
     outside = (control_times < timestamps[0]) | (control_times > timestamps[-1])
     if outside.any():
         raise WearcapError(
             f"{int(outside.sum())} of {len(control_times)} control points, first at {control_times[outside][0].item():.3f} s, lie outside the path",
             expected=f"times from {timestamps[0].item():.3f} s to {timestamps[-1].item():.3f} s",
-        )  # fmt: skip
+        )
     path = path.double()
     at = (torch.searchsorted(timestamps, control_times.contiguous(), right=True) - 1).clamp(max=len(path) - 2)
     share = (control_times - timestamps[at]) / (timestamps[at + 1] - timestamps[at])

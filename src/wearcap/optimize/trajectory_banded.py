@@ -62,9 +62,11 @@ class _Path:
         self.link[1 : problem.leader[0].item() + 1] = np.inf
         self.link[0], self.last_link = ends
         self.controls = (
-            np.searchsorted(problem.control_step.numpy(), np.arange(steps + 1)), problem.control_share.numpy(),
-            np.ascontiguousarray((problem.control_points - problem.path[0]).numpy()), problem.control_weights.numpy(),
-        )  # fmt: skip
+            np.searchsorted(problem.control_step.numpy(), np.arange(steps + 1)),
+            problem.control_share.numpy(),
+            np.ascontiguousarray((problem.control_points - problem.path[0]).numpy()),
+            problem.control_weights.numpy(),
+        )
         loss = settings.loss
         self.kinds = (NORMS.index(settings.norm), LOSSES.index(loss.kind), float(loss.delta))
         self.turn, self.place = np.zeros(steps), (problem.path - problem.path[0]).numpy().copy()
@@ -94,7 +96,7 @@ class _Path:
             half = 0.5 * weight * control_weights(distance, *self.kinds[1:], RELAXED_M)
             stretch_freely(
                 step, soft * self.link, soft * self.last_link, first, share, complex_target, half, self.free, place, z
-            )  # fmt: skip
+            )
             distance = abs(place[at] + share * (place[at + 1] - place[at]) - complex_target)
         self.gains[:] = 0.0
         turn = np.angle(z * np.conj(np.concatenate([z[:1], z[:-1]]))).cumsum() + np.angle(z[0])
@@ -107,8 +109,16 @@ class _Path:
         """One Gauss-Newton step; returns the decrease of the smoothed energy, and the damping for the next step."""
         for _ in range(8):
             xx, xy, yy, x, y = value_pass(
-                self.turn, self.place, self.link, self.last_link, *self.controls, self.kinds, smooth, damping, self.gains
-            )  # fmt: skip
+                self.turn,
+                self.place,
+                self.link,
+                self.last_link,
+                *self.controls,
+                self.kinds,
+                smooth,
+                damping,
+                self.gains,
+            )
             shift = np.zeros(2)
             if self.free:
                 ridge = 1e-9 * (xx + yy) + 1e-12

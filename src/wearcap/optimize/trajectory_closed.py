@@ -9,14 +9,7 @@ import torch
 from scipy.linalg import solveh_banded
 
 from wearcap.errors import WearcapError
-from wearcap.optimize.trajectory import (
-    BendingProblem,
-    BentPath,
-    bent,
-    bent_path,
-    control_offset,
-    energy_terms,
-)
+from wearcap.optimize.trajectory import BendingProblem, BentPath, bent, bent_path, control_offset, energy_terms
 
 
 def bend_closed(problem: BendingProblem, tolerance_m: float = 1e-6, rounds: int = 20) -> BentPath:
@@ -28,8 +21,9 @@ def bend_closed(problem: BendingProblem, tolerance_m: float = 1e-6, rounds: int 
     """
     settings = problem.settings
     if not settings.clamped_ends or settings.free_start or settings.norm != "square":
-        raise WearcapError("bending in closed form needs fixed ends",
-                           expected="clamped_ends=True, free_start=False, norm=square")  # fmt: skip
+        raise WearcapError(
+            "bending in closed form needs fixed ends", expected="clamped_ends=True, free_start=False, norm=square"
+        )
     leaders = torch.unique(problem.leader)
     stiffness = _stiffness(problem, leaders)
     turn, shift = torch.zeros(len(problem.leader), dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
@@ -48,8 +42,11 @@ def bend_closed(problem: BendingProblem, tolerance_m: float = 1e-6, rounds: int 
             reason = "points met"
             break
     if not reason:
-        raise WearcapError("the control points need large turns, or are out of reach of steps of these lengths",
-                           expected="points near the path, beside it", fix="Use the solver bend_banded.")  # fmt: skip
+        raise WearcapError(
+            "the control points need large turns, or are out of reach of steps of these lengths",
+            expected="points near the path, beside it",
+            fix="Use the solver bend_banded.",
+        )
     return bent_path(problem, turn, shift, history, reason)
 
 

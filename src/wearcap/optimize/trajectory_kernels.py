@@ -130,12 +130,7 @@ def value_pass(turn, place, link, last_link, first, share, target, weight, kinds
         pull = k * off
         force, rest = gt + pull, tt + damping * (tt + k) + TINY
         whole = k + rest
-        gains[s, 0], gains[s, 1], gains[s, 2], gains[s, 3] = (
-            -xt / whole,
-            -yt / whole,
-            k / whole,
-            -force / whole,
-        )
+        gains[s, 0], gains[s, 1], gains[s, 2], gains[s, 3] = (-xt / whole, -yt / whole, k / whole, -force / whole)
         xx, xy, yy = xx - xt * xt / whole, xy - xt * yt / whole, yy - yt * yt / whole
         gx, gy = gx - xt * force / whole, gy - yt * force / whole
         xt, yt, tt, gt = xt * k / whole, yt * k / whole, k * rest / whole, k * force / whole - pull

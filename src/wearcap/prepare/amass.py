@@ -34,7 +34,7 @@ class AmassFile:
 
 def amass_tasks(
     source: str | Path, splits: Splits, settings: MocapSettings, license: str, subsets: Sequence[str] | None = None
-) -> list[Task]:  # fmt: skip
+) -> list[Task]:
     """One task per motion file below `source`, laid out DATASET/SUBJECT/MOTION.npz, of all data sets or of `subsets`.
 
     A row of the split list that names a file (DATASET/SUBJECT/MOTION) takes precedence over its subject's.
@@ -50,8 +50,11 @@ def amass_tasks(
     for path in files:
         parts = path.relative_to(source).with_suffix("").parts
         if len(parts) < 3:
-            raise WearcapError("not below a data set's and a subject's folder", where=path,
-                               expected=f"{source}/DATASET/SUBJECT/{path.name}")  # fmt: skip
+            raise WearcapError(
+                "not below a data set's and a subject's folder",
+                where=path,
+                expected=f"{source}/DATASET/SUBJECT/{path.name}",
+            )
         name, subject, file = "__".join(parts).replace(" ", "_"), "/".join(parts[:2]), "/".join(parts)
         about = About(name, subject, "amass", license)
         settings_hash = content_hash(asdict(about), asdict(settings), VERSION, path)

@@ -28,9 +28,7 @@ class AriaRecording:
         return replace(recording, name=self.name, subject=self.subject, license=self.license)
 
 
-def aria_tasks(
-    source: str | Path, splits: Splits, subject: str, fps: float | int, license: str
-) -> list[Task]:
+def aria_tasks(source: str | Path, splits: Splits, subject: str, fps: float | int, license: str) -> list[Task]:
     """One task per closed-loop trajectory at or below `source`, named after its recording's folder."""
     source = Path(source)
     if not source.is_dir():
@@ -42,9 +40,7 @@ def aria_tasks(
     for folder in recordings:
         name = folder.resolve().name
         digest = content_hash(name, subject, float(fps), VERSION, *mps_files(folder))
-        tasks.append(
-            Task(name, AriaRecording(folder, name, subject, float(fps), license), splits.of(subject), digest)
-        )
+        tasks.append(Task(name, AriaRecording(folder, name, subject, float(fps), license), splits.of(subject), digest))
     return tasks
 
 

@@ -3,14 +3,7 @@
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from wearcap.io.datasets.behave import (
-    BODY_FILE,
-    INFO_FILE,
-    OBJECT_FILE,
-    behave_folder,
-    behave_names,
-    read_behave,
-)
+from wearcap.io.datasets.behave import BODY_FILE, INFO_FILE, OBJECT_FILE, behave_folder, behave_names, read_behave
 from wearcap.prepare.engine import Task, content_hash
 from wearcap.prepare.mocap import About, MocapSettings
 from wearcap.prepare.one_object import on_level_ground, one_object_recording

@@ -37,15 +37,22 @@ def _require_finite(name: str, key: str, tensor: Tensor) -> None:
     bad = ~torch.isfinite(tensor)
     if bad.any():
         frame = int(bad.flatten(1).any(1).nonzero()[0]) if tensor.ndim > 1 else int(bad.nonzero()[0])
-        raise WearcapError(f"{int(bad.sum())} values of {key} are not finite, the first in row {frame}",
-                           where=name, expected="numbers", fix="Mend or drop the source.")  # fmt: skip
+        raise WearcapError(
+            f"{int(bad.sum())} values of {key} are not finite, the first in row {frame}",
+            where=name,
+            expected="numbers",
+            fix="Mend or drop the source.",
+        )
 
 
 def _require_rising(name: str, key: str, timestamps: Tensor) -> None:
     still = (timestamps.diff() <= 0).nonzero()
     if len(still):
-        raise WearcapError(f"{key} do not rise at row {int(still[0]) + 1} (frame rate 0?)", where=name,
-                           expected="strictly rising seconds")  # fmt: skip
+        raise WearcapError(
+            f"{key} do not rise at row {int(still[0]) + 1} (frame rate 0?)",
+            where=name,
+            expected="strictly rising seconds",
+        )
 
 
 def _require_rotations(name: str, key: str, R: Tensor) -> None:
@@ -53,16 +60,23 @@ def _require_rotations(name: str, key: str, R: Tensor) -> None:
     away = (R.transpose(-1, -2) @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
     bad = (away > ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)
     if bad.any():
-        raise WearcapError(f"{int(bad.sum())} matrices of {key} are no rotations", where=name,
-                           expected=f"orthogonal within {ORTHOGONAL_WITHIN}, determinant +1")  # fmt: skip
+        raise WearcapError(
+            f"{int(bad.sum())} matrices of {key} are no rotations",
+            where=name,
+            expected=f"orthogonal within {ORTHOGONAL_WITHIN}, determinant +1",
+        )
 
 
 def _require_clock(name: str, part: str, timestamps: Tensor) -> None:
     if len(timestamps) < 2 or (duration := (timestamps[-1] - timestamps[0]).item()) < MIN_DURATION_S:
-        raise WearcapError(f"{part} has {len(timestamps)} frames", where=name,
-                           expected=f"at least {MIN_DURATION_S} s of motion")  # fmt: skip
+        raise WearcapError(
+            f"{part} has {len(timestamps)} frames", where=name, expected=f"at least {MIN_DURATION_S} s of motion"
+        )
     fps = (len(timestamps) - 1) / duration
     if not RATES_HZ[0] <= fps <= RATES_HZ[1]:
-        raise WearcapError(f"{part} runs at {fps:.4g} frames per second", where=name,
-                           expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g}",
-                           fix="Give the true frame rate of the source.")  # fmt: skip
+        raise WearcapError(
+            f"{part} runs at {fps:.4g} frames per second",
+            where=name,
+            expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g}",
+            fix="Give the true frame rate of the source.",
+        )

@@ -56,9 +56,7 @@ def without_glitches(motion: Motion, limits: CleaningLimits) -> tuple[Motion, st
     return motion.sliced(start, stop), note
 
 
-def foot_patches(
-    motion: Motion,
-) -> tuple[Float[Tensor, "time patch 3"], Float[Tensor, "time patch"]]:
+def foot_patches(motion: Motion) -> tuple[Float[Tensor, "time patch 3"], Float[Tensor, "time patch"]]:
     """World positions (m) and speeds (m/s, central differences) of `FOOT_PATCHES`."""
     positions = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES)
     step_s = (motion.timestamps[2:] - motion.timestamps[:-2]).to(positions.dtype)

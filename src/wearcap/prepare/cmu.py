@@ -66,8 +66,12 @@ class Trial:
         """The motion in the file's own skeleton."""
         if ".amc" in self.file.name.lower():
             if self.asf is None:
-                raise WearcapError("no skeleton beside it", where=self.file, fix="An AMC file needs its subject's .asf.",
-                                   expected=f"{self.file.name.split('_')[0]}.asf, or one .asf file")  # fmt: skip
+                raise WearcapError(
+                    "no skeleton beside it",
+                    where=self.file,
+                    fix="An AMC file needs its subject's .asf.",
+                    expected=f"{self.file.name.split('_')[0]}.asf, or one .asf file",
+                )
             return read_amc(read_asf(self.asf), self.file, self.amc_fps)
         if _is_cgspeed(self.file):
             return read_cmu_bvh(self.file)
@@ -84,18 +88,22 @@ def _head_face(asf: Path, files: tuple[Path, ...], fps: float | int) -> Float[Te
         except WearcapError:  # reported by the trial's own task
             continue
         thin = slice(None, None, HEAD_FRAME_STEP)
-        motion = on_xsens23(replace(
-            motion, timestamps=motion.timestamps[thin], R_parent_joint=motion.R_parent_joint[thin],
-            t_world_root=motion.t_world_root[thin], contact_prob=None,
-        ))  # fmt: skip
+        motion = on_xsens23(
+            replace(
+                motion,
+                timestamps=motion.timestamps[thin],
+                R_parent_joint=motion.R_parent_joint[thin],
+                t_world_root=motion.t_world_root[thin],
+                contact_prob=None,
+            )
+        )
         poses.append(motion.R_parent_joint)
     return head_level(motion.skeleton, torch.cat(poses)) if poses else None
 
 
 def cmu_tasks(
-    source: str | Path, splits: Splits, settings: MocapSettings, bvh: BvhSettings,
-    amc_fps: float | int, license: str,
-) -> list[Task]:  # fmt: skip
+    source: str | Path, splits: Splits, settings: MocapSettings, bvh: BvhSettings, amc_fps: float | int, license: str
+) -> list[Task]:
     """One task per trial found anywhere below `source`.
 
     Files are named SUBJECT_TRIAL.amc or .bvh (also .xz, .gz); an .amc needs SUBJECT.asf in its folder. Where a
@@ -106,8 +114,7 @@ def cmu_tasks(
         raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
     activities = _activities(source / "index.csv")
     trials = {
-        name: (path, _asf_for(path) if ".amc" in path.name.lower() else None)
-        for name, path in _trials(source).items()
+        name: (path, _asf_for(path) if ".amc" in path.name.lower() else None) for name, path in _trials(source).items()
     }
     same: dict[tuple[str, Path | None], list[Path]] = {}
     for name, (path, asf) in trials.items():
@@ -134,9 +141,7 @@ def _trials(source: Path) -> dict[str, Path]:
             raise WearcapError(f"two trials are called {name!r}: {files[name]} and {path}", fix="Rename one.")
         files.setdefault(name, path)
     if not files:
-        raise WearcapError(
-            "no .amc or .bvh files", where=source, expected="motion files, plain or .xz or .gz"
-        )
+        raise WearcapError("no .amc or .bvh files", where=source, expected="motion files, plain or .xz or .gz")
     return files
 
 
@@ -158,9 +163,7 @@ def _activities(index: Path) -> dict[str, str]:
         return {}
     with open(index, newline="", encoding="utf-8") as file:
         return {
-            row["trial"]: row["category"]
-            for row in csv.DictReader(file)
-            if row.get("trial") and row.get("category")
+            row["trial"]: row["category"] for row in csv.DictReader(file) if row.get("trial") and row.get("category")
         }
 
 

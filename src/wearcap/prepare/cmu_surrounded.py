@@ -38,9 +38,7 @@ class Surrounded:
         recording = RecordingFile(self.file).load()
         motion, head = recording.motion, recording.head
         if motion is None or head is None:
-            raise WearcapError(
-                "no motion or no head path", where=self.file, expected="motion capture with both"
-            )
+            raise WearcapError("no motion or no head path", where=self.file, expected="motion capture with both")
         seed = [self.seed, zlib.crc32(self.name.encode())]
         of_world, of_points, of_camera = (np.random.default_rng([number, *seed]) for number in (31, 32, 33))
         world = surround(motion, of_world, f"cmu-room-{self.name}")
@@ -58,9 +56,7 @@ def seen_points(world: World, head: HeadStream, look_round: bool, rng: np.random
 
     With `look_round`, points that the wearer sees from the start of the path are available from its first frame.
     """
-    points = semidense_points(
-        world.mesh, world.face_texture, _turned_round(head) if look_round else head, rng
-    )
+    points = semidense_points(world.mesh, world.face_texture, _turned_round(head) if look_round else head, rng)
     assert points.first_seen is not None
     return replace(points, first_seen=points.first_seen.clamp(min=head.timestamps[0].item()))
 
@@ -73,19 +69,15 @@ def _turned_round(head: HeadStream) -> HeadStream:
     R = (rotation.about_axis("z", yaw)[None] @ rotation.about_axis("y", down)[:, None]).flatten(0, 1)
     before = head.timestamps[0] - VIEW_S * torch.arange(len(R), 0, -1, dtype=torch.float64)
     return replace(
-        head, timestamps=torch.cat([before, head.timestamps]),
+        head,
+        timestamps=torch.cat([before, head.timestamps]),
         R_world_device=torch.cat([R.to(head.R_world_device.dtype), head.R_world_device]),
         t_world_device=torch.cat([head.t_world_device[:1].expand(len(R), 3), head.t_world_device]),
-    )  # fmt: skip
+    )
 
 
 def cmu_surrounded_tasks(
-    source: str | Path,
-    output: str | Path,
-    splits: Splits,
-    camera: bool,
-    look_round: bool,
-    seed: int,
+    source: str | Path, output: str | Path, splits: Splits, camera: bool, look_round: bool, seed: int
 ) -> list[Task]:
     """One task per recording of the data set `source`, which `wearcap prepare cmu` made (floors at z = 0).
 

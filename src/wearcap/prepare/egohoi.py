@@ -35,15 +35,22 @@ class EgoHoiSequence:
         file = Path("scenes") / self.name / FILE_NAME
         write_environment(read.environment, self.output / file)
         return replace(
-            read.recording, motion=resampled(read.recording.motion, self.fps), environment=file.as_posix(),
+            read.recording,
+            motion=resampled(read.recording.motion, self.fps),
+            environment=file.as_posix(),
             license=self.license,
-        )  # fmt: skip
+        )
 
 
 def egohoi_tasks(
-    source: str | Path, output: str | Path, splits: Splits, motion_types: dict[str, str],
-    object_names: dict[str, str], fps: float | int, license: str,
-) -> list[Task]:  # fmt: skip
+    source: str | Path,
+    output: str | Path,
+    splits: Splits,
+    motion_types: dict[str, str],
+    object_names: dict[str, str],
+    fps: float | int,
+    license: str,
+) -> list[Task]:
     """One task per sequence in `source`/smpl_motions; environments go to `output`/scenes.
 
     `motion_types` and `object_names` as `read_egohoi` takes them, the latter by sequence. Raises WearcapError without
@@ -52,8 +59,12 @@ def egohoi_tasks(
     source = Path(source)
     names = egohoi_names(source)
     if not names:
-        raise WearcapError("no sequences", where=source, expected="smpl_motions/NAME.json.zip or .json",
-                           fix="Give EgoHOI's folder as source=DIR.")  # fmt: skip
+        raise WearcapError(
+            "no sequences",
+            where=source,
+            expected="smpl_motions/NAME.json.zip or .json",
+            fix="Give EgoHOI's folder as source=DIR.",
+        )
     models = sorted(source.glob("object_models/*.ply"))
     tasks = []
     for name in names:
@@ -61,8 +72,15 @@ def egohoi_tasks(
         shape = source / "smpl_shapes" / f"{subject_of(name)}.json"
         make = EgoHoiSequence(source, name, motion_types, object_names.get(name), fps, license, Path(output))
         settings_hash = content_hash(
-            name, motion_types, make.object_name, float(fps), license, VERSION, *files, *models,
+            name,
+            motion_types,
+            make.object_name,
+            float(fps),
+            license,
+            VERSION,
+            *files,
+            *models,
             *([shape] if shape.is_file() else []),
-        )  # fmt: skip
+        )
         tasks.append(Task(name, make, splits.of(subject_of(name)), settings_hash))
     return tasks

@@ -18,9 +18,12 @@ from wearcap.recording.store import Entry, RecordingFile, RecordingStore, entry_
 
 
 def embed_dataset(
-    dataset: str | Path, encoder: ImageEncoder, cache: str | Path | None = None, overwrite: bool = False,
+    dataset: str | Path,
+    encoder: ImageEncoder,
+    cache: str | Path | None = None,
+    overwrite: bool = False,
     progress: bool = True,
-) -> Report:  # fmt: skip
+) -> Report:
     """Add embeddings by `encoder` to every recording with head-camera pictures, rewriting its file.
 
     Recordings that have them already are left unchanged, so that a killed run resumes where it stopped. A recording whose
@@ -50,9 +53,7 @@ def _embed_all(
                     elif not overwrite and _is_current(store, name, camera, name_of_all):
                         report.current.append(name)
                     else:
-                        pending[name] = _embed(
-                            store, name, file, encoder, None if cache is None else Path(cache)
-                        )
+                        pending[name] = _embed(store, name, file, encoder, None if cache is None else Path(cache))
                         report.written.append(name)
                 except WearcapError as error:
                     report.failed[name] = str(error)
@@ -63,8 +64,11 @@ def _embed_all(
     finally:
         store.register(pending)
     if len(report.notes) == len(store.entries):
-        raise WearcapError("no recording has a head camera's pictures", where=store.root,
-                           fix="Prepare it with them, as `wearcap prepare simulated camera=true` does.")  # fmt: skip
+        raise WearcapError(
+            "no recording has a head camera's pictures",
+            where=store.root,
+            fix="Prepare it with them, as `wearcap prepare simulated camera=true` does.",
+        )
     return report
 
 
@@ -81,9 +85,7 @@ def _is_registered(store: RecordingStore, name: str) -> bool:
     return not path.is_file() or path.stat().st_mtime_ns <= store.manifest_path.stat().st_mtime_ns
 
 
-def _embed(
-    store: RecordingStore, name: str, file: RecordingFile, encoder: ImageEncoder, cache: Path | None
-) -> Entry:
+def _embed(store: RecordingStore, name: str, file: RecordingFile, encoder: ImageEncoder, cache: Path | None) -> Entry:
     recording, entry = file.load(), store.entries[name]
     assert recording.camera is not None
     recording = replace(recording, camera=embed_camera(recording.camera, store.root, encoder, cache))

@@ -70,9 +70,15 @@ def content_hash(*parts: Any) -> str:
 
 
 def prepare(
-    tasks: list[Task], output: str | Path, *, jobs: int = -1, backend: str = "loky",
-    scheduler: str | None = None, overwrite: bool = False, progress: bool = True,
-) -> Report:  # fmt: skip
+    tasks: list[Task],
+    output: str | Path,
+    *,
+    jobs: int = -1,
+    backend: str = "loky",
+    scheduler: str | None = None,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> Report:
     """Make every recording that is missing or out of date.
 
     `jobs` is joblib's (-1: all cores); with backend "dask" and no `scheduler` address, that many local workers.
@@ -100,9 +106,12 @@ def prepare(
 
 
 def _collect(
-    outcomes: Iterator[tuple[str, Entry | str, str]], store: RecordingStore, current: list[str], total: int,
+    outcomes: Iterator[tuple[str, Entry | str, str]],
+    store: RecordingStore,
+    current: list[str],
+    total: int,
     progress: bool,
-) -> Report:  # fmt: skip
+) -> Report:
     """Register the workers' results in the manifest, and report."""
     report = Report(current=current)
     pending: dict[str, Entry] = {}
@@ -123,8 +132,11 @@ def _collect(
                     pending, written_at = {}, time.monotonic()
                 advance()
     except BrokenExecutor as error:
-        raise WearcapError("a worker process was killed (out of memory?)", where=store.root,
-                           fix="What is finished is kept: run again with fewer jobs.") from error  # fmt: skip
+        raise WearcapError(
+            "a worker process was killed (out of memory?)",
+            where=store.root,
+            fix="What is finished is kept: run again with fewer jobs.",
+        ) from error
     finally:
         store.register(pending)
     report.written.sort()
@@ -194,8 +206,11 @@ def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -
         if backend == "dask":
             from dask.distributed import Client  # type: ignore[import-not-found]
 
-            local = {"n_workers": joblib.cpu_count() if jobs < 1 else jobs, "threads_per_worker": 1,
-                     "dashboard_address": None}  # fmt: skip
+            local = {
+                "n_workers": joblib.cpu_count() if jobs < 1 else jobs,
+                "threads_per_worker": 1,
+                "dashboard_address": None,
+            }
             with Client(scheduler) if scheduler else Client(**local), joblib.parallel_config("dask"):
                 yield True
         elif backend == "ray":
@@ -215,15 +230,16 @@ def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -
             with joblib.parallel_config(backend):
                 yield True
     except ModuleNotFoundError as error:
-        raise WearcapError(f"the backend {backend!r} needs the package {error.name!r}",
-                           fix=f"pip install {'wearcap[cluster]' if backend == 'dask' else 'ray'}") from error  # fmt: skip
+        raise WearcapError(
+            f"the backend {backend!r} needs the package {error.name!r}",
+            fix=f"pip install {'wearcap[cluster]' if backend == 'dask' else 'ray'}",
+        ) from error
 
 
 @contextmanager
 def progress_bar(total: int, done: int, visible: bool) -> Iterator[Callable[[], None]]:
     """Progress bar of recordings on stderr; the yielded function is called for each finished one."""
-    columns = (TextColumn("recordings"), BarColumn(), MofNCompleteColumn(), TextColumn("left:"),
-               TimeRemainingColumn())  # fmt: skip
+    columns = (TextColumn("recordings"), BarColumn(), MofNCompleteColumn(), TextColumn("left:"), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=not visible) as bar:
         line = bar.add_task("recordings", total=total, completed=done)
         yield lambda: bar.advance(line)

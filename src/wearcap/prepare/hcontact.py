@@ -47,8 +47,12 @@ def hcontact_tasks(
     source = Path(source)
     names = hcontact_names(source)
     if not names:
-        raise WearcapError("no sequences", where=source, expected=f"body/NAME{ENDING} and contacts/NAME.json",
-                           fix="Give H-contact's folder as source=DIR.")  # fmt: skip
+        raise WearcapError(
+            "no sequences",
+            where=source,
+            expected=f"body/NAME{ENDING} and contacts/NAME.json",
+            fix="Give H-contact's folder as source=DIR.",
+        )
     held_out = held_out_subjects(source, names)
     tasks = []
     for name in names:

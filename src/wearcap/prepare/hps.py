@@ -31,37 +31,29 @@ class HpsSequence:
         assert read.motion is not None
         suit, found = read.suit, read.localization
         return replace(
-            read, motion=resampled(read.motion, self.fps), license=self.license,
+            read,
+            motion=resampled(read.motion, self.fps),
+            license=self.license,
             suit=None if suit is None else resampled(suit, self.fps),
             localization=None if found is None else resampled_localization(found, self.fps),
-        )  # fmt: skip
+        )
 
 
-def hps_tasks(
-    source: str | Path, splits: Splits, fps: float | int, camera_hz: float | int, license: str
-) -> list[Task]:
+def hps_tasks(source: str | Path, splits: Splits, fps: float | int, camera_hz: float | int, license: str) -> list[Task]:
     """One task per sequence in `source`/hps_smpl; hashed by all files with its name and its subject's betas."""
     source = Path(source)
     if not source.is_dir():
         raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
     names = hps_names(source)
     if not names:
-        raise WearcapError(
-            "no sequences", where=source, expected="hps_smpl/NAME.pkl, as the HPS data set unpacks"
-        )
+        raise WearcapError("no sequences", where=source, expected="hps_smpl/NAME.pkl, as the HPS data set unpacks")
     tasks = []
     for name in names:
         subject = subject_of(name)
         files = sorted(
-            [
-                *source.glob(f"*/{name}[._]*"),
-                *source.glob(f"*betas*/{subject}.json"),
-                *source.glob("*/cameras.json"),
-            ]
+            [*source.glob(f"*/{name}[._]*"), *source.glob(f"*betas*/{subject}.json"), *source.glob("*/cameras.json")]
         )
-        small = [
-            path for path in files if path.suffix.lower() != ".mp4"
-        ]  # only a video's rate and length matter
+        small = [path for path in files if path.suffix.lower() != ".mp4"]  # only a video's rate and length matter
         sequence = HpsSequence(source, name, fps, camera_hz, license)
         settings_hash = content_hash(name, float(fps), float(camera_hz), license, VERSION, *small)
         tasks.append(Task(name, sequence, splits.of(subject), settings_hash))

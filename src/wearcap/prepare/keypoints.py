@@ -80,7 +80,7 @@ class Recorded:
 
     def _of(self, name: str) -> Path:
         if self.file is None:
-            raise WearcapError("no file of recorded keypoints", fix="Give file=PATH, a .csv or a folder of NAME.csv.")  # fmt: skip
+            raise WearcapError("no file of recorded keypoints", fix="Give file=PATH, a .csv or a folder of NAME.csv.")
         return Path(self.file) / f"{name}.csv" if Path(self.file).is_dir() else Path(self.file)
 
 
@@ -96,8 +96,11 @@ class Simulated:
     def __call__(self, recording: Recording, folder: Path) -> Recording:
         motion = recording.motion
         if motion is None:
-            raise WearcapError("no true motion to simulate keypoints of", where=recording.name,
-                               expected="motion capture, or another detector")  # fmt: skip
+            raise WearcapError(
+                "no true motion to simulate keypoints of",
+                where=recording.name,
+                expected="motion capture, or another detector",
+            )
         rng = np.random.default_rng([41, self.seed, zlib.crc32(recording.name.encode())])
         every = max(1, round(motion.fps / CAMERA_FPS))
         stream = recording.camera or action_camera(motion.timestamps[::every].contiguous())
@@ -125,34 +128,45 @@ class WithKeypoints:
 
 
 def keypoints_dataset(
-    dataset: str | Path, output: str | Path, detector: Source, *, jobs: int = 1, backend: str = "loky",
-    scheduler: str | None = None, overwrite: bool = False, progress: bool = True,
-) -> Report:  # fmt: skip
+    dataset: str | Path,
+    output: str | Path,
+    detector: Source,
+    *,
+    jobs: int = 1,
+    backend: str = "loky",
+    scheduler: str | None = None,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> Report:
     """Make a data set with the recordings of another and their keypoints, in the same splits.
 
     Raises WearcapError when both are one folder, and for one file of keypoints with several recordings.
     """
     store = RecordingStore.open(dataset)
     if Path(output).resolve() == store.root.resolve():
-        raise WearcapError(
-            "the new data set would replace the old one", where=output, expected="another folder"
-        )
+        raise WearcapError("the new data set would replace the old one", where=output, expected="another folder")
     file = detector.file if isinstance(detector, Recorded) else None
     if file is not None and Path(file).is_file() and len(store.names()) > 1:
-        raise WearcapError(f"one file of keypoints for {len(store.names())} recordings", where=file,
-                           expected="a folder with NAME.csv for each")  # fmt: skip
+        raise WearcapError(
+            f"one file of keypoints for {len(store.names())} recordings",
+            where=file,
+            expected="a folder with NAME.csv for each",
+        )
     tasks = []
     for name in store.names():
         entry = store.entries[name]
         make = WithKeypoints(store.root / entry.file, store.root, Path(output), detector)
         tasks.append(Task(name, make, entry.split, content_hash(entry.sha256, *detector.settings(name))))
-    return prepare(tasks, output, jobs=jobs, backend=backend, scheduler=scheduler, overwrite=overwrite, progress=progress)  # fmt: skip
+    return prepare(
+        tasks, output, jobs=jobs, backend=backend, scheduler=scheduler, overwrite=overwrite, progress=progress
+    )
 
 
 def _camera(recording: Recording) -> CameraStream:
     if recording.camera is None:
-        raise WearcapError("no head camera", where=recording.name,
-                           expected="a recording with one, whose pixels keypoints are")  # fmt: skip
+        raise WearcapError(
+            "no head camera", where=recording.name, expected="a recording with one, whose pixels keypoints are"
+        )
     return recording.camera
 
 
@@ -166,9 +180,8 @@ def _from_elsewhere(recording: Recording, prefix: str) -> Recording:
     if camera is not None:
         files = camera.image_files
         camera = replace(
-            camera, video=moved(camera.video),
+            camera,
+            video=moved(camera.video),
             image_files=None if files is None else tuple(Path(prefix, name).as_posix() for name in files),
-        )  # fmt: skip
-    return replace(
-        recording, camera=camera, scene=moved(recording.scene), environment=moved(recording.environment)
-    )
+        )
+    return replace(recording, camera=camera, scene=moved(recording.scene), environment=moved(recording.environment))

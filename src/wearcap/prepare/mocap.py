@@ -7,14 +7,7 @@ import torch
 
 from wearcap.body.retarget import fit_offsets, retarget
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
-from wearcap.prepare.clean import (
-    CleaningLimits,
-    floor_height,
-    foot_contacts,
-    foot_patches,
-    levelled,
-    without_glitches,
-)
+from wearcap.prepare.clean import CleaningLimits, floor_height, foot_contacts, foot_patches, levelled, without_glitches
 from wearcap.prepare.engine import NOTE
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ContactTrack, FloorTrack, HeadStream, Recording
@@ -55,17 +48,23 @@ def mocap_recording(motion: Motion, about: About, settings: MocapSettings) -> Re
     contact = foot_contacts(positions, speed, floor if level else None, settings.limits)
     provenance = motion.provenance | {"floor_m": f"{floor:.4f}", "floor": "level" if level else "uneven"}
     motion = replace(
-        levelled(motion, floor), timestamps=motion.timestamps - motion.timestamps[0],
+        levelled(motion, floor),
+        timestamps=motion.timestamps - motion.timestamps[0],
         provenance=provenance | ({NOTE: note} if note else {}),
-    )  # fmt: skip
+    )
     times = motion.timestamps
     return Recording(
-        about.name, head=nominal_head(motion, settings.t_head_device), motion=motion,
+        about.name,
+        head=nominal_head(motion, settings.t_head_device),
+        motion=motion,
         contacts=ContactTrack(times, FOOT_PATCHES, contact),
         floor=FloorTrack(times, torch.zeros(len(times))) if level else None,
-        skeleton=motion.skeleton, subject=about.subject, activity=about.activity, source=about.source,
+        skeleton=motion.skeleton,
+        subject=about.subject,
+        activity=about.activity,
+        source=about.source,
         license=about.license,
-    )  # fmt: skip
+    )
 
 
 def on_xsens23(motion: Motion) -> Motion:

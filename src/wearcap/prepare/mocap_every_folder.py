@@ -52,9 +52,7 @@ class MocapEveryCapture:
         """Recording without outlier poses, which are detected in metres before the world is changed."""
         read = read_mocap_every_folder(self.folder)
         scale, T_world_slam = _alignment(read, self.settings, self.folder)
-        clean = clean_track(
-            read.T_slam_cam, self.settings.max_acceleration / scale, self.settings.max_burst_s
-        )
+        clean = clean_track(read.T_slam_cam, self.settings.max_acceleration / scale, self.settings.max_burst_s)
         recording = mocap_every_recording(replace(read, T_slam_cam=clean.trajectory), scale, T_world_slam)
         return replace(recording, name=self.name, subject=self.subject, license=self.license)
 
@@ -85,9 +83,12 @@ def _alignment(read: MocapEveryFolder, settings: MocapEverySettings, folder: Pat
     """Scale and T_world_slam from the calibration board, or from a given scale and a level first pose."""
     if settings.scale is None:
         if read.board is None:
-            raise WearcapError("it does not define the length of a unit of SLAM", where=folder,
-                               expected="cam_scale_origin in config.yaml, and x and y in camera_calib.pkl",
-                               fix="Measure it, and give scale=METRES_PER_UNIT.")  # fmt: skip
+            raise WearcapError(
+                "it does not define the length of a unit of SLAM",
+                where=folder,
+                expected="cam_scale_origin in config.yaml, and x and y in camera_calib.pkl",
+                fix="Measure it, and give scale=METRES_PER_UNIT.",
+            )
         board = read.board
         return align_by_walks(board.x_slam, board.y_slam, board.length_m, board.height_m)
     if settings.scale <= 0:

@@ -30,12 +30,7 @@ class NymeriaSequence:
 
 
 def nymeria_tasks(
-    source: str | Path,
-    splits: Splits,
-    fps: float | int,
-    license: str,
-    camera: bool = False,
-    output: str = ".",
+    source: str | Path, splits: Splits, fps: float | int, license: str, camera: bool = False, output: str = "."
 ) -> list[Task]:
     """One task per sequence folder (with `body/xdata.npz`) below `source`; hashed by its motion, head path and points.
 
@@ -55,7 +50,8 @@ def nymeria_tasks(
         vrs = head_vrs(folder)
         video = Path(output) / "videos" / f"{name}.mp4" if camera and vrs.is_file() else None
         sequence = NymeriaSequence(folder, name, fps, license, video)
-        settings_hash = content_hash(name, float(fps), VERSION, about, folder / "body" / "xdata.npz", *paths,
-                                     vrs.stat().st_size if video else 0)  # fmt: skip
+        settings_hash = content_hash(
+            name, float(fps), VERSION, about, folder / "body" / "xdata.npz", *paths, vrs.stat().st_size if video else 0
+        )
         tasks.append(Task(name, sequence, splits.of(about["subject"]), settings_hash))
     return tasks

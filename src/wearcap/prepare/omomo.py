@@ -49,9 +49,13 @@ class OmomoTake:
 
 
 def omomo_tasks(
-    source: str | Path, output: str | Path, splits: Splits, settings: MocapSettings, source_fps: float | int,
+    source: str | Path,
+    output: str | Path,
+    splits: Splits,
+    settings: MocapSettings,
+    source_fps: float | int,
     license: str,
-) -> list[Task]:  # fmt: skip
+) -> list[Task]:
     """One task per sequence of `source`'s files; environments go to `output`/scenes.
 
     `source_fps` is the frame rate, which the files lack. Raises WearcapError without sequences, for a rate that is no
@@ -59,9 +63,7 @@ def omomo_tasks(
     """
     source = Path(source)
     if not 0 < source_fps < 1e4:
-        raise WearcapError(
-            f"a frame rate of {source_fps} Hz", expected="source_fps=30 or another positive number"
-        )
+        raise WearcapError(f"a frame rate of {source_fps} Hz", expected="source_fps=30 or another positive number")
     sequences = read_omomo(source)
     check_rate(sequences, source, source_fps)
     shared = content_hash(asdict(settings), float(source_fps), license, VERSION)
@@ -97,9 +99,10 @@ def check_rate(sequences: list[OmomoSequence], root: str | Path, fps: float | in
     if fast or slow:
         raise WearcapError(
             f"at {fps:g} frames per second people walk at {pelvis:.2f} m/s and swing their feet at {foot:.2f} m/s",
-            where=root, expected="some 1 and 3 m/s",
+            where=root,
+            expected="some 1 and 3 m/s",
             fix=f"The true rate is {'lower' if fast else 'higher'} (public loaders use 30 or 120): give it as source_fps=….",
-        )  # fmt: skip
+        )
 
 
 def walking_speeds(motion: Motion) -> tuple[float, float, float]:
@@ -108,9 +111,7 @@ def walking_speeds(motion: Motion) -> tuple[float, float, float]:
     _, foot = foot_patches(motion)
     steps = motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1)
     pelvis = steps / motion.timestamps.diff().to(steps.dtype)
-    return (
-        float(torch.quantile(pelvis, 0.95)), float(torch.quantile(foot.amax(1), 0.99)), float(steps.sum()),
-    )  # fmt: skip
+    return (float(torch.quantile(pelvis, 0.95)), float(torch.quantile(foot.amax(1), 0.99)), float(steps.sum()))
 
 
 def _digest(sequence: OmomoSequence) -> str:

@@ -36,9 +36,7 @@ _MIN_STEPS = 10
 _UPSIDE_DOWN_M = 0.2
 
 
-def one_object_recording(
-    take: OneObject, about: About, settings: MocapSettings, output: str | Path
-) -> Recording:
+def one_object_recording(take: OneObject, about: About, settings: MocapSettings, output: str | Path) -> Recording:
     """Like `mocap_recording`, with the object's path on the motion's clock and an environment of that one object.
 
     The environment is written to `output`/scenes/NAME; the object is free to move and handled throughout, so there
@@ -54,13 +52,17 @@ def one_object_recording(
     notes = "; ".join(text for text in (cut, note) if text)
     provenance = recording.motion.provenance | ({NOTE: notes} if notes else {})
     path = _on_clock(kept.path, motion, recording.motion)
-    item = SceneObject(take.object_name, kind, take.mesh, path.R_world_body[0], path.t_world_body[0], Freedom("free"))  # fmt: skip
+    item = SceneObject(take.object_name, kind, take.mesh, path.R_world_body[0], path.t_world_body[0], Freedom("free"))
     file = Path("scenes") / about.name / FILE_NAME
     write_environment(Environment((item,)), Path(output) / file)
     return replace(
-        recording, motion=replace(recording.motion, provenance=provenance), object_motion={take.object_name: path},
-        environment=file.as_posix(), shape=take.shape, location=take.location,
-    )  # fmt: skip
+        recording,
+        motion=replace(recording.motion, provenance=provenance),
+        object_motion={take.object_name: path},
+        environment=file.as_posix(),
+        shape=take.shape,
+        location=take.location,
+    )
 
 
 def longest_stretch(take: OneObject) -> tuple[OneObject, str]:
@@ -85,8 +87,12 @@ def on_level_ground(take: OneObject, limits: CleaningLimits) -> OneObject:
     R = ground_rotation(positions[speed < limits.contact_speed])
     tilt = float(torch.rad2deg(torch.arccos(R[2, 2].clamp(max=1.0))))
     if tilt > MAX_TILT_DEG:
-        raise WearcapError(f"the ground below the feet is tilted by {tilt:.0f}°", where=take.name,
-                           expected=f"at most {MAX_TILT_DEG:g}°", fix="Check which of the source's axes is up.")  # fmt: skip
+        raise WearcapError(
+            f"the ground below the feet is tilted by {tilt:.0f}°",
+            where=take.name,
+            expected=f"at most {MAX_TILT_DEG:g}°",
+            fix="Check which of the source's axes is up.",
+        )
     motion = replace(motion, provenance=motion.provenance | {"tilt_deg": f"{tilt:.2f}"})
     return replace(take, motion=motion).turned(R)
 
@@ -129,5 +135,9 @@ def _require_upright(motion: Motion, name: str) -> None:
     feet = torch.stack([motion.joint(f"{side}_ankle").t[:, 2] for side in ("left", "right")]).mean(0)
     above = float((motion.joint("head").t[:, 2] - feet).median())
     if above < -_UPSIDE_DOWN_M:
-        raise WearcapError(f"the head is {-above:.2f} m below the feet", where=name, expected="a world whose z is up",
-                           fix="The source's axes are others than published.")  # fmt: skip
+        raise WearcapError(
+            f"the head is {-above:.2f} m below the feet",
+            where=name,
+            expected="a world whose z is up",
+            fix="The source's axes are others than published.",
+        )

@@ -29,9 +29,17 @@ class Simulated:
 
 
 def simulated_tasks(
-    splits: Splits, recordings: dict[str, int], duration_s: float | int, fps: float | int, points: bool,
-    activities: list[str] | None, seed: int, world: str | None = None, camera: bool = False, output: str = ".",
-) -> list[Task]:  # fmt: skip
+    splits: Splits,
+    recordings: dict[str, int],
+    duration_s: float | int,
+    fps: float | int,
+    points: bool,
+    activities: list[str] | None,
+    seed: int,
+    world: str | None = None,
+    camera: bool = False,
+    output: str = ".",
+) -> list[Task]:
     """`recordings[split]` recordings of `duration_s` each; people and places of the splits never meet.
 
     With `camera`, the head camera's video is written to `output`/videos.
@@ -40,8 +48,14 @@ def simulated_tasks(
     `world` is "flat", "outdoor" or None (drawn). Raises WearcapError for an unknown split or world, or when a
     simulated person's name belongs to another split's list.
     """
-    config = SimulationConfig(duration_s=float(duration_s), fps=float(fps), points=points,
-                              activities=tuple(activities) if activities else None, world=world, camera=camera)  # fmt: skip
+    config = SimulationConfig(
+        duration_s=float(duration_s),
+        fps=float(fps),
+        points=points,
+        activities=tuple(activities) if activities else None,
+        world=world,
+        camera=camera,
+    )
     if not config.duration_s > 0 or not config.fps > 0:
         raise WearcapError(f"recordings of {duration_s} s at {fps} Hz", expected="positive numbers")
     checked_splits(recordings, splits)
@@ -61,8 +75,11 @@ def checked_splits(recordings: Mapping[str, int], splits: Splits) -> None:
         raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
     for split in recordings:
         if splits.of(f"sim-{split}-person-000") != split:
-            raise WearcapError(f"people of the simulated {split} split are listed elsewhere", where=splits.path,
-                               expected=f"a line sim-{split}-*,{split}")  # fmt: skip
+            raise WearcapError(
+                f"people of the simulated {split} split are listed elsewhere",
+                where=splits.path,
+                expected=f"a line sim-{split}-*,{split}",
+            )
 
 
 def source_files() -> str:

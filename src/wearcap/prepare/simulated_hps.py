@@ -66,17 +66,25 @@ class SimulatedHps:
         times = times[times < stop]
         claps = [simulated.to_camera(clap) for clap in simulated.session.claps_s]
         file = Path("videos") / f"{self.name}.mp4"
-        write_head_video(
-            self.root / file, Scenery.of(world), camera.camera, path, times, Filming(), rng, claps
-        )
+        write_head_video(self.root / file, Scenery.of(world), camera.camera, path, times, Filming(), rng, claps)
         return replace(recording, camera=replace(camera, timestamps=times, video=file.as_posix()))
 
 
 def simulated_hps_tasks(
-    splits: Splits, output: str, recordings: dict[str, int], fps: float | int, camera_fps: float | int,
-    returns_m: list[float], end_m: float | int, spacing_m: float | None, photo_m: float | int, video_s: float | None,
-    video_fps: float | int, changed: float | int, seed: int,
-) -> list[Task]:  # fmt: skip
+    splits: Splits,
+    output: str,
+    recordings: dict[str, int],
+    fps: float | int,
+    camera_fps: float | int,
+    returns_m: list[float],
+    end_m: float | int,
+    spacing_m: float | None,
+    photo_m: float | int,
+    video_s: float | None,
+    video_fps: float | int,
+    changed: float | int,
+    seed: int,
+) -> list[Task]:
     """`recordings[split]` sessions each; people and sites of the splits never meet, and a split's sites are few.
 
     Scenes go to `output`/scenes: points `spacing_m` apart (None: no scene at all), photo stations `photo_m` apart

@@ -15,11 +15,7 @@ from wearcap.prepare.engine import Task, content_hash
 from wearcap.prepare.simulated import checked_splits, source_files
 from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
-from wearcap.simulation.interaction_session import (
-    InteractionConfig,
-    SimulatedInteractions,
-    simulate_interactions,
-)
+from wearcap.simulation.interaction_session import InteractionConfig, SimulatedInteractions, simulate_interactions
 from wearcap.simulation.scan import scan_world
 from wearcap.simulation.views import Scenery
 
@@ -43,9 +39,7 @@ class SimulatedInteractionsTask:
         folder = Path("scenes") / simulated.recording.location
         self._write_scene(simulated, self.root / folder)
         return replace(
-            simulated.recording,
-            scene=(folder / CLOUD).as_posix(),
-            environment=(folder / FILE_NAME).as_posix(),
+            simulated.recording, scene=(folder / CLOUD).as_posix(), environment=(folder / FILE_NAME).as_posix()
         )
 
     def _write_scene(self, simulated: SimulatedInteractions, folder: Path) -> None:
@@ -68,9 +62,15 @@ def is_made(folder: Path, wanted: str, *files: str) -> bool:
 
 
 def simulated_interactions_tasks(
-    splits: Splits, output: str, recordings: dict[str, int], minutes: float | int, fps: float | int,
-    camera_fps: float | int, spacing_m: float | int, seed: int,
-) -> list[Task]:  # fmt: skip
+    splits: Splits,
+    output: str,
+    recordings: dict[str, int],
+    minutes: float | int,
+    fps: float | int,
+    camera_fps: float | int,
+    spacing_m: float | int,
+    seed: int,
+) -> list[Task]:
     """`recordings[split]` recordings of some minutes each; people and flats of the splits never meet.
 
     Scenes go to `output`/scenes, with points `spacing_m` apart. Raises WearcapError for an unknown split, or when a
@@ -84,9 +84,7 @@ def simulated_interactions_tasks(
     for split, count in recordings.items():
         for index in range(count):
             name, number = f"interactions-{split}-{seed}-{index:04d}", seed * 1_000_000 + index
-            make = SimulatedInteractionsTask(
-                config, float(spacing_m), simulator, name, split, number, Path(output)
-            )
+            make = SimulatedInteractionsTask(config, float(spacing_m), simulator, name, split, number, Path(output))
             key = content_hash(asdict(config), float(spacing_m), number, split, simulator)
             tasks.append(Task(name, make, split, key))
     return tasks

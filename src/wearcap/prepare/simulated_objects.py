@@ -36,8 +36,8 @@ class SimulatedObjectsTask:
 
 
 def simulated_objects_tasks(
-    splits: Splits, output: str, recordings: dict[str, int], minutes: float | int, fps: float | int, seed: int,
-) -> list[Task]:  # fmt: skip
+    splits: Splits, output: str, recordings: dict[str, int], minutes: float | int, fps: float | int, seed: int
+) -> list[Task]:
     """`recordings[split]` recordings of some minutes each; people and flats of the splits never meet.
 
     Environments go to `output`/scenes. Raises WearcapError for an unknown split, or when a simulated person's name

@@ -25,8 +25,11 @@ class Splits:
         for pattern, split in self.rows:
             if fnmatchcase(subject, pattern):
                 return _by_hash(subject) if split == BY_HASH else split
-        raise WearcapError(f"subject {subject!r} is in no split", where=self.path,
-                           fix="Add a row with it, or a last row such as '*,train'.")  # fmt: skip
+        raise WearcapError(
+            f"subject {subject!r} is in no split",
+            where=self.path,
+            fix="Add a row with it, or a last row such as '*,train'.",
+        )
 
 
 def read_splits(path: str | Path) -> Splits:
@@ -38,16 +41,15 @@ def read_splits(path: str | Path) -> Splits:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:
-        raise WearcapError(
-            "no such split list", where=path, expected="a .csv with columns subject,split"
-        ) from error
+        raise WearcapError("no such split list", where=path, expected="a .csv with columns subject,split") from error
     table = list(csv.DictReader(line for line in lines if line.strip() and not line.startswith("#")))
     if not table or set(table[0]) != {"subject", "split"}:
         raise WearcapError("not a split list", where=path, expected="columns subject,split")
     for row in table:
         if row["split"] not in (*SPLITS, BY_HASH):
-            raise WearcapError(f"no split {row['split']!r}", where=path,
-                               expected=f"one of {', '.join((*SPLITS, BY_HASH))}")  # fmt: skip
+            raise WearcapError(
+                f"no split {row['split']!r}", where=path, expected=f"one of {', '.join((*SPLITS, BY_HASH))}"
+            )
     return Splits(path, tuple((row["subject"], row["split"]) for row in table))
 
 

@@ -16,7 +16,16 @@ from wearcap.recording.recording import (
 from wearcap.recording.store import RecordingStore
 
 __all__ = [
-    "CameraStream", "ContactTrack", "Cue", "FloorTrack", "HeadStream", "ImuStream", "Intervals",
+    "CameraStream",
+    "ContactTrack",
+    "Cue",
+    "FloorTrack",
+    "HeadStream",
+    "ImuStream",
+    "Intervals",
     "Localization",
-    "Motion", "PointCloud", "Recording", "RecordingStore",
-]  # fmt: skip
+    "Motion",
+    "PointCloud",
+    "Recording",
+    "RecordingStore",
+]

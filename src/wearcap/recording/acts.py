@@ -39,8 +39,11 @@ def true_acts(recording: Recording, margin_s: float = MARGIN_S) -> list[Act]:
         if not objects:
             return []
         if len(objects) > 1:
-            raise WearcapError(f"{len(objects)} objects and no interactions to choose the active one", where=recording.name,
-                               expected="interactions, or a single object")  # fmt: skip
+            raise WearcapError(
+                f"{len(objects)} objects and no interactions to choose the active one",
+                where=recording.name,
+                expected="interactions, or a single object",
+            )
         times = recording.object_motion[objects[0]].timestamps
         return [Act(objects[0], times[0].item(), times[-1].item() + 1.0)]
     spans = sorted(zip(interactions.start_s.tolist(), interactions.stop_s.tolist(), interactions.objects))
@@ -72,9 +75,7 @@ def _side_by_side(held: Sequence[Act]) -> list[Act]:
     left, done = list(held), []
     while left:
         act = left.pop(0)
-        within = (
-            k for k, other in enumerate(left) if other.stop_s < act.stop_s and other.object != act.object
-        )
+        within = (k for k, other in enumerate(left) if other.stop_s < act.stop_s and other.object != act.object)
         inner = next(within, None)
         if inner is not None:
             left.insert(inner + 1, Act(act.object, left[inner].stop_s, act.stop_s))
@@ -85,9 +86,7 @@ def _side_by_side(held: Sequence[Act]) -> list[Act]:
     return done
 
 
-def active_at(
-    acts: Iterable[Act], names: Sequence[str], timestamps: Float64[Tensor, "time"]
-) -> Int64[Tensor, "time"]:
+def active_at(acts: Iterable[Act], names: Sequence[str], timestamps: Float64[Tensor, "time"]) -> Int64[Tensor, "time"]:
     """Index in `names` of the active object at each time, `NO_OBJECT` where none is active.
 
     Raises WearcapError for an act of an object that is not among the names.
@@ -95,7 +94,7 @@ def active_at(
     active = torch.full((len(timestamps),), NO_OBJECT)
     for act in acts:
         if act.object not in names:
-            raise WearcapError(f"an act of {act.object!r}", expected=f"one of {', '.join(names) or 'no objects'}")  # fmt: skip
+            raise WearcapError(f"an act of {act.object!r}", expected=f"one of {', '.join(names) or 'no objects'}")
         ends = torch.tensor([act.start_s, act.stop_s], dtype=torch.float64) - SAME_S
         first, last = torch.searchsorted(timestamps, ends)
         active[int(first) : int(last)] = list(names).index(act.object)

@@ -33,10 +33,7 @@ def close_pieces(folder: str | Path) -> None:
 
 
 def follow_pieces(
-    folder: str | Path,
-    patience_s: float = 60.0,
-    poll_s: float = 0.1,
-    refused: Counter[str] | None = None,
+    folder: str | Path, patience_s: float = 60.0, poll_s: float = 0.1, refused: Counter[str] | None = None
 ) -> Iterator[Recording]:
     """Yield pieces as they appear, until `end`. A damaged file is counted in `refused` and skipped.
 
@@ -53,9 +50,12 @@ def follow_pieces(
         elif ended:
             return
         elif time.monotonic() - since > patience_s:
-            raise WearcapError(f"no piece {number} after {patience_s:.0f} s", where=folder,
-                               expected=f"{piece_path(folder, number).name}, or a file named {END!r}",
-                               fix="Is the recorder still running?")  # fmt: skip
+            raise WearcapError(
+                f"no piece {number} after {patience_s:.0f} s",
+                where=folder,
+                expected=f"{piece_path(folder, number).name}, or a file named {END!r}",
+                fix="Is the recorder still running?",
+            )
         else:
             time.sleep(poll_s)
 

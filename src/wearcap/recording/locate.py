@@ -19,12 +19,16 @@ def load_recording(where: str | Path) -> Recording:
         names = RecordingStore.open(path).names()
         if len(names) == 1:
             return RecordingStore.open(path).load(names[0])
-        raise WearcapError(f"a data set of {len(names)} recordings", where=path,
-                           expected=f"one of them, such as {path / names[0] if names else path / 'NAME'}")  # fmt: skip
+        raise WearcapError(
+            f"a data set of {len(names)} recordings",
+            where=path,
+            expected=f"one of them, such as {path / names[0] if names else path / 'NAME'}",
+        )
     if (path.parent / "manifest.json").is_file():
         return RecordingStore.open(path.parent).load(path.name)
-    raise WearcapError("no recording here", where=path,
-                       expected="DATASET/NAME or a .safetensors file that `wearcap prepare` wrote")  # fmt: skip
+    raise WearcapError(
+        "no recording here", where=path, expected="DATASET/NAME or a .safetensors file that `wearcap prepare` wrote"
+    )
 
 
 def dataset_folder(where: str | Path) -> Path:

@@ -62,14 +62,17 @@ class Motion:
         skin = None if self.body_contact_prob is None else self.body_contact_prob[start:stop]
         objects = self.object_motion
         if objects is not None and len(times):
-            objects = {
-                name: _within(track, times[0].item(), times[-1].item()) for name, track in objects.items()
-            }
+            objects = {name: _within(track, times[0].item(), times[-1].item()) for name, track in objects.items()}
         return replace(
-            self, timestamps=times, R_parent_joint=self.R_parent_joint[start:stop],
-            t_world_root=self.t_world_root[start:stop], contact_prob=contact, hand_contact_prob=hands,
-            body_contact_prob=skin, object_motion=objects,
-        )  # fmt: skip
+            self,
+            timestamps=times,
+            R_parent_joint=self.R_parent_joint[start:stop],
+            t_world_root=self.t_world_root[start:stop],
+            contact_prob=contact,
+            hand_contact_prob=hands,
+            body_contact_prob=skin,
+            object_motion=objects,
+        )
 
     def moved(self, T_new_world: Rigid) -> "Motion":
         """The motion and its objects in the coordinates of another world frame."""
@@ -81,15 +84,11 @@ class Motion:
             objects = {
                 name: Trajectory(track.timestamps, R_new @ track.R_world_body, track.t_world_body @ R_new.mT + t_new)
                 for name, track in objects.items()
-            }  # fmt: skip
-        return replace(
-            self, R_parent_joint=R, t_world_root=self.t_world_root @ R_new.mT + t_new, object_motion=objects
-        )
+            }
+        return replace(self, R_parent_joint=R, t_world_root=self.t_world_root @ R_new.mT + t_new, object_motion=objects)
 
 
 def _within(track: Trajectory, start_s: float, stop_s: float) -> Trajectory:
     first = int(torch.searchsorted(track.timestamps, start_s))
     last = int(torch.searchsorted(track.timestamps, stop_s, right=True))
-    return Trajectory(
-        track.timestamps[first:last], track.R_world_body[first:last], track.t_world_body[first:last]
-    )
+    return Trajectory(track.timestamps[first:last], track.R_world_body[first:last], track.t_world_body[first:last])

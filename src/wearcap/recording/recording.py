@@ -175,14 +175,10 @@ class Recording:
     @property
     def duration_s(self) -> float:
         """Time from the earliest to the latest timestamp of all streams."""
-        spans = [
-            s.timestamps for s in (self.head, self.motion, self.suit, self.camera, self.localization) if s
-        ]
+        spans = [s.timestamps for s in (self.head, self.motion, self.suit, self.camera, self.localization) if s]
         spans += [s.timestamps for s in self.imu.values()]
         spans = [s for s in spans if len(s)]
-        return max((s[-1].item() for s in spans), default=0.0) - min(
-            (s[0].item() for s in spans), default=0.0
-        )
+        return max((s[-1].item() for s in spans), default=0.0) - min((s[0].item() for s in spans), default=0.0)
 
 
 MIN_DURATION_S = 0.25

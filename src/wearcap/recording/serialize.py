@@ -24,11 +24,24 @@ from wearcap.recording.motion import Motion
 KNOWN: dict[str, type] = {
     cls.__name__: cls
     for cls in (
-        Motion, Skeleton, Site, Camera, Trajectory, containers.Recording, containers.HeadStream,
-        containers.ImuStream, containers.CameraStream, containers.Localization, containers.PointCloud,
-        containers.Cue, containers.ContactTrack, containers.FloorTrack, containers.Intervals, Interactions,
+        Motion,
+        Skeleton,
+        Site,
+        Camera,
+        Trajectory,
+        containers.Recording,
+        containers.HeadStream,
+        containers.ImuStream,
+        containers.CameraStream,
+        containers.Localization,
+        containers.PointCloud,
+        containers.Cue,
+        containers.ContactTrack,
+        containers.FloorTrack,
+        containers.Intervals,
+        Interactions,
     )
-}  # fmt: skip
+}
 
 
 def flatten(value: Any, key: str = "") -> tuple[Any, dict[str, Tensor]]:
@@ -77,11 +90,7 @@ def require_part(kind: type, name: str, value: Any) -> None:
     """Raise WearcapError unless a value matches the annotation of a dataclass field (tensors: type and shape)."""
     hint = _hints(kind).get(name)
     if hint is not None and not _fits(value, hint):
-        found = (
-            f"{value.dtype} of shape {list(value.shape)}"
-            if isinstance(value, Tensor)
-            else type(value).__name__
-        )
+        found = f"{value.dtype} of shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
         raise WearcapError(f"{kind.__name__}.{name} is a {found}", expected=str(hint)[:120])
 
 
@@ -112,8 +121,10 @@ def _require_one_length(kind: type, items: dict[str, Any]) -> None:
     times = items.get("timestamps")
     for name in _over_time(kind) if isinstance(times, Tensor) else ():
         if isinstance(items.get(name), Tensor) and len(items[name]) != len(times):
-            raise WearcapError(f"{kind.__name__}.{name} has {len(items[name])} rows for {len(times)} timestamps",
-                               expected="a row for each timestamp")  # fmt: skip
+            raise WearcapError(
+                f"{kind.__name__}.{name} has {len(items[name])} rows for {len(times)} timestamps",
+                expected="a row for each timestamp",
+            )
 
 
 @functools.cache
@@ -121,12 +132,9 @@ def _over_time(kind: type) -> tuple[str, ...]:
     """Names of the fields whose first annotated axis is "time"."""
     hints = _hints(kind)
     shapes = {
-        name: [getattr(part, "dim_str", "") for part in (get_args(hint) or (hint,))]
-        for name, hint in hints.items()
+        name: [getattr(part, "dim_str", "") for part in (get_args(hint) or (hint,))] for name, hint in hints.items()
     }
-    return tuple(
-        name for name, found in shapes.items() if any(dims.split()[:1] == ["time"] for dims in found)
-    )
+    return tuple(name for name, found in shapes.items() if any(dims.split()[:1] == ["time"] for dims in found))
 
 
 def dumps(tree: Any) -> str:

@@ -67,21 +67,25 @@ class RecordingFile:
             raise self._missing(error) from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
             raise WearcapError(
-                "not a readable recording", where=path, expected="a complete .safetensors file",
+                "not a readable recording",
+                where=path,
+                expected="a complete .safetensors file",
                 fix="Prepare this recording again.",
-            ) from error  # fmt: skip
+            ) from error
         metadata = self._file.metadata() or {}
         if "wearcap" not in metadata:
-            raise WearcapError("a .safetensors file, but not a recording", where=path,
-                               expected="one that `wearcap prepare` wrote")  # fmt: skip
+            raise WearcapError(
+                "a .safetensors file, but not a recording", where=path, expected="one that `wearcap prepare` wrote"
+            )
         content = parse_json(metadata["wearcap"], path)
         try:
             version, self._tree = content["schema_version"], dict(content["recording"])
         except (KeyError, TypeError, ValueError) as error:
             raise self._unreadable(error) from error
         if version != SCHEMA_VERSION:
-            raise WearcapError(f"schema version {version}", where=path,
-                               expected=f"version {SCHEMA_VERSION}", fix="Prepare it again.")  # fmt: skip
+            raise WearcapError(
+                f"schema version {version}", where=path, expected=f"version {SCHEMA_VERSION}", fix="Prepare it again."
+            )
 
     @cached_property
     def keys(self) -> frozenset[str]:
@@ -129,13 +133,15 @@ class RecordingFile:
         return WearcapError("no such recording", where=self.path)
 
     def _unreadable(self, error: Exception) -> WearcapError:
-        return WearcapError(f"its description is unreadable ({error})", where=self.path,
-                            fix="Prepare this recording again.")  # fmt: skip
+        return WearcapError(
+            f"its description is unreadable ({error})", where=self.path, fix="Prepare this recording again."
+        )
 
     def _require(self, key: str) -> None:
         if key not in self.keys:
-            raise WearcapError(f"this recording has no {key!r}", where=self.path,
-                               expected=f"one of {', '.join(sorted(self.keys))}")  # fmt: skip
+            raise WearcapError(
+                f"this recording has no {key!r}", where=self.path, expected=f"one of {', '.join(sorted(self.keys))}"
+            )
 
 
 def _verify(path: Path) -> None:
@@ -147,8 +153,12 @@ def _verify(path: Path) -> None:
         found = manifest.stat()
         entry = _entries(manifest, found.st_size, found.st_mtime_ns, found.st_ino).get(path.name)
         if entry is not None and (size := path.stat().st_size) != entry.bytes:
-            raise WearcapError(f"{size} bytes long", where=path, expected=f"{entry.bytes} bytes, as the manifest says",
-                               fix="It was cut short or replaced: prepare it again.")  # fmt: skip
+            raise WearcapError(
+                f"{size} bytes long",
+                where=path,
+                expected=f"{entry.bytes} bytes, as the manifest says",
+                fix="It was cut short or replaced: prepare it again.",
+            )
         if entry is not None and remembered_sha256(path) != entry.sha256:
             raise _differs(path)
     except OSError as error:
@@ -156,8 +166,9 @@ def _verify(path: Path) -> None:
 
 
 def _differs(path: Path) -> WearcapError:
-    return WearcapError("its checksum differs from the manifest's", where=path,
-                        fix="It was damaged or replaced: prepare it again.")  # fmt: skip
+    return WearcapError(
+        "its checksum differs from the manifest's", where=path, fix="It was damaged or replaced: prepare it again."
+    )
 
 
 @lru_cache(maxsize=16)
@@ -187,8 +198,12 @@ class RecordingStore:
     def open(cls, root: str | Path) -> "RecordingStore":
         """Open an existing data set. Raises WearcapError if there is none."""
         if not (Path(root) / MANIFEST).is_file():
-            raise WearcapError("no data set here", where=root, expected="a folder with a manifest.json",
-                               fix="Make one with `wearcap prepare`.")  # fmt: skip
+            raise WearcapError(
+                "no data set here",
+                where=root,
+                expected="a folder with a manifest.json",
+                fix="Make one with `wearcap prepare`.",
+            )
         return cls(root)
 
     @property
@@ -203,13 +218,20 @@ class RecordingStore:
             raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
         version = manifest.get("schema_version") if isinstance(manifest, dict) else None
         if version != SCHEMA_VERSION:
-            raise WearcapError(f"schema version {str(version)[:40]}", where=path,
-                               expected=f"version {SCHEMA_VERSION}", fix="Prepare the data set again.")  # fmt: skip
+            raise WearcapError(
+                f"schema version {str(version)[:40]}",
+                where=path,
+                expected=f"version {SCHEMA_VERSION}",
+                fix="Prepare the data set again.",
+            )
         try:
             return {name: self._entry(name, entry) for name, entry in manifest["recordings"].items()}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise WearcapError(f"not a readable manifest ({str(error)[:200]})", where=path,
-                               fix="Delete it and prepare the data set again.") from error  # fmt: skip
+            raise WearcapError(
+                f"not a readable manifest ({str(error)[:200]})",
+                where=path,
+                fix="Delete it and prepare the data set again.",
+            ) from error
 
     def _entry(self, name: str, row: dict[str, Any]) -> Entry:
         """Parse one row of the manifest. Raises ValueError or TypeError for invalid values."""
@@ -252,8 +274,11 @@ class RecordingStore:
     def require(self, name: str) -> None:
         """Raise WearcapError when the data set has no recording of this name."""
         if name not in self.entries:
-            raise WearcapError(f"no recording {name!r}", where=self.manifest_path,
-                               expected=f"one of {len(self.entries)} recordings, as {self.names()[:3]}")  # fmt: skip
+            raise WearcapError(
+                f"no recording {name!r}",
+                where=self.manifest_path,
+                expected=f"one of {len(self.entries)} recordings, as {self.names()[:3]}",
+            )
 
     def open_file(self, name: str) -> RecordingFile:
         """Open one recording for slicing. Raises WearcapError when it is missing, damaged or foreign."""
@@ -295,8 +320,16 @@ def entry_for(recording: Recording, root: Path, split: str, config_hash: str) ->
     frames = len(stream.timestamps) if stream else 0
     fps = round(1 / stream.timestamps.diff().median().item(), 4) if stream and frames > 1 else 0.0
     return Entry(
-        file=path.relative_to(root).as_posix(), sha256=sha256_of(path), bytes=path.stat().st_size, frames=frames,
-        fps=fps, duration_s=round(recording.duration_s, 4), subject=recording.subject,
-        location=recording.location, activity=recording.activity, split=split, license=recording.license,
+        file=path.relative_to(root).as_posix(),
+        sha256=sha256_of(path),
+        bytes=path.stat().st_size,
+        frames=frames,
+        fps=fps,
+        duration_s=round(recording.duration_s, 4),
+        subject=recording.subject,
+        location=recording.location,
+        activity=recording.activity,
+        split=split,
+        license=recording.license,
         config_hash=config_hash,
-    )  # fmt: skip
+    )

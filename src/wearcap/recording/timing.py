@@ -28,9 +28,12 @@ def resampled(motion: Motion, fps: float | int) -> Motion:
     if even and abs(ratio - round(ratio)) < 0.01 and ratio > 0.5:
         n = round(ratio)
         return replace(
-            motion, timestamps=motion.timestamps[::n].contiguous(), R_parent_joint=motion.R_parent_joint[::n],
-            t_world_root=motion.t_world_root[::n], **_probabilities(motion, lambda prob: prob[::n]),
-        )  # fmt: skip
+            motion,
+            timestamps=motion.timestamps[::n].contiguous(),
+            R_parent_joint=motion.R_parent_joint[::n],
+            t_world_root=motion.t_world_root[::n],
+            **_probabilities(motion, lambda prob: prob[::n]),
+        )
     start, stop = motion.timestamps[0].item(), motion.timestamps[-1].item()
     times = start + torch.arange(int((stop - start) * fps + 1e-6) + 1, dtype=torch.float64) / fps
     return at_times(motion, times)
@@ -39,10 +42,12 @@ def resampled(motion: Motion, fps: float | int) -> Motion:
 def at_times(motion: Motion, times: Float64[Tensor, "new_time"]) -> Motion:
     """Resample a motion at times within its span: slerp (rotations), lerp (root, contacts)."""
     return replace(
-        motion, timestamps=times, R_parent_joint=_slerp(motion.timestamps, motion.R_parent_joint, times),
+        motion,
+        timestamps=times,
+        R_parent_joint=_slerp(motion.timestamps, motion.R_parent_joint, times),
         t_world_root=interpolate(motion.timestamps, motion.t_world_root, times),
         **_probabilities(motion, lambda prob: interpolate(motion.timestamps, prob, times)),
-    )  # fmt: skip
+    )
 
 
 def joined(parts: Sequence[Motion]) -> Motion | None:
@@ -54,10 +59,7 @@ def joined(parts: Sequence[Motion]) -> Motion | None:
         return parts[0] if parts else None
     fields = ("timestamps", "R_parent_joint", "t_world_root", *PROBABILITIES)
     rows = {name: [getattr(part, name) for part in parts] for name in fields}
-    whole = {
-        name: None if any(row is None for row in values) else torch.cat(values)
-        for name, values in rows.items()
-    }
+    whole = {name: None if any(row is None for row in values) else torch.cat(values) for name, values in rows.items()}
     tracks: dict[str, list[Trajectory]] = {}
     for part in parts:
         for name, track in (part.object_motion or {}).items():
@@ -73,12 +75,8 @@ def _end_to_end(tracks: list[Trajectory]) -> Trajectory:
 
 
 def _all_of(parts: list[Interactions]) -> Interactions:
-    start, stop, hands = (
-        torch.cat([getattr(each, name) for each in parts]) for name in ("start_s", "stop_s", "hands")
-    )
-    objects, classes = (
-        tuple(name for each in parts for name in getattr(each, key)) for key in ("objects", "classes")
-    )
+    start, stop, hands = (torch.cat([getattr(each, name) for each in parts]) for name in ("start_s", "stop_s", "hands"))
+    objects, classes = (tuple(name for each in parts for name in getattr(each, key)) for key in ("objects", "classes"))
     return Interactions(start, stop, hands, objects, classes)
 
 

@@ -52,9 +52,7 @@ def modules_of(value: Any) -> set[str]:
             rest += part
         elif isinstance(part, Callable) and hasattr(part, "__qualname__"):
             modules.add(part.__module__)
-        elif not isinstance(part, Tensor | np.ndarray | Path) and type(part).__module__.startswith(
-            "wearcap."
-        ):
+        elif not isinstance(part, Tensor | np.ndarray | Path) and type(part).__module__.startswith("wearcap."):
             modules.add(type(part).__module__)
             rest += list(getattr(part, "__dict__", {}).values())
     return {name for name in modules if name.startswith("wearcap.")}

@@ -115,8 +115,16 @@ class StageCache:
             if not note.exists():
                 return None
             raise WearcapError("incomplete", where=tensors) from None
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, WearcapError,
-                safetensors.SafetensorError) as error:  # fmt: skip
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            RecursionError,
+            WearcapError,
+            safetensors.SafetensorError,
+        ) as error:
             raise WearcapError(f"damaged ({error})", where=note) from error
         if found != expected:
             raise WearcapError("damaged (its content is not what was written)", where=tensors)
@@ -139,10 +147,7 @@ class StageCache:
 
 
 def run_stages(
-    stages: list[Stage],
-    cache: StageCache | None = None,
-    until: str | None = None,
-    console: Console | None = None,
+    stages: list[Stage], cache: StageCache | None = None, until: str | None = None, console: Console | None = None
 ) -> tuple[dict[str, Any], list[StageRun]]:
     """Results by stage, up to and including `until`, and how each was obtained; the console shows a line for each.
 
@@ -169,9 +174,7 @@ def run_stages(
             if cache:
                 digests[stage.name] = cache.write(stage.name, key, results[stage.name], seconds)
         runs.append(StageRun(stage.name, round(seconds, 3), kept is not None))
-        console.print(
-            f"{stage.name}: {'reused' if kept is not None else f'{seconds:.1f} s'}", highlight=False
-        )
+        console.print(f"{stage.name}: {'reused' if kept is not None else f'{seconds:.1f} s'}", highlight=False)
         if stage.name == until:
             break
     return results, runs
@@ -183,17 +186,13 @@ def _key(stage: Stage, digests: dict[str, str]) -> str:
     return digest(stage.name, code_digest(*modules_of([stage.make, reads])), reads, followed)
 
 
-def _kept(
-    stage: Stage, key: str, cache: StageCache | None, console: Console
-) -> tuple[Any, str, float] | None:
+def _kept(stage: Stage, key: str, cache: StageCache | None, console: Console) -> tuple[Any, str, float] | None:
     if cache is None:
         return None
     try:
         return cache.read(stage.name, key)
     except WearcapError as error:
-        console.print(
-            f"{stage.name}: {error.where} is {error.what}; it is made again", markup=False, soft_wrap=True
-        )
+        console.print(f"{stage.name}: {error.where} is {error.what}; it is made again", markup=False, soft_wrap=True)
         return None
 
 
@@ -223,12 +222,8 @@ class StagedCapture:
         source = Source(recording, self.folder, self._scan(recording), self.metres_per_unit)
         cache = None if self.cache is None else StageCache(self.cache / recording.name)
         results, runs = run_stages(self.pipeline.stages(source), cache, until, self.console)
-        report = {
-            "pipeline": self.pipeline.name,
-            "recording": recording.name,
-            "stages": [vars(run) for run in runs],
-        }
-        return Captured(self.pipeline.motion_of(results), report | self.pipeline.report(source, results))  # fmt: skip
+        report = {"pipeline": self.pipeline.name, "recording": recording.name, "stages": [vars(run) for run in runs]}
+        return Captured(self.pipeline.motion_of(results), report | self.pipeline.report(source, results))
 
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
         """One motion per recording; seeds have no effect."""

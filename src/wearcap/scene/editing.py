@@ -17,9 +17,16 @@ from wearcap.scene.scan import Scan
 from wearcap.scene.selection import Box, SlicedCloud
 
 USUAL_KIND = {
-    "door": "hinge", "window": "hinge", "drawer": "axis", "sofa": "plane", "table": "plane", "chair": "plane",
-    "cupboard": "plane", "box": "free", "other": "plane",
-}  # fmt: skip
+    "door": "hinge",
+    "window": "hinge",
+    "drawer": "axis",
+    "sofa": "plane",
+    "table": "plane",
+    "chair": "plane",
+    "cupboard": "plane",
+    "box": "free",
+    "other": "plane",
+}
 """Default kind of freedom of each offered category."""
 FEWEST_POINTS = 20
 """Fewest points of an object."""
@@ -118,8 +125,11 @@ class ObjectEditing:
         """
         self._check_name(name)
         if len(self.selected) < FEWEST_POINTS:
-            raise WearcapError(f"{len(self.selected)} points are selected", expected=f"{FEWEST_POINTS} or more",
-                               fix="Select the object's points with the box or the brush first.")  # fmt: skip
+            raise WearcapError(
+                f"{len(self.selected)} points are selected",
+                expected=f"{FEWEST_POINTS} or more",
+                fix="Select the object's points with the box or the brush first.",
+            )
         points = self.scan.points[self.selected]
         remaining = self.left()
         remaining[self.selected] = False
@@ -130,8 +140,9 @@ class ObjectEditing:
             colors = self.scan.colors[self.selected].astype(np.float32) / 255
         mesh = Mesh((points - origin).astype(np.float32), np.empty((0, 3), np.int32), colors)
         kind = kind or USUAL_KIND.get(category, "plane")
-        item = SceneObject(name, category, mesh, torch.eye(3), torch.from_numpy(origin).float(),
-                           usual_freedom(kind, points, floor))  # fmt: skip
+        item = SceneObject(
+            name, category, mesh, torch.eye(3), torch.from_numpy(origin).float(), usual_freedom(kind, points, floor)
+        )
         self._step(_State((*self._state.cuts, _Cut(item, self.selected)), np.empty(0, np.int64)))
         return item
 
@@ -183,8 +194,9 @@ class ObjectEditing:
 
     def _check_name(self, name: str) -> None:
         if not _NAME.fullmatch(name):
-            raise WearcapError(f"an object cannot be named {name!r}",
-                               expected="letters, digits, _ and -: it becomes a file's name")  # fmt: skip
+            raise WearcapError(
+                f"an object cannot be named {name!r}", expected="letters, digits, _ and -: it becomes a file's name"
+            )
         if name.lower() in {cut.item.name.lower() for cut in self._state.cuts}:
             raise WearcapError(f"there is an object {name!r} already", expected="another name")
 
@@ -216,6 +228,8 @@ def _must_stand_inside(item: SceneObject, scan: Float[np.ndarray, "point 3"]) ->
     middle = (points.min(0) + points.max(0)) / 2
     beyond = float(np.maximum(scan.min(0) - middle, middle - scan.max(0)).max())
     if beyond > _OUTSIDE_M:
-        raise WearcapError(f"the object {item.name!r} stands {beyond:.1f} m outside the scan",
-                           expected="an environment of this scene",
-                           fix="Give the scan that it was made from, or another environment file.")  # fmt: skip
+        raise WearcapError(
+            f"the object {item.name!r} stands {beyond:.1f} m outside the scan",
+            expected="an environment of this scene",
+            fix="Give the scan that it was made from, or another environment file.",
+        )

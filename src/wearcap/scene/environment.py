@@ -91,24 +91,18 @@ class Environment:
         objects of that class count. A point with NaN has no nearest object.
         """
         if contact_class not in (None, *CONTACT_CLASSES):
-            raise WearcapError(
-                f"no contact class {contact_class!r}", expected=f"one of {', '.join(CONTACT_CLASSES)}"
-            )
+            raise WearcapError(f"no contact class {contact_class!r}", expected=f"one of {', '.join(CONTACT_CLASSES)}")
         R, t = self._initial_R.copy(), self._initial_t.copy()
         for name, pose in (T_world_object or {}).items():
             R[self.index(name)], t[self.index(name)] = pose.R.numpy(), pose.t.numpy()
-        chosen = np.flatnonzero(
-            [contact_class in (None, item.freedom.contact_class) for item in self.objects]
-        )
+        chosen = np.flatnonzero([contact_class in (None, item.freedom.contact_class) for item in self.objects])
         if not len(chosen):
             return _nothing(points_world)
         index, distance, point = self._bodies.nearest(
             points_world.double().contiguous().numpy(), chosen, R[chosen], t[chosen], float(reach_m)
         )
         dtype = points_world.dtype
-        return Nearest(
-            torch.from_numpy(index), torch.from_numpy(distance).to(dtype), torch.from_numpy(point).to(dtype)
-        )
+        return Nearest(torch.from_numpy(index), torch.from_numpy(distance).to(dtype), torch.from_numpy(point).to(dtype))
 
     def distance(
         self, name: str, points_world: Float[Tensor, "time 3"], T_world_object: Rigid
@@ -134,9 +128,7 @@ def surface_index(mesh: Mesh) -> TriangleIndex:
 
 def box_in_world(item: SceneObject) -> Float64[np.ndarray, "2 3"]:
     """Minimum and maximum corner (m) of the bounding box of an object at its initial pose, in the world."""
-    points = (
-        item.mesh.vertices @ item.R_world_object.double().numpy().T + item.t_world_object.double().numpy()
-    )
+    points = item.mesh.vertices @ item.R_world_object.double().numpy().T + item.t_world_object.double().numpy()
     return np.stack([points.min(0), points.max(0)])
 
 
@@ -152,6 +144,7 @@ def hinge_gap_m(item: SceneObject) -> float:
 def _nothing(points_world: Tensor) -> Nearest:
     count = len(points_world)
     return Nearest(
-        torch.full((count,), -1), points_world.new_full((count,), float("inf")),
+        torch.full((count,), -1),
+        points_world.new_full((count,), float("inf")),
         points_world.new_full((count, 3), float("nan")),
-    )  # fmt: skip
+    )

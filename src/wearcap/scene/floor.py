@@ -53,9 +53,7 @@ class FloorEstimate:
 
 
 def estimate_floor(
-    points_world: Float[Tensor, "point 3"],
-    t_world_head: Float[Tensor, "time 3"],
-    standing_m: float | None = None,
+    points_world: Float[Tensor, "point 3"], t_world_head: Float[Tensor, "time 3"], standing_m: float | None = None
 ) -> FloorEstimate:
     """Floor below a moving head: everywhere the lowest strong horizontal layer, with as little change as possible.
 
@@ -75,17 +73,18 @@ def estimate_floor(
     near, wide = (_votes(points, keys, bottom, bins, reach) for reach in (_NEAR, _WIDE))
     votes = near + wide * (1 - near.sum(1, keepdims=True) / _ENOUGH).clip(0.02, 1)
     if not votes.any():
-        raise WearcapError("no points below the head's path", expected="a cloud in the head's world, z up",
-                           fix="Give the wearer's stature instead: floor_from_head.")  # fmt: skip
+        raise WearcapError(
+            "no points below the head's path",
+            expected="a cloud in the head's world, z up",
+            fix="Give the wearer's stature instead: floor_from_head.",
+        )
     heights = bottom + (np.arange(bins) + 0.5) * _BIN_M
     clearance, evidence = keys[:, 2:] - heights, _evidence(votes)
     if standing_m is None:
         first = _cheapest_path(evidence + _posture_cost(clearance, 1.9, 20.0), _CHANGE_COST * _BIN_M)
         standing_m = _usual_clearance(np.take_along_axis(clearance, first[:, None], 1)[:, 0])
     # With the wearer's height, a ceiling below an upper floor is no longer mistaken for that floor.
-    chosen = _cheapest_path(
-        evidence + _posture_cost(clearance, standing_m + 0.03, 40.0), _CHANGE_COST * _BIN_M
-    )
+    chosen = _cheapest_path(evidence + _posture_cost(clearance, standing_m + 0.03, 40.0), _CHANGE_COST * _BIN_M)
     support = gaussian_filter1d(votes, 1.5, axis=1)[np.arange(len(keys)), chosen] * (1.5 * np.sqrt(2 * np.pi))
     refined = _centre_of_layer(votes, chosen, heights)
     return FloorEstimate(
@@ -161,9 +160,7 @@ def _usual_clearance(clearance: np.ndarray) -> float:
     peak = int(counts.argmax())
     near = np.arange(max(peak - 25, 0), peak + 1)
     inner = counts[near]
-    summit = (
-        (inner >= np.r_[0.0, inner[:-1]]) & (inner >= np.r_[inner[1:], 0.0]) & (inner > 0.3 * counts[peak])
-    )
+    summit = (inner >= np.r_[0.0, inner[:-1]]) & (inner >= np.r_[inner[1:], 0.0]) & (inner > 0.3 * counts[peak])
     return float(0.01 * (near[summit][0] + 0.5))
 
 

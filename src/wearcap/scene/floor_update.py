@@ -23,9 +23,7 @@ class FloorFollower(Protocol):
         """Predicted floor height (m) of the next frames, before their feet are estimated."""
         ...
 
-    def follow(
-        self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]
-    ) -> None:
+    def follow(self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]) -> None:
         """Take in the same frames' contact probabilities and foot joint positions (m)."""
         ...
 
@@ -58,9 +56,7 @@ class _Cloud:
         """Heights (m) of the `count` nearest points of each tree to each position; NaN beyond the radius."""
         columns = []
         for tree in self._trees:
-            number = tree.query(positions, count, distance_upper_bound=radius_m)[1].reshape(
-                len(positions), -1
-            )
+            number = tree.query(positions, count, distance_upper_bound=radius_m)[1].reshape(len(positions), -1)
             columns.append(np.append(tree.data[:, 2], np.nan)[number])
         return np.concatenate(columns, 1) if columns else np.full((len(positions), 1), np.nan)
 
@@ -102,11 +98,7 @@ class FloorUpdate:
     def ahead(self, t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
         return torch.full((len(t_world_head),), self._height)
 
-    def follow(
-        self,
-        contact_prob: Float[Tensor, "time foot"],
-        t_world_foot: Float[Tensor, "time foot 3"],
-    ) -> None:
+    def follow(self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]) -> None:
         settled = self._settings.settled
         prob = contact_prob.detach().cpu().numpy()
         contact = np.concatenate([self._contact, prob > self._settings.contact])
@@ -179,9 +171,7 @@ class FloorFollow:
         self._floors = self._floors[-1] + np.cumsum(rise)
         return torch.from_numpy(self._floors).float()
 
-    def follow(
-        self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]
-    ) -> None:
+    def follow(self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]) -> None:
         settings, correction = self._settings, 0.0
         weight = (contact_prob.detach().cpu().numpy() - settings.contact).clip(0) / (1 - settings.contact)
         height, from_points = self._floor_at(t_world_foot.detach().cpu().double().numpy())
@@ -235,7 +225,5 @@ class FloorFixed:
     def ahead(self, t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
         return torch.full((len(t_world_head),), self.height)
 
-    def follow(
-        self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]
-    ) -> None:
+    def follow(self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]) -> None:
         """Nothing changes."""

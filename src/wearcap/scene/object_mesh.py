@@ -47,23 +47,33 @@ def check_object_mesh(mesh: Mesh, where: str | Path, own_axes: bool = True) -> N
     if bad.any():
         raise WearcapError(
             f"{int(bad.sum())} vertices of the object's mesh are NaN or infinite, the first is {int(bad.argmax())}",
-            where=where, expected="finite coordinates (m)", fix="Export the mesh again.",
-        )  # fmt: skip
+            where=where,
+            expected="finite coordinates (m)",
+            fix="Export the mesh again.",
+        )
     if not len(faces):
-        raise WearcapError("the object's mesh has no faces", where=where, expected="triangles, not a point cloud",
-                           fix="Export it as a triangle mesh.")  # fmt: skip
+        raise WearcapError(
+            "the object's mesh has no faces",
+            where=where,
+            expected="triangles, not a point cloud",
+            fix="Export it as a triangle mesh.",
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise WearcapError(f"a face of the object's mesh names vertex {faces.max()}, there are {len(vertices)}",
-                           where=where, expected="faces of its own vertices")  # fmt: skip
+        raise WearcapError(
+            f"a face of the object's mesh names vertex {faces.max()}, there are {len(vertices)}",
+            where=where,
+            expected="faces of its own vertices",
+        )
     low, high = vertices.min(0), vertices.max(0)
     _check_unit(float((high - low).max()), where)
     off = float(np.linalg.norm(np.maximum(np.maximum(low, -high), 0.0)))
     if own_axes and off > MAX_OFF_CENTER * (high - low).max():
         raise WearcapError(
-            f"the object's mesh is not centred: its origin lies {off:.2f} m outside of the box around it", where=where,
+            f"the object's mesh is not centred: its origin lies {off:.2f} m outside of the box around it",
+            where=where,
             expected="axes of its own, with the origin in or near the object",
             fix="Subtract the mean of its vertices, and place its poses accordingly.",
-        )  # fmt: skip
+        )
 
 
 def _check_unit(extent: float, where: str | Path) -> None:
@@ -72,5 +82,6 @@ def _check_unit(extent: float, where: str | Path) -> None:
         return
     millimetres = extent > greatest and least <= extent / 1000 <= greatest
     guess = "It looks like millimetres: divide by 1000." if millimetres else "Bring it to metres."
-    raise WearcapError(f"the object's mesh is {extent:.4g} m long", where=where,
-                       expected=f"{least:g} to {greatest:g} m", fix=guess)  # fmt: skip
+    raise WearcapError(
+        f"the object's mesh is {extent:.4g} m long", where=where, expected=f"{least:g} to {greatest:g} m", fix=guess
+    )

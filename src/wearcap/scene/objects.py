@@ -35,21 +35,21 @@ class Freedom:
 
     def __post_init__(self):
         if self.kind not in FREEDOMS:
-            raise WearcapError(
-                f"no degree of freedom {self.kind!r}", expected=f"one of {', '.join(FREEDOMS)}"
-            )
+            raise WearcapError(f"no degree of freedom {self.kind!r}", expected=f"one of {', '.join(FREEDOMS)}")
         if (self.kind == "hinge") != (self.pivot is not None):
-            raise WearcapError(f"a {self.kind} {'with' if self.pivot else 'without'} a pivot",
-                               expected="a hinge and a point of its axis together")  # fmt: skip
+            raise WearcapError(
+                f"a {self.kind} {'with' if self.pivot else 'without'} a pivot",
+                expected="a hinge and a point of its axis together",
+            )
         if (self.kind == "axis") != (self.axis is not None):
-            raise WearcapError(f"{self.kind!r} {'with' if self.axis else 'without'} an axis",
-                               expected="a slide along an axis and its direction together")  # fmt: skip
+            raise WearcapError(
+                f"{self.kind!r} {'with' if self.axis else 'without'} an axis",
+                expected="a slide along an axis and its direction together",
+            )
         if self.axis is not None and abs(float(np.linalg.norm(self.axis)) - 1.0) > 1e-3:
             raise WearcapError(f"axis {self.axis}", expected="a unit vector")
         if self.limits is not None and not self.limits[0] <= 0.0 <= self.limits[1]:
-            raise WearcapError(
-                f"limits {self.limits}", expected="least ≤ 0 ≤ greatest: 0 is the initial pose"
-            )
+            raise WearcapError(f"limits {self.limits}", expected="least ≤ 0 ≤ greatest: 0 is the initial pose")
 
     @property
     def contact_class(self) -> str:

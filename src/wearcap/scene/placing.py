@@ -44,9 +44,7 @@ def footprint(points: Float[np.ndarray, "point 3"]) -> Footprint:
     low, high = ((reduce(corners @ along.T, 0), reduce(corners @ across.T, 0)) for reduce in (np.min, np.max))
     sides = np.stack([high[0] - low[0], high[1] - low[1]], 1)
     best = int(sides.prod(1).argmin())
-    center = (low[0][best] + high[0][best]) / 2 * along[best] + (low[1][best] + high[1][best]) / 2 * across[
-        best
-    ]
+    center = (low[0][best] + high[0][best]) / 2 * along[best] + (low[1][best] + high[1][best]) / 2 * across[best]
     length, width = sides[best]
     long = along[best] if length >= width else across[best]
     return Footprint(center, long, max(length, width) / 2, min(length, width) / 2)

@@ -99,8 +99,9 @@ def _lower(points, seen, time, place, frame, cells, cell, square, squares):
 
 
 @compiled
-def fill_grids(places, yaws, times, half, below, clip, tile, keys, chains, counts, block_points, block_seen, before,
-               grids):  # fmt: skip
+def fill_grids(
+    places, yaws, times, half, below, clip, tile, keys, chains, counts, block_points, block_seen, before, grids
+):
     """Distance (m) from every cell's centre to the nearest point of that cell seen by then, at most `clip`.
 
     places (frame, 3) and yaws (rad) of the device; the box of half edge `half` has its centre `below` under it. A frame
@@ -123,17 +124,23 @@ def fill_grids(places, yaws, times, half, below, clip, tile, keys, chains, count
             for ix in range(math.floor((x - across) / tile), math.floor((x + across) / tile) + 1):
                 for iy in range(math.floor((y - across) / tile), math.floor((y + across) / tile) + 1):
                     ahead, aside = (ix + 0.5) * tile - x, (iy + 0.5) * tile - y
-                    if (
-                        abs(cosine * ahead + sine * aside) > reach
-                        or abs(cosine * aside - sine * ahead) > reach
-                    ):
+                    if abs(cosine * ahead + sine * aside) > reach or abs(cosine * aside - sine * ahead) > reach:
                         continue
                     for iz in range(math.floor((z - half) / tile), math.floor((z + half) / tile) + 1):
                         slot = place_of(keys, tile_key(ix, iy, iz))
                         block = chains[slot] if keys[slot] != FREE else FREE
                         while block != FREE:
-                            _lower(block_points[block], block_seen[block], times[frame], places[frame], frame_of, cells,
-                                   cell, square, squares)  # fmt: skip
+                            _lower(
+                                block_points[block],
+                                block_seen[block],
+                                times[frame],
+                                places[frame],
+                                frame_of,
+                                cells,
+                                cell,
+                                square,
+                                squares,
+                            )
                             block = before[block]
         for i in range(cells):
             for j in range(cells):

@@ -30,8 +30,10 @@ class VoxelGrid:
 
     def __post_init__(self):
         if self.cells < 1 or not 0 < self.clip_m <= 0.5 * self.cell_m * (1 + 1e-9):
-            raise WearcapError(f"a voxel grid of {self.cells} cells in {self.size_m} m, distances up to {self.clip_m} m",
-                               expected=f"distances up to half a cell ({0.5 * self.cell_m:g} m)")  # fmt: skip
+            raise WearcapError(
+                f"a voxel grid of {self.cells} cells in {self.size_m} m, distances up to {self.clip_m} m",
+                expected=f"distances up to half a cell ({0.5 * self.cell_m:g} m)",
+            )
 
     @property
     def cell_m(self) -> float:
@@ -77,15 +79,11 @@ class VoxelMap:
     def _free_tiles(size: int) -> tuple[np.ndarray, ...]:
         return np.full(size, FREE, np.int64), np.empty(size, np.int32), np.empty(size, np.int32)
 
-    def add(
-        self, points_world: Float[Tensor, "point 3"], first_seen: Float64[Tensor, "point"] | None = None
-    ) -> None:
+    def add(self, points_world: Float[Tensor, "point 3"], first_seen: Float64[Tensor, "point"] | None = None) -> None:
         """Take in points (m), seen at `first_seen` (s), or always."""
         points = points_world.detach().cpu().to(torch.float32)
         seen = (
-            first_seen.cpu()
-            if first_seen is not None
-            else torch.full((len(points),), -math.inf, dtype=torch.float64)
+            first_seen.cpu() if first_seen is not None else torch.full((len(points),), -math.inf, dtype=torch.float64)
         )
         usable = points.isfinite().all(-1) & ~seen.isnan()
         if not usable.all():
@@ -115,14 +113,20 @@ class VoxelMap:
         """Grids (m) of every frame, of the points seen by its timestamp, or of all without timestamps."""
         grid, frames = self.grid, len(T_world_device.t)
         yaws = rotation.yaw_of(T_world_device.R.detach().cpu().double()).contiguous()
-        times = (
-            torch.full((frames,), math.inf, dtype=torch.float64) if timestamps is None else timestamps.cpu()
-        )
+        times = torch.full((frames,), math.inf, dtype=torch.float64) if timestamps is None else timestamps.cpu()
         grids = torch.empty(frames, grid.cells, grid.cells, grid.cells)
         fill_grids(
-            T_world_device.t.detach().cpu().float().contiguous().numpy(), yaws.numpy(), times.contiguous().numpy(),
-            0.5 * grid.size_m, grid.below_m, grid.clip_m, _TILE_M, *self._tiles, *self._blocks, grids.numpy(),
-        )  # fmt: skip
+            T_world_device.t.detach().cpu().float().contiguous().numpy(),
+            yaws.numpy(),
+            times.contiguous().numpy(),
+            0.5 * grid.size_m,
+            grid.below_m,
+            grid.clip_m,
+            _TILE_M,
+            *self._tiles,
+            *self._blocks,
+            grids.numpy(),
+        )
         return grids
 
 

@@ -32,9 +32,11 @@ def align_suit(
     if not early.any():
         raise WearcapError(
             f"none of {len(seen)} frames is localised between {suit.timestamps[0]:.1f} s and "
-            f"{suit.timestamps[-1]:.1f} s", where="localization",
-            expected="camera poses on the suit's clock", fix="Synchronise the clocks, or check the map.",
-        )  # fmt: skip
+            f"{suit.timestamps[-1]:.1f} s",
+            where="localization",
+            expected="camera poses on the suit's clock",
+            fix="Synchronise the clocks, or check the map.",
+        )
     times, weight = localization.timestamps[early], localization.confidence[early]
     head = suit.joint("head")
     head = resample(Trajectory(suit.timestamps, head.R, head.t), times).T_world_body
@@ -96,9 +98,7 @@ def _weighted_median(value: Float[Tensor, "sample 3"], weight: Float[Tensor, "sa
 
 
 def estimate_head_camera(
-    R_world_head: Float[Tensor, "time 3 3"],
-    R_world_cam: Float[Tensor, "time 3 3"],
-    confidence: Float[Tensor, "time"],
+    R_world_head: Float[Tensor, "time 3 3"], R_world_cam: Float[Tensor, "time 3 3"], confidence: Float[Tensor, "time"]
 ) -> Float[Tensor, "3 3"]:
     """R_head_cam from the aligned suit's head and the localised camera (HPS paper eq. 4, thesis eq. 4.3).
 
@@ -108,9 +108,7 @@ def estimate_head_camera(
     """
     good = (confidence > 0) & R_world_cam.isfinite().all(-1).all(-1)
     if not good.any():
-        raise WearcapError(
-            "no localised frame", expected="at least one, to estimate the camera's mount on the head"
-        )
+        raise WearcapError("no localised frame", expected="at least one, to estimate the camera's mount on the head")
     R, weight = R_world_head[good].mT @ R_world_cam[good], confidence[good]
     median = torch.stack([_weighted_median(R[:, :, column], weight) for column in range(3)], -1)
     centre: Tensor = roma.special_procrustes(median)  # pyright: ignore[reportAssignmentType]

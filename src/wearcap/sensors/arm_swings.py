@@ -74,17 +74,22 @@ def swing_peaks(
     times = stream.timestamps.numpy()
     start, stop = stretch or (times[0], times[-1])
     grid = np.arange(max(start, times[0]), min(stop, times[-1]), _STEP_S)
-    none = WearcapError(f"no arm swing from {start:.1f} s to {stop:.1f} s", where=stream.joint,
-                        expected=f"a forearm that rises by {settings.min_rise_deg:g}° and falls again",
-                        fix="Swing the stretched arms from hanging to above the shoulders, ten times.")  # fmt: skip
+    none = WearcapError(
+        f"no arm swing from {start:.1f} s to {stop:.1f} s",
+        where=stream.joint,
+        expected=f"a forearm that rises by {settings.min_rise_deg:g}° and falls again",
+        fix="Swing the stretched arms from hanging to above the shoulders, ten times.",
+    )
     if len(grid) < 2 * _TOP_S / _STEP_S + 3:
         raise none
     elevation = np.rad2deg(np.interp(grid, times, forearm_elevation(stream).double().numpy()))
     smooth = scipy.ndimage.gaussian_filter1d(elevation, _TREMOR_S / _STEP_S)
     tops, _ = scipy.signal.find_peaks(
-        smooth, height=settings.min_height_deg, prominence=settings.min_rise_deg,
+        smooth,
+        height=settings.min_height_deg,
+        prominence=settings.min_rise_deg,
         distance=max(round(settings.min_apart_s / _STEP_S), 1),
-    )  # fmt: skip
+    )
     reach = round(_TOP_S / _STEP_S)
     tops = tops[(tops >= reach) & (tops < len(smooth) - reach)]
     if not len(tops):
@@ -110,9 +115,12 @@ def fit_swing_clock(
     try:
         clock = fit_clock(camera_s, watch_s, max_offset_s)
     except WearcapError as error:
-        raise WearcapError(error.what.replace("clap", "swing").replace("suit", "watch"), where="arm swings",
-                           expected=error.expected.replace("clap", "swing"),
-                           fix="Give the times of the frames in which the hands are highest, at uneven intervals.") from error  # fmt: skip
+        raise WearcapError(
+            error.what.replace("clap", "swing").replace("suit", "watch"),
+            where="arm swings",
+            expected=error.expected.replace("clap", "swing"),
+            fix="Give the times of the frames in which the hands are highest, at uneven intervals.",
+        ) from error
     ours = clock.to_camera(watch_s)
     gap = (camera_s[:, None] - ours).abs()
     nearest = gap.argmin(1)
@@ -130,12 +138,12 @@ def fit_swing_clock(
     return SwingClock(replace(clock, camera_s=clock.camera_s + mean), std)
 
 
-def swing_checks(
-    found: SwingClock, joint: str, min_swings: int = 5, max_std_s: float = 0.005
-) -> list[StepCheck]:
+def swing_checks(found: SwingClock, joint: str, min_swings: int = 5, max_std_s: float = 0.005) -> list[StepCheck]:
     """Quality checks of the swings."""
     more = "Swing ten times, and give the frames in which the hands are nearest to the camera."
     return [
-        StepCheck(f"arm swings, {joint}", "seen by both clocks", found.clock.claps, min_swings, "", more, at_least=True),
+        StepCheck(
+            f"arm swings, {joint}", "seen by both clocks", found.clock.claps, min_swings, "", more, at_least=True
+        ),
         StepCheck(f"arm swings, {joint}", "deviation of the offset", 1000 * found.std_s, 1000 * max_std_s, "ms", more),
-    ]  # fmt: skip
+    ]

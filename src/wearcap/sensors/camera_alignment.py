@@ -86,8 +86,12 @@ class HeadMount:
         """The camera's path as a head stream, with the device axes rotated to the head's."""
         R = T_world_cam.R_world_body
         return HeadStream(
-            T_world_cam.timestamps, R @ self.R_head_cam.mT.to(R), T_world_cam.t_world_body, torch.eye(3), self.t_head_cam
-        )  # fmt: skip
+            T_world_cam.timestamps,
+            R @ self.R_head_cam.mT.to(R),
+            T_world_cam.t_world_body,
+            torch.eye(3),
+            self.t_head_cam,
+        )
 
 
 def mark_positions(
@@ -96,8 +100,11 @@ def mark_positions(
     """Mean camera centres during the four stretches, the root mean square deviation of samples from them (SLAM units),
     and the camera's rotation meanwhile (degrees)."""
     if len(stretches) != len(MARKS):
-        raise WearcapError(f"{len(stretches)} stretches on the board", where="camera on the board",
-                           expected="four: C1 and C2 on the y axis, C3 and C4 on the x axis")  # fmt: skip
+        raise WearcapError(
+            f"{len(stretches)} stretches on the board",
+            where="camera on the board",
+            expected="four: C1 and C2 on the y axis, C3 and C4 on the x axis",
+        )
     inside = [during(slam.timestamps, s, f"camera on {name}", 1.0) for name, s in zip(MARKS, stretches)]
     there = [slam.t_world_body[part].double() for part in inside]
     mean = torch.stack([part.mean(0) for part in there])
@@ -117,22 +124,31 @@ def align_by_marks(
     lines = np.stack([C[1] - C[0], C[3] - C[2]])
     lengths = np.linalg.norm(lines, axis=1)
     if min(distances_m) <= 0 or not np.isfinite(C).all() or lengths.min() < 1e-9:
-        raise WearcapError(f"distances of {distances_m} m, and {lengths.round(4).tolist()} in the SLAM", where="camera on the board",
-                           expected="four different places and distances above 0",
-                           fix="Measure |C1 C2| and |C3 C4| on the board.")  # fmt: skip
+        raise WearcapError(
+            f"distances of {distances_m} m, and {lengths.round(4).tolist()} in the SLAM",
+            where="camera on the board",
+            expected="four different places and distances above 0",
+            fix="Measure |C1 C2| and |C3 C4| on the board.",
+        )
     across = np.linalg.norm(np.cross(*lines)) / lengths.prod()
     if across < 0.5:
-        raise WearcapError(f"C1 C2 and C3 C4 are {math.degrees(math.asin(across)):.0f}° apart", where="camera on the board",
-                           expected="90°", fix="Put C1 and C2 on the y axis, C3 and C4 on the x axis.")  # fmt: skip
+        raise WearcapError(
+            f"C1 C2 and C3 C4 are {math.degrees(math.asin(across)):.0f}° apart",
+            where="camera on the board",
+            expected="90°",
+            fix="Put C1 and C2 on the y axis, C3 and C4 on the x axis.",
+        )
     scales = np.array(distances_m) / lengths
     start = _closed_form(C, np.array(distances_m), height_m)
     found = least_squares(_residuals, start, args=(C, distances_m, height_m), x_scale="jac")
     return SlamAlignment(
-        float(np.exp(found.x[3])), torch.from_numpy(Rotation.from_rotvec(found.x[:3]).as_matrix()),
-        torch.from_numpy(found.x[4:].copy()), float(np.sqrt(np.mean(found.fun**2))),
+        float(np.exp(found.x[3])),
+        torch.from_numpy(Rotation.from_rotvec(found.x[:3]).as_matrix()),
+        torch.from_numpy(found.x[4:].copy()),
+        float(np.sqrt(np.mean(found.fun**2))),
         float(abs(scales[0] - scales[1]) / scales.mean()),
         abs(90 - math.degrees(math.acos(np.clip(lines[0] @ lines[1] / lengths.prod(), -1, 1)))),
-    )  # fmt: skip
+    )
 
 
 def _closed_form(C: np.ndarray, distances: np.ndarray, height: float) -> np.ndarray:
@@ -157,10 +173,7 @@ def _residuals(x: np.ndarray, C: np.ndarray, distances: tuple[float, float], hei
 
 
 def align_by_walks(
-    x_slam: Float[Tensor, "end 3"],
-    y_slam: Float[Tensor, "end 3"],
-    length_m: tuple[float, float],
-    height_m: float,
+    x_slam: Float[Tensor, "end 3"], y_slam: Float[Tensor, "end 3"], length_m: tuple[float, float], height_m: float
 ) -> tuple[float, Rigid]:
     """Scale (m per unit) and T_world_slam of a camera that was carried along the board's x and y edge.
 
@@ -174,8 +187,12 @@ def align_by_walks(
     displacements = torch.stack([end[1] - end[0] for end in (x_slam, y_slam)]).double()
     length = displacements.norm(dim=1)
     if not (length > 0).all() or abs((displacements[0] @ displacements[1] / length.prod()).item()) > 0.5:
-        raise WearcapError("the camera's paths along the board's edges are not at a right angle", where="camera on the board",
-                           expected="about 90°", fix="Check the times of the walks along x and y.")  # fmt: skip
+        raise WearcapError(
+            "the camera's paths along the board's edges are not at a right angle",
+            where="camera on the board",
+            expected="about 90°",
+            fix="Check the times of the walks along x and y.",
+        )
     scale = (torch.tensor(length_m, dtype=torch.float64) / length).mean().item()
     axes = torch.eye(3, dtype=torch.float64)[:2]
     R: Tensor = roma.special_procrustes(axes.T @ (displacements / length[:, None]))  # pyright: ignore[reportAssignmentType]
@@ -195,8 +212,12 @@ def scale_by_walks(slam: Trajectory, walks: Sequence[tuple[float, float, float]]
     lengths = (ends[:, 1] - ends[:, 0]).norm(dim=-1).numpy()
     metres = np.array([walk[2] for walk in walks])
     if lengths.min() < 1e-9 or metres.min() <= 0:
-        raise WearcapError(f"walks of {metres.tolist()} m, and {lengths.round(4).tolist()} in the SLAM", where="walked distances",
-                           expected="two different places and a distance above 0", fix="Check the times of the walks.")  # fmt: skip
+        raise WearcapError(
+            f"walks of {metres.tolist()} m, and {lengths.round(4).tolist()} in the SLAM",
+            where="walked distances",
+            expected="two different places and a distance above 0",
+            fix="Check the times of the walks.",
+        )
     scales = metres / lengths
     return float(metres @ lengths / (lengths @ lengths)), float(np.ptp(scales) / scales.mean())
 
@@ -232,19 +253,43 @@ def mark_checks(
         rows.append(StepCheck(f"camera on {name}", "turns", turned, limits.mark_still_deg, "°", still))
     return [
         *rows,
-        StepCheck("camera on the board", "scales by the two distances differ", 100 * found.scale_spread,
-                  100 * limits.scale_spread, "%", ruler),
-        StepCheck("camera on the board", "axes miss a right angle", found.corner_deg, limits.corner_deg, "°",
-                  "Put C1 and C2 on the y axis, C3 and C4 on the x axis."),
+        StepCheck(
+            "camera on the board",
+            "scales by the two distances differ",
+            100 * found.scale_spread,
+            100 * limits.scale_spread,
+            "%",
+            ruler,
+        ),
+        StepCheck(
+            "camera on the board",
+            "axes miss a right angle",
+            found.corner_deg,
+            limits.corner_deg,
+            "°",
+            "Put C1 and C2 on the y axis, C3 and C4 on the x axis.",
+        ),
         StepCheck("camera on the board", "residual", found.residual_m, limits.residual_m, "m", ruler),
-    ]  # fmt: skip
+    ]
 
 
 def mount_checks(found: HeadMount, limits: AlignmentLimits = AlignmentLimits()) -> list[StepCheck]:
     """Quality checks of standing."""
     return [
-        StepCheck("standing", "not still", found.still_deg, limits.stand_still_deg, "°",
-                  "Stand upright and look ahead for 10 s, or give a calmer stretch."),
-        StepCheck("standing", "optical axis away from straight ahead", found.view_deg, limits.view_deg, "°",
-                  "Face the board's y while standing, or give the direction that you faced (facing_deg)."),
-    ]  # fmt: skip
+        StepCheck(
+            "standing",
+            "not still",
+            found.still_deg,
+            limits.stand_still_deg,
+            "°",
+            "Stand upright and look ahead for 10 s, or give a calmer stretch.",
+        ),
+        StepCheck(
+            "standing",
+            "optical axis away from straight ahead",
+            found.view_deg,
+            limits.view_deg,
+            "°",
+            "Face the board's y while standing, or give the direction that you faced (facing_deg).",
+        ),
+    ]

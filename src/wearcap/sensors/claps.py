@@ -60,11 +60,12 @@ def detect_claps(*wrists: ImuStream, settings: ClapSettings = CLAPS) -> Float64[
         where = " and ".join(wrist.joint for wrist in wrists)
         span = f"{wrists[0].timestamps[0]:.1f} s to {wrists[0].timestamps[-1]:.1f} s"
         raise WearcapError(
-            f"no clap found between {span}", where=f"acceleration of {where}",
+            f"no clap found between {span}",
+            where=f"acceleration of {where}",
             expected=f"a spike of 20 to 60 m/s² within {settings.max_width_s * 1000:.0f} ms"
             + (" in both wrists" if len(wrists) == 2 else ""),
             fix="Give the times of the claps by hand, or lower min_acc.",
-        )  # fmt: skip
+        )
     return torch.from_numpy(times)
 
 
@@ -79,9 +80,7 @@ def _fast_part(wrist: ImuStream) -> np.ndarray:
     elif wrist.acc_imu is not None:
         acc = wrist.acc_imu.double().norm(dim=-1, keepdim=True) - GRAVITY
     else:
-        raise WearcapError(
-            "a stream without acceleration", where=wrist.joint, expected="acc_world or acc_imu"
-        )
+        raise WearcapError("a stream without acceleration", where=wrist.joint, expected="acc_world or acc_imu")
     acc = acc.numpy()
     # A spike of 50 ms fills a third of the window and leaves its median alone.
     window = max(2 * round(0.075 / _step(wrist.timestamps.numpy())) + 1, 5)
@@ -95,9 +94,7 @@ def _step(timestamps: np.ndarray) -> float:
 def _spikes(timestamps: np.ndarray, jerk: np.ndarray, settings: ClapSettings) -> np.ndarray:
     """Times of single short peaks; the top lies where a Gaussian through three samples has it."""
     step, amount = _step(timestamps), np.linalg.norm(jerk, axis=1)
-    peaks, _ = scipy.signal.find_peaks(
-        amount, height=0.6 * settings.min_acc, distance=max(round(0.1 / step), 1)
-    )
+    peaks, _ = scipy.signal.find_peaks(amount, height=0.6 * settings.min_acc, distance=max(round(0.1 / step), 1))
     peaks = peaks[(peaks > 0) & (peaks < len(amount) - 1)]
     width = scipy.signal.peak_widths(amount, peaks, rel_height=0.5)[0] * step
     window = 2 * round(0.5 / step) + 1
@@ -126,8 +123,7 @@ def _alike(times: np.ndarray, clocks: list[np.ndarray], jerks: list[np.ndarray])
     """Cosine between the two wrists' fast accelerations over 50 ms around each time."""
     at = times[:, None] + np.linspace(-0.025, 0.025, 13)
     left, right = (
-        np.stack([np.interp(at, clock, jerk[:, axis]) for axis in range(3)], -1)
-        for clock, jerk in zip(clocks, jerks)
+        np.stack([np.interp(at, clock, jerk[:, axis]) for axis in range(3)], -1) for clock, jerk in zip(clocks, jerks)
     )
     size = np.sqrt((left**2).sum((1, 2)) * (right**2).sum((1, 2)))
     return (left * right).sum((1, 2)) / np.maximum(size, 1e-12)
@@ -165,10 +161,11 @@ def detect_claps_audio(
     onsets = onsets[later[(onsets + round(1000 * max_length_s)).clip(max=len(total) - 1)] <= peak - 10]
     if not len(onsets):
         raise WearcapError(
-            f"no clap found in {len(sound) / rate:.1f} s", where="sound track",
+            f"no clap found in {len(sound) / rate:.1f} s",
+            where="sound track",
             expected="a short sound with a sudden start, 1 to 7.5 kHz",
             fix="Give the times of the claps by hand.",
-        )  # fmt: skip
+        )
     return torch.from_numpy(np.array([_start(sound, rate, i * hop, hop) for i in onsets.tolist()]))
 
 
@@ -194,16 +191,12 @@ def read_audio(video: str | Path) -> tuple[Float[Tensor, "sample"], float, float
     try:
         with av.open(str(video)) as container:
             if not container.streams.audio:
-                raise WearcapError(
-                    "this video has no sound", where=video, fix="Give the times of the claps by hand."
-                )
+                raise WearcapError("this video has no sound", where=video, fix="Give the times of the claps by hand.")
             sound = container.streams.audio[0]
             starts = [_start_s(stream) for stream in (sound, *container.streams.video[:1])]
             mono = av.AudioResampler(format="flt", layout="mono")
             pieces = [
-                piece.to_ndarray()[0]
-                for frame in [*container.decode(sound), None]
-                for piece in mono.resample(frame)
+                piece.to_ndarray()[0] for frame in [*container.decode(sound), None] for piece in mono.resample(frame)
             ]
             rate = float(sound.rate)
     except (av.FFmpegError, OSError) as error:
@@ -228,8 +221,6 @@ def camera_claps(
     if given_s is not None:
         return torch.tensor(sorted(given_s), dtype=torch.float64) + start
     if camera.video is None:
-        raise WearcapError(
-            "a camera without a video", expected="a video with sound, or the times of the claps"
-        )
+        raise WearcapError("a camera without a video", expected="a video with sound, or the times of the claps")
     waveform, rate, delay = read_audio(Path(folder) / camera.video)
     return detect_claps_audio(waveform, rate) + delay + start

@@ -61,9 +61,7 @@ def _through(time: Tensor, knots: Tensor, values: Tensor, rate: float) -> Tensor
 
 
 def fit_clock(
-    claps_camera: Float64[Tensor, "clap_camera"],
-    claps_suit: Float64[Tensor, "clap_suit"],
-    max_offset_s: float = 600.0,
+    claps_camera: Float64[Tensor, "clap_camera"], claps_suit: Float64[Tensor, "clap_suit"], max_offset_s: float = 600.0
 ) -> Clock:
     """The clock under which most claps of the two lists (s, any order) coincide; either list may miss some.
 
@@ -74,16 +72,17 @@ def fit_clock(
     camera, suit = (np.sort(claps.numpy()) for claps in (claps_camera, claps_suit))
     for name, claps in (("camera", camera), ("suit", suit)):
         if not len(claps):
-            raise WearcapError(f"no clap found by the {name}", expected="at least one that both clocks saw",
-                               fix="Give the times of the claps by hand.")  # fmt: skip
+            raise WearcapError(
+                f"no clap found by the {name}",
+                expected="at least one that both clocks saw",
+                fix="Give the times of the claps by hand.",
+            )
     pairs = _matched(camera, suit, max_offset_s)
     camera, suit = camera[pairs[1]], suit[pairs[0]]
     rate = _drift(suit, camera)
     group = np.concatenate([[0], np.cumsum(np.diff(suit) > GROUP_S)])
     count = np.bincount(group)
-    knots = [
-        torch.from_numpy(np.bincount(group, times - times[0]) / count + times[0]) for times in (camera, suit)
-    ]
+    knots = [torch.from_numpy(np.bincount(group, times - times[0]) / count + times[0]) for times in (camera, suit)]
     clock = Clock(*knots, drift_s_per_hour=3600 * rate, residual_s=0.0, claps=len(suit))
     off = torch.from_numpy(camera) - clock.to_camera(torch.from_numpy(suit))
     return replace(clock, residual_s=off.square().mean().sqrt().item())
@@ -112,8 +111,10 @@ def _matched(camera: np.ndarray, suit: np.ndarray, max_offset_s: float) -> tuple
     if not len(offset):
         raise WearcapError(
             f"no clap of the suit (first {suit[0]:.1f} s) is less than {max_offset_s:.0f} s from one of the camera "
-            f"(first {camera[0]:.1f} s)", expected="clocks that are nearer to each other", fix="Raise max_offset_s.",
-        )  # fmt: skip
+            f"(first {camera[0]:.1f} s)",
+            expected="clocks that are nearer to each other",
+            fix="Raise max_offset_s.",
+        )
     best = np.argsort(-_agreement(camera, suit, start, offset), kind="stable")[:200]
     found: dict[bytes, tuple[float, float, tuple]] = {}
     for candidate in best:
@@ -129,8 +130,9 @@ def _matched(camera: np.ndarray, suit: np.ndarray, max_offset_s: float) -> tuple
         raise WearcapError(
             f"the {len(camera)} claps of the camera and {len(suit)} of the suit fit together in several ways, with "
             f"offsets of {at:.3f} s and {rivals[0][1]:.3f} s",
-            expected="claps at uneven intervals, or one in each", fix="Give the times of the claps by hand.",
-        )  # fmt: skip
+            expected="claps at uneven intervals, or one in each",
+            fix="Give the times of the claps by hand.",
+        )
     return pairs
 
 

@@ -42,8 +42,9 @@ def contacts_from_motion(motion: Motion, settings: ContactSettings = CONTACTS) -
     """Contacts of `FOOT_PATCHES`: each patch from its own speed. The skeleton needs the sites of that name."""
     missing = [patch for patch in FOOT_PATCHES if patch not in motion.skeleton.sites]
     if missing:
-        raise WearcapError(f"skeleton {motion.skeleton.name!r} has no {missing[0]!r}",
-                           expected=f"sites {', '.join(FOOT_PATCHES)}")  # fmt: skip
+        raise WearcapError(
+            f"skeleton {motion.skeleton.name!r} has no {missing[0]!r}", expected=f"sites {', '.join(FOOT_PATCHES)}"
+        )
     if len(motion) < 3:
         raise WearcapError(f"a motion of {len(motion)} frames", expected="three or more")
     require_rising(motion.timestamps)
@@ -75,9 +76,7 @@ def contacts_from_imu(
 
 def _foot_contacts(foot: ImuStream, fps: float, settings: ContactSettings) -> Bool[Tensor, "time 2"]:
     if foot.gyro_imu is None or foot.acc_world is None:
-        raise WearcapError(
-            "no angular rate or free acceleration", where=foot.joint, expected="gyro_imu and acc_world"
-        )
+        raise WearcapError("no angular rate or free acceleration", where=foot.joint, expected="gyro_imu and acc_world")
     gyro, acc = foot.gyro_imu.norm(dim=-1)[:, None], foot.acc_world.norm(dim=-1)[:, None]
     flat = _hysteresis(gyro, settings.gyro) & _hysteresis(acc, settings.acc)
     flat = _without_short(flat, settings.shortest_s * fps)[:, 0].numpy()
@@ -93,9 +92,7 @@ def _foot_contacts(foot: ImuStream, fps: float, settings: ContactSettings) -> Bo
     return torch.from_numpy(np.stack([heel, toes], 1))
 
 
-def _hysteresis(
-    value: Float[Tensor, "time column"], thresholds: tuple[float, float]
-) -> Bool[Tensor, "time column"]:
+def _hysteresis(value: Float[Tensor, "time column"], thresholds: tuple[float, float]) -> Bool[Tensor, "time column"]:
     """True from where a value falls below the first threshold until it rises above the second."""
     frame = torch.arange(1, len(value) + 1)[:, None].expand_as(value)
     below = torch.where(value < thresholds[0], frame, 0).cummax(0).values

@@ -77,8 +77,11 @@ class Subtraction:
 def empty_scene(frames_mm: UInt16[np.ndarray, "time height width"]) -> Background:
     """Mean depth of an empty scene, of the frames that saw each pixel. Raises WearcapError without frames."""
     if not len(frames_mm):
-        raise WearcapError("no frames of the empty scene", expected="at least one depth image without the person",
-                           fix="Record a few seconds of the scene before the person enters.")  # fmt: skip
+        raise WearcapError(
+            "no frames of the empty scene",
+            expected="at least one depth image without the person",
+            fix="Record a few seconds of the scene before the person enters.",
+        )
     seen = frames_mm > 0
     count = seen.sum(0)
     depth = frames_mm.astype(np.float32) / 1000
@@ -89,17 +92,17 @@ def empty_scene(frames_mm: UInt16[np.ndarray, "time height width"]) -> Backgroun
 
 
 def foreground(
-    depth_mm: UInt16[np.ndarray, "height width"],
-    background: Background,
-    subtraction: Subtraction = Subtraction(),
+    depth_mm: UInt16[np.ndarray, "height width"], background: Background, subtraction: Subtraction = Subtraction()
 ) -> Bool[np.ndarray, "height width"]:
     """Pixels clearly before the empty scene's depth; all measured ones where the background gave none.
 
     Raises WearcapError when the sizes differ.
     """
     if depth_mm.shape != background.depth_m.shape:
-        raise WearcapError(f"a depth image of shape {depth_mm.shape} and a background of {background.depth_m.shape}",
-                           expected="images of one camera")  # fmt: skip
+        raise WearcapError(
+            f"a depth image of shape {depth_mm.shape} and a background of {background.depth_m.shape}",
+            expected="images of one camera",
+        )
     depth = depth_mm / np.float32(1000)
     margin = subtraction.margin_m + subtraction.deviations * background.deviation_m
     before = (depth_mm > 0) & (depth < background.depth_m - margin)
@@ -115,9 +118,7 @@ def unproject_depth(
     return points[np.isfinite(points).all(1)].astype(np.float64)
 
 
-def largest_cluster(
-    points: Float[np.ndarray, "point 3"], eps_m: float = CLUSTER_EPS_M
-) -> Bool[np.ndarray, "point"]:
+def largest_cluster(points: Float[np.ndarray, "point 3"], eps_m: float = CLUSTER_EPS_M) -> Bool[np.ndarray, "point"]:
     """Points of the DBSCAN cluster that holds most of them; none where all are noise."""
     if not len(points):
         return np.zeros(0, bool)
@@ -150,9 +151,7 @@ def register_view(
     return replace(view, T_world_cam=result.T_scene_cloud), result
 
 
-def visible_points(
-    scene: Float32[np.ndarray, "scene_point 3"], T_world_cam: Rigid
-) -> Float32[np.ndarray, "point 3"]:
+def visible_points(scene: Float32[np.ndarray, "scene_point 3"], T_world_cam: Rigid) -> Float32[np.ndarray, "point 3"]:
     """Points of a scan (m) that nothing hides from a camera at about this pose, within 100° (ours)."""
     wide = Camera.pinhole(500, 500, 100.0)
     splats = Splats(scene, np.ones(3, np.float32), _SPLAT_M, metric=True)
@@ -203,8 +202,6 @@ def _flying(depth_m: np.ndarray, edge_m: float) -> np.ndarray:
 @lru_cache(maxsize=8)
 def _rays(camera: Camera) -> Float[np.ndarray, "height width 3"]:
     """Directions of all pixels with z = 1."""
-    y, x = torch.meshgrid(
-        torch.arange(camera.height).double(), torch.arange(camera.width).double(), indexing="ij"
-    )
+    y, x = torch.meshgrid(torch.arange(camera.height).double(), torch.arange(camera.width).double(), indexing="ij")
     rays = camera.unproject(torch.stack([x, y], -1))
     return (rays / rays[..., 2:]).numpy().astype(np.float32)

@@ -70,12 +70,19 @@ def by_head_imu(
     length = np.linalg.norm(up) / k if abs(k) > 1e-12 else math.inf
     deviation = math.sqrt(covariance[0, 0]) / abs(k)
     if deviation > 0.1:
-        raise WearcapError(f"the scale stays uncertain by {100 * deviation:.0f} %", where="scale from the head's sensor",
-                           expected="at most 10 %", fix="Walk with turns for half a minute; give more of the log.")  # fmt: skip
+        raise WearcapError(
+            f"the scale stays uncertain by {100 * deviation:.0f} %",
+            where="scale from the head's sensor",
+            expected="at most 10 %",
+            fix="Walk with turns for half a minute; give more of the log.",
+        )
     if k <= 0 or abs(length / GRAVITY - 1) > _GRAVITY_SHARE:
-        raise WearcapError(f"gravity of {length:.2f} m/s² and a scale of {1 / k:.3g}", where="scale from the head's sensor",
-                           expected="9.81 m/s² and a scale above 0",
-                           fix="Check the unit of the accelerations, how the sensor sits on the camera, and the clocks.")  # fmt: skip
+        raise WearcapError(
+            f"gravity of {length:.2f} m/s² and a scale of {1 / k:.3g}",
+            where="scale from the head's sensor",
+            expected="9.81 m/s² and a scale above 0",
+            fix="Check the unit of the accelerations, how the sensor sits on the camera, and the clocks.",
+        )
     direction = up / np.linalg.norm(up)
     across = np.eye(3) - np.outer(direction, direction)
     turn = across @ covariance[1:4, 1:4] @ across / (up @ up)
@@ -90,25 +97,29 @@ def _alike(
     (p(t-h) + p(t+h) - 2p(t)) / h² is the acceleration under a triangle of half-width h; so the forces go under one, too.
     """
     if imu.acc_imu is None:
-        raise WearcapError(
-            "a stream without acc_imu", where="the head's sensor", expected="specific force (m/s²)"
-        )
+        raise WearcapError("a stream without acc_imu", where="the head's sensor", expected="specific force (m/s²)")
     start, stop = max(slam.timestamps[0], imu.timestamps[0]), min(slam.timestamps[-1], imu.timestamps[-1])
     if stop - start < 10:
-        raise WearcapError(f"camera and sensor share {max((stop - start).item(), 0):.1f} s", where="scale from the head's sensor",
-                           expected="10 s or more", fix="Bring both to one clock, and walk for longer.")  # fmt: skip
+        raise WearcapError(
+            f"camera and sensor share {max((stop - start).item(), 0):.1f} s",
+            where="scale from the head's sensor",
+            expected="10 s or more",
+            fix="Bring both to one clock, and walk for longer.",
+        )
     if len(gaps := find_gaps(slam.timestamps, 0.5)):
-        raise WearcapError(f"the camera is lost at {slam.timestamps[gaps[0]].item():.2f} s", where="scale from the head's sensor",
-                           expected="poses without gaps", fix="Give a part without gaps.")  # fmt: skip
+        raise WearcapError(
+            f"the camera is lost at {slam.timestamps[gaps[0]].item():.2f} s",
+            where="scale from the head's sensor",
+            expected="poses without gaps",
+            fix="Give a part without gaps.",
+        )
     step, fine = slam.timestamps.diff().median().item(), 4
     n = max(round(_HALF_S / step), 1)
     # On the camera's frames: between them positions would be interpolated, which flattens them.
     first = slam.timestamps[torch.searchsorted(slam.timestamps, start)].item()
     dense = torch.arange(first, stop.item(), step / fine, dtype=torch.float64)
     R_cam_imu = torch.eye(3) if R_cam_imu is None else R_cam_imu
-    poses = resample(
-        Trajectory(slam.timestamps, slam.R_world_body.double(), slam.t_world_body.double()), dense
-    )
+    poses = resample(Trajectory(slam.timestamps, slam.R_world_body.double(), slam.t_world_body.double()), dense)
     R = poses.R_world_body @ R_cam_imu.double()
     force = interpolate(imu.timestamps, imu.acc_imu.double(), dense)
     force_slam = (R @ force[..., None])[..., 0].numpy()
@@ -170,9 +181,7 @@ def by_floor(
     random = np.random.default_rng(seed)
     eyes = slam.t_world_body[during(slam.timestamps, standing, "standing", 1.0)].double().mean(0).numpy()
     rough = -slam.R_world_body[:, :, 1].double().mean(0).numpy()
-    points = _below(
-        points_slam.double().numpy(), slam.t_world_body.double().numpy(), rough / np.linalg.norm(rough)
-    )
+    points = _below(points_slam.double().numpy(), slam.t_world_body.double().numpy(), rough / np.linalg.norm(rough))
     floor = _floor_points(points, eyes, rough / np.linalg.norm(rough), random)
     up, height = _plane(floor, eyes)
     patch = np.unique(np.floor(floor / (height / 4)).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
@@ -196,9 +205,7 @@ def _below(points: np.ndarray, path: np.ndarray, up: np.ndarray) -> np.ndarray:
     return points[below]
 
 
-def _floor_points(
-    points: np.ndarray, eyes: np.ndarray, rough: np.ndarray, random: np.random.Generator
-) -> np.ndarray:
+def _floor_points(points: np.ndarray, eyes: np.ndarray, rough: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Points of the plane with most support; a point counts within 2 % of the camera's height above it."""
     best = np.zeros(len(points), bool)
     for _ in range(500 if len(points) >= 30 else 0):
@@ -213,8 +220,12 @@ def _floor_points(
         best = near if near.sum() > best.sum() else best
     for _ in range(3):
         if best.sum() < 30:
-            raise WearcapError(f"{int(best.sum())} of {len(points)} points below the path lie on one plane", where="scale from the floor",
-                               expected="30 or more", fix="Look at the floor while walking, or use the board.")  # fmt: skip
+            raise WearcapError(
+                f"{int(best.sum())} of {len(points)} points below the path lie on one plane",
+                where="scale from the floor",
+                expected="30 or more",
+                fix="Look at the floor while walking, or use the board.",
+            )
         up, height = _plane(points[best], eyes)
         best = np.abs((points - eyes) @ up + height) < 0.02 * height
     return points[best]

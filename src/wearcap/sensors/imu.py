@@ -117,11 +117,7 @@ def _off_clock(path: Trajectory, noise: ImuNoise, rng: np.random.Generator) -> t
 
 def _estimated(R: Tensor, noise: ImuNoise, rng: np.random.Generator, fps: float) -> Tensor:
     """The sensor's estimated orientation: a slowly varying attitude error and a drifting heading."""
-    attitude = (
-        np.deg2rad(noise.attitude_deg)
-        * smooth_noise(rng, len(R), 3, noise.attitude_period_s, fps)
-        / np.sqrt(3)
-    )
+    attitude = np.deg2rad(noise.attitude_deg) * smooth_noise(rng, len(R), 3, noise.attitude_period_s, fps) / np.sqrt(3)
     per_sqrt_s = np.deg2rad(noise.heading_walk_deg_per_sqrt_min) / np.sqrt(60)
     heading = rotation.about_axis("z", random_walk(rng, len(R), 1, per_sqrt_s, fps)[:, 0])
     return heading @ R @ rotation.exp(attitude)

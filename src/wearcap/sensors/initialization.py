@@ -46,8 +46,10 @@ class InitializationSettings:
             if value not in choices:
                 raise WearcapError(f"{name}={value!r}", expected=f"one of {', '.join(choices)}")
         if self.bridge == "line" and self.path_smoothing_s:
-            raise WearcapError(f"bridge='line' with path_smoothing_s={self.path_smoothing_s:g}",
-                               expected="path_smoothing_s=0: smoothing applies to the difference from the suit's path")  # fmt: skip
+            raise WearcapError(
+                f"bridge='line' with path_smoothing_s={self.path_smoothing_s:g}",
+                expected="path_smoothing_s=0: smoothing applies to the difference from the suit's path",
+            )
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,12 @@ def initialize(
     settings, suit, seen = settings or InitializationSettings(), suit_aligned, inliers(localization)
     seen &= (localization.timestamps >= suit.timestamps[0]) & (localization.timestamps <= suit.timestamps[-1])
     if not seen.any():
-        raise WearcapError("no localised frame in the suit's time", where="localization",
-                           expected="camera poses on the suit's clock", fix="Synchronise the clocks, or check the map.")  # fmt: skip
+        raise WearcapError(
+            "no localised frame in the suit's time",
+            where="localization",
+            expected="camera poses on the suit's clock",
+            fix="Synchronise the clocks, or check the map.",
+        )
     valid = _covered(suit, localization, seen)
     body = body_camera(suit, t_head_cam)
     camera = _interpolated(suit.timestamps, localization.timestamps[seen], localization.t_world_cam[seen])
@@ -109,12 +115,8 @@ class _Paths:
     def steps(self, span_s: float) -> tuple[Tensor, Tensor, Tensor]:
         """Horizontal displacements during the next `span_s` by suit and camera (complex, m), and where they are valid
         from start to end."""
-        ahead = torch.searchsorted(self.timestamps, self.timestamps + span_s - 1e-6).clamp(
-            max=len(self.timestamps) - 1
-        )
-        body, camera = (
-            torch.view_as_complex((p[ahead] - p)[:, :2].contiguous()) for p in (self.body, self.camera)
-        )
+        ahead = torch.searchsorted(self.timestamps, self.timestamps + span_s - 1e-6).clamp(max=len(self.timestamps) - 1)
+        body, camera = (torch.view_as_complex((p[ahead] - p)[:, :2].contiguous()) for p in (self.body, self.camera))
         lost = torch.cat([self.valid.new_zeros(1), ~self.valid]).cumsum(0)
         whole = (lost[ahead + 1] == lost[:-1]) & (self.timestamps[ahead] - self.timestamps > 0.9 * span_s)
         return body, camera, whole
@@ -135,18 +137,12 @@ def _tangent_yaw(paths: _Paths, settings: InitializationSettings) -> Float64[Ten
 
 
 def _orientation_yaw(
-    suit: Motion,
-    localization: Localization,
-    seen: Tensor,
-    R_head_cam: Tensor,
-    settings: InitializationSettings,
+    suit: Motion, localization: Localization, seen: Tensor, R_head_cam: Tensor, settings: InitializationSettings
 ) -> Float64[Tensor, "time"]:
     """Angle about gravity from the suit's head to the head implied by the camera's orientation, robustly smoothed."""
     head, times = suit.joint("head"), localization.timestamps[seen]
     R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), times).R_world_body
-    angle, certainty = yaw_between(
-        R_world_head, localization.R_world_cam[seen].to(head.R.dtype) @ R_head_cam.mT
-    )
+    angle, certainty = yaw_between(R_world_head, localization.R_world_cam[seen].to(head.R.dtype) @ R_head_cam.mT)
     weight = (localization.confidence[seen] * certainty).double()
     pointer = torch.stack([angle.cos(), angle.sin()], -1).double()
     smooth = _robust_smooth(times, pointer, weight, settings.yaw_smoothing_s, ANGLE_SCALE)

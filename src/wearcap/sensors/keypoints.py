@@ -51,14 +51,21 @@ def camera_path(motion: Motion, stream: CameraStream) -> Trajectory:
     times = stream.timestamps
     times = times[(times >= motion.timestamps[0]) & (times <= motion.timestamps[-1])]
     if len(times) < 2:
-        raise WearcapError(f"{len(times)} pictures of the head camera during the motion", expected="two or more, on one clock")  # fmt: skip
+        raise WearcapError(
+            f"{len(times)} pictures of the head camera during the motion", expected="two or more, on one clock"
+        )
     return resample(Trajectory(motion.timestamps, T_world_cam.R, T_world_cam.t), times)
 
 
 def seen_joints(
-    motion: Motion, T_world_cam: Trajectory, camera: Camera, joints: Sequence[str], noise_px: float, drop: float,
+    motion: Motion,
+    T_world_cam: Trajectory,
+    camera: Camera,
+    joints: Sequence[str],
+    noise_px: float,
+    drop: float,
     rng: np.random.Generator,
-) -> dict[str, Cue]:  # fmt: skip
+) -> dict[str, Cue]:
     """Simulated 2D detections of joints in a camera's frames (OpenCV axes, within the motion's time).
 
     A share `drop` of the visible joints is missed, in short bursts. Half of the noise variance is correlated over about
@@ -82,9 +89,14 @@ def seen_joints(
 
 
 def seen_wearer(
-    motion: Motion, T_world_cam: Trajectory, camera: Camera, noise_deg: float, rng: np.random.Generator,
-    period_s: float = 1.0, range_m: float = 8.0,
-) -> tuple[Motion, Float[Tensor, "time joint"]]:  # fmt: skip
+    motion: Motion,
+    T_world_cam: Trajectory,
+    camera: Camera,
+    noise_deg: float,
+    rng: np.random.Generator,
+    period_s: float = 1.0,
+    range_m: float = 8.0,
+) -> tuple[Motion, Float[Tensor, "time joint"]]:
     """Simulated monocular pose estimate of a person in another wearer's camera, and its confidence.
 
     Local rotations have errors of `noise_deg` (root mean square) that vary over about `period_s`; the root has an error
@@ -108,9 +120,17 @@ def seen_wearer(
     R = motion.R_parent_joint[nearest] @ rotation.exp(np.deg2rad(noise_deg) / np.sqrt(3) * turn)
     deeper = DEPTH_SHARE * smooth_noise(rng, count, 1, period_s, fps)
     estimate = replace(
-        motion, timestamps=times, R_parent_joint=R, t_world_root=joints[:, 0] + deeper * away, contact_prob=None,
-        hand_contact_prob=None, body_contact_prob=None, object_motion=None, interactions=None, provenance={"source": "simulated pose estimator"},
-    )  # fmt: skip
+        motion,
+        timestamps=times,
+        R_parent_joint=R,
+        t_world_root=joints[:, 0] + deeper * away,
+        contact_prob=None,
+        hand_contact_prob=None,
+        body_contact_prob=None,
+        object_motion=None,
+        interactions=None,
+        provenance={"source": "simulated pose estimator"},
+    )
     return estimate, confidence.float()
 
 

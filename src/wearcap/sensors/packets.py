@@ -80,9 +80,13 @@ def rotation_fault(R: object) -> str | None:
     if fault := _values_fault([*rows[0], *rows[1], *rows[2]], 2.0):
         return NOT_A_ROTATION if fault is OUT_OF_RANGE else fault
     products = (
-        ax * ax + ay * ay + az * az - 1, bx * bx + by * by + bz * bz - 1, cx * cx + cy * cy + cz * cz - 1,
-        ax * bx + ay * by + az * bz, ax * cx + ay * cy + az * cz, bx * cx + by * cy + bz * cz,
-    )  # fmt: skip
+        ax * ax + ay * ay + az * az - 1,
+        bx * bx + by * by + bz * bz - 1,
+        cx * cx + cy * cy + cz * cz - 1,
+        ax * bx + ay * by + az * bz,
+        ax * cx + ay * cy + az * cz,
+        bx * cx + by * cy + bz * cz,
+    )
     right_handed = ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx) > 0
     orthogonal = min(products) >= -ROTATION_TOLERANCE and max(products) <= ROTATION_TOLERANCE
     return None if orthogonal and right_handed else NOT_A_ROTATION
@@ -247,9 +251,7 @@ class HeadInput:
             assert isinstance(T_world_device, Rigid)
             pose = owned_pose(T_world_device)
             x, y, z = pose.t.tolist()
-            self.far = (
-                0 if self.place is None or math.dist(self.place, (x, y, z)) <= MAX_JUMP_M else self.far + 1
-            )
+            self.far = 0 if self.place is None or math.dist(self.place, (x, y, z)) <= MAX_JUMP_M else self.far + 1
             if self.far in (0, AGREEING):
                 self.place, self.far = (x, y, z), 0
                 return pose

@@ -75,9 +75,16 @@ def register(
         target, tree = small_gicp.preprocess_points(near, stage.voxel_m, _NORMAL_NEIGHBORS)
         source = small_gicp.voxelgrid_sampling(points, stage.voxel_m)
         result = small_gicp.align(
-            target, source, tree, pose, "PLANE_ICP", max_correspondence_distance=stage.reach_m,
-            max_iterations=40, rotation_epsilon=1e-4, translation_epsilon=1e-4,
-        )  # fmt: skip
+            target,
+            source,
+            tree,
+            pose,
+            "PLANE_ICP",
+            max_correspondence_distance=stage.reach_m,
+            max_iterations=40,
+            rotation_epsilon=1e-4,
+            translation_epsilon=1e-4,
+        )
         if result.num_inliers < _SHARE * source.size():
             raise _no_overlap(stage.reach_m)
         pose, converged = np.array(result.T_target_source), result.converged
@@ -93,9 +100,7 @@ def _near(scene: np.ndarray, points: np.ndarray, pose: np.ndarray, voxel_m: floa
     return small_gicp.voxelgrid_sampling(scene[inside].astype(np.float64), voxel_m).points()[:, :3]
 
 
-def _report(
-    points: np.ndarray, near: np.ndarray, pose: np.ndarray, converged: bool, voxel_m: float
-) -> Registration:
+def _report(points: np.ndarray, near: np.ndarray, pose: np.ndarray, converged: bool, voxel_m: float) -> Registration:
     target, _ = small_gicp.preprocess_points(near, voxel_m, _NORMAL_NEIGHBORS)
     thin = small_gicp.voxelgrid_sampling(points, voxel_m).points()[:, :3]
     placed = _moved(thin, pose)
@@ -105,10 +110,12 @@ def _report(
     to_plane = ((placed[inside] - target.points()[index[inside], :3]) * normals).sum(1)
     facing = np.linalg.eigvalsh(normals.T @ normals / max(len(normals), 1))
     return Registration(
-        Rigid.from_matrix(torch.from_numpy(pose)), float(inside.mean()),
+        Rigid.from_matrix(torch.from_numpy(pose)),
+        float(inside.mean()),
         float(np.sqrt(np.mean(to_plane**2))) if inside.any() else float("nan"),
-        float(facing[0]), converged,
-    )  # fmt: skip
+        float(facing[0]),
+        converged,
+    )
 
 
 def _moved(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -117,8 +124,9 @@ def _moved(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 def _finite(points: np.ndarray, name: str) -> Float[np.ndarray, "point 3"]:
     if len(points) < _FEWEST or not np.isfinite(points).all():
-        raise WearcapError(f"{name} has {len(points)} points, or some are NaN",
-                           expected=f"at least {_FEWEST} finite points (m)")  # fmt: skip
+        raise WearcapError(
+            f"{name} has {len(points)} points, or some are NaN", expected=f"at least {_FEWEST} finite points (m)"
+        )
     return points.astype(np.float64)
 
 

@@ -66,9 +66,7 @@ def acceleration_outliers(
     return valid, time[kept][:-1][cut]
 
 
-def _jump_acceleration(
-    position: Float64[Tensor, "time 3"], time: Float64[Tensor, "time"]
-) -> Float64[Tensor, "step"]:
+def _jump_acceleration(position: Float64[Tensor, "time 3"], time: Float64[Tensor, "time"]) -> Float64[Tensor, "step"]:
     """For each step from frame to frame, the smaller of the accelerations (m/s²) at its two ends.
 
     Second differences on uneven times; the first and the last frame have none of their own.
@@ -86,9 +84,7 @@ def _padded(value: Float[Tensor, "inner"], *, first: bool) -> Float[Tensor, "ste
     return torch.cat([beyond, value] if first else [value, beyond])
 
 
-def _short_pieces(
-    cut: Bool[Tensor, "step"], time: Float64[Tensor, "time"], max_burst_s: float
-) -> Bool[Tensor, "time"]:
+def _short_pieces(cut: Bool[Tensor, "step"], time: Float64[Tensor, "time"], max_burst_s: float) -> Bool[Tensor, "time"]:
     """Frames of pieces between cuts that are not longer than the pieces beside them nor than `max_burst_s`."""
     if not cut.any():
         return torch.zeros_like(time, dtype=torch.bool)

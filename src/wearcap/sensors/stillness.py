@@ -44,8 +44,12 @@ def require(checks: Sequence[StepCheck]) -> None:
     """Raise WearcapError for the first check that is not ok: the step, what was measured, what is expected."""
     for check in checks:
         if not check.ok:
-            raise WearcapError(f"{check.what}: {check.measured:.3g} {check.unit}".rstrip(), where=check.step,
-                               expected=check.expected, fix=check.fix)  # fmt: skip
+            raise WearcapError(
+                f"{check.what}: {check.measured:.3g} {check.unit}".rstrip(),
+                where=check.step,
+                expected=check.expected,
+                fix=check.fix,
+            )
 
 
 def during(
@@ -54,15 +58,21 @@ def during(
     """Samples of a stretch. Raises WearcapError, naming the step, when it is too short or not in the log."""
     start, stop = stretch
     if stop - start < min_s:
-        raise WearcapError(f"the stretch from {start:.2f} s to {stop:.2f} s is {stop - start:.2f} s long", where=step,
-                           expected=f"at least {min_s:g} s", fix="Hold still for longer and do this step again.")  # fmt: skip
+        raise WearcapError(
+            f"the stretch from {start:.2f} s to {stop:.2f} s is {stop - start:.2f} s long",
+            where=step,
+            expected=f"at least {min_s:g} s",
+            fix="Hold still for longer and do this step again.",
+        )
     inside = (timestamps >= start) & (timestamps <= stop)
     first, last = (timestamps[inside][[0, -1]] if inside.any() else timestamps.new_zeros(2)).tolist()
     if not inside.any() or first - start > 0.25 or stop - last > 0.25:
         raise WearcapError(
-            f"the log has {int(inside.sum())} samples from {start:.2f} s to {stop:.2f} s", where=step,
+            f"the log has {int(inside.sum())} samples from {start:.2f} s to {stop:.2f} s",
+            where=step,
             expected=f"a stretch within the log, {timestamps[0].item():.2f} s to {timestamps[-1].item():.2f} s",
-            fix="Give other times for this step.")  # fmt: skip
+            fix="Give other times for this step.",
+        )
     return inside
 
 
@@ -73,10 +83,7 @@ def unstillness_deg(R: Float[Tensor, "time 3 3"]) -> float:
 
 
 def still_intervals(
-    timestamps: Float64[Tensor, "time"],
-    R: Float[Tensor, "time 3 3"],
-    min_s: float = 2.0,
-    still_deg: float = 4.0,
+    timestamps: Float64[Tensor, "time"], R: Float[Tensor, "time 3 3"], min_s: float = 2.0, still_deg: float = 4.0
 ) -> list[Stretch]:
     """Stretches during which a sensor turns by less than `still_deg` in any half second, their ends trimmed."""
     if len(timestamps) < 2 or timestamps[-1] - timestamps[0] < max(min_s, _LOOK_S):

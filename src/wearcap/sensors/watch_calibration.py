@@ -18,15 +18,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording.recording import ImuStream
-from wearcap.sensors.stillness import (
-    StepCheck,
-    Stretch,
-    common,
-    during,
-    require,
-    still_intervals,
-    unstillness_deg,
-)
+from wearcap.sensors.stillness import StepCheck, Stretch, common, during, require, still_intervals, unstillness_deg
 from wearcap.sensors.watches import WRISTS, require_sides
 
 FACING_DEG = 90.0
@@ -84,7 +76,7 @@ class WatchCalibration:
         acc = None if stream.acc_world is None else stream.acc_world @ R.mT
         return replace(
             stream, joint=self.joint, R_world_imu=R @ R_ref_imu, acc_world=acc, R_joint_imu=self.R_joint_imu.to(R)
-        )  # fmt: skip
+        )
 
 
 def measure_watch(stream: ImuStream, board: Stretch, t_pose: Stretch) -> WatchCalibration:
@@ -99,20 +91,25 @@ def measure_watch(stream: ImuStream, board: Stretch, t_pose: Stretch) -> WatchCa
     R_world_imu = R_ref_world.mT @ rotation.mean_rotation(worn.double())
     R_world_joint = rotation.about_axis("z", torch.tensor(math.radians(FACING_DEG), dtype=torch.float64))
     return WatchCalibration(
-        stream.joint, R_ref_world.mT.float().contiguous(), (R_world_joint.mT @ R_world_imu).float(),
-        unstillness_deg(on_board), _angle_deg(R_ref_world[2, 2]), unstillness_deg(worn),
-    )  # fmt: skip
+        stream.joint,
+        R_ref_world.mT.float().contiguous(),
+        (R_world_joint.mT @ R_world_imu).float(),
+        unstillness_deg(on_board),
+        _angle_deg(R_ref_world[2, 2]),
+        unstillness_deg(worn),
+    )
 
 
-def measure_watches(
-    streams: Mapping[str, ImuStream], board: Stretch, t_pose: Stretch
-) -> dict[str, WatchCalibration]:
+def measure_watches(streams: Mapping[str, ImuStream], board: Stretch, t_pose: Stretch) -> dict[str, WatchCalibration]:
     """`measure_watch` for both wrists. Raises WearcapError when one is missing or the stretches overlap."""
     if missing := [joint for joint in WRISTS if joint not in streams]:
         raise WearcapError(f"no watch on {' and '.join(missing)}", expected=" and ".join(WRISTS))
     if board[0] < t_pose[1] and t_pose[0] < board[1]:
-        raise WearcapError(f"board {board} and T-pose {t_pose} overlap", where="board and T-pose",
-                           expected="two stretches, one after the other")  # fmt: skip
+        raise WearcapError(
+            f"board {board} and T-pose {t_pose} overlap",
+            where="board and T-pose",
+            expected="two stretches, one after the other",
+        )
     return {joint: measure_watch(streams[joint], board, t_pose) for joint in WRISTS}
 
 
@@ -135,12 +132,18 @@ def watch_checks(
             ("T-pose", "slope of the forearm", one.arm_level_deg, limits.arm_level_deg, level),
             ("T-pose", "face of the watch looks away from up", one.face_up_deg, limits.face_up_deg, palms),
             ("T-pose", "forearm away from the wearer's side", one.arm_facing_deg, limits.arm_facing_deg, facing),
-        ):  # fmt: skip
+        ):
             rows.append(StepCheck(f"{step}, {joint}", what, measured, limit, "°", fix))
     rows.append(
-        StepCheck("T-pose, both", "the forearms' lines disagree", _apart_deg(found), limits.arms_apart_deg, "°",
-                  "Stretch both arms out to one line; both watches lie on the board in the same direction.")
-    )  # fmt: skip
+        StepCheck(
+            "T-pose, both",
+            "the forearms' lines disagree",
+            _apart_deg(found),
+            limits.arms_apart_deg,
+            "°",
+            "Stretch both arms out to one line; both watches lie on the board in the same direction.",
+        )
+    )
     return rows
 
 
@@ -167,10 +170,7 @@ def require_watches(
 
 
 def calibrate_watches(
-    streams: Mapping[str, ImuStream],
-    board: Stretch,
-    t_pose: Stretch,
-    limits: CalibrationLimits = CalibrationLimits(),
+    streams: Mapping[str, ImuStream], board: Stretch, t_pose: Stretch, limits: CalibrationLimits = CalibrationLimits()
 ) -> dict[str, WatchCalibration]:
     """Both watches' calibrations from logs (by joint) and the stretches (s, on their clocks) of board and T-pose.
 
@@ -207,8 +207,12 @@ def propose_steps(streams: Mapping[str, ImuStream]) -> tuple[Stretch | None, Str
 
 def _orientation(stream: ImuStream) -> Float[Tensor, "time 3 3"]:
     if stream.R_world_imu is None:
-        raise WearcapError("a watch's log without orientation", where=stream.joint, expected="one with attitude",
-                           fix="Switch on device motion when you record.")  # fmt: skip
+        raise WearcapError(
+            "a watch's log without orientation",
+            where=stream.joint,
+            expected="one with attitude",
+            fix="Switch on device motion when you record.",
+        )
     return stream.R_world_imu
 
 

@@ -32,11 +32,17 @@ def watches_at(
     worn = []
     for joint in WRISTS:
         if joint not in streams:
-            raise WearcapError(f"no watch on {joint}", where=where, expected=" and ".join(WRISTS),
-                               fix="Give both watches, or capture with the head alone: pipeline=hmd2.")  # fmt: skip
+            raise WearcapError(
+                f"no watch on {joint}",
+                where=where,
+                expected=" and ".join(WRISTS),
+                fix="Give both watches, or capture with the head alone: pipeline=hmd2.",
+            )
         stream = streams[joint]
         if stream.R_world_imu is None or stream.acc_world is None:
-            raise WearcapError("a watch without orientation or free acceleration", where=f"{where}, {joint}", expected="both")  # fmt: skip
+            raise WearcapError(
+                "a watch without orientation or free acceleration", where=f"{where}, {joint}", expected="both"
+            )
         _require_no_gaps(stream.timestamps, timestamps, f"{where}, {joint}")
         worn.append(stream)
     step = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
@@ -47,10 +53,7 @@ def watches_at(
 
 
 def filtered(
-    streams: Sequence[ImuStream],
-    timestamps: Float64[Tensor, "time"],
-    around: Float64[Tensor, "more"],
-    step_s: float,
+    streams: Sequence[ImuStream], timestamps: Float64[Tensor, "time"], around: Float64[Tensor, "more"], step_s: float
 ) -> tuple[Float[Tensor, "time wrist 3 3"], Float[Tensor, "time wrist 3"]]:
     """`watches_at` without checks. `around` holds the frames of the filter: the times with `FILTER` // 2 more on either
     side. Outside a watch's log its first or last sample is repeated."""
@@ -78,43 +81,49 @@ def require_sides(R_world_wrist: Float[Tensor, "time wrist 3 3"], where: str) ->
     """
     up = R_world_wrist[:, :, 2, 1].mean(0)
     if up[0] > _HANGING and up[1] < -_HANGING:
-        raise WearcapError("the watches seem to be swapped: both forearms would point up most of the time", where=where,
-                           fix="Exchange the logs of the left and the right watch, or calibrate them again.")  # fmt: skip
+        raise WearcapError(
+            "the watches seem to be swapped: both forearms would point up most of the time",
+            where=where,
+            fix="Exchange the logs of the left and the right watch, or calibrate them again.",
+        )
 
 
 def _require_no_gaps(times: Tensor, requested: Tensor, where: str) -> None:
     """Raise WearcapError when the watch has no samples at some of the requested times."""
     step = times.diff()
     if len(times) < 2 or (step <= 0).any():
-        raise WearcapError("times of a watch that do not grow", where=where,
-                           fix="Sort its samples by time and leave repeated ones out.")  # fmt: skip
+        raise WearcapError(
+            "times of a watch that do not grow",
+            where=where,
+            fix="Sort its samples by time and leave repeated ones out.",
+        )
     early, late = (times[0] - requested[0]).item(), (requested[-1] - times[-1]).item()
     if early > MAX_GAP_S or late > MAX_GAP_S:
         raise WearcapError(
-            f"the watch logged from {times[0].item():.2f} s to {times[-1].item():.2f} s", where=where,
+            f"the watch logged from {times[0].item():.2f} s to {times[-1].item():.2f} s",
+            where=where,
             expected=f"{requested[0].item():.2f} s to {requested[-1].item():.2f} s, as the camera did",
-            fix="Put both on one clock (wearcap calibrate), or cut the recording to what they share.")  # fmt: skip
+            fix="Put both on one clock (wearcap calibrate), or cut the recording to what they share.",
+        )
     gaps = find_gaps(times, MAX_GAP_S)
     inside = [g for g in gaps.tolist() if times[g + 1] > requested[0] and times[g] < requested[-1]]
     if inside:
         first = inside[0]
         raise WearcapError(
             f"the watch is silent, or its clock jumps, for {step[first].item():.2f} s at {times[first].item():.2f} s "
-            f"({len(inside)} such gaps)", where=where, expected=f"no gap above {MAX_GAP_S} s",
-            fix="Cut the recording there.")  # fmt: skip
+            f"({len(inside)} such gaps)",
+            where=where,
+            expected=f"no gap above {MAX_GAP_S} s",
+            fix="Cut the recording there.",
+        )
 
 
 def _averaged(
-    times: Float64[Tensor, "sample"],
-    value: Float[Tensor, "sample 3"],
-    at: Float64[Tensor, "time"],
-    step_s: float,
+    times: Float64[Tensor, "sample"], value: Float[Tensor, "sample 3"], at: Float64[Tensor, "time"], step_s: float
 ) -> Float[Tensor, "time 3"]:
     """Mean over the frame around each time, with linear interpolation between samples at any sample rate."""
     step = times.diff()[:, None]
-    area = torch.cat(
-        [value.new_zeros(1, 3).double(), ((value[1:] + value[:-1]).double() / 2 * step).cumsum(0)]
-    )
+    area = torch.cat([value.new_zeros(1, 3).double(), ((value[1:] + value[:-1]).double() / 2 * step).cumsum(0)])
     edges = torch.stack([at - step_s / 2, at + step_s / 2]).clamp(times[0].item(), times[-1].item())
     after = torch.searchsorted(times, edges.contiguous(), right=True).clamp(1, len(times) - 1)
     before = after - 1

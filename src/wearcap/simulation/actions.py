@@ -142,9 +142,7 @@ def approach(
     return True
 
 
-def follow(
-    plan: Plan, world: World, rng: np.random.Generator, path: np.ndarray, heading: float | None = None
-) -> None:
+def follow(plan: Plan, world: World, rng: np.random.Generator, path: np.ndarray, heading: float | None = None) -> None:
     """Walk along a path that `World.plan_path` found and turn to a heading (rad) at its end."""
     start = plan.time
     if path_length(path) > 0.25:

@@ -62,9 +62,7 @@ def arm_motion(
     at_shoulder = girdle.at_shoulder
 
     R_upper = R_world_chest @ R_swing
-    wrist = _rotate(
-        R_upper, lower + _rotate(rotation.exp(bend[:, None] * hinge), forearm.expand(len(times), 3))
-    )
+    wrist = _rotate(R_upper, lower + _rotate(rotation.exp(bend[:, None] * hinge), forearm.expand(len(times), 3)))
     mirror = torch.tensor([1.0, sign, 1.0], dtype=torch.float64)
     posed = torch.from_numpy(pose[:, :3].copy()) * mirror * length
     out = elbow_pole(torch.from_numpy(pose[:, 3].copy()), sign)
@@ -76,9 +74,7 @@ def arm_motion(
     grips = _gripped(plan, side, bones, chest, at_shoulder, times, fps)
     for part, share, taken in grips:
         wrist[part] += share[:, None] * (taken.wrist - at_shoulder[part] - wrist[part])
-        pole[part] += share[:, None] * (
-            _rotate(R_world_chest[part], elbow_pole(taken.swivel, sign)) - pole[part]
-        )
+        pole[part] += share[:, None] * (_rotate(R_world_chest[part], elbow_pole(taken.swivel, sign)) - pole[part])
     R_shoulder, flexion = two_bone(lower, forearm, hinge, _shy_of_shoulder(wrist, length), pole)
 
     relaxed = wander(rng, len(times), 3, 3.0, 0.05, fps)
@@ -125,18 +121,11 @@ class Girdle:
 
 
 def shoulder_girdle(
-    plan: Plan,
-    side: str,
-    trunk: Trunk,
-    chest: Rigid,
-    goal: Float[Tensor, "time 3"],
-    weight: Float[Tensor, "time"],
+    plan: Plan, side: str, trunk: Trunk, chest: Rigid, goal: Float[Tensor, "time 3"], weight: Float[Tensor, "time"]
 ) -> Girdle:
     """The shoulder girdle; the shoulder follows a hand that is drawn to a goal in the world."""
     skeleton = plan.skeleton
-    collar, shoulder = skeleton.t_parent_joint[
-        skeleton.indices(f"{side}_collar", f"{side}_shoulder")
-    ].double()
+    collar, shoulder = skeleton.t_parent_joint[skeleton.indices(f"{side}_collar", f"{side}_shoulder")].double()
     at_collar = chest.t + (chest.R @ collar)
     in_chest = _rotate(chest.R.transpose(-1, -2), goal - at_collar) - shoulder
     length = arm_bones(skeleton, side).length
@@ -205,13 +194,7 @@ def _rotate(R: Tensor, vector: Tensor) -> Tensor:
 
 
 def _swing(
-    plan: Plan,
-    sign: float,
-    trunk: Trunk,
-    running: np.ndarray,
-    times: np.ndarray,
-    fps: float,
-    rng: np.random.Generator,
+    plan: Plan, sign: float, trunk: Trunk, running: np.ndarray, times: np.ndarray, fps: float, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
     """Rotation of the hanging upper arm in the chest, and the elbow's bend (rad)."""
     style = plan.style

@@ -12,20 +12,30 @@ from wearcap.recording.motion import Motion
 from wearcap.simulation.outline import turn
 
 _MIDDLE = (
-    ("pelvis", "l3", 0.14, 0.17, "seat"), ("l3", "t8", 0.13, 0.14, "trunk"), ("t8", "neck", 0.12, 0.124, "trunk"),
-    ("neck", "head", 0.07, 0.01, "trunk"), ("head", "crown", 0.10, 0.06, "trunk"),
-    ("left_hip", "right_hip", 0.11, 0.0, "seat"), ("left_shoulder", "right_shoulder", 0.07, 0.0, "trunk"),
-)  # fmt: skip
+    ("pelvis", "l3", 0.14, 0.17, "seat"),
+    ("l3", "t8", 0.13, 0.14, "trunk"),
+    ("t8", "neck", 0.12, 0.124, "trunk"),
+    ("neck", "head", 0.07, 0.01, "trunk"),
+    ("head", "crown", 0.10, 0.06, "trunk"),
+    ("left_hip", "right_hip", 0.11, 0.0, "seat"),
+    ("left_shoulder", "right_shoulder", 0.07, 0.0, "trunk"),
+)
 _SIDE = (
-    ("hip", "knee", 0.08, 0.14, "seat"), ("knee", "ankle", 0.05, 0.045, "shin"), ("heel", "toe_tip", 0.03, 0.014, "foot"),
-    ("shoulder", "elbow", 0.055, 0.027, "arm"), ("elbow", "wrist", 0.045, 0.016, "arm"),
+    ("hip", "knee", 0.08, 0.14, "seat"),
+    ("knee", "ankle", 0.05, 0.045, "shin"),
+    ("heel", "toe_tip", 0.03, 0.014, "foot"),
+    ("shoulder", "elbow", 0.055, 0.027, "arm"),
+    ("elbow", "wrist", 0.045, 0.016, "arm"),
     ("wrist", "fingertip", 0.035, 0.006, "hand"),
-)  # fmt: skip
+)
 LIMBS: tuple[tuple[str, str, float, float, str], ...] = (
     *_MIDDLE,
-    *((f"{side}_{a}", f"{side}_{b}", radius, mass, part)
-      for side in ("left", "right") for a, b, radius, mass, part in _SIDE),
-)  # fmt: skip
+    *(
+        (f"{side}_{a}", f"{side}_{b}", radius, mass, part)
+        for side in ("left", "right")
+        for a, b, radius, mass, part in _SIDE
+    ),
+)
 """Capsules of an adult: joint or site at either end, radius (m), share of the body's mass (after de Leva), part."""
 
 PARTS = ("seat", "trunk", "shin", "foot", "arm", "hand")
@@ -144,23 +154,16 @@ class SweptFloor:
         clear = np.full((len(TOPS_M), *shape), np.inf)
         for radius in np.unique(size):
             lowest = np.full(shape, np.inf)
-            np.minimum.at(
-                lowest, tuple(c[size == radius] for c in cell), body.points[size == radius, 2] - radius
-            )
+            np.minimum.at(lowest, tuple(c[size == radius] for c in cell), body.points[size == radius, 2] - radius)
             away, count = np.full(shape, np.inf), 0
             for layer, top in zip(clear, TOPS_M):
                 taken = lowest < top
                 if taken.sum() > count:
-                    away, count = (
-                        np.asarray(scipy.ndimage.distance_transform_edt(~taken)) * CELL_M,
-                        taken.sum(),
-                    )
+                    away, count = (np.asarray(scipy.ndimage.distance_transform_edt(~taken)) * CELL_M, taken.sum())
                 np.minimum(layer, away - radius - _CELL_ERROR_M, out=layer)
         return cls(origin, clear)
 
-    def distance(
-        self, center: tuple[float, float], size: tuple[float, float], heading: float, top: float
-    ) -> float:
+    def distance(self, center: tuple[float, float], size: tuple[float, float], heading: float, top: float) -> float:
         """Distance from a rectangle up to a height (m) to the nearest part of the body; never too large."""
         rows, columns = (np.linspace(-0.5, 0.5, max(2, int(np.ceil(s / CELL_M)) + 1)) * s for s in size)
         points = np.stack(np.meshgrid(rows, columns), -1).reshape(-1, 2) @ turn(heading).T + np.array(center)

@@ -43,9 +43,7 @@ class Piece:
     """Points a hand reaches for from the front."""
 
 
-def hue(
-    rng: np.random.Generator, saturation: tuple[float, float] = (0.15, 0.7)
-) -> tuple[float, float, float]:
+def hue(rng: np.random.Generator, saturation: tuple[float, float] = (0.15, 0.7)) -> tuple[float, float, float]:
     """A random RGB colour (0…1) of medium brightness."""
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(0.45, 0.9))
 
@@ -79,14 +77,10 @@ class WorldBuilder:
     def from_world(self, points_xy: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         return (points_xy - np.array(self.shift)) @ turn(self.heading)
 
-    def add_triangles(
-        self, vertices: np.ndarray, faces: np.ndarray, color, texture: float, item: int = -1
-    ) -> None:
+    def add_triangles(self, vertices: np.ndarray, faces: np.ndarray, color, texture: float, item: int = -1) -> None:
         self._triangles.append((self.to_world(vertices), faces, color, texture, item))
 
-    def add_box(
-        self, center, size, color, texture: float = 6.0, heading: float = 0.0, item: int = -1, sides=4
-    ):
+    def add_box(self, center, size, color, texture: float = 6.0, heading: float = 0.0, item: int = -1, sides=4):
         """A box, or a column of `sides` sides, around `center` (m)."""
         if sides == 4:
             ring = rectangle(center[:2], size[:2], heading)
@@ -97,22 +91,12 @@ class WorldBuilder:
         vertices = np.concatenate([np.concatenate([ring, low], 1), np.concatenate([ring, high], 1)])
         self.add_triangles(vertices, _BOX_FACES if sides == 4 else _prism_faces(sides), color, texture, item)
 
-    def add_prism(
-        self, vertices: Float[np.ndarray, "corner 3"], color, texture: float, item: int = -1
-    ) -> None:
+    def add_prism(self, vertices: Float[np.ndarray, "corner 3"], color, texture: float, item: int = -1) -> None:
         """A solid between a lower ring of corners and the upper one that follows it, both counter-clockwise."""
         self.add_triangles(vertices, _prism_faces(len(vertices) // 2), color, texture, item)
 
     def add_surface(
-        self,
-        kind: str,
-        polygon,
-        color,
-        *,
-        plane=(0.0, 0.0, 0.0),
-        level: int = 0,
-        texture: float = 1.0,
-        thickness=0.0,
+        self, kind: str, polygon, color, *, plane=(0.0, 0.0, 0.0), level: int = 0, texture: float = 1.0, thickness=0.0
     ) -> None:
         """Add a walkable surface, as a Surface and as a slab of the given thickness (m)."""
         polygon = np.asarray(polygon, dtype=np.float64)
@@ -130,16 +114,20 @@ class WorldBuilder:
         plane_world = (float(gradient[0]), float(gradient[1]), float(offset))
         self.surfaces.append(w.Surface(kind, self.to_world(polygon), plane_world, level))
 
-    def add_object(
-        self, kind: str, outline, z_range: tuple[float, float], position, heading: float = 0.0
-    ) -> int:
+    def add_object(self, kind: str, outline, z_range: tuple[float, float], position, heading: float = 0.0) -> int:
         """Add an obstacle without triangles; returns its index for `add_box(item=…)`."""
         place = self.to_world(np.asarray(position))
         number = len(self.objects)
         self.objects.append(
-            w.WorldObject(f"{kind}_{number:03d}", kind, self.to_world(outline), z_range,
-                          tuple(place.tolist()), self.heading + heading)
-        )  # fmt: skip
+            w.WorldObject(
+                f"{kind}_{number:03d}",
+                kind,
+                self.to_world(outline),
+                z_range,
+                tuple(place.tolist()),
+                self.heading + heading,
+            )
+        )
         return number
 
     def add_block(self, kind: str, center, size, color, texture: float = 6.0, heading: float = 0.0) -> int:
@@ -163,15 +151,14 @@ class WorldBuilder:
             self.add_box(center, part.size, part.color, part.texture, heading, item, part.sides)
         for seat_x, seat_y, height, seat_heading, depth in piece.seats:
             spot = self.to_world(np.array([*(about @ np.array([seat_x, seat_y]) + (x, y)), z + height]))
-            self.seats.append(
-                w.Seat(tuple(spot.tolist()), self.heading + heading + seat_heading, height, depth)
-            )
+            self.seats.append(w.Seat(tuple(spot.tolist()), self.heading + heading + seat_heading, height, depth))
         for reach in piece.reaches:
             front = piece.size[0] / 2 + 0.33
             self.add_reach(
                 (*(about @ np.array(reach[:2]) + (x, y)), z + reach[2]),
-                (*(about @ np.array([front, reach[1]]) + (x, y)), z), heading + np.pi,
-            )  # fmt: skip
+                (*(about @ np.array([front, reach[1]]) + (x, y)), z),
+                heading + np.pi,
+            )
         return item
 
     def add_reach(self, position, stand, heading: float) -> None:
@@ -198,11 +185,21 @@ class WorldBuilder:
             np.repeat(np.array([t[2] for t in self._triangles], np.float32), counts, axis=0),
         )
         return w.World(
-            self.name, mesh, np.repeat([t[4] for t in self._triangles], face_counts),
+            self.name,
+            mesh,
+            np.repeat([t[4] for t in self._triangles], face_counts),
             np.repeat(np.array([t[3] for t in self._triangles], np.float64), face_counts),
-            tuple(self.objects), tuple(self.surfaces), seats, reaches, tuple(self.flights), tuple(self.rooms),
-            tuple(self.doors), cell, self.outdoors, tuple(self.spots),
-        )  # fmt: skip
+            tuple(self.objects),
+            tuple(self.surfaces),
+            seats,
+            reaches,
+            tuple(self.flights),
+            tuple(self.rooms),
+            tuple(self.doors),
+            cell,
+            self.outdoors,
+            tuple(self.spots),
+        )
 
 
 def piece_mesh(piece: Piece) -> Mesh:
@@ -217,16 +214,15 @@ def piece_mesh(piece: Piece) -> Mesh:
         colors.append(np.tile(np.array(color), (len(corners), 1)))
         start += len(corners)
     return Mesh(
-        np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32),
+        np.concatenate(vertices).astype(np.float32),
+        np.concatenate(faces).astype(np.int32),
         np.concatenate(colors).astype(np.float32),
-    )  # fmt: skip
+    )
 
 
 def _reachable(world: w.World, point: np.ndarray, within_m: float) -> bool:
     node = world.navigation.nearest_node(point)
-    return node is not None and bool(
-        np.linalg.norm(world.navigation.node_points[node][:2] - point[:2]) < within_m
-    )
+    return node is not None and bool(np.linalg.norm(world.navigation.node_points[node][:2] - point[:2]) < within_m)
 
 
 def _prism_faces(sides: int) -> np.ndarray:

@@ -102,26 +102,35 @@ def simulate_calibration(
     rng = np.random.default_rng(seed)
     tops = SWINGS_S + 0.8 + np.cumsum(rng.normal(1.35, 0.12, swings).clip(1.0, 1.7))
     end = tops[-1] + 3 + walk_s
-    watches = {joint: _watch(joint, tops, watch_fps, end, noise, rng) for joint in ("left_wrist", "right_wrist")}  # fmt: skip
+    watches = {joint: _watch(joint, tops, watch_fps, end, noise, rng) for joint in ("left_wrist", "right_wrist")}
     scale = float(np.exp(rng.normal(0.7, 0.8)))
     R_world_slam, t_world_slam = _turn(rng, math.pi), torch.from_numpy(rng.normal(0, 2, 3))
     pitch = rotation.about_axis("x", torch.tensor(-math.radians(rng.uniform(5, 25)), dtype=torch.float64))
     R_head_cam = R_DEVICE_CAM.double() @ pitch @ _turn(rng, math.radians(4))
-    distances, height = (float(rng.uniform(0.4, 0.7)), float(rng.uniform(0.4, 0.7))), float(rng.uniform(0.7, 1.0))  # fmt: skip
+    distances, height = (float(rng.uniform(0.4, 0.7)), float(rng.uniform(0.4, 0.7))), float(rng.uniform(0.7, 1.0))
     T_world_cam = _camera_path(R_head_cam, distances, height, end, _FINER * camera_fps, noise, rng)
     slam = _seen(T_world_cam[::_FINER], scale, R_world_slam, t_world_slam, camera_fps, noise, rng)
     upright = (T_world_cam.timestamps >= STANDING[0]) & (T_world_cam.timestamps <= STANDING[1])
     points = (_floor_and_objects(rng) - t_world_slam) @ R_world_slam / scale
     return CalibrationSession(
-        {joint: made[0] for joint, made in watches.items()}, slam, _head_imu(T_world_cam, watch_fps, noise, rng),
-        points.float(), torch.from_numpy(np.round(tops * camera_fps) / camera_fps), distances, height,
+        {joint: made[0] for joint, made in watches.items()},
+        slam,
+        _head_imu(T_world_cam, watch_fps, noise, rng),
+        points.float(),
+        torch.from_numpy(np.round(tops * camera_fps) / camera_fps),
+        distances,
+        height,
         T_world_cam.t_world_body[upright, 2].mean().item(),
-        {joint: made[1] for joint, made in watches.items()}, {joint: made[2] for joint, made in watches.items()},
-        R_world_slam, t_world_slam, scale, R_head_cam,
+        {joint: made[1] for joint, made in watches.items()},
+        {joint: made[2] for joint, made in watches.items()},
+        R_world_slam,
+        t_world_slam,
+        scale,
+        R_head_cam,
         {joint: -made[3](SWINGS_S) + SWINGS_S for joint, made in watches.items()},
         {joint: (made[3](BOARD[0]), made[3](BOARD[1])) for joint, made in watches.items()},
         {joint: (made[3](T_POSE[0]), made[3](T_POSE[1])) for joint, made in watches.items()},
-    )  # fmt: skip
+    )
 
 
 def _turn(rng: np.random.Generator, angle: float) -> Float64[Tensor, "3 3"]:
@@ -165,9 +174,7 @@ def _elevation(time: np.ndarray, tops: np.ndarray, rng: np.random.Generator) -> 
     return -np.pi / 2 + (high + np.pi / 2) * 0.5 * (1 - np.cos(np.pi * phase))
 
 
-def _arm(
-    joint: str, tops: np.ndarray, time: np.ndarray, noise: SessionNoise, rng: np.random.Generator
-) -> Tensor:
+def _arm(joint: str, tops: np.ndarray, time: np.ndarray, noise: SessionNoise, rng: np.random.Generator) -> Tensor:
     """R_world_joint of a wrist: T-pose, hanging, swinging, hanging while walking with a swing of 20°."""
     side = 1.0 if joint.startswith("left") else -1.0
     fps = 1 / (time[1] - time[0])
@@ -188,7 +195,9 @@ def _watch(
     """A watch's log, R_world_ref, R_joint_imu, and what its clock shows at a true time."""
     time = np.arange(0, end, 1 / fps)
     crown = 90.0 if joint.startswith("left") or rng.random() < 0.5 else -90.0
-    R_joint_imu = rotation.about_axis("z", torch.tensor(math.radians(crown), dtype=torch.float64)) @ _turn(rng, math.radians(8))  # fmt: skip
+    R_joint_imu = rotation.about_axis("z", torch.tensor(math.radians(crown), dtype=torch.float64)) @ _turn(
+        rng, math.radians(8)
+    )
     R_world_ref = rotation.about_axis("z", torch.tensor(rng.uniform(-math.pi, math.pi), dtype=torch.float64))
     R_world_joint = _arm(joint, tops, time, noise, rng)
     onto = np.array([0.0, BOARD[1] + _MARGIN_S]), (T_POSE[0] - _MARGIN_S, np.inf)
@@ -201,10 +210,7 @@ def _watch(
     reach = torch.tensor([0.0, 0.55 * side, 0.0], dtype=torch.float64)
     position = (R_world_joint @ reach) * torch.from_numpy(worn)[:, None]
     stream = _logged(time, joint, R_world_imu, position, R_world_ref, noise, rng)
-    offset, rate = (
-        rng.uniform(-1, 1) * noise.clock_offset_s,
-        1 + 1e-6 * noise.clock_ppm * rng.standard_normal(),
-    )
+    offset, rate = (rng.uniform(-1, 1) * noise.clock_offset_s, 1 + 1e-6 * noise.clock_ppm * rng.standard_normal())
 
     def clock(true_s: float) -> float:
         return 1.7e9 + offset + rate * true_s
@@ -215,8 +221,14 @@ def _watch(
 
 
 def _logged(
-    time: np.ndarray, joint: str, R_world_imu: Tensor, position: Tensor, R_world_ref: Tensor, noise: SessionNoise, rng: np.random.Generator
-) -> ImuStream:  # fmt: skip
+    time: np.ndarray,
+    joint: str,
+    R_world_imu: Tensor,
+    position: Tensor,
+    R_world_ref: Tensor,
+    noise: SessionNoise,
+    rng: np.random.Generator,
+) -> ImuStream:
     """Core Motion's log in its reference frame: attitude that errs more when moved, and the measured acceleration."""
     fps = 1 / (time[1] - time[0])
     R, times = R_world_imu, torch.from_numpy(time)
@@ -230,36 +242,49 @@ def _logged(
     # Slower than 0.2 rad/s on average counts as rest for the filter.
     moved = torch.from_numpy((turning - 0.2).clip(0, 1))
     error = noise.still_deg * smooth_noise(rng, len(time), 3, noise.still_period_s, fps).double()
-    error += (
-        noise.moving_deg
-        * smooth_noise(rng, len(time), 3, noise.moving_period_s, fps).double()
-        * moved[:, None]
-    )
+    error += noise.moving_deg * smooth_noise(rng, len(time), 3, noise.moving_period_s, fps).double() * moved[:, None]
     R_ref_imu = R_world_ref.mT @ R @ rotation.exp(torch.deg2rad(error) / np.sqrt(3))
     acc_ref = (R_ref_imu @ felt[..., None])[..., 0] - up
     return ImuStream(times, joint, R_ref_imu.float(), acc_ref.float(), felt.float(), rate.float())
 
 
 def _camera_path(
-    R_head_cam: Tensor, distances: tuple[float, float], height: float, end: float, fps: float, noise: SessionNoise, rng: np.random.Generator
-) -> Trajectory:  # fmt: skip
+    R_head_cam: Tensor,
+    distances: tuple[float, float],
+    height: float,
+    end: float,
+    fps: float,
+    noise: SessionNoise,
+    rng: np.random.Generator,
+) -> Trajectory:
     """True poses of the camera: on the board's four positions, then on the head of someone who stands and walks."""
     time = np.arange(0, end, 1 / fps)
     first = rng.uniform(0.05, 0.15, 2)
-    marks = [[0, first[0], height], [0, first[0] + distances[0], height], [first[1], 0, height], [first[1] + distances[1], 0, height]]  # fmt: skip
+    marks = [
+        [0, first[0], height],
+        [0, first[0] + distances[0], height],
+        [first[1], 0, height],
+        [first[1] + distances[1], 0, height],
+    ]
     head_t = torch.tensor([-0.4, -0.9, rng.uniform(1.45, 1.65)], dtype=torch.float64)
     sway = _centred(smooth_noise(rng, len(time), 6, 2.5, fps).double(), time, STANDING)
     R_head, t_head = _walk(time, end, head_t, rng)
     R_head = R_head @ rotation.exp(sway[:, :3] * np.deg2rad(noise.sway_deg) / np.sqrt(3))
-    T_world_cam = Rigid(R_head, t_head + 0.004 * sway[:, 3:]) @ Rigid(R_head_cam, torch.tensor([0.09, 0.0, 0.09]).double())  # fmt: skip
+    T_world_cam = Rigid(R_head, t_head + 0.004 * sway[:, 3:]) @ Rigid(
+        R_head_cam, torch.tensor([0.09, 0.0, 0.09]).double()
+    )
     on_board = _FACING @ R_DEVICE_CAM.double() @ _turn(rng, math.radians(5))
     turned = [on_board @ rotation.about_axis("y", torch.tensor(a).double()) for a in (0.0, 0.5, 0.1, 0.6)]
     holds = [(a - _MARGIN_S, b + _MARGIN_S) for a, b in MARKS]
     place = _held(time, [*holds, (MARKS[-1][1] + 4, np.inf)])
     R = _between(torch.stack([*turned, T_world_cam.R[0]]), place)
-    t = torch.stack([torch.from_numpy(np.interp(place, range(5), column)) for column in zip(*marks, T_world_cam.t[0].tolist())], -1)  # fmt: skip
+    t = torch.stack(
+        [torch.from_numpy(np.interp(place, range(5), column)) for column in zip(*marks, T_world_cam.t[0].tolist())], -1
+    )
     worn = torch.from_numpy(time >= MARKS[-1][1] + 4)[:, None]
-    return Trajectory(torch.from_numpy(time), torch.where(worn[..., None], T_world_cam.R, R), torch.where(worn, T_world_cam.t, t))  # fmt: skip
+    return Trajectory(
+        torch.from_numpy(time), torch.where(worn[..., None], T_world_cam.R, R), torch.where(worn, T_world_cam.t, t)
+    )
 
 
 def _walk(time: np.ndarray, end: float, standing: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
@@ -275,19 +300,27 @@ def _walk(time: np.ndarray, end: float, standing: Tensor, rng: np.random.Generat
     stride = 2 * np.pi * (0.95 * along)
     bob = 0.022 * np.sin(2 * stride + rng.uniform(0, 6)) * walking
     lateral = 0.02 * np.sin(stride) * walking
-    t = np.stack([ground[:, 0] - lateral * np.sin(heading), ground[:, 1] + lateral * np.cos(heading), bob], -1)  # fmt: skip
+    t = np.stack([ground[:, 0] - lateral * np.sin(heading), ground[:, 1] + lateral * np.cos(heading), bob], -1)
     fps = 1 / (time[1] - time[0])
-    look = (
-        smooth_noise(rng, len(time), 3, 3.0, fps).double().numpy() * walking[:, None] * np.deg2rad([4, 9, 16])
-    )
+    look = smooth_noise(rng, len(time), 3, 3.0, fps).double().numpy() * walking[:, None] * np.deg2rad([4, 9, 16])
     R = rotation.about_axis("z", torch.from_numpy(heading + look[:, 2]))
-    R = R @ rotation.about_axis("y", torch.from_numpy(look[:, 1])) @ rotation.about_axis("x", torch.from_numpy(look[:, 0]))  # fmt: skip
+    R = (
+        R
+        @ rotation.about_axis("y", torch.from_numpy(look[:, 1]))
+        @ rotation.about_axis("x", torch.from_numpy(look[:, 0]))
+    )
     return R, standing + torch.from_numpy(t)
 
 
 def _seen(
-    T: Trajectory, scale: float, R_world_slam: Tensor, t_world_slam: Tensor, fps: float, noise: SessionNoise, rng: np.random.Generator
-) -> Trajectory:  # fmt: skip
+    T: Trajectory,
+    scale: float,
+    R_world_slam: Tensor,
+    t_world_slam: Tensor,
+    fps: float,
+    noise: SessionNoise,
+    rng: np.random.Generator,
+) -> Trajectory:
     """The path as a monocular SLAM reports it."""
     jitter = smooth_noise(rng, len(T), 6, noise.jitter_period_s, fps).double()
     R = T.R_world_body @ rotation.exp(np.deg2rad(noise.jitter_deg) * jitter[:, :3])

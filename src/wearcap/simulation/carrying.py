@@ -65,9 +65,7 @@ class Carry(Errand):
 
     def _before(self, pose: np.ndarray) -> np.ndarray:
         heading = pose[2] + self.facing
-        return np.array(
-            [pose[0] - self.away * np.cos(heading), pose[1] - self.away * np.sin(heading), heading]
-        )
+        return np.array([pose[0] - self.away * np.cos(heading), pose[1] - self.away * np.sin(heading), heading])
 
     def palm_height(self, pose: Float[np.ndarray, "4"]) -> float:
         """Height of the palms on a box at a pose (m)."""
@@ -87,11 +85,7 @@ class Lifted:
 
 
 def carry_options(
-    plan: Plan,
-    movable: Movable,
-    start: Float[np.ndarray, "4"],
-    stop: Float[np.ndarray, "4"],
-    rng: np.random.Generator,
+    plan: Plan, movable: Movable, start: Float[np.ndarray, "4"], stop: Float[np.ndarray, "4"], rng: np.random.Generator
 ) -> Iterator[Carry]:
     """Options for carrying a box between two poses (x, y, heading, underside height; m, rad), in random order.
 
@@ -110,9 +104,7 @@ def carry_options(
         }
         below = float(rng.uniform(*BELOW_CHEST)) * plan.hip_height
         chest = np.array([deep + rng.uniform(*BEFORE_CHEST_M), below + left.point[2]])
-        away = (
-            plan.sole[1] + 0.08 + 0.2 * max(movable.height - 0.25, 0.0) + deep + float(rng.uniform(0.0, 0.06))
-        )
+        away = plan.sole[1] + 0.08 + 0.2 * max(movable.height - 0.25, 0.0) + deep + float(rng.uniform(0.0, 0.06))
         yield Carry(movable, start, stop, places, facing, away, chest)
 
 
@@ -132,9 +124,7 @@ def lift(plan: Plan, choice: Carry, rng: np.random.Generator) -> Lifted:
     rise = float((0.9 + 1.2 * bend) * rng.uniform(0.9, 1.3) / plan.style.briskness)
     bow(plan, start, touch, bend, lean)
     spread(plan, (start, start + 0.45 * down), (touch, begin + rise))
-    plan.gaze_point.move(
-        start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.movable.height)
-    )
+    plan.gaze_point.move(start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.movable.height))
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(begin + 0.3 * rise, begin + rise, 0.0)
     bow(plan, begin, begin + rise, 0.0, float(rng.normal(-0.04, 0.03)))
@@ -162,10 +152,14 @@ def put_down(plan: Plan, lifted: Lifted, rng: np.random.Generator) -> Handling:
     for side in SIDES:
         late = float(rng.uniform(0.0, 0.12)) if rng.random() < 0.5 else 0.0
         grip = Grip(
-            choice.places[side], moves, lifted.touch_s, release + late,
-            lifted.touch_s - lifted.start_s, float(np.clip(0.7 * rise, 0.4, 1.1)),
+            choice.places[side],
+            moves,
+            lifted.touch_s,
+            release + late,
+            lifted.touch_s - lifted.start_s,
+            float(np.clip(0.7 * rise, 0.4, 1.1)),
             float(rng.uniform(0.15, 0.22)),
-        )  # fmt: skip
+        )
         plan.grip(side, grip)
         grips.append((side, grip))
     plan.time = release + rise + float(rng.uniform(0.0, 0.3))

@@ -8,9 +8,20 @@ from wearcap.simulation.outline import turn
 from wearcap.simulation.world import World
 
 MOVABLE = (
-    "chair", "armchair", "plant", "lamp", "board", "bin", "bench", "coffee_table", "table", "desk", "cabinet", "sofa",
+    "chair",
+    "armchair",
+    "plant",
+    "lamp",
+    "board",
+    "bin",
+    "bench",
+    "coffee_table",
+    "table",
+    "desk",
+    "cabinet",
+    "sofa",
     "planter",
-)  # fmt: skip
+)
 
 
 def changed_world(
@@ -40,9 +51,12 @@ def changed_world(
         )
     mesh = replace(world.mesh, vertices=vertices, faces=world.mesh.faces[kept])
     return replace(
-        world, mesh=mesh, face_object=world.face_object[kept], face_texture=world.face_texture[kept],
+        world,
+        mesh=mesh,
+        face_object=world.face_object[kept],
+        face_texture=world.face_texture[kept],
         objects=tuple(objects),
-    )  # fmt: skip
+    )
 
 
 def _beside_spot(world: World, position: tuple[float, float, float]) -> bool:

@@ -78,11 +78,7 @@ def forearm_and_wrist(
 
 
 def take(
-    bones: ArmBones,
-    hold: Hold,
-    R_world_chest: Float[Tensor, "time 3 3"],
-    shoulder: Float[Tensor, "time 3"],
-    fps: float,
+    bones: ArmBones, hold: Hold, R_world_chest: Float[Tensor, "time 3 3"], shoulder: Float[Tensor, "time 3"], fps: float
 ) -> ArmPosture:
     """Choose elbow swivel and hand yaw over time: the softly least strained of a grid of both, smooth in time."""
     count = len(shoulder)
@@ -106,9 +102,7 @@ def _strain(
     wrist = hold.palm - hand @ bones.palm - shoulder
     pole = (R_world_chest @ elbow_pole(swivel, bones.sign)[..., None])[..., 0]
     shape = swivel.shape
-    R_upper, flexion = two_bone(
-        bones.upper, bones.fore, bones.hinge, wrist.reshape(-1, 3), pole.reshape(-1, 3)
-    )
+    R_upper, flexion = two_bone(bones.upper, bones.fore, bones.hinge, wrist.reshape(-1, 3), pole.reshape(-1, 3))
     R_forearm = (R_upper @ rotation.exp(flexion[:, None] * bones.hinge)).reshape(*shape, 3, 3)
     turn, bend = forearm_and_wrist(R_forearm, hand, bones.axis)
     parts = {"twist": turn, "flexion": bend[..., 0], "deviation": bend[..., 2]}

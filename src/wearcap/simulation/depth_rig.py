@@ -66,12 +66,7 @@ def look_at(position: Float[np.ndarray, "*batch 3"], target: Float[np.ndarray, "
 
 
 def place_rig(
-    world: World,
-    spot: Float[np.ndarray, "3"],
-    *,
-    radius_m: float = 2.4,
-    height_m: float = 1.8,
-    count: int = 3,
+    world: World, spot: Float[np.ndarray, "3"], *, radius_m: float = 2.4, height_m: float = 1.8, count: int = 3
 ) -> Rigid:
     """Poses "camera" of tripods around a floor point, evenly turned, that see a person there from all sides.
 
@@ -88,8 +83,10 @@ def place_rig(
     worst = np.min([np.roll(room, -k * apart) for k in range(count)], 0)
     first = int(worst.argmax())
     if worst[first] < _NEAREST_M:
-        raise WearcapError(f"no room for {count} cameras around {np.round(spot, 2).tolist()}",
-                           expected="a spot with 1.6 m of free floor on all sides")  # fmt: skip
+        raise WearcapError(
+            f"no room for {count} cameras around {np.round(spot, 2).tolist()}",
+            expected="a spot with 1.6 m of free floor on all sides",
+        )
     chosen = first + apart * np.arange(count)
     distance = room[chosen % len(turn)]
     feet, crown = np.arctan2(-height_m, distance), np.arctan2(_TALLEST_M - height_m, distance)
@@ -99,15 +96,12 @@ def place_rig(
     return look_at(position, aim)
 
 
-def approximate(
-    poses: Rigid, rng: np.random.Generator, translation_m: float = 0.1, rotation_deg: float = 3.0
-) -> Rigid:
+def approximate(poses: Rigid, rng: np.random.Generator, translation_m: float = 0.1, rotation_deg: float = 3.0) -> Rigid:
     """Poses with errors of the size that visual localisation leaves, each in a random direction."""
     shift, axis = (torch.from_numpy(rng.standard_normal(poses.t.shape)) for _ in range(2))
     unit = [part / part.norm(dim=-1, keepdim=True) for part in (shift, axis)]
     return Rigid(
-        exp(np.deg2rad(rotation_deg) * unit[1]).to(poses.R) @ poses.R,
-        poses.t + translation_m * unit[0].to(poses.t),
+        exp(np.deg2rad(rotation_deg) * unit[1]).to(poses.R) @ poses.R, poses.t + translation_m * unit[0].to(poses.t)
     )
 
 

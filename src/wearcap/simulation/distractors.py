@@ -22,11 +22,7 @@ LOW_M, HOVER_LOW_M = 0.60, 0.18
 
 
 def hover(
-    plan: Plan,
-    places: dict[str, GripPlace],
-    T_world_object: Rigid,
-    rng: np.random.Generator,
-    gaze: bool = True,
+    plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, rng: np.random.Generator, gaze: bool = True
 ) -> None:
     """Reach for places on an object as if to take hold, stop short of them, stay a while, and draw back.
 
@@ -43,11 +39,7 @@ def hover(
     lean = lean or float(np.clip(rng.normal(0.2, 0.1), 0.0, 0.5))
     stop = leave
     for side, place in places.items():
-        point = (
-            np.array(place.point)
-            + gap * np.array(place.normal)
-            - rng.uniform(0.0, 0.05) * np.array(place.fingers)
-        )
+        point = np.array(place.point) + gap * np.array(place.normal) - rng.uniform(0.0, 0.05) * np.array(place.fingers)
         x, y, z = (float(v) for v in point + 0.02 * rng.standard_normal(3))
         late = float(rng.uniform(0.0, 0.3))
         grip = drawn_grip(
@@ -146,9 +138,7 @@ def linger(plan: Plan, rng: np.random.Generator) -> None:
     plan.time = stop
 
 
-def _look(
-    plan: Plan, T_world_object: Rigid, local: tuple[float, float, float], start: float, stop: float
-) -> None:
+def _look(plan: Plan, T_world_object: Rigid, local: tuple[float, float, float], start: float, stop: float) -> None:
     point = T_world_object.R.double().numpy() @ np.array(local) + T_world_object.t.double().numpy()
     plan.gaze_point.move(start, start, point)
     plan.gaze_weight.move(start, start + 0.5, 0.85)

@@ -15,9 +15,16 @@ from wearcap.simulation.builder import hue
 _SKIN = np.array([[0.93, 0.76, 0.66], [0.80, 0.58, 0.44], [0.56, 0.36, 0.25], [0.30, 0.19, 0.14]])
 """Skin tones from light to dark."""
 _WORN = {
-    "wrist": "skin", "elbow": "forearm", "shoulder": "sleeve", "collar": "shirt", "hip": "trousers",
-    "knee": "shin", "ankle": "shoe", "toe": "shoe", "pelvis": "trousers",
-}  # fmt: skip
+    "wrist": "skin",
+    "elbow": "forearm",
+    "shoulder": "sleeve",
+    "collar": "shirt",
+    "hip": "trousers",
+    "knee": "shin",
+    "ankle": "shoe",
+    "toe": "shoe",
+    "pelvis": "trousers",
+}
 """Clothing of the body part that follows each joint; the shirt covers all others."""
 _MOTTLE = 0.06
 """Deviation of the colour from vertex to vertex, as a share: folds and veins."""
@@ -48,9 +55,13 @@ def ego_body(skeleton: Skeleton, shape: dict[str, float], rng: np.random.Generat
     number = torch.zeros(len(kept), dtype=torch.int64)
     number[vertices] = torch.arange(len(vertices))
     body = replace(
-        whole, rest_vertices=whole.rest_vertices[vertices], faces=number[faces], regions={},
-        skin_joints=whole.skin_joints[vertices], skin_weights=whole.skin_weights[vertices],
-    )  # fmt: skip
+        whole,
+        rest_vertices=whole.rest_vertices[vertices],
+        faces=number[faces],
+        regions={},
+        skin_joints=whole.skin_joints[vertices],
+        skin_weights=whole.skin_weights[vertices],
+    )
     color = _colors(skeleton, dominant[vertices].numpy(), rng)
     return EgoBody(body, body.faces.numpy().astype(np.int32), color)
 
@@ -63,9 +74,7 @@ def skin_tone(skeleton: Skeleton) -> Float32[np.ndarray, "3"]:
     return (np.array(tone) * own.uniform(0.94, 1.06)).astype(np.float32)
 
 
-def _colors(
-    skeleton: Skeleton, dominant: np.ndarray, rng: np.random.Generator
-) -> Float32[np.ndarray, "vertex 3"]:
+def _colors(skeleton: Skeleton, dominant: np.ndarray, rng: np.random.Generator) -> Float32[np.ndarray, "vertex 3"]:
     skin = skin_tone(skeleton)
     shirt, trousers, shoe = (np.array(hue(rng, (0.0, 0.75))) * rng.uniform(0.25, 1.1) for _ in range(3))
     worn = {"skin": skin, "shirt": shirt, "trousers": trousers, "shoe": shoe}

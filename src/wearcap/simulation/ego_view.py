@@ -54,9 +54,7 @@ class Shot:
         turn, rise = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(35, 75))
         to_light = [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)]
         key = KEY * rng.uniform(0.6, 2.0)
-        light = np.array(
-            [*to_light, key, AMBIENT_BELOW - 0.5 * (key - KEY), AMBIENT_ABOVE - 0.5 * (key - KEY)]
-        )
+        light = np.array([*to_light, key, AMBIENT_BELOW - 0.5 * (key - KEY), AMBIENT_ABOVE - 0.5 * (key - KEY)])
         x, y = np.linspace(-1, 1, EGO_CAMERA.width), np.linspace(-1, 1, EGO_CAMERA.height)[:, None]
         corner = 1 - rng.uniform(0.05, 0.2) * (x**2 + y**2)
         gain = corner[..., None] * np.exp(0.05 * rng.standard_normal(3))
@@ -83,11 +81,10 @@ def write_ego_video(
     every = max(1, round(motion.fps / EGO_FPS)) if len(motion) > 1 else 1
     times = motion.timestamps[::every]
     if len(times) < 2:
-        raise WearcapError(f"a video of {len(times)} frames", where=motion.provenance.get("source"),
-                           expected="two or more")  # fmt: skip
-    stream = CameraStream(
-        times, EGO_CAMERA, *_mount(t_head_device, rng), video=f"{file.parent.name}/{file.name}"
-    )
+        raise WearcapError(
+            f"a video of {len(times)} frames", where=motion.provenance.get("source"), expected="two or more"
+        )
+    stream = CameraStream(times, EGO_CAMERA, *_mount(t_head_device, rng), video=f"{file.parent.name}/{file.name}")
     frames = ego_frames(world, motion, shape, stream, rng)
     write_frames(file, frames, motion.fps / every)
     return stream
@@ -127,9 +124,7 @@ def draw_view(
     pose = np.concatenate([R, t[:, None]], 1)
     nearness, index = visible(scenery, R, t, _VIEW)
     own, in_cam = np.full_like(index, -1), (vertices - t) @ R
-    raster.draw_pinhole(
-        in_cam, body.faces, _VIEW.focal, _VIEW.focal, _VIEW.cx, _VIEW.cy, NEAR_M, nearness, own
-    )
+    raster.draw_pinhole(in_cam, body.faces, _VIEW.focal, _VIEW.focal, _VIEW.cx, _VIEW.cy, NEAR_M, nearness, own)
     index[own >= 0] = -1
     picture = _surroundings(scenery, pose, nearness, index, light)
     mine = own >= 0
@@ -166,26 +161,70 @@ def _surroundings(
     face, facing, footprint, distance = np.empty(count, np.int32), *np.empty((3, count), np.float32)
     paint = scenery.paint
     view_kernels.meet_faces(
-        _RAYS, _SLOTS, _REACH, 1.0 / EGO_CAMERA.fx, pose, index.ravel(), nearness.ravel(), paint.frames, SKY, points,
-        face, facing, footprint, distance, out,
-    )  # fmt: skip
+        _RAYS,
+        _SLOTS,
+        _REACH,
+        1.0 / EGO_CAMERA.fx,
+        pose,
+        index.ravel(),
+        nearness.ravel(),
+        paint.frames,
+        SKY,
+        points,
+        face,
+        facing,
+        footprint,
+        distance,
+        out,
+    )
     texture_kernels.color_points(
-        points, face, facing, footprint, paint.frames, paint.extents, paint.colors, paint.materials, paint.seeds,
-        light, out,
-    )  # fmt: skip
+        points,
+        face,
+        facing,
+        footprint,
+        paint.frames,
+        paint.extents,
+        paint.colors,
+        paint.materials,
+        paint.seeds,
+        light,
+        out,
+    )
     return out.reshape(EGO_CAMERA.height, EGO_CAMERA.width, 3)
 
 
 def _lit_body(
     body: EgoBody, in_cam: np.ndarray, pose: np.ndarray, nearness: np.ndarray, own: np.ndarray, light: np.ndarray
-) -> UInt8[np.ndarray, "height width 3"]:  # fmt: skip
+) -> UInt8[np.ndarray, "height width 3"]:
     """Image of the body alone, each face with its own normal, by the renderer's shading."""
     rays = (_RAYS * _REACH[:, None]).reshape(EGO_CAMERA.height, EGO_CAMERA.width, 3)
     none, no_map = np.zeros(len(body.faces), bool), np.zeros((0, 0), np.float32)
     out = np.empty((EGO_CAMERA.height, EGO_CAMERA.width, 3), np.uint8)
     raster.resolve(
-        nearness, own, rays, 1, pose, in_cam, body.faces, body.color, none, none, 255 * body.color, body.faces,
-        body.color, light, np.zeros((6, 4)), 1.0, no_map, no_map, no_map, no_map, 1.0,
-        np.zeros((EGO_CAMERA.height, 3), np.float32), out, np.empty(own.shape, np.float32), np.empty_like(own),
-    )  # fmt: skip
+        nearness,
+        own,
+        rays,
+        1,
+        pose,
+        in_cam,
+        body.faces,
+        body.color,
+        none,
+        none,
+        255 * body.color,
+        body.faces,
+        body.color,
+        light,
+        np.zeros((6, 4)),
+        1.0,
+        no_map,
+        no_map,
+        no_map,
+        no_map,
+        1.0,
+        np.zeros((EGO_CAMERA.height, 3), np.float32),
+        out,
+        np.empty(own.shape, np.float32),
+        np.empty_like(own),
+    )
     return out

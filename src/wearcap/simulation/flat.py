@@ -42,9 +42,11 @@ def build_flat(rng: np.random.Generator, name: str, stairs: bool | None = None) 
 
 
 def lay_out(
-    builder: WorldBuilder, rng: np.random.Generator, stairs: bool,
+    builder: WorldBuilder,
+    rng: np.random.Generator,
+    stairs: bool,
     furnish: Callable[[Plan, str, np.random.Generator], None] = Plan.furnish,
-) -> None:  # fmt: skip
+) -> None:
     """Build walls and floors, and furnish each room by its kind (`ROOM_KINDS`)."""
     layout = _draw_layout(rng, stairs)
     hall = (0.0, layout.hall[0], layout.width, layout.hall[1])
@@ -77,9 +79,14 @@ def _split(rng: np.random.Generator, width: float, count: int, low: float, high:
 
 
 def _build_storey(
-    builder: WorldBuilder, layout: Layout, level: int, z: float, hall: list[Box],
-    rng: np.random.Generator, furnish: Callable[[Plan, str, np.random.Generator], None],
-) -> None:  # fmt: skip
+    builder: WorldBuilder,
+    layout: Layout,
+    level: int,
+    z: float,
+    hall: list[Box],
+    rng: np.random.Generator,
+    furnish: Callable[[Plan, str, np.random.Generator], None],
+) -> None:
     slab, wall_color = (0.05 if level == 0 else z - HEIGHT), hue(rng, (0.0, 0.15))
     for outline in hall:
         _floor(builder, outline, z, level, slab, wood(rng))
@@ -133,9 +140,7 @@ def _build_stairs(builder: WorldBuilder, layout: Layout, rng: np.random.Generato
     y = layout.hall[1] - THICKNESS / 2 - width / 2 - 0.01
     rightwards = bool(rng.uniform() < 0.5)
     start, direction = ((low, y), 0.0) if rightwards else ((low + run, y), np.pi)
-    flight = build_flight(
-        builder, start, direction, steps, rise, tread, width, 0.0, (-1,) if rightwards else (1,)
-    )
+    flight = build_flight(builder, start, direction, steps, rise, tread, width, 0.0, (-1,) if rightwards else (1,))
     hole = (low, y - width / 2 - 0.06, low + run, layout.hall[1])
     rail_y = y - width / 2 - 0.03
     build_railing(builder, (low, rail_y), (low + run, rail_y), flight.top_z)
@@ -155,9 +160,7 @@ def _around(hall: Box, hole: Box) -> list[Box]:
 
 def _floor(builder: WorldBuilder, outline: Box, z: float, level: int, slab: float, color: tuple) -> None:
     corners = rectangle(_middle(outline), (outline[2] - outline[0], outline[3] - outline[1]))
-    builder.add_surface(
-        "floor", corners, color, plane=(0.0, 0.0, z), level=level, texture=1.5, thickness=slab
-    )
+    builder.add_surface("floor", corners, color, plane=(0.0, 0.0, z), level=level, texture=1.5, thickness=slab)
 
 
 def before_door(builder: WorldBuilder, door) -> Box:

@@ -75,12 +75,9 @@ class Plan:
             if along[1] - along[0] <= 2 * width:
                 continue
             place = rng.uniform(along[0] + width, along[1] - width)
-            x, y = [
-                (x_low + depth, place),
-                (place, y_low + depth),
-                (x_high - depth, place),
-                (place, y_high - depth),
-            ][side]
+            x, y = [(x_low + depth, place), (place, y_low + depth), (x_high - depth, place), (place, y_high - depth)][
+                side
+            ]
             heading = side * np.pi / 2
             if self.try_place(piece, x, y, heading, front):
                 return x, y, heading
@@ -92,7 +89,10 @@ class Plan:
         x_low, y_low, x_high, y_high = self.room
         for _ in range(tries):
             heading = int(rng.integers(2)) * np.pi / 2
-            x, y = rng.uniform(x_low + 1.3, max(x_high - 1.3, x_low + 1.3)), rng.uniform(y_low + 1.3, max(y_high - 1.3, y_low + 1.3))  # fmt: skip
+            x, y = (
+                rng.uniform(x_low + 1.3, max(x_high - 1.3, x_low + 1.3)),
+                rng.uniform(y_low + 1.3, max(y_high - 1.3, y_low + 1.3)),
+            )
             if self.try_place(table, x, y, heading):
                 break
         else:
@@ -101,9 +101,7 @@ class Plan:
             for across in (-0.32, 0.32):
                 chair = MAKERS["chair"](rng)
                 off = side * (table.size[0] / 2 + rng.uniform(0.30, 0.42))
-                cx, cy = _ahead(
-                    *_ahead(x, y, heading, off), heading + np.pi / 2, across * table.size[1] / 0.8 * 0.6
-                )
+                cx, cy = _ahead(*_ahead(x, y, heading, off), heading + np.pi / 2, across * table.size[1] / 0.8 * 0.6)
                 turned = heading + (0.0 if side < 0 else np.pi) + rng.uniform(-0.4, 0.4)
                 if rng.uniform() < 0.75:
                     self.try_place(chair, cx, cy, turned)
@@ -148,6 +146,4 @@ def _outline(size: tuple[float, float], x: float, y: float, heading: float) -> B
 
 
 def _inside(inner: Box, outer: Box) -> bool:
-    return bool(
-        inner[0] >= outer[0] and inner[1] >= outer[1] and inner[2] <= outer[2] and inner[3] <= outer[3]
-    )
+    return bool(inner[0] >= outer[0] and inner[1] >= outer[1] and inner[2] <= outer[2] and inner[3] <= outer[3])

@@ -53,8 +53,9 @@ def _upholstered(rng: np.random.Generator, kind: str, places: int) -> Piece:
     middles = [(k - (places - 1) / 2) * 0.62 for k in range(places)]
     parts += [
         Part((-depth / 2 + 0.28, y, seat + 0.2), (0.1, 0.4, 0.36), hue(rng), PATTERNED)
-        for y in middles if rng.uniform() < 0.6
-    ]  # fmt: skip
+        for y in middles
+        if rng.uniform() < 0.6
+    ]
     seats = tuple((depth / 2 - 0.24, y, seat, 0.0, 0.24) for y in middles)
     return Piece(kind, (depth, width), (0.0, 0.85), tuple(parts), seats=seats)
 
@@ -85,15 +86,16 @@ def desk(rng: np.random.Generator) -> Piece:
 
 
 def coffee_table(rng: np.random.Generator) -> Piece:
-    return _table(
-        rng, "coffee_table", (rng.uniform(0.5, 0.7), rng.uniform(0.8, 1.2)), rng.uniform(0.38, 0.46)
-    )
+    return _table(rng, "coffee_table", (rng.uniform(0.5, 0.7), rng.uniform(0.8, 1.2)), rng.uniform(0.38, 0.46))
 
 
 def _table(rng: np.random.Generator, kind: str, size: tuple[float, float], top: float) -> Piece:
     depth, width = size
     color = wood(rng)
-    parts = [*_legs(depth - 0.06, width - 0.06, top - 0.04, 0.06, color), Part((0, 0, top - 0.02), (depth, width, 0.04), color, PLAIN)]  # fmt: skip
+    parts = [
+        *_legs(depth - 0.06, width - 0.06, top - 0.04, 0.06, color),
+        Part((0, 0, top - 0.02), (depth, width, 0.04), color, PLAIN),
+    ]
     props = [_prop(rng, (rng.uniform(0.0, depth / 2 - 0.12), y, top)) for y in _spread(rng, width - 0.3, 3)]
     reaches = tuple((p.center[0], p.center[1], top + p.size[2] * 0.7) for p in props)
     return Piece(kind, size, (0.0, top), (*parts, *props), reaches=reaches)
@@ -102,19 +104,14 @@ def _table(rng: np.random.Generator, kind: str, size: tuple[float, float], top: 
 def shelf(rng: np.random.Generator) -> Piece:
     depth, width, height = rng.uniform(0.28, 0.36), rng.uniform(0.6, 1.6), rng.uniform(1.2, 2.1)
     color, boards = wood(rng), int(rng.integers(3, 6))
-    parts = [
-        Part((0, side * (width - 0.03) / 2, height / 2), (depth, 0.03, height), color, PLAIN)
-        for side in (-1, 1)
-    ]
+    parts = [Part((0, side * (width - 0.03) / 2, height / 2), (depth, 0.03, height), color, PLAIN) for side in (-1, 1)]
     parts.append(Part((-depth / 2 + 0.01, 0, height / 2), (0.015, width, height), color, PLAIN))
     levels = np.linspace(0.08, height - 0.02, boards + 1)
     for z, above in zip(levels, np.append(levels[1:], np.nan)):
         parts.append(Part((0, 0, z), (depth, width - 0.04, 0.025), color, PLAIN))
         if np.isfinite(above):
             parts += _books(rng, z, above, depth, width)
-    reaches = tuple(
-        (depth / 2 - 0.03, rng.uniform(-0.3, 0.3) * width, z + 0.14) for z in levels[:-1] if 0.3 < z < 1.75
-    )
+    reaches = tuple((depth / 2 - 0.03, rng.uniform(-0.3, 0.3) * width, z + 0.14) for z in levels[:-1] if 0.3 < z < 1.75)
     return Piece("shelf", (depth, width), (0.0, height), tuple(parts), reaches=reaches)
 
 
@@ -125,12 +122,7 @@ def _books(rng: np.random.Generator, z: float, above: float, depth: float, width
         run, tall = rng.uniform(0.08, 0.25), min(rng.uniform(0.16, 0.30), above - z - 0.05)
         if rng.uniform() < 0.75:
             blocks.append(
-                Part(
-                    (0.0, y + run / 2, z + 0.0125 + tall / 2),
-                    (depth - 0.08, run, tall),
-                    hue(rng),
-                    3 * PATTERNED,
-                )
+                Part((0.0, y + run / 2, z + 0.0125 + tall / 2), (depth - 0.08, run, tall), hue(rng), 3 * PATTERNED)
             )
         y += run + rng.uniform(0.0, 0.08)
     return blocks
@@ -152,9 +144,7 @@ def cabinet(rng: np.random.Generator) -> Piece:
     top = height
     if rng.uniform() < 0.5:
         tall = rng.uniform(0.5, 0.7)
-        parts.append(
-            Part((0, 0, height + 0.05 + tall / 2), (0.05, min(1.2, width), tall), (0.08, 0.08, 0.1), 1.0)
-        )
+        parts.append(Part((0, 0, height + 0.05 + tall / 2), (0.05, min(1.2, width), tall), (0.08, 0.08, 0.1), 1.0))
         top += 0.05 + tall
     else:
         parts += [_prop(rng, (0.0, y, height)) for y in _spread(rng, width - 0.2, 3)]
@@ -179,9 +169,7 @@ def counter(rng: np.random.Generator) -> Piece:
 
 def plant(rng: np.random.Generator) -> Piece:
     pot, height = rng.uniform(0.25, 0.38), rng.uniform(0.5, 1.3)
-    crown = Part(
-        (0, 0, 0.3 + height / 2), (pot * 1.5, 0, height), (0.2, rng.uniform(0.35, 0.6), 0.2), PATTERNED, 7
-    )
+    crown = Part((0, 0, 0.3 + height / 2), (pot * 1.5, 0, height), (0.2, rng.uniform(0.35, 0.6), 0.2), PATTERNED, 7)
     return Piece(
         "plant",
         (pot * 1.5, pot * 1.5),
@@ -206,9 +194,7 @@ def bench(rng: np.random.Generator) -> Piece:
         Part((0.0, 0, seat - 0.025), (0.44, width, 0.05), color, 15.0),
         Part((-0.2, 0, seat + 0.25), (0.04, width, 0.35), color, 15.0),
         *(
-            Part(
-                (0.0, side * (width / 2 - 0.15), seat / 2 - 0.025), (0.4, 0.08, seat - 0.05), (0.3, 0.3, 0.32)
-            )
+            Part((0.0, side * (width / 2 - 0.15), seat / 2 - 0.025), (0.4, 0.08, seat - 0.05), (0.3, 0.3, 0.32))
             for side in (-1, 1)
         ),
     ]
@@ -252,9 +238,7 @@ def low_wall(rng: np.random.Generator) -> Piece:
     """A low wall to sit on or walk around; its front is a long side."""
     depth, width, height = rng.uniform(0.36, 0.45), rng.uniform(1.4, 2.6), rng.uniform(0.42, 0.47)
     parts = (
-        Part(
-            (0, 0, height / 2 - 0.03), (depth - 0.06, width - 0.06, height - 0.06), (0.55, 0.42, 0.36), 20.0
-        ),
+        Part((0, 0, height / 2 - 0.03), (depth - 0.06, width - 0.06, height - 0.06), (0.55, 0.42, 0.36), 20.0),
         Part((0, 0, height - 0.03), (depth, width, 0.06), (0.70, 0.69, 0.66), 12.0),
     )
     seat = (depth / 2 - 0.22, float(rng.uniform(-0.25, 0.25)) * width, height, 0.0, 0.22)
@@ -321,8 +305,9 @@ def car(rng: np.random.Generator) -> Piece:
 def _legs(depth: float, width: float, height: float, thick: float, color) -> list[Part]:
     return [
         Part((x * (depth - thick) / 2, y * (width - thick) / 2, height / 2), (thick, thick, height), color, 8.0)
-        for x in (-1, 1) for y in (-1, 1)
-    ]  # fmt: skip
+        for x in (-1, 1)
+        for y in (-1, 1)
+    ]
 
 
 def _prop(rng: np.random.Generator, base: tuple[float, float, float]) -> Part:
@@ -340,9 +325,28 @@ def _spread(rng: np.random.Generator, width: float, most: int) -> np.ndarray:
 
 
 MAKERS: dict[str, Callable[[np.random.Generator], Piece]] = {
-    "chair": chair, "armchair": armchair, "sofa": sofa, "bed": bed, "table": table, "desk": desk,
-    "coffee_table": coffee_table, "shelf": shelf, "wardrobe": wardrobe, "cabinet": cabinet, "counter": counter,
-    "plant": plant, "lamp": lamp, "bench": bench, "tree": tree, "bush": bush, "street_lamp": street_lamp,
-    "bin": bin_, "low_wall": low_wall, "planter": planter, "bollard": bollard, "board": board,
-    "letter_box": letter_box, "car": car,
-}  # fmt: skip
+    "chair": chair,
+    "armchair": armchair,
+    "sofa": sofa,
+    "bed": bed,
+    "table": table,
+    "desk": desk,
+    "coffee_table": coffee_table,
+    "shelf": shelf,
+    "wardrobe": wardrobe,
+    "cabinet": cabinet,
+    "counter": counter,
+    "plant": plant,
+    "lamp": lamp,
+    "bench": bench,
+    "tree": tree,
+    "bush": bush,
+    "street_lamp": street_lamp,
+    "bin": bin_,
+    "low_wall": low_wall,
+    "planter": planter,
+    "bollard": bollard,
+    "board": board,
+    "letter_box": letter_box,
+    "car": car,
+}

@@ -78,9 +78,7 @@ def foot_motion(
     pivot_x, pivot_z = _pivot(at, roll, turned, shape)
     depth = _depth(shape, roll, bend, SOFT_M * bump(share))
     rolled = pivot_x - (np.cos(roll) * pivot_x + np.sin(roll) * pivot_z)
-    raised = (
-        at.clearance * bump(share) + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * _late(share) + depth
-    )
+    raised = at.clearance * bump(share) + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * _late(share) + depth
     tilt = at.mix("tilt", turned)
     heading = at.mix("heading", turned)
     ground = at.mix("ground", moved[:, None])
@@ -95,9 +93,7 @@ def foot_motion(
     press = _pressure_along(at, shape)
     pressure = ground + press[:, None] * np.stack([cos, sin, np.zeros_like(cos)], 1)
     contact = at.planted[:, None] & np.stack([roll < 0.01, roll > -0.01], 1)
-    return FootMotion(
-        ankle, ground, heading, roll + tilt, bend, at.planted, contact, pressure, at.running
-    )  # fmt: skip
+    return FootMotion(ankle, ground, heading, roll + tilt, bend, at.planted, contact, pressure, at.running)
 
 
 class _Timeline:
@@ -106,16 +102,7 @@ class _Timeline:
     def __init__(self, prints: list[Footprint], times: np.ndarray):
         columns = {
             name: np.array([getattr(p, name) for p in prints], np.float64)
-            for name in (
-                "land_s",
-                "lift_s",
-                "land_pitch",
-                "lift_pitch",
-                "clearance",
-                "bow",
-                "tilt",
-                "heading",
-            )
+            for name in ("land_s", "lift_s", "land_pitch", "lift_pitch", "clearance", "bow", "tilt", "heading")
         }
         columns["ground"] = np.stack([p.ground for p in prints])
         columns["height"] = columns["ground"][:, 2]
@@ -142,9 +129,7 @@ class _Timeline:
         return here + share * (self._columns[name][self.next] - here)
 
 
-def glide(
-    share: Float[np.ndarray, "*batch"], ramps: tuple[float, float] = (0.36, 0.30)
-) -> Float[np.ndarray, "*batch"]:
+def glide(share: Float[np.ndarray, "*batch"], ramps: tuple[float, float] = (0.36, 0.30)) -> Float[np.ndarray, "*batch"]:
     """Progress of a swing, 0 to 1: accelerates over the first of `ramps` (shares of it), decelerates over the last."""
 
     def integral(u):
@@ -157,9 +142,7 @@ def glide(
     return (rise + flat + fall) / (1.0 - (first + last) / 2)
 
 
-def advance(
-    share: Float[np.ndarray, "*batch"], rise: Float[np.ndarray, "*#batch"]
-) -> Float[np.ndarray, "*batch"]:
+def advance(share: Float[np.ndarray, "*batch"], rise: Float[np.ndarray, "*#batch"]) -> Float[np.ndarray, "*batch"]:
     """Horizontal progress of a swing that rises by `rise` (m) in total, from 0 to 1."""
     up, down = np.clip(rise / 0.12, 0.0, 1.0), np.clip(-rise / 0.12, 0.0, 1.0)
     return glide(np.clip((share - STAIR_WAIT * up) / (1.0 - STAIR_WAIT * (up + down)), 0.0, 1.0))
@@ -218,9 +201,7 @@ def _depth(shape: FootShape, roll: np.ndarray, bend: np.ndarray, soft: np.ndarra
     return top + width * np.log(np.exp((points - top) / width).sum(0)) * (soft > 1e-5)
 
 
-def climb(
-    rise: Float[np.ndarray, "*#batch"], share: Float[np.ndarray, "*batch"]
-) -> Float[np.ndarray, "*batch"]:
+def climb(rise: Float[np.ndarray, "*#batch"], share: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
     """Height profile of the floor below a swing: up early and down late, so that the foot clears the stair's edge."""
     early, late = ease(share / 0.58), ease((share - 0.45) / 0.55)
     up = np.clip(0.5 + rise / 0.12, 0.0, 1.0)

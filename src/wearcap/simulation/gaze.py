@@ -13,12 +13,7 @@ PITCH_LIMITS = (-0.75, 0.95)
 
 
 def look_about(
-    plan: Plan,
-    start_s: float,
-    stop_s: float,
-    rng: np.random.Generator,
-    spread: float = 0.5,
-    pause_s: float = 1.6,
+    plan: Plan, start_s: float, stop_s: float, rng: np.random.Generator, spread: float = 0.5, pause_s: float = 1.6
 ) -> None:
     """Head turns of 10 to 60 degrees every 1 to 4 s between two times, back to the front at the end.
 

@@ -93,8 +93,7 @@ class Grip:
         """Goal of the palm's position and of the hand's directions at times (s)."""
         T = self.moves(times, T_world_chest).to(torch.float64)
         point, normal, fingers = (
-            torch.tensor(v, dtype=torch.float64)
-            for v in (self.place.point, self.place.normal, self.place.fingers)
+            torch.tensor(v, dtype=torch.float64) for v in (self.place.point, self.place.normal, self.place.fingers)
         )
         before = (self.touch_s - times) / (DESCENT * self.reach_s)
         after = (times - self.release_s) / (DESCENT * self.return_s)
@@ -104,12 +103,7 @@ class Grip:
 
 
 def drawn_grip(
-    place: GripPlace,
-    moves: Moves,
-    touch_s: float,
-    release_s: float,
-    rng: np.random.Generator,
-    briskness: float,
+    place: GripPlace, moves: Moves, touch_s: float, release_s: float, rng: np.random.Generator, briskness: float
 ) -> Grip:
     """A grip with random durations of approach and return (0.4–1.2 s each) and hover distance."""
     there, back = (float(np.clip(rng.normal(0.75, 0.15) / briskness, 0.4, 1.2)) for _ in range(2))
@@ -126,7 +120,5 @@ def still(T_world_object: Rigid) -> Moves:
 def following(trajectory: Trajectory) -> Moves:
     """Motion of an object along a given trajectory; it is static before its start and after its end."""
     first, last = trajectory.timestamps[0].item(), trajectory.timestamps[-1].item()
-    track = Trajectory(
-        trajectory.timestamps, trajectory.R_world_body.double(), trajectory.t_world_body.double()
-    )
+    track = Trajectory(trajectory.timestamps, trajectory.R_world_body.double(), trajectory.t_world_body.double())
     return lambda times, chest: resample(track, torch.from_numpy(np.clip(times, first, last))).T_world_body

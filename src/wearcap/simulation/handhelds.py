@@ -57,8 +57,9 @@ def suitcase(rng: np.random.Generator) -> Handheld:
     top = wheel + body
     outline = _squircle(length, thick, 6.0)
     parts = [_loft(outline, [(0.94, wheel), (1.0, wheel + 0.02), (1.0, top - 0.02), (0.94, top)], color)]
-    parts += [_box((x, 0.0, wheel + body / 2), (0.012, thick + 0.004, 0.92 * body), DARK)
-              for x in (-length / 4, length / 4)]  # fmt: skip
+    parts += [
+        _box((x, 0.0, wheel + body / 2), (0.012, thick + 0.004, 0.92 * body), DARK) for x in (-length / 4, length / 4)
+    ]
     parts += [_box((x, 0.0, top + handle / 2), (0.018, 0.02, handle), DARK) for x in (-0.065, 0.065)]
     parts.append(_box((0.0, 0.0, top + handle), (0.148, 0.022, 0.022), DARK))
     for x in (-length / 2 + 0.05, length / 2 - 0.05):
@@ -79,10 +80,9 @@ def backpack(rng: np.random.Generator) -> Handheld:
     shade: Color = (0.75 * color[0], 0.75 * color[1], 0.75 * color[2])
     pocket = _loft(
         _squircle(0.08, 0.72 * width, 4.0), [(0.85, 0.04), (1.0, 0.08), (1.0, 0.4 * body), (0.7, 0.46 * body)], shade
-    )  # fmt: skip
+    )
     parts.append(_moved(pocket, (depth / 2 - 0.01, 0.0, 0.0)))
-    parts += [_box((-depth / 2 - 0.004, y, 0.5 * body), (0.016, 0.05, 0.72 * body), DARK)
-              for y in (-0.09, 0.09)]  # fmt: skip
+    parts += [_box((-depth / 2 - 0.004, y, 0.5 * body), (0.016, 0.05, 0.72 * body), DARK) for y in (-0.09, 0.09)]
     loop = body + 0.045
     parts += [_box((0.0, y, body + 0.015), (0.022, 0.014, 0.06), DARK) for y in (-0.05, 0.05)]
     parts.append(_box((0.0, 0.0, loop), (0.022, 0.114, 0.014), DARK))
@@ -106,9 +106,7 @@ def bottle(rng: np.random.Generator) -> Handheld:
     grasps = []
     for facing in np.arange(8) * np.pi / 4:
         for side, sign in (("left", 1.0), ("right", -1.0)):
-            grasps.append(
-                _grasp(side, (0.0, sign * reach, level), (0.0, sign, 0.0), (0.9, 0.0, -0.44), facing)
-            )
+            grasps.append(_grasp(side, (0.0, sign * reach, level), (0.0, sign, 0.0), (0.9, 0.0, -0.44), facing))
     return Handheld(merged(parts), (2 * radius, 2 * radius), height, (), tuple(grasps))
 
 
@@ -165,10 +163,7 @@ def mop(rng: np.random.Generator) -> Handheld:
     ahead = np.array([np.cos(slope), 0.0, -np.sin(slope)])
     R = np.stack([np.array([-ahead[2], 0.0, ahead[0]]), np.array([0.0, -1.0, 0.0]), ahead], 1)
     tail = np.array([-far, 0.0, radius])
-    parts = [
-        _turned(_moved(rag, (0.0, 0.0, 0.0)), R, tail),
-        _turned(rod, R, tail + (head - 0.02) * ahead),
-    ]
+    parts = [_turned(_moved(rag, (0.0, 0.0, 0.0)), R, tail), _turned(rod, R, tail + (head - 0.02) * ahead)]
     mesh = merged(parts)
     low = float(mesh.vertices[:, 2].min())
     mesh = _moved(mesh, (0.0, 0.0, -low))
@@ -188,14 +183,16 @@ def ball(rng: np.random.Generator) -> Handheld:
     wedge = np.arctan2(mesh.vertices[:, 1], mesh.vertices[:, 0]) // (np.pi / 3) % 2 == 0
     rows = np.where(wedge[:, None], np.array(colors[0]), np.array(colors[1])).astype(np.float32)
     mesh = Mesh(mesh.vertices, mesh.faces, rows)
-    return Handheld(
-        mesh, (2 * radius, 2 * radius), 2 * radius, _between(dict.fromkeys(QUARTERS, radius), radius)
-    )
+    return Handheld(mesh, (2 * radius, 2 * radius), 2 * radius, _between(dict.fromkeys(QUARTERS, radius), radius))
 
 
 MAKERS: dict[str, Callable[[np.random.Generator], Handheld]] = {
-    "suitcase": suitcase, "backpack": backpack, "bottle": bottle, "tool": tool, "ball": ball,
-}  # fmt: skip
+    "suitcase": suitcase,
+    "backpack": backpack,
+    "bottle": bottle,
+    "tool": tool,
+    "ball": ball,
+}
 
 
 def _beside_body(bar: tuple[float, float, float], facings: Sequence[float]) -> tuple[Grasp, ...]:
@@ -223,9 +220,7 @@ def _between(halves: dict[float, float], level: float) -> tuple[Side, ...]:
     sides = []
     for facing, half in halves.items():
         left, right = (
-            _grasp(
-                side, (0.0, sign * (half + SKIN_M), level), (0.0, sign, 0.0), (0.94, 0.0, -0.33), facing
-            ).place
+            _grasp(side, (0.0, sign * (half + SKIN_M), level), (0.0, sign, 0.0), (0.94, 0.0, -0.33), facing).place
             for side, sign in (("left", 1.0), ("right", -1.0))
         )
         sides.append((left, right, facing))
@@ -272,8 +267,7 @@ def _loft(
         a, b = ring * count, (ring + 1) * count
         faces += [np.stack([a + k, a + nxt, b + nxt], 1), np.stack([a + k, b + nxt, b + k], 1)]
     bottom, top, last = rings * count, rings * count + 1, (rings - 1) * count
-    faces += [np.stack([np.full(count, bottom), nxt, k], 1),
-              np.stack([np.full(count, top), last + k, last + nxt], 1)]  # fmt: skip
+    faces += [np.stack([np.full(count, bottom), nxt, k], 1), np.stack([np.full(count, top), last + k, last + nxt], 1)]
     return _mesh(np.concatenate(vertices), np.concatenate(faces), color)
 
 
@@ -303,6 +297,4 @@ def _turned(mesh: Mesh, R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) 
 
 
 def _mesh(vertices: np.ndarray, faces: np.ndarray, color: Color) -> Mesh:
-    return Mesh(
-        vertices.astype(np.float32), faces.astype(np.int32), np.tile(np.float32(color), (len(vertices), 1))
-    )
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), np.tile(np.float32(color), (len(vertices), 1)))

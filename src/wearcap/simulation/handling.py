@@ -50,9 +50,7 @@ def hand_rows(held: Iterable[tuple[str, float, float]]) -> list[Row]:
 
 def interactions_of(handlings: Sequence[Handling]) -> Interactions:
     """All rows, ordered by their start."""
-    rows = sorted(
-        ((row, handling) for handling in handlings for row in handling.rows), key=lambda pair: pair[0][:2]
-    )
+    rows = sorted(((row, handling) for handling in handlings for row in handling.rows), key=lambda pair: pair[0][:2])
     return Interactions(
         torch.tensor([row[0] for row, _ in rows], dtype=torch.float64),
         torch.tensor([row[1] for row, _ in rows], dtype=torch.float64),

@@ -22,9 +22,7 @@ FINGERS_USED = 0.9
 ON_THIGHS = (0.46, -0.02, -0.66, 0.35, 0.5, 0.1)
 
 
-def hold(
-    plan: Plan, sides: tuple[str, ...], pose: tuple[float, ...], start_s: float, stop_s: float, rng
-) -> None:
+def hold(plan: Plan, sides: tuple[str, ...], pose: tuple[float, ...], start_s: float, stop_s: float, rng) -> None:
     """Bring hands into a posture at one time and let them hang again at the other (s)."""
     rise = 0.7 / plan.style.briskness
     for side in sides:
@@ -106,9 +104,7 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
     """One reach with the nearer hand: minimum-jerk out, a pause, and back (0.4–1.2 s each way)."""
     ahead = np.array([np.cos(plan.heading), np.sin(plan.heading)])
     across = np.array([-ahead[1], ahead[0]])
-    point = np.array(target.position) + np.append(
-        0.08 * rng.standard_normal() * across, 0.04 * rng.standard_normal()
-    )
+    point = np.array(target.position) + np.append(0.08 * rng.standard_normal() * across, 0.04 * rng.standard_normal())
     aside = float((point[:2] - plan.position[:2]) @ across) + 0.1 * rng.standard_normal()
     side = "left" if aside > 0 else "right"
     hand, arm = plan.hands[side], plan.arm_length

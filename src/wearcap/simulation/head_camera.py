@@ -80,7 +80,16 @@ def view_texture(world: World, path: Trajectory, every: int = 15) -> Float[Tenso
     for row, frame in enumerate(frames):
         nearness = np.full((_GLANCE.height, _GLANCE.width), -np.inf, np.float32)
         index = np.full((_GLANCE.height, _GLANCE.width), -1, np.int32)
-        raster.draw_pinhole((world.mesh.vertices - t[frame]) @ R[frame], world.mesh.faces, _GLANCE.fx, _GLANCE.fy,
-                            _GLANCE.cx, _GLANCE.cy, 0.03, nearness, index)  # fmt: skip
+        raster.draw_pinhole(
+            (world.mesh.vertices - t[frame]) @ R[frame],
+            world.mesh.faces,
+            _GLANCE.fx,
+            _GLANCE.fy,
+            _GLANCE.cx,
+            _GLANCE.cy,
+            0.03,
+            nearness,
+            index,
+        )
         seen[row] = grade[index].mean()
     return torch.from_numpy(np.interp(np.arange(len(path.timestamps)), frames, seen)).float()

@@ -44,12 +44,7 @@ class Filming:
 
 
 def film(
-    scenery: Scenery,
-    camera: Camera,
-    path: Trajectory,
-    times: torch.Tensor,
-    filming: Filming,
-    rng: np.random.Generator,
+    scenery: Scenery, camera: Camera, path: Trajectory, times: torch.Tensor, filming: Filming, rng: np.random.Generator
 ):
     """Yields the frame (uint8 height width 3) of every time (s, on the clock of `path`, the camera's true poses)."""
     first, last = path.timestamps[0], path.timestamps[-1]
@@ -62,9 +57,7 @@ def film(
         moments = torch.linspace(time, time + (filming.shutter_s if steps > 1 else 0.0), steps).double()
         poses = resample(path, moments.clamp(first, last))
         glared = any(start <= time < stop for start, stop in filming.glare_s)
-        how = Development(
-            exposure[number].item(), GLARE if glared else 1.0, filming.noise, filming.vignetting
-        )
+        how = Development(exposure[number].item(), GLARE if glared else 1.0, filming.noise, filming.vignetting)
         yield render_view(scenery, camera, Rigid(poses.R_world_body, poses.t_world_body), how, rng)
 
 
@@ -84,8 +77,9 @@ def write_head_video(
     """
     if camera.width % 2 or camera.height % 2 or len(times) < 2:
         raise WearcapError(
-            f"a video of {len(times)} frames of {camera.width}x{camera.height}", expected="even sizes, two frames or more",
-        )  # fmt: skip
+            f"a video of {len(times)} frames of {camera.width}x{camera.height}",
+            expected="even sizes, two frames or more",
+        )
     fps = 1.0 / times.diff().median().item()
     with atomic_path(file) as temporary, av.open(str(temporary), "w", format="mp4") as container:
         codec, options = video_encoder(filming.crf)
@@ -115,8 +109,6 @@ def _sound(times: torch.Tensor, claps_s: Sequence[float], rng: np.random.Generat
             burst = 0.35 * fading * rng.standard_normal(length, np.float32)
             wave[start:stop] += burst[: stop - start]
     for start in range(0, count, 1024):
-        piece = av.AudioFrame.from_ndarray(
-            wave[None, start : start + 1024].clip(-1, 1).copy(), "fltp", "mono"
-        )
+        piece = av.AudioFrame.from_ndarray(wave[None, start : start + 1024].clip(-1, 1).copy(), "fltp", "mono")
         piece.rate, piece.pts = SOUND_HZ, start
         yield piece

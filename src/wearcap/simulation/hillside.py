@@ -41,9 +41,7 @@ class Layout:
 
 def build_hillside(rng: np.random.Generator, name: str) -> World:
     """Terraces at -4 … 4 m (3.4 m apart at least), stairs of 15–17 cm steps and ramps of 10–15 % between them."""
-    builder = WorldBuilder(
-        name, rng.uniform(-np.pi, np.pi), tuple(rng.uniform(-5.0, 5.0, 2).tolist()), outdoors=True
-    )
+    builder = WorldBuilder(name, rng.uniform(-np.pi, np.pi), tuple(rng.uniform(-5.0, 5.0, 2).tolist()), outdoors=True)
     steps, rise = int(rng.integers(22, 25)), rng.uniform(0.155, 4.0 / 24)
     layout = Layout(steps * rise, steps, rng.uniform(0.28, 0.32), rng.uniform(0.10, 0.15))
     middle = (0.0, 0.0, PLATEAU_M, DEPTH_M)
@@ -81,7 +79,9 @@ def _stairs_and_ramp(builder: WorldBuilder, layout: Layout, x: float, base: floa
     slab(builder, "ramp", ramp, top, 0.3, GROUND, 6.0, plane)
     foot = x if base == 0.0 else x + layout.ramp - layout.stairs
     rise = layout.rise / layout.steps
-    build_flight(builder, (foot, 0.1 + STAIRS_M / 2), 0.0, layout.steps, rise, layout.tread, STAIRS_M - 0.3, base, (-1, 1), STONE)  # fmt: skip
+    build_flight(
+        builder, (foot, 0.1 + STAIRS_M / 2), 0.0, layout.steps, rise, layout.tread, STAIRS_M - 0.3, base, (-1, 1), STONE
+    )
     beside = RAMP_M - 0.1
     sloped_rail(builder, (x, beside), (x + layout.ramp, beside), base, (base, top))
     sloped_rail(builder, (x, DEPTH_M - 0.05), (x + layout.ramp, DEPTH_M - 0.05), base, (base, top))

@@ -124,9 +124,14 @@ class Held:
         self.keys = Track(self.carry)
 
     def go(
-        self, start_s: float, stop_s: float, place: tuple[float, float, float],
-        pitch: float = 0.0, yaw: float = 0.0, roll: float = 0.0,
-    ) -> None:  # fmt: skip
+        self,
+        start_s: float,
+        stop_s: float,
+        place: tuple[float, float, float],
+        pitch: float = 0.0,
+        yaw: float = 0.0,
+        roll: float = 0.0,
+    ) -> None:
         """Bring it to a place, as shares of the arm's reach, and angles (rad) between two times."""
         self.keys.move(start_s, stop_s, np.array([*(self.reach * np.array(place)), pitch, yaw, roll]))
 
@@ -136,11 +141,7 @@ class Held:
 
 
 def take_options(
-    plan: Plan,
-    movable: Movable,
-    start: Float[np.ndarray, "4"],
-    stop: Float[np.ndarray, "4"],
-    rng: np.random.Generator,
+    plan: Plan, movable: Movable, start: Float[np.ndarray, "4"], stop: Float[np.ndarray, "4"], rng: np.random.Generator
 ) -> Iterator[Take]:
     """Options for holding an object and moving it to another pose, in random order; see `carrying.carry_options`.
 
@@ -179,9 +180,7 @@ def take_up(plan: Plan, choice: Take, rng: np.random.Generator) -> Held:
     bow(plan, start, touch, bend, lean, aside)
     bow(plan, begin, begin + rise, 0.0, float(rng.normal(-0.03, 0.03)), _counter(choice))
     _other_hand(plan, choice, bend, (start, start + 0.5 * down), (touch, begin + rise), rng)
-    plan.gaze_point.move(
-        start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.movable.height)
-    )
+    plan.gaze_point.move(start, start, np.append(choice.start[:2], choice.start[3] + 0.8 * choice.movable.height))
     plan.gaze_weight.move(start, start + 0.5, 0.9)
     plan.gaze_weight.move(begin + 0.3 * rise, begin + rise, 0.0)
     plan.time = begin + rise + float(rng.uniform(0.0, 0.3))
@@ -190,9 +189,7 @@ def take_up(plan: Plan, choice: Take, rng: np.random.Generator) -> Held:
         shoulder[1] = 0.0
     shoulder[1] *= choice.sign
     reach = plan.arm_length + float(np.linalg.norm(plan.skeleton.sites["left_palm"].t_joint_site))
-    return Held(
-        choice, start, touch, begin, begin + rise, shoulder, reach, _carried(plan, choice, reach, rng)
-    )
+    return Held(choice, start, touch, begin, begin + rise, shoulder, reach, _carried(plan, choice, reach, rng))
 
 
 def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
@@ -214,9 +211,14 @@ def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
     grips = []
     for side, place in choice.places.items():
         grip = Grip(
-            place, moves, held.touch_s, release, held.touch_s - held.start_s,
-            float(np.clip(0.7 * rise, 0.4, 1.1)), float(rng.uniform(0.05, 0.09) if choice.side else rng.uniform(0.12, 0.18)),
-        )  # fmt: skip
+            place,
+            moves,
+            held.touch_s,
+            release,
+            held.touch_s - held.start_s,
+            float(np.clip(0.7 * rise, 0.4, 1.1)),
+            float(rng.uniform(0.05, 0.09) if choice.side else rng.uniform(0.12, 0.18)),
+        )
         plan.grip(side, grip)
         grips.append((side, grip))
     plan.time = release + rise + float(rng.uniform(0.0, 0.3))
@@ -299,9 +301,7 @@ def strides(plan: Plan, held: Held, until_s: float) -> Track:
         step = float((print_.ground - other.ground)[:2] @ ahead)
         size = float(np.clip(step / 0.6, -1.0, 1.2))
         if print_.land_s > last + 0.2:
-            track.move(
-                max(last, print_.land_s - 0.7), print_.land_s, -held.choice.sign * LEFT_SIGN[side] * size
-            )
+            track.move(max(last, print_.land_s - 0.7), print_.land_s, -held.choice.sign * LEFT_SIGN[side] * size)
             last = print_.land_s
     track.move(last, last + 0.7, 0.0)
     return track
@@ -324,9 +324,7 @@ class _HeldPath:
         )
         point, R = self._in_hand(times, T_world_chest)
         middle = torch.from_numpy(choice.middle)
-        R_first, R_last = (
-            rotation.about_axis("z", torch.tensor(pose[2])) for pose in (choice.start, choice.stop)
-        )
+        R_first, R_last = (rotation.about_axis("z", torch.tensor(pose[2])) for pose in (choice.start, choice.stop))
         first, last = (
             torch.from_numpy(pose[[0, 1, 3]]) + R_pose @ middle
             for pose, R_pose in ((choice.start, R_first), (choice.stop, R_last))
@@ -355,11 +353,7 @@ class _HeldPath:
         mirror = torch.tensor([1.0, choice.sign, 1.0], dtype=torch.float64)
         anchor = T_world_chest.t.double() + T_world_chest.R.double() @ torch.from_numpy(self.held.anchor)
         point = anchor + (R_heading @ (keys[:, :3] * mirror)[..., None])[..., 0]
-        turned = (
-            about("z", choice.sign * keys[:, 4])
-            @ about("y", keys[:, 3])
-            @ about("x", choice.sign * keys[:, 5])
-        )
+        turned = about("z", choice.sign * keys[:, 4]) @ about("y", keys[:, 3]) @ about("x", choice.sign * keys[:, 5])
         return point, R_heading @ turned @ torch.from_numpy(choice.neutral())
 
     def _raise(

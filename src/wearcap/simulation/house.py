@@ -54,10 +54,11 @@ class House:
         grid = static.navigation.barred(extra, around)
         near = lambda point: _beside(grid.node_points, np.array(point))  # noqa: E731
         now = replace(
-            static, objects=(*static.objects, *extra),
+            static,
+            objects=(*static.objects, *extra),
             seats=tuple(seat for seat in static.seats if near(seat.standing_point())),
             reach_targets=tuple(target for target in static.reach_targets if near(target.stand)),
-        )  # fmt: skip
+        )
         now.__dict__["navigation"] = grid
         return now
 
@@ -67,9 +68,12 @@ class House:
         kept = torch.nonzero(rows.start_s < until_s)[:, 0]
         pick = lambda names: tuple(names[k] for k in kept.tolist())  # noqa: E731
         return Interactions(
-            rows.start_s[kept], rows.stop_s[kept].clamp(max=until_s), rows.hands[kept], pick(rows.objects),
+            rows.start_s[kept],
+            rows.stop_s[kept].clamp(max=until_s),
+            rows.hands[kept],
+            pick(rows.objects),
             pick(rows.classes),
-        )  # fmt: skip
+        )
 
     def object_motion(self, motion: Motion) -> dict[str, Trajectory]:
         """Poses of all movable objects and openables on a motion's timestamps; each stays where it was left."""
@@ -81,7 +85,5 @@ class House:
         }
 
 
-def _beside(
-    points: Float[np.ndarray, "node 3"], point: Float[np.ndarray, "3"], within_m: float = 0.3
-) -> bool:
+def _beside(points: Float[np.ndarray, "node 3"], point: Float[np.ndarray, "3"], within_m: float = 0.3) -> bool:
     return bool(len(points)) and float(np.linalg.norm(points[:, :2] - point[:2], axis=1).min()) < within_m

@@ -21,8 +21,15 @@ from wearcap.simulation.rearranging import fetch, floor_place, rearrange, reloca
 from wearcap.simulation.wearer import TAIL_S, Wearer
 
 WEIGHTS = {
-    "door": 1.5, "window": 2.2, "drawer": 2.2, "cabinet_door": 1.8, "sofa": 2.5, "table": 1.2, "chair": 1.2, "box": 0.8
-}  # fmt: skip
+    "door": 1.5,
+    "window": 2.2,
+    "drawer": 2.2,
+    "cabinet_door": 1.8,
+    "sofa": 2.5,
+    "table": 1.2,
+    "chair": 1.2,
+    "box": 0.8,
+}
 """Weight of each category in the choice of the next object."""
 HANDHELD = ("suitcase", "backpack", "bottle", "tool", "ball")
 """Categories that are used while they are carried."""
@@ -190,15 +197,9 @@ class Household:
             world = self.house.world(self.plan.position)
             points = world.navigation.node_points
             away = np.linalg.norm(points[:, :2] - goal[:2], axis=1)
-            if (
-                len(points)
-                and away.min() < max(REACHED_M, stop_m)
-                and self._same_side(points[away.argmin()], goal)
-            ):
+            if len(points) and away.min() < max(REACHED_M, stop_m) and self._same_side(points[away.argmin()], goal):
                 near = np.flatnonzero(away < max(away.min() + 0.15, stop_m))
-                target = points[
-                    near[np.linalg.norm(points[near, :2] - self.plan.position[:2], axis=1).argmin()]
-                ]
+                target = points[near[np.linalg.norm(points[near, :2] - self.plan.position[:2], axis=1).argmin()]]
                 path = world.plan_path(self.plan.position, target, self.rng)
                 if path is None:
                     return False
@@ -286,9 +287,7 @@ class Household:
         """Whether no wall or closed door stands between two points near each other."""
         between = goal[:2] + np.linspace(0.0, 1.0, 9)[:, None] * (point[:2] - goal[:2])
         walls = [
-            item.footprint
-            for item in self.house.flat.static.objects
-            if item.kind == "wall" and item.z_range[0] < 1.0
+            item.footprint for item in self.house.flat.static.objects if item.kind == "wall" and item.z_range[0] < 1.0
         ]
         walls += [
             door.footprint(self.house.values[door.name])

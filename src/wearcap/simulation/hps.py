@@ -63,9 +63,7 @@ def site_number(split: str, index: int) -> int:
     return index % min(SITES[split], POOLS[split][1])
 
 
-def simulate_hps(
-    config: HpsConfig, name: str, split: str, seed: int, world: World | None = None
-) -> Simulated:
+def simulate_hps(config: HpsConfig, name: str, split: str, seed: int, world: World | None = None) -> Simulated:
     """The recording of a seed; without a world, in the split's site of the same number.
 
     Streams of the suit run on its clock, the camera's and its localisation on the camera's. True are `motion`,
@@ -79,8 +77,7 @@ def simulate_hps(
     motion = session.simulated.motion
     suit = suit_motion(motion, session.simulated.contact, config.suit, rng)
     strength = rng.uniform(*config.clap_acc, len(session.claps_s))
-    imu = {f"{side}_wrist": _wrist(motion, side, config, session.claps_s, strength, rng)
-           for side in ("left", "right")}  # fmt: skip
+    imu = {f"{side}_wrist": _wrist(motion, side, config, session.claps_s, strength, rng) for side in ("left", "right")}
     camera, path, clock = head_camera(motion, person.t_head_device, config, rng)
     localization = None
     if config.localization is not None:
@@ -88,28 +85,42 @@ def simulate_hps(
         localization = localize_statistically(path, config.localization, rng, texture)
     about = {
         "claps_s": " ".join(f"{time:.4f}" for time in session.claps_s),
-        "camera_clock_offset_s": f"{clock[0]:.6f}", "camera_clock_drift_ms_per_h": f"{clock[1]:.3f}",
-    }  # fmt: skip
+        "camera_clock_offset_s": f"{clock[0]:.6f}",
+        "camera_clock_drift_ms_per_h": f"{clock[1]:.3f}",
+    }
     recording = Recording(
-        name, imu=imu, suit=suit, camera=camera, localization=localization,
+        name,
+        imu=imu,
+        suit=suit,
+        camera=camera,
+        localization=localization,
         motion=replace(motion, provenance=motion.provenance | about),
         contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, session.simulated.contact),
-        object_motion={HEAD_CAMERA_TRUTH: path}, floor=FloorTrack(motion.timestamps, session.simulated.floor_height),
-        intervals=session.intervals, skeleton=person.skeleton, shape=person.shape, subject=person.name,
-        location=world.name, activity="session", source="wearcap simulation", license="MIT (generated)",
-    )  # fmt: skip
+        object_motion={HEAD_CAMERA_TRUTH: path},
+        floor=FloorTrack(motion.timestamps, session.simulated.floor_height),
+        intervals=session.intervals,
+        skeleton=person.skeleton,
+        shape=person.shape,
+        subject=person.name,
+        location=world.name,
+        activity="session",
+        source="wearcap simulation",
+        license="MIT (generated)",
+    )
     return Simulated(recording, session, world, clock)
 
 
 def _wrist(
-    motion: Motion, side: str, config: HpsConfig, claps_s: tuple[float, ...], strength: np.ndarray,
+    motion: Motion,
+    side: str,
+    config: HpsConfig,
+    claps_s: tuple[float, ...],
+    strength: np.ndarray,
     rng: np.random.Generator,
-) -> ImuStream:  # fmt: skip
+) -> ImuStream:
     """Readings of a wrist's sensor; palms that meet push the wrists apart for some hundredths of a second."""
     stream = synthesize_imu(motion, f"{side}_wrist", noise=config.imu, rng=rng, n=1)
-    apart = (
-        motion.joint(f"{side}_wrist").t - motion.joint("right_wrist" if side == "left" else "left_wrist").t
-    )
+    apart = motion.joint(f"{side}_wrist").t - motion.joint("right_wrist" if side == "left" else "left_wrist").t
     apart = apart / apart.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     times = stream.timestamps[:, None] - torch.tensor(claps_s, dtype=torch.float64)
     pulse = (torch.exp(-0.5 * (times / CLAP_WIDTH_S) ** 2) * torch.from_numpy(strength)).sum(1).float()
@@ -118,6 +129,7 @@ def _wrist(
     assert stream.acc_imu is not None
     R = motion.joint(f"{side}_wrist").R
     return replace(
-        stream, acc_world=stream.acc_world + shock,
+        stream,
+        acc_world=stream.acc_world + shock,
         acc_imu=stream.acc_imu + (R.transpose(-1, -2) @ shock[..., None])[..., 0],
-    )  # fmt: skip
+    )

@@ -52,11 +52,7 @@ class SimulatedSession:
 
 
 def simulate_session(
-    world: World,
-    person: Wearer,
-    rng: np.random.Generator,
-    fps: float = 60.0,
-    protocol: Protocol = Protocol(),
+    world: World, person: Wearer, rng: np.random.Generator, fps: float = 60.0, protocol: Protocol = Protocol()
 ) -> SimulatedSession:
     """A session at the world's first capture spot, deterministic for a given state of `rng`."""
     session = _Session(world, person, rng, protocol)
@@ -78,9 +74,11 @@ def simulate_session(
     starts, stops, names = zip(*session.stretches)
     travelled = np.interp(starts, simulated.motion.timestamps.numpy()[1:], path_so_far)
     intervals = Intervals(
-        torch.tensor(starts, dtype=torch.float64), torch.tensor(stops, dtype=torch.float64),
-        torch.from_numpy(travelled).float(), names,
-    )  # fmt: skip
+        torch.tensor(starts, dtype=torch.float64),
+        torch.tensor(stops, dtype=torch.float64),
+        torch.from_numpy(travelled).float(),
+        names,
+    )
     return SimulatedSession(simulated, intervals, tuple(session.clap_times))
 
 
@@ -91,9 +89,7 @@ class _Session:
         self.world, self.rng, self.protocol = world, rng, protocol
         self.spot: CaptureSpot = world.spots[0]
         self.home = np.array(self.spot.position)
-        self.plan = Plan(
-            person.skeleton, person.style, self.home.copy(), self.spot.heading, world.floor_height
-        )
+        self.plan = Plan(person.skeleton, person.style, self.home.copy(), self.spot.heading, world.floor_height)
         self.plan.time = 0.8
         self.travelled = 0.0
         self.stretches: list[tuple[float, float, str]] = []
@@ -142,9 +138,7 @@ class _Session:
     def clap(self) -> None:
         """Raise the hands and clap; palms meet at `clap_times`."""
         plan, rng, start = self.plan, self.rng, self.plan.time
-        wide = float(
-            plan.skeleton.t_parent_joint[plan.skeleton.indices("left_collar", "left_shoulder"), 1].sum()
-        )
+        wide = float(plan.skeleton.t_parent_joint[plan.skeleton.indices("left_collar", "left_shoulder"), 1].sum())
         pose = lambda gap: (CLAP_AHEAD, (gap - wide) / plan.arm_length, CLAP_HEIGHT, 0.5, 0.0, 0.0)  # noqa: E731
         raise_s = 0.8
         time = start + raise_s + 0.2

@@ -62,9 +62,7 @@ def flat_of(split: str, number: int) -> InteractiveFlat:
     return build_interactive_flat(rng, f"sim-{split}-interactive_flat-{number:03d}")
 
 
-def simulate_interactions(
-    config: InteractionConfig, name: str, split: str, seed: int
-) -> SimulatedInteractions:
+def simulate_interactions(config: InteractionConfig, name: str, split: str, seed: int) -> SimulatedInteractions:
     """The recording of a seed, in the split's flat of the same number.
 
     Sensed are `suit`, `camera` and its `localization`. True are `motion`, `contacts` of the feet, `floor`,
@@ -82,13 +80,21 @@ def simulate_interactions(
     camera, path, _ = head_camera(motion, person.t_head_device, config, rng)
     texture = view_texture(flat.world, path, max(1, round(config.camera_fps / 2)))
     recording = Recording(
-        name, suit=suit, camera=camera,
-        localization=localize_statistically(path, config.localization, rng, texture), motion=motion,
+        name,
+        suit=suit,
+        camera=camera,
+        localization=localize_statistically(path, config.localization, rng, texture),
+        motion=motion,
         contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, simulated.contact),
-        object_motion=house.object_motion(motion), interactions=house.interactions(duration),
-        floor=FloorTrack(motion.timestamps, simulated.floor_height), skeleton=person.skeleton, shape=person.shape,
-        subject=person.name, location=flat.static.name,
-        activity=activity_of(simulated.labels), source="wearcap simulation",
+        object_motion=house.object_motion(motion),
+        interactions=house.interactions(duration),
+        floor=FloorTrack(motion.timestamps, simulated.floor_height),
+        skeleton=person.skeleton,
+        shape=person.shape,
+        subject=person.name,
+        location=flat.static.name,
+        activity=activity_of(simulated.labels),
+        source="wearcap simulation",
         license="MIT (generated)",
-    )  # fmt: skip
+    )
     return SimulatedInteractions(recording, flat.environment, flat.world, flat.static)

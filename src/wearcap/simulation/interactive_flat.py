@@ -77,9 +77,12 @@ class InteractiveFlat:
             face_texture.append(np.full(len(scene_object.mesh.faces), 6.0))
             objects.append(obstacle(item, None))
         return replace(
-            world, mesh=merged(meshes), face_object=np.concatenate(face_object),
-            face_texture=np.concatenate(face_texture), objects=tuple(objects),
-        )  # fmt: skip
+            world,
+            mesh=merged(meshes),
+            face_object=np.concatenate(face_object),
+            face_texture=np.concatenate(face_texture),
+            objects=tuple(objects),
+        )
 
 
 def obstacle(item: Movable | Openable, pose: Rigid | None) -> WorldObject:
@@ -138,9 +141,7 @@ def _draw(rng: np.random.Generator, name: str) -> InteractiveFlat:
     lay_out(builder, rng, stairs=False, furnish=_furnish)
     static = builder.finish(cell=0.1)
     leaves = _add_door_leaves(builder, static, rng) + _add_sashes(builder, static, rng)
-    return InteractiveFlat(
-        static, tuple(_numbered(builder.movables)), tuple(_numbered([*leaves, *builder.openables]))
-    )
+    return InteractiveFlat(static, tuple(_numbered(builder.movables)), tuple(_numbered([*leaves, *builder.openables])))
 
 
 def _numbered(items: list) -> list:
@@ -221,8 +222,9 @@ def _add_door_leaves(builder: _Builder, static: World, rng: np.random.Generator)
         order = np.argsort(rng.random(4) + np.where(into_hall, rng.choice([0.0, 1.0], p=[0.2, 0.8]), 0.0))
         for side, hand in (variants[k] for k in order):
             foot, heading, opening_sign = _jamb(door, side, hand, door.width - 0.01)
-            leaf = hinged("door", foot, heading, opening_sign, door.width - 0.02,
-                          (0.01, DOOR_HEIGHT - 0.04), MOST_OPEN, rng)  # fmt: skip
+            leaf = hinged(
+                "door", foot, heading, opening_sign, door.width - 0.02, (0.01, DOOR_HEIGHT - 0.04), MOST_OPEN, rng
+            )
             most = _free_angle(leaf, static, builder.movables, door.position)
             if most >= LEAST_OPEN:
                 leaves.append(_ajar(_limited(leaf, most), rng, AJAR_SHARE))
@@ -242,8 +244,16 @@ def _add_sashes(builder: _Builder, static: World, rng: np.random.Generator) -> l
         hands = (float(rng.choice([-1.0, 1.0])),) if single else (-1.0, 1.0)
         for hand in hands:
             foot, heading, opening_sign = _jamb(window, sides[0], hand, window.width - 0.01)
-            sash = hinged("window", foot, heading, opening_sign, width - 0.02,
-                          (WINDOW[0] + 0.035, WINDOW[1] - 0.035), MOST_OPEN, rng)  # fmt: skip
+            sash = hinged(
+                "window",
+                foot,
+                heading,
+                opening_sign,
+                width - 0.02,
+                (WINDOW[0] + 0.035, WINDOW[1] - 0.035),
+                MOST_OPEN,
+                rng,
+            )
             most = _free_angle(sash, static, builder.movables, window.position)
             if most >= LEAST_OPEN:
                 sashes.append(_ajar(_limited(sash, most), rng, AJAR_SHARE / 2))
@@ -256,11 +266,7 @@ def _jamb(gap: Door, side: float, hand: float, width: float) -> tuple[np.ndarray
     along = hand * np.array([-ahead[1], ahead[0]])
     foot = np.array(gap.position)
     foot[:2] += (THICKNESS / 2 + FRAME_M) * ahead - width / 2 * along
-    return (
-        foot,
-        float(np.arctan2(along[1], along[0])),
-        float(np.sign(along[0] * ahead[1] - along[1] * ahead[0])),
-    )
+    return (foot, float(np.arctan2(along[1], along[0])), float(np.sign(along[0] * ahead[1] - along[1] * ahead[0])))
 
 
 def _room_at(static: World, gap: Door, side: float) -> str:
@@ -270,26 +276,18 @@ def _room_at(static: World, gap: Door, side: float) -> str:
     return names[0] if names else ""
 
 
-def _free_angle(
-    leaf: Openable, static: World, movables: list[Movable], gap: tuple[float, float, float]
-) -> float:
+def _free_angle(leaf: Openable, static: World, movables: list[Movable], gap: tuple[float, float, float]) -> float:
     """Angle to which a leaf opens before it touches something (rad), its own frame left aside."""
     solid = [item for item in static.objects if np.linalg.norm(np.array(item.position[:2]) - gap[:2]) < 4.0]
     solid += [obstacle(movable, None) for movable in movables]
-    solid = [
-        item for item in solid if item.z_range[0] < leaf.z_range[1] and item.z_range[1] > leaf.z_range[0]
-    ]
+    solid = [item for item in solid if item.z_range[0] < leaf.z_range[1] and item.z_range[1] > leaf.z_range[0]]
     angles = np.deg2rad(np.arange(15.0, 106.0, 5.0))
     edge = np.linspace(0.3, 1.0, 12)[:, None] * leaf.outline[1]  # along the leaf, away from the frame
-    points = np.einsum(
-        "aij,ej->aei", leaf.pose(leaf.closed + leaf.opening_sign * angles).R[:, :2, :2].numpy(), edge
-    )
+    points = np.einsum("aij,ej->aei", leaf.pose(leaf.closed + leaf.opening_sign * angles).R[:, :2, :2].numpy(), edge)
     points = points + np.array(leaf.object.t_world_object[:2].tolist())
     apart = np.min([distance_to_convex(points, item.footprint).min(1) for item in solid], 0)
     hit = np.flatnonzero(apart < 0.02)
-    return float(
-        min(angles[hit[0] - 1] if len(hit) and hit[0] > 0 else (0.0 if len(hit) else MOST_OPEN), MOST_OPEN)
-    )
+    return float(min(angles[hit[0] - 1] if len(hit) and hit[0] > 0 else (0.0 if len(hit) else MOST_OPEN), MOST_OPEN))
 
 
 def _limited(leaf: Openable, most: float) -> Openable:
@@ -297,9 +295,7 @@ def _limited(leaf: Openable, most: float) -> Openable:
     freedom = leaf.object.freedom
     low, high = (min(leaf.opening_sign * most, 0.0), max(leaf.opening_sign * most, 0.0))
     return replace(
-        leaf,
-        object=replace(leaf.object, freedom=replace(freedom, limits=(low, high))),
-        opened=leaf.opening_sign * most,
+        leaf, object=replace(leaf.object, freedom=replace(freedom, limits=(low, high))), opened=leaf.opening_sign * most
     )
 
 

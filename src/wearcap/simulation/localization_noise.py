@@ -46,10 +46,7 @@ class LocalizationNoise:
 
 
 def localize_statistically(
-    path: Trajectory,
-    noise: LocalizationNoise,
-    rng: np.random.Generator,
-    texture: Float[Tensor, "time"] | None = None,
+    path: Trajectory, noise: LocalizationNoise, rng: np.random.Generator, texture: Float[Tensor, "time"] | None = None
 ) -> Localization:
     """Localisation of a camera along its true path (OpenCV axes in the world, an even frame rate).
 
@@ -70,9 +67,8 @@ def localize_statistically(
     spread = scale.float() * (0.75 / sure) * torch.from_numpy(np.exp(0.3 * rng.standard_normal((count, 1))))
     R = rotation.exp(error[:, :3]) @ path.R_world_body
     found = Localization(
-        path.timestamps, R, path.t_world_body + error[:, 3:], confidence,
-        torch.diag_embed(spread.float() ** 2),
-    )  # fmt: skip
+        path.timestamps, R, path.t_world_body + error[:, 3:], confidence, torch.diag_embed(spread.float() ** 2)
+    )
     return _without(found, lost)
 
 
@@ -84,7 +80,9 @@ def with_outage(localization: Localization, start_s: float, length_s: float) -> 
     times = localization.timestamps
     lost = (times >= start_s) & (times < start_s + length_s)
     if not lost.any():
-        raise WearcapError(f"an outage of {length_s} s at {start_s} s", expected=f"within {times[0]:.1f} to {times[-1]:.1f} s")  # fmt: skip
+        raise WearcapError(
+            f"an outage of {length_s} s at {start_s} s", expected=f"within {times[0]:.1f} to {times[-1]:.1f} s"
+        )
     return _without(localization, lost)
 
 
@@ -115,9 +113,7 @@ def _view_noise(path: Trajectory, lasting: float, rng: np.random.Generator, fps:
     return np.sqrt(lasting) * torch.from_numpy(slow).float() + np.sqrt(1 - lasting) * quick
 
 
-def _outliers(
-    count: int, noise: LocalizationNoise, rng: np.random.Generator, fps: float
-) -> tuple[Tensor, Tensor]:
+def _outliers(count: int, noise: LocalizationNoise, rng: np.random.Generator, fps: float) -> tuple[Tensor, Tensor]:
     """Mask of wrong frames, in bursts, and their errors: rotation vector and position (time, 6)."""
     burst = smooth_noise(rng, count, 1, noise.burst_s, fps)[:, 0]
     wrong = burst > torch.quantile(burst[:: max(1, count // 100_000)], 1 - rng.uniform(*noise.outliers))
@@ -127,9 +123,7 @@ def _outliers(
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     length = np.exp(rng.uniform(*np.log(noise.outlier_m), (bursts, 1)))
     turn = np.deg2rad(12.0) * length * rng.standard_normal((bursts, 3))
-    jumpy = np.where(
-        rng.random((bursts, 1)) < 0.5, 0.6, 0.08
-    )  # Some stay at one wrong place, others leap about.
+    jumpy = np.where(rng.random((bursts, 1)) < 0.5, 0.6, 0.08)  # Some stay at one wrong place, others leap about.
     offset = torch.from_numpy(np.concatenate([turn, length * direction], 1))[number]
     shake = torch.from_numpy(rng.standard_normal((count, 6)))
     return wrong, offset + shake * offset.abs().mean(-1, keepdim=True) * torch.from_numpy(jumpy)[number]
@@ -147,9 +141,7 @@ def _outages(
         pull = 1 + (BLANK_PULL - 1) * (1 - rank) ** 4
     while left > noise.outage_s[0] * fps:
         longest = min(noise.outage_s[1], left / fps)
-        length = np.exp(
-            rng.uniform(np.log(noise.outage_s[0]), np.log(max(longest, noise.outage_s[0] * 1.01)))
-        )
+        length = np.exp(rng.uniform(np.log(noise.outage_s[0]), np.log(max(longest, noise.outage_s[0] * 1.01))))
         start = int(rng.choice(count, p=pull / pull.sum()))
         stop = min(start + round(length * fps), count)
         lost[start:stop] = True
@@ -166,5 +158,7 @@ def _confidence(
     good += 0.10 * rng.standard_normal(count)
     bad = rng.beta(2.0, 7.0, count)
     fooled = rng.random(count) < noise.misjudged
-    value = np.where(wrong.numpy() & ~fooled, bad, np.where(wrong.numpy(), 0.7 + 0.12 * rng.standard_normal(count), good))  # fmt: skip
+    value = np.where(
+        wrong.numpy() & ~fooled, bad, np.where(wrong.numpy(), 0.7 + 0.12 * rng.standard_normal(count), good)
+    )
     return torch.from_numpy(np.clip(value, 0.02, 1.0)).float()

@@ -41,8 +41,9 @@ class Rail:
         point = np.array(self.start) + share * np.subtract(self.stop, self.start)
         normal, fingers = np.array(self.normal), np.array(self.fingers)
         normal, fingers = (
-            np.cos(tilt) * normal - np.sin(tilt) * fingers, np.cos(tilt) * fingers + np.sin(tilt) * normal,
-        )  # fmt: skip
+            np.cos(tilt) * normal - np.sin(tilt) * fingers,
+            np.cos(tilt) * fingers + np.sin(tilt) * normal,
+        )
         return GripPlace(vector(point + SKIN_M * normal), vector(normal), vector(fingers))
 
 
@@ -106,9 +107,7 @@ def _sofa(name: str, rng: np.random.Generator) -> Movable:
 def _table(name: str, rng: np.random.Generator) -> Movable:
     """A table, held at its top's edges."""
     piece = furniture.table(rng)
-    bare = replace(
-        piece, parts=piece.parts[:5]
-    )  # The four legs and the top; nothing stands on a table that is moved.
+    bare = replace(piece, parts=piece.parts[:5])  # The four legs and the top; nothing stands on a table that is moved.
     half_depth, half_width = piece.size[0] / 2, piece.size[1] / 2
     top = piece.z_range[1]
     rails = []
@@ -119,9 +118,7 @@ def _table(name: str, rng: np.random.Generator) -> Movable:
         edge = -(deep - 0.012) * ahead
         ends = (np.append(edge + sign * wide * left, top) for sign in (1.0, -1.0))
         start, stop = (vector(end) for end in ends)
-        rails.append(
-            Rail(start, stop, (0.0, 0.0, 1.0), (float(ahead[0]), float(ahead[1]), 0.0), facing, 0.012)
-        )
+        rails.append(Rail(start, stop, (0.0, 0.0, 1.0), (float(ahead[0]), float(ahead[1]), 0.0), facing, 0.012))
     return _sliding(name, "table", bare, rails)
 
 
@@ -141,21 +138,11 @@ def _chair(name: str, rng: np.random.Generator) -> Movable:
 def _box(name: str, rng: np.random.Generator) -> Movable:
     """A box, lifted between the palms, which press on two opposite faces."""
     depth, width = rng.uniform(0.20, 0.45), rng.uniform(0.25, 0.55)
-    height, color = (
-        rng.uniform(0.20, 0.50),
-        hue(rng, (0.2, 0.6)) if rng.random() < 0.4 else (0.68, 0.52, 0.35),
-    )
-    piece = Piece(
-        "box", (depth, width), (0.0, height), (Part((0, 0, height / 2), (depth, width, height), color),)
-    )
+    height, color = (rng.uniform(0.20, 0.50), hue(rng, (0.2, 0.6)) if rng.random() < 0.4 else (0.68, 0.52, 0.35))
+    piece = Piece("box", (depth, width), (0.0, height), (Part((0, 0, height / 2), (depth, width, height), color),))
     level, up = float(rng.uniform(0.35, 0.6) + 0.6 * max(height - 0.3, 0.0)) * height, (0.0, 0.0, 1.0)
     sides = []
-    for facing, half in (
-        (0.0, width / 2),
-        (np.pi, width / 2),
-        (np.pi / 2, depth / 2),
-        (-np.pi / 2, depth / 2),
-    ):
+    for facing, half in ((0.0, width / 2), (np.pi, width / 2), (np.pi / 2, depth / 2), (-np.pi / 2, depth / 2)):
         ahead, left = (
             np.array([np.cos(facing), np.sin(facing), 0.0]),
             np.array([-np.sin(facing), np.cos(facing), 0.0]),
@@ -192,6 +179,9 @@ def _of_piece(name: str, category: str, piece: Piece, freedom: Freedom) -> Movab
 
 
 MOVABLES: dict[str, Callable[[str, np.random.Generator], Movable]] = {
-    "sofa": _sofa, "table": _table, "chair": _chair, "box": _box,
+    "sofa": _sofa,
+    "table": _table,
+    "chair": _chair,
+    "box": _box,
     **{category: _handheld(category, make) for category, make in handhelds.MAKERS.items()},
-}  # fmt: skip
+}

@@ -222,9 +222,7 @@ def _parts(height: np.ndarray, free: np.ndarray) -> np.ndarray:
     return np.where(free, part.reshape(free.shape), -1)
 
 
-def _keep_off(
-    objects: tuple, origin: np.ndarray, cell: float, height: np.ndarray, clearance: np.ndarray
-) -> None:
+def _keep_off(objects: tuple, origin: np.ndarray, cell: float, height: np.ndarray, clearance: np.ndarray) -> None:
     """Lower, in place, the clearance of the cells about objects to the distance from them."""
     shape = height.shape[1:]
     for item in objects:

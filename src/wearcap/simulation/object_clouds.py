@@ -29,8 +29,11 @@ def check_classes(classes: Sequence[str]) -> None:
     available = (*MOVABLES, *OPENABLES)
     for name in classes:
         if name not in available:
-            raise WearcapError(f"no objects of class {name!r} are generated", expected=f"some of {', '.join(available)}",
-                               fix=nearest(name, available))  # fmt: skip
+            raise WearcapError(
+                f"no objects of class {name!r} are generated",
+                expected=f"some of {', '.join(available)}",
+                fix=nearest(name, available),
+            )
 
 
 def generate_clouds(

@@ -65,11 +65,19 @@ def simulate_objects(config: ObjectConfig, name: str, split: str, seed: int) -> 
     simulated = perform(household.plan, flat.static, rng, duration, config.fps)
     motion = simulated.motion
     recording = Recording(
-        name, head=head_stream(motion, person.t_head_device, config.head_noise, rng), motion=motion,
+        name,
+        head=head_stream(motion, person.t_head_device, config.head_noise, rng),
+        motion=motion,
         contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, simulated.contact),
-        object_motion=house.object_motion(motion), interactions=house.interactions(duration),
-        floor=FloorTrack(motion.timestamps, simulated.floor_height), skeleton=person.skeleton, shape=person.shape,
-        subject=person.name, location=flat.static.name, activity=activity_of(simulated.labels),
-        source="wearcap simulation", license="MIT (generated)",
-    )  # fmt: skip
+        object_motion=house.object_motion(motion),
+        interactions=house.interactions(duration),
+        floor=FloorTrack(motion.timestamps, simulated.floor_height),
+        skeleton=person.skeleton,
+        shape=person.shape,
+        subject=person.name,
+        location=flat.static.name,
+        activity=activity_of(simulated.labels),
+        source="wearcap simulation",
+        license="MIT (generated)",
+    )
     return SimulatedObjects(recording, flat.environment)

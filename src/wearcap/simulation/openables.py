@@ -60,9 +60,7 @@ class Openable:
 
     def pose(self, value: float | Float[np.ndarray, "*batch"]) -> Rigid:
         """Pose in the world at a value."""
-        return self.object.freedom.moved(
-            self.object.T_world_object, torch.as_tensor(np.asarray(value, np.float64))
-        )
+        return self.object.freedom.moved(self.object.T_world_object, torch.as_tensor(np.asarray(value, np.float64)))
 
     def openness(self, value: float) -> float:
         """Opening at a value (rad or m)."""
@@ -74,9 +72,7 @@ class Openable:
         R, t = pose.R[..., :2, :2].numpy(), pose.t[..., :2].numpy()
         return np.einsum("...ij,cj->...ci", R, self.outline) + t[..., None, :]
 
-    def handle(
-        self, number: int, values: float | Float[np.ndarray, "*batch"]
-    ) -> Float[np.ndarray, "*batch 3"]:
+    def handle(self, number: int, values: float | Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 3"]:
         """Position of the palm on a handle, in the world (m)."""
         pose = self.pose(values)
         return pose.t.numpy() + pose.R.numpy() @ np.array(self.handles[number].point)
@@ -99,9 +95,15 @@ def hook(point: tuple[float, float, float], inwards: tuple[float, float]) -> Gri
 
 
 def hinged(
-    category: str, foot: Float[np.ndarray, "3"], heading: float, opening_sign: float, width: float,
-    z_range: tuple[float, float], most: float, rng: np.random.Generator,
-) -> Openable:  # fmt: skip
+    category: str,
+    foot: Float[np.ndarray, "3"],
+    heading: float,
+    opening_sign: float,
+    width: float,
+    z_range: tuple[float, float],
+    most: float,
+    rng: np.random.Generator,
+) -> Openable:
     """An unnamed leaf with its hinge's foot at `foot` (m), closed along `heading` (rad), opening by `most` (rad).
 
     `opening_sign` is the sense of opening about z; `z_range` is above the foot (m).
@@ -132,19 +134,11 @@ def hinged(
         category, category, _mesh(category, parts), spin, torch.from_numpy(np.asarray(foot)).float(), freedom
     )
     outline = _box_outline((0.0, width), sorted((0.0, -opening_sign * thick)))
-    return Openable(
-        scene_object, outline, (foot[2] + low, foot[2] + high), tuple(handles), 0.0, opening_sign * most
-    )
+    return Openable(scene_object, outline, (foot[2] + low, foot[2] + high), tuple(handles), 0.0, opening_sign * most)
 
 
 def _leaf(
-    category: str,
-    width: float,
-    thick: float,
-    low: float,
-    high: float,
-    opening_sign: float,
-    rng: np.random.Generator,
+    category: str, width: float, thick: float, low: float, high: float, opening_sign: float, rng: np.random.Generator
 ) -> list[Part]:
     """Parts of a leaf: a slab, or a frame around a pane."""
     off, color = -opening_sign * thick / 2, wood(rng) if rng.random() < 0.5 else hue(rng, (0.0, 0.25))
@@ -153,27 +147,25 @@ def _leaf(
         parts = [Part((width / 2, off, middle), (width, thick, tall), color, PLAIN)]
         if category == "door" and rng.random() < 0.6:
             parts += [
-                Part(
-                    (width / 2, off, low + share * tall),
-                    (0.66 * width, thick + 0.012, 0.33 * tall),
-                    color,
-                    8.0,
-                )
+                Part((width / 2, off, low + share * tall), (0.66 * width, thick + 0.012, 0.33 * tall), color, 8.0)
                 for share in (0.25, 0.72)
             ]
         return parts
     bar, pane = 0.06, (0.75, 0.85, 0.9)
     parts = [Part((x, off, middle), (bar, thick, tall), color, 6.0) for x in (bar / 2, width - bar / 2)]
-    parts += [
-        Part((width / 2, off, z), (width, thick, bar), color, 6.0) for z in (low + bar / 2, high - bar / 2)
-    ]
+    parts += [Part((width / 2, off, z), (width, thick, bar), color, 6.0) for z in (low + bar / 2, high - bar / 2)]
     return [*parts, Part((width / 2, off, middle), (width - bar, 0.008, tall - bar), pane, 0.5)]
 
 
 def drawer(
-    front: Float[np.ndarray, "3"], heading: float, width: float, level: tuple[float, float], depth: float,
-    travel: float, rng: np.random.Generator,
-) -> Openable:  # fmt: skip
+    front: Float[np.ndarray, "3"],
+    heading: float,
+    width: float,
+    level: tuple[float, float],
+    depth: float,
+    travel: float,
+    rng: np.random.Generator,
+) -> Openable:
     """An unnamed drawer; its closed front is over the floor point `front` (m) and slides `travel` (m) along `heading`.
 
     `level` is the front's lower and upper edge above the floor (m).
@@ -186,10 +178,7 @@ def drawer(
     ]
     parts += [
         Part(
-            (-depth / 2, side * (width / 2 - 0.03), low + 0.35 * tall),
-            (depth - 0.02, 0.015, 0.6 * tall),
-            color,
-            PLAIN,
+            (-depth / 2, side * (width / 2 - 0.03), low + 0.35 * tall), (depth - 0.02, 0.015, 0.6 * tall), color, PLAIN
         )
         for side in (-1, 1)
     ]
@@ -199,9 +188,13 @@ def drawer(
     axis = (float(np.cos(heading)), float(np.sin(heading)), 0.0)
     spin = rotation.about_axis("z", torch.tensor(heading, dtype=torch.float64)).float()
     scene_object = SceneObject(
-        "drawer", "drawer", _mesh("drawer", parts), spin, torch.from_numpy(np.asarray(front)).float(),
+        "drawer",
+        "drawer",
+        _mesh("drawer", parts),
+        spin,
+        torch.from_numpy(np.asarray(front)).float(),
         Freedom("axis", axis=axis, limits=(0.0, travel)),
-    )  # fmt: skip
+    )
     outline = _box_outline((-depth, 0.03), (-width / 2, width / 2))
     return Openable(scene_object, outline, (front[2] + low, front[2] + high), (handle,), 0.0, travel)
 
@@ -212,9 +205,11 @@ def at(openable: Openable, value: float) -> Openable:
     assert freedom.limits is not None
     limits = (min(freedom.limits[0] - value, 0.0), max(freedom.limits[1] - value, 0.0))
     moved = replace(
-        openable.object, R_world_object=pose.R.float(), t_world_object=pose.t.float(),
+        openable.object,
+        R_world_object=pose.R.float(),
+        t_world_object=pose.t.float(),
         freedom=replace(freedom, limits=limits),
-    )  # fmt: skip
+    )
     return replace(openable, object=moved, closed=openable.closed - value, opened=openable.opened - value)
 
 

@@ -52,9 +52,14 @@ class Turn:
 
 
 def operate(
-    plan: Plan, house: House, rng: np.random.Generator, item: Openable, value: float, handle: int = 0,
+    plan: Plan,
+    house: House,
+    rng: np.random.Generator,
+    item: Openable,
+    value: float,
+    handle: int = 0,
     distractor: Distractor | None = None,
-) -> bool:  # fmt: skip
+) -> bool:
     """Go to an openable and bring it to a value by one of its handles; False, with nothing done, if impossible.
 
     With `distractor`, that act is done there instead, and nothing is touched.
@@ -69,22 +74,14 @@ def operate(
     if far and not approach(plan, world, rng, goal, float(first[2])):
         return False
     if distractor is not None:
-        distractor(
-            plan, {turn.side: item.handles[handle]}, item.pose(turn.start), item.handles[handle].point[2], rng
-        )
+        distractor(plan, {turn.side: item.handles[handle]}, item.pose(turn.start), item.handles[handle].point[2], rng)
     else:
         _perform(plan, house, turn, rng)
     return True
 
 
 def plan_turn(
-    plan: Plan,
-    house: House,
-    world: World,
-    rng: np.random.Generator,
-    item: Openable,
-    value: float,
-    handle: int,
+    plan: Plan, house: House, world: World, rng: np.random.Generator, item: Openable, value: float, handle: int
 ) -> Turn | None:
     """Hand, tempo and body path; None where the leaf or drawer would hit something or one cannot stand for it."""
     start, shoulder = house.values[item.name], 1.50 * plan.hip_height
@@ -93,22 +90,27 @@ def plan_turn(
     keys = max(round(seconds / KEY_S), 6)
     values = start + ease(np.linspace(0.0, 1.0, keys)) * (value - start)
     palms, footprint = item.handle(handle, values), item.footprint(values)
-    near = [other for other in world.objects
-            if other.name != item.name and distance_to_convex(palms[:, :2], other.footprint).min() < NEAR_M]  # fmt: skip
+    near = [
+        other
+        for other in world.objects
+        if other.name != item.name and distance_to_convex(palms[:, :2], other.footprint).min() < NEAR_M
+    ]
     if _hits(item, values, near):
         return None
     floor = float(plan.position[2])
     solid = [other for other in near if other.z_range[0] < floor + 1.9 and other.z_range[1] > floor + 0.1]
-    high = [
-        other
-        for other in solid
-        if other.z_range[1] > palms[0, 2] - 0.05 and other.z_range[0] < floor + shoulder
-    ]
+    high = [other for other in solid if other.z_range[1] > palms[0, 2] - 0.05 and other.z_range[0] < floor + shoulder]
     task = Task(
-        palms, footprint, tuple(other.footprint for other in solid), tuple(other.footprint for other in high), 1.0,
-        floor + shoulder, plan.arm_length + PALM_M, low=bool(item.z_range[1] < palms[0, 2] + 0.2),
+        palms,
+        footprint,
+        tuple(other.footprint for other in solid),
+        tuple(other.footprint for other in high),
+        1.0,
+        floor + shoulder,
+        plan.arm_length + PALM_M,
+        low=bool(item.z_range[1] < palms[0, 2] + 0.2),
         beyond=_beyond(item, handle),
-    )  # fmt: skip
+    )
     walkable = world.navigation.node_points[:, :2]
     walkable = walkable[np.linalg.norm(walkable - palms[0, :2], axis=1) < 2.0]
     found = [(side, find_stances(replace(task, sign=LEFT_SIGN[side]), walkable, rng)) for side in SIDES]
@@ -132,9 +134,10 @@ def _beyond(item: Openable, handle: int) -> tuple[Float[np.ndarray, "2"], float]
 def _hits(item: Openable, values: Float[np.ndarray, "key"], near: list[WorldObject]) -> bool:
     """Whether a leaf or drawer, once it is out of its frame, meets other objects."""
     others = [
-        other.footprint for other in near
+        other.footprint
+        for other in near
         if other.z_range[0] < item.z_range[1] - 0.02 and other.z_range[1] > item.z_range[0] + 0.02
-    ]  # fmt: skip
+    ]
     out = values[np.abs(values - item.closed) > (OUT_RAD if item.hinged else OUT_M)]
     footprint = item.footprint(out)
     edges = np.concatenate([footprint[:, (1, 2)], footprint[:, (1, 2)].mean(1, keepdims=True)], 1)
@@ -176,9 +179,7 @@ def _perform(plan: Plan, house: House, turn: Turn, rng: np.random.Generator) -> 
     body = lambda at: np.stack([np.interp(at, times, column) for column in path.T], 1)  # noqa: E731
     shuffle(plan, rng, body, begin - 0.1, stop)
     contact_class = item.object.freedom.contact_class
-    house.handlings.append(
-        handling_of(item.name, contact_class, lambda at, chest: poses(at), [(turn.side, grip)])
-    )
+    house.handlings.append(handling_of(item.name, contact_class, lambda at, chest: poses(at), [(turn.side, grip)]))
     house.values[item.name] = turn.stop
     plan.time = max(plan.time, release)
 

@@ -14,8 +14,18 @@ from wearcap.simulation.world import Room, World
 KERB_STONE_M = 0.15
 LONGEST_RAMP_M = 9.5
 SQUARE_KINDS = (
-    "tree", "bench", "board", "bin", "tree", "low_wall", "bench", "planter", "street_lamp", "bush", "bollard",
-)  # fmt: skip
+    "tree",
+    "bench",
+    "board",
+    "bin",
+    "tree",
+    "low_wall",
+    "bench",
+    "planter",
+    "street_lamp",
+    "bush",
+    "bollard",
+)
 PAVEMENT_KINDS = ("street_lamp", "letter_box", "bench", "bollard", "tree", "bin")
 TERRACE_KINDS = ("bench", "planter", "bin")
 """Furniture of each part, in order of preference."""
@@ -65,9 +75,7 @@ class Layout:
 
 def build_outdoor(rng: np.random.Generator, name: str, ramp_slope: float | None = None) -> World:
     """An open place with kerbs of 10–15 cm, stairs and a ramp of 7–10 % (`ramp_slope` None leaves it to chance)."""
-    builder = WorldBuilder(
-        name, rng.uniform(-np.pi, np.pi), tuple(rng.uniform(-5.0, 5.0, 2).tolist()), outdoors=True
-    )
+    builder = WorldBuilder(name, rng.uniform(-np.pi, np.pi), tuple(rng.uniform(-5.0, 5.0, 2).tolist()), outdoors=True)
     layout = _draw_layout(rng, ramp_slope)
     _build_ground(builder, layout, rng)
     _build_terrace(builder, layout)
@@ -92,17 +100,27 @@ def _draw_layout(rng: np.random.Generator, ramp_slope: float | None) -> Layout:
     stair_x = margin + rng.uniform(stair_width / 2 + 0.3, terrace[0] - stair_width / 2 - 0.3)
     ramp_up = int(rng.choice([-1, 1]))  # falls towards larger x from a terrace on the left, or mirrored
     flip = (lambda low, high: (low, high)) if ramp_up < 0 else (lambda low, high: (width - high, width - low))
-    terrace_x, ramp_x = (
-        flip(margin, margin + terrace[0]),
-        flip(margin + terrace[0], margin + terrace[0] + run),
-    )
+    terrace_x, ramp_x = (flip(margin, margin + terrace[0]), flip(margin + terrace[0], margin + terrace[0] + run))
     crossings = _draw_crossings(rng, width)
     return Layout(
-        width, street, pavement, depth, kerb, kerb + height,
-        (terrace_x[0], depth - terrace[1], terrace_x[1], depth), (ramp_x[0], depth - ramp_width, ramp_x[1], depth),
-        slope, ramp_up, steps, tread, flip(stair_x, stair_x)[0], stair_width, crossings,
-        int(rng.integers(-1, len(crossings))), kerb / rng.uniform(0.08, 0.10),
-    )  # fmt: skip
+        width,
+        street,
+        pavement,
+        depth,
+        kerb,
+        kerb + height,
+        (terrace_x[0], depth - terrace[1], terrace_x[1], depth),
+        (ramp_x[0], depth - ramp_width, ramp_x[1], depth),
+        slope,
+        ramp_up,
+        steps,
+        tread,
+        flip(stair_x, stair_x)[0],
+        stair_width,
+        crossings,
+        int(rng.integers(-1, len(crossings))),
+        kerb / rng.uniform(0.08, 0.10),
+    )
 
 
 def _draw_crossings(rng: np.random.Generator, width: float) -> tuple[tuple[float, float], ...]:
@@ -138,9 +156,10 @@ def _build_ground(builder: WorldBuilder, layout: Layout, rng: np.random.Generato
     center = (width / 2, layout.depth / 2, -0.11)
     builder.add_box(center, (width + 24.0, layout.depth + 24.0, 0.1), (0.42, 0.52, 0.32), 1.0)
     for name, low, high, z in (
-        ("street", 0.0, street, 0.0), ("pavement", street, layout.pavement, kerb),
+        ("street", 0.0, street, 0.0),
+        ("pavement", street, layout.pavement, kerb),
         ("square", layout.pavement, layout.stair_foot, kerb),
-    ):  # fmt: skip
+    ):
         corners = np.array([[0.0, low], [width, low], [width, high], [0.0, high]])
         builder.rooms.append(Room(name, builder.to_world(corners), z))
 
@@ -193,9 +212,7 @@ def _line_kerb(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) 
 def _build_borders(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) -> None:
     """A house behind the square, one across the street or at an end, garden walls and hedges."""
     width, depth = layout.width, layout.depth
-    doors = [
-        (layout.terrace[0] + rng.uniform(0.3, 0.7) * (layout.terrace[2] - layout.terrace[0]), layout.top)
-    ]
+    doors = [(layout.terrace[0] + rng.uniform(0.3, 0.7) * (layout.terrace[2] - layout.terrace[0]), layout.top)]
     open_end = width - 1.0 if layout.ramp_up < 0 else 1.0
     doors.append((open_end, layout.kerb))
     build_facade(builder, (0.0, depth, width, depth + 0.4), rng.uniform(5.0, 7.5), doors, layout.top, rng)
@@ -204,7 +221,7 @@ def _build_borders(builder: WorldBuilder, layout: Layout, rng: np.random.Generat
             tall, hedge = rng.uniform(0.8, 2.2), rng.uniform() < 0.5
             color, texture = ((0.22, 0.42, 0.2), 35.0) if hedge else (hue(rng, (0.1, 0.35)), 9.0)
             center = (x + 1.5, -0.25, tall / 2)
-            builder.add_block("hedge" if hedge else "wall", center, (rng.uniform(2.0, 3.0), 0.4, tall), color, texture)  # fmt: skip
+            builder.add_block("hedge" if hedge else "wall", center, (rng.uniform(2.0, 3.0), 0.4, tall), color, texture)
     for x in (-0.2, width + 0.2):
         if rng.uniform() < 0.6:
             tall, low = rng.uniform(0.9, 2.4), rng.uniform(layout.street, layout.pavement)
@@ -230,9 +247,7 @@ def _furnish(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) ->
     terrace = (layout.terrace[0] + 0.2, layout.terrace[1] + 0.2, layout.terrace[2] - 0.2, layout.depth - 0.05)
     inner = (terrace[0], layout.ramp[1] - 0.4, terrace[2], terrace[3])
     stairs_head = (layout.stair_x - half, layout.terrace[1], layout.stair_x + half, layout.terrace[1] + 1.2)
-    ramp_head = (
-        (terrace[2] - 1.2, *inner[1:]) if layout.ramp_up < 0 else (*inner[:2], terrace[0] + 1.2, inner[3])
-    )
+    ramp_head = (terrace[2] - 1.2, *inner[1:]) if layout.ramp_up < 0 else (*inner[:2], terrace[0] + 1.2, inner[3])
     for room, z, kinds in (
         (square, kerb, SQUARE_KINDS),
         (pavement, kerb, PAVEMENT_KINDS),

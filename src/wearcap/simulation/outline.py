@@ -4,9 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 
-def rectangle(
-    center: tuple[float, float], size: tuple[float, float], heading: float = 0.0
-) -> Float[np.ndarray, "4 2"]:
+def rectangle(center: tuple[float, float], size: tuple[float, float], heading: float = 0.0) -> Float[np.ndarray, "4 2"]:
     """Counter-clockwise corners of a rectangle, `size` along and across its heading (m)."""
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * np.array(size) / 2
     return corners @ turn(heading).T + np.array(center)

@@ -41,11 +41,7 @@ def plan_path(
 def _onto_line(points: np.ndarray, flight, side: float) -> None:
     """Move, in place, the inner points on a flight to `side` metres left of its middle line."""
     run, off = flight.up_and_left(points[:, :2])
-    on = (
-        (run > -STAIR_APPROACH_M)
-        & (run < flight.length + STAIR_APPROACH_M)
-        & (np.abs(off) < flight.width / 2)
-    )
+    on = (run > -STAIR_APPROACH_M) & (run < flight.length + STAIR_APPROACH_M) & (np.abs(off) < flight.width / 2)
     on &= (points[:, 2] > flight.base_z - 0.3) & (points[:, 2] < flight.top_z + 0.3)
     on[[0, -1]] = False
     points[on, :2] += ((side - off[on]) * 0.5)[:, None] * flight.left

@@ -31,9 +31,7 @@ def draw_person(name: str, rng: np.random.Generator) -> Person:
     height = float(np.clip(rng.normal(1.72, 0.10), 1.50, 1.95))
     base = xsens23()
     stature = base.rest_sites["crown"][2].item() + base.root_height
-    legs, arms, width = (
-        float(np.clip(rng.normal(1.0, s), 1 - 2 * s, 1 + 2 * s)) for s in (0.03, 0.035, 0.05)
-    )
+    legs, arms, width = (float(np.clip(rng.normal(1.0, s), 1 - 2 * s, 1 + 2 * s)) for s in (0.03, 0.035, 0.05))
     scale = height / stature
     offsets = base.t_parent_joint * scale
     share = base.root_height / stature
@@ -50,13 +48,15 @@ def draw_person(name: str, rng: np.random.Generator) -> Person:
         elif part not in _LEG and part not in _ARM:
             offsets[joint, 2] *= trunk
     sites = {
-        key: Site(site.joint, tuple(float(v) * scale for v in site.t_joint_site))
-        for key, site in base.sites.items()
+        key: Site(site.joint, tuple(float(v) * scale for v in site.t_joint_site)) for key, site in base.sites.items()
     }
     skeleton = Skeleton(base.name, base.joint_names, base.parents, offsets, sites)
     mass_index = float(np.clip(rng.normal(24.0, 3.0), 18.0, 34.0))
     device = torch.tensor([rng.uniform(0.08, 0.10), rng.normal(0.0, 0.003), rng.uniform(0.08, 0.10)]).float()
     return Person(
-        name, skeleton, Style.sample(rng, skeleton.root_height), {"height": height, "weight": mass_index * height**2},
+        name,
+        skeleton,
+        Style.sample(rng, skeleton.root_height),
+        {"height": height, "weight": mass_index * height**2},
         device,
-    )  # fmt: skip
+    )

@@ -45,9 +45,7 @@ def step_rise(old: Footprint, new: Footprint) -> float:
     if old.tilt == new.tilt == 0.0:
         return rise
     offset = (new.ground - old.ground)[:2]
-    slopes = (
-        -np.tan(p.tilt) * (offset @ np.array([np.cos(p.heading), np.sin(p.heading)])) / 2 for p in (old, new)
-    )
+    slopes = (-np.tan(p.tilt) * (offset @ np.array([np.cos(p.heading), np.sin(p.heading)])) / 2 for p in (old, new))
     remaining = rise - sum(slopes)
     return remaining if abs(remaining) > STEP_M else 0.0
 
@@ -140,9 +138,7 @@ class Plan:
     def grip(self, side: str, grip: Grip) -> None:
         """Add a grip to a hand; the hand must have let go of its last object."""
         if self.grips[side] and self.grips[side][-1].release_s > grip.start_s + 1e-9:
-            raise ValueError(
-                f"the {side} hand reaches at {grip.start_s} s for one object while it holds another"
-            )
+            raise ValueError(f"the {side} hand reaches at {grip.start_s} s for one object while it holds another")
         self.grips[side].append(grip)
 
     @property

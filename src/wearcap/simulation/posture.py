@@ -73,11 +73,7 @@ HELP = ("lean", "bend", "twist", "crouch", "ahead", "aside")
 
 
 def stance_motion(
-    plan: Plan,
-    feet: dict[str, FootMotion],
-    times: Float[np.ndarray, "time"],
-    fps: float,
-    rng: np.random.Generator,
+    plan: Plan, feet: dict[str, FootMotion], times: Float[np.ndarray, "time"], fps: float, rng: np.random.Generator
 ) -> Stance:
     """Motion of the wearer's mass over the feet."""
     left, right = (feet[side] for side in SIDES)
@@ -105,9 +101,7 @@ def trunk_motion(
     help_: Float[np.ndarray, "time 6"] | None = None,
 ) -> Trunk:
     """Pelvis and chest that follow from the feet, the plan's channels, the wearer's habits and the hands' need."""
-    style, heading, forward, stride, drift = (
-        plan.style, stance.heading, stance.forward, stance.stride, stance.drift
-    )  # fmt: skip
+    style, heading, forward, stride, drift = (plan.style, stance.heading, stance.forward, stance.stride, stance.drift)
     seated = plan.seat_weight.sample(times)
     moving = np.clip(np.abs(stance.speed) / 0.8, 0.0, 1.0)
     lean, crouch, shift = plan.lean.sample(times), plan.crouch.sample(times)[:, 0], plan.shift.sample(times)
@@ -126,10 +120,7 @@ def trunk_motion(
     sideways = (stance.acceleration * across).sum(1)
     chest_angles = np.stack(
         [
-            heading
-            + style.trunk_counter * style.pelvis_yaw * blur(stride, 0.05, fps)
-            + lean[:, 2]
-            + drift[:, 1],
+            heading + style.trunk_counter * style.pelvis_yaw * blur(stride, 0.05, fps) + lean[:, 2] + drift[:, 1],
             style.slouch
             + 0.035 * stance.speed
             + 0.03 * blur((stance.acceleration * forward).sum(1), 0.12, fps)
@@ -191,8 +182,7 @@ def _height(
     limits = []
     for side in SIDES:
         hip, knee, ankle = (
-            skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double()
-            for joint in ("hip", "knee", "ankle")
+            skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double() for joint in ("hip", "knee", "ankle")
         )
         bears = blur(feet[side].planted.astype(np.float64), 0.08, fps)
         soft = np.zeros_like(place[:, :1]).repeat(3, 1)

@@ -22,11 +22,7 @@ ROUNDS, SMOOTH_ROUNDS, EAGER = 6, 3, 1.2
 
 
 def reach_help(
-    plan: Plan,
-    feet: dict[str, FootMotion],
-    stance: Stance,
-    times: Float[np.ndarray, "time"],
-    fps: float,
+    plan: Plan, feet: dict[str, FootMotion], stance: Stance, times: Float[np.ndarray, "time"], fps: float
 ) -> Float[np.ndarray, "time 6"] | None:
     """Additional trunk motion, columns as `HELP`, smooth; None where nothing is held.
 
@@ -93,11 +89,7 @@ def _lack(
 
 
 def _gains(
-    plan: Plan,
-    spine: Spine,
-    trunk: Trunk,
-    shoulder: Float[Tensor, "time 3"],
-    toward: Float[np.ndarray, "time 3"],
+    plan: Plan, spine: Spine, trunk: Trunk, shoulder: Float[Tensor, "time 3"], toward: Float[np.ndarray, "time 3"]
 ) -> Float[np.ndarray, "time 6"]:
     """Motion of the shoulder along `toward` per unit of each of `HELP`: lever arms of pelvis and chest."""
     zero = np.zeros_like(trunk.heading)
@@ -113,9 +105,7 @@ def _gains(
 
 
 def _shared(
-    lack: Float[np.ndarray, "time hand"],
-    gain: Float[np.ndarray, "time hand 6"],
-    easy: Float[np.ndarray, "time 6"],
+    lack: Float[np.ndarray, "time hand"], gain: Float[np.ndarray, "time hand 6"], easy: Float[np.ndarray, "time 6"]
 ) -> Float[np.ndarray, "time 6"]:
     """The least effort that brings both hands within reach: W² Gᵀ (G W² Gᵀ + ε)⁻¹ lack."""
     weighed = gain * easy[:, None] ** 2

@@ -73,23 +73,21 @@ def rearrange(
     return True
 
 
-def choose_slide(
-    plan: Plan, house: House, world: World, rng: np.random.Generator, movable: Movable
-) -> Slide | None:
+def choose_slide(plan: Plan, house: House, world: World, rng: np.random.Generator, movable: Movable) -> Slide | None:
     """A new place for an object and a plan to slide it there; None where none was found."""
     start, points = floor_place(house, movable), world.navigation.node_points[:, :2]
     if np.linalg.norm(points - start[:2], axis=1).min() > max(movable.half_size) + 1.0:
         return None
     near = [
-        item for item in world.objects
-        if item.name != movable.name and item.z_range[0] < 1.9 and item.z_range[1] > 0.1
+        item
+        for item in world.objects
+        if item.name != movable.name
+        and item.z_range[0] < 1.9
+        and item.z_range[1] > 0.1
         and distance_to_convex(start[:2], item.footprint) < 5.0
-    ]  # fmt: skip
+    ]
     low = [item.footprint for item in near if item.z_range[0] < movable.height]
-    solid, zones = (
-        [item.footprint for item in near],
-        [zone for zone in kept_free(house) if _meets(zone, start)],
-    )
+    solid, zones = ([item.footprint for item in near], [zone for zone in kept_free(house) if _meets(zone, start)])
     for _ in range(TRIES):
         stop = _drawn_stop(movable, start, rng)
         outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
@@ -106,9 +104,7 @@ def choose_slide(
             if (
                 free > BODY_M
                 and reached
-                and _keeps_floor_reachable(
-                    house, world, movable, choice.stop, choice.body_at(np.ones(1))[0, :2]
-                )
+                and _keeps_floor_reachable(house, world, movable, choice.stop, choice.body_at(np.ones(1))[0, :2])
             ):
                 return choice
     return None
@@ -244,8 +240,7 @@ def _swept(item: Openable) -> Float[np.ndarray, "4 2"]:
     behind = -0.9 if item.category == "door" else 0.0
     low, high = sorted((sign * (width + 0.1), sign * behind))
     return _local(
-        item.pose(item.closed),
-        np.array([[0.0, low], [width + BEFORE_M, low], [width + BEFORE_M, high], [0.0, high]]),
+        item.pose(item.closed), np.array([[0.0, low], [width + BEFORE_M, low], [width + BEFORE_M, high], [0.0, high]])
     )
 
 
@@ -259,9 +254,7 @@ def _meets(zone: Float[np.ndarray, "4 2"], start: Float[np.ndarray, "3"]) -> boo
     return distance < 4.0
 
 
-def _drawn_stop(
-    movable: Movable, start: Float[np.ndarray, "3"], rng: np.random.Generator
-) -> Float[np.ndarray, "3"]:
+def _drawn_stop(movable: Movable, start: Float[np.ndarray, "3"], rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A new place, mostly displaced along the object's own axes, now and then turned."""
     low, high = FAR_M[movable.category]
     along = rng.choice(4) * np.pi / 2 + start[2] if rng.random() < 0.7 else rng.uniform(-np.pi, np.pi)
@@ -274,16 +267,12 @@ def _drawn_stop(
     return start + np.array([far * np.cos(angle), far * np.sin(angle), spin])
 
 
-def outlines(
-    outline: Float[np.ndarray, "4 2"], places: Float[np.ndarray, "key 3"]
-) -> Float[np.ndarray, "key 4 2"]:
+def outlines(outline: Float[np.ndarray, "4 2"], places: Float[np.ndarray, "key 3"]) -> Float[np.ndarray, "key 4 2"]:
     """An outline at places x, y (m), heading (rad)."""
     return np.stack([outline @ turn(heading).T + np.array([x, y]) for x, y, heading in places])
 
 
-def apart(
-    outlines: Float[np.ndarray, "key 4 2"], others: list[Float[np.ndarray, "corner 2"]], least_m: float
-) -> bool:
+def apart(outlines: Float[np.ndarray, "key 4 2"], others: list[Float[np.ndarray, "corner 2"]], least_m: float) -> bool:
     """Whether outlines keep a distance from others: neither's border comes near the other."""
     share = np.linspace(0.0, 1.0, 7)[:-1, None]
     border = lambda corners: np.concatenate(  # noqa: E731

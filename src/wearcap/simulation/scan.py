@@ -43,9 +43,12 @@ class Scanner:
 
 
 def scan_world(
-    scenery: Scenery, spacing_m: float, rng: np.random.Generator, scanner: Scanner = Scanner(),
+    scenery: Scenery,
+    spacing_m: float,
+    rng: np.random.Generator,
+    scanner: Scanner = Scanner(),
     walked: World | None = None,
-) -> Scan:  # fmt: skip
+) -> Scan:
     """The scan of a world: points about `spacing_m` apart on surfaces seen by any station, in the world's axes (m).
 
     Stations stand where one can walk in the world, or in `walked`: the same world without its doors.
@@ -70,9 +73,19 @@ def _measured(scenery: Scenery, survey: tuple, scanner: Scanner, face, place, rn
     """Measured positions of surface samples, and a mask of those that were measured."""
     measured, kept = np.empty_like(place), np.zeros(len(place), bool)
     scan_kernels.measure(
-        place, scenery.paint.frames[face, 9:12], *survey, rng.random((len(place), 3)), scanner.full_m,
-        scanner.max_m, scanner.noise_m, scanner.mixed, scanner.wrong, rng.standard_normal(len(place)), measured, kept,
-    )  # fmt: skip
+        place,
+        scenery.paint.frames[face, 9:12],
+        *survey,
+        rng.random((len(place), 3)),
+        scanner.full_m,
+        scanner.max_m,
+        scanner.noise_m,
+        scanner.mixed,
+        scanner.wrong,
+        rng.standard_normal(len(place)),
+        measured,
+        kept,
+    )
     return measured, kept
 
 
@@ -85,9 +98,7 @@ def _faces_seen(
     return kept.reshape(-1, PROBES).any(1)
 
 
-def place_stations(
-    world: World, spacing_m: float, clearance_m: float = 0.45
-) -> Float[np.ndarray, "station 3"]:
+def place_stations(world: World, spacing_m: float, clearance_m: float = 0.45) -> Float[np.ndarray, "station 3"]:
     """Floor points (m) that cover the walkable area, none nearer to another than the spacing; always the same."""
     points = world.navigation.node_points
     free = points[world.clearance(points) > clearance_m]

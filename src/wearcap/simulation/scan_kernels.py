@@ -25,8 +25,26 @@ def cube_pixel(x, y, z, size):
 
 
 @compiled
-def measure(points, normals, stations, near_stations, near_first, cell, origin, shape, nearness, luck, full_m, max_m,
-            noise_m, mixed, wrong, draws, out, kept):  # fmt: skip
+def measure(
+    points,
+    normals,
+    stations,
+    near_stations,
+    near_first,
+    cell,
+    origin,
+    shape,
+    nearness,
+    luck,
+    full_m,
+    max_m,
+    noise_m,
+    mixed,
+    wrong,
+    draws,
+    out,
+    kept,
+):
     """Measured position of every point that a station sees; `kept` is their mask.
 
     The stations of a point's cell are tried from near to far; `nearness` is 1/depth (station side row column).
@@ -58,8 +76,10 @@ def measure(points, normals, stations, near_stations, near_first, cell, origin, 
             if luck[k, 1] < wrong:
                 stretch = -0.5 * luck[k, 2]
             elif luck[k, 1] < wrong + mixed:
-                beyond = max(nearness[station, side, row, min(size - 1, column + 1)],
-                             nearness[station, side, row, max(0, column - 1)])  # fmt: skip
+                beyond = max(
+                    nearness[station, side, row, min(size - 1, column + 1)],
+                    nearness[station, side, row, max(0, column - 1)],
+                )
                 if beyond * depth > 1.15:
                     stretch = luck[k, 2] * (1.0 / (beyond * depth) - 1.0)
             out[k, 0], out[k, 1], out[k, 2] = x + stretch * dx, y + stretch * dy, z + stretch * dz

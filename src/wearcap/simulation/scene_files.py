@@ -63,25 +63,19 @@ def plan_photos(scenery: Scenery, settings: SceneSettings) -> list[Photo]:
             R_rig = lean @ rotation.about_axis("z", yaw)
             t = torch.from_numpy(station).float() + R_rig @ torch.tensor([RIG_RADIUS_M, 0.0, height])
             photos.append(
-                Photo(
-                    Path(f"photos/{number:05d}-cam{camera}.jpg"), lens, Rigid(R_rig @ down @ R_DEVICE_CAM, t)
-                )
+                Photo(Path(f"photos/{number:05d}-cam{camera}.jpg"), lens, Rigid(R_rig @ down @ R_DEVICE_CAM, t))
             )
     return photos
 
 
-def write_scene(
-    scenery: Scenery, folder: str | Path, settings: SceneSettings, seed: int, turn: int = 0
-) -> None:
+def write_scene(scenery: Scenery, folder: str | Path, settings: SceneSettings, seed: int, turn: int = 0) -> None:
     """Write the missing files of a scene: `pointcloud.ply`, `photos/*.jpg`, `photos.json`; settings go to `made.json`.
 
     Files of other settings or another seed are made again. Processes that fill one folder at once should have different
     `turn`s: each begins with other photos.
     """
     folder = Path(folder)
-    wanted = json.dumps(
-        {"settings": asdict(settings), "seed": seed, "world": scenery.world.name}, sort_keys=True
-    )
+    wanted = json.dumps({"settings": asdict(settings), "seed": seed, "world": scenery.world.name}, sort_keys=True)
     plan = plan_photos(scenery, settings)
     _discard_stale(folder, wanted)
     if not (folder / CLOUD).is_file():
@@ -91,9 +85,7 @@ def write_scene(
         photo = plan[number]
         if not (folder / photo.file).is_file():
             rng = np.random.default_rng([14, seed, int(number)])
-            light = Development(
-                exposure=float(rng.uniform(0.92, 1.06)), noise=settings.noise, vignetting=0.25
-            )
+            light = Development(exposure=float(rng.uniform(0.92, 1.06)), noise=settings.noise, vignetting=0.25)
             save_jpeg(render_view(scenery, photo.camera, photo.T_world_cam, light, rng), folder / photo.file)
     if not (folder / FILE_NAME).is_file():
         write_photos(plan, folder)

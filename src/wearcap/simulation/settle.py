@@ -33,9 +33,7 @@ def sit(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return True
 
 
-def _down_and_up(
-    plan: Plan, start: float, down: float, leave: float, up: float, rng: np.random.Generator
-) -> None:
+def _down_and_up(plan: Plan, start: float, down: float, leave: float, up: float, rng: np.random.Generator) -> None:
     """Lean forward 40–45°, hips back and down, lean back; and in reverse order (Schenkman et al. 1990)."""
     bow, seated_lean = np.deg2rad(rng.uniform(36, 44)), rng.normal(-0.06, 0.06)
     plan.lean.move(start, start + 0.55 * down, (bow, 0.0, 0.0))
@@ -71,9 +69,7 @@ def crouch(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return True
 
 
-def _touch_floor(
-    plan: Plan, start: float, down: float, leave: float, up: float, rng: np.random.Generator
-) -> None:
+def _touch_floor(plan: Plan, start: float, down: float, leave: float, up: float, rng: np.random.Generator) -> None:
     """Touch an object that lies in front of the feet with one hand."""
     side = str(rng.choice(SIDES))
     angle = plan.heading + rng.normal(0.0, 0.3) + (0.25 if side == "left" else -0.25)

@@ -44,9 +44,8 @@ class _BodyPath:
         speed = blur(np.gradient(place, step, axis=0), 0.12, 1.0 / step)
         cos, sin = np.cos(place[:, 2]), np.sin(place[:, 2])
         return cls(
-            times, place, cos * speed[:, 0] + sin * speed[:, 1], cos * speed[:, 1] - sin * speed[:, 0],
-            speed[:, 2],
-        )  # fmt: skip
+            times, place, cos * speed[:, 0] + sin * speed[:, 1], cos * speed[:, 1] - sin * speed[:, 0], speed[:, 2]
+        )
 
     def at(self, name: str, time: float) -> float:
         return float(np.interp(time, self.times, getattr(self, name)))
@@ -56,12 +55,7 @@ class _BodyPath:
 
 
 def shuffle(
-    plan: Plan,
-    rng: np.random.Generator,
-    body: Body,
-    start_s: float,
-    stop_s: float,
-    width: float | None = None,
+    plan: Plan, rng: np.random.Generator, body: Body, start_s: float, stop_s: float, width: float | None = None
 ) -> None:
     """Follow a body's path from one time to another with alternate steps, feet together at its end.
 
@@ -98,9 +92,8 @@ def step_to(
     duration = max(1.5 * effort / speed, 0.7)
     begin = plan.time + 0.15
     shuffle(
-        plan, rng, lambda times: start + ease((times - begin) / duration)[:, None] * change, begin,
-        begin + duration,
-    )  # fmt: skip
+        plan, rng, lambda times: start + ease((times - begin) / duration)[:, None] * change, begin, begin + duration
+    )
 
 
 def _landings(
@@ -157,9 +150,8 @@ def _print(
     size = float(np.clip(2.0 * abs(ahead) * beat / 1.0, 0.0, 0.45))
     land_pitch = -0.35 * size if ahead > 0 else 0.5 * size
     return plan.footprint(
-        side, center, heading, half, land_pitch=land_pitch, clearance=0.02 + 0.03 * size,
-        bow=LEFT_SIGN[side] * 0.012,
-    )  # fmt: skip
+        side, center, heading, half, land_pitch=land_pitch, clearance=0.02 + 0.03 * size, bow=LEFT_SIGN[side] * 0.012
+    )
 
 
 def _step(plan: Plan, path: _BodyPath, side: str, land: float, swing: float, print_: Footprint) -> None:

@@ -60,9 +60,7 @@ class SimulationConfig:
 
     def __post_init__(self):
         if self.world is not None and self.world not in WORLDS:
-            raise WearcapError(
-                f"no world {self.world!r}", expected=f"{' or '.join(WORLDS)}, or null to draw one"
-            )
+            raise WearcapError(f"no world {self.world!r}", expected=f"{' or '.join(WORLDS)}, or null to draw one")
 
 
 def simulate_recording(
@@ -92,9 +90,7 @@ def simulate_recording(
 
 def person_of(split: str, number: int) -> Person:
     """A split's person by number, always the same."""
-    return draw_person(
-        f"sim-{split}-person-{number:03d}", np.random.default_rng([1, sum(map(ord, split)), number])
-    )
+    return draw_person(f"sim-{split}-person-{number:03d}", np.random.default_rng([1, sum(map(ord, split)), number]))
 
 
 def world_of(split: str, number: int, kind: str = "flat") -> World:
@@ -115,20 +111,26 @@ def sense(
     """Add sensor readings to a simulated motion."""
     motion = simulated.motion
     head = head_stream(motion, person.t_head_device, config.head_noise, rng)
-    imu = {
-        joint: synthesize_imu(motion, joint, noise=config.imu_noise, rng=rng) for joint in config.imu_joints
-    }
-    points: PointCloud | None = (
-        semidense_points(world.mesh, world.face_texture, head, rng) if config.points else None
-    )
+    imu = {joint: synthesize_imu(motion, joint, noise=config.imu_noise, rng=rng) for joint in config.imu_joints}
+    points: PointCloud | None = semidense_points(world.mesh, world.face_texture, head, rng) if config.points else None
     suit = suit_motion(motion, simulated.contact, config.suit, rng) if config.suit else None
     return Recording(
-        name, head=head, imu=imu, suit=suit, points=points, motion=motion,
+        name,
+        head=head,
+        imu=imu,
+        suit=suit,
+        points=points,
+        motion=motion,
         contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, simulated.contact),
-        floor=FloorTrack(motion.timestamps, simulated.floor_height), skeleton=person.skeleton, shape=person.shape,
-        subject=person.name, location=world.name,
-        activity=activity_of(simulated.labels), source="wearcap simulation", license="MIT (generated)",
-    )  # fmt: skip
+        floor=FloorTrack(motion.timestamps, simulated.floor_height),
+        skeleton=person.skeleton,
+        shape=person.shape,
+        subject=person.name,
+        location=world.name,
+        activity=activity_of(simulated.labels),
+        source="wearcap simulation",
+        license="MIT (generated)",
+    )
 
 
 def activity_of(labels: Sequence[Label]) -> str:

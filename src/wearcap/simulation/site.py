@@ -19,23 +19,27 @@ SPOT_M = 4.0
 """Side of the capture spot."""
 RISE_M, RISERS, TREAD_M = 0.16, 2, 0.31
 RAMP_SLOPE = 0.08
-HALL_KINDS = (
-    "shelf",
-    "board",
-    "cabinet",
-    "plant",
-    "shelf",
-    "desk",
-    "sofa",
-    "shelf",
-    "board",
-    "plant",
-    "shelf",
-)
+HALL_KINDS = ("shelf", "board", "cabinet", "plant", "shelf", "desk", "sofa", "shelf", "board", "plant", "shelf")
 YARD_KINDS = (
-    "tree", "bench", "board", "planter", "bush", "tree", "low_wall", "street_lamp", "bin", "bench", "letter_box",
-    "tree", "bush", "planter", "bollard", "tree", "low_wall", "street_lamp",
-)  # fmt: skip
+    "tree",
+    "bench",
+    "board",
+    "planter",
+    "bush",
+    "tree",
+    "low_wall",
+    "street_lamp",
+    "bin",
+    "bench",
+    "letter_box",
+    "tree",
+    "bush",
+    "planter",
+    "bollard",
+    "tree",
+    "low_wall",
+    "street_lamp",
+)
 TERRACE_KINDS = ("bench", "planter", "bin", "board")
 """Furniture of each part, in order of preference."""
 
@@ -97,14 +101,19 @@ def _draw_layout(rng: np.random.Generator, scale: float) -> Layout:
         ramp_x, stair_x = width - ramp_x, width - stair_x
     half = rng.uniform(0.8, 1.0)
     return Layout(
-        width, rooms, corridor, halls, (0.0, top, width, edge), yard,
-        (ramp_x - half, edge, ramp_x + half, edge + run), stair_x, rng.uniform(1.8, 2.8),
-    )  # fmt: skip
+        width,
+        rooms,
+        corridor,
+        halls,
+        (0.0, top, width, edge),
+        yard,
+        (ramp_x - half, edge, ramp_x + half, edge + run),
+        stair_x,
+        rng.uniform(1.8, 2.8),
+    )
 
 
-def _side_by_side(
-    rng: np.random.Generator, width: float, count: int, low: float, high: float
-) -> tuple[Box, ...]:
+def _side_by_side(rng: np.random.Generator, width: float, count: int, low: float, high: float) -> tuple[Box, ...]:
     shares = 1.0 + rng.uniform(-0.18, 0.18, count)
     edges = np.concatenate([[0.0], np.cumsum(shares / shares.sum())]) * width
     return tuple((float(a), low, float(b), high) for a, b in pairwise(edges))
@@ -114,7 +123,7 @@ def _walls(layout: Layout, rng: np.random.Generator) -> list[Wall]:
     """Outer walls with windows, doors to the terrace, a door or two to the corridor from every room and hall."""
     width, top = layout.width, layout.terrace[1]
     low, high = layout.corridor[1], layout.corridor[3]
-    south, west, east = Wall((0.0, 0.0), (width, 0.0)), Wall((0.0, 0.0), (0.0, top)), Wall((width, 0.0), (width, top))  # fmt: skip
+    south, west, east = Wall((0.0, 0.0), (width, 0.0)), Wall((0.0, 0.0), (0.0, top)), Wall((width, 0.0), (width, top))
     north, below, above = (Wall((0.0, y), (width, y)) for y in (top, low, high))
     for box in layout.rooms:
         south.windows += _row(box, 2.6, rng.uniform(1.0, 1.5))
@@ -166,13 +175,13 @@ def _build_open_air(builder: WorldBuilder, layout: Layout, rng: np.random.Genera
     slope = (0.0, -RAMP_SLOPE, RAMP_SLOPE * edge)
     slab(builder, "ramp", layout.ramp, 0.0, -base, paving, 6.0, slope)
     start = (layout.stair_x, edge + (RISERS - 1) * TREAD_M)
-    build_flight(
-        builder, start, -np.pi / 2, RISERS, RISE_M, TREAD_M, layout.stair_width, base, (-1, 1), STONE
-    )
+    build_flight(builder, start, -np.pi / 2, RISERS, RISE_M, TREAD_M, layout.stair_width, base, (-1, 1), STONE)
     gaps = sorted(
-        [(layout.ramp[0], layout.ramp[2]),
-         (layout.stair_x - layout.stair_width / 2 - 0.03, layout.stair_x + layout.stair_width / 2 + 0.03)]
-    )  # fmt: skip
+        [
+            (layout.ramp[0], layout.ramp[2]),
+            (layout.stair_x - layout.stair_width / 2 - 0.03, layout.stair_x + layout.stair_width / 2 + 0.03),
+        ]
+    )
     ends = [x_low + 0.05, *(x for gap in gaps for x in gap), x_high - 0.05]
     for a, b in zip(ends[::2], ends[1::2]):
         if b - a > 0.1:
@@ -249,7 +258,7 @@ def _capture_spot(plan: Plan, rng: np.random.Generator) -> None:
     position = plan.builder.to_world(np.array([x, y, plan.z]))
     plan.builder.spots.append(
         CaptureSpot(tuple(position.tolist()), plan.builder.heading + float(heading), SPOT_M, half, table.z_range[1])
-    )  # fmt: skip
+    )
 
 
 def _pillars(plan: Plan, rng: np.random.Generator) -> None:

@@ -58,18 +58,20 @@ class Slide:
         change = self.stop - self.start
         across = np.array([-change[1], change[0], 0.0])
         across /= max(float(np.linalg.norm(across)), 1e-9)
-        return (
-            self.start + share[:, None] * change + self.bow * (np.sin(np.pi * share) ** 2)[:, None] * across
-        )
+        return self.start + share[:, None] * change + self.bow * (np.sin(np.pi * share) ** 2)[:, None] * across
 
     def body_at(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
         """Pose of the wearer (x, y, heading) at a share of the path."""
         x, y, heading = self.object_at(share).T
         cos, sin = np.cos(heading), np.sin(heading)
         return np.stack(
-            [x + cos * self.local[0] - sin * self.local[1], y + sin * self.local[0] + cos * self.local[1],
-             heading + self.local[2]], 1,
-        )  # fmt: skip
+            [
+                x + cos * self.local[0] - sin * self.local[1],
+                y + sin * self.local[0] + cos * self.local[1],
+                heading + self.local[2],
+            ],
+            1,
+        )
 
     @property
     def stand(self) -> Float[np.ndarray, "3"]:
@@ -90,11 +92,7 @@ class Slide:
 
 
 def slide_options(
-    plan: Plan,
-    movable: Movable,
-    start: Float[np.ndarray, "3"],
-    stop: Float[np.ndarray, "3"],
-    rng: np.random.Generator,
+    plan: Plan, movable: Movable, start: Float[np.ndarray, "3"], stop: Float[np.ndarray, "3"], rng: np.random.Generator
 ) -> Iterator[Slide]:
     """Options for sliding an object from one place to another (x, y in m, heading in rad) for this wearer.
 
@@ -129,9 +127,15 @@ def slide_options(
 
 
 def _drawn(
-    plan: Plan, movable: Movable, start: np.ndarray, stop: np.ndarray, rail: Rail, both: bool, angle: float,
+    plan: Plan,
+    movable: Movable,
+    start: np.ndarray,
+    stop: np.ndarray,
+    rail: Rail,
+    both: bool,
+    angle: float,
     rng: np.random.Generator,
-) -> Slide:  # fmt: skip
+) -> Slide:
     """Draw the remaining choices: hands and their places, tempo, pause, distance."""
     change = stop - start
     length, turned = float(np.linalg.norm(change[:2])), abs(change[2])
@@ -143,9 +147,7 @@ def _drawn(
     pause = float(rng.uniform(0.5, 1.6)) if seconds > 3.0 and rng.random() < 0.25 else 0.0
     hands = _hand_sets(both, bool(turned > 0), seconds, rng)
     used = sorted({side for group in hands for side in group})
-    wide = 2.0 * float(
-        plan.skeleton.t_parent_joint[plan.skeleton.indices("left_collar", "left_shoulder"), 1].sum()
-    )
+    wide = 2.0 * float(plan.skeleton.t_parent_joint[plan.skeleton.indices("left_collar", "left_shoulder"), 1].sum())
     apart = min(wide * rng.uniform(0.75, 1.5), rail.length) if len(used) > 1 else 0.0
     reach = max(rail.length - apart, 0.0) / 2
     middle = rail.length / 2 + float(np.clip(rng.normal(0.0, 0.4), -1, 1)) * min(reach, 0.5)
@@ -158,14 +160,21 @@ def _drawn(
         along = float(np.clip(middle + offsets[side], 0.0, rail.length))
         places[side] = rail.at(along, tilt + float(rng.normal(0.0, 0.05)))
     return Slide(
-        movable, start, stop, float(np.clip(rng.normal(0.0, 0.05), -0.1, 0.1)) * length if turned == 0 else 0.0, rail,
-        places, hands, _body(plan, rail, places, speed, angle, EFFORT[movable.category], rng), seconds, pause, angle,
-    )  # fmt: skip
+        movable,
+        start,
+        stop,
+        float(np.clip(rng.normal(0.0, 0.05), -0.1, 0.1)) * length if turned == 0 else 0.0,
+        rail,
+        places,
+        hands,
+        _body(plan, rail, places, speed, angle, EFFORT[movable.category], rng),
+        seconds,
+        pause,
+        angle,
+    )
 
 
-def _hand_sets(
-    both: bool, turns: bool, seconds: float, rng: np.random.Generator
-) -> tuple[tuple[str, ...], ...]:
+def _hand_sets(both: bool, turns: bool, seconds: float, rng: np.random.Generator) -> tuple[tuple[str, ...], ...]:
     """Sets of holding hands, one after the other; only both may turn an object."""
     if turns:
         return (SIDES,)
@@ -208,10 +217,7 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
 
     Writes footsteps, lean, grips and gaze; `plan.time` becomes the end. The object is static at `choice.stop` then.
     """
-    if (
-        np.hypot(*(choice.stand[:2] - plan.position[:2])) > 0.03
-        or abs(wrap(choice.stand[2] - plan.heading)) > 0.1
-    ):
+    if np.hypot(*(choice.stand[:2] - plan.position[:2])) > 0.03 or abs(wrap(choice.stand[2] - plan.heading)) > 0.1:
         step_to(plan, rng, choice.stand[:2], choice.stand[2])
     touch = plan.time + float(np.clip(rng.normal(0.8, 0.15) / plan.style.briskness, 0.5, 1.3))
     begin = touch + float(rng.uniform(0.25, 0.8))
@@ -262,13 +268,7 @@ def _stagger(rng: np.random.Generator) -> float:
 
 
 def _lean(
-    plan: Plan,
-    choice: Slide,
-    start: float,
-    begin: float,
-    end: float,
-    release: float,
-    rng: np.random.Generator,
+    plan: Plan, choice: Slide, start: float, begin: float, end: float, release: float, rng: np.random.Generator
 ) -> None:
     """Lean into a push, back in a pull; a little already when taking hold."""
     effort = EFFORT[choice.movable.category]
@@ -294,13 +294,7 @@ def _lean(
 
 
 def _look(
-    plan: Plan,
-    choice: Slide,
-    touch: float,
-    begin: float,
-    end: float,
-    floor_z: float,
-    rng: np.random.Generator,
+    plan: Plan, choice: Slide, touch: float, begin: float, end: float, floor_z: float, rng: np.random.Generator
 ) -> None:
     """Look at the place of the grip, then about where the path leads."""
     local = torch.tensor(next(iter(choice.places.values())).point, dtype=torch.float64)
@@ -316,7 +310,5 @@ def _look(
             if back and rng.random() < 0.4
             else rng.normal(0, 0.2)
         )
-        time = (
-            turn_head(plan, time, (side, float(rng.normal(0.35, 0.12)))) + float(rng.exponential(1.2)) + 0.3
-        )
+        time = turn_head(plan, time, (side, float(rng.normal(0.35, 0.12)))) + float(rng.exponential(1.2)) + 0.3
     turn_head(plan, max(time, end), (0.0, plan.style.head_pitch))

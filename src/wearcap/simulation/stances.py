@@ -59,9 +59,7 @@ class Stances:
     cost: float
 
 
-def find_stances(
-    task: Task, walkable: Float[np.ndarray, "point 2"], rng: np.random.Generator
-) -> Stances | None:
+def find_stances(task: Task, walkable: Float[np.ndarray, "point 2"], rng: np.random.Generator) -> Stances | None:
     """The cheapest path, or None where none is free; it begins within 0.45 m of a walkable point."""
     low, high = task.handle[:, :2].min(0) - AROUND_M, task.handle[:, :2].max(0) + AROUND_M
     axes = [np.arange(a, b, SPACING_M) for a, b in zip(low, high)]
@@ -111,9 +109,11 @@ def _rated(
 
 
 def _arm_hits(
-    task: Task, shoulder: Float[np.ndarray, "key point 2"], arm: Float[np.ndarray, "key point 2"],
+    task: Task,
+    shoulder: Float[np.ndarray, "key point 2"],
+    arm: Float[np.ndarray, "key point 2"],
     far: Float[np.ndarray, "key point"],
-) -> Bool[np.ndarray, "key point"]:  # fmt: skip
+) -> Bool[np.ndarray, "key point"]:
     """Whether the straight arm, except its last 7 cm, passes through the moved object or another."""
     last = np.clip(1.0 - 0.07 / np.maximum(far, 0.1), 0.0, 1.0)[..., None]
     hits = np.zeros(far.shape, bool)

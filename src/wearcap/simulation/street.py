@@ -16,18 +16,19 @@ BRICK_TEXTURE = 9.0
 
 
 def slab(
-    builder: WorldBuilder, kind: str, box: Box, z: float, thickness: float, color: tuple, texture: float,
+    builder: WorldBuilder,
+    kind: str,
+    box: Box,
+    z: float,
+    thickness: float,
+    color: tuple,
+    texture: float,
     plane: tuple[float, float, float] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """A rectangle of ground whose top lies at z, or on a plane (of the builder's frame)."""
     middle, size = middle_and_size(box)
     builder.add_surface(
-        kind,
-        rectangle(middle, size),
-        color,
-        plane=plane or (0.0, 0.0, z),
-        texture=texture,
-        thickness=thickness,
+        kind, rectangle(middle, size), color, plane=plane or (0.0, 0.0, z), texture=texture, thickness=thickness
     )
 
 
@@ -40,9 +41,13 @@ def build_kerb(builder: WorldBuilder, x: float, y: float, width: float, height: 
 
 
 def sloped_rail(
-    builder: WorldBuilder, start: tuple[float, float], end: tuple[float, float], base_z: float,
-    tops: tuple[float, float], height: float = 0.9,
-) -> None:  # fmt: skip
+    builder: WorldBuilder,
+    start: tuple[float, float],
+    end: tuple[float, float],
+    base_z: float,
+    tops: tuple[float, float],
+    height: float = 0.9,
+) -> None:
     """A wall beside a slope whose ground is at `tops` (m) at its two ends, low, with a hand rail on posts."""
     a, b = np.array(start), np.array(end)
     length, heading = float(np.linalg.norm(b - a)), float(np.arctan2(*(b - a)[::-1]))
@@ -73,8 +78,15 @@ def _sloped_bar(builder, ends, heights, low_high, thick: float, color, texture: 
     builder.add_prism(vertices, color, texture, item)
 
 
-def barrier(builder: WorldBuilder, x_low: float, x_high: float, y: float, z: tuple[float, float],
-            rng: np.random.Generator, cars: bool) -> None:  # fmt: skip
+def barrier(
+    builder: WorldBuilder,
+    x_low: float,
+    x_high: float,
+    y: float,
+    z: tuple[float, float],
+    rng: np.random.Generator,
+    cars: bool,
+) -> None:
     """Barriers along the kerb at y (ground at z[0] before it, z[1] behind) from one x to another."""
     length = x_high - x_low
     if length < 0.15:
@@ -89,17 +101,21 @@ def barrier(builder: WorldBuilder, x_low: float, x_high: float, y: float, z: tup
         barrier(builder, middle + half, x_high, y, z, rng, cars)
     elif kind in ("hedge", "wall"):
         tall, thick = (rng.uniform(0.6, 1.0), 0.55) if kind == "hedge" else (rng.uniform(0.4, 0.8), 0.30)
-        color, texture = ((0.22, rng.uniform(0.36, 0.5), 0.2), 35.0) if kind == "hedge" else (STONE, BRICK_TEXTURE)  # fmt: skip
+        color, texture = ((0.22, rng.uniform(0.36, 0.5), 0.2), 35.0) if kind == "hedge" else (STONE, BRICK_TEXTURE)
         center = ((x_low + x_high) / 2, y + 0.02 + thick / 2, z[1] + tall / 2)
-        builder.add_block("hedge" if kind == "hedge" else "low_wall", center, (length, thick, tall), color, texture)  # fmt: skip
+        builder.add_block("hedge" if kind == "hedge" else "low_wall", center, (length, thick, tall), color, texture)
     else:
         sloped_rail(builder, (x_low, y + 0.08), (x_high, y + 0.08), z[1], (z[1], z[1]), rng.uniform(0.8, 1.0))
 
 
 def build_facade(
-    builder: WorldBuilder, box: Box, height: float, doors: list[tuple[float, float]], low_sill: float,
+    builder: WorldBuilder,
+    box: Box,
+    height: float,
+    doors: list[tuple[float, float]],
+    low_sill: float,
     rng: np.random.Generator,
-) -> None:  # fmt: skip
+) -> None:
     """A house front whose face is the box's lower y, with windows in rows and doors at (x, sill height)."""
     middle, face = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), box[1]
     size = (box[2] - box[0], box[3] - box[1], height)

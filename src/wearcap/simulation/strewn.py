@@ -31,9 +31,7 @@ def with_handhelds(flat: InteractiveFlat, rng: np.random.Generator) -> Interacti
         for item in flat.openables
     )
     flat = InteractiveFlat(flat.static, flat.movables, openables)
-    names = [
-        f"{category}_{number}" for category in MAKERS for number in range(1, 2 + int(rng.random() < TWICE))
-    ]
+    names = [f"{category}_{number}" for category in MAKERS for number in range(1, 2 + int(rng.random() < TWICE))]
     for name in names:
         movable = make_movable(name.rpartition("_")[0], name, rng)
         if (placed := _placed(flat, movable, rng)) is not None:

@@ -108,17 +108,13 @@ def find_treads(motion: Motion, sits: list[Sit]) -> list[Tread]:
     flying = np.gradient(np.gradient(smooth, step_s), step_s) < FLYING
     seated = np.zeros(len(feet), bool)
     for sit in sits:
-        near = np.linalg.norm(
-            motion.t_world_root.double().numpy() - sit.place - [0, 0, PELVIS_OVER_SEAT_M], axis=1
-        )
+        near = np.linalg.norm(motion.t_world_root.double().numpy() - sit.place - [0, 0, PELVIS_OVER_SEAT_M], axis=1)
         seated |= near < 0.15
     soles = feet.reshape(len(feet), 2, 2, 3)
     patch = soles[..., 2].argmin(2)
     lowest = np.take_along_axis(soles, patch[..., None, None], 2)[:, :, 0]
     resting = np.stack([_speed(motion, lowest[:, side]) for side in (0, 1)], 1) < RESTING
-    above = (lowest[..., 2] > LOWEST_STEP_M) & (
-        motion.t_world_root.double().numpy()[:, None, 2] > lowest[..., 2] + 0.3
-    )
+    above = (lowest[..., 2] > LOWEST_STEP_M) & (motion.t_world_root.double().numpy()[:, None, 2] > lowest[..., 2] + 0.3)
     lower = lowest[..., 2] <= lowest[..., 2].min(1, keepdims=True) + 0.02
     stands = resting & above & lower & ~flying[:, None] & ~seated[:, None]
     rests = resting & above & seated[:, None]
@@ -146,9 +142,7 @@ def _merged(soles: Float[np.ndarray, "time 2 2 3"], spans: list[tuple[int, int, 
         new = Tread(xy.min(0) - SOLE_WIDTH_M / 2, xy.max(0) + SOLE_WIDTH_M / 2, z, heading)
         for other in [t for t in treads if _one_step(t, new)]:
             treads.remove(other)
-            new = Tread(
-                np.minimum(new.low, other.low), np.maximum(new.high, other.high), min(z, other.z), heading
-            )
+            new = Tread(np.minimum(new.low, other.low), np.maximum(new.high, other.high), min(z, other.z), heading)
         treads.append(new)
     return sorted(treads, key=lambda tread: tread.z)
 
@@ -184,9 +178,13 @@ def build_seat(
 
 
 def meets(
-    body: BodySpace, piece: Piece, position: Float[np.ndarray, "3"], heading: float, margin: float,
+    body: BodySpace,
+    piece: Piece,
+    position: Float[np.ndarray, "3"],
+    heading: float,
+    margin: float,
     may_touch: dict[str, float] | None = None,
-) -> bool:  # fmt: skip
+) -> bool:
     """Whether a body comes nearer than `margin` (m) to a piece at a place in the world, as `BodySpace.meets`."""
     corners = np.array([np.abs(part.center) + np.array(box_size(part)) / 2 for part in piece.parts])
     reach = float(np.linalg.norm(corners.max(0)))
@@ -210,8 +208,9 @@ def _stool(rng: np.random.Generator) -> Piece:
     under = [Part((0, 0, (seat - THICK_M) / 2), (0.8 * wide, 0.8 * wide, seat - THICK_M), color, 8.0)]
     if rng.uniform() < 0.7:
         edge, tall = wide / 2 - 0.03, seat - THICK_M
-        under = [Part((x * edge, y * edge, tall / 2), (0.035, 0.035, tall), color, 8.0)
-                 for x in (-1, 1) for y in (-1, 1)]  # fmt: skip
+        under = [
+            Part((x * edge, y * edge, tall / 2), (0.035, 0.035, tall), color, 8.0) for x in (-1, 1) for y in (-1, 1)
+        ]
     parts = (*under, Part((0, 0, seat - THICK_M / 2), (wide, wide, THICK_M), hue(rng), 20.0))
     return Piece("stool", (wide, wide), (0.0, seat), parts, seats=((0.0, 0.0, seat, 0.0, wide / 2),))
 
@@ -228,8 +227,10 @@ def _pedestal(rng: np.random.Generator, wide: float = 0.30) -> Piece:
 
 
 _SEAT_MAKERS: dict[str, Callable[[np.random.Generator], Piece]] = {
-    "stool": _stool, "pedestal": _pedestal, "small pedestal": lambda rng: _pedestal(rng, 0.18),
-}  # fmt: skip
+    "stool": _stool,
+    "pedestal": _pedestal,
+    "small pedestal": lambda rng: _pedestal(rng, 0.18),
+}
 
 
 def _of_height(piece: Piece, factor: float) -> Piece:
@@ -243,9 +244,7 @@ def _of_height(piece: Piece, factor: float) -> Piece:
     return replace(piece, parts=parts, seats=seats, z_range=(factor * low, factor * high), reaches=())
 
 
-def build_tread(
-    builder: WorldBuilder, body: BodySpace, tread: Tread, rng: np.random.Generator
-) -> Tread | None:
+def build_tread(builder: WorldBuilder, body: BodySpace, tread: Tread, rng: np.random.Generator) -> Tread | None:
     """Build a step down to the floor, else a board or a rung, as large as the body leaves room for.
 
     Returns what was built (`heading` and corners of the world); None where not even a rung fits.
@@ -276,9 +275,7 @@ def _clear(body: BodySpace, tread: Tread, solid: bool) -> bool:
 def _grown(body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator) -> Tread:
     """The tread widened on all sides while the body is clear of it, up to a drawn size."""
     most = (
-        np.array([rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)])
-        if solid
-        else np.array([0.0, rng.uniform(0.45, 0.6)])
+        np.array([rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)]) if solid else np.array([0.0, rng.uniform(0.45, 0.6)])
     )
     open_sides = [(axis, sign) for axis in (1, 0) for sign in (-1, 1)]
     while open_sides:
@@ -293,9 +290,7 @@ def _grown(body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator)
     return tread
 
 
-def _add_step(
-    builder: WorldBuilder, body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator
-) -> None:
+def _add_step(builder: WorldBuilder, body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator) -> None:
     """The step, and for a board the posts that carry it where the body leaves room."""
     heading = tread.heading - builder.heading
     middle = builder.from_world(tread.center)
@@ -303,9 +298,7 @@ def _add_step(
     color = (0.5 * shade, 0.425 * shade, 0.35 * shade)
     outline = rectangle(tuple(middle.tolist()), tuple(tread.size.tolist()), heading)
     thick = tread.z if solid else THICK_M
-    builder.add_surface(
-        "stairs_step", outline, color, plane=(0.0, 0.0, tread.z), texture=12.0, thickness=thick
-    )
+    builder.add_surface("stairs_step", outline, color, plane=(0.0, 0.0, tread.z), texture=12.0, thickness=thick)
     for side in () if solid else (-1, 1):
         end = tread.center + turn(tread.heading) @ np.array([0.0, side * (tread.size[1] / 2 + POST_M / 2)])
         size = (POST_M, POST_M, tread.z)

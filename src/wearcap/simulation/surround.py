@@ -32,30 +32,8 @@ BEYOND_M = 5.0
 """Margin of the checked floor around the body."""
 FAST, TALL_M = 2.0, HEIGHT - 0.25
 """Speed (m/s) and reach above which a motion is mostly, or always, outdoors."""
-NEAR_INDOORS = (
-    "table",
-    "chair",
-    "coffee_table",
-    "armchair",
-    "plant",
-    "lamp",
-    "cabinet",
-    "desk",
-    "shelf",
-    "sofa",
-)
-NEAR_OUTDOORS = (
-    "bench",
-    "bin",
-    "bollard",
-    "planter",
-    "bush",
-    "street_lamp",
-    "low_wall",
-    "tree",
-    "letter_box",
-    "board",
-)
+NEAR_INDOORS = ("table", "chair", "coffee_table", "armchair", "plant", "lamp", "cabinet", "desk", "shelf", "sofa")
+NEAR_OUTDOORS = ("bench", "bin", "bollard", "planter", "bush", "street_lamp", "low_wall", "tree", "letter_box", "board")
 
 
 @dataclass(kw_only=True)
@@ -163,9 +141,7 @@ def _room(plan: FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator
             _passage(builder, wall, color, rng)
         elif rng.uniform() < 0.7:
             count = max(1, int(wall.length / 3.0))
-            wall.windows += [
-                (wall.length * (k + 0.5) / count, float(rng.uniform(0.9, 1.4))) for k in range(count)
-            ]
+            wall.windows += [(wall.length * (k + 0.5) / count, float(rng.uniform(0.9, 1.4))) for k in range(count)]
         build_wall(builder, wall, color, rng)
     plan.room = (box[0] + 0.07, box[1] + 0.07, box[2] - 0.07, box[3] - 0.07)
     plan.kept_free += [before_door(builder, door) for door in builder.doors]
@@ -183,7 +159,14 @@ def _passage(builder: WorldBuilder, wall: Wall, color: tuple, rng: np.random.Gen
     """The view through a door: a bit of hallway."""
     deep = rng.uniform(1.3, 1.8)
     a, b = wall.at(-0.06, -deep), wall.at(wall.length + 0.06, -deep)
-    outline = np.array([wall.at(-0.06, -deep), wall.at(wall.length + 0.06, -deep), wall.at(wall.length + 0.06, -0.06), wall.at(-0.06, -0.06)])  # fmt: skip
+    outline = np.array(
+        [
+            wall.at(-0.06, -deep),
+            wall.at(wall.length + 0.06, -deep),
+            wall.at(wall.length + 0.06, -0.06),
+            wall.at(-0.06, -0.06),
+        ]
+    )
     builder.add_surface("floor", outline, wood(rng), texture=1.5, thickness=0.05)
     for start, end in ((wall.start, a), (a, b), (b, wall.end)):
         build_wall(builder, Wall(start, end), color, rng)
@@ -197,9 +180,7 @@ def _beside(plan: FreePlan, kinds: tuple[str, ...], path: np.ndarray, rng: np.ra
         for _ in range(40):
             angle, reach = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 2.2)
             x, y = path[rng.integers(len(path))] + reach * np.array([np.cos(angle), np.sin(angle)])
-            heading = float(
-                rng.integers(4) * np.pi / 2 + (rng.normal(0.0, 0.3) if piece.kind == "chair" else 0.0)
-            )
+            heading = float(rng.integers(4) * np.pi / 2 + (rng.normal(0.0, 0.3) if piece.kind == "chair" else 0.0))
             near = plan.distance(piece, float(x), float(y), heading)
             if NEAR_M[0] <= near <= NEAR_M[1] and plan.try_place(piece, float(x), float(y), heading):
                 break
@@ -212,15 +193,7 @@ def _street(plan: FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generat
     box = (reach[0] - ends[0], reach[1] - across, reach[2] + ends[1], reach[3] + front)
     light = rng.uniform(0.32, 0.7)
     warm = 1.0 + rng.uniform(0.0, 0.12)
-    slab(
-        builder,
-        "floor",
-        box,
-        0.0,
-        0.05,
-        (light * warm, light, light * 0.98),
-        float(rng.choice([3.0, 5.0, 6.0])),
-    )
+    slab(builder, "floor", box, 0.0, 0.05, (light * warm, light, light * 0.98), float(rng.choice([3.0, 5.0, 6.0])))
     middle, size = middle_and_size(box)
     builder.rooms.append(Room("street", builder.to_world(rectangle(middle, size)), 0.0, open_air=True))
     builder.add_box((*middle, -0.11), (size[0] + 24.0, size[1] + 24.0, 0.1), (0.42, 0.52, 0.32), 1.0)

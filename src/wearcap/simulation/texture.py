@@ -19,18 +19,7 @@ LIGHT = (0.35, 0.5, 1.0)
 KEY, AMBIENT_BELOW, AMBIENT_ABOVE = 0.26, 0.66, 0.90
 
 _TEXTILE = ("sofa", "armchair", "bed")
-_WOODEN = (
-    "table",
-    "desk",
-    "coffee_table",
-    "shelf",
-    "wardrobe",
-    "cabinet",
-    "chair",
-    "bench",
-    "door_frame",
-    "railing",
-)
+_WOODEN = ("table", "desk", "coffee_table", "shelf", "wardrobe", "cabinet", "chair", "bench", "door_frame", "railing")
 _STONY = ("low_wall", "planter", "garden_wall")
 _PRINTED = 95.0
 """Visual features per m² from which on a face has a print."""
@@ -63,9 +52,12 @@ class Paint:
         color = world.mesh.color[world.mesh.faces[:, 0]].astype(np.float64)
         materials = _materials(world, corners.mean(1), normal, color, extents)
         return cls(
-            np.concatenate([origin, u, v, normal, height[:, None]], 1), extents, color, materials,
+            np.concatenate([origin, u, v, normal, height[:, None]], 1),
+            extents,
+            color,
+            materials,
             _seeds(world, extents, materials, normal, color),
-        )  # fmt: skip
+        )
 
     @property
     def tables(self) -> tuple[np.ndarray, ...]:
@@ -176,8 +168,7 @@ def _seeds(world: World, extents, materials, normal, color) -> Int[np.ndarray, "
     place = np.round(64 * extents).astype(np.int64) @ np.array([73856093, 19349663, 83492791, 5915587])
     shell = world.face_object < 0
     level = np.isin(
-        materials,
-        (kernels.PARQUET, kernels.TILES, kernels.ASPHALT, kernels.STONE, kernels.CEILING, kernels.CARPET),
+        materials, (kernels.PARQUET, kernels.TILES, kernels.ASPHALT, kernels.STONE, kernels.CEILING, kernels.CARPET)
     )
     own = np.isin(materials, (kernels.POSTER, kernels.BOOKS, kernels.PAINT))
     seed = base + tint + np.where(shell & level, 0, side) + np.where(own, place, 0)

@@ -224,9 +224,7 @@ def grain(along, across, red, green, blue, seed, footprint):
     if chance(i, j, seed + 4) < 0.3:
         x = along - (i + 0.2 + 0.6 * chance(i, j, seed + 5)) * 0.55
         y = across - (j + 0.2 + 0.6 * chance(i, j, seed + 6)) * 0.22
-        tone -= 0.40 * inside(
-            0.010 + 0.012 * chance(i, j, seed + 7) - math.hypot(0.6 * x, y), 0.008 + footprint
-        )
+        tone -= 0.40 * inside(0.010 + 0.012 * chance(i, j, seed + 7) - math.hypot(0.6 * x, y), 0.008 + footprint)
     tone += 1.0
     return red * tone, green * tone, blue * tone
 
@@ -326,9 +324,7 @@ def ceiling(a, b, red, green, blue, seed, footprint):
     x, y = a - (i + 0.5) * size, b - (j + 0.5) * size
     kind = chance(i, j, seed + 2)
     if kind < 0.06:
-        tone -= (
-            0.5 * inside(0.2 - max(abs(x), abs(y)), footprint) * (0.3 + 0.7 * joint(x, 0.05, 0.02, footprint))
-        )
+        tone -= 0.5 * inside(0.2 - max(abs(x), abs(y)), footprint) * (0.3 + 0.7 * joint(x, 0.05, 0.02, footprint))
     elif kind < 0.14:
         tone -= 0.5 * inside(0.035 - math.hypot(x, y), footprint)
     elif kind < 0.2:
@@ -379,9 +375,7 @@ def shaded(face, x, y, z, facing, footprint, frames, extents, colors, materials,
     a = px * f[3] + py * f[4] + pz * f[5]
     b = px * f[6] + py * f[7] + pz * f[8]
     c = colors[face]
-    red, green, blue = pattern(
-        materials[face], a, b, extents[face], c[0], c[1], c[2], seeds[face], footprint
-    )  # fmt: skip
+    red, green, blue = pattern(materials[face], a, b, extents[face], c[0], c[1], c[2], seeds[face], footprint)
     if materials[face] == LAMP:
         shade = 250.0
     else:
@@ -396,5 +390,17 @@ def color_points(points, face, facing, footprint, frames, extents, colors, mater
     """Colours (0…255 and beyond) of points of faces; entries without a face (-1) keep their value."""
     for k in range(len(points)):
         if face[k] >= 0:
-            out[k] = shaded(face[k], points[k, 0], points[k, 1], points[k, 2], facing[k], footprint[k], frames,
-                            extents, colors, materials, seeds, light)  # fmt: skip
+            out[k] = shaded(
+                face[k],
+                points[k, 0],
+                points[k, 1],
+                points[k, 2],
+                facing[k],
+                footprint[k],
+                frames,
+                extents,
+                colors,
+                materials,
+                seeds,
+                light,
+            )

@@ -69,9 +69,7 @@ def blur(signal: np.ndarray, sigma_s: float, fps: float) -> np.ndarray:
     return scipy.ndimage.gaussian_filter1d(signal, sigma_s * fps, axis=0, mode="nearest", truncate=3.5)
 
 
-def lower_envelope(
-    signal: Float[np.ndarray, "time"], half_width_s: float, fps: float
-) -> Float[np.ndarray, "time"]:
+def lower_envelope(signal: Float[np.ndarray, "time"], half_width_s: float, fps: float) -> Float[np.ndarray, "time"]:
     """A smooth curve that nowhere exceeds the signal: minimum over a window, then a mean over the same window."""
     half = max(round(half_width_s * fps), 1)
     lowest = scipy.ndimage.minimum_filter1d(signal, 2 * half + 1, mode="nearest")
@@ -79,9 +77,7 @@ def lower_envelope(
     return scipy.ndimage.convolve1d(lowest, kernel / kernel.sum(), mode="nearest")
 
 
-def falling_at_most(
-    signal: Float[np.ndarray, "time"], acceleration: float, fps: float
-) -> Float[np.ndarray, "time"]:
+def falling_at_most(signal: Float[np.ndarray, "time"], acceleration: float, fps: float) -> Float[np.ndarray, "time"]:
     """The highest curve that nowhere exceeds the signal and never curves down by more than `acceleration` (per s²).
 
     With acceleration · t² / 2 added, such a curve is convex: it is the lower convex hull of the signal so raised.
@@ -96,9 +92,7 @@ def falling_at_most(
     return np.interp(time, time[below], raised[below]) - 0.5 * acceleration * time**2
 
 
-def pendulum(
-    pressure: Float[np.ndarray, "time feature"], rate: float, fps: float
-) -> Float[np.ndarray, "time feature"]:
+def pendulum(pressure: Float[np.ndarray, "time feature"], rate: float, fps: float) -> Float[np.ndarray, "time feature"]:
     """The bounded centre of mass over a moving centre of pressure: x'' = rate² (x − p).
 
     The linear inverted pendulum's only solution that stays over the feet is p averaged with the two-sided kernel

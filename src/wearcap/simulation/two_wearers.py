@@ -38,8 +38,7 @@ def simulate_two_wearers(
     world = world_of(split, number, config.world or kind)
     activities = config.activities or STAYING
     first, second = (
-        simulate_motion(world, person, rng, config.duration_s, config.fps, list(activities))
-        for person in people
+        simulate_motion(world, person, rng, config.duration_s, config.fps, list(activities)) for person in people
     )
     both = (first, face_to_face(first, second, distance_m))
     recordings = []

@@ -37,9 +37,7 @@ def _uses(held: Held) -> tuple[Use, ...]:
 def drink(plan: Plan, held: Held, rng: np.random.Generator) -> None:
     """Bring a bottle to the mouth and tilt it, once or twice."""
     choice, skeleton = held.choice, plan.skeleton
-    head = skeleton.t_parent_joint[skeleton.indices("neck", "head")].double().sum(0).numpy() + np.array(
-        MOUTH_M
-    )
+    head = skeleton.t_parent_joint[skeleton.indices("neck", "head")].double().sum(0).numpy() + np.array(MOUTH_M)
     mouth = (head - shoulder_of(plan)) / held.reach
     top = choice.movable.height - choice.middle[2]
     aside = float(np.abs(choice.middle[:2]).max())
@@ -47,9 +45,7 @@ def drink(plan: Plan, held: Held, rng: np.random.Generator) -> None:
     for _ in range(int(rng.integers(1, 3))):
         tilt, yaw = float(rng.uniform(*TILT)), -float(rng.uniform(0.1, 0.4))
         ahead, up = top * np.sin(tilt), -top * np.cos(tilt)
-        off = np.array(
-            [ahead * np.cos(yaw) - aside * np.sin(yaw), ahead * np.sin(yaw) + aside * np.cos(yaw), up]
-        )
+        off = np.array([ahead * np.cos(yaw) - aside * np.sin(yaw), ahead * np.sin(yaw) + aside * np.cos(yaw), up])
         at = mouth + off / held.reach
         raise_ = float(rng.uniform(0.9, 1.3) / plan.style.briskness)
         before = (float(at[0] + 0.06), float(at[1] + 0.02), float(at[2] - 0.14))
@@ -96,11 +92,7 @@ def drill(plan: Plan, held: Held, rng: np.random.Generator) -> None:
     start = time = plan.time + 0.1
     at = (0.0, 0.0, 0.0)
     for _ in range(int(rng.integers(1, 3))):
-        at = (
-            float(rng.uniform(0.58, 0.70)),
-            float(rng.uniform(-0.25, 0.05)),
-            float(rng.uniform(-0.45, 0.10)),
-        )
+        at = (float(rng.uniform(0.58, 0.70)), float(rng.uniform(-0.25, 0.05)), float(rng.uniform(-0.45, 0.10)))
         pitch = float(rng.normal(0.0, 0.08))
         held.go(time, time + 1.0, at, pitch)
         press = time + 1.0 + float(rng.uniform(0.1, 0.4))
@@ -207,9 +199,7 @@ def sway(plan: Plan, held: Held, rng: np.random.Generator) -> None:
     )
     for _ in range(int(rng.integers(3, 8))):
         beat, far = float(rng.uniform(0.7, 1.2)), float(rng.uniform(0.2, 0.42)) * sign
-        held.go(
-            time, time + beat, (ahead - 0.25 * abs(far), far, level + rng.normal(0.0, 0.03)), 0.0, 0.9 * far
-        )
+        held.go(time, time + beat, (ahead - 0.25 * abs(far), far, level + rng.normal(0.0, 0.03)), 0.0, 0.9 * far)
         plan.lean.move(time, time + beat, (0.0, 0.0, 0.55 * far))
         time, sign = time + beat + float(rng.uniform(0.0, 0.3)), -sign
     _watch(plan, held, (1.2, 0.0, level), start, time)
@@ -246,17 +236,15 @@ def _watch(plan: Plan, held: Held, at: tuple[float, float, float], start_s: floa
     aside = held.choice.sign * (out + (0.0 if held.choice.side is None else shoulder[1]))
     cos, sin = np.cos(plan.heading), np.sin(plan.heading)
     x, y, z = plan.position
-    point = [
-        x + ahead * cos - aside * sin,
-        y + ahead * sin + aside * cos,
-        max(z + shoulder_height(plan) + up, z),
-    ]
+    point = [x + ahead * cos - aside * sin, y + ahead * sin + aside * cos, max(z + shoulder_height(plan) + up, z)]
     plan.gaze_point.move(start_s, start_s, point)
     plan.gaze_weight.move(start_s + 0.1, start_s + 0.7, 0.85)
     plan.gaze_weight.move(stop_s, stop_s + 0.6, 0.0)
 
 
 ONE: dict[str, tuple[Use, ...]] = {
-    "suitcase": (hold_up, hold_up, swing), "backpack": (hold_up, swing), "bottle": (drink, drink, drink, look_at),
-}  # fmt: skip
+    "suitcase": (hold_up, hold_up, swing),
+    "backpack": (hold_up, swing),
+    "bottle": (drink, drink, drink, look_at),
+}
 BOTH: dict[str, tuple[Use, ...]] = {"backpack": (hug, hug, sway), "ball": (overhead, sway)}

@@ -6,8 +6,23 @@ from wearcap.geometry.compiled import compiled
 
 
 @compiled
-def meet_faces(rays, slots, reach, pixel_angle, pose, index, nearness, frames, sky, points, face, facing, footprint,
-               distance, light):  # fmt: skip
+def meet_faces(
+    rays,
+    slots,
+    reach,
+    pixel_angle,
+    pose,
+    index,
+    nearness,
+    frames,
+    sky,
+    points,
+    face,
+    facing,
+    footprint,
+    distance,
+    light,
+):
     """Point, face, side (1 front, -1 back), footprint (m) and distance along the ray (m) of every pixel.
 
     `rays` are unit, in the camera's axes; `slots` are the indices of their samples in the (flat) visibility buffers, -1
@@ -36,10 +51,6 @@ def meet_faces(rays, slots, reach, pixel_angle, pose, index, nearness, frames, s
         near = reach[k] / nearness[slot]
         d = (f[12] - above) / slope if abs(slope) > 1e-9 else near
         d = min(1.08 * near, max(0.92 * near, d))
-        points[k, 0], points[k, 1], points[k, 2] = (
-            pose[0, 3] + d * dx,
-            pose[1, 3] + d * dy,
-            pose[2, 3] + d * dz,
-        )
+        points[k, 0], points[k, 1], points[k, 2] = (pose[0, 3] + d * dx, pose[1, 3] + d * dy, pose[2, 3] + d * dz)
         face[k], distance[k], facing[k] = number, d, -1.0 if slope > 0 else 1.0
         footprint[k] = d * pixel_angle / math.sqrt(max(0.12, abs(slope)))

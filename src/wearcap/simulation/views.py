@@ -120,10 +120,22 @@ def _exposed(scenery: Scenery, camera: Camera, T_world_cam: Rigid) -> tuple[np.n
     light, points = np.zeros((count, 3), np.float32), np.empty((count, 3))
     face, facing, footprint, distance = np.empty(count, np.int32), *np.empty((3, count), np.float32)
     view_kernels.meet_faces(
-        lens.rays.reshape(-1, 3), lens.slots.ravel(), lens.reach.ravel(), 2.0 / (camera.fx + camera.fy),
-        np.concatenate([R, t[:, None]], 1), index, nearness, scenery.paint.frames, SKY, points, face, facing,
-        footprint, distance, light,
-    )  # fmt: skip
+        lens.rays.reshape(-1, 3),
+        lens.slots.ravel(),
+        lens.reach.ravel(),
+        2.0 / (camera.fx + camera.fy),
+        np.concatenate([R, t[:, None]], 1),
+        index,
+        nearness,
+        scenery.paint.frames,
+        SKY,
+        points,
+        face,
+        facing,
+        footprint,
+        distance,
+        light,
+    )
     texture_kernels.color_points(points, face, facing, footprint, *scenery.paint.tables, light)
     shape = camera.height, camera.width
     return light.reshape(*shape, 3), distance.reshape(shape)
@@ -156,9 +168,7 @@ def visible(scenery: Scenery, R: np.ndarray, t: np.ndarray, view: View) -> tuple
     nearness = np.full((view.height, view.width), -np.inf, np.float32)
     index = np.full((view.height, view.width), -1, np.int32)
     vertices = (scenery.vertices - t) @ R
-    raster.draw_pinhole(
-        vertices, scenery.faces, view.focal, view.focal, view.cx, view.cy, NEAR_M, nearness, index
-    )
+    raster.draw_pinhole(vertices, scenery.faces, view.focal, view.focal, view.cx, view.cy, NEAR_M, nearness, index)
     return nearness, index
 
 

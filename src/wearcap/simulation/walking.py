@@ -53,11 +53,7 @@ class Course:
 
 
 def walk_along(
-    plan: Plan,
-    path: Float[np.ndarray, "waypoint 3"],
-    rng: np.random.Generator,
-    speed: float,
-    flights: tuple = (),
+    plan: Plan, path: Float[np.ndarray, "waypoint 3"], rng: np.random.Generator, speed: float, flights: tuple = ()
 ) -> None:
     """Turn towards a path's start, walk (or run, above 2.1 m/s) along it and stop at its end, feet together."""
     course = plan_course(plan, path, speed, flights)
@@ -107,9 +103,14 @@ def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprin
         clearance = 0.03
     clearance = max(clearance, _over_corner(plan, old, print_))
     new = Footprint(
-        print_.ground, print_.heading, print_.tilt, land_pitch=land_pitch, clearance=clearance,
-        bow=LEFT_SIGN[side] * 0.012, running=running,
-    )  # fmt: skip
+        print_.ground,
+        print_.heading,
+        print_.tilt,
+        land_pitch=land_pitch,
+        clearance=clearance,
+        bow=LEFT_SIGN[side] * 0.012,
+        running=running,
+    )
     plan.step(side, lift, land, lift_pitch, new)
 
 
@@ -124,9 +125,7 @@ def _over_corner(plan: Plan, old: Footprint, new: Footprint) -> float:
     heading = old.heading + share * wrap(new.heading - old.heading)
     toes = ankle[:, :2] + plan.sole[1] * np.stack([np.cos(heading), np.sin(heading)], 1)
     floor = plan.floor_height(toes, np.full(len(share), max(old.ground[2], new.ground[2])))
-    line = (
-        old.ground[2] + (new.ground[2] - old.ground[2] - rise) * moved + rise * climb(np.array(rise), share)
-    )
+    line = old.ground[2] + (new.ground[2] - old.ground[2] - rise) * moved + rise * climb(np.array(rise), share)
     need = np.nan_to_num(floor - line, nan=0.0)
     least = STEP_M if rise > STEP_M else 0.002
     need = np.where(need > least, (need + 0.02) / bump(share), 0.0)

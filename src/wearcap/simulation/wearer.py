@@ -75,9 +75,7 @@ def simulate_motion(
     return perform(plan, world, rng, duration_s, fps)
 
 
-def perform(
-    plan: Plan, world: World, rng: np.random.Generator, duration_s: float, fps: float
-) -> SimulatedMotion:
+def perform(plan: Plan, world: World, rng: np.random.Generator, duration_s: float, fps: float) -> SimulatedMotion:
     """The motion that a plan describes; the plan should reach `TAIL_S` beyond the duration."""
     skeleton = plan.skeleton
     count = round(duration_s * fps)
@@ -113,11 +111,7 @@ def _over_floor(world: World, motion: Motion) -> Bool[Tensor, "time patch"]:
 
 
 def _plan(
-    world: World,
-    person: Wearer,
-    rng: np.random.Generator,
-    duration_s: float,
-    activities: Sequence[str] | None,
+    world: World, person: Wearer, rng: np.random.Generator, duration_s: float, activities: Sequence[str] | None
 ) -> Plan:
     position, heading = start_place(world, rng)
     plan = Plan(person.skeleton, person.style, position, heading, world.floor_height)
@@ -181,8 +175,7 @@ def _set_arm(skeleton: Skeleton, R: Tensor, side: str, arm: ArmMotion) -> None:
 def _leg(skeleton: Skeleton, R: Tensor, side: str, foot: FootMotion, trunk: Trunk) -> None:
     """Rotations of hip and knee that carry the pelvis over the ankle, and of foot and toes as planned."""
     hip, knee, ankle = (
-        skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double()
-        for joint in ("hip", "knee", "ankle")
+        skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double() for joint in ("hip", "knee", "ankle")
     )
     heading, body = torch.from_numpy(foot.heading), torch.from_numpy(trunk.pelvis_angles[:, 0].copy())
     zero = torch.zeros_like(heading)

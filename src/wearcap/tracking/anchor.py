@@ -31,19 +31,11 @@ def anchor(
     R_parent_measured = T_root_joint.R[..., parent, :, :].transpose(-1, -2) @ T_world_measured.R
     shift = T_world_measured.t - T_root_joint.t[..., at, :]
     R_anchored = torch.cat(
-        [
-            R_parent_joint[..., :at, :, :],
-            R_parent_measured[..., None, :, :],
-            R_parent_joint[..., at + 1 :, :, :],
-        ],
+        [R_parent_joint[..., :at, :, :], R_parent_measured[..., None, :, :], R_parent_joint[..., at + 1 :, :, :]],
         dim=-3,
     )
     R_world = torch.cat(
-        [
-            T_root_joint.R[..., :at, :, :],
-            T_world_measured.R[..., None, :, :],
-            T_root_joint.R[..., at + 1 :, :, :],
-        ],
+        [T_root_joint.R[..., :at, :, :], T_world_measured.R[..., None, :, :], T_root_joint.R[..., at + 1 :, :, :]],
         dim=-3,
     )
     return R_anchored, Rigid(R_world, T_root_joint.t + shift[..., None, :])
@@ -58,9 +50,7 @@ def anchored_to_head(motion: Motion, T_world_head: Rigid) -> Motion:
 def with_hand_moved(motion: Motion, side: str, offset: Float[Tensor, "time 3"]) -> Motion:
     """The motion with one wrist moved by an offset in the world (m), shoulder and elbow following."""
     skeleton, T = motion.skeleton, motion.T_world_joint
-    shoulder, elbow, wrist = skeleton.indices(
-        *(f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist"))
-    )
+    shoulder, elbow, wrist = skeleton.indices(*(f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist")))
     # Double precision, as the bend of a nearly straight arm is the root of a small difference of squares.
     start, middle, end = (T.t[:, joint].double() for joint in (shoulder, elbow, wrist))
     upper, lower = (turn.to(T.R) for turn in reach(start, middle, end, end + offset.double()))

@@ -93,9 +93,7 @@ class FloorTracker:
         """Add points (m); points that are not finite are left out."""
         points = points_world.detach().cpu().numpy()
         points = points[np.isfinite(points).all(1)]
-        tiles, which = np.unique(
-            np.floor(points[:, :2] / _TILE_M).astype(np.int64), axis=0, return_inverse=True
-        )
+        tiles, which = np.unique(np.floor(points[:, :2] / _TILE_M).astype(np.int64), axis=0, return_inverse=True)
         for number, (x, y) in enumerate(tiles.tolist()):
             self._tiles[x, y].append(points[which.reshape(-1) == number])
 

@@ -60,17 +60,22 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
     that are not rotations, and for too few poses for their time span.
     """
     if recording.head is None:
-        raise WearcapError("no head poses in this recording", where=recording.name,
-                           expected="a recording with a `head` stream")  # fmt: skip
+        raise WearcapError(
+            "no head poses in this recording", where=recording.name, expected="a recording with a `head` stream"
+        )
     head = recording.head
     finite = head.R_world_device.isfinite().all(-1).all(-1) & head.t_world_device.isfinite().all(-1)
     times = head.timestamps[finite]
     if len(times) < 2 or times[-1] - times[0] < MIN_DURATION_S:
-        raise WearcapError(f"head poses of {len(times)} frames", where=recording.name,
-                           expected=f"at least {MIN_DURATION_S} s")  # fmt: skip
+        raise WearcapError(
+            f"head poses of {len(times)} frames", where=recording.name, expected=f"at least {MIN_DURATION_S} s"
+        )
     if not (times.diff() > 0).all():
-        raise WearcapError("head poses whose timestamps do not grow", where=recording.name,
-                           fix="Sort the head stream by time and leave repeated poses out.")  # fmt: skip
+        raise WearcapError(
+            "head poses whose timestamps do not grow",
+            where=recording.name,
+            fix="Sort the head stream by time and leave repeated poses out.",
+        )
     _require_plausible(head.R_world_device[finite], times, fps, recording.name)
     skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
     trajectory = Trajectory(times, head.R_world_device[finite], head.t_world_device[finite])
@@ -88,9 +93,13 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
         first = int(torch.searchsorted(timestamps, after - 1e-6))
     stretches.append((first, count))
     return HeadPath(
-        timestamps, T_world_head, trajectory.T_world_body, floor, skeleton,
+        timestamps,
+        T_world_head,
+        trajectory.T_world_body,
+        floor,
+        skeleton,
         tuple((start, stop) for start, stop in stretches if stop > start),
-    )  # fmt: skip
+    )
 
 
 def _require_plausible(
@@ -99,12 +108,20 @@ def _require_plausible(
     """Raise WearcapError for matrices that are not rotations, and for timestamps that are not in seconds."""
     skewed = (R_world_device.transpose(-1, -2) @ R_world_device - torch.eye(3)).abs().amax((-1, -2)) > 0.05
     if skewed.any():
-        raise WearcapError(f"the head pose at {times[skewed][0].item():.3f} s is no rotation", where=name,
-                           expected="orthonormal matrices", fix="Run `wearcap doctor` on the recording.")  # fmt: skip
+        raise WearcapError(
+            f"the head pose at {times[skewed][0].item():.3f} s is no rotation",
+            where=name,
+            expected="orthonormal matrices",
+            fix="Run `wearcap doctor` on the recording.",
+        )
     span = (times[-1] - times[0]).item()
     if span * fps > MAX_FILL * len(times):
-        raise WearcapError(f"{len(times)} head poses over {span:.0f} s", where=name,
-                           expected=f"one in {MAX_FILL / fps:.0f} s at least", fix="Give timestamps in seconds, or cut the recording at its pauses.")  # fmt: skip
+        raise WearcapError(
+            f"{len(times)} head poses over {span:.0f} s",
+            where=name,
+            expected=f"one in {MAX_FILL / fps:.0f} s at least",
+            fix="Give timestamps in seconds, or cut the recording at its pauses.",
+        )
 
 
 def breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
@@ -114,6 +131,5 @@ def breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
     turn = rotation.geodesic(trajectory.R_world_body[:-1], trajectory.R_world_body[1:]) / step
     broken = (step > MAX_GAP_S) | (speed > MAX_SPEED_M_S) | (turn > 60.0)
     return [
-        (trajectory.timestamps[i].item(), trajectory.timestamps[i + 1].item())
-        for i in broken.nonzero()[:, 0].tolist()
+        (trajectory.timestamps[i].item(), trajectory.timestamps[i + 1].item()) for i in broken.nonzero()[:, 0].tolist()
     ]

@@ -54,13 +54,13 @@ class HeadTrack:
     def state(self) -> dict[str, Tensor]:
         start = math.nan if self._start is None else self._start
         numbers = [start, self._next, self.inside, self._provisional, self.newest, self.dropped]
-        times, R, t = (
-            zip(*self._poses) if self._poses else ((), (torch.zeros(0, 3, 3),), (torch.zeros(0, 3),))
-        )
+        times, R, t = zip(*self._poses) if self._poses else ((), (torch.zeros(0, 3, 3),), (torch.zeros(0, 3),))
         return {
-            "numbers": torch.tensor(numbers, dtype=torch.float64), "times": torch.tensor(times, dtype=torch.float64),
-            "R": torch.stack(R).reshape(-1, 3, 3), "t": torch.stack(t).reshape(-1, 3),
-        }  # fmt: skip
+            "numbers": torch.tensor(numbers, dtype=torch.float64),
+            "times": torch.tensor(times, dtype=torch.float64),
+            "R": torch.stack(R).reshape(-1, 3, 3),
+            "t": torch.stack(t).reshape(-1, 3),
+        }
 
     def restore(self, state: dict[str, Tensor]) -> None:
         start, next_frame, inside, provisional, self.newest, dropped = state["numbers"].tolist()

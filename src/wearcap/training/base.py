@@ -27,10 +27,7 @@ class GivenOptimizer(lightning.LightningModule):
         optimizer = self._optimizer(self.get_submodule("net").parameters())
         if self._scheduler is None:
             return optimizer
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
-        }
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"}}
 
 
 class Measured(GivenOptimizer):
@@ -48,9 +45,12 @@ class Measured(GivenOptimizer):
         measured = self.measure(batch)
         self.log_dict(
             {f"{stage}/{name}": value for name, value in measured.items()},
-            batch_size=len(batch[0]), prog_bar=stage == "train", sync_dist=stage == "val",
-            on_step=stage == "train", on_epoch=stage == "val",
-        )  # fmt: skip
+            batch_size=len(batch[0]),
+            prog_bar=stage == "train",
+            sync_dist=stage == "val",
+            on_step=stage == "train",
+            on_epoch=stage == "val",
+        )
         return measured["loss"]
 
     def training_step(self, batch: tuple[Tensor, ...], batch_idx: int) -> Tensor:

@@ -77,9 +77,11 @@ def first_seconds(recording: Recording, seconds: float) -> Recording:
     stop = int(torch.searchsorted(recording.head.timestamps, recording.head.timestamps[0] + seconds))
     head, contacts = recording.head, recording.contacts
     head = replace(
-        head, timestamps=head.timestamps[:stop], R_world_device=head.R_world_device[:stop],
+        head,
+        timestamps=head.timestamps[:stop],
+        R_world_device=head.R_world_device[:stop],
         t_world_device=head.t_world_device[:stop],
-    )  # fmt: skip
+    )
     if contacts is not None:
         contacts = replace(contacts, timestamps=contacts.timestamps[:stop], contact=contacts.contact[:stop])
     return replace(recording, head=head, motion=recording.motion.sliced(0, stop), contacts=contacts)

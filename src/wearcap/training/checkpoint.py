@@ -38,9 +38,7 @@ class RunCheckpointIO(CheckpointIO):
         """`folder`: of the run; checkpoints elsewhere, which a file to resume from may name, are never removed."""
         self.folder = Path(folder).resolve()
 
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
-    ) -> None:
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write a checkpoint. Raises WearcapError when the disk is full or the folder cannot be written."""
         content = io.BytesIO()  # PyTorch's own writing to a file does not report why it failed
         torch.save(checkpoint, content)
@@ -72,6 +70,9 @@ def require_resumable(path: str | Path, own: Mapping[str, Tensor]) -> None:
     saved = read_run_file(path)
     missing = [key for key in TRAINING_STATE if key not in saved]
     if missing or not isinstance(saved["state_dict"], dict):
-        raise WearcapError(f"a checkpoint without {missing[0] if missing else 'weights'}", where=path,
-                           expected="a run's .ckpt file, as `wearcap train` writes it")  # fmt: skip
+        raise WearcapError(
+            f"a checkpoint without {missing[0] if missing else 'weights'}",
+            where=path,
+            expected="a run's .ckpt file, as `wearcap train` writes it",
+        )
     check_weights(own, saved["state_dict"], path)

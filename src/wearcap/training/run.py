@@ -56,8 +56,11 @@ def resume_path(resume: str | None, own: Path, runs: Path) -> Path | None:
         return None
     if resume != "auto":
         if not Path(resume).is_file():
-            raise WearcapError("no such checkpoint to resume from", where=resume,
-                               expected="a run's .ckpt file, or resume=auto for the newest")  # fmt: skip
+            raise WearcapError(
+                "no such checkpoint to resume from",
+                where=resume,
+                expected="a run's .ckpt file, or resume=auto for the newest",
+            )
         return Path(resume)
     if (mine := own / "checkpoints" / "last.ckpt").is_file():
         return mine

@@ -58,11 +58,17 @@ class Take:
         """All data except the numbers per frame, for JSON."""
         clock = self.clock
         return {
-            "name": clock.name, "frames": clock.frames, "start_s": clock.start_s, "stop_s": clock.stop_s,
-            "points": self.point_names, "bones": self.bones, "hands": dict(zip(HANDS, self.hands)),
-            "objects": self.objects, "notice": self.notice,
+            "name": clock.name,
+            "frames": clock.frames,
+            "start_s": clock.start_s,
+            "stop_s": clock.stop_s,
+            "points": self.point_names,
+            "bones": self.bones,
+            "hands": dict(zip(HANDS, self.hands)),
+            "objects": self.objects,
+            "notice": self.notice,
             "video": None if self.video is None else {"file": self.video.path.name, "times": self.video.times.tolist()},
-        }  # fmt: skip
+        }
 
     def numbers(self) -> bytes:
         """Little-endian bytes of all frames: float64 timestamps, then float32 floor heights, then float32 points."""
@@ -70,17 +76,18 @@ class Take:
         return b"".join(np.ascontiguousarray(array, dtype).tobytes() for array, dtype in parts)
 
 
-def take_of(
-    recording: Recording, folder: Path, motion: Motion | None = None, video: Video | None = None
-) -> Take:
+def take_of(recording: Recording, folder: Path, motion: Motion | None = None, video: Video | None = None) -> Take:
     """Data of a recording with its true motion, else the suit's, and its camera's video; `motion` and `video` replace these.
 
     `folder` is the data set's. Raises WearcapError without a motion, or for a body without hands.
     """
     shown = motion or recording.motion or recording.suit
     if shown is None:
-        raise WearcapError(f"recording {recording.name!r} has no motion", expected="one to look at",
-                           fix="Give a captured one with --motion.")  # fmt: skip
+        raise WearcapError(
+            f"recording {recording.name!r} has no motion",
+            expected="one to look at",
+            fix="Give a captured one with --motion.",
+        )
     clock = LabelClock.of(recording.name, shown.timestamps)
     names, points, bones = _drawn(shown)
     notice = ""
@@ -92,9 +99,17 @@ def take_of(
         else:
             notice = f"The video {path} is not there: give it with --video."
     return Take(
-        clock, shown.timestamps.numpy(), points, _floor(recording, shown, points), names, bones,
-        _hands(shown, names), _objects(recording, folder), video, notice,
-    )  # fmt: skip
+        clock,
+        shown.timestamps.numpy(),
+        points,
+        _floor(recording, shown, points),
+        names,
+        bones,
+        _hands(shown, names),
+        _objects(recording, folder),
+        video,
+        notice,
+    )
 
 
 def video_from(path: str | Path, start_s: float) -> Video:
@@ -114,8 +129,9 @@ def _drawn(motion: Motion) -> tuple[tuple[str, ...], Float32[np.ndarray, "time p
     names = [*skeleton.joint_names, *sites]
     parts = [T.t, site_positions(skeleton, T, tuple(sites))] if sites else [T.t]
     bones = [(parent, joint) for joint, parent in enumerate(skeleton.parents) if joint > 0]
-    bones += [(skeleton.index(skeleton.sites[name].joint), names.index(name))
-              for name in sites if not name.endswith("_palm")]  # fmt: skip
+    bones += [
+        (skeleton.index(skeleton.sites[name].joint), names.index(name)) for name in sites if not name.endswith("_palm")
+    ]
     if "head" in skeleton:
         head = skeleton.index("head")
         parts.append((T[:, head] @ _NOSE.to(T.t))[:, None])
@@ -158,9 +174,12 @@ class Desk:
     """The recordings to annotate and the folder of their labels. Recordings are loaded when they are opened."""
 
     def __init__(
-        self, names: tuple[str, ...], recording: Callable[[int], Recording],
-        open_take: Callable[[int], Take], output: Path,
-    ):  # fmt: skip
+        self,
+        names: tuple[str, ...],
+        recording: Callable[[int], Recording],
+        open_take: Callable[[int], Take],
+        output: Path,
+    ):
         self.names, self.recording, self.output = names, recording, output
         self._files: dict[int, AnnotationFile] = {}
         self._lock = threading.Lock()
@@ -168,9 +187,13 @@ class Desk:
 
     @classmethod
     def of(
-        cls, where: str | Path, output: Path | None = None, motion: Motion | None = None,
-        video: Path | None = None, video_start_s: float | None = None,
-    ) -> "Desk":  # fmt: skip
+        cls,
+        where: str | Path,
+        output: Path | None = None,
+        motion: Motion | None = None,
+        video: Path | None = None,
+        video_start_s: float | None = None,
+    ) -> "Desk":
         """A recording, or all of a data set's; labels go to `output` or outputs/annotate/<data set>.
 
         A motion and a video require a single recording. Raises WearcapError if there is nothing to annotate.
@@ -182,24 +205,23 @@ class Desk:
         if not places:
             raise WearcapError("a data set without recordings", where=where, fix="Prepare some first.")
         if len(places) > 1 and (motion is not None or video is not None):
-            raise WearcapError("a motion or a video for several recordings", where=where,
-                               expected=f"one recording, such as {places[0]}")  # fmt: skip
+            raise WearcapError(
+                "a motion or a video for several recordings",
+                where=where,
+                expected=f"one recording, such as {places[0]}",
+            )
         recordings = lru_cache(maxsize=2)(lambda index: load_recording(places[index]))
 
         def open_take(index: int) -> Take:
             recording = recordings(index)
             shown = motion or recording.motion or recording.suit
-            start = (
-                video_start_s if video_start_s is not None else float(shown.timestamps[0]) if shown else 0.0
-            )
+            start = video_start_s if video_start_s is not None else float(shown.timestamps[0]) if shown else 0.0
             return take_of(recording, folder, motion, video_from(video, start) if video else None)
 
         names = tuple(Path(place).name for place in places)
         if len(places) == 1:
             names = (recordings(0).name,)
-        return cls(
-            names, recordings, open_take, output or Path("outputs") / "annotate" / folder.resolve().name
-        )
+        return cls(names, recordings, open_take, output or Path("outputs") / "annotate" / folder.resolve().name)
 
     def path(self, name: str) -> Path:
         """Path of the labels of a recording of that name, which need not exist yet."""

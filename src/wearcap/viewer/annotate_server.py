@@ -22,10 +22,21 @@ from wearcap.viewer.annotation_file import Conflict
 from wearcap.viewer.guard import Guard, Refused
 
 PAGE = Path(__file__).parent / "annotator"
-TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8",
-         ".svg": "image/svg+xml"}  # fmt: skip
-VIDEO_TYPES = {".mp4": "video/mp4", ".m4v": "video/mp4", ".mov": "video/mp4", ".webm": "video/webm", ".mkv": "video/x-matroska",
-               ".avi": "video/x-msvideo", ".ogv": "video/ogg"}  # fmt: skip
+TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+VIDEO_TYPES = {
+    ".mp4": "video/mp4",
+    ".m4v": "video/mp4",
+    ".mov": "video/mp4",
+    ".webm": "video/webm",
+    ".mkv": "video/x-matroska",
+    ".avi": "video/x-msvideo",
+    ".ogv": "video/ogg",
+}
 MAX_SAVE_BYTES = 16 << 20
 PIECE_BYTES = 1 << 18
 MAX_CONNECTIONS = 32
@@ -81,9 +92,7 @@ class AnnotationServer:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    request_queue_size = (
-        128  # queued requests of a burst are served in turn, instead of being retried after a second
-    )
+    request_queue_size = 128  # queued requests of a burst are served in turn, instead of being retried after a second
     allow_reuse_address = os.name == "posix"
     desk: Desk
     guard: Guard
@@ -101,9 +110,7 @@ class _Server(ThreadingHTTPServer):
             self._close_longest_idle() and self._free.acquire(timeout=_CLOSE_S)
         ):
             with contextlib.suppress(OSError):
-                request.sendall(
-                    b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
-                )
+                request.sendall(b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
             return self.shutdown_request(request)
         self.begin_idle(request)
         try:
@@ -228,7 +235,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _listing(self) -> list[dict]:
         desk = self.server.desk
-        return [{"name": name, "annotated": desk.path(name).is_file()} for name in desk.names]  # fmt: skip
+        return [{"name": name, "annotated": desk.path(name).is_file()} for name in desk.names]
 
     def _post(self, path: str) -> None:
         match = re.fullmatch(r"/recordings/(\d{1,6})/labels", path)

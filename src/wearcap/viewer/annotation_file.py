@@ -37,9 +37,7 @@ class AnnotationFile:
         with self._lock:
             revision = self._revision()
             if not revision:
-                return parse_labels(
-                    {"contacts": {"left_hand": [], "right_hand": []}}, self.clock, where=self.path
-                ), ""
+                return parse_labels({"contacts": {"left_hand": [], "right_hand": []}}, self.clock, where=self.path), ""
             return parse_labels(read_json(self.path), self.clock, where=self.path), revision
 
     def save(self, content: Any, base: str, *, client: str = "", force: bool = False) -> str:
@@ -58,9 +56,10 @@ class AnnotationFile:
                 return new
             if not (force or there == base or (there and self._writer == (client, there))):
                 raise Conflict(
-                    "the labels on disk were changed by another window or program", where=self.path,
+                    "the labels on disk were changed by another window or program",
+                    where=self.path,
                     expected="the state that this page loaded or saved last",
-                )  # fmt: skip
+                )
             if there and there not in self._ours:
                 self._back_up(there)
             write_text(self.path, text)

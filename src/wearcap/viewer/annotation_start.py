@@ -23,16 +23,23 @@ def starting_labels(source: str | Path, recording: Recording, clock: LabelClock)
     """
     if str(source) == "recording":
         if recording.interactions is None:
-            raise WearcapError("no interactions to start from", where=recording.name, expected="a recording that has them",
-                               fix="Start from a label file (.json), from a captured motion (.npz), or from nothing.")  # fmt: skip
+            raise WearcapError(
+                "no interactions to start from",
+                where=recording.name,
+                expected="a recording that has them",
+                fix="Start from a label file (.json), from a captured motion (.npz), or from nothing.",
+            )
         return labels_of(recording.interactions, clock)
     if Path(source).suffix == ".json":
         return parse_labels(read_json(source), clock, where=source)
     motion = read_motion(source)
     found = motion.interactions or _predicted(motion)
     if found is None:
-        raise WearcapError("a motion without contacts of the hands", where=source,
-                           expected="one that a pipeline with a contact network captured")  # fmt: skip
+        raise WearcapError(
+            "a motion without contacts of the hands",
+            where=source,
+            expected="one that a pipeline with a contact network captured",
+        )
     return labels_of(found, clock)
 
 
@@ -42,9 +49,7 @@ def _predicted(motion: Motion) -> Interactions | None:
     if prob is None:
         return None
     if prob.shape != (len(motion), len(HANDS)):
-        raise WearcapError(
-            f"hand contacts of shape {tuple(prob.shape)}", expected=f"({len(motion)}, {len(HANDS)})"
-        )
+        raise WearcapError(f"hand contacts of shape {tuple(prob.shape)}", expected=f"({len(motion)}, {len(HANDS)})")
     contact = active(prob, motion.timestamps, ContactSettings())
     edges = _edges(motion.timestamps)
     spans, hands = [], []

@@ -46,11 +46,16 @@ class BodyPointsLayer:
         self.motion, self.points, self.offset = motion, contact_points(body), np.zeros(3)
         ball = trimesh.creation.icosphere(subdivisions=2, radius=BALL_M)
         self.handle = server.scene.add_batched_meshes_simple(
-            f"/{name}", np.asarray(ball.vertices), np.asarray(ball.faces),
+            f"/{name}",
+            np.asarray(ball.vertices),
+            np.asarray(ball.faces),
             batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (BODY_POINTS, 1)),
-            batched_positions=np.zeros((BODY_POINTS, 3)), batched_scales=np.zeros(BODY_POINTS),
-            batched_colors=np.zeros((BODY_POINTS, 3), np.uint8), cast_shadow=False, lod="off",
-        )  # fmt: skip
+            batched_positions=np.zeros((BODY_POINTS, 3)),
+            batched_scales=np.zeros(BODY_POINTS),
+            batched_colors=np.zeros((BODY_POINTS, 3), np.uint8),
+            cast_shadow=False,
+            lod="off",
+        )
 
     def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
         self.offset = offset
@@ -67,8 +72,6 @@ class BodyPointsLayer:
         # The balls' parent node is at the root, so that the browser's culling considers the body's position.
         root = pose.t[0].double().numpy()
         self.handle.position = root + self.offset
-        self.handle.batched_positions = (self.points.vertices(pose).double().numpy() - root).astype(
-            np.float32
-        )
+        self.handle.batched_positions = (self.points.vertices(pose).double().numpy() - root).astype(np.float32)
         self.handle.batched_scales = size
         self.handle.batched_colors = (255 * lit_color(prob)).round().astype(np.uint8)

@@ -18,9 +18,7 @@ LOOKS = 12
 """Number of viewing directions drawn along the path."""
 
 
-def draw_head_path(
-    recording: Recording, size: tuple[int, int] = (640, 520)
-) -> UInt8[np.ndarray, "height width 3"]:
+def draw_head_path(recording: Recording, size: tuple[int, int] = (640, 520)) -> UInt8[np.ndarray, "height width 3"]:
     """Two panels of `size` (width, height). Raises WearcapError if there is no head path either."""
     if recording.head is None:
         raise WearcapError("nothing to draw", where=recording.name, expected="a motion, or a head's path")

@@ -37,9 +37,7 @@ _SIDE_M = 4.0
 class ObjectEditor:
     """The page of one scan. `run` serves until interrupted and saves what changes; `stop` saves and closes."""
 
-    def __init__(
-        self, scan: Scan, file: Path, title: str = "scene", host: str = "127.0.0.1", port: int = 8080
-    ):
+    def __init__(self, scan: Scan, file: Path, title: str = "scene", host: str = "127.0.0.1", port: int = 8080):
         """`file` is the environment.json to edit or create. Raises WearcapError for one of another scene."""
         environment = read_environment(file) if file.exists() else None
         try:
@@ -90,10 +88,15 @@ class ObjectEditor:
         self.select.name.value = self.editing.free_name(self.select.category.value)
         middle = (np.median(points, 0) + 0.0).astype(float)
         self.box_center = (float(middle[0]), float(middle[1]), low + 0.5)
-        keys = (("Undo", "Z", "cmd/ctrl", self.undo), ("Look", "V", None, lambda: self.use("look")),
-                ("Box", "B", None, lambda: self.use("box")), ("Brush", "P", None, lambda: self.use("brush")),
-                ("Eraser", "E", None, lambda: self.use("eraser")),
-                ("Hinge or slide", "H", None, lambda: self.use("hinge / slide")), ("Try", "T", None, lambda: self.use("try")))  # fmt: skip
+        keys = (
+            ("Undo", "Z", "cmd/ctrl", self.undo),
+            ("Look", "V", None, lambda: self.use("look")),
+            ("Box", "B", None, lambda: self.use("box")),
+            ("Brush", "P", None, lambda: self.use("brush")),
+            ("Eraser", "E", None, lambda: self.use("eraser")),
+            ("Hinge or slide", "H", None, lambda: self.use("hinge / slide")),
+            ("Try", "T", None, lambda: self.use("try")),
+        )
         for label, key, modifier, action in keys:
             gui.add_command(label, hotkey=key, modifier=modifier).on_trigger(self._acting(action))
         self.undo_button.on_click(self._acting(self.undo))
@@ -110,9 +113,7 @@ class ObjectEditor:
                 try:
                     action()
                 except WearcapError as error:
-                    event.client.add_notification(
-                        "That does not go", str(error), color="red", auto_close_seconds=10
-                    )
+                    event.client.add_notification("That does not go", str(error), color="red", auto_close_seconds=10)
                 self._refresh()
 
         return act
@@ -261,9 +262,7 @@ class ObjectEditor:
     def _set_limits(self) -> None:
         item = self._item()
         limits = self.objects.limits(item.freedom.kind)
-        self.editing.set_freedom(
-            item.name, replace(item.freedom, limits=limits), stroke=("limits", item.name)
-        )
+        self.editing.set_freedom(item.name, replace(item.freedom, limits=limits), stroke=("limits", item.name))
 
     def _turn_axis(self) -> None:
         item, angle = self._item(), np.deg2rad(self.objects.direction.value)
@@ -286,8 +285,11 @@ class ObjectEditor:
             if axis is not None:
                 self.editing.set_freedom(item.name, replace(item.freedom, axis=axis))
         else:
-            raise WearcapError(f"{item.name} {'is carried' if item.freedom.kind == 'free' else 'slides on the floor'}",
-                               expected="an object with a hinge or a slide", fix="Choose how it moves under Objects.")  # fmt: skip
+            raise WearcapError(
+                f"{item.name} {'is carried' if item.freedom.kind == 'free' else 'slides on the floor'}",
+                expected="an object with a hinge or a slide",
+                fix="Choose how it moves under Objects.",
+            )
         self._show_objects()
 
     def _set_pivot(self, item: SceneObject, pivot: Float[np.ndarray, "3"]) -> None:
@@ -296,7 +298,9 @@ class ObjectEditor:
         gap = hinge_gap_m(replace(item, freedom=freedom))
         if gap > MAX_HINGE_GAP_M:
             self._show_objects()
-            raise WearcapError(f"the hinge would be {gap:.2f} m from {item.name}", expected=f"at most {MAX_HINGE_GAP_M} m")  # fmt: skip
+            raise WearcapError(
+                f"the hinge would be {gap:.2f} m from {item.name}", expected=f"at most {MAX_HINGE_GAP_M} m"
+            )
         self.editing.set_freedom(item.name, freedom)
 
     def _box_dragged(self) -> None:

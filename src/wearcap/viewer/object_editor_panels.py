@@ -18,8 +18,11 @@ HINTS = {
 }
 _NONE: str = "none yet"
 _NAMES_OF_KINDS = {
-    "plane": "slides on the floor", "axis": "slides along an axis", "hinge": "turns about a hinge", "free": "is carried",
-}  # fmt: skip
+    "plane": "slides on the floor",
+    "axis": "slides along an axis",
+    "hinge": "turns about a hinge",
+    "free": "is carried",
+}
 
 
 class SelectPanel:

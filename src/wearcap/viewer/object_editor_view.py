@@ -16,15 +16,8 @@ from wearcap.scene.scan import Scan
 from wearcap.scene.selection import Box, first_hit
 
 SHOWN_POINTS, SHOWN_SELECTED, SHOWN_OF_OBJECT = 250_000, 80_000, 40_000
-SELECTED_COLOR, BOX_COLOR, BRUSH_COLOR, HINGE_COLOR = (
-    (255, 120, 20),
-    (30, 120, 240),
-    (255, 120, 20),
-    (220, 30, 120),
-)
-TINTS = np.array(
-    [[70, 160, 150], [90, 110, 220], [190, 110, 190], [130, 170, 60], [210, 150, 60], [90, 170, 220]]
-)
+SELECTED_COLOR, BOX_COLOR, BRUSH_COLOR, HINGE_COLOR = ((255, 120, 20), (30, 120, 240), (255, 120, 20), (220, 30, 120))
+TINTS = np.array([[70, 160, 150], [90, 110, 220], [190, 110, 190], [130, 170, 60], [210, 150, 60], [90, 170, 220]])
 CURRENT_TINT = np.array([230, 60, 130])
 _ARROW_M = 0.5
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)], np.float32)
@@ -80,20 +73,22 @@ class EditorView:
         self._add_cloud("/selection", self.scan.points[shown], colors, 1.8 * self.point_m)
 
     def _add_cloud(
-        self,
-        name: str,
-        points: Float[np.ndarray, "shown 3"],
-        colors: UInt8[np.ndarray, "shown 3"],
-        size: float,
+        self, name: str, points: Float[np.ndarray, "shown 3"], colors: UInt8[np.ndarray, "shown 3"], size: float
     ) -> None:
         if not len(points):
             self.scene.remove_by_name(name)
             return
         # Relative to the middle: float32 in the browser is exact to less than a millimetre there only.
         self.scene.add_point_cloud(
-            name, (points - self._center).astype(np.float32), colors, point_size=size, precision="float32",
-            position=self._center, point_shape="rounded", point_shading="flat",
-        )  # fmt: skip
+            name,
+            (points - self._center).astype(np.float32),
+            colors,
+            point_size=size,
+            precision="float32",
+            position=self._center,
+            point_shape="rounded",
+            point_shading="flat",
+        )
 
     def show_box(self, box: Box, visible: bool) -> None:
         self.box.visible = self.box_handle.visible = visible
@@ -127,16 +122,23 @@ class EditorView:
         own = mesh.color[::every] if len(mesh.color) == len(mesh.vertices) else np.full(3, 0.6)
         colors = 0.45 * 255 * own + 0.55 * tint
         if len(mesh.faces):
-            handle = self.scene.add_mesh_simple(node, mesh.vertices, mesh.faces.astype(np.uint32), color=tuple(int(c) for c in tint))  # fmt: skip
+            handle = self.scene.add_mesh_simple(
+                node, mesh.vertices, mesh.faces.astype(np.uint32), color=tuple(int(c) for c in tint)
+            )
         else:
             vertices = mesh.vertices[::every]
             rows = np.broadcast_to(colors, vertices.shape).astype(np.uint8)
-            handle = self.scene.add_point_cloud(node, vertices, rows, point_size=1.2 * self.point_m,
-                                                precision="float32", point_shape="rounded", point_shading="flat")  # fmt: skip
+            handle = self.scene.add_point_cloud(
+                node,
+                vertices,
+                rows,
+                point_size=1.2 * self.point_m,
+                precision="float32",
+                point_shape="rounded",
+                point_shading="flat",
+            )
         top = mesh.vertices[:, 2].max() + 0.1
-        label = self.scene.add_label(
-            f"{node}/name", item.name, position=(0.0, 0.0, float(top)), anchor="bottom-center"
-        )
+        label = self.scene.add_label(f"{node}/name", item.name, position=(0.0, 0.0, float(top)), anchor="bottom-center")
         return _Shown(item, tinted, handle, label, points_world(item)[::every])
 
     def place(self, name: str, T_world_object: Rigid) -> None:
@@ -174,9 +176,7 @@ class EditorView:
             self.try_handle.wxyz = quat_wxyz_from_matrix(item.R_world_object.double()).numpy()
             self.try_handle.position = item.t_world_object.double().numpy()
 
-    def hit(
-        self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
-    ) -> Float[np.ndarray, "3"] | None:
+    def hit(self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"] | None:
         """First point of the scan that a ray of the view meets."""
         number = first_hit(self.visible, origin, direction, self.point_m)
         return None if number is None else self.visible[number].astype(np.float64)

@@ -52,9 +52,7 @@ def shown_mesh(item: SceneObject) -> Mesh:
 
 def posed_meshes(environment: Environment, tracks: dict[str, Trajectory], time_s: float) -> list[Mesh]:
     """Meshes of all objects at a time (s), in the world."""
-    return [
-        moved(shown_mesh(item), pose_at(tracks.get(item.name), item, time_s)) for item in environment.objects
-    ]
+    return [moved(shown_mesh(item), pose_at(tracks.get(item.name), item, time_s)) for item in environment.objects]
 
 
 def moved(mesh: Mesh, T_world_object: Rigid) -> Mesh:
@@ -73,7 +71,7 @@ def with_objects(recording: Recording, environment: Environment | None = None) -
     points = None if environment is None else true_body_contact(recording, truth, environment)
     return replace(
         truth, object_motion=recording.object_motion or None, hand_contact_prob=hands, body_contact_prob=points
-    )  # fmt: skip
+    )
 
 
 def true_body_contact(
@@ -122,9 +120,13 @@ class ObjectsLayer:
     """Objects on the page; a frame is one pose per object."""
 
     def __init__(
-        self, server: viser.ViserServer, name: str, objects: Sequence[SceneObject], tracks: dict[str, Trajectory],
+        self,
+        server: viser.ViserServer,
+        name: str,
+        objects: Sequence[SceneObject],
+        tracks: dict[str, Trajectory],
         tint: tuple[int, int, int] | None = None,
-    ):  # fmt: skip
+    ):
         """`tint` is the RGB colour (0…255) that the objects' own colours are mixed with equally."""
         self.objects, self.tracks, self.offset = tuple(objects), tracks, np.zeros(3)
         self.handles = []
@@ -133,10 +135,14 @@ class ObjectsLayer:
             color = 255 * np.atleast_2d(mesh.color).mean(0)
             if tint is not None:
                 color = (color + tint) / 2
-            self.handles.append(server.scene.add_mesh_simple(
-                f"/{name}/{item.name}", mesh.vertices, mesh.faces.astype(np.uint32),
-                color=tuple(int(c) for c in color),
-            ))  # fmt: skip
+            self.handles.append(
+                server.scene.add_mesh_simple(
+                    f"/{name}/{item.name}",
+                    mesh.vertices,
+                    mesh.faces.astype(np.uint32),
+                    color=tuple(int(c) for c in color),
+                )
+            )
 
     def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
         self.offset = offset
@@ -146,9 +152,6 @@ class ObjectsLayer:
     def show(self, time: float) -> None:
         for item, handle in zip(self.objects, self.handles):
             pose = pose_at(self.tracks.get(item.name), item, time)
-            wxyz, position = (
-                quat_wxyz_from_matrix(pose.R.double()).numpy(),
-                pose.t.double().numpy() + self.offset,
-            )
+            wxyz, position = (quat_wxyz_from_matrix(pose.R.double()).numpy(), pose.t.double().numpy() + self.offset)
             if not (np.array_equal(wxyz, handle.wxyz) and np.array_equal(position, handle.position)):
                 handle.wxyz, handle.position = wxyz, position

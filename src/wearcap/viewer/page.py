@@ -27,9 +27,15 @@ class Page:
     """One recording's page. `run` plays until interrupted; `stop` closes the server."""
 
     def __init__(
-        self, recording: Recording, captures: dict[str, Motion] | None = None, *, folder: Path | None = None,
-        host: str = "127.0.0.1", port: int = 8080, environment: Environment | None = None,
-    ):  # fmt: skip
+        self,
+        recording: Recording,
+        captures: dict[str, Motion] | None = None,
+        *,
+        folder: Path | None = None,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        environment: Environment | None = None,
+    ):
         """`captures` are the captured motions by display name; several are shown side by side at first.
 
         `folder` is the data set's folder, which `recording.scene` is relative to. Moving objects of an `environment` are
@@ -79,11 +85,7 @@ class Page:
         gui.add_markdown(f"**{recording.name}**  \n{recording.activity or recording.source}")
         self._play = gui.add_button("Play")
         self._slider = gui.add_slider(
-            "Time (s)",
-            min=clock.start,
-            max=max(clock.stop, clock.start + 1e-3),
-            step=0.01,
-            initial_value=clock.start,
+            "Time (s)", min=clock.start, max=max(clock.stop, clock.start + 1e-3), step=0.01, initial_value=clock.start
         )
         self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1×")
         self._follow = gui.add_checkbox("Follow with the camera", initial_value=False)
@@ -98,9 +100,11 @@ class Page:
             layout = gui.add_dropdown("Truth and captures", self._layouts(), initial_value=self.layout)
             layout.on_update(lambda _: self.arrange(layout.value))
         keys = (
-            ("Play or pause", "space", self.toggle), ("Back one second", "J", lambda: self.jump(-1.0)),
-            ("On one second", "L", lambda: self.jump(1.0)), ("To the start", "home", lambda: self.jump(-np.inf)),
-        )  # fmt: skip
+            ("Play or pause", "space", self.toggle),
+            ("Back one second", "J", lambda: self.jump(-1.0)),
+            ("On one second", "L", lambda: self.jump(1.0)),
+            ("To the start", "home", lambda: self.jump(-np.inf)),
+        )
         for label, key, action in keys:
             gui.add_command(label, hotkey=key).on_trigger(lambda _, action=action: action())
 
@@ -195,8 +199,9 @@ def _timeline(recording: Recording, motions: dict[str, Motion]) -> Timeline:
     if head is not None and len(head.timestamps):
         streams.append(head.timestamps)
     if not streams and recording.points is None and not recording.scene:
-        raise WearcapError(f"recording {recording.name!r} has nothing to show",
-                           expected="a motion, a head path, points or a scene")  # fmt: skip
+        raise WearcapError(
+            f"recording {recording.name!r} has nothing to show", expected="a motion, a head path, points or a scene"
+        )
     start = min((times[0].item() for times in streams), default=0.0)
     return Timeline(start, max((times[-1].item() for times in streams), default=0.0), start)
 

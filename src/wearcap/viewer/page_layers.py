@@ -50,9 +50,7 @@ def nearest_frame(timestamps: Float64[Tensor, "time"], time: float) -> int:
 def stick_body(skeleton: Skeleton) -> BodyModel:
     """Capsules along the bones and a ball for the head: a body for any skeleton."""
     rest = skeleton.rest_joints.double().numpy()
-    joints = [
-        joint for joint in range(1, len(skeleton)) if np.linalg.norm(skeleton.t_parent_joint[joint]) > 1e-4
-    ]
+    joints = [joint for joint in range(1, len(skeleton)) if np.linalg.norm(skeleton.t_parent_joint[joint]) > 1e-4]
     bones = [skeleton.parents[joint] for joint in joints]
     radius = np.clip([0.12 * float(skeleton.t_parent_joint[j].norm()) for j in joints], 0.012, 0.05)
     start, end = rest[bones], rest[joints]
@@ -65,9 +63,12 @@ def stick_body(skeleton: Skeleton) -> BodyModel:
     weights = torch.zeros(len(bone_of_vertex), 4)
     weights[:, 0] = 1
     return BodyModel(
-        skeleton, torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces).long(),
-        bone_of_vertex[:, None].repeat(1, 4), weights,
-    )  # fmt: skip
+        skeleton,
+        torch.from_numpy(mesh.vertices),
+        torch.from_numpy(mesh.faces).long(),
+        bone_of_vertex[:, None].repeat(1, 4),
+        weights,
+    )
 
 
 def surface_or_sticks(skeleton: Skeleton, shape: dict[str, float]) -> BodyModel:
@@ -82,12 +83,7 @@ class BodyLayer:
     """One motion as a skinned mesh. The browser does the skinning: a frame is one pose per joint."""
 
     def __init__(
-        self,
-        server: viser.ViserServer,
-        name: str,
-        motion: Motion,
-        body: BodyModel,
-        color: tuple[int, int, int],
+        self, server: viser.ViserServer, name: str, motion: Motion, body: BodyModel, color: tuple[int, int, int]
     ):
         self.motion, self.offset = motion, np.zeros(3)
         joints = len(motion.skeleton)
@@ -95,10 +91,14 @@ class BodyLayer:
         rows = np.arange(len(weights))[:, None]
         np.add.at(weights, (rows, body.skin_joints.numpy()), body.skin_weights.numpy())
         self.handle = server.scene.add_mesh_skinned(
-            f"/{name}", body.rest_vertices.numpy(), body.faces.numpy().astype(np.uint32),
-            bone_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1)), bone_positions=motion.skeleton.rest_joints.numpy(),
-            skin_weights=weights, color=color,
-        )  # fmt: skip
+            f"/{name}",
+            body.rest_vertices.numpy(),
+            body.faces.numpy().astype(np.uint32),
+            bone_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1)),
+            bone_positions=motion.skeleton.rest_joints.numpy(),
+            skin_weights=weights,
+            color=color,
+        )
 
     def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
         self.offset = offset
@@ -119,13 +119,16 @@ class FeetLayer:
     """Balls at heels and toe tips, coloured by contact."""
 
     def __init__(
-        self, server: viser.ViserServer, name: str, motion: Motion,
-        contact: Bool[Tensor, "frame patch"], clock: Float64[Tensor, "frame"],
-    ):  # fmt: skip
+        self,
+        server: viser.ViserServer,
+        name: str,
+        motion: Motion,
+        contact: Bool[Tensor, "frame patch"],
+        clock: Float64[Tensor, "frame"],
+    ):
         self.motion, self.contact, self.clock, self.offset = motion, contact, clock, np.zeros(3)
         self.balls = [
-            server.scene.add_icosphere(f"/{name}/{patch}", 0.028, AIR_COLOR, subdivisions=2)
-            for patch in FOOT_PATCHES
+            server.scene.add_icosphere(f"/{name}/{patch}", 0.028, AIR_COLOR, subdivisions=2) for patch in FOOT_PATCHES
         ]
 
     def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
@@ -153,9 +156,7 @@ class HeadLayer:
         if len(path) > 1:
             segments = np.stack([path[:-1], path[1:]], 1)
             server.scene.add_line_segments("/head/path", segments, (70, 110, 200), thickness=0.006)
-        self.frustum = server.scene.add_camera_frustum(
-            "/head/frustum", 1.2, 1.33, scale=0.15, color=(30, 60, 160)
-        )
+        self.frustum = server.scene.add_camera_frustum("/head/frustum", 1.2, 1.33, scale=0.15, color=(30, 60, 160))
 
     def show(self, time: float) -> None:
         frame = nearest_frame(self.head.timestamps, time)
@@ -175,9 +176,13 @@ def add_points(server: viser.ViserServer, cloud: PointCloud) -> None:
     # Half precision is exact to a millimetre only near the node, so the node is in the points' middle.
     centre = points.mean(0)
     server.scene.add_point_cloud(
-        "/surroundings/points", (points - centre).astype(np.float32), colors.astype(np.uint8), point_size=0.012,
-        position=centre, precision="float32",
-    )  # fmt: skip
+        "/surroundings/points",
+        (points - centre).astype(np.float32),
+        colors.astype(np.uint8),
+        point_size=0.012,
+        position=centre,
+        precision="float32",
+    )
 
 
 def read_scene(path: Path) -> trimesh.Trimesh:
@@ -185,9 +190,7 @@ def read_scene(path: Path) -> trimesh.Trimesh:
     try:
         mesh = trimesh.load(path, force="mesh")
     except Exception as error:  # trimesh's loaders raise whatever their parsers do
-        raise WearcapError(
-            f"not a readable scene ({error})", where=path, expected="a .ply or .glb mesh"
-        ) from error
+        raise WearcapError(f"not a readable scene ({error})", where=path, expected="a .ply or .glb mesh") from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise WearcapError("a scene without triangles", where=path, expected="a .ply or .glb mesh")
     return mesh

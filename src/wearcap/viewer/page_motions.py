@@ -16,13 +16,7 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
 from wearcap.viewer.body_points import BodyPointsLayer
 from wearcap.viewer.objects import ObjectsLayer, poses_at, with_objects
-from wearcap.viewer.page_layers import (
-    BodyLayer,
-    FeetLayer,
-    LabelLayer,
-    Placed,
-    surface_or_sticks,
-)
+from wearcap.viewer.page_layers import BodyLayer, FeetLayer, LabelLayer, Placed, surface_or_sticks
 
 TRUTH = "truth"
 TRUTH_COLOR = (150, 155, 160)
@@ -65,10 +59,7 @@ def _moves(track: Trajectory | None, item: SceneObject) -> bool:
 
 
 def placed_motions(
-    server: viser.ViserServer,
-    recording: Recording,
-    motions: dict[str, Motion],
-    items: Sequence[SceneObject],
+    server: viser.ViserServer, recording: Recording, motions: dict[str, Motion], items: Sequence[SceneObject]
 ) -> dict[str, Placed]:
     """All motions by name, each with its own moving objects, tinted like its body if there are several motions."""
     placed, captures = {}, 0
@@ -83,9 +74,12 @@ def placed_motions(
             tint = color if several else None
             objects = ObjectsLayer(server, f"{name}_objects", items, motion.object_motion, tint)
         placed[name] = Placed(
-            BodyLayer(server, name, motion, body, color), _feet(server, name, motion, recording), points, objects,
+            BodyLayer(server, name, motion, body, color),
+            _feet(server, name, motion, recording),
+            points,
+            objects,
             LabelLayer(server, name, motion) if several else None,
-        )  # fmt: skip
+        )
     return placed
 
 

@@ -52,9 +52,11 @@ def start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
             console.quiet = quiet
     if not hooked:  # nothing has been shown on it yet
         server.stop()
-        raise WearcapError(f"viser {viser.__version__} does not let its pages be guarded against other sites",
-                           expected="a viser that serves through websockets.asyncio.server.serve",
-                           fix="Install the version that wearcap asks for: pip install 'viser>=1.1.1,<1.2'.")  # fmt: skip
+        raise WearcapError(
+            f"viser {viser.__version__} does not let its pages be guarded against other sites",
+            expected="a viser that serves through websockets.asyncio.server.serve",
+            fix="Install the version that wearcap asks for: pip install 'viser>=1.1.1,<1.2'.",
+        )
     return server
 
 
@@ -71,8 +73,11 @@ def _check_host(host: str) -> None:
                 return probe.bind(address)
         except OSError as error:
             problem = str(error)
-    raise WearcapError(f"cannot serve a page on {host!r} ({problem})", expected="a name or address of this machine",
-                       fix="Leave out --host for this machine alone, or give 0.0.0.0 for all of its addresses.")  # fmt: skip
+    raise WearcapError(
+        f"cannot serve a page on {host!r} ({problem})",
+        expected="a name or address of this machine",
+        fix="Leave out --host for this machine alone, or give 0.0.0.0 for all of its addresses.",
+    )
 
 
 def _guarded(guard: Guard, answer: _Answer) -> _Answer:

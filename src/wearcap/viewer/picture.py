@@ -55,9 +55,7 @@ class Actor:
         """Body, marks of feet in contact, contact points (without them: marks of hands in contact), and objects."""
         T = self.motion.T_world_joint[frame]
         vertices = self.body.vertices(T).detach().numpy().astype(np.float32)
-        body = Mesh(
-            vertices, self.body.faces.numpy().astype(np.int32), self.color.astype(np.float32), smooth=True
-        )
+        body = Mesh(vertices, self.body.faces.numpy().astype(np.int32), self.color.astype(np.float32), smooth=True)
         palms = tuple(f"{side}_palm" for side in HANDS)
         feet = self._marks(T, FOOT_PATCHES, self.motion.contact_prob, frame, 0.028, CONTACT_COLOR)
         if self.motion.body_contact_prob is None:
@@ -67,9 +65,7 @@ class Actor:
             touching = [] if lit is None else [lit]
         if self.environment is None:
             return [body, *feet, *touching]
-        objects = posed_meshes(
-            self.environment, self.motion.object_motion or {}, self.motion.timestamps[frame].item()
-        )
+        objects = posed_meshes(self.environment, self.motion.object_motion or {}, self.motion.timestamps[frame].item())
         return [body, *feet, *touching, *objects]
 
     @cached_property
@@ -77,9 +73,14 @@ class Actor:
         return contact_points(self.body)
 
     def _marks(
-        self, T_world_joint: Rigid, sites: tuple[str, ...], prob: Tensor | None, frame: int, radius: float,
+        self,
+        T_world_joint: Rigid,
+        sites: tuple[str, ...],
+        prob: Tensor | None,
+        frame: int,
+        radius: float,
         color: Float[np.ndarray, "3"],
-    ) -> list[Mesh]:  # fmt: skip
+    ) -> list[Mesh]:
         """Balls at the sites that are in contact."""
         skeleton = self.motion.skeleton
         if prob is None or not set(sites) <= set(skeleton.sites):
@@ -106,9 +107,7 @@ def actors(
     return shown
 
 
-def follow_camera(
-    target: Float[np.ndarray, "3"], size: tuple[int, int], distance: float = 4.2
-) -> tuple[Camera, Rigid]:
+def follow_camera(target: Float[np.ndarray, "3"], size: tuple[int, int], distance: float = 4.2) -> tuple[Camera, Rigid]:
     """A camera of `size` (width, height) that looks down at a point (m) from the front left of the world."""
     width, height = size
     focal = 1.75 * min(height, width * 1.3)
@@ -138,9 +137,8 @@ def panel(
     below = (float(target[0]), float(target[1]), float(ground[2]))
     light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
     return render(
-        camera, T_world_cam, [*actor.meshes(frame), stage], light=light, background=SKY,
-        supersample=supersample,
-    ).color  # fmt: skip
+        camera, T_world_cam, [*actor.meshes(frame), stage], light=light, background=SKY, supersample=supersample
+    ).color
 
 
 def contact_sheet(

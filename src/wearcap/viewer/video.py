@@ -33,9 +33,7 @@ def write_video(
     The camera follows the first motion. Raises WearcapError when the motions share no time, or for odd sizes.
     """
     if size[0] % 2 or size[1] % 2 or fps <= 0:
-        raise WearcapError(
-            f"a video of {size[0]}x{size[1]} at {fps} fps", expected="even sizes, a positive rate"
-        )
+        raise WearcapError(f"a video of {size[0]}x{size[1]} at {fps} fps", expected="even sizes, a positive rate")
     shown = actors(motions, body, environment)
     start, stop = shared_time(motions.values())
     if max_seconds is not None:
@@ -46,15 +44,11 @@ def write_video(
         stream = container.add_stream(_codec(), rate=round(fps))
         assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = size[0] * len(shown), size[1], "yuv420p"
-        for time in track(
-            times, f"video {Path(path).name}", console=Console(stderr=True), disable=not progress
-        ):
+        for time in track(times, f"video {Path(path).name}", console=Console(stderr=True), disable=not progress):
             frames = [int(np.abs(clock - time).argmin()) for clock in clocks]
             target = focus(shown[0].motion, frames[0])
             panels = [
-                np.asarray(
-                    captioned(panel(actor, frame, target, size, world=world, supersample=1), actor.label)
-                )
+                np.asarray(captioned(panel(actor, frame, target, size, world=world, supersample=1), actor.label))
                 for actor, frame in zip(shown, frames)
             ]
             picture = av.VideoFrame.from_ndarray(np.concatenate(panels, 1), format="rgb24")

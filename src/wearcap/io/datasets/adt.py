@@ -61,12 +61,15 @@ def read_adt(folder: str | Path, *, fps: float | None = None, T_aria_cpf: Rigid 
     skeletons = sorted(folder.glob("Skeleton_*.json"))
     objects = read_objects(folder) if (folder / "scene_objects.csv").is_file() else []
     return Recording(
-        name=folder.resolve().name, head=head_stream(trajectory, fps=fps, T_aria_cpf=T_aria_cpf, where=folder),
+        name=folder.resolve().name,
+        head=head_stream(trajectory, fps=fps, T_aria_cpf=T_aria_cpf, where=folder),
         cues=read_skeleton(skeletons[0]) if skeletons else {},
         object_motion={o.name: _path(o) for o in objects if o.moves and o.timestamps is not None},
-        location=str(read_json_object(folder / "metadata.json").get("scene", "")) if (folder / "metadata.json").is_file() else "",
+        location=str(read_json_object(folder / "metadata.json").get("scene", ""))
+        if (folder / "metadata.json").is_file()
+        else "",
         source="Aria Digital Twin",
-    )  # fmt: skip
+    )
 
 
 def read_skeleton(path: str | Path) -> dict[str, Cue]:
@@ -110,15 +113,22 @@ def read_objects(folder: str | Path) -> list[AdtObject]:
         if about is None or uid not in box_of:
             continue
         if not isinstance(about, dict):
-            raise WearcapError(f"object {name} is a {type(about).__name__}", where=folder / "instances.json",
-                               expected="its instance_name, category and motion_type")  # fmt: skip
-        T_world_obj, times = _object_poses(
-            {name: poses[name][rows] for name in (*names, "timestamp[ns]")}, poses_path
+            raise WearcapError(
+                f"object {name} is a {type(about).__name__}",
+                where=folder / "instances.json",
+                expected="its instance_name, category and motion_type",
+            )
+        T_world_obj, times = _object_poses({name: poses[name][rows] for name in (*names, "timestamp[ns]")}, poses_path)
+        objects.append(
+            AdtObject(
+                str(about.get("instance_name", name)),
+                str(about.get("category", "")),
+                about.get("motion_type") == "dynamic",
+                torch.tensor(box_of[uid], dtype=torch.float32),
+                T_world_obj,
+                times,
+            )
         )
-        objects.append(AdtObject(
-            str(about.get("instance_name", name)), str(about.get("category", "")), about.get("motion_type") == "dynamic",
-            torch.tensor(box_of[uid], dtype=torch.float32), T_world_obj, times,
-        ))  # fmt: skip
     return objects
 
 
@@ -127,7 +137,9 @@ def _object_poses(rows: dict[str, np.ndarray], where: Path) -> tuple[Rigid, Tens
     try:
         times = rows["timestamp[ns]"].astype(np.float64) * 1e-9
     except ValueError as error:
-        raise WearcapError(f"a time is no number ({error})"[:200], where=where, expected="nanoseconds, or -1") from error  # fmt: skip
+        raise WearcapError(
+            f"a time is no number ({error})"[:200], where=where, expected="nanoseconds, or -1"
+        ) from error
     timeless = bool((times < 0).any())
     keep = slice(0, 1) if timeless else slice(None)
     t = np.stack([rows[f"t_wo_{axis}[m]"] for axis in "xyz"], 1)[keep]

@@ -24,8 +24,17 @@ PELVIS_SMPLH = (-0.0022, -0.2408, 0.0286)
 PELVIS_SMPLX = (0.0031, -0.3514, 0.0120)
 """J₀ of the mean bodies (m); a person's own differs by a few centimetres with the betas."""
 
-_KEYS = ("trans", "poses", "root_orient", "pose_body", "betas", "gender", "mocap_framerate", "mocap_frame_rate",
-         "surface_model_type")  # fmt: skip
+_KEYS = (
+    "trans",
+    "poses",
+    "root_orient",
+    "pose_body",
+    "betas",
+    "gender",
+    "mocap_framerate",
+    "mocap_frame_rate",
+    "surface_model_type",
+)
 _RATES = ("mocap_framerate", "mocap_frame_rate")
 _SMPLX_BODY = 66
 
@@ -39,8 +48,12 @@ def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] |
     path = Path(path)
     arrays = read_npz(path, _KEYS)
     if "poses" not in arrays and "pose_body" not in arrays:
-        raise WearcapError("holds no poses", where=path, expected="a motion file of AMASS (poses, trans, mocap_framerate)",
-                           fix="shape.npz files beside the motions hold none: leave them out.")  # fmt: skip
+        raise WearcapError(
+            "holds no poses",
+            where=path,
+            expected="a motion file of AMASS (poses, trans, mocap_framerate)",
+            fix="shape.npz files beside the motions hold none: leave them out.",
+        )
     fps = _rate(arrays, path)
     stageii = _is_smplx(arrays)
     skeleton = smplx22() if stageii else smplh52()
@@ -49,11 +62,17 @@ def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] |
     t_root = torch.from_numpy(arrays["trans"].astype(np.float64)) + torch.tensor(pelvis, dtype=torch.float64)
     gender = _text(arrays.get("gender"))
     provenance = {"source": path.name, "format": "amass", **({"gender": gender} if gender else {})}
-    motion = Motion(torch.arange(len(R), dtype=torch.float64) / fps, skeleton, R.float(), t_root.float(), provenance=provenance)  # fmt: skip
+    motion = Motion(
+        torch.arange(len(R), dtype=torch.float64) / fps, skeleton, R.float(), t_root.float(), provenance=provenance
+    )
     return Recording(
-        path.stem, motion=motion, skeleton=skeleton, shape=shape_from_arrays(arrays, path), subject=path.absolute().parent.name,
+        path.stem,
+        motion=motion,
+        skeleton=skeleton,
+        shape=shape_from_arrays(arrays, path),
+        subject=path.absolute().parent.name,
         source="AMASS",
-    )  # fmt: skip
+    )
 
 
 def write_amass(
@@ -69,8 +88,12 @@ def write_amass(
     """
     target = smplh52()
     if set(motion.skeleton.joint_names[:22]) != set(target.joint_names[:22]):
-        raise WearcapError(f"a motion of skeleton {motion.skeleton.name!r}", where=path, expected="one of SMPL's skeletons",
-                           fix='Retarget it to "smplh52" first (body.retarget).')  # fmt: skip
+        raise WearcapError(
+            f"a motion of skeleton {motion.skeleton.name!r}",
+            where=path,
+            expected="one of SMPL's skeletons",
+            fix='Retarget it to "smplh52" first (body.retarget).',
+        )
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("the motion holds NaN or infinite values", where=path, expected="finite poses")
     frames, fps = even_frames(motion)
@@ -84,16 +107,21 @@ def write_amass(
     if betas is not None:
         shape[: len(betas[:16])] = betas[:16].double().numpy()
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, trans=trans.numpy(), gender=np.array(gender), mocap_framerate=np.array(fps), betas=shape,
-                 dmpls=np.zeros((len(frames), 8)), poses=rotation.log(R).flatten(1).numpy())  # fmt: skip
+        np.savez(
+            file,
+            trans=trans.numpy(),
+            gender=np.array(gender),
+            mocap_framerate=np.array(fps),
+            betas=shape,
+            dmpls=np.zeros((len(frames), 8)),
+            poses=rotation.log(R).flatten(1).numpy(),
+        )
 
 
 def _rate(arrays: dict[str, np.ndarray], path: Path) -> float:
     found = [arrays[key] for key in _RATES if key in arrays]
     if not found or found[0].size != 1 or not np.issubdtype(found[0].dtype, np.number):
-        raise WearcapError(
-            "no frame rate", where=path, expected="mocap_framerate or mocap_frame_rate, one number"
-        )
+        raise WearcapError("no frame rate", where=path, expected="mocap_framerate or mocap_frame_rate, one number")
     fps = float(found[0].reshape(-1)[0].real)
     if not (np.isfinite(fps) and 0 < fps < 1e5):
         raise WearcapError(f"a frame rate of {fps} Hz", where=path, expected="a positive number")

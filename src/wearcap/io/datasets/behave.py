@@ -37,9 +37,11 @@ R_WORLD_CAMERA = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.
 
 _FOLDERS = ("sequences", "behave-30fps-params-v1")
 _REGISTERED = {
-    "chairblack": "chairblack_f2500.ply", "chairwood": "chairwood_f2500.ply", "monitor": "monitor_closed_f1000.ply",
+    "chairblack": "chairblack_f2500.ply",
+    "chairwood": "chairwood_f2500.ply",
+    "monitor": "monitor_closed_f1000.ply",
     "tablesquare": "tablesquare_f2000.ply",
-}  # fmt: skip
+}
 """Files of the registered meshes; those of all other objects are OBJECT_f1000.ply."""
 _OFF_GRID = 0.1
 """Largest distance (frames) of a time from a multiple of 1/30 s: times are rounded to milliseconds."""
@@ -51,8 +53,12 @@ def behave_folder(root: str | Path) -> Path:
     folders = [Path(root) / name for name in _FOLDERS]
     found = [folder for folder in folders if _names(folder)]
     if not found:
-        raise WearcapError("no sequences", where=root, expected=f"sequences/NAME/{BODY_FILE} and {OBJECT_FILE}",
-                           fix="Give BEHAVE's folder as source=DIR, with the parameters of all frames (30 fps) in it.")  # fmt: skip
+        raise WearcapError(
+            "no sequences",
+            where=root,
+            expected=f"sequences/NAME/{BODY_FILE} and {OBJECT_FILE}",
+            fix="Give BEHAVE's folder as source=DIR, with the parameters of all frames (30 fps) in it.",
+        )
     return found[0]
 
 
@@ -62,9 +68,7 @@ def behave_names(root: str | Path) -> list[str]:
 
 
 def _names(folder: Path) -> list[str]:
-    return sorted(
-        {path.parent.name for file in (BODY_FILE, OBJECT_FILE) for path in folder.glob(f"*/{file}")}
-    )
+    return sorted({path.parent.name for file in (BODY_FILE, OBJECT_FILE) for path in folder.glob(f"*/{file}")})
 
 
 def read_behave(root: str | Path, name: str) -> OneObject:
@@ -77,8 +81,11 @@ def read_behave(root: str | Path, name: str) -> OneObject:
         raise WearcapError(f"no sequence {name!r}", where=root, expected=f"sequences/{name}/{BODY_FILE}")
     parts = name.split("_")
     if len(parts) < 3:
-        raise WearcapError("not named as BEHAVE's are", where=behave_folder(root) / name,
-                           expected="a folder DATE_SUBJECT_OBJECT, such as Date01_Sub01_boxlarge_hand")  # fmt: skip
+        raise WearcapError(
+            "not named as BEHAVE's are",
+            where=behave_folder(root) / name,
+            expected="a folder DATE_SUBJECT_OBJECT, such as Date01_Sub01_boxlarge_hand",
+        )
     folder = behave_folder(root) / name
     body = read_npz(folder / BODY_FILE, ("poses", "trans", "betas", "frame_times"))
     fitted = read_npz(folder / OBJECT_FILE, ("angles", "trans", "frame_times"))
@@ -93,9 +100,16 @@ def read_behave(root: str | Path, name: str) -> OneObject:
     R = rotation.exp(torch.from_numpy(fitted["angles"].astype(np.float64)))
     path = Trajectory(times, R.float(), torch.from_numpy(fitted["trans"].astype(np.float32)))
     take = OneObject(
-        name, motion, object_name, path, read_behave_mesh(root, object_name), _shape(body, folder / BODY_FILE, frames),
-        subject=parts[1], activity="_".join(parts[2:]), location=parts[0],
-    )  # fmt: skip
+        name,
+        motion,
+        object_name,
+        path,
+        read_behave_mesh(root, object_name),
+        _shape(body, folder / BODY_FILE, frames),
+        subject=parts[1],
+        activity="_".join(parts[2:]),
+        location=parts[0],
+    )
     return take.turned(R_WORLD_CAMERA)
 
 
@@ -110,11 +124,17 @@ def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
     Raises WearcapError where it is missing, and for what `check_object_mesh` refuses.
     """
     if not re.fullmatch(r"[\w-]{1,64}", object_name):
-        raise WearcapError(f"an object named {object_name[:60]!r}", where=root, expected="one of BEHAVE's names, as boxlarge")  # fmt: skip
+        raise WearcapError(
+            f"an object named {object_name[:60]!r}", where=root, expected="one of BEHAVE's names, as boxlarge"
+        )
     path = behave_mesh_path(root, object_name)
     if not path.is_file():
-        raise WearcapError(f"no mesh of {object_name}", where=path, expected="objects/OBJECT/OBJECT_f1000.ply",
-                           fix="Unpack BEHAVE's objects.zip beside the sequences.")  # fmt: skip
+        raise WearcapError(
+            f"no mesh of {object_name}",
+            where=path,
+            expected="objects/OBJECT/OBJECT_f1000.ply",
+            fix="Unpack BEHAVE's objects.zip beside the sequences.",
+        )
     ply = read_ply(path)
     faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
     mesh = Mesh(ply.points, faces, _COLOR if ply.colors is None else ply.colors.astype(np.float32) / 255)
@@ -131,8 +151,12 @@ def _common_times(
     if not frames:
         raise WearcapError("no frames", where=folder / BODY_FILE, expected="poses of at least one frame")
     if len(fitted["angles"]) != frames:
-        raise WearcapError(f"the object has {len(fitted['angles'])} frames, the body {frames}", where=folder,
-                           expected=f"as many in {OBJECT_FILE} as in {BODY_FILE}", fix="Fetch both files again.")  # fmt: skip
+        raise WearcapError(
+            f"the object has {len(fitted['angles'])} frames, the body {frames}",
+            where=folder,
+            expected=f"as many in {OBJECT_FILE} as in {BODY_FILE}",
+            fix="Fetch both files again.",
+        )
     times = _times(fitted, folder / OBJECT_FILE, frames)
     if "frame_times" in body:
         other = _times(body, folder / BODY_FILE, frames)
@@ -140,8 +164,10 @@ def _common_times(
         if len(apart):
             raise WearcapError(
                 f"the body's frame {apart[0]} is of {other[apart[0]]:.3f} s, the object's of {times[apart[0]]:.3f} s",
-                where=folder, expected="the same frame_times in both files", fix="Fetch both files again.",
-            )  # fmt: skip
+                where=folder,
+                expected="the same frame_times in both files",
+                fix="Fetch both files again.",
+            )
     return torch.from_numpy(times)
 
 
@@ -149,22 +175,30 @@ def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np
     """Times (s) from `frame_times` ("t0003.033"), snapped to whole frames. Raises WearcapError for rates other than 30."""
     stamps = arrays.get("frame_times")
     if stamps is None or stamps.shape != (frames,) or stamps.dtype.kind not in "US":
-        raise WearcapError(f"frame_times is {'missing' if stamps is None else f'{stamps.dtype} {stamps.shape}'}", where=path,
-                           expected=f'{frames} texts such as "t0003.033" (s)')  # fmt: skip
+        raise WearcapError(
+            f"frame_times is {'missing' if stamps is None else f'{stamps.dtype} {stamps.shape}'}",
+            where=path,
+            expected=f'{frames} texts such as "t0003.033" (s)',
+        )
     texts = [text.decode("latin-1") if isinstance(text, bytes) else str(text) for text in stamps]
     try:
         seconds = np.array([float(text.removeprefix("t")) for text in texts])
     except ValueError as error:
-        raise WearcapError(f"frame_times cannot be read ({error})"[:200], where=path,
-                           expected='texts such as "t0003.033" (s)') from error  # fmt: skip
+        raise WearcapError(
+            f"frame_times cannot be read ({error})"[:200], where=path, expected='texts such as "t0003.033" (s)'
+        ) from error
     if not (np.abs(seconds) < 1e6).all():
         raise WearcapError("frame_times holds NaN or infinity", where=path, expected="seconds")
     grid = np.rint(seconds * FPS)
     step = float(np.median(np.diff(grid))) if frames > 1 else 1.0
     if np.abs(seconds * FPS - grid).max() > _OFF_GRID or step != 1.0:
         rate = 1 / max(float(np.median(np.abs(np.diff(seconds)))), 1e-6) if frames > 1 else 0.0
-        raise WearcapError(f"frames come at {rate:.4g} per second", where=path, expected=f"{FPS} per second",
-                           fix="Use the release of all frames (30 fps), not the one of one frame per second.")  # fmt: skip
+        raise WearcapError(
+            f"frames come at {rate:.4g} per second",
+            where=path,
+            expected=f"{FPS} per second",
+            fix="Use the release of all frames (30 fps), not the one of one frame per second.",
+        )
     check_rising(grid / FPS, path)
     return grid / FPS
 
@@ -172,9 +206,7 @@ def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np
 def _about(info: Any, path: Path) -> tuple[str, str]:
     """Name of the object and gender of the person."""
     if not isinstance(info, dict) or not isinstance(info.get("cat"), str) or not info["cat"].isidentifier():
-        raise WearcapError(
-            "does not name the object", where=path, expected='{"cat": "boxlarge", "gender": "male", …}'
-        )
+        raise WearcapError("does not name the object", where=path, expected='{"cat": "boxlarge", "gender": "male", …}')
     gender = info.get("gender")
     return info["cat"], gender if isinstance(gender, str) else ""
 

@@ -80,8 +80,12 @@ def read_egohoi(
     """
     root = Path(root)
     if name not in egohoi_names(root):
-        raise WearcapError(f"no sequence {name!r}", where=root, expected=f"smpl_motions/{name}.json.zip or .json",
-                           fix=f"There are {len(egohoi_names(root))}, such as {egohoi_names(root)[:3]}.")  # fmt: skip
+        raise WearcapError(
+            f"no sequence {name!r}",
+            where=root,
+            expected=f"smpl_motions/{name}.json.zip or .json",
+            fix=f"There are {len(egohoi_names(root))}, such as {egohoi_names(root)[:3]}.",
+        )
     packed = root / "smpl_motions" / f"{name}.json.zip"
     body = read_smpl_json(packed if packed.is_file() else packed.with_suffix(""))
     clock = LabelClock.of(name, body.motion.timestamps)
@@ -91,9 +95,7 @@ def read_egohoi(
         kind = _motion_type(object_id, annotated, motion_types or {}, locations)
         if kind == "absent":
             continue
-        item = scene_object(
-            object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s
-        )
+        item = scene_object(object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s)
         objects.append(item)
         paths[object_id] = annotated.trajectory
         if labels is not None:
@@ -104,9 +106,17 @@ def read_egohoi(
     shape = root / "smpl_shapes" / f"{subject_of(name)}.json"
     betas = body.shape or (shape_from_betas(read_hps_subject(shape).betas) if shape.is_file() else {})
     recording = Recording(
-        name, motion=body.motion, object_motion=paths, interactions=interactions, skeleton=body.motion.skeleton,
-        shape=betas, subject=subject_of(name), location=location_of(name), activity=activity_of(name), source="EgoHOI",
-    )  # fmt: skip
+        name,
+        motion=body.motion,
+        object_motion=paths,
+        interactions=interactions,
+        skeleton=body.motion.skeleton,
+        shape=betas,
+        subject=subject_of(name),
+        location=location_of(name),
+        activity=activity_of(name),
+        source="EgoHOI",
+    )
     return EgoHoi(recording, Environment(tuple(objects)))
 
 
@@ -121,12 +131,11 @@ def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, t
         raise WearcapError(
             "no object locations of this sequence", where=single, expected=f"this file, or a folder {several}"
         )
-    places = {
-        object_id: [root / folder / labels for folder in _CONTACTS]
-        for object_id, (_, labels) in found.items()
+    places = {object_id: [root / folder / labels for folder in _CONTACTS] for object_id, (_, labels) in found.items()}
+    return {
+        object_id: (path, next((place for place in places[object_id] if place.is_file()), None))
+        for object_id, (path, _) in found.items()
     }
-    return {object_id: (path, next((place for place in places[object_id] if place.is_file()), None))
-            for object_id, (path, _) in found.items()}  # fmt: skip
 
 
 def _only_object(root: Path, name: str) -> str:
@@ -135,23 +144,27 @@ def _only_object(root: Path, name: str) -> str:
     models = sorted(path.stem for path in root.glob("object_models/*.ply"))
     fitting = [stem] if stem in models else [model for model in models if model.startswith(stem)]
     if len(fitting) != 1:
-        raise WearcapError(f"{len(fitting)} models fit the sequence {name!r}", where=root / "object_models",
-                           expected=f"{stem}.ply", fix=f"Give its object's name: one of {', '.join(fitting or models)}.")  # fmt: skip
+        raise WearcapError(
+            f"{len(fitting)} models fit the sequence {name!r}",
+            where=root / "object_models",
+            expected=f"{stem}.ply",
+            fix=f"Give its object's name: one of {', '.join(fitting or models)}.",
+        )
     return fitting[0]
 
 
-def _motion_type(
-    object_id: str, annotated: AnnotatedObject, motion_types: Mapping[str, str], where: Path
-) -> str:
+def _motion_type(object_id: str, annotated: AnnotatedObject, motion_types: Mapping[str, str], where: Path) -> str:
     default = "along_floor" if annotated.hinge is None else "hinge"
     kind = next((kind for pattern, kind in motion_types.items() if fnmatchcase(object_id, pattern)), default)
     if kind not in MOTION_TYPES:
-        raise WearcapError(
-            f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}"
-        )
+        raise WearcapError(f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}")
     if kind == "hinge" and annotated.hinge is None:
-        raise WearcapError(f"{object_id} is to turn about a hinge and has none", where=where, expected='"hinge": [x, y, z]',
-                           fix="Give it another motion type.")  # fmt: skip
+        raise WearcapError(
+            f"{object_id} is to turn about a hinge and has none",
+            where=where,
+            expected='"hinge": [x, y, z]',
+            fix="Give it another motion type.",
+        )
     return kind
 
 
@@ -181,8 +194,11 @@ def read_object_locations(path: str | Path) -> AnnotatedObject:
 
 
 def _not_locations(path: str | Path, detail: str) -> WearcapError:
-    return WearcapError(f"no object locations ({detail})"[:300], where=path,
-                        expected='{"center": [x, y, z], "locations": [{"time", "position", "quaternion"}]}')  # fmt: skip
+    return WearcapError(
+        f"no object locations ({detail})"[:300],
+        where=path,
+        expected='{"center": [x, y, z], "locations": [{"time", "position", "quaternion"}]}',
+    )
 
 
 def _triple(point: np.ndarray) -> tuple[float, float, float]:
@@ -191,9 +207,11 @@ def _triple(point: np.ndarray) -> tuple[float, float, float]:
 
 
 def _about_center(
-    times: Float64[np.ndarray, "time"], positions: Float64[np.ndarray, "time 3"],
-    quat_wxyz: Float64[np.ndarray, "time 4"], center: Float64[np.ndarray, "3"],
-) -> Trajectory:  # fmt: skip
+    times: Float64[np.ndarray, "time"],
+    positions: Float64[np.ndarray, "time 3"],
+    quat_wxyz: Float64[np.ndarray, "time 4"],
+    center: Float64[np.ndarray, "3"],
+) -> Trajectory:
     """Trajectory of the centre c: a vertex v is at R·v + p = R·(v - c) + (p + R·c)."""
     R = rotation.matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz))
     t = torch.from_numpy(positions) + R @ torch.from_numpy(center)
@@ -212,16 +230,16 @@ def scene_object(
     vertices = (ply.points.astype(np.float64) - annotated.center).astype(np.float32)
     color = _COLOR if ply.colors is None else ply.colors.astype(np.float32) / 255
     mesh = Mesh(vertices, np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces, color)
-    freedom = Freedom({"hinge": "hinge", "along_floor": "plane", "free": "free"}[motion_type],
-                      annotated.hinge if motion_type == "hinge" else None)  # fmt: skip
+    freedom = Freedom(
+        {"hinge": "hinge", "along_floor": "plane", "free": "free"}[motion_type],
+        annotated.hinge if motion_type == "hinge" else None,
+    )
     seen = max(int(torch.searchsorted(annotated.trajectory.timestamps, start_s, right=True)) - 1, 0)
     first = annotated.trajectory.T_world_body[seen]
     return SceneObject(name, name.rpartition("_")[2], mesh, first.R, first.t, freedom)
 
 
-def read_egohoi_contacts(
-    path: str | Path, clock: LabelClock, object_name: str, contact_class: str
-) -> Interactions:
+def read_egohoi_contacts(path: str | Path, clock: LabelClock, object_name: str, contact_class: str) -> Interactions:
     """Read {"interactions": [{start, end, parts}]} with one object; intervals without parts have no contact.
 
     Raises WearcapError for labels that end before they start, that overlap or lie outside the motion, for parts that
@@ -230,9 +248,7 @@ def read_egohoi_contacts(
     content = read_json(path)
     rows = content.get("interactions") if isinstance(content, dict) else None
     if not isinstance(rows, list):
-        raise WearcapError(
-            "no contact labels", where=path, expected='{"interactions": [{"start", "end", "parts"}]}'
-        )
+        raise WearcapError("no contact labels", where=path, expected='{"interactions": [{"start", "end", "parts"}]}')
     parts: dict[str, list[list[Any]]] = {f"{hand}_hand": [] for hand in HANDS}
     for number, row in enumerate(rows):
         if not isinstance(row, dict) or not isinstance(row.get("parts"), list):
@@ -241,28 +257,32 @@ def read_egohoi_contacts(
             )
         start, end = row.get("start"), row.get("end")
         if isinstance(start, int | float) and isinstance(end, int | float) and end < start:
-            raise WearcapError(f"interaction {number} ends before it starts: {start} to {end} s", where=path,
-                               expected="start < end", fix="Exchange the two, if that is what was meant.")  # fmt: skip
+            raise WearcapError(
+                f"interaction {number} ends before it starts: {start} to {end} s",
+                where=path,
+                expected="start < end",
+                fix="Exchange the two, if that is what was meant.",
+            )
         for part in row["parts"]:
             if part not in parts:
-                raise WearcapError(
-                    f"interaction {number} is with {part!r}", where=path, expected=" or ".join(parts)
-                )
+                raise WearcapError(f"interaction {number} is with {part!r}", where=path, expected=" or ".join(parts))
             parts[part].append([start, end])
-    named = {key: {hand: [text] * len(spans) for hand, spans in parts.items()}
-             for key, text in (("objects", object_name), ("classes", contact_class))}  # fmt: skip
+    named = {
+        key: {hand: [text] * len(spans) for hand, spans in parts.items()}
+        for key, text in (("objects", object_name), ("classes", contact_class))
+    }
     return interactions_of(parse_labels({"contacts": parts, **named}, clock, where=path))
 
 
 def _joined(parts: list[Interactions]) -> Interactions:
     """Interactions of all objects, sorted by start."""
-    start, stop, hands = (
-        torch.cat([getattr(part, key) for part in parts]) for key in ("start_s", "stop_s", "hands")
-    )
+    start, stop, hands = (torch.cat([getattr(part, key) for part in parts]) for key in ("start_s", "stop_s", "hands"))
     names, kinds = ([text for part in parts for text in getattr(part, key)] for key in ("objects", "classes"))
     order = torch.argsort(start, stable=True)
     index = order.tolist()
-    return Interactions(start[order], stop[order], hands[order], tuple(names[k] for k in index), tuple(kinds[k] for k in index))  # fmt: skip
+    return Interactions(
+        start[order], stop[order], hands[order], tuple(names[k] for k in index), tuple(kinds[k] for k in index)
+    )
 
 
 def write_object_npz(
@@ -274,13 +294,17 @@ def write_object_npz(
     """
     R, t = trajectory.R_world_body.double(), trajectory.t_world_body.double()
     if not (R.isfinite().all() and t.isfinite().all() and trajectory.timestamps.isfinite().all()):
-        raise WearcapError(
-            "the object's path holds NaN or infinite values", where=path, expected="finite poses"
-        )
+        raise WearcapError("the object's path holds NaN or infinite values", where=path, expected="finite poses")
     moved = t - R @ _double(center)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, version=np.array(2), type=np.array("sequential"), translations=moved.numpy(),
-                            quaternions=rotation.quat_wxyz_from_matrix(R).numpy(), timestamps=trajectory.timestamps.numpy())  # fmt: skip
+        np.savez_compressed(
+            file,
+            version=np.array(2),
+            type=np.array("sequential"),
+            translations=moved.numpy(),
+            quaternions=rotation.quat_wxyz_from_matrix(R).numpy(),
+            timestamps=trajectory.timestamps.numpy(),
+        )
 
 
 def read_object_npz(path: str | Path, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Trajectory:

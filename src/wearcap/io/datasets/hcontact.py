@@ -41,21 +41,29 @@ def read_hcontact(root: str | Path, name: str, contact_class: str = "") -> Recor
     and for what the readers of bodies and contacts refuse.
     """
     if contact_class not in ("", *CONTACT_CLASSES):
-        raise WearcapError(
-            f"no contact class {contact_class!r}", expected=f"one of {', '.join(CONTACT_CLASSES)}"
-        )
+        raise WearcapError(f"no contact class {contact_class!r}", expected=f"one of {', '.join(CONTACT_CLASSES)}")
     root = Path(root)
     if name not in hcontact_names(root):
-        raise WearcapError(f"no sequence {name!r}", where=root, expected=f"body/{name}{ENDING}",
-                           fix=f"There are {len(hcontact_names(root))}, such as {hcontact_names(root)[:3]}.")  # fmt: skip
+        raise WearcapError(
+            f"no sequence {name!r}",
+            where=root,
+            expected=f"body/{name}{ENDING}",
+            fix=f"There are {len(hcontact_names(root))}, such as {hcontact_names(root)[:3]}.",
+        )
     body = read_smpl_json(root / "body" / f"{name}{ENDING}")
     clock = LabelClock.of(name, body.motion.timestamps)
     contacts = read_contact_labels(root / "contacts" / f"{name}.json", clock)
     return Recording(
-        name, motion=body.motion, interactions=_of_class(contacts, contact_class), skeleton=body.motion.skeleton,
-        shape=body.shape, subject=subject_of(name), location=location_of(name), activity=activity_of(name),
+        name,
+        motion=body.motion,
+        interactions=_of_class(contacts, contact_class),
+        skeleton=body.motion.skeleton,
+        shape=body.shape,
+        subject=subject_of(name),
+        location=location_of(name),
+        activity=activity_of(name),
         source="H-contact",
-    )  # fmt: skip
+    )
 
 
 def _of_class(contacts: Interactions, contact_class: str) -> Interactions:
@@ -81,10 +89,17 @@ def read_hcontact_split(path: str | Path) -> HContactSplit:
     parts = ("train", "valid", "test")
     radius = content.get("window_radius") if isinstance(content, dict) else None
     lists = [content.get(part) for part in parts] if isinstance(content, dict) else []
-    sound = type(radius) is int and radius > 0 and all(
-        isinstance(windows, list) and all(type(k) is int and 0 <= k < 1 << 40 for k in windows) for windows in lists
-    )  # fmt: skip
+    sound = (
+        type(radius) is int
+        and radius > 0
+        and all(
+            isinstance(windows, list) and all(type(k) is int and 0 <= k < 1 << 40 for k in windows) for windows in lists
+        )
+    )
     if not sound:
-        raise WearcapError("not a split of windows", where=path,
-                           expected='{"window_radius": 30, "train": [frame, …], "valid": […], "test": […]}')  # fmt: skip
+        raise WearcapError(
+            "not a split of windows",
+            where=path,
+            expected='{"window_radius": 30, "train": [frame, …], "valid": […], "test": […]}',
+        )
     return HContactSplit(radius, *map(tuple, lists))

@@ -51,21 +51,15 @@ def read_hps_motion(path: str | Path, t_template_pelvis: tuple[float, float, flo
     """
     content = read_pickle(path)
     if not isinstance(content, dict):
-        raise WearcapError(
-            f"it holds a {type(content).__name__}", where=path, expected="a dict of poses and transes"
-        )
+        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="a dict of poses and transes")
     arrays = {key: np.asarray(content[key]) for key in ("poses", "transes") if key in content}
     sizes = require(arrays, path, poses=("time", 72), transes=("time", 3))
     if not sizes["time"]:
         raise WearcapError("no frames", where=path)
     R = rotations_from_smpl(torch.from_numpy(arrays["poses"].astype(np.float64)).unflatten(1, (-1, 3)))
-    t = torch.from_numpy(arrays["transes"].astype(np.float64)) + torch.tensor(
-        t_template_pelvis, dtype=torch.float64
-    )
+    t = torch.from_numpy(arrays["transes"].astype(np.float64)) + torch.tensor(t_template_pelvis, dtype=torch.float64)
     times = torch.arange(sizes["time"], dtype=torch.float64) / FPS
-    return Motion(
-        times, smpl24(), R.float(), t.float(), provenance={"source": Path(path).name, "format": "hps"}
-    )
+    return Motion(times, smpl24(), R.float(), t.float(), provenance={"source": Path(path).name, "format": "hps"})
 
 
 def read_hps_subject(path: str | Path) -> HpsSubject:
@@ -75,12 +69,13 @@ def read_hps_subject(path: str | Path) -> HpsSubject:
         betas = np.asarray(content["betas"], np.float64).reshape(-1)
         heel_m = float(content.get("root_to_heel", 0.0))
     except (KeyError, ValueError, TypeError) as error:
-        raise WearcapError(f"no betas that can be read ({error})", where=path,
-                           expected='{"betas": 10 numbers, "gender": …, "root_to_heel": …}') from error  # fmt: skip
-    if not (0 < len(betas) <= 300 and np.isfinite(betas).all() and np.isfinite(heel_m)):
         raise WearcapError(
-            f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers"
-        )
+            f"no betas that can be read ({error})",
+            where=path,
+            expected='{"betas": 10 numbers, "gender": …, "root_to_heel": …}',
+        ) from error
+    if not (0 < len(betas) <= 300 and np.isfinite(betas).all() and np.isfinite(heel_m)):
+        raise WearcapError(f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers")
     return HpsSubject(tuple(betas.tolist()), str(content.get("gender", "neutral")), heel_m)
 
 
@@ -89,9 +84,7 @@ def read_hps_starts(path: str | Path) -> tuple[int, int]:
     content = read_json_object(path)
     starts = [content.get(key) for key in ("cam_start", "imu_start")]
     if not all(isinstance(start, int | float) and 0 <= start <= MAX_FRAMES for start in starts):
-        raise WearcapError(
-            f"starts {starts}", where=path, expected='{"cam_start": frame, "imu_start": frame}, from 0'
-        )
+        raise WearcapError(f"starts {starts}", where=path, expected='{"cam_start": frame, "imu_start": frame}, from 0')
     return int(starts[0]), int(starts[1])  # pyright: ignore[reportArgumentType]
 
 
@@ -111,14 +104,13 @@ def read_hps_localization(path: str | Path, fps: float | int = FPS) -> Localizat
             quat_wxyz[frame], position[frame] = read_hps_pose(rows[key], f"{path}, frame {key}")
             confidence[frame] = 1.0
     if not confidence.any():
-        raise WearcapError(
-            "no frame has a pose", where=path, expected="poses of some frames, null for the others"
-        )
+        raise WearcapError("no frame has a pose", where=path, expected="poses of some frames, null for the others")
     return Localization(
         torch.arange(count, dtype=torch.float64) / fps,
         rotation.matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz)).float(),
-        torch.from_numpy(position).float(), confidence,
-    )  # fmt: skip
+        torch.from_numpy(position).float(),
+        confidence,
+    )
 
 
 def _frame_numbers(rows: dict[str, Any], path: str | Path) -> dict[str, int]:
@@ -138,11 +130,17 @@ def read_hps_pose(row: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
         quat_wxyz = np.asarray(row["quaternion"], np.float64).reshape(4)
         position = np.asarray(row["position"], np.float64).reshape(3)
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise WearcapError(f"no pose ({type(error).__name__}: {error})", where=where,
-                           expected='{"position": [x, y, z], "quaternion": [w, x, y, z]}') from error  # fmt: skip
+        raise WearcapError(
+            f"no pose ({type(error).__name__}: {error})",
+            where=where,
+            expected='{"position": [x, y, z], "quaternion": [w, x, y, z]}',
+        ) from error
     if not (np.abs(position) < 1e6).all() or not abs(np.linalg.norm(quat_wxyz) - 1) < NORM_TOLERANCE:
-        raise WearcapError(f"position {position.tolist()}, quaternion {quat_wxyz.tolist()}", where=where,
-                           expected="metres, and a quaternion of length 1")  # fmt: skip
+        raise WearcapError(
+            f"position {position.tolist()}, quaternion {quat_wxyz.tolist()}",
+            where=where,
+            expected="metres, and a quaternion of length 1",
+        )
     return quat_wxyz, position
 
 
@@ -164,8 +162,11 @@ def read_hps_cameras(path: str | Path) -> dict[str, Camera]:
             if not (len(focal) == len(centre) == 2 and np.isfinite([*focal, *centre, *distortion]).all()):
                 raise ValueError(f"focal lengths {focal}, centre {centre}, distortion {distortion}")
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise WearcapError(f"no intrinsics ({type(error).__name__}: {error})"[:200], where=where,
-                               expected="parameters {focal_dist_xy, center_xy, dist_coeffs} and captured_videos") from error  # fmt: skip
+            raise WearcapError(
+                f"no intrinsics ({type(error).__name__}: {error})"[:200],
+                where=where,
+                expected="parameters {focal_dist_xy, center_xy, dist_coeffs} and captured_videos",
+            ) from error
         distortion = tuple((distortion + [0.0] * 4)[: max(4, len(distortion))])
         try:
             camera = Camera("opencv", *IMAGE_SIZE, *focal, *centre, distortion)
@@ -192,9 +193,11 @@ def resampled_localization(localization: Localization, fps: float | int) -> Loca
     turn = rotation.exp(blend[:, None] * rotation.log(R[before].mT @ R[after]))
     found = (sure > 0)[:, None]
     return Localization(
-        times, torch.where(found[..., None], R[before] @ turn, torch.eye(3)),
-        torch.where(found, torch.lerp(t[before], t[after], blend[:, None]), torch.zeros(3)), sure,
-    )  # fmt: skip
+        times,
+        torch.where(found[..., None], R[before] @ turn, torch.eye(3)),
+        torch.where(found, torch.lerp(t[before], t[after], blend[:, None]), torch.zeros(3)),
+        sure,
+    )
 
 
 def nominal_mount() -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:

@@ -37,14 +37,12 @@ def read_hps_scene(folder: str | Path) -> tuple[Path, list[Photo]]:
         raise WearcapError("a packed scan", where=folder, expected="its folder", fix="Unzip it first.")
     for part in (CLOUD, CALIBRATION, "cam", "info"):
         if not (folder / part).exists():
-            raise WearcapError(
-                f"no {part}", where=folder, expected=f"a scan with {CLOUD}, {CALIBRATION}, cam/, info/"
-            )
-    cameras = {name: model.camera(f"{folder / CALIBRATION}, camera {name!r}")
-               for name, model in read_sensor_frame(folder / CALIBRATION).items()}  # fmt: skip
-    named = [
-        (match, path) for path in sorted((folder / "cam").iterdir()) if (match := _PHOTO.fullmatch(path.name))
-    ]
+            raise WearcapError(f"no {part}", where=folder, expected=f"a scan with {CLOUD}, {CALIBRATION}, cam/, info/")
+    cameras = {
+        name: model.camera(f"{folder / CALIBRATION}, camera {name!r}")
+        for name, model in read_sensor_frame(folder / CALIBRATION).items()
+    }
+    named = [(match, path) for path in sorted((folder / "cam").iterdir()) if (match := _PHOTO.fullmatch(path.name))]
     if not named:
         raise WearcapError("no pictures", where=folder / "cam", expected="files such as 00000-cam0.jpg")
     photos, info, info_path = [], {}, None
@@ -56,9 +54,7 @@ def read_hps_scene(folder: str | Path) -> tuple[Path, list[Photo]]:
         if not isinstance(info, dict) or name not in info:
             raise WearcapError(f"no pose of {name}", where=info_path, expected=f"one for {path.name}")
         if name not in cameras:
-            raise WearcapError(
-                f"no intrinsics of {name}", where=folder / CALIBRATION, expected=f"one for {path.name}"
-            )
+            raise WearcapError(f"no intrinsics of {name}", where=folder / CALIBRATION, expected=f"one for {path.name}")
         if str(info.get("valid", "true")).lower() == "false":
             continue
         quat_wxyz, position = read_hps_pose(info[name], f"{info_path}, {name}")

@@ -34,8 +34,15 @@ from wearcap.io.formats.video import video_info
 from wearcap.recording import CameraStream, Localization, Motion, Recording
 
 _SUBJECT = re.compile(r"SUB\d+")
-_SCAN_OF = {"SUB1": "MPI_BIBLIO_EG", "SUB2": "MPI_EG", "SUB3": "MPI_KINO", "SUB4": "MPI_Etage6", "SUB5": "MPI_GEB_AB",
-            "SUB6": "MPI_BIBLIO_UG", "SUB7": "MPI_BIBLIO_OG"}  # fmt: skip
+_SCAN_OF = {
+    "SUB1": "MPI_BIBLIO_EG",
+    "SUB2": "MPI_EG",
+    "SUB3": "MPI_KINO",
+    "SUB4": "MPI_Etage6",
+    "SUB5": "MPI_GEB_AB",
+    "SUB6": "MPI_BIBLIO_UG",
+    "SUB7": "MPI_BIBLIO_OG",
+}
 """Scan of each subject's sequences, except those that `scan_name` handles individually."""
 FAR_M = 2.0
 """Median distance (m) of pelvis and localised camera beyond which clocks or places of the two disagree."""
@@ -80,37 +87,52 @@ def read_hps_sequence(root: str | Path, name: str, camera_hz: float | int = FPS)
     root = Path(root)
     if not name or Path(name).name != name or escape(name) != name:
         raise WearcapError(
-            f"no sequence {name!r}",
-            where=root,
-            expected="a plain name, such as SUB4_MPI_Etage6_working_standing",
+            f"no sequence {name!r}", where=root, expected="a plain name, such as SUB4_MPI_Etage6_working_standing"
         )
     motion_path = _one(root, f"*hps_smpl*/{name}.pkl")
     if motion_path is None:
         known = hps_names(root)
-        raise WearcapError(f"no sequence {name!r}", where=root,
-                           expected=f"one of {len(known)}, such as {known[:3]}" if known else "hps_smpl/NAME.pkl")  # fmt: skip
+        raise WearcapError(
+            f"no sequence {name!r}",
+            where=root,
+            expected=f"one of {len(known)}, such as {known[:3]}" if known else "hps_smpl/NAME.pkl",
+        )
     motion = read_hps_motion(motion_path)
     shape, motion = _shaped(root, name, motion)
     localization_path = _one(root, f"*locali*/{name}.json")
     suit = _suit(root, name)
     starts = _one(root, f"*init*/{name}.json")
     if starts is None and (localization_path is not None or suit is not None):
-        raise WearcapError(f"no starts of sequence {name!r}", where=root, expected=f"hps_inits/{name}.json",
-                           fix="Without them its streams' clocks are unknown.")  # fmt: skip
+        raise WearcapError(
+            f"no starts of sequence {name!r}",
+            where=root,
+            expected=f"hps_inits/{name}.json",
+            fix="Without them its streams' clocks are unknown.",
+        )
     cam_start, imu_start = (0, 0) if starts is None else read_hps_starts(starts)
     localization = None
     if localization_path is not None:
         localization = read_hps_localization(localization_path, camera_hz)
         if cam_start >= len(localization.timestamps):
-            raise WearcapError(f"cam_start {cam_start} is beyond the {len(localization.timestamps)} localised frames", where=starts)  # fmt: skip
+            raise WearcapError(
+                f"cam_start {cam_start} is beyond the {len(localization.timestamps)} localised frames", where=starts
+            )
         localization = replace(localization, timestamps=localization.timestamps - cam_start / camera_hz)
         _warn_if_apart(motion, localization, motion_path)
     scan = _one(root, *(f"{depth}{scan_name(name)}/{CLOUD}" for depth in ("", "*/", "*/*/")))
     recording = Recording(
-        name, motion=motion, localization=localization, skeleton=motion.skeleton, shape=shape,
-        camera=_camera(root, name, cam_start / camera_hz, localization), subject=subject_of(name), location=scan_name(name),
-        activity=name.removeprefix(f"{subject_of(name)}_").removeprefix(f"{scan_name(name)}_"), scene=None if scan is None else str(scan.resolve()), source="HPS data set",
-    )  # fmt: skip
+        name,
+        motion=motion,
+        localization=localization,
+        skeleton=motion.skeleton,
+        shape=shape,
+        camera=_camera(root, name, cam_start / camera_hz, localization),
+        subject=subject_of(name),
+        location=scan_name(name),
+        activity=name.removeprefix(f"{subject_of(name)}_").removeprefix(f"{scan_name(name)}_"),
+        scene=None if scan is None else str(scan.resolve()),
+        source="HPS data set",
+    )
     return recording if suit is None else _with_suit(recording, suit, imu_start)
 
 
@@ -142,8 +164,7 @@ def _suit(root: Path, name: str) -> Recording | None:
 def _with_suit(recording: Recording, suit: Recording, imu_start: int) -> Recording:
     assert suit.suit is not None
     if imu_start >= len(suit.suit):
-        raise WearcapError(f"imu_start {imu_start} is beyond the suit's {len(suit.suit)} frames",
-                           where=recording.name)  # fmt: skip
+        raise WearcapError(f"imu_start {imu_start} is beyond the suit's {len(suit.suit)} frames", where=recording.name)
     clap_s = suit.suit.timestamps[imu_start]
 
     imu = {name: replace(part, timestamps=part.timestamps - clap_s) for name, part in suit.imu.items()}
@@ -157,37 +178,45 @@ def _camera(root: Path, name: str, clap_s: float, localization: Localization | N
         return None
     cameras = read_hps_cameras(calibration)
     if name not in cameras:
-        raise WearcapError(f"no intrinsics for the video of {name!r}", where=calibration,
-                           expected=f"its name among captured_videos (there are {len(cameras)})")  # fmt: skip
+        raise WearcapError(
+            f"no intrinsics for the video of {name!r}",
+            where=calibration,
+            expected=f"its name among captured_videos (there are {len(cameras)})",
+        )
     if video is not None:
         times = _video_times(video) - clap_s
     elif localization is not None:
         times = localization.timestamps
     else:
         return None
-    return CameraStream(
-        times, cameras[name], *nominal_mount(), video=None if video is None else str(video.resolve())
-    )
+    return CameraStream(times, cameras[name], *nominal_mount(), video=None if video is None else str(video.resolve()))
 
 
 def _video_times(path: Path) -> Float64[Tensor, "time"]:
     """Times of a video's frames (s from its first), at its own rate; the pictures must have the calibration's size."""
     video = video_info(path)
     if (video.width, video.height) != IMAGE_SIZE or not video.frames:
-        raise WearcapError(f"a video of {video.frames} frames of {video.width}x{video.height} pixels", where=path,
-                           expected=f"{IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, as its camera was calibrated")  # fmt: skip
+        raise WearcapError(
+            f"a video of {video.frames} frames of {video.width}x{video.height} pixels",
+            where=path,
+            expected=f"{IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, as its camera was calibrated",
+        )
     return torch.arange(video.frames, dtype=torch.float64) / video.fps
 
 
 def _warn_if_apart(motion: Motion, localization: Localization, path: Path) -> None:
     frame = torch.searchsorted(motion.timestamps, localization.timestamps).clamp(max=len(motion) - 1)
-    localized = (localization.confidence > 0) & (localization.timestamps >= 0) & (
-        localization.timestamps <= motion.timestamps[-1]
-    )  # fmt: skip
+    localized = (
+        (localization.confidence > 0)
+        & (localization.timestamps >= 0)
+        & (localization.timestamps <= motion.timestamps[-1])
+    )
     if not localized.any():
         warnings.warn(f"{path}: no localised frame while the motion lasts", stacklevel=3)
         return
     apart = (motion.t_world_root[frame] - localization.t_world_cam)[localized].norm(dim=-1).median().item()
     if apart > FAR_M:
-        warnings.warn(f"{path}: pelvis and localised camera are {apart:.1f} m apart (median): other clocks, or another scan",
-                      stacklevel=3)  # fmt: skip
+        warnings.warn(
+            f"{path}: pelvis and localised camera are {apart:.1f} m apart (median): other clocks, or another scan",
+            stacklevel=3,
+        )

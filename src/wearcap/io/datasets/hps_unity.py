@@ -25,9 +25,16 @@ from wearcap.recording import Motion
 _ARM = ("collar", "shoulder", "elbow", "wrist", "hand")
 _LEG = ("hip", "knee", "ankle", "foot")
 JOINTS = (
-    "pelvis", *(f"{side}_{joint}" for side in ("left", "right") for joint in _LEG), "spine1", "spine2", "spine3",
-    *(f"left_{joint}" for joint in _ARM), "neck", "head", *(f"right_{joint}" for joint in _ARM),
-)  # fmt: skip
+    "pelvis",
+    *(f"{side}_{joint}" for side in ("left", "right") for joint in _LEG),
+    "spine1",
+    "spine2",
+    "spine3",
+    *(f"left_{joint}" for joint in _ARM),
+    "neck",
+    "head",
+    *(f"right_{joint}" for joint in _ARM),
+)
 """Order of the file's Euler angles: Unity's hierarchy of SMPL, depth first."""
 _WITH_INNER_ROOT = 3 * (len(JOINTS) + 1)
 """Files name the root twice: the avatar, which turns, and below it the model's own root, which does not."""
@@ -46,8 +53,11 @@ def read_unity_motion(
         angles_deg = np.delete(angles_deg, [3, 4, 5], 1)
     trans = _table(trans_path, (3,))
     if abs(len(angles_deg) - len(trans)) > 1:
-        raise WearcapError(f"{len(trans)} positions for {len(angles_deg)} poses", where=trans_path,
-                           expected=f"as many lines as in {Path(pose_path).name}")  # fmt: skip
+        raise WearcapError(
+            f"{len(trans)} positions for {len(angles_deg)} poses",
+            where=trans_path,
+            expected=f"as many lines as in {Path(pose_path).name}",
+        )
     count = min(len(angles_deg), len(trans))
     R_smpl = rotations_from_unity(torch.from_numpy(angles_deg[:count]).unflatten(1, (-1, 3)))
     skeleton = smpl24()
@@ -55,9 +65,12 @@ def read_unity_motion(
     t_smpl = torch.from_numpy(trans[:count]) * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     t_smpl = t_smpl + torch.tensor(t_template_pelvis, dtype=torch.float64)
     return Motion(
-        torch.arange(count, dtype=torch.float64) / FPS, skeleton, (A @ R_smpl[:, order] @ A.T).float(),
-        (t_smpl @ A.T).float(), provenance={"source": Path(pose_path).name, "format": "hps unity"},
-    )  # fmt: skip
+        torch.arange(count, dtype=torch.float64) / FPS,
+        skeleton,
+        (A @ R_smpl[:, order] @ A.T).float(),
+        (t_smpl @ A.T).float(),
+        provenance={"source": Path(pose_path).name, "format": "hps unity"},
+    )
 
 
 def rotations_from_unity(angles_deg: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -77,14 +90,16 @@ def _table(path: str | Path, widths: tuple[int, ...]) -> np.ndarray:
             raise short
         width = width or len(tokens)
         if width not in widths or len(tokens) != width:
-            short = WearcapError(f"{len(tokens)} numbers", where=at_line(path, number), expected=" or ".join(map(str, widths)))  # fmt: skip
+            short = WearcapError(
+                f"{len(tokens)} numbers", where=at_line(path, number), expected=" or ".join(map(str, widths))
+            )
             if len(tokens) >= width:
                 raise short
             continue  # the recorder stops in the middle of a line: only the last may be short
         try:
             values.extend(finite_floats(tokens))
         except ValueError as error:
-            raise WearcapError(f"what is no finite number ({error})"[:200], where=at_line(path, number)) from error  # fmt: skip
+            raise WearcapError(f"what is no finite number ({error})"[:200], where=at_line(path, number)) from error
     if not values:
         raise WearcapError("no lines of numbers", where=path)
     return np.asarray(values).reshape(-1, width)

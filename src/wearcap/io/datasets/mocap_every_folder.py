@@ -94,16 +94,18 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
     size = None if video is None else (video_info(video).width, video_info(video).height)
     points = read_ply(folder / POINTS).points if (folder / POINTS).is_file() else None
     return MocapEveryFolder(
-        folder.resolve().name, track, _undistorted(folder / UNDISTORTED, size), _lens(folder / LENS, size),
-        None if points is None else torch.from_numpy(points), video,
+        folder.resolve().name,
+        track,
+        _undistorted(folder / UNDISTORTED, size),
+        _lens(folder / LENS, size),
+        None if points is None else torch.from_numpy(points),
+        video,
         {joint: read_watch_log(folder / log, joint) for joint, log in zip(WRISTS, LOGS) if (folder / log).is_file()},
         _board(track, config, marks, folder),
-    )  # fmt: skip
+    )
 
 
-def mocap_every_recording(
-    folder: MocapEveryFolder, scale: float = 1.0, T_world_slam: Rigid | None = None
-) -> Recording:
+def mocap_every_recording(folder: MocapEveryFolder, scale: float = 1.0, T_world_slam: Rigid | None = None) -> Recording:
     """Recording in the world p_world = T_world_slam @ (scale · p_slam); by default in SLAM's own world.
 
     The device is at the camera's position with the head's axes (x forward, y left, z up), mounted on the head as in
@@ -118,9 +120,11 @@ def mocap_every_recording(
     return Recording(
         folder.name,
         head=HeadStream(track.timestamps, T_world_cam.R @ R_head_cam.mT, T_world_cam.t, torch.eye(3), t_head_cam),
-        imu=folder.imu or {}, camera=_camera_stream(folder, Rigid(R_head_cam, t_head_cam)), points=cloud,
+        imu=folder.imu or {},
+        camera=_camera_stream(folder, Rigid(R_head_cam, t_head_cam)),
+        points=cloud,
         source="MocapEvery capture folder",
-    )  # fmt: skip
+    )
 
 
 def _camera_stream(folder: MocapEveryFolder, T_head_cam: Rigid) -> CameraStream | None:
@@ -144,8 +148,12 @@ def _trajectory(path: Path, start_s: float) -> Trajectory:
     if not len(table):
         raise WearcapError("no poses", where=path, expected="a row of 7 numbers per picture")
     if abs(table[0, 3]) > 0.9999 > abs(table[0, 6]):
-        raise WearcapError("the first quaternion is the identity with the scalar first", where=path,
-                           expected="x y z, then qx qy qz qw", fix="Move the scalar to the end of the rows.")  # fmt: skip
+        raise WearcapError(
+            "the first quaternion is the identity with the scalar first",
+            where=path,
+            expected="x y z, then qx qy qz qw",
+            fix="Move the scalar to the end of the rows.",
+        )
     times = start_s + np.arange(len(table)) / FPS
     return checked_trajectory(times, table[:, :3], table[:, [6, 3, 4, 5]], path)
 
@@ -169,11 +177,17 @@ def _require_plain_yaml(text: str, path: Path) -> None:
     depth = 0
     for event in yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
-            raise WearcapError("it refers to its own parts (&name, *name)", where=path, expected="plain keys with values",
-                               fix="Write them out: such references can blow up.")  # fmt: skip
+            raise WearcapError(
+                "it refers to its own parts (&name, *name)",
+                where=path,
+                expected="plain keys with values",
+                fix="Write them out: such references can blow up.",
+            )
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_JSON_DEPTH:
-            raise WearcapError("YAML that is nested too deeply", where=path, expected=f"at most {MAX_JSON_DEPTH} levels")  # fmt: skip
+            raise WearcapError(
+                "YAML that is nested too deeply", where=path, expected=f"at most {MAX_JSON_DEPTH} levels"
+            )
 
 
 def _marks(path: Path) -> dict[str, Any]:
@@ -190,24 +204,27 @@ def _shutter(config: dict[str, Any], marks: dict[str, Any], folder: Path) -> flo
     return 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
 
 
-def _board(
-    track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path
-) -> BoardWalks | None:
+def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> BoardWalks | None:
     measured = config.get("cam_scale_origin")
     if measured is None or not {"x", "y"} <= marks.keys():
         return None
     if not isinstance(measured, dict) or not {"dist", "height"} <= measured.keys():
-        raise WearcapError("cam_scale_origin lacks a number", where=folder / CONFIG, expected="dist: [x, y] and height (m)")  # fmt: skip
+        raise WearcapError(
+            "cam_scale_origin lacks a number", where=folder / CONFIG, expected="dist: [x, y] and height (m)"
+        )
     length = _numbers(measured["dist"], 2, "cam_scale_origin.dist", folder / CONFIG)
     (height,) = _numbers([measured["height"]], 1, "cam_scale_origin.height", folder / CONFIG)
     if min(*length, height) <= 0:
-        raise WearcapError(f"distances {length} and height {height}", where=folder / CONFIG, expected="metres above 0")  # fmt: skip
+        raise WearcapError(f"distances {length} and height {height}", where=folder / CONFIG, expected="metres above 0")
     ends = []
     for name in ("x", "y"):
         times = torch.tensor(_numbers(marks[name], 2, name, folder / MARKS), dtype=torch.float64)
         if not ((times >= track.timestamps[0] - 1) & (times <= track.timestamps[-1] + 1)).all():
-            raise WearcapError(f"{name} at {times.tolist()} s", where=folder / MARKS,
-                               expected=f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path")  # fmt: skip
+            raise WearcapError(
+                f"{name} at {times.tolist()} s",
+                where=folder / MARKS,
+                expected=f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path",
+            )
         ends.append(track.t_world_body[(track.timestamps[None] - times[:, None]).abs().argmin(1)])
     return BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
 
@@ -228,7 +245,11 @@ def _intrinsics(path: Path, counts: tuple[int, ...]) -> list[float]:
     except ValueError as error:
         raise WearcapError(f"not a list of numbers ({error})", where=path, expected="fx fy cx cy") from error
     if len(values) not in counts:
-        raise WearcapError(f"{len(values)} numbers", where=path, expected=f"{' or '.join(map(str, counts))}: fx fy cx cy and distortion")  # fmt: skip
+        raise WearcapError(
+            f"{len(values)} numbers",
+            where=path,
+            expected=f"{' or '.join(map(str, counts))}: fx fy cx cy and distortion",
+        )
     return values
 
 
@@ -242,8 +263,11 @@ def _undistorted(path: Path, video: tuple[int, int] | None) -> Camera | None:
         shrink = np.sqrt(_SLAM_PIXELS / (video[0] * video[1]))
         width, height = (int(side * shrink) // 8 * 8 for side in video)
     if not (0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height):
-        raise WearcapError(f"principal point {cx:.1f}, {cy:.1f}", where=path,
-                           expected=f"one near the middle of {width}x{height} pixels")  # fmt: skip
+        raise WearcapError(
+            f"principal point {cx:.1f}, {cy:.1f}",
+            where=path,
+            expected=f"one near the middle of {width}x{height} pixels",
+        )
     return Camera("pinhole", width, height, fx, fy, cx, cy)
 
 

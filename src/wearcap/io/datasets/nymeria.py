@@ -19,13 +19,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate
 from wearcap.io.datasets.amass import PELVIS_SMPLH
-from wearcap.io.devices.aria_mps import (
-    T_HEAD_DEVICE,
-    find_mps_file,
-    head_stream,
-    read_closed_loop,
-    read_mps_points,
-)
+from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, find_mps_file, head_stream, read_closed_loop, read_mps_points
 from wearcap.io.devices.aria_vrs import extract_video
 from wearcap.io.devices.head_alignment import align_head, clock_offset
 from wearcap.io.formats.json_text import read_json_object
@@ -61,27 +55,24 @@ def read_xdata(path: str | Path) -> tuple[Motion, ContactTrack | None]:
     arrays = read_npz(path, keys)
     count = len(xsens23())
     sizes = require(
-        arrays,
-        path,
-        timestamps_us=("time",),
-        segment_tXYZ=("time", 3 * count),
-        segment_qWXYZ=("time", 4 * count),
+        arrays, path, timestamps_us=("time",), segment_tXYZ=("time", 3 * count), segment_qWXYZ=("time", 4 * count)
     )
     if sizes["time"] < 2:
         raise WearcapError(f"{sizes['time']} frames", where=path, expected="at least 2")
     if "frameRate" in arrays and abs(float(arrays["frameRate"].reshape(-1)[0]) - SUIT_HZ) > 1:
-        raise WearcapError(
-            f"frame rate {arrays['frameRate'].reshape(-1)[0]}", where=path, expected=f"{SUIT_HZ:g} Hz"
-        )
+        raise WearcapError(f"frame rate {arrays['frameRate'].reshape(-1)[0]}", where=path, expected=f"{SUIT_HZ:g} Hz")
     timestamps = _clean_timestamps(arrays["timestamps_us"].astype(np.float64) * 1e-6, path)
     quat = _filled_quaternions(arrays["segment_qWXYZ"].reshape(-1, count, 4).astype(np.float64))
     R_world_joint = rotation.matrix_from_quat_wxyz(torch.from_numpy(quat))
     position = torch.from_numpy(arrays["segment_tXYZ"].reshape(-1, count, 3).astype(np.float64))
     skeleton = _measured_skeleton(R_world_joint, position)
     motion = Motion(
-        torch.from_numpy(timestamps), skeleton, local_rotations(skeleton, R_world_joint).float(), position[:, 0].float(),
+        torch.from_numpy(timestamps),
+        skeleton,
+        local_rotations(skeleton, R_world_joint).float(),
+        position[:, 0].float(),
         provenance={"source": Path(path).name, "format": "nymeria"},
-    )  # fmt: skip
+    )
     return motion, _contacts(arrays, motion, path)
 
 
@@ -90,8 +81,12 @@ def _clean_timestamps(seconds: np.ndarray, path: str | Path) -> np.ndarray:
     steps[np.abs(steps - 1 / SUIT_HZ) > _STEP_TOLERANCE_S] = 1 / SUIT_HZ
     cleaned = seconds[0] + np.concatenate([[0.0], steps.cumsum()])
     if abs(cleaned[-1] - seconds[-1]) > _DRIFT_TOLERANCE_S:
-        raise WearcapError(f"after cleaning, time ends {cleaned[-1] - seconds[-1]:+.3f} s from the file's own", where=path,
-                           expected=f"steady {SUIT_HZ:g} Hz", fix="Frames were lost: cut the sequence there.")  # fmt: skip
+        raise WearcapError(
+            f"after cleaning, time ends {cleaned[-1] - seconds[-1]:+.3f} s from the file's own",
+            where=path,
+            expected=f"steady {SUIT_HZ:g} Hz",
+            fix="Frames were lost: cut the sequence there.",
+        )
     return cleaned
 
 
@@ -120,8 +115,9 @@ def _contacts(arrays: dict[str, np.ndarray], motion: Motion, path: str | Path) -
         return None
     contact = arrays["foot_contacts"]
     if contact.shape != (len(motion), len(FOOT_PATCHES)):
-        raise WearcapError(f"foot_contacts has shape {contact.shape}", where=path,
-                           expected=f"({len(motion)}, {len(FOOT_PATCHES)})")  # fmt: skip
+        raise WearcapError(
+            f"foot_contacts has shape {contact.shape}", where=path, expected=f"({len(motion)}, {len(FOOT_PATCHES)})"
+        )
     return ContactTrack(motion.timestamps, FOOT_PATCHES, torch.from_numpy(contact > 0.5))
 
 
@@ -131,19 +127,10 @@ def read_smpl_neutral(path: str | Path) -> Motion:
     The skeleton keeps its standard bone lengths. Raises WearcapError for missing or misshapen arrays or NaN.
     """
     arrays = read_npz(path, ("timestamps", "global_orient", "body_pose", "transl"))
-    require(
-        arrays,
-        path,
-        timestamps=("time",),
-        global_orient=("time", 3),
-        body_pose=("time", 69),
-        transl=("time", 3),
-    )
+    require(arrays, path, timestamps=("time",), global_orient=("time", 3), body_pose=("time", 69), transl=("time", 3))
     axis_angle = np.concatenate([arrays["global_orient"], arrays["body_pose"]], 1).reshape(-1, 24, 3)
     R = rotations_from_smpl(torch.from_numpy(axis_angle.astype(np.float64)))
-    t_root = torch.from_numpy(arrays["transl"].astype(np.float64)) + torch.tensor(
-        PELVIS_SMPLH, dtype=torch.float64
-    )
+    t_root = torch.from_numpy(arrays["transl"].astype(np.float64)) + torch.tensor(PELVIS_SMPLH, dtype=torch.float64)
     timestamps = torch.from_numpy(arrays["timestamps"].astype(np.float64) * 1e-6)
     return Motion(timestamps, smpl24(), R.float(), t_root.float(), provenance={"source": Path(path).name})
 
@@ -162,8 +149,11 @@ def read_nymeria(
     slam = folder / "recording_head" / "mps" / "slam"
     path = find_mps_file(slam, ("closed_loop_trajectory.csv",))
     if path is None or not is_nymeria(folder):
-        raise WearcapError("not a complete Nymeria sequence", where=folder,
-                           expected="body/xdata.npz and recording_head/mps/slam/closed_loop_trajectory.csv")  # fmt: skip
+        raise WearcapError(
+            "not a complete Nymeria sequence",
+            where=folder,
+            expected="body/xdata.npz and recording_head/mps/slam/closed_loop_trajectory.csv",
+        )
     suit, contacts = read_xdata(folder / "body" / "xdata.npz")
     device = head_stream(read_closed_loop(path).T_world_aria, fps=None)
     try:
@@ -171,14 +161,28 @@ def read_nymeria(
     except WearcapError as error:
         raise WearcapError(error.what, where=folder, expected=error.expected, fix=error.fix) from error
     about = read_metadata(folder)
-    camera = None if video is None else extract_video(
-        head_vrs(folder), video, between=(head.timestamps[0].item(), head.timestamps[-1].item()),
-        T_head_device=Rigid(head.R_head_device, head.t_head_device),
-    )  # fmt: skip
+    camera = (
+        None
+        if video is None
+        else extract_video(
+            head_vrs(folder),
+            video,
+            between=(head.timestamps[0].item(), head.timestamps[-1].item()),
+            T_head_device=Rigid(head.R_head_device, head.t_head_device),
+        )
+    )
     return Recording(
-        name=folder.resolve().name, head=head, motion=motion, contacts=contact, camera=camera, skeleton=motion.skeleton,
-        points=read_mps_points(slam), source="Nymeria", license="Nymeria dataset licence", **about,
-    )  # fmt: skip
+        name=folder.resolve().name,
+        head=head,
+        motion=motion,
+        contacts=contact,
+        camera=camera,
+        skeleton=motion.skeleton,
+        points=read_mps_points(slam),
+        source="Nymeria",
+        license="Nymeria dataset licence",
+        **about,
+    )
 
 
 def _on_device(
@@ -192,23 +196,27 @@ def _on_device(
     own = Trajectory(own.timestamps + offset, own.R_world_body, own.t_world_body)
     alignment = align_head(own, track, T_HEAD_DEVICE.t)
     if alignment.residual_m > MAX_RESIDUAL_M:
-        raise WearcapError(f"the suit's head stays {100 * alignment.residual_m:.0f} cm from the device after alignment",
-                           expected="suit and device of the same wearer on one clock")  # fmt: skip
+        raise WearcapError(
+            f"the suit's head stays {100 * alignment.residual_m:.0f} cm from the device after alignment",
+            expected="suit and device of the same wearer on one clock",
+        )
     start = max(own.timestamps[0].item(), track.timestamps[0].item())
     stop = min(own.timestamps[-1].item(), track.timestamps[-1].item())
     times = start + torch.arange(int((stop - start) * fps) + 1, dtype=torch.float64) / fps
-    T_world_root = alignment.T_world_suit @ Rigid(
-        suit.R_parent_joint[:, 0].double(), suit.t_world_root.double()
-    )
+    T_world_root = alignment.T_world_suit @ Rigid(suit.R_parent_joint[:, 0].double(), suit.t_world_root.double())
     R = torch.cat([T_world_root.R[:, None].float(), suit.R_parent_joint[:, 1:]], 1)
     motion = Motion(
-        times, suit.skeleton, _resampled_rotations(own.timestamps, R, times),
+        times,
+        suit.skeleton,
+        _resampled_rotations(own.timestamps, R, times),
         interpolate(own.timestamps, T_world_root.t, times).float(),
-        provenance=suit.provenance | {
-            "clock_offset_s": f"{offset:.4f}", "head_residual_m": f"{alignment.residual_m:.4f}",
+        provenance=suit.provenance
+        | {
+            "clock_offset_s": f"{offset:.4f}",
+            "head_residual_m": f"{alignment.residual_m:.4f}",
             "head_residual_deg": f"{np.degrees(alignment.residual_rad):.2f}",
         },
-    )  # fmt: skip
+    )
     contact = (
         None
         if contacts is None
@@ -227,9 +235,7 @@ def _resampled_rotations(
 ) -> Float[Tensor, "new_time *rest"]:
     """Rotations at other times, by slerp between neighbours."""
     after = torch.searchsorted(timestamps, at, right=True).clamp(1, len(timestamps) - 1)
-    blend = (
-        ((at - timestamps[after - 1]) / (timestamps[after] - timestamps[after - 1])).clamp(0, 1).to(R.dtype)
-    )
+    blend = ((at - timestamps[after - 1]) / (timestamps[after] - timestamps[after - 1])).clamp(0, 1).to(R.dtype)
     turn = rotation.log(R[after - 1].mT @ R[after])
     return R[after - 1] @ rotation.exp(turn * blend.reshape(-1, *[1] * (turn.ndim - 1)))
 

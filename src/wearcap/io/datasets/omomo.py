@@ -67,7 +67,9 @@ def read_omomo(root: str | Path) -> list[OmomoSequence]:
     """
     paths = [Path(root) / name for name in FILES if (Path(root) / name).is_file()]
     if not paths:
-        raise WearcapError("no sequences", where=root, expected=" or ".join(FILES), fix="Give OMOMO's folder as source=DIR.")  # fmt: skip
+        raise WearcapError(
+            "no sequences", where=root, expected=" or ".join(FILES), fix="Give OMOMO's folder as source=DIR."
+        )
     found = [sequence for path in paths for sequence in _sequences(read_pickle(path), path)]
     if not found:
         raise WearcapError("files without sequences", where=root, expected="{number: {seq_name, trans, …}}")
@@ -83,13 +85,18 @@ def _sequences(content: Any, path: Path) -> list[OmomoSequence]:
     for key, entry in content.items():
         name = entry.get("seq_name") if isinstance(entry, dict) else None
         if not isinstance(name, str) or len(name.split("_")) < 3 or not name.replace("_", "").isalnum():
-            raise WearcapError(f"sequence {key!r} is named {name!r}"[:200], where=path,
-                               expected="seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000")  # fmt: skip
+            raise WearcapError(
+                f"sequence {key!r} is named {name!r}"[:200],
+                where=path,
+                expected="seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000",
+            )
         arrays = {key: entry[key] for key in _KEYS if isinstance(entry.get(key), np.ndarray)}
         gender = entry.get("gender", "")
         if isinstance(gender, np.ndarray) and gender.size == 1:
             gender = gender.reshape(-1)[0]
-        found.append(OmomoSequence(name, f"{path}, sequence {name}", arrays, str(gender) if isinstance(gender, str) else ""))  # fmt: skip
+        found.append(
+            OmomoSequence(name, f"{path}, sequence {name}", arrays, str(gender) if isinstance(gender, str) else "")
+        )
     return found
 
 
@@ -110,8 +117,12 @@ def omomo_take(sequence: OmomoSequence, root: str | Path, fps: float | int) -> O
     require(arrays, where, obj_rot=("frame", 3, 3), obj_trans=("frame", 3), obj_scale=("frame",))
     frames, others = len(arrays["trans"]), len(arrays["obj_trans"])
     if frames != others or not frames:
-        raise WearcapError(f"the object has {others} frames, the body {frames}", where=where,
-                           expected="as many of both, and at least one", fix="Fetch the file again.")  # fmt: skip
+        raise WearcapError(
+            f"the object has {others} frames, the body {frames}",
+            where=where,
+            expected="as many of both, and at least one",
+            fix="Fetch the file again.",
+        )
     times = torch.arange(frames, dtype=torch.float64) / fps
     provenance = {
         "source": sequence.name,
@@ -127,8 +138,16 @@ def omomo_take(sequence: OmomoSequence, root: str | Path, fps: float | int) -> O
     scale = _scale(arrays["obj_scale"][posed], where)
     mesh, center = _mesh(root, sequence.object_name, scale)
     path = _path(arrays, times, torch.from_numpy(center), torch.from_numpy(posed), where)
-    take = OneObject(sequence.name, motion, sequence.object_name, path, mesh, shape_from_arrays(arrays, where), sequence.subject,
-                     "_".join(sequence.name.split("_")[1:]))  # fmt: skip
+    take = OneObject(
+        sequence.name,
+        motion,
+        sequence.object_name,
+        path,
+        mesh,
+        shape_from_arrays(arrays, where),
+        sequence.subject,
+        "_".join(sequence.name.split("_")[1:]),
+    )
     return take.frames(torch.from_numpy(posed))
 
 
@@ -154,13 +173,14 @@ def _pelvis(arrays: dict[str, np.ndarray], where: str) -> Float64[np.ndarray, "t
 
 def _scale(scales: np.ndarray, where: str) -> float:
     if not len(scales):
-        raise WearcapError(
-            "obj_scale is nowhere positive", where=where, expected="metres per unit of the mesh"
-        )
+        raise WearcapError("obj_scale is nowhere positive", where=where, expected="metres per unit of the mesh")
     scale = float(np.median(scales))
     if np.ptp(scales) > _SCALE_WITHIN * scale:
-        raise WearcapError(f"obj_scale runs from {scales.min():.4g} to {scales.max():.4g}", where=where,
-                           expected=f"one scale within {_SCALE_WITHIN:.0%}: a rigid object")  # fmt: skip
+        raise WearcapError(
+            f"obj_scale runs from {scales.min():.4g} to {scales.max():.4g}",
+            where=where,
+            expected=f"one scale within {_SCALE_WITHIN:.0%}: a rigid object",
+        )
     return scale
 
 
@@ -168,24 +188,29 @@ def _mesh(root: str | Path, object_name: str, scale: float) -> tuple[Mesh, Float
     """The mesh in metres about its centre, and the centre in the file's axes and unit."""
     path = omomo_mesh_path(root, object_name)
     if not path.is_file():
-        raise WearcapError(f"no mesh of {object_name}", where=path, expected=f"{MESHES}/OBJECT{MESH_ENDING}",
-                           fix="Unpack OMOMO's captured_objects beside the sequences.")  # fmt: skip
+        raise WearcapError(
+            f"no mesh of {object_name}",
+            where=path,
+            expected=f"{MESHES}/OBJECT{MESH_ENDING}",
+            fix="Unpack OMOMO's captured_objects beside the sequences.",
+        )
     mesh, center = centered(read_obj(path))
     mesh = Mesh((mesh.vertices.astype(np.float64) * scale).astype(np.float32), mesh.faces, mesh.color)
     check_object_mesh(mesh, path)
     return mesh, center
 
 
-def _path(
-    arrays: dict[str, np.ndarray], times: Tensor, center: Tensor, posed: Tensor, where: str
-) -> Trajectory:
+def _path(arrays: dict[str, np.ndarray], times: Tensor, center: Tensor, posed: Tensor, where: str) -> Trajectory:
     """Trajectory of the mesh's centre: scale · R · c + t."""
     R = torch.from_numpy(arrays["obj_rot"].astype(np.float64))
     away = (R.mT @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
     bad = ((away > _ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)) & posed
     if bad.any():
-        raise WearcapError(f"obj_rot of frame {int(bad.nonzero()[0])} is no rotation ({int(bad.sum())} such frames)",
-                           where=where, expected="orthogonal matrices of determinant +1")  # fmt: skip
+        raise WearcapError(
+            f"obj_rot of frame {int(bad.nonzero()[0])} is no rotation ({int(bad.sum())} such frames)",
+            where=where,
+            expected="orthogonal matrices of determinant +1",
+        )
     U, _, Vh = torch.linalg.svd(torch.where(posed[:, None, None], R, torch.eye(3, dtype=R.dtype)))
     R = U @ Vh
     scale = torch.from_numpy(arrays["obj_scale"].astype(np.float64))

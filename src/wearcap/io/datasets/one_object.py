@@ -35,9 +35,10 @@ class OneObject:
         R_joints = self.motion.R_parent_joint
         R_new = R_new_old.to(R_joints.dtype)
         motion = replace(
-            self.motion, R_parent_joint=torch.cat([R_new @ R_joints[:, :1], R_joints[:, 1:]], 1),
+            self.motion,
+            R_parent_joint=torch.cat([R_new @ R_joints[:, :1], R_joints[:, 1:]], 1),
             t_world_root=self.motion.t_world_root @ R_new.mT,
-        )  # fmt: skip
+        )
         path = self.path
         turned = Trajectory(path.timestamps, R_new @ path.R_world_body, path.t_world_body @ R_new.mT)
         return replace(self, motion=motion, path=turned)
@@ -45,16 +46,21 @@ class OneObject:
     def frames(self, chosen: slice | Bool[Tensor, "time"]) -> "OneObject":
         """The take with the selected frames of body and object, by slice or mask."""
         motion = replace(
-            self.motion, timestamps=self.motion.timestamps[chosen],
-            R_parent_joint=self.motion.R_parent_joint[chosen], t_world_root=self.motion.t_world_root[chosen],
-        )  # fmt: skip
+            self.motion,
+            timestamps=self.motion.timestamps[chosen],
+            R_parent_joint=self.motion.R_parent_joint[chosen],
+            t_world_root=self.motion.t_world_root[chosen],
+        )
         return replace(self, motion=motion, path=self.path[chosen])
 
 
 def smpl_motion(
-    timestamps: Float64[Tensor, "time"], skeleton: Skeleton, rotvec: Float64[Tensor, "time joint 3"],
-    t_world_pelvis: Float64[Tensor, "time 3"], provenance: dict[str, str],
-) -> Motion:  # fmt: skip
+    timestamps: Float64[Tensor, "time"],
+    skeleton: Skeleton,
+    rotvec: Float64[Tensor, "time joint 3"],
+    t_world_pelvis: Float64[Tensor, "time 3"],
+    provenance: dict[str, str],
+) -> Motion:
     """Motion of a wearcap skeleton from rotation vectors (rad) in SMPL's axes and the pelvis' position (m)."""
     R = rotations_from_smpl(rotvec)
     return Motion(timestamps, skeleton, R.float(), t_world_pelvis.float(), provenance=provenance)

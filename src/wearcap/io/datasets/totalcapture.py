@@ -33,10 +33,24 @@ TOTALCAPTURE = ("left_elbow", "right_elbow", "left_knee", "right_knee", "head", 
 """Sensors of `ori` and `acc` as MocapEvery's authors read them, by the joint whose bone carries them: a forearm's is the
 elbow. Other tools list the shins first; a file's order is checked against its pose."""
 DIP_IMU = (
-    "head", "spine3", "pelvis", "left_collar", "right_collar", "left_shoulder", "right_shoulder", "left_elbow",
-    "right_elbow", "left_hip", "right_hip", "left_knee", "right_knee", "left_wrist", "right_wrist", "left_ankle",
+    "head",
+    "spine3",
+    "pelvis",
+    "left_collar",
+    "right_collar",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_hip",
+    "right_hip",
+    "left_knee",
+    "right_knee",
+    "left_wrist",
+    "right_wrist",
+    "left_ankle",
     "right_ankle",
-)  # fmt: skip
+)
 R_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 """Rotation of a world with y up to z up: +90° about x."""
 
@@ -87,30 +101,31 @@ def read_dip_imu(path: str | Path, order: Sequence[str] = DIP_IMU) -> ImuSequenc
 
 def as_watches(imu: Mapping[str, ImuStream]) -> dict[str, ImuStream]:
     """The forearms' sensors as watches on the wrists, which turn with the forearm as long as the hand is not bent."""
-    return {
-        f"{side}_wrist": replace(imu[f"{side}_elbow"], joint=f"{side}_wrist") for side in ("left", "right")
-    }
+    return {f"{side}_wrist": replace(imu[f"{side}_elbow"], joint=f"{side}_wrist") for side in ("left", "right")}
 
 
 def _read(path: str | Path, keys: dict[str, str], order: Sequence[str], motion: Motion | None) -> ImuSequence:
     path = Path(path)
     skeleton = smpl24()
     if len(set(order)) < len(order) or not set(order) <= set(skeleton.joint_names):
-        raise WearcapError(
-            f"an order of sensors {list(order)}", where=path, expected="different joints of smpl24"
-        )
+        raise WearcapError(f"an order of sensors {list(order)}", where=path, expected="different joints of smpl24")
     arrays = _arrays(path, (*keys.values(), "gt"))
     ori, acc = (_wanted(arrays, keys[part], path) for part in ("ori", "acc"))
     frames = len(ori)
     if ori.shape != (frames, len(order), 3, 3) or acc.shape != (frames, len(order), 3) or not frames:
-        raise WearcapError(f"{keys['ori']} and {keys['acc']} of shapes {ori.shape} and {acc.shape}", where=path,
-                           expected=f"(T, {len(order)}, 3, 3) and (T, {len(order)}, 3)")  # fmt: skip
+        raise WearcapError(
+            f"{keys['ori']} and {keys['acc']} of shapes {ori.shape} and {acc.shape}",
+            where=path,
+            expected=f"(T, {len(order)}, 3, 3) and (T, {len(order)}, 3)",
+        )
     if "gt" in arrays:
         motion = _motion(arrays, frames, path)
     R = R_UP @ torch.from_numpy(ori.astype(np.float64))
     acc_world = torch.from_numpy(acc.astype(np.float64)) @ R_UP.T
-    streams = {joint: _stream(joint, R[:, k], acc_world[:, k], f"{path}, sensor {k} ({joint})")
-               for k, joint in enumerate(order)}  # fmt: skip
+    streams = {
+        joint: _stream(joint, R[:, k], acc_world[:, k], f"{path}, sensor {k} ({joint})")
+        for k, joint in enumerate(order)
+    }
     if motion is not None:
         require_order(streams, motion, path)
     return ImuSequence(streams, motion)
@@ -128,14 +143,22 @@ def require_order(imu: Mapping[str, ImuStream], motion: Motion, where: str | Pat
     moved = best != row
     assigned, fits = np.rad2deg(np.diag(cost)), np.rad2deg(cost[row, best])
     if fits.mean() > _MAX_DEG:
-        raise WearcapError(f"the sensors turn {fits.mean():.0f}° apart from the body, in whatever order", where=where,
-                           expected="sensors and pose of the same recording")  # fmt: skip
+        raise WearcapError(
+            f"the sensors turn {fits.mean():.0f}° apart from the body, in whatever order",
+            where=where,
+            expected="sensors and pose of the same recording",
+        )
     if moved.any():
         now, other = assigned[moved].mean(), fits[moved].mean()
         if now > _WORSE * other and now > other + _WORSE_DEG:
             order = ", ".join(joints[k] for k in best)
-            raise WearcapError(f"the sensors are in another order: {now:.1f}° apart from their joints, {other:.1f}° in the order "
-                               f"that fits", where=where, expected=", ".join(joints), fix=f"Give order=({order}).")  # fmt: skip
+            raise WearcapError(
+                f"the sensors are in another order: {now:.1f}° apart from their joints, {other:.1f}° in the order "
+                f"that fits",
+                where=where,
+                expected=", ".join(joints),
+                fix=f"Give order=({order}).",
+            )
 
 
 def _turn_differences(imu: Mapping[str, ImuStream], motion: Motion) -> Float[np.ndarray, "sensor sensor"]:
@@ -156,9 +179,7 @@ def _turn_differences(imu: Mapping[str, ImuStream], motion: Motion) -> Float[np.
         there = turn.isfinite().all(-1).all(-1)
         if there.any():
             cost[k] = (
-                rotation.geodesic(turn[there, None].expand_as(turn_joint[there]), turn_joint[there])
-                .mean(0)
-                .numpy()
+                rotation.geodesic(turn[there, None].expand_as(turn_joint[there]), turn_joint[there]).mean(0).numpy()
             )
     return cost
 
@@ -171,25 +192,36 @@ def _motion(arrays: dict[str, np.ndarray], frames: int, path: Path) -> Motion:
     R = rotations_from_smpl(torch.from_numpy(pose.astype(np.float64)).unflatten(1, (-1, 3)))
     R = torch.cat([R_UP @ R[:, :1], R[:, 1:]], 1)
     return Motion(
-        torch.arange(frames, dtype=torch.float64) / FPS, smpl24(), R.float(), torch.zeros(frames, 3),
+        torch.arange(frames, dtype=torch.float64) / FPS,
+        smpl24(),
+        R.float(),
+        torch.zeros(frames, 3),
         provenance={"source": path.name, "format": "totalcapture"},
-    )  # fmt: skip
+    )
 
 
 def _stream(joint: str, R: Float[Tensor, "time 3 3"], acc: Float[Tensor, "time 3"], where: str) -> ImuStream:
     """One sensor's stream without NaN samples."""
     there = R.isfinite().all(-1).all(-1) & acc.isfinite().all(-1)
     if there.sum() < max(len(R) // 2, 1):
-        raise WearcapError(f"{int((~there).sum())} of {len(R)} samples are not finite", where=where, expected="half of them at least")  # fmt: skip
+        raise WearcapError(
+            f"{int((~there).sum())} of {len(R)} samples are not finite", where=where, expected="half of them at least"
+        )
     R, acc = R[there], acc[there]
     away = (R.mT @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
     bad = (away > _NOT_ORTHONORMAL) | (torch.linalg.det(R) < 0)
     if bad.any():
-        raise WearcapError(f"{int(bad.sum())} orientations are no rotations", where=where, expected="orthonormal matrices")  # fmt: skip
+        raise WearcapError(
+            f"{int(bad.sum())} orientations are no rotations", where=where, expected="orthonormal matrices"
+        )
     mean = acc.mean(0).norm().item()
     if mean > _GRAVITY:
-        raise WearcapError(f"a mean acceleration of {mean:.1f} m/s²", where=where, expected="free acceleration",
-                           fix="Take gravity out of it.")  # fmt: skip
+        raise WearcapError(
+            f"a mean acceleration of {mean:.1f} m/s²",
+            where=where,
+            expected="free acceleration",
+            fix="Take gravity out of it.",
+        )
     times = torch.arange(len(there), dtype=torch.float64)[there] / FPS
     return ImuStream(times, joint, R.float(), acc.float(), R_joint_imu=A.float())
 
@@ -201,13 +233,17 @@ def _arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     else:
         content = _torch_content(path) if path.suffix in (".pt", ".pth") else read_pickle(path)
     if not isinstance(content, dict):
-        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected=f"a dict of {', '.join(names)}")  # fmt: skip
+        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected=f"a dict of {', '.join(names)}")
     found = {name: content[name] for name in names if name in content}
     for name, value in found.items():
         value = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-            raise WearcapError(f"{name} is a {type(value).__name__}", where=path, expected="an array of numbers",
-                               fix="Several sequences in one file: save one of them.")  # fmt: skip
+            raise WearcapError(
+                f"{name} is a {type(value).__name__}",
+                where=path,
+                expected="an array of numbers",
+                fix="Several sequences in one file: save one of them.",
+            )
         found[name] = value
     return found
 
@@ -223,8 +259,11 @@ def _torch_content(path: Path) -> Any:
     except WearcapError:
         raise
     except Exception as error:  # the opcodes are the file's own program and can raise anything
-        raise WearcapError(f"not a readable PyTorch file ({' '.join(str(error).split())[:120]})", where=path,
-                           expected="a dict of tensors, without code") from error  # fmt: skip
+        raise WearcapError(
+            f"not a readable PyTorch file ({' '.join(str(error).split())[:120]})",
+            where=path,
+            expected="a dict of tensors, without code",
+        ) from error
 
 
 def _require_short_words(path: Path) -> None:
@@ -250,5 +289,5 @@ def _walk(stream: io.BytesIO | mmap.mmap) -> None:
 
 def _wanted(arrays: dict[str, np.ndarray], name: str, path: Path) -> np.ndarray:
     if name not in arrays:
-        raise WearcapError(f"no array {name!r}", where=path, expected="the sensors' orientations and accelerations")  # fmt: skip
+        raise WearcapError(f"no array {name!r}", where=path, expected="the sensors' orientations and accelerations")
     return arrays[name]

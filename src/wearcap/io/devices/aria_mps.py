@@ -44,9 +44,7 @@ def nominal_T_aria_cpf() -> Rigid:
     Source: projectaria_tools, DeviceCadExtrinsics, row camera-slam-left (position, y axis, z axis in cpf).
     """
     y = torch.nn.functional.normalize(torch.tensor([0.793353, 0.0, -0.608761], dtype=torch.float64), dim=0)
-    z = torch.nn.functional.normalize(
-        torch.tensor([0.607927, -0.052336, 0.792266], dtype=torch.float64), dim=0
-    )
+    z = torch.nn.functional.normalize(torch.tensor([0.607927, -0.052336, 0.792266], dtype=torch.float64), dim=0)
     x = torch.linalg.cross(y, z)
     R_cpf_aria = torch.stack([x, torch.linalg.cross(z, x), z], 1)
     T_cpf_aria = Rigid(R_cpf_aria, torch.tensor([0.069051, 0.002372, 0.009254], dtype=torch.float64))
@@ -78,12 +76,18 @@ def read_closed_loop(path: str | Path, *, up: str = "z") -> MpsTrajectory:
     gravity = [f"gravity_{axis}_world" for axis in "xyz"]
     time, quality = "tracking_timestamp_us", "quality_score"
     table = read_columns(path, [time, *pose, *velocity, *spin, *gravity, quality], text=["graph_uid"])
-    columns = {key: np.stack([table[name] for name in names], 1)
-               for key, names in {"pose": pose, "velocity": velocity, "spin": spin, "gravity": gravity}.items()}  # fmt: skip
+    columns = {
+        key: np.stack([table[name] for name in names], 1)
+        for key, names in {"pose": pose, "velocity": velocity, "spin": spin, "gravity": gravity}.items()
+    }
     check_finite({**columns, quality: table[quality]}, path)
     if len(graphs := np.unique(table["graph_uid"])) > 1:
-        raise WearcapError(f"{len(graphs)} unconnected world frames (graph_uid)", where=path, expected="one",
-                           fix="Keep the rows of one graph_uid.")  # fmt: skip
+        raise WearcapError(
+            f"{len(graphs)} unconnected world frames (graph_uid)",
+            where=path,
+            expected="one",
+            fix="Keep the rows of one graph_uid.",
+        )
     _check_gravity(columns["gravity"], up, path)
     trajectory = checked_trajectory(table[time] * 1e-6, columns["pose"][:, :3], columns["pose"][:, 3:], path)
     T_turned = Rigid(turn_up(up), torch.zeros(3)) @ trajectory.T_world_body
@@ -114,9 +118,11 @@ def _check_gravity(gravity: np.ndarray, up: str, where: str | Path) -> None:
         axis = "xyz"[int(np.abs(upward).argmax())]
         sign = "-" if upward["xyz".index(axis)] < 0 else "+"
         raise WearcapError(
-            f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up", where=where, expected=f"+{up} up",
+            f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up",
+            where=where,
+            expected=f"+{up} up",
             fix="Read it with up='y'." if (axis, sign) == ("y", "+") else "Rotate the world, or fix gravity's sign.",
-        )  # fmt: skip
+        )
 
 
 def head_stream(
@@ -136,16 +142,18 @@ def head_stream(
     if fps is not None:
         start, stop = trajectory.timestamps[0].item(), trajectory.timestamps[-1].item()
         if stop - start > _MAX_DURATION_S:
-            raise WearcapError(f"poses over {(stop - start) / 3600:.3g} hours", where=where, expected="a recording of less than half a day",
-                               fix="A time stamp is damaged, or two recordings stand in one file: cut it.")  # fmt: skip
+            raise WearcapError(
+                f"poses over {(stop - start) / 3600:.3g} hours",
+                where=where,
+                expected="a recording of less than half a day",
+                fix="A time stamp is damaged, or two recordings stand in one file: cut it.",
+            )
         count = int((stop - start) * fps + 1e-6) + 1
         trajectory = resample(trajectory, start + torch.arange(count, dtype=torch.float64) / fps)
     T_aria_cpf = T_aria_cpf or nominal_T_aria_cpf()
     T_world_device = trajectory.T_world_body @ T_aria_cpf @ Rigid(R_CPF_DEVICE, torch.zeros(3))
     T_head_device = T_head_device or T_HEAD_DEVICE
-    return HeadStream(
-        trajectory.timestamps, T_world_device.R, T_world_device.t, T_head_device.R, T_head_device.t
-    )
+    return HeadStream(trajectory.timestamps, T_world_device.R, T_world_device.t, T_head_device.R, T_head_device.t)
 
 
 def read_points(
@@ -187,9 +195,7 @@ def _first_seen(path: str | Path, uid: np.ndarray) -> np.ndarray:
         named = known[place] == rows["uid"]
         np.minimum.at(first_us, place[named], rows["frame_tracking_timestamp_us"][named])
     if (first_us == np.iinfo(np.int64).max).all():
-        raise WearcapError(
-            "names none of the points", where=path, expected="the observations of the same recording"
-        )
+        raise WearcapError("names none of the points", where=path, expected="the observations of the same recording")
     seen = np.empty(len(uid))
     seen[order] = np.where(first_us < np.iinfo(np.int64).max, first_us * 1e-6, np.inf)
     return seen
@@ -217,12 +223,13 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
     """
     path = find_mps_file(folder, _TRAJECTORY)
     if path is None:
-        raise WearcapError("no closed_loop_trajectory.csv (plain, .gz or .xz)", where=folder,
-                           expected="the output folder of Aria's MPS")  # fmt: skip
+        raise WearcapError(
+            "no closed_loop_trajectory.csv (plain, .gz or .xz)",
+            where=folder,
+            expected="the output folder of Aria's MPS",
+        )
     head = head_stream(read_closed_loop(path).T_world_aria, fps=fps, T_aria_cpf=T_aria_cpf, where=path)
-    return Recording(
-        name=Path(folder).resolve().name, head=head, points=read_mps_points(folder), source="Aria MPS"
-    )
+    return Recording(name=Path(folder).resolve().name, head=head, points=read_mps_points(folder), source="Aria MPS")
 
 
 def read_mps_points(folder: str | Path) -> PointCloud | None:

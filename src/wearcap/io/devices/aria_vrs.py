@@ -52,8 +52,9 @@ def read_device(path: str | Path) -> AriaDevice:
     poses = {label: device.get_transform_device_sensor(label) for label in labels}
     return AriaDevice(
         _rigid(device.get_transform_device_cpf()),
-        {label: _rigid(pose) for label, pose in poses.items() if pose is not None}, device.get_device_subtype(),
-    )  # fmt: skip
+        {label: _rigid(pose) for label, pose in poses.items() if pose is not None},
+        device.get_device_subtype(),
+    )
 
 
 def read_imus(path: str | Path, T_head_device: Rigid | None = None) -> dict[str, ImuStream]:
@@ -75,11 +76,12 @@ def read_imus(path: str | Path, T_head_device: Rigid | None = None) -> dict[str,
         acc = np.array([rectify.raw_to_rectified_accel(np.array(sample.accel_msec2)) for sample in samples])
         gyro = np.array([rectify.raw_to_rectified_gyro(np.array(sample.gyro_radsec)) for sample in samples])
         streams[label] = ImuStream(
-            torch.tensor([sample.capture_timestamp_ns * 1e-9 for sample in samples], dtype=torch.float64), "head",
+            torch.tensor([sample.capture_timestamp_ns * 1e-9 for sample in samples], dtype=torch.float64),
+            "head",
             acc_imu=torch.tensor(acc, dtype=torch.float32).reshape(-1, 3),
             gyro_imu=torch.tensor(gyro, dtype=torch.float32).reshape(-1, 3),
             R_joint_imu=R_head_aria @ device.T_aria_sensor[label].R,
-        )  # fmt: skip
+        )
     return streams
 
 
@@ -128,8 +130,11 @@ def extract_video(
     if between is not None:
         first, stop = np.searchsorted(times.numpy(), between).tolist()
     if stop - first < 2:
-        raise WearcapError(f"{stop - first} pictures of {label!r} in the time that is wanted", where=path,
-                           expected="a recording of the same time")  # fmt: skip
+        raise WearcapError(
+            f"{stop - first} pictures of {label!r} in the time that is wanted",
+            where=path,
+            expected="a recording of the same time",
+        )
     fps = 1 / times[first:stop].diff().median().item()
     write_frames(file, (view.picture(i) for i in range(first, stop)), fps)
     return replace(view.stream(times[first:stop], T_head_device), video=f"{file.parent.name}/{file.name}")
@@ -170,7 +175,7 @@ class _UprightView:
         """The upright camera on the head joint, without pictures."""
         upright = aria_calibration.rotate_camera_calib_cw90deg(self.pinhole)
         T_device_aria = Rigid(R_CPF_DEVICE.T, torch.zeros(3)) @ self.device.T_aria_cpf.inverse()
-        T_head_cam = (T_head_device or T_HEAD_DEVICE) @ T_device_aria @ _rigid(upright.get_transform_device_camera())  # fmt: skip
+        T_head_cam = (T_head_device or T_HEAD_DEVICE) @ T_device_aria @ _rigid(upright.get_transform_device_camera())
         (fx, fy), (cx, cy) = upright.get_focal_lengths(), upright.get_principal_point()
         camera = Camera("pinhole", self.size, self.size, float(fx), float(fy), float(cx), float(cy))
         return CameraStream(times, camera, T_head_cam.R, T_head_cam.t)
@@ -184,23 +189,22 @@ def timecode_offset_s(path: str | Path) -> float:
     provider = _open(path)
     device_ns = provider.get_first_time_ns_all_streams(TimeDomain.DEVICE_TIME)
     if not provider.supports_time_domain(provider.get_all_streams()[0], TimeDomain.TIME_CODE):
-        raise WearcapError(
-            "carries no time code", where=path, expected="a recording made with one, as Nymeria's"
-        )
+        raise WearcapError("carries no time code", where=path, expected="a recording made with one, as Nymeria's")
     return (device_ns - provider.convert_from_device_time_to_timecode_ns(device_ns)) * 1e-9
 
 
 def _open(path: str | Path):
     """Data provider of projectaria-tools. Raises WearcapError that names what is missing."""
     if data_provider is None:
-        raise WearcapError("reading VRS recordings needs projectaria-tools", where=path,
-                           fix='Install it with `pip install "wearcap[aria]"` (about 1 GB).')  # fmt: skip
+        raise WearcapError(
+            "reading VRS recordings needs projectaria-tools",
+            where=path,
+            fix='Install it with `pip install "wearcap[aria]"` (about 1 GB).',
+        )
     file_size(path)
     provider = data_provider.create_vrs_data_provider(str(path))
     if provider is None:
-        raise WearcapError(
-            "not a readable VRS recording", where=path, expected="a complete .vrs file of Aria glasses"
-        )
+        raise WearcapError("not a readable VRS recording", where=path, expected="a complete .vrs file of Aria glasses")
     return provider
 
 

@@ -56,11 +56,18 @@ def read_depth_rig(folder: str | Path) -> DepthRigFiles:
         with explained(row.file):
             empty, depth = (tuple(sorted((row.file / part).glob("*.png"))) for part in ("empty", "depth"))
         if not empty:
-            raise WearcapError("no images of the empty scene", where=row.file / "empty",
-                               expected="16-bit PNG files", fix="Record the scene without the person.")  # fmt: skip
+            raise WearcapError(
+                "no images of the empty scene",
+                where=row.file / "empty",
+                expected="16-bit PNG files",
+                fix="Record the scene without the person.",
+            )
         if len(depth) != len(timestamps):
-            raise WearcapError(f"{len(depth)} depth images for {len(timestamps)} times", where=row.file / "depth",
-                               expected="one per line of timestamps.txt, for every camera")  # fmt: skip
+            raise WearcapError(
+                f"{len(depth)} depth images for {len(timestamps)} times",
+                where=row.file / "depth",
+                expected="one per line of timestamps.txt, for every camera",
+            )
         cameras.append(DepthCameraFiles(row.file.name, row.camera, row.T_world_cam, empty, depth))
     if not cameras:
         raise WearcapError("no cameras", where=folder / "photos.json", expected="a row for each depth camera")
@@ -73,16 +80,21 @@ def read_depth(path: str | Path, camera: Camera) -> UInt16[np.ndarray, "height w
     with open_image(path) as image:
         mode, (width, height) = image.mode, image.size
         if (width, height) != (camera.width, camera.height):
-            raise WearcapError(f"an image of {width}x{height} pixels", where=path,
-                               expected=f"{camera.width}x{camera.height}, as its camera is calibrated")  # fmt: skip
+            raise WearcapError(
+                f"an image of {width}x{height} pixels",
+                where=path,
+                expected=f"{camera.width}x{camera.height}, as its camera is calibrated",
+            )
         if mode not in ("I;16", "I;16B", "I"):
-            raise WearcapError(f"not a depth image (mode {mode})", where=path,
-                               expected="one channel of 16 bits, millimetres")  # fmt: skip
+            raise WearcapError(
+                f"not a depth image (mode {mode})", where=path, expected="one channel of 16 bits, millimetres"
+            )
         depth = np.asarray(image).astype(np.int64)
     measured = depth[depth > 0]
     if len(measured) and not 100 < np.median(measured) < _FARTHEST_MM:
-        raise WearcapError(f"its middle depth is {np.median(measured):.0f}", where=path,
-                           expected="millimetres, between 0.1 and 20 m")  # fmt: skip
+        raise WearcapError(
+            f"its middle depth is {np.median(measured):.0f}", where=path, expected="millimetres, between 0.1 and 20 m"
+        )
     return np.clip(depth, 0, 65535).astype(np.uint16)
 
 
@@ -119,9 +131,7 @@ def _timestamps(path: Path) -> Float64[np.ndarray, "time"]:
     try:
         times = np.array([float(line) for line in read_text(path).split()])
     except ValueError as error:
-        raise WearcapError(
-            f"a line is no number ({error})", where=path, expected="seconds, one per line"
-        ) from error
+        raise WearcapError(f"a line is no number ({error})", where=path, expected="seconds, one per line") from error
     if not np.isfinite(times).all():
         raise WearcapError("a time is NaN or infinite", where=path, expected="seconds, one per line")
     check_rising(times, path)

@@ -48,8 +48,10 @@ def clock_offset(suit: Trajectory, device: Trajectory) -> float:
     a, b = (speed.clamp(max=10.0).numpy() for speed in speeds)
     lag, score = best_shift(*correlate_shifts(a, b, 1 / 3))
     if score < 0.5:
-        raise WearcapError(f"head and device do not move alike at any shift of their clocks (correlation {score:.2f})",
-                           expected="a recording of the same head")  # fmt: skip
+        raise WearcapError(
+            f"head and device do not move alike at any shift of their clocks (correlation {score:.2f})",
+            expected="a recording of the same head",
+        )
     return grids[1][0].item() - grids[0][0].item() + lag / _RATE_HZ
 
 
@@ -94,9 +96,7 @@ def align_head(
     """
     shared = (suit.timestamps >= device.timestamps[0]) & (suit.timestamps <= device.timestamps[-1])
     if shared.sum() < 2 or suit.timestamps[shared][-1] - suit.timestamps[shared][0] < 10:
-        raise WearcapError(
-            "suit and device share less than 10 s", expected="overlapping recordings on one clock"
-        )
+        raise WearcapError("suit and device share less than 10 s", expected="overlapping recordings on one clock")
     start, stop = suit.timestamps[shared][0].item(), suit.timestamps[shared][-1].item()
     grid = start + torch.arange(int((stop - start) * _RATE_HZ), dtype=torch.float64) / _RATE_HZ
     head, seen = (_double(resample(track, grid)) for track in (suit, device))
@@ -127,9 +127,7 @@ def _mounting_rotation(R_head: Tensor, R_device: Tensor) -> Float64[Tensor, "3 3
     turn_head = rotation.log(R_head[:-step].mT @ R_head[step:])
     turn_device = rotation.log(R_device[:-step].mT @ R_device[step:])
     if turn_head.norm(dim=-1).quantile(0.9) < 0.1:
-        raise WearcapError(
-            "the head hardly turns", expected="turns of more than 6° in half a second, now and then"
-        )
+        raise WearcapError("the head hardly turns", expected="turns of more than 6° in half a second, now and then")
     a = torch.cat([turn_head, R_head[:, 2, :]])
     b = torch.cat([turn_device, R_device[:, 2, :]])
     weight = torch.ones(len(a), dtype=torch.float64)
@@ -152,9 +150,7 @@ def _mounting_position(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) 
         scale = residual.median().clamp(min=1e-4)
         # Half-second differences overlap thirtyfold, so the samples' weight is reduced accordingly.
         weight = 1 / (residual / scale).clamp(min=1.0) / (scale**2 * step)
-        normal = (
-            torch.einsum("n,nki,nkj->ij", weight, A, A) + torch.eye(3, dtype=torch.float64) / _SEAT_PRIOR_M**2
-        )
+        normal = torch.einsum("n,nki,nkj->ij", weight, A, A) + torch.eye(3, dtype=torch.float64) / _SEAT_PRIOR_M**2
         right = torch.einsum("n,nki,nk->i", weight, A, b) + t_prior / _SEAT_PRIOR_M**2
         t = torch.linalg.solve(normal, right)
     return t
@@ -176,9 +172,9 @@ def _windowed_median(value: Tensor, grid: Tensor, knots: Tensor, window_s: float
     last = torch.searchsorted(grid, knots + window_s / 2, right=True)
     middle = torch.searchsorted(grid, knots).clamp(max=len(grid) - 1)
     reach = torch.minimum(middle - first, last - 1 - middle).clamp(min=int(0.5 * _RATE_HZ))
-    return torch.stack([
-        value[max(m - r, 0) : m + r + 1].median(0).values for m, r in zip(middle.tolist(), reach.tolist())
-    ])  # fmt: skip
+    return torch.stack(
+        [value[max(m - r, 0) : m + r + 1].median(0).values for m, r in zip(middle.tolist(), reach.tolist())]
+    )
 
 
 def _between(knots: Tensor, value: Tensor, at: Tensor) -> Tensor:

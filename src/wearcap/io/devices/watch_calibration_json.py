@@ -41,10 +41,7 @@ class WornCalibration:
 
 
 def write_watch_calibration(
-    found: WornCalibration,
-    path: str | Path,
-    checks: Sequence[StepCheck] = (),
-    about: dict[str, Any] | None = None,
+    found: WornCalibration, path: str | Path, checks: Sequence[StepCheck] = (), about: dict[str, Any] | None = None
 ) -> None:
     """Write a calibration, its checks and its metadata (plain numbers, text, lists), atomically."""
     content: dict[str, Any] = {
@@ -55,24 +52,30 @@ def write_watch_calibration(
         },
         "clocks": {
             joint: {
-                "camera_s": one.clock.camera_s.tolist(), "watch_s": one.clock.suit_s.tolist(), "swings": one.clock.claps,
-                "drift_s_per_hour": one.clock.drift_s_per_hour, "residual_s": one.clock.residual_s, "std_s": one.std_s,
+                "camera_s": one.clock.camera_s.tolist(),
+                "watch_s": one.clock.suit_s.tolist(),
+                "swings": one.clock.claps,
+                "drift_s_per_hour": one.clock.drift_s_per_hour,
+                "residual_s": one.clock.residual_s,
+                "std_s": one.std_s,
             }
             for joint, one in found.clocks.items()
         },
-    }  # fmt: skip
+    }
     if found.camera is not None:
         content["camera"] = {name: getattr(found.camera, name) for name in _CAMERA} | {
-            "R_world_slam_wxyz": _wxyz(found.camera.R_world_slam), "t_world_slam": found.camera.t_world_slam.tolist()
-        }  # fmt: skip
+            "R_world_slam_wxyz": _wxyz(found.camera.R_world_slam),
+            "t_world_slam": found.camera.t_world_slam.tolist(),
+        }
     if found.head is not None:
         content["head"] = {
-            "R_head_cam_wxyz": _wxyz(found.head.R_head_cam), "t_head_cam": found.head.t_head_cam.tolist(),
+            "R_head_cam_wxyz": _wxyz(found.head.R_head_cam),
+            "t_head_cam": found.head.t_head_cam.tolist(),
             "still_deg": found.head.still_deg,
-        }  # fmt: skip
+        }
     content["checks"] = [
         {"step": c.step, "what": c.what, "measured": c.measured, "expected": c.expected, "ok": c.ok} for c in checks
-    ]  # fmt: skip
+    ]
     write_text(path, json.dumps(content | ({"about": about} if about else {}), indent=1) + "\n")
 
 
@@ -88,8 +91,12 @@ def read_watch_calibration(path: str | Path) -> WornCalibration:
         )
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise WearcapError(f"not a watches' calibration ({what})"[:300], where=path, expected=EXAMPLE,
-                           fix="Calibrate again: wearcap calibrate steps=watches.") from error  # fmt: skip
+        raise WearcapError(
+            f"not a watches' calibration ({what})"[:300],
+            where=path,
+            expected=EXAMPLE,
+            fix="Calibrate again: wearcap calibrate steps=watches.",
+        ) from error
 
 
 def _watch(joint: str, row: Any) -> WatchCalibration:
@@ -101,13 +108,13 @@ def _clock(row: Any) -> SwingClock:
     camera_s, watch_s = (torch.tensor(row[key], dtype=torch.float64) for key in ("camera_s", "watch_s"))
     if camera_s.ndim != 1 or not len(camera_s) or camera_s.shape != watch_s.shape:
         raise ValueError("a clock without knots")
-    clock = Clock(camera_s, watch_s, float(row["drift_s_per_hour"]), float(row["residual_s"]), int(row["swings"]))  # fmt: skip
+    clock = Clock(camera_s, watch_s, float(row["drift_s_per_hour"]), float(row["residual_s"]), int(row["swings"]))
     return SwingClock(clock, float(row["std_s"]))
 
 
 def _camera(row: Any) -> SlamAlignment:
     quality = (float(row[name]) for name in _CAMERA[1:])
-    return SlamAlignment(float(row["scale"]), _matrix(row["R_world_slam_wxyz"]), _three(row["t_world_slam"]), *quality)  # fmt: skip
+    return SlamAlignment(float(row["scale"]), _matrix(row["R_world_slam_wxyz"]), _three(row["t_world_slam"]), *quality)
 
 
 def _head(row: Any) -> HeadMount:

@@ -24,14 +24,17 @@ UPRIGHT = 0.98
 WRISTS = ("left_wrist", "right_wrist")
 _XYZ = ("X", "Y", "Z")
 _SENSOR_LOGGER = {
-    "turn": [f"rotationRate{axis}" for axis in _XYZ], "gravity": [f"gravity{axis}" for axis in _XYZ],
-    "free": [f"acceleration{axis}" for axis in _XYZ], "quaternion": [f"quaternion{axis}" for axis in "WXYZ"],
-}  # fmt: skip
+    "turn": [f"rotationRate{axis}" for axis in _XYZ],
+    "gravity": [f"gravity{axis}" for axis in _XYZ],
+    "free": [f"acceleration{axis}" for axis in _XYZ],
+    "quaternion": [f"quaternion{axis}" for axis in "WXYZ"],
+}
 _SENSOR_LOG = {
     "turn": [f"motionRotationRate{axis}(rad/s)" for axis in _XYZ],
     "whole": [f"accelerometerAcceleration{axis}(G)" for axis in _XYZ],
-    "free": [f"motionUserAcceleration{axis}(G)" for axis in _XYZ], "quaternion": [f"motionQuaternion{axis}(R)" for axis in "WXYZ"],
-}  # fmt: skip
+    "free": [f"motionUserAcceleration{axis}(G)" for axis in _XYZ],
+    "quaternion": [f"motionQuaternion{axis}(R)" for axis in "WXYZ"],
+}
 
 
 def read_watch_log(path: str | Path, joint: str) -> ImuStream:
@@ -56,9 +59,13 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
     free, felt = np.sign(upright) * unit * parts["free"], np.sign(upright) * unit * (parts["free"] + gravity)
     turn = torch.from_numpy(parts["turn"]).float() if "turn" in parts else None
     return ImuStream(
-        torch.from_numpy(seconds), joint, torch.from_numpy(R).float(), acc_world=torch.from_numpy(np.einsum("tij,tj->ti", R, free)).float(),
-        acc_imu=torch.from_numpy(felt).float(), gyro_imu=turn,
-    )  # fmt: skip
+        torch.from_numpy(seconds),
+        joint,
+        torch.from_numpy(R).float(),
+        acc_world=torch.from_numpy(np.einsum("tij,tj->ti", R, free)).float(),
+        acc_imu=torch.from_numpy(felt).float(),
+        gyro_imu=turn,
+    )
 
 
 def _columns(path: str | Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -70,14 +77,17 @@ def _columns(path: str | Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         seconds = table[time] / 1e9
     elif "motionQuaternionW(R)" in header:
         # The wearer chooses which of Core Motion's other outputs are logged.
-        groups = {name: group for name, group in _SENSOR_LOG.items() if name != "turn" or set(group) <= set(header)}  # fmt: skip
+        groups = {name: group for name, group in _SENSOR_LOG.items() if name != "turn" or set(group) <= set(header)}
         time = "loggingTime(txt)"
         table = read_columns(path, [name for group in groups.values() for name in group], text=[time])
         seconds = np.array([_seconds(text, row, path) for row, text in enumerate(table[time])])
     else:
-        raise WearcapError("not a watch's motion log", where=path,
-                           expected="SensorLog's CSV (motionQuaternionW(R), …) or WristMotion.csv (quaternionW, …)",
-                           fix="Switch on device motion when you record.")  # fmt: skip
+        raise WearcapError(
+            "not a watch's motion log",
+            where=path,
+            expected="SensorLog's CSV (motionQuaternionW(R), …) or WristMotion.csv (quaternionW, …)",
+            fix="Switch on device motion when you record.",
+        )
     return seconds, {name: np.stack([table[column] for column in group], 1) for name, group in groups.items()}
 
 
@@ -85,8 +95,9 @@ def _seconds(text: bytes, row: int, path: str | Path) -> float:
     try:
         return datetime.fromisoformat(text.decode().strip().replace(" +", "+").replace(" -", "-")).timestamp()
     except ValueError as error:
-        raise WearcapError(f"time {text.decode()!r} in row {row}", where=path,
-                           expected="such as 2024-05-01T12:00:00.123+02:00") from error  # fmt: skip
+        raise WearcapError(
+            f"time {text.decode()!r} in row {row}", where=path, expected="such as 2024-05-01T12:00:00.123+02:00"
+        ) from error
 
 
 def _require_times(seconds: np.ndarray, path: str | Path) -> None:
@@ -95,11 +106,18 @@ def _require_times(seconds: np.ndarray, path: str | Path) -> None:
     step = np.diff(seconds)
     if (step <= 0).any():
         row = int(np.flatnonzero(step <= 0)[0]) + 1
-        raise WearcapError(f"time does not grow at row {row} ({step[row - 1]:+.3f} s)", where=path,
-                           fix="Sort the rows by time and leave repeated ones out.")  # fmt: skip
+        raise WearcapError(
+            f"time does not grow at row {row} ({step[row - 1]:+.3f} s)",
+            where=path,
+            fix="Sort the rows by time and leave repeated ones out.",
+        )
     if np.median(step) > 1 / MIN_RATE_HZ:
-        raise WearcapError(f"{1 / np.median(step):.1f} rows a second", where=path,
-                           expected=f"at least {MIN_RATE_HZ:g}", fix="Log at 30 Hz or more.")  # fmt: skip
+        raise WearcapError(
+            f"{1 / np.median(step):.1f} rows a second",
+            where=path,
+            expected=f"at least {MIN_RATE_HZ:g}",
+            fix="Log at 30 Hz or more.",
+        )
 
 
 def _unit(gravity: np.ndarray, path: str | Path) -> float:
@@ -122,6 +140,10 @@ def _attitude(quaternion: np.ndarray, gravity: np.ndarray, path: str | Path) -> 
     there, back = (float((turned @ down[..., None])[:, 2, 0].mean()) for turned in (R, R.swapaxes(1, 2)))
     best = max(abs(there), abs(back))
     if best < UPRIGHT:
-        raise WearcapError(f"the attitude turns gravity {best:.2f} upright", where=path, expected=f"at least {UPRIGHT}",
-                           fix="Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame.")  # fmt: skip
+        raise WearcapError(
+            f"the attitude turns gravity {best:.2f} upright",
+            where=path,
+            expected=f"at least {UPRIGHT}",
+            fix="Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame.",
+        )
     return (R, there) if abs(there) >= abs(back) else (np.ascontiguousarray(R.swapaxes(1, 2)), back)

@@ -83,16 +83,24 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     offsets[0] = 0
     leaves = {name: ends[joint] for joint, name in enumerate(names) if joint not in parents}
     skeleton = Skeleton(
-        "cmu31" if set(names) == CMU_NODES else path.name.split(".")[0], tuple(names), tuple(parents),
-        offsets.float(), _sites(names, ends, leaves),
-    )  # fmt: skip
+        "cmu31" if set(names) == CMU_NODES else path.name.split(".")[0],
+        tuple(names),
+        tuple(parents),
+        offsets.float(),
+        _sites(names, ends, leaves),
+    )
     to_rad = 1.0 if radians else math.pi / 180
     angles = to_rad * torch.tensor([bone.axis_deg for bone in table], dtype=torch.float64)
     order = tuple(bone.order for bone in table)
     return AsfSkeleton(
-        skeleton, tuple(bone.dof for bone in table), order, _euler(angles, order),
-        unit_m * torch.tensor(root.direction, dtype=torch.float64), unit_m, radians,
-    )  # fmt: skip
+        skeleton,
+        tuple(bone.dof for bone in table),
+        order,
+        _euler(angles, order),
+        unit_m * torch.tensor(root.direction, dtype=torch.float64),
+        unit_m,
+        radians,
+    )
 
 
 def read_amc(asf: AsfSkeleton, path: str | Path, fps: float | int = 120) -> Motion:
@@ -120,14 +128,15 @@ def read_amc(asf: AsfSkeleton, path: str | Path, fps: float | int = 120) -> Moti
     undo = torch.cat([torch.eye(3, dtype=torch.float64)[None], C[1:].transpose(-1, -2)])
     R = (R_WORLD_FILE @ C) @ R @ (undo @ R_WORLD_FILE.T)
     return Motion(
-        torch.from_numpy((frames - frames[0]) / fps), asf.skeleton, R.float(), (t_root @ R_WORLD_FILE.T).float(),
+        torch.from_numpy((frames - frames[0]) / fps),
+        asf.skeleton,
+        R.float(),
+        (t_root @ R_WORLD_FILE.T).float(),
         provenance={"source": path.name, "format": "amc"},
-    )  # fmt: skip
+    )
 
 
-def _euler(
-    angles: Float[Tensor, "*batch joint 3"], order: tuple[str, ...]
-) -> Float[Tensor, "*batch joint 3 3"]:
+def _euler(angles: Float[Tensor, "*batch joint 3"], order: tuple[str, ...]) -> Float[Tensor, "*batch joint 3 3"]:
     """Product of the rotations about x, y, z (rad), the first axis of each joint's `order` acting first."""
     R = torch.empty(*angles.shape, 3, dtype=angles.dtype)
     for axes in set(order):
@@ -170,13 +179,15 @@ def _parse_asf(path: Path):
                     raise ValueError(f"more than {MAX_BONES} bones")
         except (ValueError, IndexError) as error:
             raise WearcapError(
-                f"cannot read {text.strip()[:80]!r} ({error})",
-                where=at_line(path, number),
-                expected="Acclaim ASF",
+                f"cannot read {text.strip()[:80]!r} ({error})", where=at_line(path, number), expected="Acclaim ASF"
             ) from error
     if bone is not None or not bones or not hierarchy:
-        raise WearcapError("bones or hierarchy are missing or cut short", where=at_line(path, number),
-                           expected="an ASF file with :bonedata and :hierarchy", fix="Fetch the file again.")  # fmt: skip
+        raise WearcapError(
+            "bones or hierarchy are missing or cut short",
+            where=at_line(path, number),
+            expected="an ASF file with :bonedata and :hierarchy",
+            fix="Fetch the file again.",
+        )
     return units, root, bones, hierarchy
 
 
@@ -248,8 +259,11 @@ def _tree_order(path: Path, bones: dict[str, _Bone], hierarchy: list[tuple[int, 
     for line, (parent, *below) in hierarchy:
         for name in below:
             if name not in bones or name in seen:
-                raise WearcapError(f"bone {name!r} is unknown or has two parents", where=at_line(path, line),
-                                   expected="every bone of :bonedata once below a parent")  # fmt: skip
+                raise WearcapError(
+                    f"bone {name!r} is unknown or has two parents",
+                    where=at_line(path, line),
+                    expected="every bone of :bonedata once below a parent",
+                )
             seen.add(name)
         children.setdefault(parent, []).extend(below)
     names, parents = ["root"], [-1]
@@ -260,17 +274,30 @@ def _tree_order(path: Path, bones: dict[str, _Bone], hierarchy: list[tuple[int, 
         parents.append(parent)
         stack += [(child, len(names) - 1) for child in reversed(children.get(name, []))]
     if missing := sorted(set(bones) - set(names)):
-        raise WearcapError(f"bones {missing[:5]} do not hang on the root", where=path,
-                           expected="one tree below 'root' in :hierarchy")  # fmt: skip
+        raise WearcapError(
+            f"bones {missing[:5]} do not hang on the root", where=path, expected="one tree below 'root' in :hierarchy"
+        )
     return names, parents
 
 
 CMU_NODES = {"root", "lowerback", "upperback", "thorax", "lowerneck", "upperneck", "head"} | {
     side + part
     for side in SIDES
-    for part in ("hipjoint", "femur", "tibia", "foot", "toes", "clavicle", "humerus", "radius", "wrist", "hand",
-                 "fingers", "thumb")
-}  # fmt: skip
+    for part in (
+        "hipjoint",
+        "femur",
+        "tibia",
+        "foot",
+        "toes",
+        "clavicle",
+        "humerus",
+        "radius",
+        "wrist",
+        "hand",
+        "fingers",
+        "thumb",
+    )
+}
 
 
 def _sites(names: list[str], ends: Tensor, leaves: dict[str, Tensor]) -> dict[str, Site]:
@@ -323,8 +350,12 @@ def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Flo
         else:
             _take_values(values, words, first[place - 1][1], path, number)
     if place < len(first):
-        raise WearcapError("the last frame is cut short", where=at_line(path, number),
-                           expected=f"{len(first)} bones per frame", fix="Fetch the file again.")  # fmt: skip
+        raise WearcapError(
+            "the last frame is cut short",
+            where=at_line(path, number),
+            expected=f"{len(first)} bones per frame",
+            fix="Fetch the file again.",
+        )
     return np.array(frames), joints, torch.from_numpy(np.array(values).reshape(len(frames), -1))
 
 
@@ -334,9 +365,7 @@ def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
     for number, line in numbered_lines(path):
         words = line.split()
         if not begun and line.strip().upper() == (":DEGREES" if asf.radians else ":RADIANS"):
-            raise WearcapError(
-                "its angles are in another unit than the ASF's", where=path, expected="one unit in both"
-            )
+            raise WearcapError("its angles are in another unit than the ASF's", where=path, expected="one unit in both")
         begun = begun or (bool(words) and words[0][0] not in "#:")
         if begun and words:
             yield number, words
@@ -345,16 +374,22 @@ def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
 def _take_frame_number(frames: "array[int]", words: list[str], path: Path, line: int) -> None:
     sound = len(words) == 1 and words[0].isdecimal() and len(words[0]) <= 15
     if not sound or (frames and int(words[0]) <= frames[-1]):
-        raise WearcapError(f"{' '.join(words)[:60]!r} where a frame number should stand", where=at_line(path, line),
-                           expected="rising frame numbers")  # fmt: skip
+        raise WearcapError(
+            f"{' '.join(words)[:60]!r} where a frame number should stand",
+            where=at_line(path, line),
+            expected="rising frame numbers",
+        )
     frames.append(int(words[0]))
 
 
 def _take_values(values: "array[float]", words: list[str], like: list[str], path: Path, line: int) -> None:
     """A bone's values, whose name and number must be those of the first frame."""
     if words[0] != like[0] or len(words) != len(like):
-        raise WearcapError(f"{' '.join(words)[:60]!r} differs from the first frame", where=at_line(path, line),
-                           expected=f"{like[0]!r} with {len(like) - 1} values")  # fmt: skip
+        raise WearcapError(
+            f"{' '.join(words)[:60]!r} differs from the first frame",
+            where=at_line(path, line),
+            expected=f"{like[0]!r} with {len(like) - 1} values",
+        )
     try:
         found = list(map(float, words[1:]))
     except ValueError:
@@ -370,13 +405,21 @@ def _layout_joints(path: Path, asf: AsfSkeleton, start: int, first: list[tuple[i
     names = [words[0] for _, words in first]
     for line, (name, *values) in first:
         if name not in asf.skeleton.joint_names or names.count(name) > 1:
-            raise WearcapError(f"bone {name!r} is not in the ASF, or comes twice", where=at_line(path, line),
-                               expected="bones of the skeleton, once per frame", fix="Check that AMC and ASF belong together.")  # fmt: skip
+            raise WearcapError(
+                f"bone {name!r} is not in the ASF, or comes twice",
+                where=at_line(path, line),
+                expected="bones of the skeleton, once per frame",
+                fix="Check that AMC and ASF belong together.",
+            )
         if len(values) != (expected := len(asf.dof[asf.skeleton.index(name)])):
-            raise WearcapError(f"{len(values)} values for {name!r}", where=at_line(path, line),
-                               expected=f"{expected} as in the ASF")  # fmt: skip
+            raise WearcapError(
+                f"{len(values)} values for {name!r}", where=at_line(path, line), expected=f"{expected} as in the ASF"
+            )
     moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
     if not names or moving - set(names):
-        raise WearcapError(f"the first frame lacks {sorted(moving - set(names))[:5]}", where=at_line(path, start),
-                           expected="every bone that has channels in the ASF")  # fmt: skip
+        raise WearcapError(
+            f"the first frame lacks {sorted(moving - set(names))[:5]}",
+            where=at_line(path, start),
+            expected="every bone that has channels in the ASF",
+        )
     return [asf.skeleton.index(name) for name in names]

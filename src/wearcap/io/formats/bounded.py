@@ -45,11 +45,19 @@ class Budget:
         """Count bytes before or after they are unpacked. Raises WearcapError beyond the limit."""
         self.spent += size
         if self.spent > self.max_bytes:
-            raise WearcapError(f"larger than {_size_text(self.max_bytes)} once unpacked", where=self.path,
-                               expected="a smaller file", fix=_lift(self.spent))  # fmt: skip
+            raise WearcapError(
+                f"larger than {_size_text(self.max_bytes)} once unpacked",
+                where=self.path,
+                expected="a smaller file",
+                fix=_lift(self.spent),
+            )
         if self.spent > self._by_ratio:
-            raise WearcapError(f"it unpacks to more than {MAX_RATIO} times its size", where=self.path,
-                               expected="a capture, which packs 5 to 30 times", fix=_lift(self.spent))  # fmt: skip
+            raise WearcapError(
+                f"it unpacks to more than {MAX_RATIO} times its size",
+                where=self.path,
+                expected="a capture, which packs 5 to 30 times",
+                fix=_lift(self.spent),
+            )
 
 
 def _from_environment() -> int | None:
@@ -65,9 +73,7 @@ def gib_bytes(text: str, where: str) -> int:
     except ValueError:
         gib = math.nan
     if not 0 < gib < 1e9:
-        raise WearcapError(
-            f"a limit of {text[:30]!r} GiB", where=where, expected="a number above 0, such as 16"
-        )
+        raise WearcapError(f"a limit of {text[:30]!r} GiB", where=where, expected="a number above 0, such as 16")
     return int(gib * (1 << 30))
 
 
@@ -97,7 +103,7 @@ def file_size(path: str | Path, kind: str = "file") -> int:
             raise IsADirectoryError
         if not stat.S_ISREG(mode):
             found = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
-            raise WearcapError(f"a {found}", where=path, expected="a regular file", fix="Copy its content to a file.")  # fmt: skip
+            raise WearcapError(f"a {found}", where=path, expected="a regular file", fix="Copy its content to a file.")
         return status.st_size
 
 
@@ -109,12 +115,17 @@ def explained(path: str | Path, kind: str = "file") -> Iterator[None]:
     except (FileNotFoundError, NotADirectoryError) as error:
         raise WearcapError(f"no such {kind}", where=path) from error
     except PermissionError as error:
-        raise WearcapError("no permission to read it", where=path, fix="Ask its owner, or change its mode (chmod).") from error  # fmt: skip
+        raise WearcapError(
+            "no permission to read it", where=path, fix="Ask its owner, or change its mode (chmod)."
+        ) from error
     except IsADirectoryError as error:
         raise WearcapError("a folder", where=path, expected="a file") from error
     except _DAMAGE as error:
-        raise WearcapError(f"not a complete {Path(path).suffix} file: its packed data is damaged or cut short ({error})",
-                           where=path, fix="Copy or fetch it again.") from error  # fmt: skip
+        raise WearcapError(
+            f"not a complete {Path(path).suffix} file: its packed data is damaged or cut short ({error})",
+            where=path,
+            fix="Copy or fetch it again.",
+        ) from error
     except OSError as error:
         raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
     except MemoryError as error:
@@ -122,9 +133,7 @@ def explained(path: str | Path, kind: str = "file") -> Iterator[None]:
 
 
 @contextmanager
-def open_bytes(
-    path: str | Path, max_bytes: int | None = None, usual: int = MAX_BYTES
-) -> Iterator[io.BufferedReader]:
+def open_bytes(path: str | Path, max_bytes: int | None = None, usual: int = MAX_BYTES) -> Iterator[io.BufferedReader]:
     """Open a file for reading bytes, unpacked when its name ends in .gz or .xz.
 
     Raises WearcapError, while opening or while reading inside the `with` block, when the file is missing, no regular

@@ -66,19 +66,24 @@ def read_bvh(
     bones = _bones(path, joints, translation, float(unit_m))
     to_world = float(unit_m) * R_world_file.T
     skeleton = Skeleton(
-        "bvh", tuple(joint.name for joint in joints), tuple(joint.parent for joint in joints),
-        (bones @ to_world).float(), _sites(joints, to_world),
-    )  # fmt: skip
+        "bvh",
+        tuple(joint.name for joint in joints),
+        tuple(joint.parent for joint in joints),
+        (bones @ to_world).float(),
+        _sites(joints, to_world),
+    )
     root = (
         translation[0]
         if translation[0] is not None
         else torch.tensor(joints[0].offset, dtype=torch.float64).expand(len(values), 3)
     )
     motion = Motion(
-        torch.arange(len(values), dtype=torch.float64) / nominal_fps(1 / step_s), skeleton,
-        (R_world_file @ R @ R_world_file.T).float(), (root @ to_world).float(),
+        torch.arange(len(values), dtype=torch.float64) / nominal_fps(1 / step_s),
+        skeleton,
+        (R_world_file @ R @ R_world_file.T).float(),
+        (root @ to_world).float(),
         provenance={"source": path.name, "format": "bvh"},
-    )  # fmt: skip
+    )
     if check:
         check_body(motion, path, float(unit_m), R_world_file)
     return motion
@@ -94,8 +99,13 @@ def read_cmu_bvh(path: str | Path) -> Motion:
     if len(motion) < 2:
         raise WearcapError("only the T-pose frame", where=path, expected="frames of motion after it")
     motion = motion.sliced(1, len(motion))
-    return Motion(motion.timestamps - motion.timestamps[0], motion.skeleton, motion.R_parent_joint,
-                  motion.t_world_root, provenance=motion.provenance)  # fmt: skip
+    return Motion(
+        motion.timestamps - motion.timestamps[0],
+        motion.skeleton,
+        motion.R_parent_joint,
+        motion.t_world_root,
+        provenance=motion.provenance,
+    )
 
 
 def _axes(path: Path, up: str, forward: str) -> Tensor:
@@ -103,15 +113,16 @@ def _axes(path: Path, up: str, forward: str) -> Tensor:
     rows = {}
     for name in (up, forward):
         if name.removeprefix("-") not in ("x", "y", "z"):
-            raise WearcapError(
-                f"axis {name!r}", where=path, expected='one of "x", "y", "z", "-x", "-y", "-z"'
-            )
+            raise WearcapError(f"axis {name!r}", where=path, expected='one of "x", "y", "z", "-x", "-y", "-z"')
         row = torch.zeros(3, dtype=torch.float64)
         row["xyz".index(name[-1])] = -1.0 if name.startswith("-") else 1.0
         rows[name] = row
     if up[-1] == forward[-1]:
-        raise WearcapError(f"up {up!r} and forward {forward!r} are one axis", where=path,
-                           fix='For a z-up file give forward as well, mostly "-y", "x" or "y".')  # fmt: skip
+        raise WearcapError(
+            f"up {up!r} and forward {forward!r} are one axis",
+            where=path,
+            fix='For a z-up file give forward as well, mostly "-y", "x" or "y".',
+        )
     return torch.stack([rows[forward], torch.linalg.cross(rows[up], rows[forward]), rows[up]])
 
 
@@ -154,8 +165,11 @@ def _bones(
         stretch = {k: (t - median[k]).norm(dim=-1).max().item() * unit_m for k, t in moved.items()}
         worst = max(stretch, key=lambda k: stretch[k])
         if stretch[worst] > STRETCH_M:
-            warnings.warn(f"{path}: bone {joints[worst].name!r} changes its length by up to {stretch[worst]:.3f} m; "
-                          "its median is kept", stacklevel=3)  # fmt: skip
+            warnings.warn(
+                f"{path}: bone {joints[worst].name!r} changes its length by up to {stretch[worst]:.3f} m; "
+                "its median is kept",
+                stacklevel=3,
+            )
         for k in moved:
             bones[k] = median[k] if whole else bones[k] + median[k]
     bones[0] = 0
@@ -201,8 +215,14 @@ def write_bvh(motion: Motion, path: str | Path, unit_m: float | int = 0.01) -> N
     order = _depth_first(motion.skeleton)
     table = np.concatenate([root.numpy(), degrees[:, order].reshape(len(frames), -1)], -1)
     row = " ".join(["%.6f"] * table.shape[1])
-    lines = ["HIERARCHY", *_hierarchy(motion.skeleton, 0, 0, float(unit_m)), "MOTION", f"Frames: {len(table)}",
-             f"Frame Time: {1 / fps:.9f}", *(row % tuple(values) for values in table.tolist())]  # fmt: skip
+    lines = [
+        "HIERARCHY",
+        *_hierarchy(motion.skeleton, 0, 0, float(unit_m)),
+        "MOTION",
+        f"Frames: {len(table)}",
+        f"Frame Time: {1 / fps:.9f}",
+        *(row % tuple(values) for values in table.tolist()),
+    ]
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -229,16 +249,17 @@ def _hierarchy(skeleton: Skeleton, joint: int, depth: int, unit_m: float) -> lis
     tab = "\t" * depth
     offset = _R_FILE_WORLD @ skeleton.t_parent_joint[joint].double() / unit_m * (joint > 0)
     position = "6 Xposition Yposition Zposition" if joint == 0 else "3"
-    lines = [f"{tab}{'JOINT' if joint else 'ROOT'} {skeleton.joint_names[joint]}", tab + "{",
-             tab + "\tOFFSET {:.6f} {:.6f} {:.6f}".format(*offset.tolist()),
-             f"{tab}\tCHANNELS {position} Zrotation Yrotation Xrotation"]  # fmt: skip
+    lines = [
+        f"{tab}{'JOINT' if joint else 'ROOT'} {skeleton.joint_names[joint]}",
+        tab + "{",
+        tab + "\tOFFSET {:.6f} {:.6f} {:.6f}".format(*offset.tolist()),
+        f"{tab}\tCHANNELS {position} Zrotation Yrotation Xrotation",
+    ]
     children = _children(skeleton, joint)
     for child in children:
         lines += _hierarchy(skeleton, child, depth + 1, unit_m)
     if not children:
-        ends = [
-            site.t_joint_site for site in skeleton.sites.values() if site.joint == skeleton.joint_names[joint]
-        ]
+        ends = [site.t_joint_site for site in skeleton.sites.values() if site.joint == skeleton.joint_names[joint]]
         end = max(ends, key=lambda end: math.hypot(*end), default=(0.0, 0.0, 0.0))
         end = _R_FILE_WORLD @ torch.tensor(end, dtype=torch.float64) / unit_m
         lines += [

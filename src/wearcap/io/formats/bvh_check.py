@@ -10,8 +10,15 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.recording.motion import Motion
 
-UNITS_M = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254,
-           "feet": 0.3048, "CMU's units": 0.0254 / 0.45}  # fmt: skip
+UNITS_M = {
+    "metres": 1.0,
+    "decimetres": 0.1,
+    "centimetres": 0.01,
+    "millimetres": 0.001,
+    "inches": 0.0254,
+    "feet": 0.3048,
+    "CMU's units": 0.0254 / 0.45,
+}
 REACH_PER_HEIGHT = 1.46
 """Longest path along the bones (fingertip to toe tip) over body height; in the tested skeletons 1.46 … 1.53."""
 
@@ -25,10 +32,12 @@ def check_body(motion: Motion, path: Path, unit_m: float, R_world_file: Float[Te
         nearest = {name: abs(height / unit_m * unit - 1.7) for name, unit in UNITS_M.items()}
         name = min(nearest, key=lambda name: nearest[name])
         raise WearcapError(
-            f"the body would be about {height:.3g} m tall with unit_m={unit_m:g}", where=path, expected="a person's size",
+            f"the body would be about {height:.3g} m tall with unit_m={unit_m:g}",
+            where=path,
+            expected="a person's size",
             fix=f"unit_m={UNITS_M[name]:.6g} ({name}) would make it {height / unit_m * UNITS_M[name]:.2f} m; "
             "check=False takes it as it is.",
-        )  # fmt: skip
+        )
     rest, moving = _extents(motion)
     long_axes = [axis for axis in (0, 1) if rest[2] < 0.5 * rest[axis] and moving[2] < 0.6 * moving[axis]]
     if long_axes:
@@ -36,10 +45,11 @@ def check_body(motion: Motion, path: Path, unit_m: float, R_world_file: Float[Te
         axis = max(long_axes, key=lambda axis: _mirror_error(motion.skeleton, axis))
         name = "xyz"[int(R_world_file[axis].abs().argmax())]
         raise WearcapError(
-            f"the body lies down: {moving[2]:.2f} m high and {moving[axis]:.2f} m long", where=path,
+            f"the body lies down: {moving[2]:.2f} m high and {moving[axis]:.2f} m long",
+            where=path,
             expected="a person upright in the bind pose or in most frames",
             fix=f'up="{name}" (or "-{name}") would raise it; check=False takes it as it is.',
-        )  # fmt: skip
+        )
 
 
 def _mirror_error(skeleton: Skeleton, axis: int) -> float:

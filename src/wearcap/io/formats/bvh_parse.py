@@ -55,11 +55,18 @@ def parse_hierarchy(path: Path, lines: Iterator[tuple[int, str]]) -> tuple[list[
             elif key != "HIERARCHY":
                 raise ValueError(f"unknown word {word[:30]!r}")
     except (ValueError, IndexError, StopIteration) as error:
-        raise WearcapError(f"the hierarchy is broken here ({str(error) or 'it ends too early'})"[:200],
-                           where=at_line(path, line), expected="BVH") from error  # fmt: skip
+        raise WearcapError(
+            f"the hierarchy is broken here ({str(error) or 'it ends too early'})"[:200],
+            where=at_line(path, line),
+            expected="BVH",
+        ) from error
     if not joints or blocks or not words.motion_line:
-        raise WearcapError("no complete HIERARCHY followed by MOTION", where=at_line(path, words.line),
-                           expected="a whole BVH file", fix="Fetch it again.")  # fmt: skip
+        raise WearcapError(
+            "no complete HIERARCHY followed by MOTION",
+            where=at_line(path, words.line),
+            expected="a whole BVH file",
+            fix="Fetch it again.",
+        )
     if len({joint.name for joint in joints}) < len(joints):
         raise WearcapError("two joints share a name", where=path, expected="unique joint names")
     return joints, words.motion_line
@@ -137,13 +144,9 @@ def parse_motion(
         count = int(first.lower().split("frames:")[1])
         step_s = float(second.lower().split("frame time:")[1])
     except (ValueError, IndexError, StopIteration) as error:
-        raise WearcapError(
-            "no 'Frames:' and 'Frame Time:' below MOTION", where=at_line(path, motion_line)
-        ) from error
+        raise WearcapError("no 'Frames:' and 'Frame Time:' below MOTION", where=at_line(path, motion_line)) from error
     if not 1e-5 <= step_s <= 10:
-        raise WearcapError(
-            f"frame time {step_s} s", where=at_line(path, line), expected="seconds per frame, above 0"
-        )
+        raise WearcapError(f"frame time {step_s} s", where=at_line(path, line), expected="seconds per frame, above 0")
     values, odd, rows = array("d"), None, 0
     for number, text in lines:
         words = text.split()
@@ -154,8 +157,11 @@ def parse_motion(
             bad = next(word for word in words if not is_finite_number(word))
             raise WearcapError(f"{bad[:30]!r} is no finite number", where=at_line(path, number)) from error
         if len(words) != channels and odd is None:
-            odd = WearcapError(f"{len(words)} values", where=at_line(path, number),
-                               expected=f"{channels}, one per channel of the hierarchy")  # fmt: skip
+            odd = WearcapError(
+                f"{len(words)} values",
+                where=at_line(path, number),
+                expected=f"{channels}, one per channel of the hierarchy",
+            )
         if len(values) > count * channels:
             break
     if len(values) != count * channels or not values:

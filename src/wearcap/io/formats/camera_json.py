@@ -11,7 +11,9 @@ from wearcap.geometry.camera import Camera
 from wearcap.io.formats.json_text import read_json
 
 _NUMBERS = ("fx", "fy", "cx", "cy")
-EXAMPLE = '{"camera": {"model": "opencv", "width": …, "height": …, "fx": …, "fy": …, "cx": …, "cy": …, "distortion": […]}}'
+EXAMPLE = (
+    '{"camera": {"model": "opencv", "width": …, "height": …, "fx": …, "fy": …, "cx": …, "cy": …, "distortion": […]}}'
+)
 
 
 def camera_row(camera: Camera) -> dict[str, Any]:
@@ -25,8 +27,13 @@ def camera_from_row(row: Any, where: str | Path) -> Camera:
     try:
         if not all(math.isfinite(float(value)) for value in (row["cx"], row["cy"], *row["distortion"])):
             raise ValueError("numbers that are not finite")
-        return Camera(str(row["model"]), int(row["width"]), int(row["height"]), *(float(row[key]) for key in _NUMBERS),
-                      tuple(map(float, row["distortion"])))  # fmt: skip
+        return Camera(
+            str(row["model"]),
+            int(row["width"]),
+            int(row["height"]),
+            *(float(row[key]) for key in _NUMBERS),
+            tuple(map(float, row["distortion"])),
+        )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise WearcapError(f"no intrinsics ({what})", where=where, expected=EXAMPLE) from error

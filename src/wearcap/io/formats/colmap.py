@@ -26,14 +26,27 @@ from wearcap.recording.photo import Photo
 _MAX_BYTES = 1 << 34
 """Largest binary file that is read (16 GiB)."""
 _MODELS = {
-    "SIMPLE_PINHOLE": ("pinhole", 3), "PINHOLE": ("pinhole", 4), "SIMPLE_RADIAL": ("opencv", 4),
-    "RADIAL": ("opencv", 5), "OPENCV": ("opencv", 8), "OPENCV_FISHEYE": ("fisheye", 8),
-}  # fmt: skip
+    "SIMPLE_PINHOLE": ("pinhole", 3),
+    "PINHOLE": ("pinhole", 4),
+    "SIMPLE_RADIAL": ("opencv", 4),
+    "RADIAL": ("opencv", 5),
+    "OPENCV": ("opencv", 8),
+    "OPENCV_FISHEYE": ("fisheye", 8),
+}
 """wearcap's camera model, and the number of parameters of COLMAP's."""
 _BY_NUMBER = (
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
-    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
-)  # fmt: skip
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +126,18 @@ def _images_folder(folder: Path) -> Path:
 
 def _photo(image: _Image, cameras: dict[int, Camera], images: Path) -> Photo:
     if image.camera not in cameras:
-        raise WearcapError(f"image {image.name!r} names camera {image.camera}, which is not in the model",
-                           where=image.where, expected=f"one of {', '.join(map(str, sorted(cameras)))}")  # fmt: skip
+        raise WearcapError(
+            f"image {image.name!r} names camera {image.camera}, which is not in the model",
+            where=image.where,
+            expected=f"one of {', '.join(map(str, sorted(cameras)))}",
+        )
     wxyz = torch.tensor(image.quaternion_wxyz, dtype=torch.float64)
     if not (wxyz.isfinite().all() and 0.9 < wxyz.norm() < 1.1 and all(map(math.isfinite, image.translation))):
-        raise WearcapError(f"image {image.name!r} has no valid pose", where=image.where,
-                           expected="a unit quaternion (w first) and a finite translation")  # fmt: skip
+        raise WearcapError(
+            f"image {image.name!r} has no valid pose",
+            where=image.where,
+            expected="a unit quaternion (w first) and a finite translation",
+        )
     wxyz = wxyz / wxyz.norm()
     R_cam_world = roma.unitquat_to_rotmat(wxyz[[1, 2, 3, 0]])
     T_cam_world = Rigid(R_cam_world, torch.tensor(image.translation, dtype=torch.float64))
@@ -136,16 +155,22 @@ def _tracks(images: list[_Image], points: _Points) -> Tracks:
     known = (seen >= 0) & (len(number) > 0) & (np.abs(pixels) < 1e6).all(1)
     known[known] = number[place[known]] == seen[known]
     return Tracks(
-        points.xyz, points.rgb, photo[known].astype(np.int64), order[place[known]].astype(np.int64),
+        points.xyz,
+        points.rgb,
+        photo[known].astype(np.int64),
+        order[place[known]].astype(np.int64),
         (pixels[known] - 0.5).astype(np.float32),
-    )  # fmt: skip
+    )
 
 
 def _camera(model: str, width: int, height: int, values: list[float], where: str) -> Camera:
     if model not in _MODELS:
-        raise WearcapError(f"camera model {model} is not supported", where=where,
-                           expected=f"one of {', '.join(_MODELS)}",
-                           fix="COLMAP's image_undistorter turns any model into PINHOLE.")  # fmt: skip
+        raise WearcapError(
+            f"camera model {model} is not supported",
+            where=where,
+            expected=f"one of {', '.join(_MODELS)}",
+            fix="COLMAP's image_undistorter turns any model into PINHOLE.",
+        )
     ours, count = _MODELS[model]
     if len(values) != count or not all(map(math.isfinite, values)):
         raise WearcapError(
@@ -198,18 +223,32 @@ def _read_images_txt(path: Path) -> list[_Image]:
                 raise ValueError("no name")
             place, second = next(lines, (where, None))
             if second is None:
-                raise WearcapError(f"it ends after image {name!r}", where=where, expected="a line of its points",
-                                   fix="The file was cut short: copy it again.")  # fmt: skip
+                raise WearcapError(
+                    f"it ends after image {name!r}",
+                    where=where,
+                    expected="a line of its points",
+                    fix="The file was cut short: copy it again.",
+                )
             if len(second) % 3:
-                raise WearcapError(f"{len(second)} numbers for the points of image {name!r}", where=place,
-                                   expected="X Y POINT3D_ID for each point")  # fmt: skip
+                raise WearcapError(
+                    f"{len(second)} numbers for the points of image {name!r}",
+                    where=place,
+                    expected="X Y POINT3D_ID for each point",
+                )
             table = finite_floats(second).reshape(-1, 3)
-            images.append(_Image(name, int(camera), tuple(pose[:4]), tuple(pose[4:]),
-                                 table[:, :2], table[:, 2].astype(np.int64), where))  # fmt: skip
+            images.append(
+                _Image(
+                    name,
+                    int(camera),
+                    tuple(pose[:4]),
+                    tuple(pose[4:]),
+                    table[:, :2],
+                    table[:, 2].astype(np.int64),
+                    where,
+                )
+            )
         except (ValueError, IndexError) as error:
-            raise _damaged(
-                where, error, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points"
-            ) from error
+            raise _damaged(where, error, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points") from error
     return images
 
 
@@ -230,9 +269,8 @@ def _read_points_txt(path: Path) -> _Points:
 
 def _checked_points(numbers: "array[int]", xyz: "array[float]", rgb: bytearray, path: Path) -> _Points:
     points = _Points(
-        np.array(numbers, np.int64), np.array(xyz, np.float64).reshape(-1, 3),
-        np.array(rgb, np.uint8).reshape(-1, 3),
-    )  # fmt: skip
+        np.array(numbers, np.int64), np.array(xyz, np.float64).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3)
+    )
     if not np.isfinite(points.xyz).all():
         raise WearcapError("a point is NaN or infinite", where=path, expected="finite coordinates")
     return points
@@ -270,8 +308,12 @@ class _Cursor:
         return content.decode("utf-8", errors="replace")
 
     def cut_short(self, part: str) -> WearcapError:
-        return WearcapError(f"it ends inside {part}", where=self.path, expected="a whole COLMAP file",
-                            fix="The file was cut short: copy it again.")  # fmt: skip
+        return WearcapError(
+            f"it ends inside {part}",
+            where=self.path,
+            expected="a whole COLMAP file",
+            fix="The file was cut short: copy it again.",
+        )
 
 
 def _read_cameras_bin(path: Path) -> dict[int, Camera]:
@@ -296,8 +338,17 @@ def _read_images_bin(path: Path) -> list[_Image]:
         name = cursor.text(where)
         (length,) = cursor.take("Q", where)
         table = cursor.rows(length, observation, where)
-        images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:]),
-                             table["xy"].astype(np.float64), table["point"].astype(np.int64), str(path)))  # fmt: skip
+        images.append(
+            _Image(
+                name,
+                camera,
+                tuple(pose[:4]),
+                tuple(pose[4:]),
+                table["xy"].astype(np.float64),
+                table["point"].astype(np.int64),
+                str(path),
+            )
+        )
     return images
 
 

@@ -42,9 +42,7 @@ class LabelClock:
     def of(cls, name: str, timestamps: Float64[Tensor, "time"]) -> "LabelClock":
         """Raises WearcapError for fewer than two frames."""
         if len(timestamps) < 2:
-            raise WearcapError(
-                f"a motion of {len(timestamps)} frames", where=name, expected="at least two to label"
-            )
+            raise WearcapError(f"a motion of {len(timestamps)} frames", where=name, expected="at least two to label")
         step = timestamps.diff().median().item()
         return cls(name, len(timestamps), timestamps[0].item(), timestamps[-1].item() + step)
 
@@ -97,12 +95,7 @@ def annotation_of(labels: Labels, clock: LabelClock) -> dict[str, Any]:
     """wearcap's own file: H-contact's content with objects, classes and the recording that the labels belong to."""
     return {
         "schema_version": SCHEMA,
-        "recording": {
-            "name": clock.name,
-            "frames": clock.frames,
-            "start_s": clock.start_s,
-            "stop_s": clock.stop_s,
-        },
+        "recording": {"name": clock.name, "frames": clock.frames, "start_s": clock.start_s, "stop_s": clock.stop_s},
         "contacts": hcontact_of(labels, clock),
         "objects": {f"{hand}_hand": [label.object for label in labels[hand]] for hand in HANDS},
         "classes": {f"{hand}_hand": [label.contact_class for label in labels[hand]] for hand in HANDS},
@@ -114,8 +107,11 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
     contacts = content.get("contacts") if isinstance(content, dict) else None
     names = [f"{hand}_hand" for hand in HANDS]
     if not isinstance(contacts, dict) or not all(isinstance(contacts.get(name), list) for name in names):
-        raise WearcapError("no contact labels", where=where,
-                           expected='{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}} in seconds')  # fmt: skip
+        raise WearcapError(
+            "no contact labels",
+            where=where,
+            expected='{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}} in seconds',
+        )
     if "recording" in content:
         _check_recording(content, clock, where)
     labels: Labels = {}
@@ -123,8 +119,9 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
         pairs = contacts[name]
         objects, classes = (_texts(content, key, name, len(pairs), where) for key in ("objects", "classes"))
         if unknown := set(classes) - {"", *CONTACT_CLASSES}:
-            raise WearcapError(f"class {unknown.pop()!r} in {name}", where=where,
-                               expected=f"one of {', '.join(CONTACT_CLASSES)}")  # fmt: skip
+            raise WearcapError(
+                f"class {unknown.pop()!r} in {name}", where=where, expected=f"one of {', '.join(CONTACT_CLASSES)}"
+            )
         spans = [_span(pair, clock, f"{name} label {place}", where) for place, pair in enumerate(pairs)]
         found = [Label(*span, item, kind) for span, item, kind in zip(spans, objects, classes)]
         labels[hand] = tuple(sorted(found, key=lambda label: label.start_s))
@@ -134,9 +131,7 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
 
 def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> None:
     if content.get("schema_version") != SCHEMA:
-        raise WearcapError(
-            f"schema version {content.get('schema_version')}", where=where, expected=f"version {SCHEMA}"
-        )
+        raise WearcapError(f"schema version {content.get('schema_version')}", where=where, expected=f"version {SCHEMA}")
     about = content["recording"]
     try:
         name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
@@ -145,10 +140,11 @@ def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> Non
         raise WearcapError(f"does not name the recording of its labels ({error})", where=where) from error
     if name != clock.name or frames != clock.frames or not same:
         raise WearcapError(
-            f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s", where=where,
+            f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s",
+            where=where,
             expected=f"{clock.name!r} with {clock.frames} frames from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
             fix="Give another output folder, or move this file away.",
-        )  # fmt: skip
+        )
 
 
 def _texts(content: dict, key: str, name: str, count: int, where: str | Path) -> list[str]:
@@ -167,16 +163,20 @@ def _span(pair: Any, clock: LabelClock, label: str, where: str | Path) -> tuple[
         raise WearcapError(f"{label} is {pair!r}"[:200], where=where, expected="[start, end] in seconds")
     start, end = pair
     if start == end:
-        raise WearcapError(f"{label} is empty: {start} to {end} s", where=where, expected="an end after the start",
-                           fix="Delete the label, or write an end before its start where it lasts to the end.")  # fmt: skip
+        raise WearcapError(
+            f"{label} is empty: {start} to {end} s",
+            where=where,
+            expected="an end after the start",
+            fix="Delete the label, or write an end before its start where it lasts to the end.",
+        )
     stop = clock.stop_s if end < start else end
-    if not (
-        clock.start_s - SLACK_S <= start < clock.stop_s - 1e-9
-        and clock.start_s < stop <= clock.stop_s + SLACK_S
-    ):
-        raise WearcapError(f"{label} from {start} to {end} s is outside the recording", where=where,
-                           expected=f"times from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
-                           fix="Is it the file of another recording?")  # fmt: skip
+    if not (clock.start_s - SLACK_S <= start < clock.stop_s - 1e-9 and clock.start_s < stop <= clock.stop_s + SLACK_S):
+        raise WearcapError(
+            f"{label} from {start} to {end} s is outside the recording",
+            where=where,
+            expected=f"times from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
+            fix="Is it the file of another recording?",
+        )
     return max(float(start), clock.start_s), min(float(stop), clock.stop_s)
 
 
@@ -186,26 +186,23 @@ def _refuse_overlap(labels: Sequence[Label], clock: LabelClock, name: str, where
             until = "to the end of the recording" if label.stop_s == clock.stop_s else f"to {label.stop_s} s"
             raise WearcapError(
                 f"labels of {name} overlap: one from {label.start_s} {until}, the next from {following.start_s} s",
-                where=where, expected="one contact of a hand at a time",
+                where=where,
+                expected="one contact of a hand at a time",
                 fix="Give the first an end before the second starts (an end before its start means: until the end).",
-            )  # fmt: skip
+            )
 
 
 def interactions_of(labels: Labels) -> Interactions:
     """Labels as interactions: hands on the same named object share one; a new one starts when the hands change."""
     found: list[tuple[float, float, tuple[bool, ...], str, str]] = []
     for item in {(label.object, label.contact_class) for hand in HANDS for label in labels[hand]}:
-        by_hand = [
-            [label for label in labels[hand] if (label.object, label.contact_class) == item] for hand in HANDS
-        ]
+        by_hand = [[label for label in labels[hand] if (label.object, label.contact_class) == item] for hand in HANDS]
         if not item[0]:  # two hands on unknown objects need not hold the same one
             for number, spans in enumerate(by_hand):
                 one = tuple(other == number for other in range(len(HANDS)))
                 found += [(label.start_s, label.stop_s, one, *item) for label in spans]
             continue
-        edges = sorted(
-            {edge for spans in by_hand for label in spans for edge in (label.start_s, label.stop_s)}
-        )
+        edges = sorted({edge for spans in by_hand for label in spans for edge in (label.start_s, label.stop_s)})
         for start, stop in itertools.pairwise(edges):
             hands = tuple(any(s.start_s <= start < s.stop_s for s in spans) for spans in by_hand)
             if any(hands):
@@ -213,9 +210,12 @@ def interactions_of(labels: Labels) -> Interactions:
     found.sort(key=lambda row: row[0])
     column = lambda index: [row[index] for row in found]  # noqa: E731
     return Interactions(
-        torch.tensor(column(0), dtype=torch.float64), torch.tensor(column(1), dtype=torch.float64),
-        torch.tensor(column(2), dtype=torch.bool).reshape(-1, len(HANDS)), tuple(column(3)), tuple(column(4)),
-    )  # fmt: skip
+        torch.tensor(column(0), dtype=torch.float64),
+        torch.tensor(column(1), dtype=torch.float64),
+        torch.tensor(column(2), dtype=torch.bool).reshape(-1, len(HANDS)),
+        tuple(column(3)),
+        tuple(column(4)),
+    )
 
 
 def labels_of(interactions: Interactions, clock: LabelClock) -> Labels:
@@ -224,8 +224,15 @@ def labels_of(interactions: Interactions, clock: LabelClock) -> Labels:
     Raises WearcapError where a hand would hold two objects at once, or outside the recording.
     """
     labels: Labels = {}
-    rows = list(zip(interactions.start_s.tolist(), interactions.stop_s.tolist(), interactions.hands.tolist(),
-                    interactions.objects, interactions.classes))  # fmt: skip
+    rows = list(
+        zip(
+            interactions.start_s.tolist(),
+            interactions.stop_s.tolist(),
+            interactions.hands.tolist(),
+            interactions.objects,
+            interactions.classes,
+        )
+    )
     for number, hand in enumerate(HANDS):
         joined: list[Label] = []
         for start, stop, hands, item, kind in sorted(rows, key=lambda row: row[0]):

@@ -37,7 +37,7 @@ def open_text(path: str | Path, usual: int = MAX_BYTES) -> Iterator[Iterator[str
 def _lines(file: io.TextIOWrapper, path: str | Path) -> Iterator[str]:
     while line := file.readline(MAX_LINE):
         if len(line) == MAX_LINE:
-            raise WearcapError(f"a line longer than {MAX_LINE} characters", where=path, expected="a table as text")  # fmt: skip
+            raise WearcapError(f"a line longer than {MAX_LINE} characters", where=path, expected="a table as text")
         yield line
 
 
@@ -75,9 +75,12 @@ def iter_columns(
     for name in wanted:
         if name not in header:
             near = difflib.get_close_matches(name, header, n=1)
-            raise WearcapError(f"no column {name!r}", where=path,
-                               expected=f"the columns {', '.join(wanted)}",
-                               fix=f"The nearest is {near[0]!r}." if near else "")  # fmt: skip
+            raise WearcapError(
+                f"no column {name!r}",
+                where=path,
+                expected=f"the columns {', '.join(wanted)}",
+                fix=f"The nearest is {near[0]!r}." if near else "",
+            )
     kinds = dict.fromkeys(columns, "f8") | dict.fromkeys(text, "S64") | dict.fromkeys(whole, "i8")
     done = 0
     with open_text(path, MAX_BYTES if rows is None else MAX_STREAMED_BYTES) as file:
@@ -94,23 +97,24 @@ def iter_columns(
 
 
 def _read_rows(
-    file: Iterable[str],
-    path: str | Path,
-    header: list[str],
-    kinds: dict[str, str],
-    rows: int | None,
-    done: int,
+    file: Iterable[str], path: str | Path, header: list[str], kinds: dict[str, str], rows: int | None, done: int
 ) -> np.ndarray:
     """The next rows of an open file as a structured array; `done` were read before."""
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", UserWarning
-        )  # numpy warns about an empty file; the WearcapError follows
+        warnings.simplefilter("ignore", UserWarning)  # numpy warns about an empty file; the WearcapError follows
         try:
             return np.loadtxt(
-                file, dtype=np.dtype(list(kinds.items())), delimiter=",", usecols=[header.index(name) for name in kinds],
-                comments=None, ndmin=1, max_rows=rows,
-            )  # fmt: skip
+                file,
+                dtype=np.dtype(list(kinds.items())),
+                delimiter=",",
+                usecols=[header.index(name) for name in kinds],
+                comments=None,
+                ndmin=1,
+                max_rows=rows,
+            )
         except (ValueError, OverflowError) as error:
-            raise WearcapError(f"not a table of numbers ({error}; rows count from {f'row {done}' if done else 'after the header'})",
-                               where=path, expected=f"{len(header)} comma-separated fields in every line") from error  # fmt: skip
+            raise WearcapError(
+                f"not a table of numbers ({error}; rows count from {f'row {done}' if done else 'after the header'})",
+                where=path,
+                expected=f"{len(header)} comma-separated fields in every line",
+            ) from error

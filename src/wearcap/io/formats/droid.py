@@ -51,9 +51,7 @@ class DroidTrack:
     """Points; `confidence` is the share of neighbours that agree, `first_seen` the time of a point's own keyframe."""
 
 
-def read_droid(
-    folder: str | Path, stamps_per_s: float, points: DroidPoints | None = DroidPoints()
-) -> DroidTrack:
+def read_droid(folder: str | Path, stamps_per_s: float, points: DroidPoints | None = DroidPoints()) -> DroidTrack:
     """Read a reconstruction; `stamps_per_s` is the rate of SLAM's input frames (a 30 Hz video at stride 3: 10).
 
     Without `points`, only the size of the disparities is read. Raises WearcapError for missing files, arrays of objects, wrong
@@ -70,8 +68,11 @@ def read_droid(
     track = _trajectory(arrays["poses"], arrays["tstamps"] / stamps_per_s, folder)
     disparity = _load(folder / "disps.npy")
     if disparity.ndim != 3 or len(disparity) != len(track) or disparity.dtype.kind != "f":
-        raise WearcapError(f"{disparity.dtype} of shape {disparity.shape}", where=folder / "disps.npy",
-                           expected=f"floats of shape ({len(track)}, height, width)")  # fmt: skip
+        raise WearcapError(
+            f"{disparity.dtype} of shape {disparity.shape}",
+            where=folder / "disps.npy",
+            expected=f"floats of shape ({len(track)}, height, width)",
+        )
     camera = _camera(arrays["intrinsics"], disparity.shape[2], disparity.shape[1], folder)
     cloud = None if points is None else _points(track, disparity, camera, points, folder)
     return DroidTrack(track, camera, cloud)
@@ -80,8 +81,12 @@ def read_droid(
 def _load(path: Path) -> np.ndarray:
     """A memory-mapped .npy file, whose size is checked before memory is allocated."""
     if not path.exists():
-        raise WearcapError("no such file", where=path, expected="a reconstruction of DROID-SLAM",
-                           fix="Run it with --reconstruction_path.")  # fmt: skip
+        raise WearcapError(
+            "no such file",
+            where=path,
+            expected="a reconstruction of DROID-SLAM",
+            fix="Run it with --reconstruction_path.",
+        )
     return map_npy(path)
 
 
@@ -102,8 +107,11 @@ def _camera(intrinsics: np.ndarray, width: int, height: int, folder: Path) -> Ca
     for scale in (1, REDUCED):
         if 0.3 < scale * cx / width < 0.7 and 0.3 < scale * cy / height < 0.7 and fx > 0 and fy > 0:
             return Camera("pinhole", width, height, *(scale * value for value in (fx, fy, cx, cy)))
-    raise WearcapError(f"fx fy cx cy = {fx:.1f} {fy:.1f} {cx:.1f} {cy:.1f} for disparities of {width}x{height}", where=path,
-                       expected=f"a principal point near the middle of these pixels, or of an {REDUCED}th of them")  # fmt: skip
+    raise WearcapError(
+        f"fx fy cx cy = {fx:.1f} {fy:.1f} {cx:.1f} {cy:.1f} for disparities of {width}x{height}",
+        where=path,
+        expected=f"a principal point near the middle of these pixels, or of an {REDUCED}th of them",
+    )
 
 
 def _points(
@@ -113,7 +121,7 @@ def _points(
     floor = settings.min_disparity * _mean(disparity, folder)
     grid = torch.meshgrid(
         torch.arange(0, camera.width, settings.stride), torch.arange(0, camera.height, settings.stride), indexing="xy"
-    )  # fmt: skip
+    )
     column, row = (axis.flatten() for axis in grid)
     ray = camera.unproject(torch.stack([column, row], -1).float())
     ray = ray / ray[:, 2:]
@@ -123,8 +131,11 @@ def _points(
         seen = torch.from_numpy(np.array(disparity[frame], np.float32))[row, column]
         near = seen > floor
         points = T[frame] @ (ray[near] / seen[near, None])
-        others = [k for k in range(frame - settings.neighbors, frame + settings.neighbors + 1)
-                  if k != frame and 0 <= k < len(track)]  # fmt: skip
+        others = [
+            k
+            for k in range(frame - settings.neighbors, frame + settings.neighbors + 1)
+            if k != frame and 0 <= k < len(track)
+        ]
         agreeing = sum(
             (_agrees(points, T[k], disparity[k], camera, settings.agreement).long() for k in others),
             torch.zeros(len(points), dtype=torch.int64),

@@ -26,8 +26,11 @@ MAX_HINGE_GAP_M = 0.5
 
 _KEYS = ("name", "category", "mesh", "R_world_object", "t_world_object", "freedom")
 _FREEDOM_KEYS = {
-    "plane": ("kind",), "free": ("kind",), "hinge": ("kind", "pivot", "limits_deg"), "axis": ("kind", "axis", "limits_m"),
-}  # fmt: skip
+    "plane": ("kind",),
+    "free": ("kind",),
+    "hinge": ("kind", "pivot", "limits_deg"),
+    "axis": ("kind", "axis", "limits_m"),
+}
 _OPTIONAL = ("limits_deg", "limits_m")
 _ORTHOGONAL_WITHIN = 1e-3
 _LARGEST = float(np.finfo(np.float32).max)
@@ -47,8 +50,12 @@ def read_environment(path: str | Path) -> Environment:
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
         raise WearcapError("not an environment", where=path, expected='{"schema_version": 1, "objects": […]}')
     if content.get("schema_version") != SCHEMA:
-        raise WearcapError(f"schema version {content.get('schema_version')!r}", where=path, expected=str(SCHEMA),
-                           fix="Read it with the wearcap that wrote it, or update.")  # fmt: skip
+        raise WearcapError(
+            f"schema version {content.get('schema_version')!r}",
+            where=path,
+            expected=str(SCHEMA),
+            fix="Read it with the wearcap that wrote it, or update.",
+        )
     _require_keys(content, ("schema_version", "objects"), path)
     objects = tuple(_object(row, number, path) for number, row in enumerate(content["objects"]))
     try:
@@ -80,21 +87,27 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
     named = isinstance(row, dict) and isinstance(row.get("name"), str) and row["name"].strip()
     where = f"{path}: object {row['name']!r}" if named else f"{path}: object {number}"
     if not named:
-        raise WearcapError(
-            "an object without a name", where=where, expected=f"an object with {', '.join(_KEYS)}"
-        )
+        raise WearcapError("an object without a name", where=where, expected=f"an object with {', '.join(_KEYS)}")
     if row.get("freedom") is None:
-        raise WearcapError("no degree of freedom", where=where, expected=f'"freedom": {{"kind": one of {", ".join(FREEDOMS)}}}',
-                           fix="What cannot move belongs to the scan and not among the objects.")  # fmt: skip
+        raise WearcapError(
+            "no degree of freedom",
+            where=where,
+            expected=f'"freedom": {{"kind": one of {", ".join(FREEDOMS)}}}',
+            fix="What cannot move belongs to the scan and not among the objects.",
+        )
     _require_keys(row, _KEYS, where)
     if not isinstance(row["category"], str):
         raise WearcapError(f"category {row['category']!r}", where=where, expected="text")
     R = _rotation(row["R_world_object"], where)
     t = torch.from_numpy(_numbers(row["t_world_object"], (3,), "t_world_object", where)).float()
     item = SceneObject(
-        row["name"], row["category"], _mesh(row["mesh"], path, where), torch.from_numpy(R).float(), t,
+        row["name"],
+        row["category"],
+        _mesh(row["mesh"], path, where),
+        torch.from_numpy(R).float(),
+        t,
         _freedom(row["freedom"], where),
-    )  # fmt: skip
+    )
     _check(item, where)
     return item
 
@@ -102,9 +115,7 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
 def _freedom(row: Any, where: str) -> Freedom:
     kind = row.get("kind") if isinstance(row, dict) else None
     if kind not in FREEDOMS:
-        raise WearcapError(
-            f"no degree of freedom {kind!r}", where=where, expected=f"one of {', '.join(FREEDOMS)}"
-        )
+        raise WearcapError(f"no degree of freedom {kind!r}", where=where, expected=f"one of {', '.join(FREEDOMS)}")
     _require_keys(row, _FREEDOM_KEYS[kind], f"{where}, freedom")
     pivot = None if kind != "hinge" else tuple(_numbers(row["pivot"], (3,), "pivot", where).tolist())
     axis = None if kind != "axis" else tuple(_numbers(row["axis"], (3,), "axis", where).tolist())
@@ -112,9 +123,7 @@ def _freedom(row: Any, where: str) -> Freedom:
     if (key := _FREEDOM_KEYS[kind][-1]) in row and key in _OPTIONAL and row[key] is not None:
         limits = _numbers(row[key], (2,), key, where)
         if limits[0] > limits[1]:
-            raise WearcapError(
-                f"{key} {limits.tolist()} are reversed", where=where, expected="[least, greatest]"
-            )
+            raise WearcapError(f"{key} {limits.tolist()} are reversed", where=where, expected="[least, greatest]")
         limits = tuple((np.radians(limits) if key == "limits_deg" else limits).tolist())
     try:
         return Freedom(kind, pivot, axis, limits)
@@ -131,12 +140,20 @@ def _mesh(name: Any, path: Path, where: str) -> Mesh:
         and len(name.encode(errors="replace")) < 256
     )
     if not inside or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-        raise WearcapError(f"mesh {name!r}", where=where, expected="a .ply file below the environment's folder",
-                           fix="Copy it there and name it relatively, as objects/sofa_1.ply.")  # fmt: skip
+        raise WearcapError(
+            f"mesh {name!r}",
+            where=where,
+            expected="a .ply file below the environment's folder",
+            fix="Copy it there and name it relatively, as objects/sofa_1.ply.",
+        )
     file = path.parent / name
     if not file.is_file():
-        raise WearcapError(f"its mesh {name} is missing", where=where, expected=str(file),
-                           fix="Copy the folder objects/ together with the environment.")  # fmt: skip
+        raise WearcapError(
+            f"its mesh {name} is missing",
+            where=where,
+            expected=str(file),
+            fix="Copy the folder objects/ together with the environment.",
+        )
     ply = read_ply(file)
     if not len(ply.points):
         raise WearcapError("an empty mesh", where=file, expected="at least one point")
@@ -153,16 +170,22 @@ def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
     if freedom.axis is not None:
         row["axis"] = list(freedom.axis)
     if limits is not None and freedom.kind not in ("hinge", "axis"):
-        raise WearcapError(f"limits of an object that is {freedom.kind!r}", where=where,
-                           expected="limits of hinges and of slides along an axis alone")  # fmt: skip
+        raise WearcapError(
+            f"limits of an object that is {freedom.kind!r}",
+            where=where,
+            expected="limits of hinges and of slides along an axis alone",
+        )
     if limits is not None:
         hinge = freedom.kind == "hinge"
         row["limits_deg" if hinge else "limits_m"] = [math.degrees(v) if hinge else v for v in limits]
     return {
-        "name": item.name, "category": item.category, "mesh": mesh,
+        "name": item.name,
+        "category": item.category,
+        "mesh": mesh,
         "R_world_object": [[_shortest(v) for v in line] for line in item.R_world_object.tolist()],
-        "t_world_object": [_shortest(v) for v in item.t_world_object.tolist()], "freedom": row,
-    }  # fmt: skip
+        "t_world_object": [_shortest(v) for v in item.t_world_object.tolist()],
+        "freedom": row,
+    }
 
 
 def _shortest(value: float) -> float:
@@ -197,24 +220,29 @@ def _check(item: SceneObject, where: str) -> None:
     pose = [*item.R_world_object.flatten().tolist(), *item.t_world_object.tolist()]
     freedom = [*(item.freedom.pivot or ()), *(item.freedom.axis or ()), *(item.freedom.limits or ())]
     if not item.name.strip() or not len(item.mesh.vertices):
-        raise WearcapError(
-            "no name, or no points", where=where, expected="a named object with a mesh or a cloud"
-        )
+        raise WearcapError("no name, or no points", where=where, expected="a named object with a mesh or a cloud")
     if not (np.isfinite([*pose, *freedom]).all() and np.isfinite(item.mesh.vertices).all()):
         raise WearcapError("numbers that are not finite", where=where, expected="finite coordinates (m)")
     _rotation(item.R_world_object.tolist(), where)
     gap = hinge_gap_m(item)
     if gap > MAX_HINGE_GAP_M:
-        raise WearcapError(f"its hinge is {gap:.2f} m from its mesh, seen from above", where=where,
-                           expected=f"at most {MAX_HINGE_GAP_M} m", fix="The pivot is a point of the world, in metres.")  # fmt: skip
+        raise WearcapError(
+            f"its hinge is {gap:.2f} m from its mesh, seen from above",
+            where=where,
+            expected=f"at most {MAX_HINGE_GAP_M} m",
+            fix="The pivot is a point of the world, in metres.",
+        )
 
 
 def _rotation(value: Any, where: str) -> Float64[np.ndarray, "3 3"]:
     """The rotation nearest to a matrix that is a rotation up to rounding."""
     R = _numbers(value, (3, 3), "R_world_object", where)
     if np.abs(R.T @ R - np.eye(3)).max() > _ORTHOGONAL_WITHIN or np.linalg.det(R) < 0:
-        raise WearcapError("R_world_object is no rotation", where=where,
-                           expected=f"an orthogonal matrix (within {_ORTHOGONAL_WITHIN}) of determinant +1")  # fmt: skip
+        raise WearcapError(
+            "R_world_object is no rotation",
+            where=where,
+            expected=f"an orthogonal matrix (within {_ORTHOGONAL_WITHIN}) of determinant +1",
+        )
     return rotation.mean_rotation(torch.from_numpy(R)[None]).numpy()
 
 

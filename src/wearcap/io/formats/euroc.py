@@ -18,14 +18,15 @@ def read_euroc(path: str | Path) -> Trajectory:
     """
     try:
         with open_text(path) as file, warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", UserWarning
-            )  # numpy warns about an empty file; the WearcapError follows
+            warnings.simplefilter("ignore", UserWarning)  # numpy warns about an empty file; the WearcapError follows
             lines = (line for line in file if line.strip() and not line.startswith("#"))
             table = np.loadtxt(lines, delimiter=",", ndmin=2, usecols=range(8))
     except ValueError as error:
-        raise WearcapError(f"not an EuRoC trajectory ({error})", where=path,
-                           expected="timestamp [ns], x, y, z, qw, qx, qy, qz in every line") from error  # fmt: skip
+        raise WearcapError(
+            f"not an EuRoC trajectory ({error})",
+            where=path,
+            expected="timestamp [ns], x, y, z, qw, qx, qy, qz in every line",
+        ) from error
     if not len(table):
         raise WearcapError("no poses in the file", where=path, expected="lines of at least 8 numbers")
     return checked_trajectory(table[:, 0] * 1e-9, table[:, 1:4], table[:, 4:8], path)

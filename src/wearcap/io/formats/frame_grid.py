@@ -23,8 +23,11 @@ def even_frames(motion: Motion) -> tuple[Int64[Tensor, "time"], float]:
         return torch.zeros(1, dtype=torch.int64), STILL_FPS
     steps, fps = motion.timestamps.diff(), nominal_fps(motion.fps)
     if not (steps > 0).all() or steps.max() > 60:
-        raise WearcapError("timestamps fall, repeat or leave a gap of over a minute", expected="rising timestamps in s",
-                           fix="Cut the motion at the gap.")  # fmt: skip
+        raise WearcapError(
+            "timestamps fall, repeat or leave a gap of over a minute",
+            expected="rising timestamps in s",
+            fix="Cut the motion at the gap.",
+        )
     start, duration = motion.timestamps[0], motion.timestamps[-1] - motion.timestamps[0]
     grid = start + torch.arange(round(duration.item() * fps) + 1, dtype=torch.float64) / fps
     midpoints = (motion.timestamps[1:] + motion.timestamps[:-1]) / 2

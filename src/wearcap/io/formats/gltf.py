@@ -26,8 +26,11 @@ _Z_UP_XYZW = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 _COMPONENT = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _TYPE = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _VERTICES, _INDICES = 34962, 34963
-_MATERIAL = {"name": "skin", "doubleSided": True, "pbrMetallicRoughness": {
-    "baseColorFactor": [0.62, 0.68, 0.76, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.7}}  # fmt: skip
+_MATERIAL = {
+    "name": "skin",
+    "doubleSided": True,
+    "pbrMetallicRoughness": {"baseColorFactor": [0.62, 0.68, 0.76, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.7},
+}
 
 
 def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -> None:
@@ -41,36 +44,32 @@ def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -
     values = [motion.R_parent_joint, motion.t_world_root]
     values += [v for track in tracks.values() for v in (track.R_world_body, track.t_world_body)]
     if len(motion) == 0 or not all(value.isfinite().all() for value in (*values, *clocks)):
-        raise WearcapError(
-            "the motion is empty or holds NaN or infinite values", where=path, expected="finite poses"
-        )
+        raise WearcapError("the motion is empty or holds NaN or infinite values", where=path, expected="finite poses")
     if not all((clock.diff() > 0).all() for clock in clocks):
         raise WearcapError("timestamps repeat or fall", where=path, expected="rising timestamps")
     joints = len(motion.skeleton)
     shown = sticks(motion.skeleton) if body is None else skin_of(body, motion.skeleton)
     figure = _Figure(start_s=min(clock[0].item() for clock in clocks))
     figure.nodes = _joint_nodes(motion)
-    figure.animate(
-        motion.timestamps, dict(enumerate(motion.R_parent_joint.unbind(1), 1)), {1: motion.t_world_root}
-    )
+    figure.animate(motion.timestamps, dict(enumerate(motion.R_parent_joint.unbind(1), 1)), {1: motion.t_world_root})
     for name, track in tracks.items():
         if len(track):
             figure.nodes[0]["children"].append(len(figure.nodes))
             figure.nodes.append({"name": name})
             node = len(figure.nodes) - 1
             figure.animate(track.timestamps, {node: track.R_world_body}, {node: track.t_world_body})
-    skin = {
-        "joints": list(range(1, 1 + joints)),
-        "skeleton": 1,
-        "inverseBindMatrices": figure.inverse_bind(shown),
-    }
+    skin = {"joints": list(range(1, 1 + joints)), "skeleton": 1, "inverseBindMatrices": figure.inverse_bind(shown)}
     figure.nodes.append({"name": "body", "mesh": 0, "skin": 0})
     document = {
         "asset": {"version": "2.0", "generator": "wearcap", "extras": dict(motion.provenance)},
-        "scene": 0, "scenes": [{"nodes": [0, len(figure.nodes) - 1]}], "nodes": figure.nodes,
-        "meshes": [{"name": "body", "primitives": [figure.primitive(shown)]}], "materials": [_MATERIAL],
-        "skins": [skin], "animations": [{"name": "motion", "samplers": figure.samplers, "channels": figure.channels}],
-    }  # fmt: skip
+        "scene": 0,
+        "scenes": [{"nodes": [0, len(figure.nodes) - 1]}],
+        "nodes": figure.nodes,
+        "meshes": [{"name": "body", "primitives": [figure.primitive(shown)]}],
+        "materials": [_MATERIAL],
+        "skins": [skin],
+        "animations": [{"name": "motion", "samplers": figure.samplers, "channels": figure.channels}],
+    }
     _write(path, document, figure)
 
 
@@ -114,12 +113,15 @@ class _Figure:
         view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": array.nbytes}
         self.views.append(view | ({"target": target} if target else {}))
         self.binary += np.ascontiguousarray(array).tobytes()
-        accessor = {"bufferView": len(self.views) - 1, "componentType": _COMPONENT[array.dtype.name],
-                    "count": len(array), "type": _TYPE[array.shape[1:]]}  # fmt: skip
+        accessor = {
+            "bufferView": len(self.views) - 1,
+            "componentType": _COMPONENT[array.dtype.name],
+            "count": len(array),
+            "type": _TYPE[array.shape[1:]],
+        }
         if bounds:
             accessor |= {
-                name: np.atleast_1d(value).tolist()
-                for name, value in (("min", array.min(0)), ("max", array.max(0)))
+                name: np.atleast_1d(value).tolist() for name, value in (("min", array.min(0)), ("max", array.max(0)))
             }
         self.accessors.append(accessor)
         return len(self.accessors) - 1

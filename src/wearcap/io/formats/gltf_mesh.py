@@ -38,8 +38,11 @@ class SkinnedMesh:
 def skin_of(body: BodyModel, skeleton: Skeleton) -> SkinnedMesh:
     """A body model's skin. Raises WearcapError when the motion's skeleton has other joints than the body."""
     if body.skeleton.joint_names != skeleton.joint_names:
-        raise WearcapError(f"the motion has skeleton {skeleton.name!r}, the body {body.skeleton.name!r}",
-                           expected="the same joints", fix="Make the body for the motion's skeleton, or retarget.")  # fmt: skip
+        raise WearcapError(
+            f"the motion has skeleton {skeleton.name!r}, the body {body.skeleton.name!r}",
+            expected="the same joints",
+            fix="Make the body for the motion's skeleton, or retarget.",
+        )
     mesh = Mesh(body.rest_vertices.float().numpy(), body.faces.int().numpy(), _GREY, smooth=True)
     weights = body.skin_weights.float().numpy()
     # Joints without weight must be named as joint 0.
@@ -49,23 +52,14 @@ def skin_of(body: BodyModel, skeleton: Skeleton) -> SkinnedMesh:
 
 def sticks(skeleton: Skeleton) -> SkinnedMesh:
     """A rounded stick along every bone and out to every site; each moves with the joint it starts from."""
-    bones = [
-        (parent, skeleton.t_parent_joint[joint]) for joint, parent in enumerate(skeleton.parents) if joint
-    ]
-    bones += [
-        (skeleton.index(site.joint), torch.tensor(site.t_joint_site)) for site in skeleton.sites.values()
-    ]
+    bones = [(parent, skeleton.t_parent_joint[joint]) for joint, parent in enumerate(skeleton.parents) if joint]
+    bones += [(skeleton.index(site.joint), torch.tensor(site.t_joint_site)) for site in skeleton.sites.values()]
     bones.append((0, torch.zeros(3)))
     owners = np.array([joint for joint, _ in bones])
     start = skeleton.rest_joints.double().numpy()[owners]
     end = start + torch.stack([offset for _, offset in bones]).double().numpy()
     mesh = capsules(
-        start,
-        end,
-        np.full(len(bones), _THICK_M),
-        np.full(len(bones), _THIN_M),
-        np.tile(_GREY, (len(bones), 1)),
-        8,
+        start, end, np.full(len(bones), _THICK_M), np.full(len(bones), _THIN_M), np.tile(_GREY, (len(bones), 1)), 8
     )
     joints = np.zeros((len(mesh.vertices), 4), dtype=np.int64)
     joints[:, 0] = np.repeat(owners, len(mesh.vertices) // len(bones))

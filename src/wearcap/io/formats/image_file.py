@@ -18,8 +18,21 @@ from wearcap.io.formats.bounded import Budget, file_size, read_bytes
 
 FORMATS = ("BMP", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
 _PIXEL_BYTES = 4
-_DAMAGE = (OSError, SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, AttributeError, struct.error,
-           zlib.error, EOFError, RuntimeError, MemoryError, Image.DecompressionBombError)  # fmt: skip
+_DAMAGE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    LookupError,
+    TypeError,
+    ArithmeticError,
+    AttributeError,
+    struct.error,
+    zlib.error,
+    EOFError,
+    RuntimeError,
+    MemoryError,
+    Image.DecompressionBombError,
+)
 """Exceptions that Pillow raises on truncated or damaged files."""
 
 
@@ -37,5 +50,6 @@ def open_image(path: str | Path, max_bytes: int | None = None) -> Iterator[Image
             budget.spend(_PIXEL_BYTES * image.width * image.height)
             yield image
     except _DAMAGE as error:
-        raise WearcapError(f"not a readable picture ({error})"[:300], where=path, expected="a JPEG or PNG file",
-                           fix="Copy it again.") from error  # fmt: skip
+        raise WearcapError(
+            f"not a readable picture ({error})"[:300], where=path, expected="a JPEG or PNG file", fix="Copy it again."
+        ) from error

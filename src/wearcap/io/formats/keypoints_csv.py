@@ -34,19 +34,17 @@ def read_keypoints(path: str | Path) -> dict[str, Cue]:
     for wrong, what, expected in (
         (~np.isfinite(times), "a timestamp that is no time", "seconds"),
         (~((confidence >= 0) & (confidence <= 1)), "a confidence that is none", "0 to 1"),
-        (
-            observed & ~(np.abs(points) <= MAX_PLACE).all(-1),
-            "a place that is none",
-            "numbers, or a confidence of 0",
-        ),
+        (observed & ~(np.abs(points) <= MAX_PLACE).all(-1), "a place that is none", "numbers, or a confidence of 0"),
         (joints == "", "no joint", "a joint's name"),
     ):
         if wrong.any():
-            raise WearcapError(what, where=f"{path}, row {int(wrong.argmax()) + 1} after the header", expected=expected)  # fmt: skip
+            raise WearcapError(what, where=f"{path}, row {int(wrong.argmax()) + 1} after the header", expected=expected)
     return {
-        str(joint): _cue(path, str(joint), *(part[observed & (joints == joint)] for part in (times, points, confidence)))
+        str(joint): _cue(
+            path, str(joint), *(part[observed & (joints == joint)] for part in (times, points, confidence))
+        )
         for joint in np.unique(joints[observed])
-    }  # fmt: skip
+    }
 
 
 def write_keypoints(cues: Mapping[str, Cue], path: str | Path) -> None:
@@ -56,23 +54,22 @@ def write_keypoints(cues: Mapping[str, Cue], path: str | Path) -> None:
     """
     axes = {cue.points.shape[-1] for cue in cues.values()}
     if len(axes) > 1 or len({cue.joint for cue in cues.values()}) < len(cues):
-        raise WearcapError("keypoints of several kinds, or twice of one joint", where=path,
-                           expected="pixels or places, one cue per joint")  # fmt: skip
+        raise WearcapError(
+            "keypoints of several kinds, or twice of one joint",
+            where=path,
+            expected="pixels or places, one cue per joint",
+        )
     rows = []
     for cue in cues.values():
         observed = (cue.confidence > 0) & cue.points.isfinite().all(-1)
         for time, point, confidence in zip(
-            cue.timestamps[observed].tolist(),
-            cue.points[observed].tolist(),
-            cue.confidence[observed].tolist(),
+            cue.timestamps[observed].tolist(), cue.points[observed].tolist(), cue.confidence[observed].tolist()
         ):
             rows.append((time, cue.joint, [*point, confidence]))
     if not rows:
         raise WearcapError("no keypoints to write", where=path, expected="one at least")
     lines = [",".join(["timestamp", "joint", *AXES[: axes.pop()], "confidence"])]
-    lines += [
-        ",".join([repr(time), joint, *(f"{v:.9g}" for v in rest)]) for time, joint, rest in sorted(rows)
-    ]
+    lines += [",".join([repr(time), joint, *(f"{v:.9g}" for v in rest)]) for time, joint, rest in sorted(rows)]
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -81,8 +78,10 @@ def _cue(path: str | Path, joint: str, times: np.ndarray, points: np.ndarray, co
     times = times[order]
     if (np.diff(times) == 0).any():
         twice = times[:-1][np.diff(times) == 0][0]
-        raise WearcapError(f"{joint!r} is twice at {twice:.6f} s", where=path, expected="one row per joint and time")  # fmt: skip
+        raise WearcapError(f"{joint!r} is twice at {twice:.6f} s", where=path, expected="one row per joint and time")
     return Cue(
-        torch.from_numpy(times), joint, torch.from_numpy(points[order]).float(),
+        torch.from_numpy(times),
+        joint,
+        torch.from_numpy(points[order]).float(),
         torch.from_numpy(confidence[order]).float(),
-    )  # fmt: skip
+    )

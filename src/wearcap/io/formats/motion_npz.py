@@ -46,8 +46,12 @@ def read_motion(path: str | Path) -> Motion:
     """Read what `write_motion` wrote. Raises WearcapError when it is missing, damaged, not finite or foreign."""
     arrays = read_npz(path)
     if "wearcap" not in arrays:
-        raise WearcapError("an .npz file, but not of ours", where=path, expected="one that write_motion wrote",
-                           fix="AMASS files are read by io.datasets.amass.")  # fmt: skip
+        raise WearcapError(
+            "an .npz file, but not of ours",
+            where=path,
+            expected="one that write_motion wrote",
+            fix="AMASS files are read by io.datasets.amass.",
+        )
     try:
         tree = parse_json(str(arrays.pop("wearcap")), path)
         version = tree["schema"]
@@ -73,19 +77,22 @@ def _check(motion: Motion, path: str | Path) -> None:
     if not isinstance(motion, Motion):
         raise WearcapError("holds no motion", where=path)
     skeleton = motion.skeleton
-    arrays = {"timestamps": motion.timestamps, "R_parent_joint": motion.R_parent_joint,
-              "t_world_root": motion.t_world_root, "t_parent_joint": skeleton.t_parent_joint}  # fmt: skip
+    arrays = {
+        "timestamps": motion.timestamps,
+        "R_parent_joint": motion.R_parent_joint,
+        "t_world_root": motion.t_world_root,
+        "t_parent_joint": skeleton.t_parent_joint,
+    }
     shapes: dict[str, tuple[int | str, ...]] = {
-        "timestamps": ("time",), "R_parent_joint": ("time", len(skeleton), 3, 3), "t_world_root": ("time", 3),
+        "timestamps": ("time",),
+        "R_parent_joint": ("time", len(skeleton), 3, 3),
+        "t_world_root": ("time", 3),
         "t_parent_joint": (len(skeleton), 3),
-    }  # fmt: skip
+    }
     if motion.contact_prob is not None:
         arrays["contact_prob"], shapes["contact_prob"] = motion.contact_prob, ("time", "patch")
     if motion.hand_contact_prob is not None:
-        arrays["hand_contact_prob"], shapes["hand_contact_prob"] = (
-            motion.hand_contact_prob,
-            ("time", len(HANDS)),
-        )
+        arrays["hand_contact_prob"], shapes["hand_contact_prob"] = (motion.hand_contact_prob, ("time", len(HANDS)))
     if motion.body_contact_prob is not None:
         arrays["body_contact_prob"] = motion.body_contact_prob
         shapes["body_contact_prob"] = ("time", "point")
@@ -120,15 +127,11 @@ def _check_interactions(interactions: Interactions, path: str | Path) -> None:
         "stop_s": interactions.stop_s.numpy(),
         "hands": interactions.hands.numpy().astype(np.uint8),
     }
-    count = require(
-        arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS))
-    )["interval"]
+    count = require(arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS)))[
+        "interval"
+    ]
     if {interactions.start_s.dtype, interactions.stop_s.dtype} != {torch.float64}:
         raise TypeError("times of interactions of another number type")
     for names in (interactions.objects, interactions.classes):
-        if (
-            not isinstance(names, tuple)
-            or len(names) != count
-            or not all(isinstance(name, str) for name in names)
-        ):
+        if not isinstance(names, tuple) or len(names) != count or not all(isinstance(name, str) for name in names):
             raise ValueError(f"names that do not match {count} interactions")

@@ -34,8 +34,16 @@ _CHUNK, _MAX_SILENCE = 1 << 16, 1 << 26
 _MAX_NUMBER = 64
 """Most characters of a number."""
 
-_SIDED = {"shoulder": "collar", "upperarm": "shoulder", "forearm": "elbow", "hand": "wrist", "upperleg": "hip",
-          "lowerleg": "knee", "foot": "ankle", "toe": "toe"}  # fmt: skip
+_SIDED = {
+    "shoulder": "collar",
+    "upperarm": "shoulder",
+    "forearm": "elbow",
+    "hand": "wrist",
+    "upperleg": "hip",
+    "lowerleg": "knee",
+    "foot": "ankle",
+    "toe": "toe",
+}
 _JOINT_OF = {name: name for name in ("pelvis", "l5", "l3", "t12", "t8", "neck", "head")} | {
     side + segment: f"{side}_{joint}" for side in ("left", "right") for segment, joint in _SIDED.items()
 }
@@ -49,9 +57,12 @@ _SITE_OF = {"ptopofhead": "crown"} | {
 """Anatomical points of the segments that are wearcap's sites."""
 
 _FIELDS = {
-    "orientation": ("segments", 4), "position": ("segments", 3), "footContacts": ("contacts", 1),
-    "sensorFreeAcceleration": ("sensors", 3), "sensorOrientation": ("sensors", 4),
-}  # fmt: skip
+    "orientation": ("segments", 4),
+    "position": ("segments", 3),
+    "footContacts": ("contacts", 1),
+    "sensorFreeAcceleration": ("sensors", 3),
+    "sensorOrientation": ("sensors", 4),
+}
 """Fields of each frame: the list of items that a field covers, and the number of values per item."""
 
 _REST_TYPES = ("identity", "tpose")
@@ -90,11 +101,16 @@ def read_mvnx(path: str | Path, max_bytes: int | None = None) -> Recording:
             for element in _elements(iterparse(chunks, events=("start", "end"), forbid_dtd=True), chunks):
                 _take(file, element)
     except DefusedXmlException as error:
-        raise WearcapError("it declares a document type or entities", where=path, expected="plain MVNX as MVN exports it",
-                           fix="Such declarations can blow up or fetch other files, and are never read.") from error  # fmt: skip
+        raise WearcapError(
+            "it declares a document type or entities",
+            where=path,
+            expected="plain MVNX as MVN exports it",
+            fix="Such declarations can blow up or fetch other files, and are never read.",
+        ) from error
     except ParseError as error:
-        raise WearcapError(f"broken XML ({error.msg})", where=path, expected="a whole MVNX file",
-                           fix="Export or copy it again.") from error  # fmt: skip
+        raise WearcapError(
+            f"broken XML ({error.msg})", where=path, expected="a whole MVNX file", fix="Export or copy it again."
+        ) from error
     except (ValueError, LookupError) as error:
         raise WearcapError(f"cannot be understood ({error})", where=file.path, expected="MVNX") from error
     return _recording(file)
@@ -179,9 +195,7 @@ def _take_frame(file: _File, element: Element) -> None:
     if kind not in (*_REST_TYPES, "normal"):
         return
     _require_segments(file)
-    values = {
-        name: _field(file, name, child.text or "") for child in element if (name := _name(child)) in _FIELDS
-    }
+    values = {name: _field(file, name, child.text or "") for child in element if (name := _name(child)) in _FIELDS}
     if kind in _REST_TYPES:
         file.rest[kind] = values
     else:
@@ -198,8 +212,9 @@ def _take_frame(file: _File, element: Element) -> None:
 
 def _require_segments(file: _File) -> None:
     if missing := sorted(set(_JOINT_OF) - set(file.segments)):
-        raise WearcapError(f"segments {missing[:5]} are missing", where=file.path,
-                           expected="the 23 segments of a full-body suit")  # fmt: skip
+        raise WearcapError(
+            f"segments {missing[:5]} are missing", where=file.path, expected="the 23 segments of a full-body suit"
+        )
 
 
 def _field(file: _File, name: str, text: str) -> np.ndarray:
@@ -220,9 +235,7 @@ def _field(file: _File, name: str, text: str) -> np.ndarray:
 def _recording(file: _File) -> Recording:
     _require_segments(file)
     if not file.fps:
-        raise WearcapError(
-            "no subject with a frame rate", where=file.path, expected='<subject frameRate="60">'
-        )
+        raise WearcapError("no subject with a frame rate", where=file.path, expected='<subject frameRate="60">')
     if not file.index:
         raise WearcapError("no frames of motion", where=file.path, expected='frames of type "normal"')
     timestamps = _timestamps(file)
@@ -231,10 +244,16 @@ def _recording(file: _File) -> Recording:
     t_world = torch.from_numpy(np.stack(file.frames["position"])).unflatten(1, (-1, 3))[:, rows]
     skeleton = _fitted(file, skeleton, rows, R_world, t_world)
     motion = Motion(
-        timestamps, skeleton, local_rotations(skeleton, R_world).float(), t_world[:, 0].float(),
-        contact_prob=_contacts(file), provenance={"source": file.path.name, "format": "mvnx"},
-    )  # fmt: skip
-    return Recording(file.path.name.split(".")[0], motion=motion, skeleton=skeleton, imu=_imu(file, timestamps), source="Xsens MVNX")  # fmt: skip
+        timestamps,
+        skeleton,
+        local_rotations(skeleton, R_world).float(),
+        t_world[:, 0].float(),
+        contact_prob=_contacts(file),
+        provenance={"source": file.path.name, "format": "mvnx"},
+    )
+    return Recording(
+        file.path.name.split(".")[0], motion=motion, skeleton=skeleton, imu=_imu(file, timestamps), source="Xsens MVNX"
+    )
 
 
 def _label_of(joint: str) -> str:
@@ -249,8 +268,11 @@ def _timestamps(file: _File) -> Tensor:
     timestamps = (index - index[0]) / file.fps
     span_s = (file.time_ms[-1] - file.time_ms[0]) / 1000
     if np.isfinite(span_s) and abs(span_s - timestamps[-1].item()) > 0.01 * span_s + 0.05:
-        warnings.warn(f"{file.path}: frame times span {span_s:.3f} s, but {len(index)} frames at {file.fps:g} Hz span "
-                      f"{timestamps[-1]:.3f} s; the frame rate is believed", stacklevel=4)  # fmt: skip
+        warnings.warn(
+            f"{file.path}: frame times span {span_s:.3f} s, but {len(index)} frames at {file.fps:g} Hz span "
+            f"{timestamps[-1]:.3f} s; the frame rate is believed",
+            stacklevel=4,
+        )
     return timestamps
 
 
@@ -259,8 +281,11 @@ def _quaternions(file: _File, name: str) -> Float[Tensor, "time segment 4"]:
     wrong = ((quat_wxyz.norm(dim=-1) - 1).abs() > 0.02).nonzero()
     if len(wrong):
         frame, element = wrong[0].tolist()
-        raise WearcapError(f"{name} {element} is no unit quaternion", where=f"{file.path}, frame {file.index[frame]}",
-                           expected="w x y z of length 1")  # fmt: skip
+        raise WearcapError(
+            f"{name} {element} is no unit quaternion",
+            where=f"{file.path}, frame {file.index[frame]}",
+            expected="w x y z of length 1",
+        )
     return quat_wxyz
 
 
@@ -281,18 +306,21 @@ def _fitted(
     offsets = moving.median(0).values
     for kind in reversed(_REST_TYPES):
         if {"orientation", "position"} <= set(file.rest.get(kind, {})):
-            R = matrix_from_quat_wxyz(torch.from_numpy(file.rest[kind]["orientation"]).unflatten(0, (-1, 4)))[
-                rows
-            ]
+            R = matrix_from_quat_wxyz(torch.from_numpy(file.rest[kind]["orientation"]).unflatten(0, (-1, 4)))[rows]
             offsets = bones(R, torch.from_numpy(file.rest[kind]["position"]).unflatten(0, (-1, 3))[rows])
     change = (moving - offsets).norm(dim=-1).amax(0)
     if change.max() > BONE_CHANGE_M:
         worst = skeleton.joint_names[int(change.argmax())]
-        warnings.warn(f"{file.path}: {worst!r} is up to {change.max():.3f} m away from where the wearer's bones put it",
-                      stacklevel=4)  # fmt: skip
+        warnings.warn(
+            f"{file.path}: {worst!r} is up to {change.max():.3f} m away from where the wearer's bones put it",
+            stacklevel=4,
+        )
     fitted = skeleton.with_offsets(offsets.float())
-    points = {_SITE_OF[label]: Site(_JOINT_OF[segment], tuple(at)) for label, (segment, at) in file.points.items()
-              if label in _SITE_OF and segment in _JOINT_OF and len(at) == 3}  # fmt: skip
+    points = {
+        _SITE_OF[label]: Site(_JOINT_OF[segment], tuple(at))
+        for label, (segment, at) in file.points.items()
+        if label in _SITE_OF and segment in _JOINT_OF and len(at) == 3
+    }
     return replace(fitted, sites=fitted.sites | points)
 
 
@@ -308,9 +336,7 @@ def _contacts(file: _File) -> Float[Tensor, "time patch"] | None:
         side, part = patch.split("_")[:2]
         found = [k for k, label in enumerate(file.contacts) if side in label and part in label]
         if len(found) != 1:
-            raise WearcapError(
-                f"foot contacts {file.contacts}", where=file.path, expected="heel and toe of both feet"
-            )
+            raise WearcapError(f"foot contacts {file.contacts}", where=file.path, expected="heel and toe of both feet")
         columns.append(found[0])
     return contacts[:, columns]
 
@@ -320,9 +346,7 @@ def _imu(file: _File, timestamps: Tensor) -> dict[str, ImuStream]:
     streams: dict[str, ImuStream] = {}
     parts: dict[str, Any] = {}
     if file.frames["sensorFreeAcceleration"]:
-        parts["acc_world"] = torch.from_numpy(np.stack(file.frames["sensorFreeAcceleration"])).unflatten(
-            1, (-1, 3)
-        )
+        parts["acc_world"] = torch.from_numpy(np.stack(file.frames["sensorFreeAcceleration"])).unflatten(1, (-1, 3))
     if file.frames["sensorOrientation"]:
         parts["R_world_imu"] = matrix_from_quat_wxyz(_quaternions(file, "sensorOrientation"))
     for k, label in enumerate(file.sensors if parts else []):

@@ -23,9 +23,24 @@ MAX_BYTES = 1 << 32
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _MAX_HEADER = 1 << 14
 _CHUNK = 1 << 20
-DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, ValueError, OSError,
-          NotImplementedError, RuntimeError, SyntaxError, tokenize.TokenError, LookupError, TypeError,
-          OverflowError, MemoryError, AttributeError)  # fmt: skip
+DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    EOFError,
+    ValueError,
+    OSError,
+    NotImplementedError,
+    RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,
+    LookupError,
+    TypeError,
+    OverflowError,
+    MemoryError,
+    AttributeError,
+)
 """Exceptions that zipfile and numpy raise on truncated or damaged files."""
 
 
@@ -52,13 +67,15 @@ def read_npz(
             raise
     except DAMAGE as error:
         where = f"{path}, array {name!r}" if name else path
-        raise WearcapError(f"not a readable .npz file ({error})"[:300], where=where, expected="arrays saved by NumPy",
-                           fix="Fetch the file again.") from error  # fmt: skip
+        raise WearcapError(
+            f"not a readable .npz file ({error})"[:300],
+            where=where,
+            expected="arrays saved by NumPy",
+            fix="Fetch the file again.",
+        ) from error
 
 
-def _read_member(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, name: str, budget: Budget
-) -> np.ndarray:
+def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, name: str, budget: Budget) -> np.ndarray:
     with archive.open(info) as file:
         head = io.BytesIO(file.read(_MAX_HEADER))
         shape, fortran, dtype = _header(head, f"{path}, array {name!r}")
@@ -68,11 +85,7 @@ def _read_member(
         budget.spend(size)
         array = np.empty(math.prod(shape), dtype)
         _fill(memoryview(array.view(np.uint8)) if size else memoryview(bytearray()), head, file)
-    if (
-        dtype.kind == "U"
-        and size
-        and (array.view(np.dtype("u4").newbyteorder(dtype.byteorder)) > sys.maxunicode).any()
-    ):
+    if dtype.kind == "U" and size and (array.view(np.dtype("u4").newbyteorder(dtype.byteorder)) > sys.maxunicode).any():
         raise ValueError("text with characters that are none")
     return array.reshape(shape, order="F").copy(order="C") if fortran else array.reshape(shape)
 
@@ -84,8 +97,12 @@ def _header(head: io.BytesIO, where: str) -> tuple[tuple[int, ...], bool, np.dty
         raise ValueError(f"array format {version}")
     shape, fortran, dtype = _HEADERS[version](head)
     if dtype.hasobject:
-        raise WearcapError("it holds Python objects", where=where, expected="plain numbers or text",
-                           fix="Such arrays can run code when they are loaded and are never read.")  # fmt: skip
+        raise WearcapError(
+            "it holds Python objects",
+            where=where,
+            expected="plain numbers or text",
+            fix="Such arrays can run code when they are loaded and are never read.",
+        )
     if dtype.kind not in "biufcSU":
         raise WearcapError(f"an array of {dtype}"[:100], where=where, expected="plain numbers or text")
     if any(length < 0 for length in shape):
@@ -121,13 +138,15 @@ def map_npy(path: str | Path) -> np.ndarray:
         with explained(path):
             raise
     except DAMAGE as error:
-        raise WearcapError(f"not a readable .npy file ({error})"[:300], where=path,
-                           expected="an array of numbers", fix="Fetch the file again.") from error  # fmt: skip
+        raise WearcapError(
+            f"not a readable .npy file ({error})"[:300],
+            where=path,
+            expected="an array of numbers",
+            fix="Fetch the file again.",
+        ) from error
 
 
-def require(
-    arrays: dict[str, np.ndarray], path: str | Path, **shapes: tuple[int | str, ...]
-) -> dict[str, int]:
+def require(arrays: dict[str, np.ndarray], path: str | Path, **shapes: tuple[int | str, ...]) -> dict[str, int]:
     """Check that arrays are there, finite numbers, and of one consistent shape; returns the named sizes.
 
     `require(arrays, path, trans=("time", 3))` demands three columns and gives {"time": rows}.
@@ -148,5 +167,7 @@ def require(
             raise WearcapError(f"array {key!r} is of type {array.dtype}", where=path, expected="real numbers")
         if not np.isfinite(array).all():
             row = np.argwhere(~np.isfinite(array))[0].tolist()
-            raise WearcapError(f"array {key!r} holds NaN or infinity, first at {row}", where=path, expected="finite numbers")  # fmt: skip
+            raise WearcapError(
+                f"array {key!r} holds NaN or infinity, first at {row}", where=path, expected="finite numbers"
+            )
     return sizes

@@ -28,7 +28,13 @@ MAX_MISFIT_PX = 0.5
 MAX_DISAGREEMENT_PX = 3.0
 """Largest disagreement of a file's two polynomials, which are fits to each other."""
 _COUNTS = {"world2cam": (2, 64), "cam2world": (3, 64)}
-_TEXT_LINES = ("the direct polynomial", "the inverse polynomial", "the centre", "the affine parameters", "the image size")  # fmt: skip
+_TEXT_LINES = (
+    "the direct polynomial",
+    "the inverse polynomial",
+    "the centre",
+    "the affine parameters",
+    "the image size",
+)
 
 
 @dataclass(frozen=True)
@@ -55,24 +61,32 @@ class OCamModel:
         c, d, e = self.affine
         determinant = c - d * e
         if not (0 < self.width <= _MAX_SIDE and 0 < self.height <= _MAX_SIDE and 0.1 < determinant < 10):
-            raise WearcapError(f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}",
-                               where=where, expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0")  # fmt: skip
+            raise WearcapError(
+                f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}",
+                where=where,
+                expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0",
+            )
         if not (0 <= self.row < self.height and 0 <= self.column < self.width):
-            raise WearcapError(f"its centre, row {self.row:g} and column {self.column:g}, is outside the image of "
-                               f"{self.height} rows and {self.width} columns", where=where,
-                               expected="row first, then column")  # fmt: skip
+            raise WearcapError(
+                f"its centre, row {self.row:g} and column {self.column:g}, is outside the image of "
+                f"{self.height} rows and {self.width} columns",
+                where=where,
+                expected="row first, then column",
+            )
         focal = -self.pol[0]
         if focal <= 0:
-            raise WearcapError(f"its direct polynomial begins with {self.pol[0]:g}", where=where,
-                               expected="a negative number (the axis points backwards)")  # fmt: skip
+            raise WearcapError(
+                f"its direct polynomial begins with {self.pol[0]:g}",
+                where=where,
+                expected="a negative number (the axis points backwards)",
+            )
         rho, theta = self._curve(determinant, where)
         powers, misfit = _fitted(rho / focal, theta)
         if misfit * focal > MAX_MISFIT_PX:
-            raise WearcapError(f"its polynomial is met only within {misfit * focal:.2f} px", where=where,
-                               expected="a fisheye lens")  # fmt: skip
-        return Camera(
-            "ocam", self.width, self.height, focal, focal, self.column, self.row, (c, d, e, *powers)
-        )
+            raise WearcapError(
+                f"its polynomial is met only within {misfit * focal:.2f} px", where=where, expected="a fisheye lens"
+            )
+        return Camera("ocam", self.width, self.height, focal, focal, self.column, self.row, (c, d, e, *powers))
 
     def _curve(self, determinant: float, where: str | Path) -> tuple[np.ndarray, np.ndarray]:
         """Radii ρ (pixels) up to the image's furthest corner, and their angles θ from the axis (rad)."""
@@ -89,15 +103,21 @@ class OCamModel:
         last = int(falling.argmax()) if falling.any() else len(rho) - 1
         # If the polynomial turns within the image, the lens's image circle is smaller than the picture.
         if last < len(rho) // 4:
-            raise WearcapError(f"its direct polynomial turns back {rho[last]:.0f} px from the centre", where=where,
-                               expected="angles that rise with the radius")  # fmt: skip
+            raise WearcapError(
+                f"its direct polynomial turns back {rho[last]:.0f} px from the centre",
+                where=where,
+                expected="angles that rise with the radius",
+            )
         rho, theta = rho[: last + 1], theta[: last + 1]
         if self.invpol:
             disagreement = np.abs(np.polynomial.polynomial.polyval(theta - np.pi / 2, self.invpol) - rho)
             central = disagreement[theta < 0.8 * theta[-1]]
             if central.max() > MAX_DISAGREEMENT_PX:
-                raise WearcapError(f"its two polynomials differ by up to {central.max():.3g} px", where=where,
-                                   expected="two fits of one lens")  # fmt: skip
+                raise WearcapError(
+                    f"its two polynomials differ by up to {central.max():.3g} px",
+                    where=where,
+                    expected="two fits of one lens",
+                )
         return rho, theta
 
 
@@ -121,8 +141,11 @@ def read_ocamcalib(path: str | Path) -> OCamModel:
         if line.strip() and not line.lstrip().startswith(("#", "%"))
     ]
     if len(rows) < len(_TEXT_LINES):
-        raise WearcapError(f"it lacks {_TEXT_LINES[len(rows)]}", where=path, expected="calib_results.txt of OCamCalib: "
-                           f"lines of numbers for {', '.join(_TEXT_LINES)}")  # fmt: skip
+        raise WearcapError(
+            f"it lacks {_TEXT_LINES[len(rows)]}",
+            where=path,
+            expected=f"calib_results.txt of OCamCalib: lines of numbers for {', '.join(_TEXT_LINES)}",
+        )
     values = []
     for what, counted, (number, tokens) in zip(_TEXT_LINES, (True, True, False, False, False), rows):
         try:
@@ -134,9 +157,7 @@ def read_ocamcalib(path: str | Path) -> OCamModel:
         values.append(line[1:] if counted else line)
     for what, count, line, (number, _) in zip(_TEXT_LINES[2:], (2, 3, 2), values[2:], rows[2:]):
         if len(line) != count:
-            raise WearcapError(
-                f"{what} with {len(line)} numbers", where=at_line(path, number), expected=f"{count}"
-            )
+            raise WearcapError(f"{what} with {len(line)} numbers", where=at_line(path, number), expected=f"{count}")
     pol, invpol, centre, affine, size = (tuple(line.tolist()) for line in values)
     return OCamModel(pol, invpol, *centre, affine, width=int(size[1]), height=int(size[0]))  # pyright: ignore[reportArgumentType]
 
@@ -151,10 +172,13 @@ def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
     try:
         root = fromstring(text, forbid_dtd=True)
     except DefusedXmlException as error:
-        raise WearcapError("it declares a document type or entities", where=path, expected="a plain sensor_frame.xml") from error  # fmt: skip
+        raise WearcapError(
+            "it declares a document type or entities", where=path, expected="a plain sensor_frame.xml"
+        ) from error
     except (ParseError, ValueError) as error:
-        raise WearcapError(f"broken XML ({error})", where=path, expected="a whole sensor_frame.xml",
-                           fix="Copy it again.") from error  # fmt: skip
+        raise WearcapError(
+            f"broken XML ({error})", where=path, expected="a whole sensor_frame.xml", fix="Copy it again."
+        ) from error
     found: dict[str, OCamModel] = {}
     for element in (item for item in root.iter() if _tag(item) == "CameraModel"):
         name = _text(element, "SensorName", path)
@@ -165,9 +189,7 @@ def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
             raise WearcapError("the camera is there twice", where=where)
         found[name] = _from_xml(element, where)
     if not found:
-        raise WearcapError(
-            "no cameras", where=path, expected="CameraModel elements with an OCamModel (NavVis)"
-        )
+        raise WearcapError("no cameras", where=path, expected="CameraModel elements with an OCamModel (NavVis)")
     return found
 
 
@@ -180,11 +202,13 @@ def _from_xml(element: Element, where: str) -> OCamModel:
         holder = _child(lens, name)
         coefficients = [] if holder is None else [item.text or "" for item in holder if _tag(item) == "coeff"]
         if not least <= len(coefficients) <= most and (name == "cam2world" or coefficients):
-            raise WearcapError(f"{name} with {len(coefficients)} coefficients", where=where, expected=f"at least {least}")  # fmt: skip
+            raise WearcapError(
+                f"{name} with {len(coefficients)} coefficients", where=where, expected=f"at least {least}"
+            )
         polynomials[name] = tuple(_number(item, name, where) for item in coefficients)
     c, d, e, cx, cy = (_number(_text(lens, name, where), name, where) for name in ("c", "d", "e", "cx", "cy"))
     width, height = (_number(_text(size, name, where), name, where) for name in ("Width", "Height"))
-    return OCamModel(polynomials["cam2world"], polynomials["world2cam"], cx, cy, (c, d, e), int(width), int(height))  # fmt: skip
+    return OCamModel(polynomials["cam2world"], polynomials["world2cam"], cx, cy, (c, d, e), int(width), int(height))
 
 
 def _tag(element: Element) -> str:

@@ -42,8 +42,7 @@ def read_pcd(path: str | Path) -> Ply:
         points = np.stack([rows[axis] for axis in "xyz"], 1).astype(np.float32)
     valid = np.isfinite(points).all(1)
     packed = next(
-        (rows[name] for name in ("rgb", "rgba") if name in (dtype.names or ()) and dtype[name].itemsize == 4),
-        None,
+        (rows[name] for name in ("rgb", "rgba") if name in (dtype.names or ()) and dtype[name].itemsize == 4), None
     )
     colors = None if packed is None else _unpacked_colors(packed)[valid]
     return Ply(points[valid], colors)
@@ -55,17 +54,18 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[dict[str, list[str]], 
     while "DATA" not in header:
         stop = data.find(b"\n", start, _MAX_HEADER_BYTES)
         if stop < 0:
-            raise WearcapError(
-                "not a PCD file, or its header is cut short", where=path, expected="lines up to `DATA`"
-            )
+            raise WearcapError("not a PCD file, or its header is cut short", where=path, expected="lines up to `DATA`")
         words = data[start:stop].decode("ascii", errors="replace").split("#")[0].split()
         if words:
             header[words[0]] = words[1:] or [""]
         start = stop + 1
     missing = {"FIELDS", "SIZE", "TYPE", "POINTS"} - set(header)
     if missing or not (header["POINTS"][0].isdigit() and len(header["POINTS"][0]) < 15):
-        raise WearcapError(f"its header lacks {', '.join(sorted(missing)) or 'a count of points'}", where=path,
-                           expected="a PCD 0.7 header")  # fmt: skip
+        raise WearcapError(
+            f"its header lacks {', '.join(sorted(missing)) or 'a count of points'}",
+            where=path,
+            expected="a PCD 0.7 header",
+        )
     return header, start
 
 
@@ -83,14 +83,18 @@ def _row_type(header: dict[str, list[str]], path: str | Path) -> np.dtype:
             raise WearcapError("no fields x, y, z", where=path, expected="a point cloud")
         return np.dtype(fields)
     except (LookupError, ValueError, TypeError) as error:
-        raise WearcapError(f"its header cannot be understood ({error})"[:200], where=path,
-                           expected="a SIZE, TYPE and COUNT for every field") from error  # fmt: skip
+        raise WearcapError(
+            f"its header cannot be understood ({error})"[:200],
+            where=path,
+            expected="a SIZE, TYPE and COUNT for every field",
+        ) from error
 
 
 def _require(complete: bool, path: str | Path) -> None:
     if not complete:
-        raise WearcapError("it holds fewer points than its header states", where=path,
-                           fix="The file was cut short: copy it again.")  # fmt: skip
+        raise WearcapError(
+            "it holds fewer points than its header states", where=path, fix="The file was cut short: copy it again."
+        )
 
 
 def _ascii_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path) -> np.ndarray:
@@ -114,8 +118,9 @@ def _compressed_rows(body: memoryview, dtype: np.dtype, count: int, path: str | 
     try:
         plain = lzf_decompress(body[8 : 8 + compressed], size)
     except ValueError as error:
-        raise WearcapError(f"its compressed data is damaged ({error})", where=path,
-                           fix="Copy the file again.") from error  # fmt: skip
+        raise WearcapError(
+            f"its compressed data is damaged ({error})", where=path, fix="Copy the file again."
+        ) from error
     rows, start = np.empty(count, dtype), 0
     for name in dtype.names or ():
         width = dtype[name].itemsize

@@ -34,9 +34,7 @@ def read_photos(folder: str | Path) -> list[Photo]:
         if not isinstance(rows, list):
             raise TypeError("its 'photos' are no list")
     except (KeyError, TypeError) as error:
-        raise WearcapError(
-            f"not a readable list of photos ({error})", where=path, expected=_EXAMPLE
-        ) from error
+        raise WearcapError(f"not a readable list of photos ({error})", where=path, expected=_EXAMPLE) from error
     return [_photo(row, folder, f"{path}, photo {number}") for number, row in enumerate(rows)]
 
 
@@ -51,10 +49,13 @@ def write_photos(photos: list[Photo], folder: str | Path) -> None:
                 raise WearcapError("this photo is outside its scene", where=file, expected=f"in {folder}")
             file = file.relative_to(folder)
         rows.append(
-            {"file": file.as_posix(), "camera": camera_row(photo.camera),
-             "R_world_cam": photo.T_world_cam.R.double().tolist(),
-             "t_world_cam": photo.T_world_cam.t.double().tolist()}
-        )  # fmt: skip
+            {
+                "file": file.as_posix(),
+                "camera": camera_row(photo.camera),
+                "R_world_cam": photo.T_world_cam.R.double().tolist(),
+                "t_world_cam": photo.T_world_cam.t.double().tolist(),
+            }
+        )
     write_text(folder / FILE_NAME, json.dumps({"photos": rows}, indent=1) + "\n")
 
 
@@ -69,9 +70,7 @@ def _photo(row: Any, folder: Path, where: str) -> Photo:
     if file.is_absolute() or ".." in file.parts:
         raise WearcapError(f"file {str(file)!r} is outside the scene's folder", where=where)
     if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
-        raise WearcapError(
-            f"a pose of shapes {R.shape} and {t.shape}", where=where, expected="finite 3x3 and 3"
-        )
+        raise WearcapError(f"a pose of shapes {R.shape} and {t.shape}", where=where, expected="finite 3x3 and 3")
     if np.abs(R @ R.T - np.eye(3)).max() > _NOT_ORTHONORMAL or np.linalg.det(R) < 0:
         raise WearcapError("R_world_cam is no rotation", where=where, expected="an orthonormal 3x3 matrix")
     return Photo(folder / file, lens, Rigid(torch.from_numpy(R).float(), torch.from_numpy(t).float()))

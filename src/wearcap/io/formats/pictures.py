@@ -12,9 +12,7 @@ from wearcap.io.formats.video import read_frames, read_image, video_info
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 
 
-def read_pictures(
-    source: str | Path, max_count: int
-) -> Iterator[tuple[str, UInt8[np.ndarray, "height width 3"]]]:
+def read_pictures(source: str | Path, max_count: int) -> Iterator[tuple[str, UInt8[np.ndarray, "height width 3"]]]:
     """Yield (name, RGB picture) of up to `max_count` files of a folder, by name, or evenly spaced frames of a video.
 
     Raises WearcapError when there is no picture, and for one that cannot be decoded, naming it.
@@ -32,6 +30,4 @@ def read_pictures(
         for count, (_, picture) in enumerate(read_frames(source, step=step)):
             yield f"frame {count * step}", picture
     else:
-        raise WearcapError(
-            "no such file or folder", where=source, expected="a video, or a folder of pictures"
-        )
+        raise WearcapError("no such file or folder", where=source, expected="a video, or a folder of pictures")

@@ -16,10 +16,23 @@ from wearcap.files import atomic_path
 from wearcap.io.formats.bounded import read_bytes
 
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 _BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER_BYTES = 1 << 16
 _MAX_EVEN_BYTES = 1 << 28
@@ -67,16 +80,17 @@ def read_ply(path: str | Path) -> Ply:
         tables = _read_ascii(elements, memoryview(data)[body:], path)
     else:
         tables = _read_binary(elements, data, body, byte_order, path)
-    vertex = {
-        name: column for name, column in tables.get("vertex", {}).items() if isinstance(column, np.ndarray)
-    }
+    vertex = {name: column for name, column in tables.get("vertex", {}).items() if isinstance(column, np.ndarray)}
     if not {"x", "y", "z"} <= set(vertex):
         raise WearcapError("no vertices with x, y, z", where=path, expected="a PLY with `element vertex`")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is refused below
         points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float32)
     if not np.isfinite(points).all():
-        raise WearcapError(f"{int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite", where=path,
-                           expected="finite coordinates")  # fmt: skip
+        raise WearcapError(
+            f"{int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite",
+            where=path,
+            expected="finite coordinates",
+        )
     return Ply(points, _colors(vertex), _triangles(tables.get("face", {}), len(points), path))
 
 
@@ -109,8 +123,9 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
     stop = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
     newline = data.find(b"\n", stop)
     if stop < 0 or newline < 0:
-        raise WearcapError("its header has no end", where=path, expected="`end_header`",
-                           fix="The file was cut short: copy it again.")  # fmt: skip
+        raise WearcapError(
+            "its header has no end", where=path, expected="`end_header`", fix="The file was cut short: copy it again."
+        )
     byte_order, elements = "", []
     try:
         for line in data[:stop].decode("ascii").splitlines()[1:]:
@@ -129,24 +144,23 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
         raise WearcapError(
             f"its header cannot be understood ({error})"[:200], where=path, expected="a PLY 1.0 header"
         ) from error
-    names = [
-        [element.name for element in elements],
-        *([p.name for p in element.properties] for element in elements),
-    ]
+    names = [[element.name for element in elements], *([p.name for p in element.properties] for element in elements)]
     if any(len(set(group)) < len(group) or any(name.startswith("#") for name in group) for group in names):
         raise WearcapError("its header names a part twice", where=path, expected="a PLY 1.0 header")
     if not byte_order or any(not 0 <= element.count < 1 << 48 for element in elements):
         raise WearcapError(
-            "its header names no format, or an impossible or negative count",
-            where=path,
-            expected="a PLY 1.0 header",
+            "its header names no format, or an impossible or negative count", where=path, expected="a PLY 1.0 header"
         )
     return byte_order, elements, newline + 1
 
 
 def _cut_short(path: str | Path, element: _Element) -> WearcapError:
-    return WearcapError(f"it ends inside its {element.count} {element.name} rows", where=path,
-                        expected="as many rows as the header states", fix="The file was cut short: copy it again.")  # fmt: skip
+    return WearcapError(
+        f"it ends inside its {element.count} {element.name} rows",
+        where=path,
+        expected="as many rows as the header states",
+        fix="The file was cut short: copy it again.",
+    )
 
 
 def _read_binary(elements: list[_Element], data: bytes, start: int, order: str, path) -> dict[str, dict]:
@@ -175,8 +189,10 @@ def _read_list_rows(element: _Element, data: bytes, start: int, order: str, path
     if table is not None:
         return table, stop
     columns = {p.name: (bytearray(), array("q")) for p in element.properties}
-    plan = [(*columns[p.name], np.dtype(order + p.count_dtype) if p.count_dtype else None, np.dtype(p.dtype).itemsize)
-            for p in element.properties]  # fmt: skip
+    plan = [
+        (*columns[p.name], np.dtype(order + p.count_dtype) if p.count_dtype else None, np.dtype(p.dtype).itemsize)
+        for p in element.properties
+    ]
     for _ in range(element.count):
         for values, lengths, count_dtype, width in plan:
             length = 1
@@ -244,9 +260,7 @@ def _read_ascii(elements: list[_Element], body: memoryview, path) -> dict[str, d
         try:
             table, rows = (_ascii_lists if listed else _ascii_table)(element, lines)
         except (ValueError, IndexError, OverflowError) as error:
-            raise WearcapError(
-                f"a {element.name} row does not match the header ({error})"[:200], where=path
-            ) from error
+            raise WearcapError(f"a {element.name} row does not match the header ({error})"[:200], where=path) from error
         if rows < element.count:
             raise _cut_short(path, element)
         tables[element.name] = table
@@ -257,7 +271,9 @@ def _ascii_table(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
     with warnings.catch_warnings(), np.errstate(invalid="ignore", over="ignore"):
         warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
         values = np.loadtxt(islice(lines, element.count), ndmin=2, comments=None)
-        return {p.name: values[:, i].astype(p.dtype) for i, p in enumerate(element.properties) if len(values)}, len(values)  # fmt: skip
+        return {p.name: values[:, i].astype(p.dtype) for i, p in enumerate(element.properties) if len(values)}, len(
+            values
+        )
 
 
 def _ascii_lists(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
@@ -285,11 +301,7 @@ def _ascii_lists(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
 
 
 def _colors(vertex: dict) -> np.ndarray | None:
-    for names in (
-        ("red", "green", "blue"),
-        ("diffuse_red", "diffuse_green", "diffuse_blue"),
-        ("r", "g", "b"),
-    ):
+    for names in (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")):
         if set(names) <= set(vertex):
             colors = np.stack([vertex[name] for name in names], 1)
             scale = 255 if colors.dtype.kind == "f" and colors.max(initial=0) <= 1 else 1
@@ -308,7 +320,5 @@ def _triangles(face: dict, vertices: int, path) -> np.ndarray | None:
     faces = np.stack([corners.values[first], corners.values[first + k], corners.values[first + k + 1]], 1)
     if len(faces) and not (faces.min() >= 0 and faces.max() < vertices):
         low, high = faces.min(), faces.max()
-        raise WearcapError(
-            f"a face names vertex {high if low >= 0 else low:g}, there are {vertices}", where=path
-        )
+        raise WearcapError(f"a face names vertex {high if low >= 0 else low:g}, there are {vertices}", where=path)
     return faces.astype(np.int32)

@@ -47,11 +47,19 @@ def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
         _require_plain(value)
         return value
     except _RefusedError as error:
-        raise WearcapError(str(error), where=path, expected="numbers, text, lists, dicts and NumPy arrays only",
-                           fix="Anything else in a pickle can run code when it is loaded, and is never read.") from error  # fmt: skip
+        raise WearcapError(
+            str(error),
+            where=path,
+            expected="numbers, text, lists, dicts and NumPy arrays only",
+            fix="Anything else in a pickle can run code when it is loaded, and is never read.",
+        ) from error
     except Exception as error:  # the opcodes are the file's own program and can raise anything
-        raise WearcapError(f"a damaged pickle ({type(error).__name__}: {error})"[:300], where=path,
-                           expected="a whole pickle file", fix="Fetch it again.") from error  # fmt: skip
+        raise WearcapError(
+            f"a damaged pickle ({type(error).__name__}: {error})"[:300],
+            where=path,
+            expected="a whole pickle file",
+            fix="Fetch it again.",
+        ) from error
 
 
 class _RefusedError(Exception):
@@ -236,11 +244,7 @@ class _Unpickler(_PythonUnpickler):
 
     def _set_byte_order(self, dtype: np.dtype, state: tuple) -> None:
         order, parts = state[1], state[2:5]
-        if (
-            order not in ("<", ">", "|", "=")
-            or any(part is not None for part in parts)
-            or dtype.isbuiltin == 1
-        ):
+        if order not in ("<", ">", "|", "=") or any(part is not None for part in parts) or dtype.isbuiltin == 1:
             raise _RefusedError("it holds an array of structures")
         # Sizes matter for text alone; numbers have fixed ones.
         sizes = (dtype.itemsize, dtype.alignment) if dtype.kind in "SU" else (-1, -1)
@@ -272,12 +276,6 @@ class _Unpickler(_PythonUnpickler):
 
     dispatch[pickle.BUILD[0]] = load_build
     dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8
-    for opcode in (
-        pickle.EMPTY_SET,
-        pickle.ADDITEMS,
-        pickle.FROZENSET,
-        pickle.NEXT_BUFFER,
-        pickle.READONLY_BUFFER,
-    ):
+    for opcode in (pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER):
         dispatch[opcode[0]] = refuse
     dispatch = {opcode: _stepping(load) for opcode, load in dispatch.items()}

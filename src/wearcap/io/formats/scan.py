@@ -36,10 +36,19 @@ def read_scan(path: str | Path, *, needs_colors: bool = False, metres_per_unit: 
     if not len(points):
         raise WearcapError("the scan has no points", where=path, expected="a cloud of the scene's surfaces")
     if metres_per_unit is None and (fault := unit_fault(points)):
-        raise WearcapError(fault, where=path, expected="metres", fix="Give metres_per_unit=0.001 for a scan in millimetres, 1 for one that is sparse.")  # fmt: skip
+        raise WearcapError(
+            fault,
+            where=path,
+            expected="metres",
+            fix="Give metres_per_unit=0.001 for a scan in millimetres, 1 for one that is sparse.",
+        )
     if needs_colors and content.colors is None:
-        raise WearcapError("the scan has no colour", where=path, expected="red, green and blue of every point",
-                           fix="Export it with colours: pictures of the scene are drawn from them.")  # fmt: skip
+        raise WearcapError(
+            "the scan has no colour",
+            where=path,
+            expected="red, green and blue of every point",
+            fix="Export it with colours: pictures of the scene are drawn from them.",
+        )
     return Scan(points, content.colors)
 
 

@@ -33,15 +33,17 @@ def read_scene(
         model = read_colmap(folder, images)
         return model.photos, model.tracks
     raise WearcapError(
-        "no scene of a known kind", where=folder,
+        "no scene of a known kind",
+        where=folder,
         expected=f"{FILE_NAME} with {CLOUD}, a scan of the HPS data set, or a COLMAP model (cameras, images, points3D)",
-    )  # fmt: skip
+    )
 
 
 def cloud_file(scene: str | Path) -> Path:
     """The cloud of a scene: the file that was named, or the one in the folder. Raises WearcapError without one."""
     path = Path(scene) / CLOUD if Path(scene).is_dir() else Path(scene)
     if not path.is_file():
-        raise WearcapError("no scan of a scene here", where=scene,
-                           expected=f"a folder with {CLOUD}, or a .ply or .pcd file")  # fmt: skip
+        raise WearcapError(
+            "no scan of a scene here", where=scene, expected=f"a folder with {CLOUD}, or a .ply or .pcd file"
+        )
     return path

@@ -24,7 +24,9 @@ from wearcap.recording.motion import Motion
 
 _BODY = 63
 """Number of values of SMPL+H's 21 body joints; SMPL's two hand joints follow them."""
-_EXPECTED = '{"sequence": [{"time", "global_orient", "body_pose" (63 or 69), "transl", …}], "global": {"betas", "gender"}}'
+_EXPECTED = (
+    '{"sequence": [{"time", "global_orient", "body_pose" (63 or 69), "transl", …}], "global": {"betas", "gender"}}'
+)
 
 
 @dataclass(frozen=True)
@@ -52,26 +54,32 @@ def read_smpl_json(path: str | Path) -> SmplSequence:
         if name in frames[0]
     ]
     arrays = {name: _column(frames, name, path) for name in ("time", *names)}
-    require(arrays, path, time=("frame", 1), global_orient=("frame", 3), body_pose=("frame", "pose"),
-            **{name: ("frame", size) for name, size in (("transl", 3), ("left_hand_pose", 45), ("right_hand_pose", 45)) if name in arrays})  # fmt: skip
+    require(
+        arrays,
+        path,
+        time=("frame", 1),
+        global_orient=("frame", 3),
+        body_pose=("frame", "pose"),
+        **{
+            name: ("frame", size)
+            for name, size in (("transl", 3), ("left_hand_pose", 45), ("right_hand_pose", 45))
+            if name in arrays
+        },
+    )
     if arrays["body_pose"].shape[1] not in (_BODY, _BODY + 6) or ("left_hand_pose" in arrays) != (
         "right_hand_pose" in arrays
     ):
-        raise WearcapError(f"poses of {arrays['body_pose'].shape[1]} numbers with {', '.join(names)}", where=path, expected=_EXPECTED)  # fmt: skip
+        raise WearcapError(
+            f"poses of {arrays['body_pose'].shape[1]} numbers with {', '.join(names)}", where=path, expected=_EXPECTED
+        )
     times = arrays["time"][:, 0]
     check_rising(times, path)
     placed = "transl" in arrays
     gender = about.get("gender")
-    provenance = {
-        "source": path.name,
-        "format": "smpl_json",
-        **({"gender": gender} if isinstance(gender, str) else {}),
-    }
+    provenance = {"source": path.name, "format": "smpl_json", **({"gender": gender} if isinstance(gender, str) else {})}
     t = arrays["transl"] if placed else np.zeros((len(times), 3))
     skeleton, R = (smplh52() if "left_hand_pose" in arrays else smpl24()), _rotations(arrays)
-    motion = Motion(
-        torch.from_numpy(times), skeleton, R.float(), torch.from_numpy(t).float(), provenance=provenance
-    )
+    motion = Motion(torch.from_numpy(times), skeleton, R.float(), torch.from_numpy(t).float(), provenance=provenance)
     return SmplSequence(motion, _shape(about, path), placed)
 
 
@@ -92,37 +100,28 @@ def _unzipped(path: Path) -> Any:
     try:
         with zipfile.ZipFile(path) as archive:
             members = [
-                info
-                for info in archive.infolist()
-                if not info.is_dir() and not info.filename.startswith("__MACOSX")
+                info for info in archive.infolist() if not info.is_dir() and not info.filename.startswith("__MACOSX")
             ]
             if len(members) != 1:
-                raise WearcapError(
-                    f"an archive of {len(members)} files", where=path, expected="one JSON file"
-                )
+                raise WearcapError(f"an archive of {len(members)} files", where=path, expected="one JSON file")
             with archive.open(members[0]) as file, counted(file, budget) as reader:
                 content = reader.read()
     except PermissionError:
         with explained(path):
             raise
     except DAMAGE as error:
-        raise WearcapError(f"not a readable .json.zip file ({error})"[:300], where=path, expected=_EXPECTED,
-                           fix="Fetch it again.") from error  # fmt: skip
+        raise WearcapError(
+            f"not a readable .json.zip file ({error})"[:300], where=path, expected=_EXPECTED, fix="Fetch it again."
+        ) from error
     return parse_json(content, path)
 
 
 def _frames(content: Any, path: Path) -> tuple[list[dict], dict]:
     """Frames in the newer layout, and the content that applies to all of them."""
     sequence = content.get("sequence") if isinstance(content, dict) else content
-    if (
-        not isinstance(sequence, list)
-        or not sequence
-        or not all(isinstance(frame, dict) for frame in sequence)
-    ):
+    if not isinstance(sequence, list) or not sequence or not all(isinstance(frame, dict) for frame in sequence):
         raise WearcapError("no poses", where=path, expected=_EXPECTED)
-    about = (
-        content.get("global", {}) if isinstance(content, dict) else {"betas": sequence[0].get("shape", [])}
-    )
+    about = content.get("global", {}) if isinstance(content, dict) else {"betas": sequence[0].get("shape", [])}
     if "pose" in sequence[0]:
         sequence = [_newer(frame, path, number) for number, frame in enumerate(sequence)]
     return sequence, about if isinstance(about, dict) else {}
@@ -140,8 +139,9 @@ def _column(frames: list[dict], name: str, path: Path) -> np.ndarray:
     try:
         return np.array([frame[name] for frame in frames], np.float64).reshape(len(frames), -1)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise WearcapError(f"{name} is missing in a frame, or no list of numbers ({error})", where=path,
-                           expected=_EXPECTED) from error  # fmt: skip
+        raise WearcapError(
+            f"{name} is missing in a frame, or no list of numbers ({error})", where=path, expected=_EXPECTED
+        ) from error
 
 
 def _shape(about: dict, path: Path) -> dict[str, float]:
@@ -150,7 +150,5 @@ def _shape(about: dict, path: Path) -> dict[str, float]:
     except (TypeError, ValueError, OverflowError) as error:
         raise WearcapError(f"betas are no numbers ({error})", where=path) from error
     if not np.isfinite(betas).all() or len(betas) > 300:
-        raise WearcapError(
-            f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers"
-        )
+        raise WearcapError(f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers")
     return shape_from_betas(betas)

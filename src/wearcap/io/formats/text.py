@@ -57,8 +57,9 @@ def _lines(file: io.TextIOWrapper, path: str | Path) -> Iterator[str]:
         if "\0" in line:
             raise WearcapError("binary content", where=at_line(path, number), expected="a text file")
         if len(line) == MAX_LINE and not line.endswith("\n"):
-            raise WearcapError(f"a line longer than {MAX_LINE} characters", where=at_line(path, number),
-                               expected="a text file")  # fmt: skip
+            raise WearcapError(
+                f"a line longer than {MAX_LINE} characters", where=at_line(path, number), expected="a text file"
+            )
         yield line
     if not number:
         raise WearcapError("the file is empty", where=path)

@@ -23,12 +23,15 @@ def read_tum(path: str | Path) -> Trajectory:
         for number, line in enumerate(file, 1):
             row = line.split("#")[0].replace(",", " ").split()
             if row and len(row) != 8:
-                raise WearcapError(f"line {number} has {len(row)} fields", where=path,
-                                   expected="timestamp tx ty tz qx qy qz qw")  # fmt: skip
+                raise WearcapError(
+                    f"line {number} has {len(row)} fields", where=path, expected="timestamp tx ty tz qx qy qz qw"
+                )
             try:
                 values.extend(map(float, row))
             except ValueError as error:
-                raise WearcapError(f"line {number}: {error}"[:200], where=path, expected="lines of 8 numbers") from error  # fmt: skip
+                raise WearcapError(
+                    f"line {number}: {error}"[:200], where=path, expected="lines of 8 numbers"
+                ) from error
     if not values:
         raise WearcapError("no poses in the file", where=path, expected="lines of 8 numbers")
     table = np.asarray(values).reshape(-1, 8)
@@ -39,12 +42,7 @@ def write_tum(trajectory: Trajectory, path: str | Path) -> None:
     """Write a trajectory atomically, timestamps to the microsecond."""
     wxyz = quat_wxyz_from_matrix(trajectory.R_world_body.double()).numpy()
     table = np.concatenate(
-        [
-            trajectory.timestamps.numpy()[:, None],
-            trajectory.t_world_body.double().numpy(),
-            wxyz[:, [1, 2, 3, 0]],
-        ],
-        1,
+        [trajectory.timestamps.numpy()[:, None], trajectory.t_world_body.double().numpy(), wxyz[:, [1, 2, 3, 0]]], 1
     )
     lines = [f"{row[0]:.6f} " + " ".join(f"{value:.7f}" for value in row[1:]) for row in table]
     write_text(path, "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n")

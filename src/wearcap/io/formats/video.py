@@ -56,8 +56,12 @@ def read_frames(
             if number < 0:
                 raise WearcapError("a video without frames", where=path)
     except (av.FFmpegError, OSError) as error:
-        raise WearcapError(f"not a readable video ({error})", where=path, expected="a complete MP4, MKV or AVI file",
-                           fix="Play it in a video player, or copy it again.") from error  # fmt: skip
+        raise WearcapError(
+            f"not a readable video ({error})",
+            where=path,
+            expected="a complete MP4, MKV or AVI file",
+            fix="Play it in a video player, or copy it again.",
+        ) from error
 
 
 def _pictures_of(container: InputContainer, path: str | Path) -> VideoStream:
@@ -66,13 +70,15 @@ def _pictures_of(container: InputContainer, path: str | Path) -> VideoStream:
         raise WearcapError("a file without pictures", where=path, expected="a video")
     stream = container.streams.video[0]
     if stream.codec_context is None:
-        raise WearcapError(
-            "pictures packed in a way that is not known", where=path, expected="a video in H.264, say"
-        )
+        raise WearcapError("pictures packed in a way that is not known", where=path, expected="a video in H.264, say")
     stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # for sizes that only the pictures have
     if stream.width * stream.height > MAX_PIXELS:
-        raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path,
-                           expected=f"at most {MAX_PIXELS} pixels", fix="Scale the video down.")  # fmt: skip
+        raise WearcapError(
+            f"pictures of {stream.width}x{stream.height} pixels",
+            where=path,
+            expected=f"at most {MAX_PIXELS} pixels",
+            fix="Scale the video down.",
+        )
     return stream
 
 
@@ -96,10 +102,14 @@ def video_info(path: str | Path) -> VideoInfo:
             fps = float(stream.average_rate or 30)
             frames = stream.frames or round((container.duration or 0) / av.time_base * fps)
             if not (stream.width > 0 and stream.height > 0):
-                raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path, expected="a video")  # fmt: skip
+                raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path, expected="a video")
             if not (0 < fps <= _MAX_FPS and 0 <= frames <= size):
-                raise WearcapError(f"a header that announces {frames} frames at {fps:.6g} per second", where=path,
-                                   expected="no more frames than bytes", fix="The file was damaged: copy it again.")  # fmt: skip
+                raise WearcapError(
+                    f"a header that announces {frames} frames at {fps:.6g} per second",
+                    where=path,
+                    expected="no more frames than bytes",
+                    fix="The file was damaged: copy it again.",
+                )
             return VideoInfo(stream.width, stream.height, fps, frames)
     except (av.FFmpegError, OSError) as error:
         raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error
@@ -131,8 +141,11 @@ def write_frames(
                 size = (frame.shape[1], frame.shape[0])
                 stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
             if (frame.shape[1], frame.shape[0]) != size or size[0] % 2 or size[1] % 2:
-                raise WearcapError(f"a picture of {frame.shape[1]}x{frame.shape[0]} pixels", where=path,
-                                   expected="even sizes, all alike")  # fmt: skip
+                raise WearcapError(
+                    f"a picture of {frame.shape[1]}x{frame.shape[0]} pixels",
+                    where=path,
+                    expected="even sizes, all alike",
+                )
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         if not count:
             raise WearcapError("no pictures to write", where=path)

@@ -65,9 +65,7 @@ class EchoDenoiser(nn.Module):
         self.condition_normalizer = Normalizer(condition_size)
         # One more channel marks valid frames: padding would otherwise look like the mean condition.
         self.widen = Widening(condition_size + 1, 2 * width, 1, context)
-        self.object = nn.Sequential(
-            nn.Linear(object_condition_size, width), nn.GELU(), nn.Linear(width, 2 * width)
-        )
+        self.object = nn.Sequential(nn.Linear(object_condition_size, width), nn.GELU(), nn.Linear(width, 2 * width))
         self.no_object = nn.Parameter(torch.zeros(2 * width))
         self.narrow = nn.Linear(2 * width, width)
         self.motion_encoders = nn.ModuleList(MotionEncoder(size, width, 1) for size in self.sizes)
@@ -101,9 +99,7 @@ class EchoDenoiser(nn.Module):
         embedded = [embed(level[..., k]) for k, embed in enumerate(self.levels)]
         worth = tuple(encoder.plan(each) for encoder, each in zip(self.motion_encoders, embedded))
         together = torch.stack(embedded).sum(0)
-        return EchoPlan(
-            worth, tuple(block.plan(together).repeat(1, self.streams, 1) for block in self.blocks)
-        )
+        return EchoPlan(worth, tuple(block.plan(together).repeat(1, self.streams, 1) for block in self.blocks))
 
     def step(
         self,
@@ -114,10 +110,7 @@ class EchoDenoiser(nn.Module):
     ) -> Float[Tensor, "batch time feature"]:
         """x̂0 in normalised space, from x_t, the levels' plan and the encoded condition."""
         parts = x_t.split(self.sizes, -1)
-        tokens = [
-            encoder(part, worth, valid)
-            for encoder, part, worth in zip(self.motion_encoders, parts, plan.worth)
-        ]
+        tokens = [encoder(part, worth, valid) for encoder, part, worth in zip(self.motion_encoders, parts, plan.worth)]
         mask = attention_mask(valid.repeat(1, self.streams))
         if self.stream is None:
             token = encoded + torch.stack(tokens).sum(0)

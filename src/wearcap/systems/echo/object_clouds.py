@@ -118,9 +118,7 @@ class ObjectClouds(SeededWindows):
 
     def dataset(self, split: str) -> ObjectCloudDataset:
         """Objects of a split, generated if their file is missing or was made with other settings."""
-        clouds, labels = cached_clouds(
-            self.root, self.generate, split, self.classes, self.counts[split], self.points
-        )
+        clouds, labels = cached_clouds(self.root, self.generate, split, self.classes, self.counts[split], self.points)
         return ObjectCloudDataset(clouds, labels, self.augmentation, as_it_is=split != "train")
 
 

@@ -50,9 +50,7 @@ class ObjectEncoding(WeighedTerms):
 
 
 def instance_loss(
-    one: Float[Tensor, "batch feature"],
-    other: Float[Tensor, "batch feature"],
-    temperature: float = _TEMPERATURE,
+    one: Float[Tensor, "batch feature"], other: Float[Tensor, "batch feature"], temperature: float = _TEMPERATURE
 ) -> Float[Tensor, ""]:
     """Symmetric InfoNCE loss between two views of each object (van den Oord et al. 2018)."""
     similarity = F.normalize(one, dim=-1) @ F.normalize(other, dim=-1).T / temperature

@@ -62,7 +62,7 @@ class ObjectReader:
 
     def __init__(
         self, features: EchoFeatures, encoder: PointNeXt | None, embed: Callable[[Tensor], Tensor] | None = None
-    ):  # fmt: skip
+    ):
         """`encoder` None: codes are class and extents alone, for features without shape. `embed`: the network's layer
         on codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
         self.features, self.encoder, self._embed = features, encoder, embed
@@ -78,7 +78,9 @@ class ObjectReader:
         if key not in self._shapes:
             self._shapes[key] = self._read(item)
         shape = self._shapes[key]
-        return ObjectShape(item.name, *(getattr(shape, name) for name in ObjectShape.__dataclass_fields__ if name != "name"))  # fmt: skip
+        return ObjectShape(
+            item.name, *(getattr(shape, name) for name in ObjectShape.__dataclass_fields__ if name != "name")
+        )
 
     def _read(self, item: SceneObject) -> ObjectShape:
         one_hot = self.features.class_code(item.category)
@@ -91,16 +93,14 @@ class ObjectReader:
         code, code_mirrored = self._embedded(torch.cat(parts, -1)).unbind(0)
         return ObjectShape(
             item.name, item.category, item.mesh, middle, both[0].clone(), code, code_mirrored, surface_index(item.mesh)
-        )  # fmt: skip
+        )
 
     @torch.no_grad()
     def _embedded(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:
         return (codes if self._embed is None else self._embed(codes)).clone()
 
 
-def object_poses(
-    recording: Recording, environment: Environment, name: str, shape: ObjectShape, take: Tensor
-) -> Rigid:
+def object_poses(recording: Recording, environment: Environment, name: str, shape: ObjectShape, take: Tensor) -> Rigid:
     """Ground-truth poses of an object's centre at frames `take` of the motion, whose clock its trajectory shares.
 
     An object without a trajectory stays at its pose in the environment.
@@ -108,10 +108,7 @@ def object_poses(
     track = recording.object_motion.get(name)
     if track is None:
         item = environment.by_name(name)
-        T = Rigid(
-            item.R_world_object.expand(len(take), 3, 3).clone(),
-            item.t_world_object.expand(len(take), 3).clone(),
-        )
+        T = Rigid(item.R_world_object.expand(len(take), 3, 3).clone(), item.t_world_object.expand(len(take), 3).clone())
     else:
         T = track.T_world_body[take]
     return shape.centred(T)

@@ -88,7 +88,15 @@ def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> B
     if recording.floor is not None:
         floor = interpolate_clamped(recording.floor.timestamps, recording.floor.height, path.timestamps)
     observed_parts = _observed(scenario, path, names, objects, active)
-    conditioning = (R, t, floor.float(), active != NO_OBJECT, codes[active], active.float(), torch.ones(count, dtype=torch.bool))  # fmt: skip
+    conditioning = (
+        R,
+        t,
+        floor.float(),
+        active != NO_OBJECT,
+        codes[active],
+        active.float(),
+        torch.ones(count, dtype=torch.bool),
+    )
     return BatchItem(path, Conditioning(*(part[None] for part in (*conditioning, *observed_parts))), objects)
 
 
@@ -100,7 +108,9 @@ def _tracked_points(
     truth = recording.motion
     found = [joint for joint in WRISTS if joint in recording.tracked]
     if len(found) == 1:
-        raise WearcapError(f"only {found[0]} is tracked", where=recording.name, expected=f"`tracked` poses of {' and '.join(WRISTS)}")  # fmt: skip
+        raise WearcapError(
+            f"only {found[0]} is tracked", where=recording.name, expected=f"`tracked` poses of {' and '.join(WRISTS)}"
+        )
     if found:
         for joint in found:
             track = recording.tracked[joint]
@@ -111,17 +121,24 @@ def _tracked_points(
         truth = at_times(truth, times)
         poses += [truth.joint(joint) for joint in WRISTS]
     else:
-        raise WearcapError("this recording has no tracked wrists", where=recording.name,
-                           expected=f"`tracked` poses of {' and '.join(WRISTS)}, or a true motion")  # fmt: skip
+        raise WearcapError(
+            "this recording has no tracked wrists",
+            where=recording.name,
+            expected=f"`tracked` poses of {' and '.join(WRISTS)}, or a true motion",
+        )
     R, t = torch.stack([T.R.float() for T in poses], 1), torch.stack([T.t.float() for T in poses], 1)
     if not (R.isfinite().all() and t.isfinite().all()):
-        raise WearcapError("poses of wrists that are NaN or infinite", where=recording.name, expected="finite poses")  # fmt: skip
+        raise WearcapError("poses of wrists that are NaN or infinite", where=recording.name, expected="finite poses")
     heading = rotation.about_axis("z", rotation.yaw_of(R[:, 0]))
     apart = (heading.mT @ (t[:, 1] - t[:, 2])[..., None])[:, 1, 0].median().item()
     # Wrists of a ground-truth motion cannot be swapped trackers: the wearer crosses the arms.
     if found and apart < -SWAPPED_M:
-        raise WearcapError(f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median", where=recording.name,
-                           expected="the left wrist on the left", fix="Swap the two trackers.")  # fmt: skip
+        raise WearcapError(
+            f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median",
+            where=recording.name,
+            expected="the left wrist on the left",
+            fix="Swap the two trackers.",
+        )
     return R, t
 
 
@@ -131,30 +148,36 @@ def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
     times = track.timestamps
     inside = at.clamp(times[0].item(), times[-1].item())
     last = (torch.searchsorted(times, inside + SAME_S, right=True) - 1).clamp_min(0)
-    gone = (times[(last + 1).clamp_max(len(times) - 1)] - times[last] > MAX_GAP_S) | (
-        inside - times[last] <= SAME_S
-    )
+    gone = (times[(last + 1).clamp_max(len(times) - 1)] - times[last] > MAX_GAP_S) | (inside - times[last] <= SAME_S)
     found = resample(track, inside).T_world_body if len(times) > 1 else track.T_world_body[last]
     last_tracked = track.T_world_body[last]
     return Rigid(
-        torch.where(gone[:, None, None], last_tracked.R, found.R),
-        torch.where(gone[:, None], last_tracked.t, found.t),
+        torch.where(gone[:, None, None], last_tracked.R, found.R), torch.where(gone[:, None], last_tracked.t, found.t)
     )
 
 
 def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, where: str) -> None:
     if len(times) < 2 or not (times.diff() > 0).all():
-        raise WearcapError(f"{what} at {len(times)} times that do not increase", where=where, expected="increasing timestamps (s)")  # fmt: skip
+        raise WearcapError(
+            f"{what} at {len(times)} times that do not increase", where=where, expected="increasing timestamps (s)"
+        )
     late, early = times[0] - path.timestamps[0], path.timestamps[-1] - times[-1]
     if max(late.item(), early.item()) > 0.5:
-        raise WearcapError(f"{what} from {times[0]:.2f} to {times[-1]:.2f} s", where=where,
-                           expected=f"all of {path.timestamps[0]:.2f} to {path.timestamps[-1]:.2f} s, as the head")  # fmt: skip
+        raise WearcapError(
+            f"{what} from {times[0]:.2f} to {times[-1]:.2f} s",
+            where=where,
+            expected=f"all of {path.timestamps[0]:.2f} to {path.timestamps[-1]:.2f} s, as the head",
+        )
 
 
 def _objects(scenario: Scenario, names: list[str], reader: ObjectReader) -> list[ObjectShape]:
     if names and scenario.environment is None:
-        raise WearcapError(f"acts of {names[0]!r}, but no objects", where=scenario.recording.name,
-                           expected="an environment with the objects' meshes", fix="Give environment=FILE.")  # fmt: skip
+        raise WearcapError(
+            f"acts of {names[0]!r}, but no objects",
+            where=scenario.recording.name,
+            expected="an environment with the objects' meshes",
+            fix="Give environment=FILE.",
+        )
     shapes = []
     for name in names:
         assert scenario.environment is not None
@@ -176,19 +199,22 @@ def _observed(
     joints = len(path.skeleton)
     R, root = torch.eye(3).repeat(count, joints, 1, 1), torch.zeros(count, 3)
     R_object, t_object = torch.eye(3).repeat(count, 1, 1), torch.zeros(count, 3)
-    contact, is_observed = (
-        torch.zeros(count, CONTACTS),
-        torch.zeros(count, len(MODALITIES), dtype=torch.bool),
-    )
+    contact, is_observed = (torch.zeros(count, CONTACTS), torch.zeros(count, len(MODALITIES), dtype=torch.bool))
     if seen.motion is not None:
         at = _frames(seen.motion.timestamps, path, where)
         if len(seen.motion.skeleton) != joints:
-            raise WearcapError(f"an observed body of {len(seen.motion.skeleton)} joints", where=where, expected=f"{joints}, as the wearer has")  # fmt: skip
+            raise WearcapError(
+                f"an observed body of {len(seen.motion.skeleton)} joints",
+                where=where,
+                expected=f"{joints}, as the wearer has",
+            )
         R[at], root[at] = seen.motion.R_parent_joint.float(), seen.motion.t_world_root.float()
         is_observed[at, 0] = True
     for name, track in seen.object_motion.items():
         if name not in names:
-            raise WearcapError(f"an observed object {name!r}", where=where, expected=f"one of {', '.join(names) or 'no objects'}")  # fmt: skip
+            raise WearcapError(
+                f"an observed object {name!r}", where=where, expected=f"one of {', '.join(names) or 'no objects'}"
+            )
         at, number = _frames(track.timestamps, path, where), names.index(name)
         mine = active[at] == number
         T = objects[number].centred(track.T_world_body)
@@ -204,8 +230,11 @@ def _observed(
     if seen.contact is not None and seen.contact_times is not None:
         at = _frames(seen.contact_times, path, where)
         if seen.contact.shape[1] != CONTACTS:
-            raise WearcapError(f"observed contacts of {seen.contact.shape[1]} points", where=where,
-                               expected=f"{BODY_POINTS} of the body and {len(FOOT_PATCHES)} of the feet")  # fmt: skip
+            raise WearcapError(
+                f"observed contacts of {seen.contact.shape[1]} points",
+                where=where,
+                expected=f"{BODY_POINTS} of the body and {len(FOOT_PATCHES)} of the feet",
+            )
         contact[at] = seen.contact.float()
         is_observed[at, 2] = True
     for value in (R, root, R_object, t_object, contact):
@@ -220,6 +249,9 @@ def _frames(times: Float64[Tensor, "frame"], path: HeadPath, where: str) -> Tens
     step = (clock[1] - clock[0]).item() if len(clock) > 1 else 0.0
     beyond = ~((times >= clock[0] - step) & (times <= clock[-1] + step))
     if beyond.any():
-        raise WearcapError(f"an observation at {times[beyond][0].item():.2f} s, beyond the recording", where=where,
-                           expected=f"times from {clock[0].item():.2f} to {clock[-1].item():.2f} s")  # fmt: skip
+        raise WearcapError(
+            f"an observation at {times[beyond][0].item():.2f} s, beyond the recording",
+            where=where,
+            expected=f"times from {clock[0].item():.2f} to {clock[-1].item():.2f} s",
+        )
     return ((times - clock[0]) / max(step, 1e-9)).round().long().clamp(0, len(clock) - 1)

@@ -76,20 +76,24 @@ class Echo:
 
     def __post_init__(self):
         if isinstance(self.acts, str) and self.acts not in ("truth", "none"):
-            raise WearcapError(f"unknown acts {self.acts!r}", expected="truth, none, or a list of {object, start_s, stop_s}")  # fmt: skip
+            raise WearcapError(
+                f"unknown acts {self.acts!r}", expected="truth, none, or a list of {object, start_s, stop_s}"
+            )
         ramp, _ = self.rolling.ramp, self._listed_acts()
         if self.rewindow is not None and not 0 < self.rewindow <= ramp:
-            raise WearcapError(f"windows that advance by {self.rewindow} frames", expected=f"1 to {ramp}, the window less the context")  # fmt: skip
+            raise WearcapError(
+                f"windows that advance by {self.rewindow} frames", expected=f"1 to {ramp}, the window less the context"
+            )
         if self.rewindow is not None and self.step == "redraw":
-            raise WearcapError("step=redraw with windows that are denoised from scratch", expected="step=posterior, or rewindow=null")  # fmt: skip
+            raise WearcapError(
+                "step=redraw with windows that are denoised from scratch", expected="step=posterior, or rewindow=null"
+            )
         require_runtime(self.runtime, self.device)
 
     @property
     def rolling(self) -> RollingSchedule:
         """The conveyor's rolling schedule."""
-        return RollingSchedule(
-            self.net.window, self.context, self.per_frame, self.spacing, self.eta, self.step
-        )
+        return RollingSchedule(self.net.window, self.context, self.per_frame, self.spacing, self.eta, self.step)
 
     @property
     def fps(self) -> float:
@@ -120,9 +124,7 @@ class Echo:
     def reader(self) -> ObjectReader:
         """A reader that turns objects into embedded conditions for the network, each once."""
         self.prepare()
-        return ObjectReader(
-            self.features, self.encoder, lambda codes: self.net.object(codes.to(self.device)).cpu()
-        )
+        return ObjectReader(self.features, self.encoder, lambda codes: self.net.object(codes.to(self.device)).cpu())
 
     def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
         """One motion of the human alone per (recording, seed); with objects: `capture_scenarios`."""
@@ -134,7 +136,7 @@ class Echo:
         try:
             return tuple(sorted((Act(**row) for row in self.acts), key=lambda act: act.start_s))
         except TypeError as error:
-            raise WearcapError(f"acts {self.acts!r}", expected="a list of {object, start_s, stop_s}") from error  # fmt: skip
+            raise WearcapError(f"acts {self.acts!r}", expected="a list of {object, start_s, stop_s}") from error
 
     def scenario(self, recording: Recording, environment: Environment | None) -> Scenario:
         """A recording with its active objects, according to `acts`.
@@ -167,9 +169,7 @@ class Echo:
         outputs = self._sampled(items, [scenario.recording for scenario in scenarios], seeds)
         # 3. Untouched objects are made static, and the body is anchored to the measured head.
         if (threshold := self.static_below) is not None:
-            outputs = [
-                with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)
-            ]
+            outputs = [with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)]
         return [motion_of(item, part, self.anchor, self.settings()) for item, part in zip(items, outputs)]
 
     def _item(self, scenario: Scenario, reader: ObjectReader) -> BatchItem:
@@ -210,9 +210,7 @@ class Echo:
             queue.guided = pulled_by(skeletons, shapes, objects)
         return queue
 
-    def denoiser(
-        self, queue: EchoQueue, conditioning: Conditioning, frame: Rigid
-    ) -> tuple[Denoise, Correction | None]:
+    def denoiser(self, queue: EchoQueue, conditioning: Conditioning, frame: Rigid) -> tuple[Denoise, Correction | None]:
         """x̂0 of the conveyor's frames as a function of x_t and levels, and the guidance that corrects it, if any.
 
         The condition is encoded once per call; the level-dependent part is cached between calls.
@@ -221,9 +219,7 @@ class Echo:
         if self._runner is None:
             self.prepare()
         assert self._runner is not None
-        denoise = self._runner.begin(
-            condition, conditioning.object_code, conditioning.has_object, conditioning.valid
-        )
+        denoise = self._runner.begin(condition, conditioning.object_code, conditioning.has_object, conditioning.valid)
         guidance = self.guided_by
         if guidance is None or queue.guided is None:
             return denoise, None
@@ -234,20 +230,34 @@ class Echo:
     def settings(self) -> dict[str, str]:
         """Settings that a capture depends on, for its provenance."""
         return {
-            "pipeline": "echo", "context": str(self.context), "per_frame": str(self.per_frame), "spacing": str(self.spacing),
-            "eta": str(self.eta), "step": self.step, "rewindow": str(self.rewindow), "anchor": str(self.anchor),
-            "static_threshold": str(self.static_below), "placed": str(self.placed), "guidance": str(self.guided_by), "acts": "search" if callable(self.acts) else str(self.acts),
-        }  # fmt: skip
+            "pipeline": "echo",
+            "context": str(self.context),
+            "per_frame": str(self.per_frame),
+            "spacing": str(self.spacing),
+            "eta": str(self.eta),
+            "step": self.step,
+            "rewindow": str(self.rewindow),
+            "anchor": str(self.anchor),
+            "static_threshold": str(self.static_below),
+            "placed": str(self.placed),
+            "guidance": str(self.guided_by),
+            "acts": "search" if callable(self.acts) else str(self.acts),
+        }
 
 
 def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str]) -> Motion:
     """Outputs of one batch item as a motion, if `anchor` anchored to the measured head except in observed frames."""
     path, contact = item.path, outputs.contact_prob[0]
     motion = Motion(
-        path.timestamps, path.skeleton, outputs.R_parent_joint[0], outputs.t_world_root[0], contact[:, BODY_POINTS:],
+        path.timestamps,
+        path.skeleton,
+        outputs.R_parent_joint[0],
+        outputs.t_world_root[0],
+        contact[:, BODY_POINTS:],
         body_contact_prob=contact[:, :BODY_POINTS] * item.conditioning.has_object[0, :, None],
-        object_motion=object_tracks(item, outputs) or None, provenance=provenance,
-    )  # fmt: skip
+        object_motion=object_tracks(item, outputs) or None,
+        provenance=provenance,
+    )
     if not anchor:
         return motion
     anchored = anchored_to_head(motion, path.T_world_head)
@@ -258,14 +268,10 @@ def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[
 
 
 def pulled_by(
-    skeletons: Sequence[Skeleton],
-    shapes: Sequence[dict[str, float]],
-    objects: Sequence[Sequence[ObjectShape]],
+    skeletons: Sequence[Skeleton], shapes: Sequence[dict[str, float]], objects: Sequence[Sequence[ObjectShape]]
 ) -> tuple[list, list]:
     """Inputs of guidance per batch item: contact points of the body, and KD-trees over the points of its objects."""
-    surfaces = [
-        contact_points(anny_body(skeleton, shape or None)) for skeleton, shape in zip(skeletons, shapes)
-    ]
+    surfaces = [contact_points(anny_body(skeleton, shape or None)) for skeleton, shape in zip(skeletons, shapes)]
     return surfaces, [[KDTree(shape.cloud.numpy()) for shape in mine] for mine in objects]
 
 

@@ -31,10 +31,12 @@ def _own(features: EchoFeatures) -> EchoFeatures:
     return replace(features, frame="own", body=True)
 
 
-def _channels(features: EchoFeatures, points: ThreePoints, floor_height: Tensor, size: Tensor) -> Float[Tensor, "time channel"]:  # fmt: skip
+def _channels(
+    features: EchoFeatures, points: ThreePoints, floor_height: Tensor, size: Tensor
+) -> Float[Tensor, "time channel"]:
     """Descriptor of each frame's three points in head-centred coordinates: the condition without the head's path and
     heading since the window's start, and without limb lengths."""
-    condition = features.condition(ThreePoints(*(part[None] for part in points)), floor_height[None], size[None])[0]  # fmt: skip
+    condition = features.condition(ThreePoints(*(part[None] for part in points)), floor_height[None], size[None])[0]
     return torch.cat([condition[:, :36], condition[:, 39:54], condition[:, 56:57]], 1)
 
 
@@ -82,9 +84,7 @@ class NearestEcho:
         for name in sorted(set(labels)):
             mine = torch.tensor([start for start, label in zip(starts, labels) if label == name])
             descriptor[name], frames[name] = whole[mine[:, None] + offsets].flatten(1), mine
-        return cls(
-            features, dataset.encoder, window, sample, mean, scale, descriptor, frames, torch.cat(outputs)
-        )
+        return cls(features, dataset.encoder, window, sample, mean, scale, descriptor, frames, torch.cat(outputs))
 
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
         """One motion per scenario; deterministic, seeds are ignored."""
@@ -92,13 +92,13 @@ class NearestEcho:
         return [self._capture(scenario, reader) for scenario in scenarios]
 
     def _capture(self, scenario: Scenario, reader: ObjectReader) -> Motion:
-        item = batch_item_of(scenario, head_path(scenario.recording, scenario.recording.skeleton, self.features.fps), reader)  # fmt: skip
+        item = batch_item_of(
+            scenario, head_path(scenario.recording, scenario.recording.skeleton, self.features.fps), reader
+        )
         conditioning, count = item.conditioning, len(item.path.timestamps)
         points = ThreePoints(*(part[0] for part in conditioning.points))
         size = body_size(item.path.skeleton)
-        channels = (
-            _channels(self.features, points, conditioning.floor_height[0], size) - self.mean
-        ) / self.scale
+        channels = (_channels(self.features, points, conditioning.floor_height[0], size) - self.mean) / self.scale
         total, weight = torch.zeros(count, self.outputs.shape[1]), torch.zeros(count, 1)
         offsets = torch.arange(self.window)
         triangle = torch.minimum(offsets + 1, self.window - offsets).float()[:, None] / self.window
@@ -112,7 +112,7 @@ class NearestEcho:
             retrieved = self.outputs[self.frames[name][best] + offsets]
             total.index_add_(0, take, retrieved * triangle)
             weight.index_add_(0, take, triangle)
-        return motion_of(item, _decoded(self.features, total / weight, item), True, {"pipeline": "nearest_echo"})  # fmt: skip
+        return motion_of(item, _decoded(self.features, total / weight, item), True, {"pipeline": "nearest_echo"})
 
 
 def _outputs_of(features: EchoFeatures, track: EchoTrack) -> Float[Tensor, "time feature"]:
@@ -122,12 +122,14 @@ def _outputs_of(features: EchoFeatures, track: EchoTrack) -> Float[Tensor, "time
     T = Rigid(track.T_world_object.R[None], track.T_world_object.t[None])
     return torch.cat(
         [features.encode_body(batch(track.body), frame), features.encode_object(T, frame), track.contact[None]], -1
-    )[0]  # fmt: skip
+    )[0]
 
 
 def _decoded(features: EchoFeatures, outputs: Float[Tensor, "time feature"], item: BatchItem) -> Outputs:
     frame = features.canonical(item.conditioning.points)
-    human, scene_object, contact = outputs[None].split((features.human_size, 9, outputs.shape[1] - features.human_size - 9), -1)  # fmt: skip
+    human, scene_object, contact = outputs[None].split(
+        (features.human_size, 9, outputs.shape[1] - features.human_size - 9), -1
+    )
     body, T = features.decode_body(human, frame), features.decode_object(scene_object, frame)
     return Outputs(*body, T.R, T.t, contact)
 
@@ -170,7 +172,9 @@ class RigidWrist:
                 place[name], offset[name] = places.mean(0), offsets.mean(0)
                 turn[name] = rotation.mean_rotation(R)
         if not place:
-            raise WearcapError("these training recordings have no contact with objects", expected="recordings with objects in hands")  # fmt: skip
+            raise WearcapError(
+                "these training recordings have no contact with objects", expected="recordings with objects in hands"
+            )
         return cls(features, dataset.encoder, place, offset, turn)
 
     def attached(self, motion: Motion, item: BatchItem) -> Motion:
@@ -188,5 +192,7 @@ class RigidWrist:
             wrist = int((wrists - expected[:, None]).norm(dim=-1).mean(0).argmin()) if rows.any() else 0
             t[rows] = wrists[:, wrist] + heading[rows] @ self.offset[name][wrist]
             R[rows] = heading[rows] @ self.turn[name]
-        outputs = Outputs(torch.zeros(1, count, 1, 3, 3), torch.zeros(1, count, 3), R[None], t[None], torch.zeros(1, count, 1))  # fmt: skip
-        return replace(motion, object_motion=object_tracks(item, outputs), provenance={"pipeline": "rigid_wrist"})  # fmt: skip
+        outputs = Outputs(
+            torch.zeros(1, count, 1, 3, 3), torch.zeros(1, count, 3), R[None], t[None], torch.zeros(1, count, 1)
+        )
+        return replace(motion, object_motion=object_tracks(item, outputs), provenance={"pipeline": "rigid_wrist"})

@@ -67,7 +67,7 @@ class Outputs(NamedTuple):
 class Correction(Protocol):
     """Corrects x̂0, as guidance does."""
 
-    def __call__(self, x0_hat: Float[Tensor, "batch frame feature"]) -> Float[Tensor, "batch frame feature"]: ...  # fmt: skip
+    def __call__(self, x0_hat: Float[Tensor, "batch frame feature"]) -> Float[Tensor, "batch frame feature"]: ...
 
 
 @runtime_checkable
@@ -112,9 +112,7 @@ class EchoQueue:
         self.conditioning = (
             fresh
             if self.conditioning is None
-            else Conditioning(
-                *(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh))
-            )
+            else Conditioning(*(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh)))
         )
         frame = self.pipeline.features.canonical(self.conditioning.points)
         if self.pipeline.features.moves and full:
@@ -147,9 +145,7 @@ class EchoQueue:
         """A padding frame for all batch items: the last frame repeated as not valid."""
         assert self.conditioning is not None
         last = self.conditioning.frames(slice(-1, None))
-        return last._replace(
-            valid=torch.zeros_like(last.valid), is_observed=torch.zeros_like(last.is_observed)
-        )
+        return last._replace(valid=torch.zeros_like(last.valid), is_observed=torch.zeros_like(last.is_observed))
 
     def _noise(self, rows: int) -> Float[Tensor, "batch row feature"]:
         width = sum(self.pipeline.net.sizes)

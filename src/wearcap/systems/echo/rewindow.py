@@ -25,7 +25,9 @@ class Rewindow(EchoQueue):
         self.stride = stride
 
     @torch.no_grad()
-    def window(self, conditioning: Conditioning, before: Float[Tensor, "batch observed feature"]) -> Float[Tensor, "batch frame feature"]:  # fmt: skip
+    def window(
+        self, conditioning: Conditioning, before: Float[Tensor, "batch observed feature"]
+    ) -> Float[Tensor, "batch frame feature"]:
         """A sampled window in normalised space, whose first frames are inpainted with `before`."""
         frame = self.pipeline.features.canonical(conditioning.points)
         count = conditioning.valid.shape[1]
@@ -42,16 +44,13 @@ class Rewindow(EchoQueue):
         wide = self.conveyor.wide
         for now, after in pairwise(levels):
             level, then = (
-                torch.where(is_observed, 0.0, torch.where(observation.is_absent, 1.0, value))
-                for value in (now, after)
+                torch.where(is_observed, 0.0, torch.where(observation.is_absent, 1.0, value)) for value in (now, after)
             )
             x = torch.where(wide(is_observed), observed, x)
             x0_hat = denoise(x, level)
             x0_hat = x0_hat if correct is None else correct(x0_hat)
             noise = self._noise(self.rolling.window)[:, :count]
-            x = posterior_step(
-                x, x0_hat, wide(level), wide(then), noise, self.pipeline.schedule, self.rolling.eta
-            )
+            x = posterior_step(x, x0_hat, wide(level), wide(then), noise, self.pipeline.schedule, self.rolling.eta)
         return x
 
     @torch.no_grad()
@@ -63,7 +62,10 @@ class Rewindow(EchoQueue):
         while start < count:
             first = max(0, start - context)
             conditioning = whole.frames(slice(first, min(first + self.rolling.window, count)))
-            before, frame = before[:, before.shape[1] - (start - first) :], self.pipeline.features.canonical(conditioning.points)  # fmt: skip
+            before, frame = (
+                before[:, before.shape[1] - (start - first) :],
+                self.pipeline.features.canonical(conditioning.points),
+            )
             if self._frame is not None and self.pipeline.features.moves:
                 change, observed = frame.inverse() @ self._frame, conditioning.frames(slice(0, start - first))
                 before = self._reexpressed(before, change, torch.zeros(1, 1, len(MODALITIES)), observed)

@@ -35,9 +35,17 @@ from wearcap.systems.echo.observations import Observed, Scenario
 from wearcap.systems.echo.training_windows import foot_patches
 
 MEASURES = (
-    "mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "v2v_cm", "center_cm", "rotation_deg", "quaternion",
-    "touch_f1", "jitter_m_s3",
-)  # fmt: skip
+    "mpjpe_mm",
+    "mpjve_mm",
+    "foot_contact",
+    "true_foot_contact",
+    "v2v_cm",
+    "center_cm",
+    "rotation_deg",
+    "quaternion",
+    "touch_f1",
+    "jitter_m_s3",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +69,7 @@ def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: Ob
     """Ground truth at `timestamps` (s). Raises WearcapError if motion or an active object's poses are missing."""
     recording, environment = scenario.recording, scenario.environment
     if recording.motion is None:
-        raise WearcapError("no true motion to compare with", where=recording.name, expected="a recording with `motion`")  # fmt: skip
+        raise WearcapError("no true motion to compare with", where=recording.name, expected="a recording with `motion`")
     whole = recording.motion
     times = timestamps.clamp(whole.timestamps[0].item(), whole.timestamps[-1].item())
     motion = at_times(whole, times)
@@ -73,7 +81,7 @@ def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: Ob
     for number, name in enumerate(names):
         assert environment is not None
         if name not in recording.object_motion:
-            raise WearcapError(f"no true poses of {name!r}", where=recording.name, expected="them in `object_motion`")  # fmt: skip
+            raise WearcapError(f"no true poses of {name!r}", where=recording.name, expected="them in `object_motion`")
         shape = reader(environment.by_name(name))
         T = shape.centred(_poses_at(recording.object_motion[name], times))
         rows = (active == number).nonzero()[:, 0]
@@ -149,7 +157,9 @@ def observed_share(truth: Truth, modality: str, share: float, seed: int) -> Obse
     take = torch.from_numpy(chosen)
     times = truth.motion.timestamps[take]
     if modality == "human":
-        motion = Motion(times, truth.motion.skeleton, truth.motion.R_parent_joint[take], truth.motion.t_world_root[take])  # fmt: skip
+        motion = Motion(
+            times, truth.motion.skeleton, truth.motion.R_parent_joint[take], truth.motion.t_world_root[take]
+        )
         return Observed(motion=motion)
     if modality == "object":
         tracks = {}

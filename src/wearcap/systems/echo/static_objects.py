@@ -22,9 +22,7 @@ def is_touched(conditioning: Conditioning, outputs: Outputs, threshold: float) -
     return conditioning.has_object & (touch | conditioning.is_observed[..., 1])
 
 
-def _ends(
-    touched: Bool[Tensor, "batch frame"],
-) -> tuple[Int64[Tensor, "batch frame"], Int64[Tensor, "batch frame"]]:
+def _ends(touched: Bool[Tensor, "batch frame"]) -> tuple[Int64[Tensor, "batch frame"], Int64[Tensor, "batch frame"]]:
     """First and last frame of the contact that each frame belongs to."""
     count = touched.shape[1]
     frames = torch.arange(count).expand(touched.shape)
@@ -81,7 +79,9 @@ def _static(
     """Predicted object poses, corrected by the share `weight` of the difference between the static pose (`left`) and
     the predicted pose at the contact's start (`found`); rotation in world axes about the centre."""
     turn = rotation.exp(weight[..., None] * rotation.log(left.R @ found.R.mT))
-    return outputs._replace(R_world_object=turn @ predicted.R, t_world_object=predicted.t + weight[..., None] * (left.t - found.t))  # fmt: skip
+    return outputs._replace(
+        R_world_object=turn @ predicted.R, t_world_object=predicted.t + weight[..., None] * (left.t - found.t)
+    )
 
 
 class StaticObjects:
@@ -97,10 +97,7 @@ class StaticObjects:
 
     def __call__(self, conditioning: Conditioning, outputs: Outputs) -> Outputs:
         """Outputs of one frame with static objects."""
-        number, predicted = (
-            conditioning.object_number.item(),
-            Rigid(outputs.R_world_object, outputs.t_world_object),
-        )
+        number, predicted = (conditioning.object_number.item(), Rigid(outputs.R_world_object, outputs.t_world_object))
         if not conditioning.has_object.item():
             self._fading = None
             return outputs

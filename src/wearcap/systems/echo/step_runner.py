@@ -160,13 +160,16 @@ class EchoRunner:
 def require_runtime(runtime: str, device: str | torch.device) -> None:
     """Raises WearcapError for a runtime that is unknown, not installed, or not for a device."""
     if runtime not in RUNTIMES:
-        raise WearcapError(f"unknown runtime {runtime!r}", expected=f"one of {', '.join(RUNTIMES)}", fix=nearest(runtime, RUNTIMES))  # fmt: skip
+        raise WearcapError(
+            f"unknown runtime {runtime!r}", expected=f"one of {', '.join(RUNTIMES)}", fix=nearest(runtime, RUNTIMES)
+        )
     missing = missing_libraries() if runtime == "onnx" else []
     if missing or (runtime == "onnx" and torch.device(device).type != "cpu"):
         raise WearcapError(
             f"runtime 'onnx' needs {', '.join(missing)}" if missing else f"runtime 'onnx' on {device}",
-            expected="ONNX Runtime on the CPU", fix='Run: pip install "wearcap[export]", or choose pipeline.runtime=eager.',
-        )  # fmt: skip
+            expected="ONNX Runtime on the CPU",
+            fix='Run: pip install "wearcap[export]", or choose pipeline.runtime=eager.',
+        )
 
 
 def _onnx(
@@ -176,12 +179,16 @@ def _onnx(
     valid = torch.ones(frames, dtype=torch.bool)
     encode_inputs = {
         "condition": torch.zeros(*frames, len(net.condition_normalizer.mean)),
-        "scene_object": torch.zeros(*frames, len(net.no_object)), "has_object": valid, "valid": valid.clone(),
-    }  # fmt: skip
+        "scene_object": torch.zeros(*frames, len(net.no_object)),
+        "has_object": valid,
+        "valid": valid.clone(),
+    }
     step_inputs = {
-        "x_t": torch.zeros(*frames, sum(net.sizes)), "plan": torch.zeros(*frames, columns),
-        "encoded": torch.zeros(*frames, net.narrow.out_features), "valid": valid,
-    }  # fmt: skip
+        "x_t": torch.zeros(*frames, sum(net.sizes)),
+        "plan": torch.zeros(*frames, columns),
+        "encoded": torch.zeros(*frames, net.narrow.out_features),
+        "valid": valid,
+    }
     run_step, run_encode = onnx_runner(step, step_inputs), onnx_runner(encode, encode_inputs)
 
     def stepped(x_t: Tensor, plan: Tensor, encoded: Tensor, valid: Tensor) -> Tensor:

@@ -74,12 +74,10 @@ class EchoSession:
     capture restarts like a new session, keeping the active object; all other times refer to the new clock.
     """
 
-    def __init__(
-        self, pipeline: Echo, wearer: EchoWearer, environment: Environment | None = None, seed: int = 0
-    ):
+    def __init__(self, pipeline: Echo, wearer: EchoWearer, environment: Environment | None = None, seed: int = 0):
         """Raises WearcapError for a pipeline without a conveyor."""
         if pipeline.rewindow is not None:
-            raise WearcapError(f"a stream with rewindow={pipeline.rewindow}", expected="a conveyor: rewindow=null")  # fmt: skip
+            raise WearcapError(f"a stream with rewindow={pipeline.rewindow}", expected="a conveyor: rewindow=null")
         pipeline.prepare()
         self.pipeline, self.wearer, self.seed = pipeline, wearer, seed
         self.silent = 0
@@ -129,9 +127,7 @@ class EchoSession:
             if admitted.again:
                 if (motion := self._final(ended=True)) is not None:
                     self._finished.append(motion)
-                active = next(
-                    (name for start, name in reversed(self._acts) if start <= self._track.newest), None
-                )
+                active = next((name for start, name in reversed(self._acts) if start <= self._track.newest), None)
                 self._acts = [] if active is None else [(-math.inf, active)]
                 self._seen = []
             self._begin()
@@ -222,7 +218,9 @@ class EchoSession:
             check_object(item, f"object {name!r}")
             self._shapes[name] = self._reader(item)
             if self._queue is not None and self._queue.guided is not None:
-                self._queue.guided = pulled_by([self.wearer.skeleton], [dict(self.wearer.shape)], [list(self._shapes.values())])  # fmt: skip
+                self._queue.guided = pulled_by(
+                    [self.wearer.skeleton], [dict(self.wearer.shape)], [list(self._shapes.values())]
+                )
         return self._shapes[name]
 
     def poses(self, ended: bool = False) -> Motion | None:
@@ -258,9 +256,11 @@ class EchoSession:
             motions += self._finish()
             skeleton = self.wearer.skeleton
             self._queue = self.pipeline.queue(
-                [skeleton], [stretch_seed(self.seed, chunk.first)], [dict(self.wearer.shape)],
+                [skeleton],
+                [stretch_seed(self.seed, chunk.first)],
+                [dict(self.wearer.shape)],
                 [list(self._shapes.values())],
-            )  # fmt: skip
+            )
         mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
         T_world_head = chunk.T_world_device @ mount
         self._correct(chunk.corrected @ mount)
@@ -295,11 +295,25 @@ class EchoSession:
         R, t = torch.stack([T.R for T in poses], 1), torch.stack([T.t for T in poses], 1)
         joints = len(self.wearer.skeleton)
         valid = torch.ones(1, dtype=torch.bool)
-        unobserved = (torch.eye(3).repeat(1, joints, 1, 1), torch.zeros(1, 3), torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, CONTACTS))  # fmt: skip
+        unobserved = (
+            torch.eye(3).repeat(1, joints, 1, 1),
+            torch.zeros(1, 3),
+            torch.eye(3)[None],
+            torch.zeros(1, 3),
+            torch.zeros(1, CONTACTS),
+        )
         floor = torch.full((1,), self.wearer.floor_m or 0.0)
         if self.wearer.floor_m is None:
             floor = self._floor.follow(T_world_head.t)
-        fields = (R, t, floor, *self._active(time), valid, *unobserved, torch.zeros(1, len(MODALITIES), dtype=torch.bool))  # fmt: skip
+        fields = (
+            R,
+            t,
+            floor,
+            *self._active(time),
+            valid,
+            *unobserved,
+            torch.zeros(1, len(MODALITIES), dtype=torch.bool),
+        )
         return self._with_observed_object(Conditioning(*(value[None] for value in fields)), time)
 
     def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -315,9 +329,7 @@ class EchoSession:
         if not conditioning.has_object.item():
             return conditioning
         active, near = list(self._shapes)[int(conditioning.object_number)], 0.5 / self.pipeline.fps + 1e-6
-        seen = [
-            (abs(at - time), T) for at, name, T in self._seen if name == active and abs(at - time) <= near
-        ]
+        seen = [(abs(at - time), T) for at, name, T in self._seen if name == active and abs(at - time) <= near]
         if not seen:
             return conditioning
         _, T = min(seen, key=lambda pair: pair[0])
@@ -372,9 +384,13 @@ class EchoSession:
             return []
         time, conditioning, T_world_head = self._pending.pop(0)
         path = HeadPath(
-            torch.tensor([time], dtype=torch.float64), T_world_head, T_world_head, conditioning.floor_height[0],
-            self.wearer.skeleton, ((0, 1),),
-        )  # fmt: skip
+            torch.tensor([time], dtype=torch.float64),
+            T_world_head,
+            T_world_head,
+            conditioning.floor_height[0],
+            self.wearer.skeleton,
+            ((0, 1),),
+        )
         self._forget(time)
         batch_item = BatchItem(path, conditioning, list(self._shapes.values()))
         if self._static is not None:

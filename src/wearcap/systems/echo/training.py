@@ -52,9 +52,12 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         ablation."""
         super().__init__()
         self.net = net(
-            human_size=features.human_size, object_size=OBJECT_SIZE, contact_size=CONTACTS,
-            condition_size=features.condition_size, object_condition_size=features.object_condition_size,
-        )  # fmt: skip
+            human_size=features.human_size,
+            object_size=OBJECT_SIZE,
+            contact_size=CONTACTS,
+            condition_size=features.condition_size,
+            object_condition_size=features.object_condition_size,
+        )
         self.encoder = None if encoder is None else encoder.requires_grad_(False).eval()
         self.features, self.schedule, self.skeleton, self.mix = features, schedule, skeleton, levels
         self.loss_weights, self.contacts, self.seed = dict(loss_weights), contacts, seed
@@ -64,22 +67,20 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
     def set_statistics(self, dataset: EchoDataset, limit: int = 1500) -> None:
         """Compute normalisation from a training split; a resumed run loads it with the weights."""
         if dataset.features != self.features:
-            raise WearcapError("windows of other features than the model's", expected="equal data.features and model.features")  # fmt: skip
+            raise WearcapError(
+                "windows of other features than the model's", expected="equal data.features and model.features"
+            )
         random = torch.Generator().manual_seed(0)
         drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
         rows: dict[str, list[Tensor]] = {"human": [], "object": [], "condition": []}
         for first in range(0, limit, 100):
-            batch = collate(
-                [dataset[item] for item in zip(drawn[first : first + 100], range(first, first + 100))]
-            )
+            batch = collate([dataset[item] for item in zip(drawn[first : first + 100], range(first, first + 100))])
             frame = self.features.canonical(batch.points)
             rows["human"].append(self.features.encode_body(batch.body, frame)[batch.valid])
             rows["object"].append(
                 self.features.encode_object(batch.T_world_object, frame)[batch.valid & batch.has_object]
             )
-            rows["condition"].append(
-                self.features.condition(batch.points, batch.floor_height, batch.size)[batch.valid]
-            )
+            rows["condition"].append(self.features.condition(batch.points, batch.floor_height, batch.size)[batch.valid])
         human, scene_object, condition = (torch.cat(part) for part in rows.values())
         ranges = [self._range(human), self._range(scene_object)]
         mean, scale = (torch.cat(part) for part in zip(*ranges))
@@ -103,9 +104,13 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
     def pipeline_parts(self) -> dict[str, Any]:
         """The arguments of an `Echo` pipeline that come from training."""
         return {
-            "net": self.net, "features": self.features, "schedule": self.schedule, "skeleton": self.skeleton,
-            "encoder": self.encoder, "contacts": self.contacts,
-        }  # fmt: skip
+            "net": self.net,
+            "features": self.features,
+            "schedule": self.schedule,
+            "skeleton": self.skeleton,
+            "encoder": self.encoder,
+            "contacts": self.contacts,
+        }
 
     def train(self, mode: bool = True) -> "EchoDiffusion":
         """Set the mode; the frozen object encoder stays in evaluation mode."""
@@ -147,9 +152,7 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         x0, levels = self._truth(batch, frame), self._levels(batch)
         x_t = add_noise(x0, batch.noise, self.net.per_feature(levels), self.schedule)
         condition = self.features.condition(batch.points, batch.floor_height, batch.size, frame)
-        encoded = self.net.encode(
-            condition, self.net.object(batch.object_code), batch.has_object, batch.valid
-        )
+        encoded = self.net.encode(condition, self.net.object(batch.object_code), batch.has_object, batch.valid)
         x0_hat = self.net(x_t, levels, encoded, batch.valid).float()
         # Half precision is too coarse for millimetres.
         with torch.autocast(x0_hat.device.type, enabled=False):

@@ -137,9 +137,16 @@ def echo_track(
     contact[:, CONTACTS - len(FOOT_PATCHES) :] = foot_patches(recording)[take].float()
     floor = recording.floor.height[take] if recording.floor is not None else torch.zeros(len(take))
     return EchoTrack(
-        points, floor.float(), motion.skeleton, body_size(motion.skeleton),
-        Body(motion.R_parent_joint[take], motion.t_world_root[take]), contact, objects, active, Rigid(R, t),
-    )  # fmt: skip
+        points,
+        floor.float(),
+        motion.skeleton,
+        body_size(motion.skeleton),
+        Body(motion.R_parent_joint[take], motion.t_world_root[take]),
+        contact,
+        objects,
+        active,
+        Rigid(R, t),
+    )
 
 
 def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
@@ -147,8 +154,12 @@ def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
     track, motion = recording.contacts, recording.motion
     assert motion is not None
     if track is None or not set(FOOT_PATCHES) <= set(track.parts) or len(track.contact) != len(motion):
-        raise WearcapError("no foot contacts beside the motion", where=recording.name,
-                           expected=f"contacts of {', '.join(FOOT_PATCHES)}", fix="Prepare the data set again.")  # fmt: skip
+        raise WearcapError(
+            "no foot contacts beside the motion",
+            where=recording.name,
+            expected=f"contacts of {', '.join(FOOT_PATCHES)}",
+            fix="Prepare the data set again.",
+        )
     return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]
 
 
@@ -160,10 +171,20 @@ class EchoDataset(Dataset):
     """
 
     def __init__(
-        self, sources: list[Source], split: str, *, features: EchoFeatures, encoder: PointNeXt | None, window: int,
-        stride: int, mirror: bool = False, balance: float = 1.0, beginnings: float = 0.0, within_m: float = TOUCH_M,
+        self,
+        sources: list[Source],
+        split: str,
+        *,
+        features: EchoFeatures,
+        encoder: PointNeXt | None,
+        window: int,
+        stride: int,
+        mirror: bool = False,
+        balance: float = 1.0,
+        beginnings: float = 0.0,
+        within_m: float = TOUCH_M,
         objects: bool = True,
-    ):  # fmt: skip
+    ):
         """`beginnings` is the share of windows that are not full, as the first and last ones of a capture; with
         `objects` False all recordings are of humans alone."""
         self.features, self.encoder = features, encoder
@@ -176,12 +197,15 @@ class EchoDataset(Dataset):
         for source in sources:
             every = _every(source, split, features.fps)
             rows, first, share = share_out(
-                [source], split, window=window * every, stride=stride * every, fps=features.fps * every, balance=balance,
+                [source],
+                split,
+                window=window * every,
+                stride=stride * every,
+                fps=features.fps * every,
+                balance=balance,
                 min_frames=2 * MIN_FRAMES * every,
-            )  # fmt: skip
-            first = torch.stack(
-                [first[:, 0] + len(self.recordings), first[:, 1] // every, first[:, 2] // every], 1
             )
+            first = torch.stack([first[:, 0] + len(self.recordings), first[:, 1] // every, first[:, 2] // every], 1)
             self.recordings += [(store, name, every) for store, name in rows]
             starts.append(first)
             weights.append(share)
@@ -215,9 +239,7 @@ class EchoDataset(Dataset):
         window = self._cut(track, start, length, mirrored, random)
         return mirror_window(window, track.skeleton) if mirrored else window
 
-    def _cut(
-        self, track: EchoTrack, start: int, length: int, mirrored: bool, random: torch.Generator
-    ) -> EchoWindow:
+    def _cut(self, track: EchoTrack, start: int, length: int, mirrored: bool, random: torch.Generator) -> EchoWindow:
         """Frames start…start+length-1, padded to a full window by repeating the last one; with the codes of the
         mirrored objects if the window will be mirrored."""
         stop = min(start + length, len(track.floor_height))
@@ -225,18 +247,30 @@ class EchoDataset(Dataset):
         active = track.active[take]
         nothing = (torch.zeros(self.features.object_condition_size), torch.zeros(3), torch.zeros(3, 3))
         shapes = [
-            (shape.code_mirrored if mirrored else shape.code, shape.mean, shape.spread)
-            for shape in track.objects
+            (shape.code_mirrored if mirrored else shape.code, shape.mean, shape.spread) for shape in track.objects
         ]
         code, mean, spread = (torch.stack(rows)[active] for rows in zip(*shapes, nothing))
         noise = torch.randn(self.window, self.features.human_size + OBJECT_SIZE + CONTACTS, generator=random)
         return EchoWindow(
-            track.points.R_world_point[take], track.points.t_world_point[take], track.floor_height[take], track.size,
-            track.skeleton.t_parent_joint, track.body.R_parent_joint[take], track.body.t_world_root[take],
-            track.contact[take], active != NO_OBJECT, code, track.T_world_object.R[take], track.T_world_object.t[take],
-            mean, spread, torch.arange(self.window) < stop - start, noise,
-            torch.rand(self.window, 4, generator=random), torch.rand(DRAWS, generator=random),
-        )  # fmt: skip
+            track.points.R_world_point[take],
+            track.points.t_world_point[take],
+            track.floor_height[take],
+            track.size,
+            track.skeleton.t_parent_joint,
+            track.body.R_parent_joint[take],
+            track.body.t_world_root[take],
+            track.contact[take],
+            active != NO_OBJECT,
+            code,
+            track.T_world_object.R[take],
+            track.T_world_object.t[take],
+            mean,
+            spread,
+            torch.arange(self.window) < stop - start,
+            noise,
+            torch.rand(self.window, 4, generator=random),
+            torch.rand(DRAWS, generator=random),
+        )
 
 
 def _every(source: Source, split: str, fps: float) -> int:
@@ -245,8 +279,12 @@ def _every(source: Source, split: str, fps: float) -> int:
     rates = {store.entries[name].fps for name in store.names(split)}
     rate = next(iter(rates), fps)
     if len(rates) > 1 or abs(rate / fps - round(rate / fps)) > 0.01:
-        raise WearcapError(f"recordings of {', '.join(f'{each:g}' for each in sorted(rates))} frames per second", where=source.root,
-                           expected=f"one rate that is a whole multiple of {fps:g}", fix="Prepare the data set at such a rate.")  # fmt: skip
+        raise WearcapError(
+            f"recordings of {', '.join(f'{each:g}' for each in sorted(rates))} frames per second",
+            where=source.root,
+            expected=f"one rate that is a whole multiple of {fps:g}",
+            fix="Prepare the data set at such a rate.",
+        )
     return round(rate / fps)
 
 
@@ -260,13 +298,17 @@ def mirror_window(window: EchoWindow, skeleton: Skeleton) -> EchoWindow:
     points = [0, 2, 1]
     patches = [len(mirrored_points()) + k for k in (2, 3, 0, 1)]
     return window._replace(
-        R_world_point=window.R_world_point[:, points] * turn, t_world_point=window.t_world_point[:, points] * flip,
+        R_world_point=window.R_world_point[:, points] * turn,
+        t_world_point=window.t_world_point[:, points] * flip,
         t_parent_joint=window.t_parent_joint[joint_twins(skeleton)] * flip,
-        R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton), t_world_root=window.t_world_root * flip,
+        R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton),
+        t_world_root=window.t_world_root * flip,
         contact=window.contact[:, [*mirrored_points().tolist(), *patches]],
-        R_world_object=window.R_world_object * turn, t_world_object=window.t_world_object * flip,
-        object_mean=window.object_mean * flip, object_spread=window.object_spread * turn,
-    )  # fmt: skip
+        R_world_object=window.R_world_object * turn,
+        t_world_object=window.t_world_object * flip,
+        object_mean=window.object_mean * flip,
+        object_spread=window.object_spread * turn,
+    )
 
 
 @cache
@@ -278,11 +320,24 @@ class EchoWindows(SeededWindows):
     """Windows for Lightning."""
 
     def __init__(
-        self, sources: dict[str, dict | None], features: EchoFeatures, window: int, stride: int, batch_size: int,
-        steps_per_epoch: int | None = None, val_windows: int | None = None, workers: int = 0, seed: int = 0,
-        augment: bool = True, balance: float = 1.0, beginnings: float = 0.0, within_m: float = TOUCH_M,
-        objects: bool = True, encoder: PointNeXt | str | None = "object_encoder", val_sources: dict[str, dict | None] | None = None,
-    ):  # fmt: skip
+        self,
+        sources: dict[str, dict | None],
+        features: EchoFeatures,
+        window: int,
+        stride: int,
+        batch_size: int,
+        steps_per_epoch: int | None = None,
+        val_windows: int | None = None,
+        workers: int = 0,
+        seed: int = 0,
+        augment: bool = True,
+        balance: float = 1.0,
+        beginnings: float = 0.0,
+        within_m: float = TOUCH_M,
+        objects: bool = True,
+        encoder: PointNeXt | str | None = "object_encoder",
+        val_sources: dict[str, dict | None] | None = None,
+    ):
         """See `SeededWindows` and `EchoDataset`; augmentation is for training alone.
 
         `encoder` is a checkpoint of experiment=object_encoder, or another PointNeXt; None: no shape feature.
@@ -297,7 +352,15 @@ class EchoWindows(SeededWindows):
         """Windows of a split."""
         train = split == "train"
         return EchoDataset(
-            self.sources if train else self.val_sources, split, features=self.features, encoder=self.encoder,
-            window=self.window, stride=self.stride, mirror=self.augment and train, balance=self.balance if train else 1.0,
-            beginnings=self.beginnings if train else 0.0, within_m=self.within_m, objects=self.objects,
-        )  # fmt: skip
+            self.sources if train else self.val_sources,
+            split,
+            features=self.features,
+            encoder=self.encoder,
+            window=self.window,
+            stride=self.stride,
+            mirror=self.augment and train,
+            balance=self.balance if train else 1.0,
+            beginnings=self.beginnings if train else 0.0,
+            within_m=self.within_m,
+            objects=self.objects,
+        )

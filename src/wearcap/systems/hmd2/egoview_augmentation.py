@@ -20,9 +20,7 @@ _SWAPPED = [index ^ 1 for index in range(len(POINTS))]
 def relit(pictures: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 3 height width"]:
     """Images with random gain, shift, channel mixing and noise, drawn per image."""
     like = pictures[:, :1, :1, :1]
-    mix = torch.eye(3, device=pictures.device) + 0.3 * torch.randn(
-        len(pictures), 3, 3, device=pictures.device
-    )
+    mix = torch.eye(3, device=pictures.device) + 0.3 * torch.randn(len(pictures), 3, 3, device=pictures.device)
     mix = mix / mix.sum(-1, keepdim=True).clamp_min(0.3)
     pictures = (mix @ pictures.flatten(2)).unflatten(2, pictures.shape[2:])
     gain, shift = (0.25 * torch.randn_like(like)).exp(), 0.3 * torch.randn_like(like)
@@ -36,9 +34,7 @@ def turned(
     point_cam: Float[Tensor, "batch point 3"],
     visible: Bool[Tensor, "batch point"],
     deviation_deg: float,
-) -> tuple[
-    Float[Tensor, "batch 3 height width"], Float[Tensor, "batch point 3"], Bool[Tensor, "batch point"]
-]:
+) -> tuple[Float[Tensor, "batch 3 height width"], Float[Tensor, "batch point 3"], Bool[Tensor, "batch point"]]:
     """Images and points as seen by a slightly rotated camera, with angles of `deviation_deg` per axis.
 
     `intrinsics` are fx, fy, cx, cy of the images (lens distortion is ignored, as rotations are small). Areas outside
@@ -64,9 +60,7 @@ def half_mirrored(
     pictures: Float[Tensor, "batch 3 height width"],
     point_cam: Float[Tensor, "batch point 3"],
     visible: Bool[Tensor, "batch point"],
-) -> tuple[
-    Float[Tensor, "batch 3 height width"], Float[Tensor, "batch point 3"], Bool[Tensor, "batch point"]
-]:
+) -> tuple[Float[Tensor, "batch 3 height width"], Float[Tensor, "batch point 3"], Bool[Tensor, "batch point"]]:
     """A random half of the images flipped horizontally, with left and right points exchanged."""
     flip = torch.rand(len(pictures), device=pictures.device) < 0.5
     across = point_cam.new_tensor([-1.0, 1.0, 1.0])

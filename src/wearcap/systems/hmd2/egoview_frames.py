@@ -22,7 +22,11 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.store import RecordingFile, RecordingStore
 
-POINTS = tuple(f"{side}_{part}" for part in ("palm", "fingertip", "wrist", "elbow", "knee", "toe_tip") for side in ("left", "right"))  # fmt: skip
+POINTS = tuple(
+    f"{side}_{part}"
+    for part in ("palm", "fingertip", "wrist", "elbow", "knee", "toe_tip")
+    for side in ("left", "right")
+)
 """Joints and sites whose positions in the camera's frame are learned; left and right alternate."""
 HANDS = tuple(f"{side}_palm" for side in ("left", "right"))
 
@@ -74,11 +78,7 @@ class EgoFrames(Dataset):
             for name in store.names(split):
                 file = RecordingFile(store.path_of(name))
                 camera, motion = file.part("camera"), file.part("motion")
-                if (
-                    not isinstance(camera, CameraStream)
-                    or motion is None
-                    or not (camera.video or camera.image_files)
-                ):
+                if not isinstance(camera, CameraStream) or motion is None or not (camera.video or camera.image_files):
                     continue
                 frames = decoded(camera, store.root, every)
                 of_all = limb_points(motion, camera)
@@ -89,8 +89,11 @@ class EgoFrames(Dataset):
                 intrinsics.append(torch.tensor([lens.fx, lens.fy, lens.cx, lens.cy]).expand(len(frames), 4))
                 self._pictures.append(frames)
         if not points:
-            raise WearcapError(f"no head camera images in split {split!r}", where=", ".join(s.root for s in sources),
-                               fix="Prepare a data set with them: wearcap prepare simulated camera=true")  # fmt: skip
+            raise WearcapError(
+                f"no head camera images in split {split!r}",
+                where=", ".join(s.root for s in sources),
+                fix="Prepare a data set with them: wearcap prepare simulated camera=true",
+            )
         self.point_cam, self.visible, self.weights = torch.cat(points), torch.cat(visible), torch.cat(weights)
         self.intrinsics = torch.cat(intrinsics)
         shown = self.visible[:, [POINTS.index(name) for name in HANDS]].any(-1)
@@ -107,10 +110,7 @@ class EgoFrames(Dataset):
         recording = int(np.searchsorted(self._first, index, side="right")) - 1
         picture = self._pictures[recording][index - self._first[recording]]
         return EgoFrame(
-            torch.from_numpy(picture.copy()),
-            self.point_cam[index],
-            self.visible[index],
-            self.intrinsics[index],
+            torch.from_numpy(picture.copy()), self.point_cam[index], self.visible[index], self.intrinsics[index]
         )
 
 
@@ -135,8 +135,11 @@ def decoded(camera: CameraStream, root: Path, every: int) -> UInt8[np.ndarray, "
             if (count - 1) % every == 0:
                 chosen.append(picture)
         if count != len(camera.timestamps) or len({picture.shape for picture in chosen}) != 1:
-            raise WearcapError(f"{count} pictures for {len(camera.timestamps)} timestamps", where=first,
-                               expected="a picture for each timestamp, all of one size")  # fmt: skip
+            raise WearcapError(
+                f"{count} pictures for {len(camera.timestamps)} timestamps",
+                where=first,
+                expected="a picture for each timestamp, all of one size",
+            )
         with atomic_path(path) as temporary:
             np.save(temporary, np.stack(chosen), allow_pickle=False)
     return _array(path)

@@ -54,9 +54,7 @@ class EgoView(SeededSteps):
         self, pictures: Float[Tensor, "batch 3 height width"]
     ) -> tuple[Float[Tensor, "batch point"], Float[Tensor, "batch point 3"]]:
         """Logits of visibility, and positions in the camera's axes (m)."""
-        logits, places = self.heads(self.dropout(self.net(pictures))).split(
-            [len(POINTS), 3 * len(POINTS)], -1
-        )
+        logits, places = self.heads(self.dropout(self.net(pictures))).split([len(POINTS), 3 * len(POINTS)], -1)
         return logits, self.normalizer.inverse(places).unflatten(-1, (len(POINTS), 3))
 
     def pictures(self, batch: EgoFrame) -> Float[Tensor, "batch 3 height width"]:
@@ -95,10 +93,7 @@ class EgoView(SeededSteps):
     def validation_step(self, batch: EgoFrame, batch_idx: int) -> None:
         pictures = self.pictures(batch)
         self.log(
-            "val/loss",
-            self.loss(pictures, batch.point_cam, batch.visible),
-            batch_size=len(pictures),
-            sync_dist=True,
+            "val/loss", self.loss(pictures, batch.point_cam, batch.visible), batch_size=len(pictures), sync_dist=True
         )
         self._validated.append((*self(pictures), batch))
 
@@ -106,9 +101,7 @@ class EgoView(SeededSteps):
         logits, places = (torch.cat([part[k] for part in self._validated]) for k in range(2))
         truth = EgoFrame(*(torch.cat(field) for field in zip(*(part[2] for part in self._validated))))
         mean = self.normalizer.mean.unflatten(-1, (len(POINTS), 3)).expand_as(places)
-        for name, value in view_scores(
-            logits.sigmoid(), places, mean, truth.point_cam, truth.visible
-        ).items():
+        for name, value in view_scores(logits.sigmoid(), places, mean, truth.point_cam, truth.visible).items():
             self.log(f"val/{name}", value)
         self._validated.clear()
 
@@ -116,10 +109,7 @@ class EgoView(SeededSteps):
         optimizer = self._optimizer(self.parameters())
         if self._scheduler is None:
             return optimizer
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"},
-        }
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"}}
 
 
 def view_scores(
@@ -137,9 +127,7 @@ def view_scores(
     left, right = (POINTS.index(name) for name in HANDS)
     errors = {"": places, "_of_mean": mean_places}
     scores = {
-        "hand_average_precision": _mean(
-            [average_precision(prob[:, k], visible[:, k]) for k in (left, right)]
-        ),
+        "hand_average_precision": _mean([average_precision(prob[:, k], visible[:, k]) for k in (left, right)]),
         "hand_share": float(visible[:, [left, right]].double().mean()),
     }
     for suffix, guess in errors.items():

@@ -35,8 +35,9 @@ class HeadFeatures:
     def __post_init__(self):
         for name, allowed in (("frame", ("heading", "window")), ("height", ("stature", "floor", "relative"))):
             if getattr(self, name) not in allowed:
-                raise WearcapError(f"head features have no {name} {getattr(self, name)!r}",
-                                   expected=f"one of {', '.join(allowed)}")  # fmt: skip
+                raise WearcapError(
+                    f"head features have no {name} {getattr(self, name)!r}", expected=f"one of {', '.join(allowed)}"
+                )
 
     @property
     def condition_size(self) -> int:
@@ -77,15 +78,7 @@ class HeadFeatures:
         horizontal = [offset[..., :2, 0]] if self.frame == "window" else []
         body_size = [size[:, None].expand(-1, height.shape[1], -1)] if self.body else []
         return torch.cat(
-            [
-                *horizontal,
-                height,
-                rotation.rot6d_from_matrix(R_canonical_head),
-                velocity,
-                angular,
-                *body_size,
-            ],
-            -1,
+            [*horizontal, height, rotation.rot6d_from_matrix(R_canonical_head), velocity, angular, *body_size], -1
         )
 
     def encode(
@@ -107,9 +100,7 @@ class HeadFeatures:
         R = rotation.matrix_from_rot6d(motion[..., : 6 * self.joints].unflatten(-1, (-1, 6)))
         R_root = self.frame_of(R_world_head) @ R[:, :, 0]
         contact = (
-            (motion[..., 6 * self.joints :] + 1) / 2
-            if self.contacts
-            else motion.new_zeros(*motion.shape[:2], FEET)
+            (motion[..., 6 * self.joints :] + 1) / 2 if self.contacts else motion.new_zeros(*motion.shape[:2], FEET)
         )
         return torch.cat([R_root[:, :, None], R[:, :, 1:]], 2), contact.clamp(0, 1)
 
@@ -123,13 +114,9 @@ def feature_statistics(
     windows = torch.multinomial(dataset.weights, count, replacement=True, generator=random).tolist()
     sums: dict[str, list[Tensor]] = {}
     for start in range(0, count, 64):
-        batch = collate(
-            [dataset[item] for item in zip(windows[start : start + 64], range(start, start + 64))]
-        )
+        batch = collate([dataset[item] for item in zip(windows[start : start + 64], range(start, start + 64))])
         motion = features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
-        head = features.condition(
-            batch.R_world_head, batch.t_world_head, batch.floor_height, batch.size, dataset.fps
-        )
+        head = features.condition(batch.R_world_head, batch.t_world_head, batch.floor_height, batch.size, dataset.fps)
         for name, value, valid in (
             ("motion", motion, batch.valid),
             ("head", head, batch.valid),

@@ -58,7 +58,7 @@ class ConditionEncoder(nn.Module):
 
     def __init__(
         self, head_size: int, points_size: int, image_size: int, width: int, frames_per_token: int, context: int
-    ):  # fmt: skip
+    ):
         super().__init__()
         # One more channel marks valid frames: padding would otherwise look like the mean condition.
         self.normalizer = Normalizer(head_size)
@@ -67,9 +67,7 @@ class ConditionEncoder(nn.Module):
         self.image = OptionalInput(image_size, 2 * width, frames_per_token) if image_size else None
         self.narrow = nn.Linear(2 * width, width)
 
-    def forward(
-        self, conditions: Conditions, valid: Bool[Tensor, "batch time"]
-    ) -> Float[Tensor, "batch token width"]:
+    def forward(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch token width"]:
         mask = valid[..., None].to(conditions.head.dtype)
         frames = torch.cat([self.normalizer(conditions.head) * mask, mask], -1)
         wide = self.widen(frames)
@@ -128,13 +126,10 @@ class MotionDenoiser(nn.Module):
         self.condition_encoder = ConditionEncoder(
             condition_size, points_size, image_size, width, frames_per_token, context
         )
-        self.motion_encoder = MotionEncoder(
-            motion_size * (2 if self_conditioning else 1), width, frames_per_token
-        )
+        self.motion_encoder = MotionEncoder(motion_size * (2 if self_conditioning else 1), width, frames_per_token)
         self.level = LevelEmbedding(width)
         self.blocks = nn.ModuleList(
-            AdaptiveBlock(width, heads, feedforward, window // frames_per_token, dropout)
-            for _ in range(layers)
+            AdaptiveBlock(width, heads, feedforward, window // frames_per_token, dropout) for _ in range(layers)
         )
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, frames_per_token * motion_size)
@@ -142,9 +137,7 @@ class MotionDenoiser(nn.Module):
         nn.init.zeros_(self.head.bias)
         self.blend = TemporalBlend(blend) if blend else None
 
-    def encode(
-        self, conditions: Conditions, valid: Bool[Tensor, "batch time"]
-    ) -> Float[Tensor, "batch token width"]:
+    def encode(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch token width"]:
         """The encoded condition of every token; `valid` is False on padding."""
         return self.condition_encoder(conditions, valid)
 
@@ -167,9 +160,7 @@ class MotionDenoiser(nn.Module):
         k = self.frames_per_token
         token_level = level if level.shape[1] == 1 else level.unflatten(1, (-1, k)).mean(-1)
         embedded = self.level(token_level)
-        return LevelPlan(
-            self.motion_encoder.plan(embedded), tuple(block.plan(embedded) for block in self.blocks)
-        )
+        return LevelPlan(self.motion_encoder.plan(embedded), tuple(block.plan(embedded) for block in self.blocks))
 
     def step(
         self,

@@ -82,8 +82,9 @@ class HMD2:
         window = self.net.window
         advance = (3 * window // 4 if self.inpaint else window // 2) if self.stride is None else self.stride
         if not 0 < advance <= window:
-            raise WearcapError(f"windows of {window} frames cannot advance by {advance}",
-                               expected=f"a stride from 1 to {window}")  # fmt: skip
+            raise WearcapError(
+                f"windows of {window} frames cannot advance by {advance}", expected=f"a stride from 1 to {window}"
+            )
         return advance
 
     @property
@@ -92,8 +93,10 @@ class HMD2:
         shared = self.net.window - self.advance
         lookahead_frames = (0 if self.inpaint else shared // 2) if self.lookahead is None else self.lookahead
         if not 0 <= lookahead_frames <= shared:
-            raise WearcapError(f"windows that share {shared} frames cannot look {lookahead_frames} ahead",
-                               expected=f"a lookahead from 0 to {shared}")  # fmt: skip
+            raise WearcapError(
+                f"windows that share {shared} frames cannot look {lookahead_frames} ahead",
+                expected=f"a lookahead from 0 to {shared}",
+            )
         return lookahead_frames
 
     def __call__(self, recording: Recording, seed: int = 0) -> Motion:
@@ -140,27 +143,29 @@ class HMD2:
         points, points_valid = self._points(recording, path)
         image, image_valid = torch.zeros(count, self.net.image_size), torch.zeros(count, dtype=torch.bool)
         camera = recording.camera
-        if (
-            self.net.image_size
-            and "images" in self.use
-            and camera is not None
-            and camera.embedding is not None
-        ):
+        if self.net.image_size and "images" in self.use and camera is not None and camera.embedding is not None:
             size = camera.embedding.shape[1]
             if (camera.embedding_name, size) != (self.image_encoder, self.net.image_size):
                 raise WearcapError(
-                    f"embeddings of {camera.embedding_name!r} with {size} features", where=recording.name,
+                    f"embeddings of {camera.embedding_name!r} with {size} features",
+                    where=recording.name,
                     expected=f"{self.net.image_size} of {self.image_encoder!r}, which the network was trained on",
                     fix="Prepare its embeddings with that encoder, or leave images out: pipeline.use=[points].",
-                )  # fmt: skip
+                )
             number, image_valid = latest_before(camera.timestamps, path.timestamps)
             image = camera.embedding[number].float()
             image_valid &= image.isfinite().all(-1)
             image = image.nan_to_num(0.0, 0.0, 0.0)
         frames = Frames(
-            path.T_world_head.R, path.T_world_head.t, self._floor(recording, path), points, points_valid,
-            image, image_valid, torch.ones(count, dtype=torch.bool),
-        )  # fmt: skip
+            path.T_world_head.R,
+            path.T_world_head.t,
+            self._floor(recording, path),
+            points,
+            points_valid,
+            image,
+            image_valid,
+            torch.ones(count, dtype=torch.bool),
+        )
         return Frames(*(part[None] for part in frames))
 
     def _uses_points(self, recording: Recording) -> bool:
@@ -174,11 +179,7 @@ class HMD2:
         if not self._uses_points(recording) or self.place_encoder is None or cloud is None:
             return torch.zeros(count, self.net.points_size), torch.zeros(count, dtype=torch.bool)
         grid = voxelize(
-            cloud.points_world,
-            path.T_world_device,
-            self.place_encoder.grid,
-            cloud.first_seen,
-            path.timestamps,
+            cloud.points_world, path.T_world_device, self.place_encoder.grid, cloud.first_seen, path.timestamps
         )
         code = torch.cat([self.place_encoder.encode(part) for part in grid.split(2048)])
         return code, torch.ones(count, dtype=torch.bool)
@@ -212,9 +213,7 @@ class HMD2:
 
         return denoise
 
-    def _windows(
-        self, paths: Sequence[HeadPath], frames: Sequence[Frames], seeds: Sequence[int]
-    ) -> list[Poses]:
+    def _windows(self, paths: Sequence[HeadPath], frames: Sequence[Frames], seeds: Sequence[int]) -> list[Poses]:
         """Step 4: poses of every path, window after window; all stretches of all paths share batches."""
         stride, lookahead_frames, passed = self.advance, self.lookahead_frames, 0
         whole = [no_poses(self, len(path.timestamps)) for path in paths]
@@ -236,9 +235,7 @@ class HMD2:
                 for target, part in zip(whole[i], final.poses):
                     target[0, end - part.shape[1] : end] = part[0]
             items = [item for item in items if item[1] + passed < item[2]]
-        return [
-            _bridged(Poses(*(part[0] for part in poses)), path.stretches) for poses, path in zip(whole, paths)
-        ]
+        return [_bridged(Poses(*(part[0] for part in poses)), path.stretches) for poses, path in zip(whole, paths)]
 
     def sampler(self, skeleton: Skeleton, seed: int, start: int) -> WindowSampler:
         """A sampler for the stretch that begins at frame `start`; every stretch of a recording has its own noise."""
@@ -257,12 +254,7 @@ class HMD2:
         }
         contact = poses.foot_contact.repeat_interleave(2, -1) if self.features.contacts else None
         motion = Motion(
-            timestamps,
-            skeleton,
-            poses.R_parent_joint,
-            torch.zeros(len(timestamps), 3),
-            contact,
-            provenance=settings,
+            timestamps, skeleton, poses.R_parent_joint, torch.zeros(len(timestamps), 3), contact, provenance=settings
         )
         return anchored_to_head(motion, T_world_head)
 

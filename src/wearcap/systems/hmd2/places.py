@@ -26,8 +26,10 @@ class Memory:
 
     def __post_init__(self):
         if not self.radius_m >= 5.0 or self.max_points < 1000:
-            raise WearcapError(f"a memory of {self.max_points} points within {self.radius_m} m",
-                               expected="at least 1000 points within at least 5 m")  # fmt: skip
+            raise WearcapError(
+                f"a memory of {self.max_points} points within {self.radius_m} m",
+                expected="at least 1000 points within at least 5 m",
+            )
 
 
 class Places:
@@ -60,9 +62,7 @@ class Places:
         self._center = state["center"] if len(state["center"]) else None
         self._new = [(points[tracked:], seen[tracked:])]
         self._map.add(*self._new[0])
-        floor = {
-            name.removeprefix("floor."): part for name, part in state.items() if name.startswith("floor.")
-        }
+        floor = {name.removeprefix("floor."): part for name, part in state.items() if name.startswith("floor.")}
         self._begin([(points[:tracked], seen[:tracked])], floor)
 
     def add(self, points_world: Float[Tensor, "point 3"], first_seen: float) -> None:
@@ -88,9 +88,7 @@ class Places:
             self._map.add(*part)
         self._begin(tracked, self._floor.state())
 
-    def grids(
-        self, T_world_device: Rigid, timestamps: Float64[Tensor, "time"]
-    ) -> Float[Tensor, "time x y z"]:
+    def grids(self, T_world_device: Rigid, timestamps: Float64[Tensor, "time"]) -> Float[Tensor, "time x y z"]:
         """Voxel grids (m) around the device at each frame, of the points seen by then."""
         return self._map.voxelize(T_world_device, timestamps)
 

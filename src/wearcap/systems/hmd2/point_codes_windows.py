@@ -42,9 +42,17 @@ class PlaceDataset(Dataset):
     """
 
     def __init__(
-        self, sources: list[Source], split: str, *, grid: VoxelGrid, window: int, frames: int, fps: float,
-        mirror: bool = False, balance: float = 1.0,
-    ):  # fmt: skip
+        self,
+        sources: list[Source],
+        split: str,
+        *,
+        grid: VoxelGrid,
+        window: int,
+        frames: int,
+        fps: float,
+        mirror: bool = False,
+        balance: float = 1.0,
+    ):
         """`frames` are drawn from every window of `window` frames; `balance`: see `WindowDataset`.
 
         Raises WearcapError when no recording has points, and as `share_out` does.
@@ -53,13 +61,14 @@ class PlaceDataset(Dataset):
         self.recordings, starts, weights = share_out(
             sources, split, window=window, stride=window, fps=fps, balance=balance, min_frames=1
         )
-        pointed = torch.tensor(
-            [_has_points(store.path_of(name)) for store, name in self.recordings]
-        )[starts[:, 0]]  # fmt: skip
+        pointed = torch.tensor([_has_points(store.path_of(name)) for store, name in self.recordings])[starts[:, 0]]
         self.starts, self.weights = starts[pointed], weights[pointed]
         if not pointed.any():
-            raise WearcapError(f"no recording of split {split!r} has points", where=", ".join(s.root for s in sources),
-                               expected="recordings with the points that tracking found")  # fmt: skip
+            raise WearcapError(
+                f"no recording of split {split!r} has points",
+                where=", ".join(s.root for s in sources),
+                expected="recordings with the points that tracking found",
+            )
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -114,6 +123,12 @@ class PlaceWindows(SeededWindows):
         """Grids of a split; half of the training split's are mirrored."""
         train = split == "train"
         return PlaceDataset(
-            self.sources if train else self.val_sources, split, grid=self.grid, window=self.window, frames=self.frames,
-            fps=self.fps, mirror=train, balance=self.balance if train else 1.0,
-        )  # fmt: skip
+            self.sources if train else self.val_sources,
+            split,
+            grid=self.grid,
+            window=self.window,
+            frames=self.frames,
+            fps=self.fps,
+            mirror=train,
+            balance=self.balance if train else 1.0,
+        )

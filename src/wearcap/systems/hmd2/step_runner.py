@@ -44,11 +44,7 @@ class StepRunner:
     """x̂0 at a fixed sequence of levels, for any batch size. The network's weights must not change while it is used."""
 
     def __init__(
-        self,
-        net: MotionDenoiser,
-        levels: Float[Tensor, "step"],
-        runtime: str = "eager",
-        precision: str = "float32",
+        self, net: MotionDenoiser, levels: Float[Tensor, "step"], runtime: str = "eager", precision: str = "float32"
     ):
         """Raises WearcapError for a runtime or precision that is unknown, not installed, or that do not go together."""
         self.net = net
@@ -92,12 +88,15 @@ def _chosen(runtime: str, precision: str, device: torch.device) -> tuple[str, st
         plain = "int8" if runtime == "onnx" and precision == "narrowest" else "float32"
         precision = "bfloat16" if device.type == "cuda" else plain
     if (precision == "int8") > (runtime == "onnx") or (precision == "bfloat16" and runtime == "onnx"):
-        raise WearcapError(f"no {precision} with runtime {runtime!r}", expected="int8 with onnx; bfloat16 with eager or compile")  # fmt: skip
+        raise WearcapError(
+            f"no {precision} with runtime {runtime!r}", expected="int8 with onnx; bfloat16 with eager or compile"
+        )
     if runtime == "onnx" and (missing or device.type != "cpu"):
         raise WearcapError(
             f"runtime 'onnx' needs {', '.join(missing)}" if missing else f"runtime 'onnx' on {device}",
-            expected="ONNX Runtime on the CPU", fix='Run: pip install "wearcap[export]", or choose pipeline.runtime=eager.',
-        )  # fmt: skip
+            expected="ONNX Runtime on the CPU",
+            fix='Run: pip install "wearcap[export]", or choose pipeline.runtime=eager.',
+        )
     return runtime, precision
 
 
@@ -132,9 +131,12 @@ def _onnx_step(net: MotionDenoiser, precision: str) -> Step:
     batch, tokens, width = 2, net.window // net.frames_per_token, net.motion_encoder.linear.out_features
     x_t = torch.zeros(batch, net.window, net.motion_size)
     inputs = {
-        "x_t": x_t, "worth": torch.zeros(1, 1, width), "blocks": torch.zeros(len(net.blocks), 1, 1, 6 * width),
-        "encoded": torch.zeros(batch, tokens, width), "valid": torch.ones(batch, net.window, dtype=torch.bool),
-    }  # fmt: skip
+        "x_t": x_t,
+        "worth": torch.zeros(1, 1, width),
+        "blocks": torch.zeros(len(net.blocks), 1, 1, 6 * width),
+        "encoded": torch.zeros(batch, tokens, width),
+        "valid": torch.ones(batch, net.window, dtype=torch.bool),
+    }
     if net.self_conditioning:
         inputs["last"] = x_t.clone()
     run = onnx_runner(StepGraph(net), inputs, fixed=("worth", "blocks"), int8=precision == "int8")

@@ -37,23 +37,13 @@ class Session:
     reset, that wearer's capture restarts as in a new session.
     """
 
-    def __init__(
-        self, pipeline: HMD2, wearers: Sequence[Wearer], seeds: Sequence[int], memory: Memory | None = None
-    ):
+    def __init__(self, pipeline: HMD2, wearers: Sequence[Wearer], seeds: Sequence[int], memory: Memory | None = None):
         """Raises WearcapError when there is not one seed per wearer, or for a stride or lookahead that does not fit."""
         if len(wearers) != len(seeds) or not wearers:
-            raise WearcapError(
-                f"{len(seeds)} seeds for {len(wearers)} wearers", expected="one for each wearer"
-            )
+            raise WearcapError(f"{len(seeds)} seeds for {len(wearers)} wearers", expected="one for each wearer")
         pipeline.prepare()
-        self.pipeline, self.memory, self._lookahead_frames = (
-            pipeline,
-            memory or Memory(),
-            pipeline.lookahead_frames,
-        )
-        self._wearers = [
-            WearerState(pipeline, wearer, seed, self.memory) for wearer, seed in zip(wearers, seeds)
-        ]
+        self.pipeline, self.memory, self._lookahead_frames = (pipeline, memory or Memory(), pipeline.lookahead_frames)
+        self._wearers = [WearerState(pipeline, wearer, seed, self.memory) for wearer, seed in zip(wearers, seeds)]
         self._embedded = False
         """Whether an embedding of the right length has arrived."""
 
@@ -75,7 +65,9 @@ class Session:
         as none of the right length has arrived; later ones are refused.
         """
         if len(sensed) != len(self._wearers):
-            raise WearcapError(f"packets of {len(sensed)} wearers", expected=f"of {len(self._wearers)}, as the session has")  # fmt: skip
+            raise WearcapError(
+                f"packets of {len(sensed)} wearers", expected=f"of {len(self._wearers)}, as the session has"
+            )
         if not self._embedded:
             self._require_embeddings(sensed)
         before: dict[int, list[Motion]] = {}
@@ -114,8 +106,10 @@ class Session:
                 if embedding.shape == (size,):
                     self._embedded = True
                     return
-                raise WearcapError(f"an embedding of {len(embedding)} features at {_time(moment)}",
-                                   expected=f"{size} of {self.pipeline.image_encoder!r}, which the network was trained on")  # fmt: skip
+                raise WearcapError(
+                    f"an embedding of {len(embedding)} features at {_time(moment)}",
+                    expected=f"{size} of {self.pipeline.image_encoder!r}, which the network was trained on",
+                )
 
     def _run(self, wearers: Sequence[int], ended: bool) -> list[Motion | None]:
         """The next poses of some wearers; None for the others."""

@@ -57,17 +57,17 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
         embeddings, `image_size` features each. None leaves that modality out."""
         super().__init__()
         self.net = net(
-            motion_size=features.motion_size, condition_size=features.condition_size,
-            points_size=place_encoder.size if place_encoder else 0, image_size=image_size if image_encoder else 0,
-        )  # fmt: skip
+            motion_size=features.motion_size,
+            condition_size=features.condition_size,
+            points_size=place_encoder.size if place_encoder else 0,
+            image_size=image_size if image_encoder else 0,
+        )
         self.place_encoder = None if place_encoder is None else place_encoder.requires_grad_(False).eval()
         self.image_encoder, self.drop, self.tail = image_encoder, drop, tail
         self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
         self.loss_weights, self.level_tilt, self.seed = dict(loss_weights), level_tilt, seed
         self._optimizer, self._scheduler = optimizer, scheduler
-        self._feet = [
-            skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")
-        ]
+        self._feet = [skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")]
         # Methods, since compiled modules would put every weight into checkpoints a second time.
         self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
         self._encode = torch.compile(self.net.encode) if compile else self.net.encode
@@ -88,9 +88,14 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
     def pipeline_parts(self) -> dict[str, Any]:
         """Constructor arguments of `HMD2` that belong to the trained model."""
         return {
-            "net": self.net, "features": self.features, "schedule": self.schedule, "skeleton": self.skeleton,
-            "fps": self.fps, "place_encoder": self.place_encoder, "image_encoder": self.image_encoder,
-        }  # fmt: skip
+            "net": self.net,
+            "features": self.features,
+            "schedule": self.schedule,
+            "skeleton": self.skeleton,
+            "fps": self.fps,
+            "place_encoder": self.place_encoder,
+            "image_encoder": self.image_encoder,
+        }
 
     def train(self, mode: bool = True) -> "MotionDiffusion":
         """Set the training mode; the frozen place encoder stays in evaluation mode."""
@@ -158,6 +163,6 @@ def _require_same_inputs(system: MotionDiffusion, dataset: WindowDataset) -> Non
             f"windows with points of {points_size} and images of {dataset.image_size} features",
             expected=f"{net.points_size} and {net.image_size}, as the model has",
             fix="Set data.surroundings and model.{place_encoder,image_encoder,image_size} alike.",
-        )  # fmt: skip
+        )
     if system.image_encoder != dataset.surroundings.images and net.image_size:
         raise WearcapError(f"embeddings of {dataset.surroundings.images!r}", expected=system.image_encoder)

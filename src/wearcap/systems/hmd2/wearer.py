@@ -161,9 +161,7 @@ class WearerState:
         frames = Frames(*(part[number.clamp_max(count - 1)][None] for part in fields))
         return frames._replace(valid=frames.valid & (number < count))
 
-    def _floor(
-        self, times: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]
-    ) -> Float[Tensor, "time"]:
+    def _floor(self, times: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
         tracked = self.places.floor(times, t_world_head)
         if not self.floors:
             return tracked
@@ -189,9 +187,7 @@ class WearerState:
             "waiting": {"times": self.times},
             "pictures": {
                 "time": torch.tensor(shown, dtype=torch.float64),
-                "embedding": torch.stack(pictures)
-                if pictures
-                else torch.zeros(0, self.pipeline.net.image_size),
+                "embedding": torch.stack(pictures) if pictures else torch.zeros(0, self.pipeline.net.image_size),
             },
             "floors": {"known": torch.tensor(self.floors, dtype=torch.float64).reshape(-1, 2)},
             "door": self._door_state(),
@@ -206,10 +202,12 @@ class WearerState:
             T, height = sensed.T_world_device, sensed.floor_height
             parts = {
                 "timestamp": torch.tensor(sensed.timestamp, dtype=torch.float64),
-                "R": None if T is None else T.R, "t": None if T is None else T.t,
-                "points": sensed.points_world, "embedding": sensed.embedding,
+                "R": None if T is None else T.R,
+                "t": None if T is None else T.t,
+                "points": sensed.points_world,
+                "embedding": sensed.embedding,
                 "height": None if height is None else torch.tensor(height, dtype=torch.float64),
-            }  # fmt: skip
+            }
             state |= {f"{k}.{name}": part for name, part in parts.items() if part is not None}
         return state
 
@@ -219,9 +217,7 @@ class WearerState:
         clock.taken, self.door.dropped, self.door.far = int(taken), int(dropped), int(far)
         self.door.place = (place[0], place[1], place[2]) if place else None
         while (k := len(clock.waiting)) < AGREEING and f"{k}.timestamp" in state:
-            part = {
-                name.partition(".")[2]: value for name, value in state.items() if name.startswith(f"{k}.")
-            }
+            part = {name.partition(".")[2]: value for name, value in state.items() if name.startswith(f"{k}.")}
             T = Rigid(part["R"], part["t"]) if "R" in part else None
             height = part["height"].item() if "height" in part else None
             time = part["timestamp"].item()

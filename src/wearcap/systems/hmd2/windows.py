@@ -173,9 +173,7 @@ def _sample(samplers: Sequence[WindowSampler]) -> Poses:
     is_observed = number < torch.tensor([[sampler.final] for sampler in samplers])
     valid = frames.valid & (number < torch.tensor([[sampler.count] for sampler in samplers]))
     size = torch.stack([sampler.size for sampler in samplers])
-    head = features.condition(
-        frames.R_world_head, frames.t_world_head, frames.floor_height, size, pipeline.fps
-    )
+    head = features.condition(frames.R_world_head, frames.t_world_head, frames.floor_height, size, pipeline.fps)
     parts = head, frames.points, frames.points_valid, frames.image, frames.image_valid
     conditions = Conditions(*(part.to(device) for part in parts))
     # The last window's poses are re-expressed in this window's canonical frame, which may have moved.
@@ -184,9 +182,14 @@ def _sample(samplers: Sequence[WindowSampler]) -> Poses:
     )
     is_observed_on_device = is_observed.to(device)
     x0 = sample(
-        pipeline.denoiser(conditions, valid.to(device)), noise.movedim(2, 0).to(device), pipeline.schedule,
-        eta=pipeline.eta, spacing=pipeline.spacing, observed=observed, is_observed=is_observed_on_device if pipeline.inpaint else None,
-    )  # fmt: skip
+        pipeline.denoiser(conditions, valid.to(device)),
+        noise.movedim(2, 0).to(device),
+        pipeline.schedule,
+        eta=pipeline.eta,
+        spacing=pipeline.spacing,
+        observed=observed,
+        is_observed=is_observed_on_device if pipeline.inpaint else None,
+    )
     x0 = blended(x0, observed, is_observed_on_device, pipeline.fade)
     motion = net.motion_normalizer.inverse(x0.float()).cpu()
     poses = Poses(*features.decode(motion, frames.R_world_head))

@@ -57,9 +57,7 @@ class Synchronization:
 
     def by_claps(self, recording: Recording) -> bool:
         """Whether this recording is synchronised by claps."""
-        return self.clock == "claps" or (
-            self.clock == "auto" and any(name in recording.imu for name in WRISTS)
-        )
+        return self.clock == "claps" or (self.clock == "auto" and any(name in recording.imu for name in WRISTS))
 
     def reads(self, recording: Recording, folder: Path) -> list[Any]:
         """Inputs that determine the result, for its cache key."""
@@ -80,8 +78,11 @@ class Synchronization:
             return None
         camera, suit = recording.camera, recording.suit
         if camera is None:
-            raise WearcapError("no camera in this recording", where=recording.name,
-                               expected="a head camera that hears the suit's claps")  # fmt: skip
+            raise WearcapError(
+                "no camera in this recording",
+                where=recording.name,
+                expected="a head camera that hears the suit's claps",
+            )
         wrists = [recording.imu[name] for name in WRISTS if name in recording.imu]
         if not wrists and suit is not None:
             wrists = [synthesize_imu(suit, name, n=1) for name in WRISTS]
@@ -93,7 +94,9 @@ class Synchronization:
                 "Give pipeline.synchronization.max_offset_s=SECONDS if both started within so much, or "
                 "….camera_claps_s=[…], or ….clock=shared where camera and suit are on one clock already."
             )
-            raise WearcapError(error.what, where=error.where or recording.name, expected=error.expected, fix=fix) from error  # fmt: skip
+            raise WearcapError(
+                error.what, where=error.where or recording.name, expected=error.expected, fix=fix
+            ) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +131,12 @@ class MapLocalization:
             return None
         own = (folder / recording.scene).parent / MAP_NAME if recording.scene else None
         if own is None or not own.is_file():
-            raise WearcapError("no localisation in this recording, and no map", where=recording.name,
-                               expected="camera poses, or a visual map of the scene",
-                               fix="Build one (wearcap scene) and give pipeline.localization.map=FILE.")  # fmt: skip
+            raise WearcapError(
+                "no localisation in this recording, and no map",
+                where=recording.name,
+                expected="camera poses, or a visual map of the scene",
+                fix="Build one (wearcap scene) and give pipeline.localization.map=FILE.",
+            )
         return own
 
     def reads(self, recording: Recording, folder: Path) -> list[Any]:
@@ -141,9 +147,13 @@ class MapLocalization:
             return [recording.localization]
         features = [self.extractor, self.matcher, self.descriptor, self.settings, self.use_prior]
         return [
-            *features, self.every or _usual_step(stream), stream.timestamps, stream.camera, file,
+            *features,
+            self.every or _usual_step(stream),
+            stream.timestamps,
+            stream.camera,
+            file,
             *_pictures(recording, folder),
-        ]  # fmt: skip
+        ]
 
     def __call__(self, recording: Recording, folder: Path) -> Localization:
         """Localise every `every`-th frame; times are on the camera's clock.
@@ -162,9 +172,13 @@ class MapLocalization:
         )
         every = self.every or _usual_step(stream)
         return localize_video(
-            _frames(stream, folder, every), stream.timestamps[::every], stream.camera, localizer,
-            use_prior=self.use_prior, progress=sys.stderr.isatty(),
-        )  # fmt: skip
+            _frames(stream, folder, every),
+            stream.timestamps[::every],
+            stream.camera,
+            localizer,
+            use_prior=self.use_prior,
+            progress=sys.stderr.isatty(),
+        )
 
 
 def camera_stages(source: Source, synchronization: Synchronization, localize: Localize) -> list[Stage]:
@@ -173,14 +187,12 @@ def camera_stages(source: Source, synchronization: Synchronization, localize: Lo
     localize.reads(recording, folder)
     return [
         Stage(
-            "synchronize", lambda results: synchronization(recording, folder),
+            "synchronize",
+            lambda results: synchronization(recording, folder),
             lambda: synchronization.reads(recording, folder),
         ),
-        Stage(
-            "localize", lambda results: localize(recording, folder),
-            lambda: localize.reads(recording, folder),
-        ),
-    ]  # fmt: skip
+        Stage("localize", lambda results: localize(recording, folder), lambda: localize.reads(recording, folder)),
+    ]
 
 
 def on_one_clock(recording: Recording, results: dict[str, Any]) -> Recording:
@@ -195,14 +207,17 @@ def camera_report(results: dict[str, Any]) -> dict[str, Any]:
     about: dict[str, Any] = {"clock": None}
     if clock is not None:
         about["clock"] = {
-            "offset_s": clock.offset_s, "drift_ms_per_hour": 1000 * clock.drift_s_per_hour,
-            "residual_ms": 1000 * clock.residual_s, "claps": clock.claps,
-        }  # fmt: skip
+            "offset_s": clock.offset_s,
+            "drift_ms_per_hour": 1000 * clock.drift_s_per_hour,
+            "residual_ms": 1000 * clock.residual_s,
+            "claps": clock.claps,
+        }
     if "localize" in results:
         confidence = results["localize"].confidence
         about["localized"] = {
-            "frames": len(confidence), "share": (confidence > 0).double().mean().item() if len(confidence) else 0.0,
-        }  # fmt: skip
+            "frames": len(confidence),
+            "share": (confidence > 0).double().mean().item() if len(confidence) else 0.0,
+        }
     return about
 
 
@@ -215,11 +230,12 @@ def _usual_step(stream: CameraStream) -> int:
 def _pictures(recording: Recording, folder: Path) -> list[Path]:
     stream = recording.camera
     if stream is None or (stream.video is None and stream.image_files is None):
-        raise WearcapError("no pictures of the head camera", where=recording.name,
-                           expected="a video or picture files, to be localised in the map")  # fmt: skip
-    return [
-        folder / name for name in ([stream.video] if stream.video is not None else stream.image_files or ())
-    ]
+        raise WearcapError(
+            "no pictures of the head camera",
+            where=recording.name,
+            expected="a video or picture files, to be localised in the map",
+        )
+    return [folder / name for name in ([stream.video] if stream.video is not None else stream.image_files or ())]
 
 
 def _frames(stream: CameraStream, folder: Path, every: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:

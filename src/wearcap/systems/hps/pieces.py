@@ -7,14 +7,7 @@ from torch import Tensor
 
 from wearcap.recording import Motion
 from wearcap.recording.recording import Localization
-from wearcap.sensors.packets import (
-    MAX_POSITION_M,
-    MAX_TIME_S,
-    OFF_THE_CLOCK,
-    WRONG_TYPE,
-    rotations_fault,
-    values_fault,
-)
+from wearcap.sensors.packets import MAX_POSITION_M, MAX_TIME_S, OFF_THE_CLOCK, WRONG_TYPE, rotations_fault, values_fault
 
 MAX_PAUSE_S = 10.0
 """Longest gap (s) within a stretch. A piece after a longer one is kept aside until the next piece continues it; then a
@@ -34,10 +27,12 @@ def suit_fault(suit: object, like: Motion | None) -> str | None:
         or (None if contact is None else _contact_fault(contact, count))
     )
     if fault is None and like is not None:
-        same = like.skeleton.joint_names == suit.skeleton.joint_names and (contact is None) == (
-            before is None
+        same = like.skeleton.joint_names == suit.skeleton.joint_names and (contact is None) == (before is None)
+        return (
+            None
+            if same and (before is None or contact is None or before.shape[1:] == contact.shape[1:])
+            else WRONG_TYPE
         )
-        return None if same and (before is None or contact is None or before.shape[1:] == contact.shape[1:]) else WRONG_TYPE  # fmt: skip
     return fault
 
 

@@ -88,27 +88,35 @@ class HPS:
         return [
             *first,
             Stage(
-                "align", lambda done: self.align(on_one_clock(recording, done)), lambda: (self.fps, *body),
+                "align",
+                lambda done: self.align(on_one_clock(recording, done)),
+                lambda: (self.fps, *body),
                 ("synchronize", "localize"),
             ),
             Stage(
-                "initialize", lambda done: self.initialize(on_one_clock(recording, done), done["align"]),
-                lambda: (self.initialization, *mount(recording)), ("synchronize", "localize", "align"),
+                "initialize",
+                lambda done: self.initialize(on_one_clock(recording, done), done["align"]),
+                lambda: (self.initialization, *mount(recording)),
+                ("synchronize", "localize", "align"),
             ),
             Stage(
-                "optimize", lambda done: self.optimize(self._problem_of(source, done)),
+                "optimize",
+                lambda done: self.optimize(self._problem_of(source, done)),
                 lambda: (self.energy, self.solver, self.evidence, source.scan, source.metres_per_unit, recording.shape),
                 ("synchronize", "localize", "align", "initialize"),
             ),
-        ]  # fmt: skip
+        ]
 
     def require_scan(self, scan: Path | Scan | None, where: str) -> None:
         """Raise WearcapError when a term of the energy needs a scan and there is none."""
         terms = [name for name in ("contact", "contact_plane") if self.energy.weight(name)]
         if scan is None and terms:
-            raise WearcapError(f"no scan of the scene, which the energy's term {' and '.join(terms)} needs",
-                               where=where, expected="a recording that names its scan, or scene=FOLDER",
-                               fix="Without one: pipeline=hps_without_scene.")  # fmt: skip
+            raise WearcapError(
+                f"no scan of the scene, which the energy's term {' and '.join(terms)} needs",
+                where=where,
+                expected="a recording that names its scan, or scene=FOLDER",
+                fix="Without one: pipeline=hps_without_scene.",
+            )
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
         """Motion after the last stage that was run: aligned, initial or optimised."""
@@ -121,9 +129,7 @@ class HPS:
         about = camera_report(results)
         if "align" in results:
             assert source.recording.suit is not None
-            angle, _ = yaw_between(
-                source.recording.suit.R_parent_joint[0, 0], results["align"].R_parent_joint[0, 0]
-            )
+            angle, _ = yaw_between(source.recording.suit.R_parent_joint[0, 0], results["align"].R_parent_joint[0, 0])
             about["alignment_deg"] = angle.rad2deg().item()
         if "optimize" in results:
             about |= {"stopped": results["optimize"].reason, "energy": results["optimize"].history}
@@ -150,9 +156,13 @@ class HPS:
         return initialize(aligned, localization, T_head_cam.R, T_head_cam.t, self.initialization)
 
     def problem(
-        self, recording: Recording, aligned: Motion, start: Initialization, scan: Scan | None,
+        self,
+        recording: Recording,
+        aligned: Motion,
+        start: Initialization,
+        scan: Scan | None,
         R_head_cam: Float[Tensor, "3 3"] | None = None,
-    ) -> HpsData:  # fmt: skip
+    ) -> HpsData:
         """Data of the energy: initial state, localised cameras, contacts, and the suit's frame-to-frame motion.
 
         `R_head_cam` is estimated from the localised frames (HPS paper eq. 4) unless it is given.
@@ -170,11 +180,16 @@ class HPS:
         return HpsData(
             FootPatches.of(body),
             HpsState(rotation.log(motion.R_parent_joint[:, 1:].double()), root, motion.t_world_root.double()),
-            R_head_cam, R_cam, sure, sure * start.valid if self.evidence.confident else torch.ones_like(sure),
+            R_head_cam,
+            R_cam,
+            sure,
+            sure * start.valid if self.evidence.confident else torch.ones_like(sure),
             believed_contact(aligned, self.evidence.max_contact_speed).double(),
-            (heading @ aligned.t_world_root.double().diff(dim=0)[..., None])[..., 0], turns(root), turns(head),
+            (heading @ aligned.t_world_root.double().diff(dim=0)[..., None])[..., 0],
+            turns(root),
+            turns(head),
             scan.surface if scan else None,
-        )  # fmt: skip
+        )
 
     def _problem_of(self, source: Source, results: dict[str, Any]) -> HpsData:
         recording = on_one_clock(source.recording, results)
@@ -188,9 +203,11 @@ class HPS:
         """Captured motion of a solution; foot contacts are those of the suit."""
         state = solution.state
         return replace(
-            start.motion, R_parent_joint=state.R_parent_joint.float(), t_world_root=state.t_world_root.float(),
+            start.motion,
+            R_parent_joint=state.R_parent_joint.float(),
+            t_world_root=state.t_world_root.float(),
             provenance={"pipeline": self.name, "solver": solution.reason},
-        )  # fmt: skip
+        )
 
 
 def required(recording: Recording) -> tuple[Motion, Localization, Rigid]:
@@ -205,8 +222,11 @@ def require(recording: Recording, *names: str) -> None:
     """Raise WearcapError unless the recording has all of these parts."""
     missing = [name for name in names if getattr(recording, name) is None]
     if missing:
-        raise WearcapError(f"no {' and no '.join(missing)} in this recording", where=recording.name,
-                           expected="a suit's motion, a head camera, and where it was localised")  # fmt: skip
+        raise WearcapError(
+            f"no {' and no '.join(missing)} in this recording",
+            where=recording.name,
+            expected="a suit's motion, a head camera, and where it was localised",
+        )
 
 
 def mount(recording: Recording) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
@@ -247,8 +267,11 @@ def believed_contact(suit: Motion, max_speed: float | None) -> Bool[Tensor, "tim
     """
     if suit.contact_prob is None or len(suit.contact_prob) != len(suit):
         count = "no" if suit.contact_prob is None else f"{len(suit.contact_prob)} frames of"
-        raise WearcapError(f"{count} foot contacts for {len(suit)} frames of the suit's pose",
-                           expected="one per frame and patch", fix="wearcap.sensors.contacts derives them.")  # fmt: skip
+        raise WearcapError(
+            f"{count} foot contacts for {len(suit)} frames of the suit's pose",
+            expected="one per frame and patch",
+            fix="wearcap.sensors.contacts derives them.",
+        )
     contact = suit.contact_prob >= 0.5
     if max_speed is None:
         return contact

@@ -52,10 +52,12 @@ class PlacedSuit(ABC):
         return [
             *camera_stages(source, self.synchronization, self.localization),
             Stage(
-                "place", lambda done: self.place(on_one_clock(recording, done)),
-                lambda: (self.placing, self.fps, recording.suit, *mount(recording)), ("synchronize", "localize"),
+                "place",
+                lambda done: self.place(on_one_clock(recording, done)),
+                lambda: (self.placing, self.fps, recording.suit, *mount(recording)),
+                ("synchronize", "localize"),
             ),
-        ]  # fmt: skip
+        ]
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
         """The motion, once it has been placed."""
@@ -97,9 +99,7 @@ class HpsBaseline(PlacedSuit):
             return motion
         found = localization.confidence > 0
         use = inliers(localization) if self.kind == "imu_cam_filtered" else found
-        path = filled(
-            Trajectory(localization.timestamps, localization.R_world_cam, localization.t_world_cam), use
-        )
+        path = filled(Trajectory(localization.timestamps, localization.R_world_cam, localization.t_world_cam), use)
         at = motion.timestamps.clamp(path.timestamps[0], path.timestamps[-1])
         camera = interpolate(path.timestamps, path.t_world_body, at)
         return replace(motion, t_world_root=motion.t_world_root + camera - body_camera(motion, T_head_cam.t))

@@ -68,8 +68,11 @@ class HpsTruth:
         """
         motion, suit, track = recording.motion, recording.suit, recording.contacts
         if motion is None or suit is None or suit.contact_prob is None or track is None:
-            raise WearcapError("nothing to measure a capture against", where=recording.name,
-                               expected="a true motion, true contacts, and a suit with contacts")  # fmt: skip
+            raise WearcapError(
+                "nothing to measure a capture against",
+                where=recording.name,
+                expected="a true motion, true contacts, and a suit with contacts",
+            )
         columns = [track.parts.index(patch) for patch in FOOT_PATCHES]
         touching = replace(motion, contact_prob=track.contact[:, columns].float())
         true = resampled(touching, fps)
@@ -77,9 +80,13 @@ class HpsTruth:
         assert true.contact_prob is not None
         assert detected is not None
         return cls(
-            true, anny_body(motion.skeleton, recording.shape or None), scan.surface, detected >= 0.5,
-            true.contact_prob >= 0.5, tuple(tuple(clouds) for clouds in visits),
-        )  # fmt: skip
+            true,
+            anny_body(motion.skeleton, recording.shape or None),
+            scan.surface,
+            detected >= 0.5,
+            true.contact_prob >= 0.5,
+            tuple(tuple(clouds) for clouds in visits),
+        )
 
 
 @dataclass(frozen=True)
@@ -116,9 +123,13 @@ def score_hps(motion: Motion, truth: HpsTruth) -> HpsScores:
     literal, surface = zip(*(interval_chamfer(motion, truth.body, clouds) for clouds in truth.visits))
     error = joint_errors_cm(motion, truth.motion)[:, 0]
     return HpsScores(
-        literal, surface, foot_scores(motion, truth, truth.contact), foot_scores(motion, truth, truth.true_contact),
-        drift(travelled_m(truth.motion), error), joints,
-    )  # fmt: skip
+        literal,
+        surface,
+        foot_scores(motion, truth, truth.contact),
+        foot_scores(motion, truth, truth.true_contact),
+        drift(travelled_m(truth.motion), error),
+        joints,
+    )
 
 
 def visit_times(intervals: Intervals, count: int = 10) -> Float64[Tensor, "interval frame"]:
@@ -145,7 +156,9 @@ def nearest_frames(timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "ins
     frames = (timestamps[:, None] - at).abs().argmin(0)
     off = (timestamps[frames] - at).abs()
     if off.max() > 0.51 * timestamps.diff().median():
-        raise WearcapError(f"no captured frame at {at[off.argmax()]:.2f} s", expected="a capture of the whole recording")  # fmt: skip
+        raise WearcapError(
+            f"no captured frame at {at[off.argmax()]:.2f} s", expected="a capture of the whole recording"
+        )
     return frames
 
 
@@ -212,7 +225,9 @@ def planted_outages(intervals: Intervals, end_s: float, lengths_s: Sequence[floa
     for length, (start, stop) in zip(sorted(lengths_s, reverse=True), walks):
         length = min(length, stop - start - 2 * MARGIN_S)
         if length <= 0:
-            raise WearcapError(f"no room for an outage in a walk of {stop - start:.1f} s", expected=f"more than {2 * MARGIN_S:.0f} s")  # fmt: skip
+            raise WearcapError(
+                f"no room for an outage in a walk of {stop - start:.1f} s", expected=f"more than {2 * MARGIN_S:.0f} s"
+            )
         outages.append(Outage((start + stop - length) / 2, length))
     return sorted(outages, key=lambda outage: outage.length_s)
 
@@ -237,12 +252,10 @@ class Disturbance:
         return self.joint_cm / self.undisturbed_joint_cm
 
 
-def disturbance(
-    disturbed: Motion, undisturbed: Motion, truth: Motion, frames: Bool[Tensor, "time"]
-) -> Disturbance:
+def disturbance(disturbed: Motion, undisturbed: Motion, truth: Motion, frames: Bool[Tensor, "time"]) -> Disturbance:
     """Compare captures with and without outages over the given frames."""
     with_, without = (joint_errors_cm(motion, truth)[frames] for motion in (disturbed, undisturbed))
-    return Disturbance(*(float(e) for e in (with_[:, 0].mean(), with_.mean(), without[:, 0].mean(), without.mean())))  # fmt: skip
+    return Disturbance(*(float(e) for e in (with_[:, 0].mean(), with_.mean(), without[:, 0].mean(), without.mean())))
 
 
 def in_order(errors: Sequence[float]) -> bool:

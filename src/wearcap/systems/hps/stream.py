@@ -63,9 +63,7 @@ class HpsStream:
         Raises WearcapError without a camera, or without a scan where the energy needs one.
         """
         if about.camera is None:
-            raise WearcapError(
-                "no camera in this recording", where=about.name, expected="its mount on the head"
-            )
+            raise WearcapError("no camera in this recording", where=about.name, expected="its mount on the head")
         hps.require_scan(scan, about.name)
         self.hps, self.about, self.scan = hps, about, scan
         self.settings = settings or StreamSettings()
@@ -166,9 +164,10 @@ class HpsStream:
         self._refuse_alone()
         if self.suit is None and self.refused:
             raise WearcapError(
-                f"no piece can be used ({', '.join(self.refused)})", where=self.about.name,
+                f"no piece can be used ({', '.join(self.refused)})",
+                where=self.about.name,
                 expected="finite poses of the suit at rising times",
-            )  # fmt: skip
+            )
         motion = self._end()
         if self.suit is not None and not self._any_returned:
             raise WearcapError(
@@ -249,9 +248,7 @@ class HpsStream:
             return start
         carried = aligned.moved(Rigid(rotation.about_axis("z", self.yaw.float()), torch.zeros(3)))
         if self.done is not None:
-            at = int(
-                torch.searchsorted(carried.timestamps, self.done.timestamps[-1]).clamp(max=len(carried) - 1)
-            )
+            at = int(torch.searchsorted(carried.timestamps, self.done.timestamps[-1]).clamp(max=len(carried) - 1))
             move = self.done.t_world_root[-1] - carried.t_world_root[at]
             carried = replace(carried, t_world_root=carried.t_world_root + move)
         lost = torch.zeros(len(aligned), dtype=torch.bool)
@@ -265,9 +262,7 @@ class HpsStream:
         final = self.done.sliced(len(self.done) - count, len(self.done))
         t, hold = data.start.t_world_root.clone(), data.hold_confidence.clone()
         t[:count], hold[:count] = final.t_world_root.double(), self.settings.tie
-        return replace(
-            data, start=HpsState(data.start.theta, data.start.R_world_root, t), hold_confidence=hold
-        )
+        return replace(data, start=HpsState(data.start.theta, data.start.R_world_root, t), hold_confidence=hold)
 
     def _recording(self) -> Recording:
         assert self.seen is not None
@@ -302,12 +297,13 @@ def follow(
     refused = Counter() if refused is None else refused
     for piece in pieces:
         if piece.suit is None and stream is None:
-            raise WearcapError(
-                "no suit in this piece", where=piece.name, expected="a suit's motion in each piece"
-            )
+            raise WearcapError("no suit in this piece", where=piece.name, expected="a suit's motion in each piece")
         if hps.synchronization.by_claps(piece):
-            raise WearcapError("a live recording cannot be synchronised by claps", where=piece.name,
-                               fix="Set the clocks before, and give pipeline.synchronization.clock=shared.")  # fmt: skip
+            raise WearcapError(
+                "a live recording cannot be synchronised by claps",
+                where=piece.name,
+                fix="Set the clocks before, and give pipeline.synchronization.clock=shared.",
+            )
         if piece.suit is None:
             refused[f"suit: {WRONG_TYPE}"] += 1
             continue

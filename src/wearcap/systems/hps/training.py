@@ -27,17 +27,18 @@ class HpsValidation(Callback):
     """
 
     def __init__(
-        self, pipeline: HPS, localizer: Callable[[lightning.LightningModule], Localize], recordings: Sequence[str],
+        self,
+        pipeline: HPS,
+        localizer: Callable[[lightning.LightningModule], Localize],
+        recordings: Sequence[str],
         every_n_epochs: int = 1,
-    ):  # fmt: skip
+    ):
         """`recordings`: DATASET/NAME each, with a suit and a head camera."""
         self.pipeline, self.localizer = pipeline, localizer
         self.recordings, self.every_n_epochs = tuple(recordings), every_n_epochs
         self._epochs = 0
 
-    def on_validation_epoch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         if trainer.sanity_checking or not trainer.is_global_zero:
             return
         self._epochs += 1
@@ -51,9 +52,7 @@ class HpsValidation(Callback):
         pl_module.train(training)
         for name in rows[0]:
             scored = [row[name] for row in rows if row[name] == row[name]]
-            pl_module.log(
-                f"hps/{name}", sum(scored) / len(scored) if scored else float("nan"), rank_zero_only=True
-            )
+            pl_module.log(f"hps/{name}", sum(scored) / len(scored) if scored else float("nan"), rank_zero_only=True)
 
 
 def validated(pipeline: HPS, where: str) -> dict[str, float]:
@@ -65,9 +64,11 @@ def validated(pipeline: HPS, where: str) -> dict[str, float]:
     feet = surface_scores(motion, recording, source.read_scan())
     scores = score(motion, recording, where, 0).scores if recording.motion is not None else {}
     return {
-        "world_root_cm": scores.get("world_root_cm", nan), "world_mpjpe_cm": scores.get("world_mpjpe_cm", nan), **feet,
+        "world_root_cm": scores.get("world_root_cm", nan),
+        "world_mpjpe_cm": scores.get("world_mpjpe_cm", nan),
+        **feet,
         "localized_share": (results["localize"].confidence > 0).double().mean().item(),
-    }  # fmt: skip
+    }
 
 
 def surface_scores(motion: Motion, recording: Recording, scan: Scan | None) -> dict[str, float]:

@@ -36,4 +36,4 @@ class ActSearch:
         if found is None:
             return ()
         rows = sorted(zip(found.start_s.tolist(), found.stop_s.tolist(), found.objects))
-        return tuple(spread_acts([Act(name, start, stop) for start, stop, name in rows if name], self.margin_s))  # fmt: skip
+        return tuple(spread_acts([Act(name, start, stop) for start, stop, name in rows if name], self.margin_s))

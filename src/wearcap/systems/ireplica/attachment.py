@@ -14,12 +14,7 @@ from wearcap.recording.interactions import Interactions
 from wearcap.scene.environment import Environment
 from wearcap.scene.object_motion import ANCHORS, ObjectState, follow_hands
 from wearcap.scene.objects import CONTACT_CLASSES, SceneObject
-from wearcap.systems.ireplica.contact_intervals import (
-    ContactInterval,
-    ContactSettings,
-    active,
-    contact_intervals,
-)
+from wearcap.systems.ireplica.contact_intervals import ContactInterval, ContactSettings, active, contact_intervals
 
 
 @dataclass(frozen=True)
@@ -42,8 +37,10 @@ class AttachmentSettings:
 
     def __post_init__(self):
         if self.anchor not in ANCHORS or not self.reach_m > 0:
-            raise WearcapError(f"anchor {self.anchor!r}, reach {self.reach_m} m",
-                               expected=f"one of {', '.join(ANCHORS)}, and a positive distance")  # fmt: skip
+            raise WearcapError(
+                f"anchor {self.anchor!r}, reach {self.reach_m} m",
+                expected=f"one of {', '.join(ANCHORS)}, and a positive distance",
+            )
 
 
 @dataclass(frozen=True)
@@ -84,8 +81,7 @@ class Room:
 
     def __post_init__(self):
         self.states = {
-            scene_object.name: ObjectState(scene_object.T_world_object)
-            for scene_object in self.environment.objects
+            scene_object.name: ObjectState(scene_object.T_world_object) for scene_object in self.environment.objects
         }
 
     def nearest(
@@ -109,9 +105,14 @@ class Room:
         return points
 
     def take(
-        self, contact: ContactInterval, contact_class: str, scene_object: SceneObject, points: Tensor, goes_on: bool,
+        self,
+        contact: ContactInterval,
+        contact_class: str,
+        scene_object: SceneObject,
+        points: Tensor,
+        goes_on: bool,
         palms_world: Float[Tensor, "time hand 3"],
-    ) -> Held:  # fmt: skip
+    ) -> Held:
         """Move the object with the hands over the interval's frames, and leave it there."""
         state = self.states[scene_object.name]
         hands = torch.tensor(contact.hands)
@@ -122,9 +123,11 @@ class Room:
 
 
 def class_intervals(
-    contact_prob: dict[str, Float[Tensor, "time hand"]], timestamps: Float64[Tensor, "time"],
-    contact: ContactSettings, one_class: bool,
-) -> list[tuple[ContactInterval, str]]:  # fmt: skip
+    contact_prob: dict[str, Float[Tensor, "time hand"]],
+    timestamps: Float64[Tensor, "time"],
+    contact: ContactSettings,
+    one_class: bool,
+) -> list[tuple[ContactInterval, str]]:
     """Contact intervals of every class, in order of time. With `one_class`, a hand's less probable class is dropped."""
     if one_class and len(contact_prob) > 1:
         best = torch.stack(list(contact_prob.values())).amax(0)
@@ -158,23 +161,21 @@ def object_trajectories(
         for row in own:
             frames = slice(row.interval.start, row.interval.stop)
             R[frames], t[frames] = row.T_world_object.R.float(), row.T_world_object.t.float()
-            R[row.interval.stop :], t[row.interval.stop :] = (
-                R[row.interval.stop - 1],
-                t[row.interval.stop - 1],
-            )
+            R[row.interval.stop :], t[row.interval.stop :] = (R[row.interval.stop - 1], t[row.interval.stop - 1])
         tracks[scene_object.name] = Trajectory(timestamps, R, t)
     return tracks
 
 
 def interactions_of(held: Sequence[Held], timestamps: Float64[Tensor, "time"]) -> Interactions:
     """Interactions (object, hands, times) as a recording stores them."""
-    edges = torch.cat(
-        [timestamps, timestamps[-1:] + (timestamps.diff().median() if len(timestamps) > 1 else 0.0)]
-    )
+    edges = torch.cat([timestamps, timestamps[-1:] + (timestamps.diff().median() if len(timestamps) > 1 else 0.0)])
     start = [float(edges[row.interval.start]) for row in held]
     stop = [float(edges[row.interval.stop]) for row in held]
     hands = torch.tensor([row.interval.hands for row in held], dtype=torch.bool).reshape(-1, 2)
     return Interactions(
-        torch.tensor(start, dtype=torch.float64), torch.tensor(stop, dtype=torch.float64), hands,
-        tuple(row.scene_object.name for row in held), tuple(row.contact_class for row in held),
-    )  # fmt: skip
+        torch.tensor(start, dtype=torch.float64),
+        torch.tensor(stop, dtype=torch.float64),
+        hands,
+        tuple(row.scene_object.name for row in held),
+        tuple(row.contact_class for row in held),
+    )

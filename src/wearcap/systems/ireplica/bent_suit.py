@@ -41,9 +41,7 @@ class BentSuit(PlacedSuit):
         carried = body_camera(motion, T_head_cam.t) - motion.t_world_root
         points = localization.t_world_cam[use] - interpolate(motion.timestamps, carried, times)
         path = motion.t_world_root[:, :2].double()
-        bent = self.bend(
-            path, motion.timestamps, times, points[:, :2].double(), localization.confidence[use].double()
-        )
+        bent = self.bend(path, motion.timestamps, times, points[:, :2].double(), localization.confidence[use].double())
         R = motion.R_parent_joint.clone()
         R[:, 0] = rotation.about_axis("z", bent.frame_turn.to(R)) @ R[:, 0]
         root = torch.cat([bent.path.to(motion.t_world_root), motion.t_world_root[:, 2:]], 1)

@@ -22,8 +22,10 @@ class ContactSettings:
 
     def __post_init__(self):
         if not 0.0 < self.threshold < 1.0 or self.gap_s < 0:
-            raise WearcapError(f"threshold {self.threshold}, gap {self.gap_s} s",
-                               expected="a probability between 0 and 1, and no negative time")  # fmt: skip
+            raise WearcapError(
+                f"threshold {self.threshold}, gap {self.gap_s} s",
+                expected="a probability between 0 and 1, and no negative time",
+            )
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,9 @@ class ContactStream:
         done = []
         while self._undecided:
             number, time, contact = self._undecided[0]
-            if any(not on and last < time and now_s - last < self.settings.gap_s
-                   for on, last in zip(contact, self._last)):  # fmt: skip
+            if any(
+                not on and last < time and now_s - last < self.settings.gap_s for on, last in zip(contact, self._last)
+            ):
                 break
             self._undecided.popleft()
             done += self._step(number, (contact[0], contact[1]))

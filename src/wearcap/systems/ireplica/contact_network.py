@@ -42,8 +42,8 @@ def fit_temperature(
     """Temperatures (1/5 … 5) with the least cross-entropy, one per class (Guo et al. 2017); 1 where a class never occurs."""
     candidates = torch.linspace(-1.6, 1.6, 161, device=logits.device).exp()
     target = truth.to(logits.dtype)
-    losses = torch.stack([
-        F.binary_cross_entropy_with_logits(logits / t, target, reduction="none").mean(0) for t in candidates
-    ])  # fmt: skip
+    losses = torch.stack(
+        [F.binary_cross_entropy_with_logits(logits / t, target, reduction="none").mean(0) for t in candidates]
+    )
     best = candidates[losses.argmin(0)]
     return torch.where(truth.any(0), best, torch.ones_like(best)).to(logits.dtype)

@@ -36,9 +36,7 @@ class ContactDetector:
         step, out = self.net.frames_per_pass, len(feature) - 2 * REACH
         device = self.net.temperature.device
         passes = [
-            self.net.probability(feature[None, start : min(start + step, out) + 2 * REACH].to(device))[
-                0
-            ].cpu()
+            self.net.probability(feature[None, start : min(start + step, out) + 2 * REACH].to(device))[0].cpu()
             for start in range(0, out, step)
         ]
         return torch.cat(passes)
@@ -53,8 +51,10 @@ class ContactPredictor:
     def __init__(self, *detectors: ContactDetector):
         names = [name for detector in detectors for name in detector.classes]
         if not names or len(set(names)) < len(names):
-            raise WearcapError(f"contact networks for {', '.join(names) or 'nothing'}",
-                               expected="one network for each class of interaction")  # fmt: skip
+            raise WearcapError(
+                f"contact networks for {', '.join(names) or 'nothing'}",
+                expected="one network for each class of interaction",
+            )
         self.detectors, self.classes = detectors, tuple(names)
         for detector in detectors:
             detector.net.eval()
@@ -104,8 +104,7 @@ class ContactStream:
         Raises WearcapError for a pose that is not a number; the state is then unchanged.
         """
         if not R_parent_joint.isfinite().all():
-            raise WearcapError(f"the pose of frame {self._frames} is not a number",
-                               expected="a pose in every frame")  # fmt: skip
+            raise WearcapError(f"the pose of frame {self._frames} is not a number", expected="a pose in every frame")
         features = [
             detector.features.encode(in_skeleton(self._skeleton, target, R_parent_joint[None]))
             for detector, target in zip(self._detectors, self._worn)
@@ -143,8 +142,11 @@ def load_detector(path: str | Path) -> ContactDetector:
         or kinds[1] not in FEATURES
         or not (isinstance(classes, list) and isinstance(fps, int | float))
     ):
-        raise WearcapError(f"a checkpoint of {kinds[0] or 'another model'}", where=path,
-                           expected=f"a contact network: {' or '.join(NETWORKS)}")  # fmt: skip
+        raise WearcapError(
+            f"a checkpoint of {kinds[0] or 'another model'}",
+            where=path,
+            expected=f"a contact network: {' or '.join(NETWORKS)}",
+        )
     encoder = FEATURES[kinds[1]](**{key: value for key, value in features.items() if key != "_target_"})
     net = {key: value for key, value in net.items() if key != "_partial_"}
     network = build(net | {"inputs": encoder.size, "classes": len(classes)}, state, path, prefix="net.")

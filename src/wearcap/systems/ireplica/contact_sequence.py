@@ -30,9 +30,7 @@ class GatedBlock(nn.Module):
         out = x.shape[1] - 2 * self.reach
         normal = self.norm(x)
         # Tap by tap: on the CPU faster than a grouped convolution of so few channels.
-        seen = sum(
-            normal[:, i * self.dilation : i * self.dilation + out] * self.kernel[i] for i in range(self.taps)
-        )
+        seen = sum(normal[:, i * self.dilation : i * self.dilation + out] * self.kernel[i] for i in range(self.taps))
         return x[:, self.reach : self.reach + out] + self.dropout(F.glu(self.mix(seen), -1))
 
 
@@ -46,10 +44,15 @@ class ContactSequence(ContactNetwork):
     frames_per_pass = 18000
 
     def __init__(
-        self, inputs: int, classes: int = 2, width: int = 40, taps: int = 5,
-        dilations: tuple[int, ...] | list[int] = (1, 2, 4, 6), strides: tuple[int, ...] | list[int] = (1, 4),
+        self,
+        inputs: int,
+        classes: int = 2,
+        width: int = 40,
+        taps: int = 5,
+        dilations: tuple[int, ...] | list[int] = (1, 2, 4, 6),
+        strides: tuple[int, ...] | list[int] = (1, 4),
         dropout: float = 0.1,
-    ):  # fmt: skip
+    ):
         super().__init__(classes)
         self.inputs, self.strides = inputs, tuple(strides)
         derived = inputs // _HANDS * (1 + len(self.strides))
@@ -68,8 +71,7 @@ class ContactSequence(ContactNetwork):
         margin, last = max(self.strides), view.shape[1]
         parts = [view[:, margin : last - margin]]
         parts += [
-            view[:, margin + s : last - margin + s] - view[:, margin - s : last - margin - s]
-            for s in self.strides
+            view[:, margin + s : last - margin + s] - view[:, margin - s : last - margin - s] for s in self.strides
         ]
         return torch.cat(parts, -1)
 

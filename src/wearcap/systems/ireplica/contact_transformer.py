@@ -65,9 +65,10 @@ class ContactTransformer(ContactNetwork):
         super().__init__(classes)
         if classes != 1:
             raise WearcapError(
-                f"the published contact network for {classes} classes of interaction", expected="one class",
+                f"the published contact network for {classes} classes of interaction",
+                expected="one class",
                 fix="Train one network per class, as the thesis does, or model=contact_sequence.",
-            )  # fmt: skip
+            )
         self.inputs, self.batch_axis = inputs, batch_axis
         self.encoder = nn.Linear(inputs, _WIDTH)
         self.layers = nn.ModuleList(EncoderLayer(dropout) for _ in range(_LAYERS))

@@ -28,9 +28,7 @@ class PoseFeatures(Protocol):
     @property
     def size(self) -> int: ...
 
-    def encode(
-        self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]
-    ) -> Float[Tensor, "*batch feature"]: ...
+    def encode(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch feature"]: ...
 
 
 @dataclass(frozen=True)
@@ -108,12 +106,19 @@ class HandViews:
         )
         palms, origin = site_positions(body, T, ("left_palm", "right_palm")), T.t[..., [chest], :]
         sides = [
-            palms - origin, T.t[..., elbows, :] - origin, T.t[..., ankles, :], T.R[..., ankles, :, 0],
-            rotation.rot6d_from_matrix(T.R[..., wrists, :, :]), palms[..., 2:] - floor,
-        ]  # fmt: skip
+            palms - origin,
+            T.t[..., elbows, :] - origin,
+            T.t[..., ankles, :],
+            T.R[..., ankles, :, 0],
+            rotation.rot6d_from_matrix(T.R[..., wrists, :, :]),
+            palms[..., 2:] - floor,
+        ]
         middle = [
-            T.R[..., head, :, 0], R_root[..., 2], rotation.rot6d_from_matrix(T.R[..., chest, :, :]), -floor[..., 0],
-        ]  # fmt: skip
+            T.R[..., head, :, 0],
+            R_root[..., 2],
+            rotation.rot6d_from_matrix(T.R[..., chest, :, :]),
+            -floor[..., 0],
+        ]
         return torch.cat(sides, -1), torch.cat(middle, -1)
 
 
@@ -144,8 +149,11 @@ def pose_frames(
     """
     bad = ~motion.R_parent_joint.isfinite().flatten(1).all(1) | ~motion.timestamps.isfinite()
     if bad.any():
-        raise WearcapError(f"{int(bad.sum())} of {len(bad)} poses are not numbers, first frame {int(bad.nonzero()[0])}",
-                           expected="a pose in every frame", fix="Fill the gaps, or cut them out.")  # fmt: skip
+        raise WearcapError(
+            f"{int(bad.sum())} of {len(bad)} poses are not numbers, first frame {int(bad.nonzero()[0])}",
+            expected="a pose in every frame",
+            fix="Fill the gaps, or cut them out.",
+        )
     if not is_even(motion.timestamps, fps):
         motion = resampled(motion, fps)
     R = in_skeleton(motion.skeleton, worn(motion.skeleton, skeleton), motion.R_parent_joint)

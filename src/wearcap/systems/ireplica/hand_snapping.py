@@ -48,15 +48,9 @@ class HandSnapping:
             if not row.interval.hands[hand]:
                 continue
             start, frames = row.interval.start, slice(row.interval.start, row.interval.stop)
-            on = (
-                before is not None
-                and before.interval.stop == start
-                and before.scene_object is row.scene_object
-            )
+            on = before is not None and before.interval.stop == start and before.scene_object is row.scene_object
             if not on:
-                _, nearest = environment.distance(
-                    row.scene_object.name, palm[[start]], row.state.T_world_object
-                )
+                _, nearest = environment.distance(row.scene_object.name, palm[[start]], row.state.T_world_object)
                 start_pose = row.T_world_object[0].to(torch.float64)
                 point = start_pose.R.mT @ (nearest[0] - start_pose.t)
             T = row.T_world_object.to(torch.float64)

@@ -39,11 +39,7 @@ class Correction(Protocol):
         ...
 
     def offset(
-        self,
-        contact: ContactInterval,
-        scene_object: SceneObject,
-        points_world: Float[Tensor, "hand 3"],
-        goes_on: bool,
+        self, contact: ContactInterval, scene_object: SceneObject, points_world: Float[Tensor, "hand 3"], goes_on: bool
     ) -> Float[Tensor, "frame 2"]:
         """Offset of the wearer (m) at an interval's frames; intervals are passed in order of time."""
         ...
@@ -73,8 +69,9 @@ class ObjectTracker:
         motion = within(registered, contacts["timestamps"])
         prob = {
             name: interpolate(contacts["timestamps"], value, motion.timestamps)
-            for name, value in contacts.items() if name != "timestamps"
-        }  # fmt: skip
+            for name, value in contacts.items()
+            if name != "timestamps"
+        }
         palms = site_positions(motion.skeleton, motion.T_world_joint, PALMS).double()
         spans = class_intervals(prob, motion.timestamps, self.contact, self.attachment.one_class)
         spans = settled(spans, palms, motion.timestamps, self.attachment.settle_s)
@@ -82,17 +79,21 @@ class ObjectTracker:
         offset = palms.new_zeros(len(motion), 2) if self.correction is None else self.correction.finish(held)
         shift = torch.nn.functional.pad(offset, (0, 1))
         moved = replace(
-            motion, t_world_root=(motion.t_world_root.double() + shift).float(),
+            motion,
+            t_world_root=(motion.t_world_root.double() + shift).float(),
             hand_contact_prob=torch.stack(list(prob.values())).amax(0).float(),
             object_motion=object_trajectories(environment, held, motion.timestamps),
             interactions=interactions_of(held, motion.timestamps),
-        )  # fmt: skip
+        )
         return moved if self.hands is None else self.hands(moved, held, environment)
 
     def _held(
-        self, motion: Motion, palms: Float64[Tensor, "time hand 3"], spans: list[tuple[ContactInterval, str]],
+        self,
+        motion: Motion,
+        palms: Float64[Tensor, "time hand 3"],
+        spans: list[tuple[ContactInterval, str]],
         environment: Environment,
-    ) -> list[Held]:  # fmt: skip
+    ) -> list[Held]:
         room, held, busy_until = Room(environment, self.attachment), [], [0, 0]
         if self.correction is not None:
             self.correction.start(palms, motion)

@@ -52,15 +52,14 @@ class IReplica:
         before = self.registration.stages(source)
         return [
             *before,
+            Stage("contacts", lambda done: self.contacts(suit), lambda: (self.predictor, suit, self.fps)),
             Stage(
-                "contacts", lambda done: self.contacts(suit), lambda: (self.predictor, suit, self.fps),
-            ),
-            Stage(
-                "interact", lambda done: self.interact(self.registration.motion_of(done), done["contacts"], environment),
+                "interact",
+                lambda done: self.interact(self.registration.motion_of(done), done["contacts"], environment),
                 lambda: (environment, self.tracker, self.fps),
                 (*(stage.name for stage in before), "contacts"),
             ),
-        ]  # fmt: skip
+        ]
 
     def environment_file(self, source: Source) -> Path:
         """Path of the environment file. Raises WearcapError if neither the pipeline nor the recording names one."""
@@ -68,9 +67,12 @@ class IReplica:
             path = Path(self.environment)
             return path / FILE_NAME if path.is_dir() else path
         if source.recording.environment is None:
-            raise WearcapError("no objects that can be moved", where=source.recording.name,
-                               expected="a recording that names its environment, or pipeline.environment=FILE",
-                               fix="Make one with `wearcap scene`.")  # fmt: skip
+            raise WearcapError(
+                "no objects that can be moved",
+                where=source.recording.name,
+                expected="a recording that names its environment, or pipeline.environment=FILE",
+                fix="Make one with `wearcap scene`.",
+            )
         return source.folder / source.recording.environment
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:

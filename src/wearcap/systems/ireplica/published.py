@@ -51,9 +51,10 @@ def interpolated_objects(
         t = begin.t + share[:, None] * (left.t - begin.t)
         later = times >= start
         tracks[name] = Trajectory(
-            times, torch.where(later[:, None, None], R.float(), old.R.float()),
+            times,
+            torch.where(later[:, None, None], R.float(), old.R.float()),
             torch.where(later[:, None], t.float(), old.t.float()),
-        )  # fmt: skip
+        )
     return replace(motion, object_motion=tracks)
 
 

@@ -59,26 +59,28 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
     """
     truth, held = recording.motion, recording.interactions
     if truth is None or held is None or not recording.object_motion:
-        raise WearcapError("nothing to measure interactions against", where=recording.name,
-                           expected="a true motion, interactions and object motion")  # fmt: skip
+        raise WearcapError(
+            "nothing to measure interactions against",
+            where=recording.name,
+            expected="a true motion, interactions and object motion",
+        )
     if motion.object_motion is None:
         raise WearcapError("this capture has no objects", where=recording.name, expected="object_motion")
     true = at_times(truth, motion.timestamps)
     palms = [site_positions(m.skeleton, m.T_world_joint, PALMS) for m in (motion, true)]
     found = {
-        scene_object.name: poses_at(
-            motion.object_motion.get(scene_object.name), scene_object, motion.timestamps
-        )
+        scene_object.name: poses_at(motion.object_motion.get(scene_object.name), scene_object, motion.timestamps)
         for scene_object in environment.objects
     }
-    real = {name: poses_at(recording.object_motion.get(name), environment.by_name(name), motion.timestamps) for name in found}  # fmt: skip
+    real = {
+        name: poses_at(recording.object_motion.get(name), environment.by_name(name), motion.timestamps)
+        for name in found
+    }
     rows = handlings(held.start_s, held.stop_s, held.objects)
     scored = [_handling(row, rows, environment, held, motion.timestamps, palms, found, real) for row in rows]
     body, objects = _chamfer(motion, true, recording, rows, environment, found, real)
     joints = mpjpe_cm(motion.T_world_joint.t, true.T_world_joint.t).item()
-    return InteractionScores(
-        tuple(scored), joints, body, objects, _false_moves(environment, held.objects, found)
-    )
+    return InteractionScores(tuple(scored), joints, body, objects, _false_moves(environment, held.objects, found))
 
 
 def with_interactions(pipeline: IReplica, folder: Path) -> Measure:
@@ -95,15 +97,11 @@ def with_interactions(pipeline: IReplica, folder: Path) -> Measure:
     return measure
 
 
-def poses_at(
-    track: Trajectory | None, scene_object: SceneObject, timestamps: Float64[Tensor, "time"]
-) -> Rigid:
+def poses_at(track: Trajectory | None, scene_object: SceneObject, timestamps: Float64[Tensor, "time"]) -> Rigid:
     """Poses of an object at given times; it is static before and after its track, and throughout without a track."""
     if track is None:
         count = len(timestamps)
-        return Rigid(
-            scene_object.R_world_object.expand(count, 3, 3), scene_object.t_world_object.expand(count, 3)
-        )
+        return Rigid(scene_object.R_world_object.expand(count, 3, 3), scene_object.t_world_object.expand(count, 3))
     inside = timestamps.clamp(track.timestamps[0], track.timestamps[-1])
     return resample(track, inside).T_world_body
 
@@ -122,7 +120,9 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     begin = int(torch.searchsorted(timestamps, start).clamp(max=len(timestamps) - 1))
     middle = middle_of(scene_object)
     left = object_error(found[name][end], real[name][end], middle)
-    own = replace(held, **_only(held, [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())]))  # fmt: skip
+    own = replace(
+        held, **_only(held, [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())])
+    )
     frames = slice(begin, max(int(torch.searchsorted(timestamps, stop)), begin + 1))
     contact = own.hand_contact(timestamps[frames])
     apart = torch.stack(
@@ -131,26 +131,36 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     during = object_error(found[name][frames], real[name][frames], middle)
     moved = object_error(real[name][[end]], real[name][[begin]], middle)
     return Handling(
-        name, scene_object.category, start, stop, float(left.distance_cm), float(left.angle_deg), float(moved.distance_cm[0]),
+        name,
+        scene_object.category,
+        start,
+        stop,
+        float(left.distance_cm),
+        float(left.angle_deg),
+        float(moved.distance_cm[0]),
         100 * float(contact_mean(apart, contact)),
         100 * float(contact_mean((palms[0] - palms[1])[frames].norm(dim=-1), contact)),
-        float(during.distance_cm.mean()), float(during.angle_deg.mean()),
-    )  # fmt: skip
+        float(during.distance_cm.mean()),
+        float(during.angle_deg.mean()),
+    )
 
 
 def _only(held, chosen: Sequence[bool]) -> dict:
     keep = torch.tensor(chosen, dtype=torch.bool)
     pick = lambda names: tuple(name for name, on in zip(names, chosen) if on)  # noqa: E731
-    return {"start_s": held.start_s[keep], "stop_s": held.stop_s[keep], "hands": held.hands[keep],
-            "objects": pick(held.objects), "classes": pick(held.classes)}  # fmt: skip
+    return {
+        "start_s": held.start_s[keep],
+        "stop_s": held.stop_s[keep],
+        "hands": held.hands[keep],
+        "objects": pick(held.objects),
+        "classes": pick(held.classes),
+    }
 
 
 def _false_moves(environment: Environment, touched: tuple[str, ...], found: dict[str, Rigid]) -> float:
     """Mean displacement (cm) of the centres of untouched objects from the first to the last frame."""
     untouched = [scene_object for scene_object in environment.objects if scene_object.name not in touched]
-    ends = [
-        object_error(found[t.name][[-1]], found[t.name][[0]], middle_of(t)).distance_cm[0] for t in untouched
-    ]
+    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], middle_of(t)).distance_cm[0] for t in untouched]
     return float(torch.stack(ends).mean()) if ends else 0.0
 
 
@@ -167,9 +177,7 @@ def _chamfer(
         for frame in frames:
             bodies = [_thinned(body.vertices(m.T_world_joint[frame]).numpy()) for m in (motion, true)]
             errors[0].append(_both_ways(*bodies))
-            errors[1].append(
-                _both_ways(*((T[name][frame].to(torch.float32) @ surface).numpy() for T in (found, real)))
-            )
+            errors[1].append(_both_ways(*((T[name][frame].to(torch.float32) @ surface).numpy() for T in (found, real))))
     return tuple(float(np.mean(part)) if part else float("nan") for part in errors)  # pyright: ignore[reportReturnType]
 
 

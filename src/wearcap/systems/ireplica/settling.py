@@ -17,10 +17,7 @@ Span = tuple[ContactInterval, str]
 
 
 def settled(
-    spans: list[Span],
-    palms_world: Float[Tensor, "time hand 3"],
-    timestamps: Float64[Tensor, "time"],
-    settle_s: float,
+    spans: list[Span], palms_world: Float[Tensor, "time hand 3"], timestamps: Float64[Tensor, "time"], settle_s: float
 ) -> list[Span]:
     """Cut approach and retreat off the intervals, each up to `settle_s` long.
 
@@ -36,12 +33,8 @@ def settled(
     for chain in chains(spans):
         first, last = chain[0][0], chain[-1][0]
         middle = (first.start + last.stop) // 2
-        start = slowest(
-            speed, hands_of(chain, first.start, reach), first.start, min(first.start + reach, middle)
-        )
-        stop = slowest(
-            speed, hands_of(chain, last.stop - reach, reach), max(last.stop - reach, middle), last.stop
-        )
+        start = slowest(speed, hands_of(chain, first.start, reach), first.start, min(first.start + reach, middle))
+        stop = slowest(speed, hands_of(chain, last.stop - reach, reach), max(last.stop - reach, middle), last.stop)
         for contact, contact_class in chain:
             cut = replace(contact, start=max(contact.start, start), stop=min(contact.stop, stop + 1))
             if cut.start < cut.stop:

@@ -50,11 +50,7 @@ class BendCorrection(_Targets):
     transition_s: float = 1.5
 
     def offset(
-        self,
-        contact: ContactInterval,
-        scene_object: SceneObject,
-        points_world: Float[Tensor, "hand 3"],
-        goes_on: bool,
+        self, contact: ContactInterval, scene_object: SceneObject, points_world: Float[Tensor, "hand 3"], goes_on: bool
     ) -> Float[Tensor, "frame 2"]:
         frames, hands = slice(contact.start, contact.stop), torch.tensor(contact.hands)
         shift = (points_world[hands] - self._palms[contact.start, hands])[:, :2].mean(0)
@@ -68,12 +64,7 @@ class BendCorrection(_Targets):
 
     def _bent(self, weights: Float[Tensor, "time"]) -> Float[Tensor, "time 2"]:
         return bend_contacts(
-            self._targets,
-            weights,
-            self._timestamps,
-            self._path,
-            bend=self.bend,
-            transition_s=self.transition_s,
+            self._targets, weights, self._timestamps, self._path, bend=self.bend, transition_s=self.transition_s
         )
 
 
@@ -91,11 +82,7 @@ class SnapCorrection(_Targets):
     """Largest offset (m) of an interaction; larger ones are not due to an error of the wearer's position."""
 
     def offset(
-        self,
-        contact: ContactInterval,
-        scene_object: SceneObject,
-        points_world: Float[Tensor, "hand 3"],
-        goes_on: bool,
+        self, contact: ContactInterval, scene_object: SceneObject, points_world: Float[Tensor, "hand 3"], goes_on: bool
     ) -> Float[Tensor, "frame 2"]:
         frames, hands = slice(contact.start, contact.stop), torch.tensor(contact.hands)
         held = self._palms[frames][:, hands][..., :2]
@@ -118,10 +105,7 @@ class SnapCorrection(_Targets):
 
 
 def fit_about_hinge(
-    hand: Float64[Tensor, "frame 2"],
-    pivot: Float64[Tensor, "2"],
-    touch: Float64[Tensor, "2"],
-    settings: HingeFit,
+    hand: Float64[Tensor, "frame 2"], pivot: Float64[Tensor, "2"], touch: Float64[Tensor, "2"], settings: HingeFit
 ) -> Float64[Tensor, "2"]:
     """Fit the offset δ (m) under which a hand's path keeps its distance r from a hinge and starts at the touched point.
 

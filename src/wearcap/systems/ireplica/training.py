@@ -62,9 +62,7 @@ class ContactDetection(SeededSteps, GivenOptimizer):
         self.log("val/loss", loss, batch_size=len(truth), sync_dist=True)
         self._validated.append((logits.flatten(0, 1), truth.flatten(0, 1)))
 
-    def validated(
-        self,
-    ) -> tuple[Float[Tensor, "sample hand class"], Bool[Tensor, "sample hand class"]]:
+    def validated(self) -> tuple[Float[Tensor, "sample hand class"], Bool[Tensor, "sample hand class"]]:
         """Logits and ground truth of the validation epoch so far, from all processes."""
         parts = [torch.cat(part) for part in zip(*self._validated)]
         every = [torch.as_tensor(self.all_gather(part)).reshape(-1, *part.shape[1:]) for part in parts]

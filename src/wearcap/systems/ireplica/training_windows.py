@@ -14,12 +14,7 @@ from torch.utils.data import Dataset
 from wearcap.body.skeleton import Skeleton
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.data.datamodule import SeededWindows
-from wearcap.data.windows import (
-    Source,
-    mirrored_rotations,
-    requested,
-    share_out,
-)
+from wearcap.data.windows import Source, mirrored_rotations, requested, share_out
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
@@ -62,9 +57,19 @@ class ContactDataset(Dataset):
     """
 
     def __init__(
-        self, sources: list[Source], split: str, *, window: int, stride: int, fps: float, classes: tuple[str, ...],
-        skeleton: Skeleton, stream: str = "suit", augmentation: Augmentation = NONE, balance: float = 1.0,
-    ):  # fmt: skip
+        self,
+        sources: list[Source],
+        split: str,
+        *,
+        window: int,
+        stride: int,
+        fps: float,
+        classes: tuple[str, ...],
+        skeleton: Skeleton,
+        stream: str = "suit",
+        augmentation: Augmentation = NONE,
+        balance: float = 1.0,
+    ):
         if stream not in ("suit", "motion"):
             raise WearcapError(f"no stream of poses {stream!r}", expected='"suit" or "motion"')
         self.window, self.stride, self.fps, self.classes = window, stride, fps, classes
@@ -151,9 +156,7 @@ class _Poses:
             return self.converted[start:stop]
         return self.file.window(f"{self.stream}.R_parent_joint", start, stop)
 
-    def contact(
-        self, place: Float[Tensor, "place"], classes: tuple[str, ...]
-    ) -> Bool[Tensor, "place hand class"]:
+    def contact(self, place: Float[Tensor, "place"], classes: tuple[str, ...]) -> Bool[Tensor, "place hand class"]:
         """True contact at fractional frames `place`."""
         below = place.long().clamp(max=self.length - 2)
         times = torch.lerp(self.timestamps[below], self.timestamps[below + 1], place.double() - below)
@@ -167,8 +170,11 @@ def _poses(path: Path, stream: str, skeleton_name: str, fps: float) -> _Poses:
     interactions = file.part("interactions")
     if f"{stream}.timestamps" not in file.keys or interactions is None:
         missing = "interactions" if interactions is None else stream
-        raise WearcapError(f"this recording has no {missing}, which contact detection learns from", where=path,
-                           fix="Prepare a data set with interactions, such as `wearcap prepare simulated_interactions`.")  # fmt: skip
+        raise WearcapError(
+            f"this recording has no {missing}, which contact detection learns from",
+            where=path,
+            fix="Prepare a data set with interactions, such as `wearcap prepare simulated_interactions`.",
+        )
     timestamps = file.tensor(f"{stream}.timestamps")
     motion: Motion = file.part(stream)
     if is_even(timestamps, fps) and motion.skeleton.joint_names == skeleton.joint_names:
@@ -207,7 +213,14 @@ class ContactWindows(SeededWindows):
     def dataset(self, split: str) -> ContactDataset:
         train = split == "train"
         return ContactDataset(
-            self.sources if train else self.val_sources, split, window=self.window, stride=self.stride, fps=self.fps,
-            classes=self.classes, skeleton=self.features.skeleton, stream=self.stream,
-            augmentation=self.augmentation if train else NONE, balance=self.balance if train else 1.0,
-        )  # fmt: skip
+            self.sources if train else self.val_sources,
+            split,
+            window=self.window,
+            stride=self.stride,
+            fps=self.fps,
+            classes=self.classes,
+            skeleton=self.features.skeleton,
+            stream=self.stream,
+            augmentation=self.augmentation if train else NONE,
+            balance=self.balance if train else 1.0,
+        )

@@ -169,9 +169,7 @@ def energy_terms(
     ):
         if errors:
             observed = torch.stack([(confidence > 0).sum(1).clamp_min(1) for _, confidence in errors])
-            terms[name] = weight * sum(
-                ((e.sum(1) / n).sum() for (e, _), n in zip(errors, observed)), torch.zeros(())
-            )
+            terms[name] = weight * sum(((e.sum(1) / n).sum() for (e, _), n in zip(errors, observed)), torch.zeros(()))
     return terms
 
 
@@ -189,9 +187,14 @@ def solve_latent(
         iterations = solver.steps
     else:
         optimizer = torch.optim.LBFGS(
-            [latent], lr=1.0, max_iter=solver.steps, history_size=20, line_search_fn="strong_wolfe",
-            tolerance_grad=1e-7, tolerance_change=1e-7,
-        )  # fmt: skip
+            [latent],
+            lr=1.0,
+            max_iter=solver.steps,
+            history_size=20,
+            line_search_fn="strong_wolfe",
+            tolerance_grad=1e-7,
+            tolerance_change=1e-7,
+        )
         iterations = 1
 
     def closure() -> Tensor:

@@ -41,9 +41,12 @@ def mirrored(sensed: Sensed) -> Sensed:
     flip = sensed.t_world_head.new_tensor(MIRROR)
     turn = torch.outer(flip, flip)
     return Sensed(
-        sensed.R_world_head * turn, sensed.t_world_head * flip, sensed.R_world_wrist.flip(-3) * turn,
-        sensed.acc_world_wrist.flip(-2) * flip, sensed.t_world_wrist.flip(-2) * flip,
-    )  # fmt: skip
+        sensed.R_world_head * turn,
+        sensed.t_world_head * flip,
+        sensed.R_world_wrist.flip(-3) * turn,
+        sensed.acc_world_wrist.flip(-2) * flip,
+        sensed.t_world_wrist.flip(-2) * flip,
+    )
 
 
 class Canonical(NamedTuple):
@@ -102,8 +105,9 @@ class WatchFeatures:
     def __post_init__(self):
         for name, allowed in (("frame", FRAMES), ("wrists", TRACKED), ("root", ROOTS)):
             if getattr(self, name) not in allowed:
-                raise WearcapError(f"watch features have no {name} {getattr(self, name)!r}",
-                                   expected=f"one of {', '.join(allowed)}")  # fmt: skip
+                raise WearcapError(
+                    f"watch features have no {name} {getattr(self, name)!r}", expected=f"one of {', '.join(allowed)}"
+                )
 
     @property
     def size(self) -> int:
@@ -147,9 +151,11 @@ class WatchFeatures:
         vectors = sensed.acc_world_wrist if self.wrists == "watches" else sensed.t_world_wrist - t[:, :, None]
         vectors = (R_canonical_world[:, :, None] @ vectors[..., None])[..., 0]
         parts = [
-            rotation.rot6d_from_matrix(R_canonical_head), self._path(sensed, canonical),
-            rotation.rot6d_from_matrix(R_canonical_wrist).flatten(-2), vectors.flatten(-2),
-        ]  # fmt: skip
+            rotation.rot6d_from_matrix(R_canonical_head),
+            self._path(sensed, canonical),
+            rotation.rot6d_from_matrix(R_canonical_wrist).flatten(-2),
+            vectors.flatten(-2),
+        ]
         if self.absolute:
             height = (sensed.t_world_head[..., 2] - floor_height)[..., None]
             up = R_canonical_head if self.frame == "heading" else sensed.R_world_head

@@ -36,9 +36,7 @@ def encode_window(window: Posed, origin: Origin) -> Float[Tensor, "batch time fe
     """X: 5 + 6 per joint features (137 with 22 joints), in the window's canonical frame."""
     R_origin_world = origin.R.mT
     root = (R_origin_world @ (window.t_world_root - origin.t)[..., None])[..., 0]
-    R = torch.cat(
-        [(R_origin_world @ window.R_parent_joint[:, :, 0])[:, :, None], window.R_parent_joint[:, :, 1:]], 2
-    )
+    R = torch.cat([(R_origin_world @ window.R_parent_joint[:, :, 0])[:, :, None], window.R_parent_joint[:, :, 1:]], 2)
     return torch.cat([window.foot_contact, root, rotation.rot6d_from_matrix(R).flatten(-2)], -1)
 
 

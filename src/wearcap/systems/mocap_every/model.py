@@ -68,9 +68,7 @@ class TwoStageEstimator(WatchEstimator):
         per = frames_per_token
 
         def encoder() -> nn.TransformerEncoder:
-            layer = nn.TransformerEncoderLayer(
-                width, heads, feedforward, dropout, batch_first=True, norm_first=True
-            )
+            layer = nn.TransformerEncoderLayer(width, heads, feedforward, dropout, batch_first=True, norm_first=True)
             return nn.TransformerEncoder(layer, layers, nn.LayerNorm(width), enable_nested_tensor=False)
 
         def head(inputs: int, outputs: int) -> nn.Sequential:
@@ -78,8 +76,9 @@ class TwoStageEstimator(WatchEstimator):
 
         self.first: nn.ModuleDict | None = None
         if multi_stage:
-            self.first = nn.ModuleDict({"embed": nn.Linear(per * feature_size, width), "encoder": encoder(),
-                                        "ends": head(width, ENDS_SIZE)})  # fmt: skip
+            self.first = nn.ModuleDict(
+                {"embed": nn.Linear(per * feature_size, width), "encoder": encoder(), "ends": head(width, ENDS_SIZE)}
+            )
             self.first_position = nn.Parameter(0.02 * torch.randn(tokens, width))
             self.embed_ends = nn.Linear(per * ENDS_SIZE, width // 2)
         self.embed = nn.Linear(per * feature_size, width // 2 if multi_stage else width)
@@ -116,21 +115,21 @@ class LastPoseEstimator(WatchEstimator):
     """Baseline after AvatarPoser (Jiang et al. 2022): one encoder predicts the pose of the window's last frame."""
 
     def __init__(
-        self, feature_size: int, motion_size: int, window: int = 40, width: int = 256, layers: int = 3, heads: int = 8,
-        feedforward: int = 2048, dropout: float = 0.1, frames_per_token: int = 1,
-    ):  # fmt: skip
+        self,
+        feature_size: int,
+        motion_size: int,
+        window: int = 40,
+        width: int = 256,
+        layers: int = 3,
+        heads: int = 8,
+        feedforward: int = 2048,
+        dropout: float = 0.1,
+        frames_per_token: int = 1,
+    ):
         super().__init__()
         self.window = window
         self.regressor = PoseRegressor(
-            feature_size,
-            motion_size + FEET,
-            window,
-            width,
-            layers,
-            heads,
-            feedforward,
-            dropout,
-            frames_per_token,
+            feature_size, motion_size + FEET, window, width, layers, heads, feedforward, dropout, frames_per_token
         )
         self.motion_normalizer, self.ends_normalizer = Normalizer(motion_size), Normalizer(ENDS_SIZE)
 

@@ -72,12 +72,17 @@ class MocapEvery:
         if self.runtime not in ("eager", "onnx"):
             raise WearcapError(f"no runtime {self.runtime!r}", expected="eager or onnx")
         if self.runtime == "onnx" and (missing := missing_libraries()):
-            raise WearcapError(f"runtime 'onnx' needs {', '.join(missing)}", fix='Run: pip install "wearcap[export]", or choose pipeline.runtime=eager.')  # fmt: skip
+            raise WearcapError(
+                f"runtime 'onnx' needs {', '.join(missing)}",
+                fix='Run: pip install "wearcap[export]", or choose pipeline.runtime=eager.',
+            )
         if self.floor not in FLOORS:
             raise WearcapError(f"no floor {self.floor!r}", expected=f"one of {', '.join(FLOORS)}")
         if not 0 < self.stride <= self.net.window or not 0 <= self.lookahead <= self.net.window - self.stride:
-            raise WearcapError(f"windows of {self.net.window} frames with stride {self.stride} and lookahead {self.lookahead}",
-                               expected="a stride from 1 to the window, and a lookahead of at most the overlap of two windows")  # fmt: skip
+            raise WearcapError(
+                f"windows of {self.net.window} frames with stride {self.stride} and lookahead {self.lookahead}",
+                expected="a stride from 1 to the window, and a lookahead of at most the overlap of two windows",
+            )
 
     def __call__(self, recording: Recording, seed: int = 0) -> Motion:
         return self.capture([recording], [seed])[0]
@@ -105,12 +110,16 @@ class MocapEvery:
         path = head_path(recording, self.skeleton, self.fps)
         sensed = self._sensed(recording, path)
         # 2. end-effectors, contacts and poses, window by window; 3. floor height from the feet in contact
-        output = [
-            self._capture_stretch(recording, path, sensed, start, stop) for start, stop in path.stretches
-        ]
+        output = [self._capture_stretch(recording, path, sensed, start, stop) for start, stop in path.stretches]
         whole = _bridged(output, path)
-        motion = Motion(path.timestamps, path.skeleton, whole.R_parent_joint, whole.t_world_root,
-                        whole.contact_prob.repeat_interleave(2, -1), provenance=self.settings())  # fmt: skip
+        motion = Motion(
+            path.timestamps,
+            path.skeleton,
+            whole.R_parent_joint,
+            whole.t_world_root,
+            whole.contact_prob.repeat_interleave(2, -1),
+            provenance=self.settings(),
+        )
         # 4. anchor the body to the measured head
         if self.anchor:
             motion = anchored_to_head(motion, path.T_world_head)
@@ -134,15 +143,14 @@ class MocapEvery:
         truth = recording.motion
         if self.features.wrists == "positions" or (not recording.imu and truth is not None):
             if truth is None:
-                raise WearcapError("no hand positions in this recording", where=recording.name,
-                                   expected="a recording with `motion`, or a checkpoint for watches")  # fmt: skip
+                raise WearcapError(
+                    "no hand positions in this recording",
+                    where=recording.name,
+                    expected="a recording with `motion`, or a checkpoint for watches",
+                )
             truth = at_times(truth, path.timestamps)
-            return Sensed(
-                R, t, *synthetic_wrists(truth.skeleton, truth.R_parent_joint, truth.t_world_root, self.fps)
-            )
-        return Sensed(
-            R, t, *watches_at(recording.imu, path.timestamps, recording.name), torch.zeros(len(t), 2, 3)
-        )
+            return Sensed(R, t, *synthetic_wrists(truth.skeleton, truth.R_parent_joint, truth.t_world_root, self.fps))
+        return Sensed(R, t, *watches_at(recording.imu, path.timestamps, recording.name), torch.zeros(len(t), 2, 3))
 
     def _capture_stretch(
         self, recording: Recording, path: HeadPath, sensed: Sensed, start: int, stop: int
@@ -168,9 +176,9 @@ class MocapEvery:
         height estimated from the head path."""
         track = recording.floor
         if track is not None:
-            initial = interpolate_clamped(
-                track.timestamps, track.height, torch.tensor([time_s], dtype=torch.float64)
-            )[0].item()
+            initial = interpolate_clamped(track.timestamps, track.height, torch.tensor([time_s], dtype=torch.float64))[
+                0
+            ].item()
         else:
             initial = path.floor_height[int(torch.searchsorted(path.timestamps, time_s))].item()
         return self.follower(path.skeleton, initial)
@@ -188,9 +196,7 @@ class MocapEvery:
         height = floor_from_points(recording.points, path.T_world_head.t, path.stature)
         return path.floor_height if height is None else height
 
-    def _add_points(
-        self, recording: Recording, floor: FloorFollower, seen_until: float, until: float
-    ) -> float:
+    def _add_points(self, recording: Recording, floor: FloorFollower, seen_until: float, until: float) -> float:
         """Pass the points first seen between two times (s) to the follower; returns `until`."""
         cloud = recording.points
         if cloud is None or self.floor not in ("follow", "update"):
@@ -206,9 +212,13 @@ class MocapEvery:
     def settings(self) -> dict[str, str]:
         """Settings that the motion depends on, for its provenance."""
         return {
-            "pipeline": "mocap_every", "stride": str(self.stride), "lookahead": str(self.lookahead), "floor": self.floor,
-            "anchor": str(self.anchor), "mirror_average": str(self.mirror_average),
-        }  # fmt: skip
+            "pipeline": "mocap_every",
+            "stride": str(self.stride),
+            "lookahead": str(self.lookahead),
+            "floor": self.floor,
+            "anchor": str(self.anchor),
+            "mirror_average": str(self.mirror_average),
+        }
 
 
 def _bridged(output: list[FinalPoses], path: HeadPath) -> FinalPoses:

@@ -36,16 +36,17 @@ def capture_session(
     """
     _require_one_session(recordings)
     if unknown := set(views) - {recording.name for recording in recordings}:
-        raise WearcapError(
-            f"views of {min(unknown)!r}", expected=f"of {', '.join(r.name for r in recordings)}"
-        )
+        raise WearcapError(f"views of {min(unknown)!r}", expected=f"of {', '.join(r.name for r in recordings)}")
     motions = {}
     for recording in recordings:
         motion, own_views = capture(recording), views.get(recording.name, ())
         for view in own_views:
             if view.motion.skeleton.joint_names != motion.skeleton.joint_names:
-                raise WearcapError(f"a view with the joints of {view.motion.skeleton.name}", where=recording.name,
-                                   expected=f"those of {motion.skeleton.name}, as captured")  # fmt: skip
+                raise WearcapError(
+                    f"a view with the joints of {view.motion.skeleton.name}",
+                    where=recording.name,
+                    expected=f"those of {motion.skeleton.name}, as captured",
+                )
         motions[recording.name], _ = cues.edit(motion, recording, motion.joint("head"), own_views)
     return motions
 
@@ -60,9 +61,7 @@ def simulated_views(
     _require_one_session(recordings)
     for recording in recordings:
         if recording.motion is None or recording.camera is None:
-            raise WearcapError(
-                "no true motion or no camera", where=recording.name, expected="both, as simulated"
-            )
+            raise WearcapError("no true motion or no camera", where=recording.name, expected="both, as simulated")
     views: dict[str, list[View]] = {recording.name: [] for recording in recordings}
     for seen, observer in permutations(recordings, 2):
         assert seen.motion is not None
@@ -104,8 +103,11 @@ def _confidence_path(path: str | Path) -> Path:
 def _require_one_session(recordings: Sequence[Recording]) -> None:
     for recording in recordings:
         if recording.session is None or recording.session != recordings[0].session:
-            raise WearcapError(f"session {recording.session!r}", where=recording.name,
-                               expected=f"that of {recordings[0].name}, {recordings[0].session!r}")  # fmt: skip
+            raise WearcapError(
+                f"session {recording.session!r}",
+                where=recording.name,
+                expected=f"that of {recordings[0].name}, {recordings[0].session!r}",
+            )
     if repeated := [name for name, count in Counter(r.name for r in recordings).items() if count > 1]:
         raise WearcapError(f"two recordings are called {repeated[0]!r}", expected="unique names")
     spans = []
@@ -117,5 +119,6 @@ def _require_one_session(recordings: Sequence[Recording]) -> None:
             )
         spans.append((stream.timestamps[0].item(), stream.timestamps[-1].item()))
     if spans and max(start for start, _ in spans) > min(stop for _, stop in spans):
-        raise WearcapError("recordings of one session at different times", where=recordings[0].session,
-                           expected="one clock")  # fmt: skip
+        raise WearcapError(
+            "recordings of one session at different times", where=recordings[0].session, expected="one clock"
+        )

@@ -113,10 +113,7 @@ class MocapEverySession:
         return dict(self._head_input.refused)
 
     def head(
-        self,
-        timestamp: float,
-        T_world_device: Rigid | None,
-        points_world: Float[Tensor, "point 3"] | None = None,
+        self, timestamp: float, T_world_device: Rigid | None, points_world: Float[Tensor, "point 3"] | None = None
     ) -> None:
         """Take in one time step of the camera: its pose (None while tracking is lost) and new points."""
         if self._head_input.timely(timestamp):
@@ -225,10 +222,7 @@ class MocapEverySession:
         sensed = Sensed(T_world_head.R, T_world_head.t, R, acc, torch.zeros_like(acc))
         self._times = torch.cat([self._times, chunk.timestamps])
         self._heads = Rigid(
-            *(
-                torch.cat(part)
-                for part in zip((self._heads.R, self._heads.t), (T_world_head.R, T_world_head.t))
-            )
+            *(torch.cat(part) for part in zip((self._heads.R, self._heads.t), (T_world_head.R, T_world_head.t)))
         )
         return motions + self._to_motion(self._windows.advance(sensed))
 
@@ -247,11 +241,15 @@ class MocapEverySession:
                 samples = self._static(samples, chunk)
             elif len(samples) == 1:
                 samples = [samples[0]._replace(timestamp=samples[0].timestamp - step), *samples]
-            streams.append(ImuStream(
-                torch.tensor([s.timestamp for s in samples], dtype=torch.float64), joint,
-                torch.stack([s.R_world_imu for s in samples]), torch.stack([s.acc_world for s in samples]),
-                R_joint_imu=self.wearing.R_wrist_imu.get(joint),
-            ))  # fmt: skip
+            streams.append(
+                ImuStream(
+                    torch.tensor([s.timestamp for s in samples], dtype=torch.float64),
+                    joint,
+                    torch.stack([s.R_world_imu for s in samples]),
+                    torch.stack([s.acc_world for s in samples]),
+                    R_joint_imu=self.wearing.R_wrist_imu.get(joint),
+                )
+            )
             oldest_s = around[-FILTER].item() - 2 * step
             kept = self._samples[joint]
             self._samples[joint] = [s for s in kept if s.timestamp >= oldest_s] or kept[-1:]
@@ -272,8 +270,14 @@ class MocapEverySession:
             return []
         times, heads = self._times[:count], self._heads[:count]
         self._times, self._heads = self._times[count:], self._heads[count:]
-        motion = Motion(times, self.wearing.skeleton, output.R_parent_joint, output.t_world_root,
-                        output.contact_prob.repeat_interleave(2, -1), provenance=self.pipeline.settings())  # fmt: skip
+        motion = Motion(
+            times,
+            self.wearing.skeleton,
+            output.R_parent_joint,
+            output.t_world_root,
+            output.contact_prob.repeat_interleave(2, -1),
+            provenance=self.pipeline.settings(),
+        )
         return [anchored_to_head(motion, heads) if self.pipeline.anchor else motion]
 
 

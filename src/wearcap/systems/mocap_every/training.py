@@ -65,8 +65,10 @@ class WatchRegression(SeededSteps, WeighedTerms):
             self._joints(motion, batch, canonical)[:, :, self._ends], batch, canonical
         ).flatten(-2)
         for normalizer, rows in (
-            (self.net.feature_normalizer, features), (self.net.motion_normalizer, motion), (self.net.ends_normalizer, ends),
-        ):  # fmt: skip
+            (self.net.feature_normalizer, features),
+            (self.net.motion_normalizer, motion),
+            (self.net.ends_normalizer, ends),
+        ):
             rows = rows.flatten(0, 1)
             normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
 
@@ -91,19 +93,14 @@ class WatchRegression(SeededSteps, WeighedTerms):
     ) -> Float[Tensor, "batch time end 3"]:
         """Predicted end-effectors (m), transformed to the world."""
         origin = self.features.origin(batch.sensed, canonical)
-        return (
-            canonical.t[:, :, None]
-            + (canonical.R[:, :, None] @ (ends + origin[:, :, None])[..., None])[..., 0]
-        )
+        return canonical.t[:, :, None] + (canonical.R[:, :, None] @ (ends + origin[:, :, None])[..., None])[..., 0]
 
     def _ends_from_world(
         self, ends: Float[Tensor, "batch time end 3"], batch: WatchWindow, canonical: Canonical
     ) -> Float[Tensor, "batch time end 3"]:
         """The inverse of `_ends_to_world`."""
         origin = self.features.origin(batch.sensed, canonical)
-        return (canonical.R.mT[:, :, None] @ (ends - canonical.t[:, :, None])[..., None])[..., 0] - origin[
-            :, :, None
-        ]
+        return (canonical.R.mT[:, :, None] @ (ends - canonical.t[:, :, None])[..., None])[..., 0] - origin[:, :, None]
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
         """Unweighted loss terms of a batch."""
@@ -118,9 +115,7 @@ class WatchRegression(SeededSteps, WeighedTerms):
             "root": (_norm(error[..., :3]) + rotation_error[..., 0]).mean(),
             "rotation": rotation_error[..., 1:].mean(),
             "position": (distance * self._joint_weights).mean(),
-            "contact": F.binary_cross_entropy_with_logits(
-                output.contact_logit.float(), batch.foot_contact[:, -last:]
-            ),
+            "contact": F.binary_cross_entropy_with_logits(output.contact_logit.float(), batch.foot_contact[:, -last:]),
         }
         if last > 1:
             velocity = _norm((joints - joints_true).diff(dim=1) * self.fps)

@@ -13,14 +13,7 @@ from torch.utils.data import Dataset
 from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.data.datamodule import SeededWindows
 from wearcap.data.features import body_size
-from wearcap.data.windows import (
-    Source,
-    joint_twins,
-    mirrored_rotations,
-    requested,
-    share_out,
-    true_foot_contact,
-)
+from wearcap.data.windows import Source, joint_twins, mirrored_rotations, requested, share_out, true_foot_contact
 from wearcap.geometry import rotation
 from wearcap.recording.store import RecordingFile
 from wearcap.systems.mocap_every.features import Sensed, mirrored, synthetic_wrists
@@ -74,9 +67,19 @@ class WatchDataset(Dataset):
     """
 
     def __init__(
-        self, sources: list[Source], split: str, *, window: int, stride: int, fps: float, every: int,
-        augment: bool = False, balance: float = 1.0, variation: Variation | None = None, beginnings: float = 0.0,
-    ):  # fmt: skip
+        self,
+        sources: list[Source],
+        split: str,
+        *,
+        window: int,
+        stride: int,
+        fps: float,
+        every: int,
+        augment: bool = False,
+        balance: float = 1.0,
+        variation: Variation | None = None,
+        beginnings: float = 0.0,
+    ):
         """Of recordings at `fps` frames per second every `every`-th frame is used; `window` and `stride` count those.
 
         `augment` shifts windows by up to a stride, mirrors half of them, turns them about the vertical, and applies
@@ -86,9 +89,14 @@ class WatchDataset(Dataset):
         self.window, self.stride, self.fps, self.every = window, stride, fps / every, every
         self.augment, self.variation, self.beginnings = augment, variation or Variation(), beginnings
         self.recordings, self.starts, self.weights = share_out(
-            sources, split, window=window * every, stride=stride * every, fps=fps, balance=balance,
+            sources,
+            split,
+            window=window * every,
+            stride=stride * every,
+            fps=fps,
+            balance=balance,
             min_frames=window * every,
-        )  # fmt: skip
+        )
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -153,11 +161,18 @@ class Watched:
 
         sensed = self.sensed
         return WatchWindow(
-            turned_between(sensed.R_world_head), between(sensed.t_world_head), turned_between(sensed.R_world_wrist),
-            speed**2 * between(sensed.acc_world_wrist), between(sensed.t_world_wrist), between(self.floor_height),
-            self.size, turned_between(self.R_parent_joint), between(self.t_world_root), self.skeleton.t_parent_joint,
+            turned_between(sensed.R_world_head),
+            between(sensed.t_world_head),
+            turned_between(sensed.R_world_wrist),
+            speed**2 * between(sensed.acc_world_wrist),
+            between(sensed.t_world_wrist),
+            between(self.floor_height),
+            self.size,
+            turned_between(self.R_parent_joint),
+            between(self.t_world_root),
+            self.skeleton.t_parent_joint,
             self.foot_contact[frames.round().long()],
-        )  # fmt: skip
+        )
 
 
 @cache
@@ -171,9 +186,14 @@ def watched(path: Path, every: int) -> Watched:
     wrists = synthetic_wrists(motion.skeleton, motion.R_parent_joint, motion.t_world_root, motion.fps, every)
     floor = recording.floor.height if recording.floor is not None else torch.zeros(len(motion))
     return Watched(
-        Sensed(head.T_world_head.R, head.T_world_head.t, *wrists), floor.float(), motion.R_parent_joint,
-        motion.t_world_root, true_foot_contact(recording).float(), motion.skeleton, body_size(motion.skeleton),
-    )  # fmt: skip
+        Sensed(head.T_world_head.R, head.T_world_head.t, *wrists),
+        floor.float(),
+        motion.R_parent_joint,
+        motion.t_world_root,
+        true_foot_contact(recording).float(),
+        motion.skeleton,
+        body_size(motion.skeleton),
+    )
 
 
 def turned(window: WatchWindow, angle: float) -> WatchWindow:
@@ -181,20 +201,27 @@ def turned(window: WatchWindow, angle: float) -> WatchWindow:
     R = rotation.about_axis("z", torch.tensor(angle))
     root = torch.cat([(R @ window.R_parent_joint[:, 0])[:, None], window.R_parent_joint[:, 1:]], 1)
     return window._replace(
-        R_world_head=R @ window.R_world_head, t_world_head=window.t_world_head @ R.mT,
-        R_world_wrist=R @ window.R_world_wrist, acc_world_wrist=window.acc_world_wrist @ R.mT,
-        t_world_wrist=window.t_world_wrist @ R.mT, R_parent_joint=root, t_world_root=window.t_world_root @ R.mT,
-    )  # fmt: skip
+        R_world_head=R @ window.R_world_head,
+        t_world_head=window.t_world_head @ R.mT,
+        R_world_wrist=R @ window.R_world_wrist,
+        acc_world_wrist=window.acc_world_wrist @ R.mT,
+        t_world_wrist=window.t_world_wrist @ R.mT,
+        R_parent_joint=root,
+        t_world_root=window.t_world_root @ R.mT,
+    )
 
 
 def scaled(window: WatchWindow, factor: float) -> WatchWindow:
     """The window with wearer and world scaled by a factor."""
     return window._replace(
-        t_world_head=window.t_world_head * factor, acc_world_wrist=window.acc_world_wrist * factor,
-        t_world_wrist=window.t_world_wrist * factor, floor_height=window.floor_height * factor,
-        size=window.size * factor, t_world_root=window.t_world_root * factor,
+        t_world_head=window.t_world_head * factor,
+        acc_world_wrist=window.acc_world_wrist * factor,
+        t_world_wrist=window.t_world_wrist * factor,
+        floor_height=window.floor_height * factor,
+        size=window.size * factor,
+        t_world_root=window.t_world_root * factor,
         t_parent_joint=window.t_parent_joint * factor,
-    )  # fmt: skip
+    )
 
 
 def mirrored_window(window: WatchWindow, skeleton: Skeleton) -> WatchWindow:
@@ -203,20 +230,34 @@ def mirrored_window(window: WatchWindow, skeleton: Skeleton) -> WatchWindow:
     twins = joint_twins(skeleton)
     return window._replace(
         **mirrored(window.sensed)._asdict(),
-        R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton), t_world_root=window.t_world_root * flip,
-        t_parent_joint=window.t_parent_joint[twins] * flip, foot_contact=window.foot_contact.flip(1),
-    )  # fmt: skip
+        R_parent_joint=mirrored_rotations(window.R_parent_joint, skeleton),
+        t_world_root=window.t_world_root * flip,
+        t_parent_joint=window.t_parent_joint[twins] * flip,
+        foot_contact=window.foot_contact.flip(1),
+    )
 
 
 class WatchWindows(SeededWindows):
     """Lightning data module of `WatchDataset`."""
 
     def __init__(
-        self, sources: dict[str, dict | None], window: int, stride: int, fps: float, every: int, batch_size: int,
-        steps_per_epoch: int | None = None, val_windows: int | None = None, workers: int = 0, seed: int = 0,
-        augment: bool = True, balance: float = 1.0, variation: Variation | None = None, beginnings: float = 0.0,
+        self,
+        sources: dict[str, dict | None],
+        window: int,
+        stride: int,
+        fps: float,
+        every: int,
+        batch_size: int,
+        steps_per_epoch: int | None = None,
+        val_windows: int | None = None,
+        workers: int = 0,
+        seed: int = 0,
+        augment: bool = True,
+        balance: float = 1.0,
+        variation: Variation | None = None,
+        beginnings: float = 0.0,
         val_sources: dict[str, dict | None] | None = None,
-    ):  # fmt: skip
+    ):
         """See `SeededWindows` and `WatchDataset`; augmentation applies to training only."""
         super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
         self.window, self.stride, self.fps, self.every = window, stride, fps, every
@@ -225,7 +266,14 @@ class WatchWindows(SeededWindows):
     def dataset(self, split: str) -> WatchDataset:
         train = split == "train"
         return WatchDataset(
-            self.sources if train else self.val_sources, split, window=self.window, stride=self.stride, fps=self.fps,
-            every=self.every, augment=self.augment and train, balance=self.balance if train else 1.0,
-            variation=self.variation, beginnings=self.beginnings if train else 0.0,
-        )  # fmt: skip
+            self.sources if train else self.val_sources,
+            split,
+            window=self.window,
+            stride=self.stride,
+            fps=self.fps,
+            every=self.every,
+            augment=self.augment and train,
+            balance=self.balance if train else 1.0,
+            variation=self.variation,
+            beginnings=self.beginnings if train else 0.0,
+        )

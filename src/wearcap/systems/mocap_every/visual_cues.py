@@ -25,7 +25,7 @@ from wearcap.systems.mocap_every.energy import (
     anchored_body,
     energy_terms,
     solve_latent,
-)  # fmt: skip
+)
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.manifold_features import FEET, Posed, decode_window, encode_window, origin_of
 from wearcap.tracking.anchor import anchored_to_head
@@ -67,11 +67,7 @@ class VisualCues:
 
         `T_world_head` holds the measured head poses at the motion's frames.
         """
-        cues = [
-            at_frames(cue, motion.timestamps)
-            for cue in recording.cues.values()
-            if cue.joint in motion.skeleton
-        ]
+        cues = [at_frames(cue, motion.timestamps) for cue in recording.cues.values() if cue.joint in motion.skeleton]
         views = [view_at_frames(view, motion.timestamps) for view in views]
         confidence = [cue.confidence for cue in cues] + [view.confidence.amax(-1) for view in views]
         if not confidence or not torch.stack(confidence).any():
@@ -94,16 +90,19 @@ class VisualCues:
         return grid[counted[stop] > counted[grid.clamp_min(0)]]
 
     def _edit_windows(
-        self, motion: Motion, recording: Recording, T_world_head: Rigid, frames: Int64[Tensor, "window time"],
-        cues: list[Cue], views: list[View],
-    ) -> tuple[Tensor, Tensor, LatentSolution]:  # fmt: skip
+        self,
+        motion: Motion,
+        recording: Recording,
+        T_world_head: Rigid,
+        frames: Int64[Tensor, "window time"],
+        cues: list[Cue],
+        views: list[View],
+    ) -> tuple[Tensor, Tensor, LatentSolution]:
         """Optimise the latents of a batch of windows; returns local rotations, root translation and the solution."""
         skeleton = motion.skeleton
         exists = (frames >= 0) & (frames < len(motion))
         frames = frames.clamp(0, len(motion) - 1)
-        window = Posed(
-            motion.R_parent_joint[frames], motion.t_world_root[frames], _foot_contact(motion)[frames]
-        )
+        window = Posed(motion.R_parent_joint[frames], motion.t_world_root[frames], _foot_contact(motion)[frames])
         head = Rigid(T_world_head.R[frames], T_world_head.t[frames])
         seen = _observations(recording, skeleton, head, frames, exists, cues, views)
         origin = origin_of(window)
@@ -124,9 +123,7 @@ class VisualCues:
             return anchored_body(skeleton, posed.R_parent_joint, window.foot_contact, head)
 
         solution = solve_latent(
-            start,
-            lambda z: energy_terms(body(z), seen, z - start, feet, motion.fps, self.weights),
-            self.solver,
+            start, lambda z: energy_terms(body(z), seen, z - start, feet, motion.fps, self.weights), self.solver
         )
         with torch.no_grad():
             posed = decode_window(edited(solution.latent), origin)
@@ -154,9 +151,7 @@ class _Blend:
         exists = (frames >= 0) & (frames < len(self._shares))
         weight = (self._weight * exists).flatten()
         at = frames.flatten().clamp(0, len(self._shares) - 1)
-        self._rotations.index_add_(
-            0, at, weight[:, None] * rotation.rot6d_from_matrix(R).flatten(-2).flatten(0, 1)
-        )
+        self._rotations.index_add_(0, at, weight[:, None] * rotation.rot6d_from_matrix(R).flatten(-2).flatten(0, 1))
         self._roots.index_add_(0, at, weight[:, None] * root.flatten(0, 1))
         self._shares.index_add_(0, at, weight)
 
@@ -167,9 +162,7 @@ class _Blend:
         whole = self._shares[:, None] + left
         turned = self._rotations + left * rotation.rot6d_from_matrix(motion.R_parent_joint).flatten(-2)
         R = rotation.matrix_from_rot6d((turned / whole).unflatten(-1, (-1, 6)))
-        return replace(
-            motion, R_parent_joint=R, t_world_root=(self._roots + left * motion.t_world_root) / whole
-        )
+        return replace(motion, R_parent_joint=R, t_world_root=(self._roots + left * motion.t_world_root) / whole)
 
 
 def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
@@ -181,9 +174,7 @@ def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
     step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
     points = cue.points[nearest]
     near = ((cue.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6) & points.isfinite().all(-1)
-    return replace(
-        cue, timestamps=timestamps, points=points.nan_to_num(), confidence=cue.confidence[nearest] * near
-    )
+    return replace(cue, timestamps=timestamps, points=points.nan_to_num(), confidence=cue.confidence[nearest] * near)
 
 
 def view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> View:
@@ -192,32 +183,37 @@ def view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> View:
     step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
     near = (view.motion.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6
     motion = replace(
-        view.motion, timestamps=timestamps, R_parent_joint=view.motion.R_parent_joint[nearest],
-        t_world_root=view.motion.t_world_root[nearest], contact_prob=None, hand_contact_prob=None, body_contact_prob=None, object_motion=None,
-    )  # fmt: skip
+        view.motion,
+        timestamps=timestamps,
+        R_parent_joint=view.motion.R_parent_joint[nearest],
+        t_world_root=view.motion.t_world_root[nearest],
+        contact_prob=None,
+        hand_contact_prob=None,
+        body_contact_prob=None,
+        object_motion=None,
+    )
     return View(motion, view.confidence[nearest] * near[:, None])
 
 
 def _observations(
-    recording: Recording, skeleton: Skeleton, head: Rigid, frames: Tensor, exists: Tensor, cues: list[Cue], views: list[View],
-) -> Seen:  # fmt: skip
+    recording: Recording,
+    skeleton: Skeleton,
+    head: Rigid,
+    frames: Tensor,
+    exists: Tensor,
+    cues: list[Cue],
+    views: list[View],
+) -> Seen:
     """Observations of a batch of windows; frames outside the capture have confidence 0."""
     camera = recording.camera
     cues_2d, cues_3d = ([cue for cue in cues if cue.points.shape[-1] == axes] for axes in (2, 3))
     pixels = (
-        tuple(
-            PixelCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * exists)
-            for c in cues_2d
-        )
+        tuple(PixelCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * exists) for c in cues_2d)
         if camera
         else ()
     )
-    places = tuple(
-        PlaceCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * exists) for c in cues_3d
-    )
-    poses = tuple(
-        PoseCue(v.motion.R_parent_joint[frames], v.confidence[frames] * exists[..., None]) for v in views
-    )
+    places = tuple(PlaceCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * exists) for c in cues_3d)
+    poses = tuple(PoseCue(v.motion.R_parent_joint[frames], v.confidence[frames] * exists[..., None]) for v in views)
     mount = None if camera is None else Rigid(camera.R_head_cam, camera.t_head_cam)
     return Seen(head, None if camera is None else camera.camera, mount, pixels, places, poses)
 

@@ -117,9 +117,7 @@ class EstimatorWindows:
             floor, size = floor.expand(2, -1), size.expand(2, -1)
         canonical = pipeline.features.canonical(sensed, floor)
         estimated = pipeline.estimate(pipeline.features.encode(sensed, floor, size, canonical))
-        R, t = to_world(
-            *pipeline.features.decode_motion(estimated.motion.float(), sensed, canonical), canonical
-        )
+        R, t = to_world(*pipeline.features.decode_motion(estimated.motion.float(), sensed, canonical), canonical)
         contact = estimated.contact_logit.float().sigmoid()
         if pipeline.mirror_average:
             R = torch.stack([R[0], mirrored_rotations(R[1], skeleton)])

@@ -29,10 +29,13 @@ class TrackedPoints:
 
     def __post_init__(self):
         if not self.points or self.points[0] != "head":
-            raise WearcapError(f"tracked points {', '.join(self.points) or '(none)'}",
-                               expected="the head, then what else is tracked")  # fmt: skip
+            raise WearcapError(
+                f"tracked points {', '.join(self.points) or '(none)'}", expected="the head, then what else is tracked"
+            )
         if self.height not in ("stature", "floor", "world"):
-            raise WearcapError(f"tracked points have no height {self.height!r}", expected="one of stature, floor, world")  # fmt: skip
+            raise WearcapError(
+                f"tracked points have no height {self.height!r}", expected="one of stature, floor, world"
+            )
 
     @property
     def size(self) -> int:
@@ -81,9 +84,11 @@ class TrackedPoints:
         if self.height == "stature":
             position = position / stature[:, None, None, None]
         parts = [
-            rotation.rot6d_from_matrix(R_heading_point), _after_first(rotation.rot6d_from_matrix(step) * fps),
-            position, _after_first(velocity * fps),
-        ]  # fmt: skip
+            rotation.rot6d_from_matrix(R_heading_point),
+            _after_first(rotation.rot6d_from_matrix(step) * fps),
+            position,
+            _after_first(velocity * fps),
+        ]
         return torch.cat(parts, -1).flatten(-2)
 
 

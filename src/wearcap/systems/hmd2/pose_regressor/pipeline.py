@@ -53,9 +53,11 @@ class PoseRegressorCapture:
         count = len(path.timestamps)
         begins = [0, *(start for start, _ in path.stretches[1:]), count]
         features = (
-            self.points.encode(tracked.R[None, a:b], tracked.t[None, a:b], path.floor_height[None, a:b], stature, self.fps)
+            self.points.encode(
+                tracked.R[None, a:b], tracked.t[None, a:b], path.floor_height[None, a:b], stature, self.fps
+            )
             for a, b in pairwise(begins)
-        )  # fmt: skip
+        )
         motion = torch.cat([self._regressed(part) for part in features])
         R_parent_joint = decode_pose(motion, path.T_world_head.R)
         origin = torch.zeros(count, 3)
@@ -69,8 +71,11 @@ class PoseRegressorCapture:
         if len(self.points.points) == 1:
             return self.points.poses(path.skeleton, path.T_world_head)
         if truth is None:
-            raise WearcapError("no tracked hands in this recording", where=recording.name,
-                               expected="a recording with `motion`, or a checkpoint of the head alone")  # fmt: skip
+            raise WearcapError(
+                "no tracked hands in this recording",
+                where=recording.name,
+                expected="a recording with `motion`, or a checkpoint of the head alone",
+            )
         if len(truth) != len(path.timestamps) or (truth.timestamps - path.timestamps).abs().max() > 1e-6:
             truth = at_times(truth, path.timestamps)
         return self.points.poses(path.skeleton, path.T_world_head, truth.R_parent_joint)
@@ -91,8 +96,4 @@ class PoseRegressorCapture:
         return motion
 
     def _settings(self) -> dict[str, str]:
-        return {
-            "pipeline": "pose_regressor",
-            "points": ",".join(self.points.points),
-            "reach": str(self.reach),
-        }
+        return {"pipeline": "pose_regressor", "points": ",".join(self.points.points), "reach": str(self.reach)}

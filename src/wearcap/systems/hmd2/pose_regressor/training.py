@@ -66,9 +66,7 @@ class PoseRegression(SeededSteps, WeighedTerms):
 
     def _features(self, batch: Window) -> Float[Tensor, "batch time feature"]:
         T_world_head = Rigid(batch.R_world_head, batch.t_world_head)
-        poses = self.points.poses(
-            self.skeleton, T_world_head, batch.R_parent_joint, batch.t_parent_joint[:, None]
-        )
+        poses = self.points.poses(self.skeleton, T_world_head, batch.R_parent_joint, batch.t_parent_joint[:, None])
         return self.points.encode(poses.R, poses.t, batch.floor_from_head, batch.stature, self.fps)
 
     def _frame_pairs(self, batch: Window) -> Int64[Tensor, "batch end"]:
@@ -93,9 +91,7 @@ class PoseRegression(SeededSteps, WeighedTerms):
             "root": masked_mean(error[..., :6].mean(-1), valid),
             "rotation": masked_mean(error[..., 6:].mean(-1), valid),
             "joints": masked_mean((predicted - true).abs().mean((-1, -2)), valid),
-            "velocity": joint_velocity(
-                *(x.reshape(-1, 2, *x.shape[2:]) for x in (predicted, true, valid)), self.fps
-            ),
+            "velocity": joint_velocity(*(x.reshape(-1, 2, *x.shape[2:]) for x in (predicted, true, valid)), self.fps),
         }
 
     def _from_head(
