@@ -13,7 +13,7 @@ from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
 from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.scene.environment import Environment
-from wearcap.simulation.movables import make_movable
+from wearcap.simulation.places.movables import make_movable
 from wearcap.systems.echo.observations import Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import Conditioning

@@ -22,29 +22,20 @@ def functions(tree: ast.AST) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
 
 
 def public_names(tree: ast.Module) -> list[str]:
-    """Top-level names that do not begin with an underscore."""
-    names = []
-    for node in tree.body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            names.append(node.name)
-        elif isinstance(node, ast.Assign):
-            names += [target.id for target in node.targets if isinstance(target, ast.Name)]
-        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            names.append(node.target.id)
-    return [name for name in names if not name.startswith("_")]
+    """Top-level functions and classes that do not begin with an underscore."""
+    defined = [node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+    return [name for name in defined if not name.startswith("_")]
 
 
 def called_once(trees: dict[Path, ast.Module]) -> tuple[int, int]:
-    """Private functions and methods that are named in one place of their module beside their definition; and all."""
-    once = every = 0
+    """Private functions and methods whose name is used once in the whole package beside its definitions; and all."""
+    used: Counter[str] = Counter()
     for tree in trees.values():
-        used = Counter(node.id for node in ast.walk(tree) if isinstance(node, ast.Name))
-        used += Counter(node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute))
-        for function in functions(tree):
-            if function.name.startswith("_") and not function.name.startswith("__"):
-                every += 1
-                once += used[function.name] == 1
-    return once, every
+        used.update(node.id for node in ast.walk(tree) if isinstance(node, ast.Name))
+        used.update(node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute))
+    names = [function.name for tree in trees.values() for function in functions(tree)]
+    private = [name for name in names if name.startswith("_") and not name.startswith("__")]
+    return sum(used[name] == 1 for name in private), len(private)
 
 
 def wide_constructors(trees: dict[Path, ast.Module]) -> list[str]:

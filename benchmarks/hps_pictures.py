@@ -17,7 +17,7 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.simulation.depth_rig import look_at
+from wearcap.simulation.rendering.depth_rig import look_at
 from wearcap.systems.hps.scores import HpsTruth, nearest_frames
 from wearcap.viewer.picture import captioned, save_png
 

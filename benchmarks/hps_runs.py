@@ -16,7 +16,7 @@ from wearcap.cli.conf import compose
 from wearcap.metrics.surface import FootSurface
 from wearcap.recording import Motion
 from wearcap.runtime.stages import Source, run_stages
-from wearcap.simulation.localization_noise import with_outage
+from wearcap.simulation.recordings.localization_noise import with_outage
 from wearcap.systems.hps.scores import HpsScores, HpsTruth, Outage, disturbance, planted_outages, score_hps
 
 ROWS = {

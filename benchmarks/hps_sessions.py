@@ -23,11 +23,11 @@ from wearcap.recording.store import RecordingFile, save_recording
 from wearcap.scene.scan import Scan
 from wearcap.sensors.clock import Clock
 from wearcap.sensors.depth_rig import DepthView, empty_scene, person_cloud, register_view
-from wearcap.simulation.depth_rig import approximate, place_rig, simulate_rig
-from wearcap.simulation.hps import HpsConfig, simulate_hps
-from wearcap.simulation.scan import scan_world
-from wearcap.simulation.views import Scenery
-from wearcap.simulation.world import World
+from wearcap.simulation.places.world import World
+from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
+from wearcap.simulation.rendering.depth_rig import approximate, place_rig, simulate_rig
+from wearcap.simulation.rendering.scan import scan_world
+from wearcap.simulation.rendering.views import Scenery
 from wearcap.systems.hps.scores import RigCloud, nearest_frames, visit_times
 
 MICROPHONE_S = 0.002

@@ -24,7 +24,7 @@ from wearcap.optimize.banded import BandedSettings
 from wearcap.optimize.feet import FootPatches
 from wearcap.optimize.hps import HpsData, HpsEnergy, HpsState, energy_terms
 from wearcap.optimize.stretches import solve_in_stretches
-from wearcap.simulation.simulate import SimulationConfig, simulate_recording
+from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 from wearcap.systems.hps.pipeline import turns
 
 WINDOWS = slice(0, 199)

@@ -11,7 +11,13 @@ from wearcap.sensors.arm_swings import fit_swing_clock, swing_peaks
 from wearcap.sensors.camera_alignment import align_by_marks, mark_positions, mount_by_standing
 from wearcap.sensors.gravity_scale import GravityScale, by_floor, by_head_imu
 from wearcap.sensors.watch_calibration import calibrate_watches
-from wearcap.simulation.calibration_session import MARKS, STANDING, SWINGS_S, CalibrationSession, simulate_calibration
+from wearcap.simulation.recordings.calibration_session import (
+    MARKS,
+    STANDING,
+    SWINGS_S,
+    CalibrationSession,
+    simulate_calibration,
+)
 
 GOALS = {
     "watch_world_deg": 0.5,

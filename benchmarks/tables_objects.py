@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from wearcap.cli.load import load_system
 from wearcap.files import write_text
 from wearcap.models.point_encoder import bounds, to_unit_sphere
-from wearcap.simulation.object_clouds import generate_clouds
+from wearcap.simulation.places.object_clouds import generate_clouds
 from wearcap.systems.echo.object_clouds import CloudAugmentation
 from wearcap.systems.echo.object_training import ObjectEncoding
 

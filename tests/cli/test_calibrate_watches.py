@@ -15,7 +15,13 @@ from wearcap.io.formats.tum import write_tum
 from wearcap.recording import ImuStream, RecordingStore
 from wearcap.recording.locate import load_recording
 from wearcap.sensors.watches import WRISTS, watches_at
-from wearcap.simulation.calibration_session import MARKS, STANDING, SWINGS_S, CalibrationSession, simulate_calibration
+from wearcap.simulation.recordings.calibration_session import (
+    MARKS,
+    STANDING,
+    SWINGS_S,
+    CalibrationSession,
+    simulate_calibration,
+)
 from wearcap_testing import recording_of, swaying_motion
 
 G = 9.80665

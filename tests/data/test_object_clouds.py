@@ -7,7 +7,7 @@ import torch
 from wearcap.data.surface_points import object_cloud
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
-from wearcap.simulation.object_clouds import generate_clouds
+from wearcap.simulation.places.object_clouds import generate_clouds
 from wearcap.systems.echo.object_clouds import CloudAugmentation, ObjectClouds, random_rotation
 
 CLASSES = ["box", "chair", "drawer", "door"]

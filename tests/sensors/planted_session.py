@@ -5,7 +5,7 @@ from functools import lru_cache
 from torch import Tensor
 
 from wearcap.geometry import rotation
-from wearcap.simulation.calibration_session import CalibrationSession, simulate_calibration
+from wearcap.simulation.recordings.calibration_session import CalibrationSession, simulate_calibration
 
 SEEDS = range(5)
 

@@ -11,7 +11,7 @@ from wearcap.recording import ImuStream
 from wearcap.sensors.arm_swings import SwingSettings, fit_swing_clock, forearm_elevation, swing_checks, swing_peaks
 from wearcap.sensors.stillness import require
 from wearcap.sensors.watch_calibration import calibrate_watches
-from wearcap.simulation.calibration_session import SWINGS_S
+from wearcap.simulation.recordings.calibration_session import SWINGS_S
 
 MIDDLE = torch.tensor([SWINGS_S + 8], dtype=torch.float64)
 

@@ -20,7 +20,7 @@ from wearcap.sensors.camera_alignment import (
     scale_by_walks,
 )
 from wearcap.sensors.stillness import require
-from wearcap.simulation.calibration_session import MARKS, STANDING
+from wearcap.simulation.recordings.calibration_session import MARKS, STANDING
 
 WORLD = torch.tensor([[0, 0.1, 0.8], [0, 0.6, 0.8], [0.15, 0, 0.8], [0.55, 0, 0.8]], dtype=torch.float64)
 DISTANCES = (0.5, 0.4)

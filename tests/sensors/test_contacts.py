@@ -13,8 +13,8 @@ from wearcap.recording import ImuStream, Motion
 from wearcap.sensors.contacts import contacts_from_imu, contacts_from_motion
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.suit import SuitNoise, suit_motion
-from wearcap.simulation.simulate import person_of, world_of
-from wearcap.simulation.wearer import simulate_motion
+from wearcap.simulation.people.wearer import simulate_motion
+from wearcap.simulation.recordings.simulate import person_of, world_of
 
 
 @pytest.fixture(scope="module")

@@ -26,8 +26,8 @@ from wearcap.sensors.depth_rig import (
     unproject_depth,
     visible_points,
 )
-from wearcap.simulation.builder import WorldBuilder
-from wearcap.simulation.depth_rig import KINECT, SimulatedRig, approximate, place_rig, simulate_rig
+from wearcap.simulation.places.builder import WorldBuilder
+from wearcap.simulation.rendering.depth_rig import KINECT, SimulatedRig, approximate, place_rig, simulate_rig
 
 LENS = Camera("pinhole", 40, 30, 30.0, 30.0, 19.5, 14.5)
 

@@ -12,7 +12,12 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
 from wearcap.sensors.gravity_scale import GravityScale, by_floor, by_head_imu
-from wearcap.simulation.calibration_session import STANDING, CalibrationSession, SessionNoise, simulate_calibration
+from wearcap.simulation.recordings.calibration_session import (
+    STANDING,
+    CalibrationSession,
+    SessionNoise,
+    simulate_calibration,
+)
 
 SEEDS = range(4)
 

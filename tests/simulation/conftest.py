@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from wearcap.simulation.actions import ACTIVITIES
-from wearcap.simulation.flat import build_flat
-from wearcap.simulation.person import Person, draw_person
-from wearcap.simulation.wearer import SimulatedMotion, simulate_motion
-from wearcap.simulation.world import World
+from wearcap.simulation.people.actions import ACTIVITIES
+from wearcap.simulation.people.person import Person, draw_person
+from wearcap.simulation.people.wearer import SimulatedMotion, simulate_motion
+from wearcap.simulation.places.flat import build_flat
+from wearcap.simulation.places.world import World
 
 
 @pytest.fixture(scope="session")

@@ -7,12 +7,12 @@ from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry import rotation
 from wearcap.recording.motion import Motion
-from wearcap.simulation.builder import WorldBuilder
-from wearcap.simulation.comfort import forearm_and_wrist
-from wearcap.simulation.person import Person
-from wearcap.simulation.plan import SIDES, Plan
-from wearcap.simulation.wearer import SimulatedMotion, perform
-from wearcap.simulation.world import World
+from wearcap.simulation.people.comfort import forearm_and_wrist
+from wearcap.simulation.people.person import Person
+from wearcap.simulation.people.plan import SIDES, Plan
+from wearcap.simulation.people.wearer import SimulatedMotion, perform
+from wearcap.simulation.places.builder import WorldBuilder
+from wearcap.simulation.places.world import World
 
 FPS = 60.0
 

@@ -8,9 +8,9 @@ from handled import assert_natural, level_world, palm_errors, performed, plan_at
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.simulation.grips import Grip, GripPlace, drawn_grip, following, still
-from wearcap.simulation.movables import floor_pose
-from wearcap.simulation.person import draw_person
+from wearcap.simulation.handling.grips import Grip, GripPlace, drawn_grip, following, still
+from wearcap.simulation.people.person import draw_person
+from wearcap.simulation.places.movables import floor_pose
 
 UP = GripPlace((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from wearcap.simulation.hillside import build_hillside
-from wearcap.simulation.simulate import SimulationConfig, simulate_recording
+from wearcap.simulation.places.hillside import build_hillside
+from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 
 
 @pytest.fixture(scope="module", params=[0, 1])

@@ -8,13 +8,13 @@ import pytest
 import torch
 from handled import assert_natural, level_world, palm_errors, performed, plan_at
 
-from wearcap.simulation.handhelds import MAKERS, ball, bottle, drill, hammer, mop
-from wearcap.simulation.handling import object_motion
-from wearcap.simulation.holding import put_down, take_options, take_up
-from wearcap.simulation.movables import floor_pose, make_movable
-from wearcap.simulation.person import draw_person
-from wearcap.simulation.using import use
-from wearcap.simulation.walking import walk_along
+from wearcap.simulation.handling.handlings import object_motion
+from wearcap.simulation.handling.holding import put_down, take_options, take_up
+from wearcap.simulation.handling.using import use
+from wearcap.simulation.people.person import draw_person
+from wearcap.simulation.people.walking import walk_along
+from wearcap.simulation.places.handhelds import MAKERS, ball, bottle, drill, hammer, mop
+from wearcap.simulation.places.movables import floor_pose, make_movable
 
 SHAPES = {**MAKERS, "hammer": hammer, "drill": drill, "mop": mop}
 START, STOP = np.array([0.0, 0.0, 0.3, 0.0]), np.array([1.4, 0.6, 0.9, 0.0])

@@ -14,11 +14,11 @@ from wearcap.prepare.check import check_recording
 from wearcap.recording.serialize import flatten, unflatten
 from wearcap.sensors.claps import detect_claps
 from wearcap.sensors.slam import R_DEVICE_CAM
-from wearcap.simulation.head_camera import HEAD_CAMERA_TRUTH, view_texture
-from wearcap.simulation.hps import HpsConfig, simulate_hps
-from wearcap.simulation.hps_session import Protocol
-from wearcap.simulation.localization_noise import LocalizationNoise, localize_statistically, with_outage
-from wearcap.simulation.site import build_site
+from wearcap.simulation.places.site import build_site
+from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
+from wearcap.simulation.recordings.hps_session import Protocol
+from wearcap.simulation.recordings.localization_noise import LocalizationNoise, localize_statistically, with_outage
+from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, view_texture
 
 SHORT = Protocol(returns_m=(45.0,), end_m=80.0, clap_every_s=60.0)
 

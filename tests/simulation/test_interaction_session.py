@@ -8,8 +8,14 @@ import torch
 
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
-from wearcap.simulation.interaction_session import FLATS, InteractionConfig, flat_number, flat_of, simulate_interactions
-from wearcap.simulation.outline import distance_to_convex
+from wearcap.simulation.places.outline import distance_to_convex
+from wearcap.simulation.recordings.interaction_session import (
+    FLATS,
+    InteractionConfig,
+    flat_number,
+    flat_of,
+    simulate_interactions,
+)
 
 CONFIG = InteractionConfig(minutes=1.0)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from wearcap.simulation.house import House
-from wearcap.simulation.interactive_flat import FEWEST, build_interactive_flat
-from wearcap.simulation.outline import distance_to_convex
+from wearcap.simulation.handling.house import House
+from wearcap.simulation.places.interactive_flat import FEWEST, build_interactive_flat
+from wearcap.simulation.places.outline import distance_to_convex
 
 SEEDS = range(4)
 

@@ -6,15 +6,15 @@ import torch
 from handled import assert_natural, level_world, palm_errors, performed, plan_at
 
 from wearcap.geometry import rotation
-from wearcap.simulation.carrying import carry_options, lift, put_down
-from wearcap.simulation.distractors import bend_over, gesture_at, hover, squat_by
-from wearcap.simulation.handling import hand_rows, interactions_of, object_motion
-from wearcap.simulation.movables import MOVABLES, floor_pose, make_movable
-from wearcap.simulation.outline import distance_to_convex, rectangle
-from wearcap.simulation.person import draw_person
-from wearcap.simulation.plan import SIDES
-from wearcap.simulation.sliding import slide, slide_options
-from wearcap.simulation.walking import turn_to, walk_along
+from wearcap.simulation.handling.carrying import carry_options, lift, put_down
+from wearcap.simulation.handling.distractors import bend_over, gesture_at, hover, squat_by
+from wearcap.simulation.handling.handlings import hand_rows, interactions_of, object_motion
+from wearcap.simulation.handling.sliding import slide, slide_options
+from wearcap.simulation.people.person import draw_person
+from wearcap.simulation.people.plan import SIDES
+from wearcap.simulation.people.walking import turn_to, walk_along
+from wearcap.simulation.places.movables import MOVABLES, floor_pose, make_movable
+from wearcap.simulation.places.outline import distance_to_convex, rectangle
 
 
 @pytest.fixture(scope="module")

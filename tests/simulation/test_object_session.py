@@ -8,13 +8,13 @@ import torch
 
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
-from wearcap.simulation.handhelds import MAKERS
-from wearcap.simulation.handling import Handling
-from wearcap.simulation.house import House
-from wearcap.simulation.household import HANDHELD, VARIED, Household
-from wearcap.simulation.interaction_session import flat_of
-from wearcap.simulation.object_session import ObjectConfig, object_flat_of, simulate_objects
-from wearcap.simulation.simulate import POOLS, person_of
+from wearcap.simulation.handling.handlings import Handling
+from wearcap.simulation.handling.house import House
+from wearcap.simulation.handling.household import HANDHELD, VARIED, Household
+from wearcap.simulation.places.handhelds import MAKERS
+from wearcap.simulation.recordings.interaction_session import flat_of
+from wearcap.simulation.recordings.object_session import ObjectConfig, object_flat_of, simulate_objects
+from wearcap.simulation.recordings.simulate import POOLS, person_of
 
 
 @pytest.fixture(scope="module")

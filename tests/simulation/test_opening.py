@@ -5,12 +5,12 @@ import pytest
 
 from wearcap.body.kinematics import site_positions
 from wearcap.recording.interactions import HANDS
-from wearcap.simulation.house import House
-from wearcap.simulation.interactive_flat import build_interactive_flat
-from wearcap.simulation.opening import operate
-from wearcap.simulation.outline import distance_to_convex
-from wearcap.simulation.plan import Plan
-from wearcap.simulation.wearer import TAIL_S, perform
+from wearcap.simulation.handling.house import House
+from wearcap.simulation.handling.opening import operate
+from wearcap.simulation.people.plan import Plan
+from wearcap.simulation.people.wearer import TAIL_S, perform
+from wearcap.simulation.places.interactive_flat import build_interactive_flat
+from wearcap.simulation.places.outline import distance_to_convex
 
 FPS = 30.0
 CASES = [("door", 0), ("door", 1), ("window", 0), ("drawer", 0), ("cabinet_door", 0)]

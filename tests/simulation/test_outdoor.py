@@ -7,12 +7,12 @@ import torch
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry import rotation
 from wearcap.recording.serialize import flatten
-from wearcap.simulation.actions import ACTIVITIES
-from wearcap.simulation.outdoor import build_outdoor
-from wearcap.simulation.outline import points_in_convex
-from wearcap.simulation.person import draw_person
-from wearcap.simulation.simulate import SimulationConfig, simulate_recording
-from wearcap.simulation.wearer import simulate_motion
+from wearcap.simulation.people.actions import ACTIVITIES
+from wearcap.simulation.people.person import draw_person
+from wearcap.simulation.people.wearer import simulate_motion
+from wearcap.simulation.places.outdoor import build_outdoor
+from wearcap.simulation.places.outline import points_in_convex
+from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 
 FPS = 60.0
 SEEDS = range(4)

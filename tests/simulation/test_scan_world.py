@@ -6,10 +6,10 @@ import torch
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.pointcloud import PointIndex
-from wearcap.simulation.outline import points_in_convex
-from wearcap.simulation.scan import Scanner, place_stations, scan_world
-from wearcap.simulation.site import build_site
-from wearcap.simulation.views import Scenery
+from wearcap.simulation.places.outline import points_in_convex
+from wearcap.simulation.places.site import build_site
+from wearcap.simulation.rendering.scan import Scanner, place_stations, scan_world
+from wearcap.simulation.rendering.views import Scenery
 
 
 @pytest.fixture(scope="module")

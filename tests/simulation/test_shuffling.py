@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from handled import assert_natural, level_world, performed, plan_at
 
-from wearcap.simulation.person import draw_person
-from wearcap.simulation.plan import SIDES
-from wearcap.simulation.shuffling import shuffle, step_to
-from wearcap.simulation.track import ease
+from wearcap.simulation.people.person import draw_person
+from wearcap.simulation.people.plan import SIDES
+from wearcap.simulation.people.shuffling import shuffle, step_to
+from wearcap.simulation.people.track import ease
 
 
 @pytest.fixture(scope="module")

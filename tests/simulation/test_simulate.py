@@ -9,8 +9,8 @@ from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.recording.recording import Recording
 from wearcap.recording.serialize import flatten
-from wearcap.simulation import simulate
-from wearcap.simulation.simulate import POOLS, SimulationConfig, person_of, simulate_recording, world_of
+from wearcap.simulation.recordings import simulate
+from wearcap.simulation.recordings.simulate import POOLS, SimulationConfig, person_of, simulate_recording, world_of
 
 SHORT = SimulationConfig(duration_s=20.0)
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from wearcap.simulation.outline import points_in_convex
-from wearcap.simulation.site import build_site
-from wearcap.simulation.world import World
+from wearcap.simulation.places.outline import points_in_convex
+from wearcap.simulation.places.site import build_site
+from wearcap.simulation.places.world import World
 
 
 @pytest.fixture(scope="module", params=(0, 3))

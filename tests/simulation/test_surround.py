@@ -10,10 +10,10 @@ from wearcap.geometry.triangle_distance import TriangleIndex
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.prepare.clean import CleaningLimits
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
-from wearcap.simulation.body_space import LIMBS, BodySpace, limb_ends
-from wearcap.simulation.outline import points_in_convex
-from wearcap.simulation.supports import PELVIS_OVER_SEAT_M, find_sits, find_treads
-from wearcap.simulation.surround import MARGIN_M, NEAR_M, surround
+from wearcap.simulation.people.body_space import LIMBS, BodySpace, limb_ends
+from wearcap.simulation.places.outline import points_in_convex
+from wearcap.simulation.places.supports import PELVIS_OVER_SEAT_M, find_sits, find_treads
+from wearcap.simulation.places.surround import MARGIN_M, NEAR_M, surround
 
 SEEDS = range(2)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wearcap.simulation.track import Track, ease, hermite, lower_envelope, pendulum, wander
+from wearcap.simulation.people.track import Track, ease, hermite, lower_envelope, pendulum, wander
 
 
 def test_overlapping_transitions_add_up():

@@ -12,9 +12,9 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.render import render
 from wearcap.geometry.rigid import Rigid
 from wearcap.sensors.slam import R_DEVICE_CAM
-from wearcap.simulation import texture_kernels as kernels
-from wearcap.simulation.site import build_site
-from wearcap.simulation.views import Development, Scenery, render_view, view_depth
+from wearcap.simulation.places.site import build_site
+from wearcap.simulation.rendering import texture_kernels as kernels
+from wearcap.simulation.rendering.views import Development, Scenery, render_view, view_depth
 
 PINHOLE = Camera("pinhole", 160, 96, 75.0, 75.0, 79.5, 47.5)
 HEAD = Camera("opencv", 160, 96, 75.0, 76.0, 80.0, 47.0, (-0.08, 0.02, 0.001, -0.0005))

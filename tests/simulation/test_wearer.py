@@ -8,9 +8,9 @@ import torch
 
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry import rotation
-from wearcap.simulation.actions import ACTIVITIES
-from wearcap.simulation.flat import build_flat
-from wearcap.simulation.wearer import simulate_motion
+from wearcap.simulation.people.actions import ACTIVITIES
+from wearcap.simulation.people.wearer import simulate_motion
+from wearcap.simulation.places.flat import build_flat
 
 FPS = 60.0
 

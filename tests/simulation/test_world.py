@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from wearcap.simulation.flat import build_flat
-from wearcap.simulation.outline import distance_to_convex, points_in_convex, rectangle
+from wearcap.simulation.places.flat import build_flat
+from wearcap.simulation.places.outline import distance_to_convex, points_in_convex, rectangle
 
 SEEDS = range(4)
 

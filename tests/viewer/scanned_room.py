@@ -3,12 +3,12 @@
 import numpy as np
 
 from wearcap.scene.scan import Scan
-from wearcap.simulation import furniture
-from wearcap.simulation.builder import WorldBuilder
-from wearcap.simulation.outline import rectangle
-from wearcap.simulation.scan import Scanner, scan_world
-from wearcap.simulation.views import Scenery
-from wearcap.simulation.world import Room
+from wearcap.simulation.places import furniture
+from wearcap.simulation.places.builder import WorldBuilder
+from wearcap.simulation.places.outline import rectangle
+from wearcap.simulation.places.world import Room
+from wearcap.simulation.rendering.scan import Scanner, scan_world
+from wearcap.simulation.rendering.views import Scenery
 
 ROOM = (0.0, 0.0, 4.2, 3.4)
 DOOR_X, DOOR_Y = 1.4, 3.4

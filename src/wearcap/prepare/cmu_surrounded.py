@@ -15,9 +15,9 @@ from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import HeadStream, PointCloud, Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.sensors.slam import semidense_points
-from wearcap.simulation.ego_view import write_ego_video
-from wearcap.simulation.surround import surround
-from wearcap.simulation.world import World
+from wearcap.simulation.places.surround import surround
+from wearcap.simulation.places.world import World
+from wearcap.simulation.rendering.ego_view import write_ego_video
 
 TURNS, DOWN_DEG, VIEW_S = 12, (0.0, 38.0), 0.25
 """Steps per turn, pitch of each turn (°), duration of a step (s) of the wearer's turns on the spot before the recording."""

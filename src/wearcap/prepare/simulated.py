@@ -11,7 +11,7 @@ from wearcap.prepare.engine import Task, content_hash
 from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS
-from wearcap.simulation.simulate import SimulationConfig, simulate_recording
+from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from wearcap.prepare.engine import Task, content_hash
 from wearcap.prepare.simulated import checked_splits, source_files
 from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
-from wearcap.simulation.changes import changed_world
-from wearcap.simulation.head_camera import HEAD_CAMERA_TRUTH
-from wearcap.simulation.head_video import Filming, write_head_video
-from wearcap.simulation.hps import HpsConfig, Simulated, simulate_hps
-from wearcap.simulation.hps_session import Protocol
-from wearcap.simulation.scene_files import SceneSettings, write_scene
-from wearcap.simulation.views import Scenery
+from wearcap.simulation.places.changes import changed_world
+from wearcap.simulation.recordings.hps import HpsConfig, Simulated, simulate_hps
+from wearcap.simulation.recordings.hps_session import Protocol
+from wearcap.simulation.recordings.scene_files import SceneSettings, write_scene
+from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH
+from wearcap.simulation.rendering.head_video import Filming, write_head_video
+from wearcap.simulation.rendering.views import Scenery
 
 
 @dataclass(frozen=True)

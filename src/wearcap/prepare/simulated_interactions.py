@@ -15,9 +15,13 @@ from wearcap.prepare.engine import Task, content_hash
 from wearcap.prepare.simulated import checked_splits, source_files
 from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
-from wearcap.simulation.interaction_session import InteractionConfig, SimulatedInteractions, simulate_interactions
-from wearcap.simulation.scan import scan_world
-from wearcap.simulation.views import Scenery
+from wearcap.simulation.recordings.interaction_session import (
+    InteractionConfig,
+    SimulatedInteractions,
+    simulate_interactions,
+)
+from wearcap.simulation.rendering.scan import scan_world
+from wearcap.simulation.rendering.views import Scenery
 
 MADE = "made.json"
 

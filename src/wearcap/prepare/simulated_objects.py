@@ -11,7 +11,7 @@ from wearcap.prepare.simulated import checked_splits, source_files
 from wearcap.prepare.simulated_interactions import MADE, is_made
 from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
-from wearcap.simulation.object_session import ObjectConfig, simulate_objects
+from wearcap.simulation.recordings.object_session import ObjectConfig, simulate_objects
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Motions of a person who slides, carries, opens and uses objects."""

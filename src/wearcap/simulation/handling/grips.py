@@ -1,0 +1,124 @@
+"""Grips: a hand that holds an object from one time to another, however the object moves."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import exp
+from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.simulation.people.track import ease
+
+Vector = tuple[float, float, float]
+Moves = Callable[[Float[np.ndarray, "time"], Rigid], Rigid]
+"""Pose of an object in the world at increasing times (s), given the chest's pose at these times, on which only
+carried objects depend."""
+
+SKIN_M = 0.008
+"""Depth of a palm's site inside the hand: it keeps this distance from the touched surface."""
+SETTLED, DESCENT = 0.2, 0.5
+"""Shares of the approach, at its end: the hand is off its place along the normal, and comes down on it."""
+
+
+def vector(values: Float[np.ndarray, "3"]) -> Vector:
+    """A vector as a tuple of floats."""
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+@dataclass(frozen=True)
+class GripPlace:
+    """Place of a palm on an object, in the object's axes."""
+
+    point: Vector
+    """Position of the palm (m)."""
+    normal: Vector
+    """Unit vector out of the object's surface, towards the hand."""
+    fingers: Vector
+    """Preferred direction of the fingers; the arm may turn them some 40° about the normal."""
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Goals that a grip sets for a hand over time, in the world."""
+
+    palm: Float[Tensor, "time 3"]
+    normal: Float[Tensor, "time 3"]
+    fingers: Float[Tensor, "time 3"]
+
+    def hand(self, sign: float, yaw: Float[Tensor, "*pick time"]) -> Float[Tensor, "*pick time 3 3"]:
+        """Rotation of a hand (`sign` 1 left, -1 right) whose fingers are turned by `yaw` (rad) about the normal."""
+        z = torch.nn.functional.normalize(self.normal, dim=-1)
+        ahead = self.fingers - (self.fingers * z).sum(-1, keepdim=True) * z
+        ahead = torch.nn.functional.normalize(ahead, dim=-1)
+        turned = (exp(yaw[..., None] * z) @ ahead[..., None])[..., 0]
+        y, z = sign * turned, z.expand_as(turned)
+        return torch.stack([torch.linalg.cross(y, z), y, z], -1)
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A hand on a place of an object from `touch_s` to `release_s`, with the approach before and the return after it.
+
+    Until it touches and after it releases, the hand's goal keeps off the surface along its normal by `hover_m`.
+    """
+
+    place: GripPlace
+    moves: Moves
+    touch_s: float
+    release_s: float
+    reach_s: float = 0.7
+    return_s: float = 0.7
+    hover_m: float = 0.06
+
+    @property
+    def start_s(self) -> float:
+        return self.touch_s - self.reach_s
+
+    @property
+    def stop_s(self) -> float:
+        return self.release_s + self.return_s
+
+    def weight(self, times: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time"]:
+        """Weight of the grip's goal on the hand: 1 while it holds, minimum jerk before and after."""
+        there = (times - self.start_s) / self.reach_s / (1.0 - SETTLED)
+        back = 1.0 - (self.stop_s - times) / self.return_s / (1.0 - SETTLED)
+        return ease(there) - ease(back)
+
+    def hold(self, times: Float[np.ndarray, "time"], T_world_chest: Rigid) -> Hold:
+        """Goal of the palm's position and of the hand's directions at times (s)."""
+        T = self.moves(times, T_world_chest).to(torch.float64)
+        point, normal, fingers = (
+            torch.tensor(v, dtype=torch.float64) for v in (self.place.point, self.place.normal, self.place.fingers)
+        )
+        before = (self.touch_s - times) / (DESCENT * self.reach_s)
+        after = (times - self.release_s) / (DESCENT * self.return_s)
+        off = torch.from_numpy(self.hover_m * (ease(before) + ease(after)))
+        out = T.R @ normal
+        return Hold(T.t + T.R @ point + off[:, None] * out, out, T.R @ fingers)
+
+
+def drawn_grip(
+    place: GripPlace, moves: Moves, touch_s: float, release_s: float, rng: np.random.Generator, briskness: float
+) -> Grip:
+    """A grip with random durations of approach and return (0.4–1.2 s each) and hover distance."""
+    there, back = (float(np.clip(rng.normal(0.75, 0.15) / briskness, 0.4, 1.2)) for _ in range(2))
+    return Grip(place, moves, touch_s, release_s, there, back, float(rng.uniform(0.04, 0.09)))
+
+
+def still(T_world_object: Rigid) -> Moves:
+    """Motion of an object that stays where it is."""
+    return lambda times, chest: Rigid(
+        T_world_object.R.double().expand(len(times), 3, 3), T_world_object.t.double().expand(len(times), 3)
+    )
+
+
+def following(trajectory: Trajectory) -> Moves:
+    """Motion of an object along a given trajectory; it is static before its start and after its end."""
+    first, last = trajectory.timestamps[0].item(), trajectory.timestamps[-1].item()
+    track = Trajectory(trajectory.timestamps, trajectory.R_world_body.double(), trajectory.t_world_body.double())
+    return lambda times, chest: resample(track, torch.from_numpy(np.clip(times, first, last))).T_world_body

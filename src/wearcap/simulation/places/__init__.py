@@ -1,0 +1,1 @@
+"""Seeded flats, sites, streets and hillsides, and the furniture and objects in them."""

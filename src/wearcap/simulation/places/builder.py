@@ -1,0 +1,236 @@
+"""Collects surfaces, objects and their triangles into a World, in a local frame that is turned and shifted."""
+
+import colorsys
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from wearcap.geometry.mesh import Mesh
+from wearcap.simulation.places import world as w
+from wearcap.simulation.places.outline import rectangle, turn
+
+_BOX_FACES = np.array(
+    [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5],
+     [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]]
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Part:
+    """A box or column of a piece of furniture, in the piece's frame (front +x, origin on the floor)."""
+
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    color: tuple[float, float, float]
+    texture: float = 6.0
+    """Visual features per m²."""
+    sides: int = 4
+    """Number of sides: 4 is a box; more approximate a round column of diameter size[0]."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A piece of furniture to place: its outline (length along its front, width), parts, seats and reachable points."""
+
+    kind: str
+    size: tuple[float, float]
+    z_range: tuple[float, float]
+    parts: tuple[Part, ...]
+    seats: tuple[tuple[float, float, float, float, float], ...] = ()
+    """x, y, height, heading, depth to the front edge."""
+    reaches: tuple[tuple[float, float, float], ...] = ()
+    """Points a hand reaches for from the front."""
+
+
+def hue(rng: np.random.Generator, saturation: tuple[float, float] = (0.15, 0.7)) -> tuple[float, float, float]:
+    """A random RGB colour (0…1) of medium brightness."""
+    return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(0.45, 0.9))
+
+
+@dataclass
+class WorldBuilder:
+    """Collects a world in the builder's frame; the finished world is turned by `heading` and moved by `shift`."""
+
+    name: str
+    heading: float = 0.0
+    shift: tuple[float, float] = (0.0, 0.0)
+    outdoors: bool = False
+    objects: list[w.WorldObject] = field(default_factory=list)
+    surfaces: list[w.Surface] = field(default_factory=list)
+    seats: list[w.Seat] = field(default_factory=list)
+    reach_targets: list[w.ReachTarget] = field(default_factory=list)
+    flights: list[w.Flight] = field(default_factory=list)
+    rooms: list[w.Room] = field(default_factory=list)
+    doors: list[w.Door] = field(default_factory=list)
+    windows: list[w.Door] = field(default_factory=list)
+    """Gaps above a sill, given by the floor point below them."""
+    spots: list[w.CaptureSpot] = field(default_factory=list)
+    _triangles: list[tuple] = field(default_factory=list)
+
+    def to_world(self, points: Float[np.ndarray, "*batch axis"]) -> Float[np.ndarray, "*batch axis"]:
+        """Points (x y or x y z) of the builder's frame in the world."""
+        out = np.array(points, dtype=np.float64)
+        out[..., :2] = out[..., :2] @ turn(self.heading).T + np.array(self.shift)
+        return out
+
+    def from_world(self, points_xy: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        return (points_xy - np.array(self.shift)) @ turn(self.heading)
+
+    def add_triangles(self, vertices: np.ndarray, faces: np.ndarray, color, texture: float, item: int = -1) -> None:
+        self._triangles.append((self.to_world(vertices), faces, color, texture, item))
+
+    def add_box(self, center, size, color, texture: float = 6.0, heading: float = 0.0, item: int = -1, sides=4):
+        """A box, or a column of `sides` sides, around `center` (m)."""
+        if sides == 4:
+            ring = rectangle(center[:2], size[:2], heading)
+        else:
+            angle = np.arange(sides) * 2 * np.pi / sides
+            ring = np.stack([np.cos(angle), np.sin(angle)], 1) * size[0] / 2 + np.array(center[:2])
+        low, high = (np.full((sides, 1), center[2] + side * size[2] / 2) for side in (-1, 1))
+        vertices = np.concatenate([np.concatenate([ring, low], 1), np.concatenate([ring, high], 1)])
+        self.add_triangles(vertices, _BOX_FACES if sides == 4 else _prism_faces(sides), color, texture, item)
+
+    def add_prism(self, vertices: Float[np.ndarray, "corner 3"], color, texture: float, item: int = -1) -> None:
+        """A solid between a lower ring of corners and the upper one that follows it, both counter-clockwise."""
+        self.add_triangles(vertices, _prism_faces(len(vertices) // 2), color, texture, item)
+
+    def add_surface(
+        self, kind: str, polygon, color, *, plane=(0.0, 0.0, 0.0), level: int = 0, texture: float = 1.0, thickness=0.0
+    ) -> None:
+        """Add a walkable surface, as a Surface and as a slab of the given thickness (m)."""
+        polygon = np.asarray(polygon, dtype=np.float64)
+        a, b, c = plane
+        top = np.concatenate([polygon, polygon @ np.array([[a], [b]]) + c], 1)
+        count = len(polygon)
+        if thickness:
+            vertices = np.concatenate([top - [0, 0, thickness], top])
+            self.add_triangles(vertices, _prism_faces(count), color, texture)
+        else:
+            fan = np.array([[0, k, k + 1] for k in range(1, count - 1)])
+            self.add_triangles(top, fan, color, texture)
+        gradient = turn(self.heading) @ np.array([a, b])
+        offset = c - gradient @ np.array(self.shift)
+        plane_world = (float(gradient[0]), float(gradient[1]), float(offset))
+        self.surfaces.append(w.Surface(kind, self.to_world(polygon), plane_world, level))
+
+    def add_object(self, kind: str, outline, z_range: tuple[float, float], position, heading: float = 0.0) -> int:
+        """Add an obstacle without triangles; returns its index for `add_box(item=…)`."""
+        place = self.to_world(np.asarray(position))
+        number = len(self.objects)
+        self.objects.append(
+            w.WorldObject(
+                f"{kind}_{number:03d}",
+                kind,
+                self.to_world(outline),
+                z_range,
+                tuple(place.tolist()),
+                self.heading + heading,
+            )
+        )
+        return number
+
+    def add_block(self, kind: str, center, size, color, texture: float = 6.0, heading: float = 0.0) -> int:
+        """Add a box that is an object by itself: a wall, a post, a hedge."""
+        z_range = (center[2] - size[2] / 2, center[2] + size[2] / 2)
+        outline = rectangle(center[:2], size[:2], heading)
+        item = self.add_object(kind, outline, z_range, (center[0], center[1], z_range[0]), heading)
+        self.add_box(center, size, color, texture, heading, item)
+        return item
+
+    def place(self, piece: Piece, position: tuple[float, float, float], heading: float) -> int:
+        """Put a piece of furniture on the floor point `position`, its front turned to `heading`."""
+        x, y, z = position
+        about = turn(heading)
+        outline = rectangle((x, y), piece.size, heading)
+        z_range = (z + piece.z_range[0], z + piece.z_range[1])
+        item = self.add_object(piece.kind, outline, z_range, position, heading)
+        for part in piece.parts:
+            xy = about @ np.array(part.center[:2]) + np.array([x, y])
+            center = (xy[0], xy[1], z + part.center[2])
+            self.add_box(center, part.size, part.color, part.texture, heading, item, part.sides)
+        for seat_x, seat_y, height, seat_heading, depth in piece.seats:
+            spot = self.to_world(np.array([*(about @ np.array([seat_x, seat_y]) + (x, y)), z + height]))
+            self.seats.append(w.Seat(tuple(spot.tolist()), self.heading + heading + seat_heading, height, depth))
+        for reach in piece.reaches:
+            front = piece.size[0] / 2 + 0.33
+            self.add_reach(
+                (*(about @ np.array(reach[:2]) + (x, y)), z + reach[2]),
+                (*(about @ np.array([front, reach[1]]) + (x, y)), z),
+                heading + np.pi,
+            )
+        return item
+
+    def add_reach(self, position, stand, heading: float) -> None:
+        position, stand = (tuple(self.to_world(np.array(p)).tolist()) for p in (position, stand))
+        self.reach_targets.append(w.ReachTarget(position, stand, self.heading + heading))
+
+    def finish(self, cell: float) -> w.World:
+        """The world, without the seats and reach targets that no walker can stand in front of."""
+        draft = self._world((), (), cell)
+        seats = tuple(s for s in self.seats if _reachable(draft, s.standing_point(), 0.45))
+        reaches = tuple(r for r in self.reach_targets if _reachable(draft, np.array(r.stand), 0.15))
+        world = self._world(seats, reaches, cell)
+        world.__dict__["navigation"] = draft.navigation
+        return world
+
+    def _world(self, seats: tuple, reaches: tuple, cell: float) -> w.World:
+        counts = np.array([len(vertices) for vertices, *_ in self._triangles])
+        starts = np.concatenate([[0], counts.cumsum()[:-1]])
+        faces = np.concatenate([t[1] + start for t, start in zip(self._triangles, starts)]).astype(np.int32)
+        face_counts = [len(t[1]) for t in self._triangles]
+        mesh = Mesh(
+            np.concatenate([t[0] for t in self._triangles]).astype(np.float32),
+            faces,
+            np.repeat(np.array([t[2] for t in self._triangles], np.float32), counts, axis=0),
+        )
+        return w.World(
+            self.name,
+            mesh,
+            np.repeat([t[4] for t in self._triangles], face_counts),
+            np.repeat(np.array([t[3] for t in self._triangles], np.float64), face_counts),
+            tuple(self.objects),
+            tuple(self.surfaces),
+            seats,
+            reaches,
+            tuple(self.flights),
+            tuple(self.rooms),
+            tuple(self.doors),
+            cell,
+            self.outdoors,
+            tuple(self.spots),
+        )
+
+
+def piece_mesh(piece: Piece) -> Mesh:
+    """The surface of a piece of furniture in its own frame."""
+    builder = WorldBuilder(piece.kind)
+    builder.place(piece, (0.0, 0.0, 0.0), 0.0)
+    vertices, faces, colors = [], [], []
+    start = 0
+    for corners, triangles, color, _texture, _item in builder._triangles:
+        vertices.append(corners)
+        faces.append(triangles + start)
+        colors.append(np.tile(np.array(color), (len(corners), 1)))
+        start += len(corners)
+    return Mesh(
+        np.concatenate(vertices).astype(np.float32),
+        np.concatenate(faces).astype(np.int32),
+        np.concatenate(colors).astype(np.float32),
+    )
+
+
+def _reachable(world: w.World, point: np.ndarray, within_m: float) -> bool:
+    node = world.navigation.nearest_node(point)
+    return node is not None and bool(np.linalg.norm(world.navigation.node_points[node][:2] - point[:2]) < within_m)
+
+
+def _prism_faces(sides: int) -> np.ndarray:
+    """Triangles of a prism whose vertices are its lower ring, then its upper ring, both counter-clockwise."""
+    ring = range(sides)
+    faces = [[0, k + 1, k] for k in range(1, sides - 1)]
+    faces += [[sides, sides + k, sides + k + 1] for k in range(1, sides - 1)]
+    for k in ring:
+        n = (k + 1) % sides
+        faces += [[k, n, sides + n], [k, sides + n, sides + k]]
+    return np.array(faces)

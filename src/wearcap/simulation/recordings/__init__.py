@@ -1,0 +1,1 @@
+"""Simulated recordings of each system: people in places with the readings of their sensors and the truth."""

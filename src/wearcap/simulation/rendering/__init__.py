@@ -1,0 +1,1 @@
+"""What cameras and laser scanners measure of a simulated world."""

@@ -1,0 +1,114 @@
+"""The head camera's video: rendered frame by frame, blurred by motion, exposed, with a sound track of the claps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import torch
+
+from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
+from wearcap.geometry import rotation
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.io.formats.video import video_encoder
+from wearcap.sensors.noise import smooth_noise
+from wearcap.simulation.rendering.views import Development, Scenery, render_view
+
+SOUND_HZ = 48_000
+BLUR_STEP_PX, MOST_STEPS = 3.0, 5
+"""Largest motion between the sub-frames that are averaged into a frame, and most sub-frames."""
+GLARE = 0.03
+"""Contrast during glare, when the image shows next to nothing."""
+
+
+@dataclass(frozen=True)
+class Filming:
+    """Settings of the head camera's video."""
+
+    shutter_s: float = 1 / 120
+    """Exposure time; 0: no motion blur."""
+    noise: float = 3.0
+    """Deviation in grey levels."""
+    exposure: float = 0.12
+    """Deviation of the automatic exposure, as a share, over some seconds."""
+    vignetting: float = 0.3
+    crf: int = 17
+    """H.264's constant quality: lower is better."""
+    glare_s: tuple[tuple[float, float], ...] = ()
+    """Intervals (start, stop) on the camera's clock in which the image shows next to nothing."""
+
+
+def film(
+    scenery: Scenery, camera: Camera, path: Trajectory, times: torch.Tensor, filming: Filming, rng: np.random.Generator
+):
+    """Yields the frame (uint8 height width 3) of every time (s, on the clock of `path`, the camera's true poses)."""
+    first, last = path.timestamps[0], path.timestamps[-1]
+    fps = 1.0 / times.diff().median().item() if len(times) > 1 else 30.0
+    exposure = 1 + filming.exposure * smooth_noise(rng, len(times), 1, 6.0, fps)[:, 0].clamp(-2, 2)
+    for number, time in enumerate(times.tolist()):
+        ends = resample(path, torch.tensor([time, time + filming.shutter_s]).double().clamp(first, last))
+        turned = rotation.geodesic(ends.R_world_body[0], ends.R_world_body[1]).item()
+        steps = min(MOST_STEPS, 1 + int(turned * camera.fx / BLUR_STEP_PX)) if filming.shutter_s else 1
+        moments = torch.linspace(time, time + (filming.shutter_s if steps > 1 else 0.0), steps).double()
+        poses = resample(path, moments.clamp(first, last))
+        glared = any(start <= time < stop for start, stop in filming.glare_s)
+        how = Development(exposure[number].item(), GLARE if glared else 1.0, filming.noise, filming.vignetting)
+        yield render_view(scenery, camera, Rigid(poses.R_world_body, poses.t_world_body), how, rng)
+
+
+def write_head_video(
+    file: str | Path,
+    scenery: Scenery,
+    camera: Camera,
+    path: Trajectory,
+    times: torch.Tensor,
+    filming: Filming,
+    rng: np.random.Generator,
+    claps_s: Sequence[float] = (),
+) -> None:
+    """Write an MP4 with one frame per time (evenly spaced), and the claps' sound (`claps_s` on the same clock).
+
+    Raises WearcapError for odd picture sizes and fewer than two times.
+    """
+    if camera.width % 2 or camera.height % 2 or len(times) < 2:
+        raise WearcapError(
+            f"a video of {len(times)} frames of {camera.width}x{camera.height}",
+            expected="even sizes, two frames or more",
+        )
+    fps = 1.0 / times.diff().median().item()
+    with atomic_path(file) as temporary, av.open(str(temporary), "w", format="mp4") as container:
+        codec, options = video_encoder(filming.crf)
+        stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001), options=options)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
+        sound = container.add_stream("aac", rate=SOUND_HZ, layout="mono")
+        for piece in _sound(times, claps_s, rng):
+            container.mux(sound.encode(piece))
+        container.mux(sound.encode(None))
+        for picture in film(scenery, camera, path, times, filming, rng):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode(None))
+
+
+def _sound(times: torch.Tensor, claps_s: Sequence[float], rng: np.random.Generator):
+    """Audio frames from the first to the last image: a quiet room, and claps of some 10 ms."""
+    first, last = times[0].item(), times[-1].item()
+    count = int((last - first + 0.1) * SOUND_HZ)
+    wave = 0.001 * rng.standard_normal(count, np.float32)
+    length = int(0.05 * SOUND_HZ)
+    fading = np.exp(-np.arange(length) / (0.006 * SOUND_HZ)).astype(np.float32)
+    for clap in claps_s:
+        start = round((clap - first) * SOUND_HZ)
+        if 0 <= start < count:
+            stop = min(start + length, count)
+            burst = 0.35 * fading * rng.standard_normal(length, np.float32)
+            wave[start:stop] += burst[: stop - start]
+    for start in range(0, count, 1024):
+        piece = av.AudioFrame.from_ndarray(wave[None, start : start + 1024].clip(-1, 1).copy(), "fltp", "mono")
+        piece.rate, piece.pts = SOUND_HZ, start
+        yield piece
