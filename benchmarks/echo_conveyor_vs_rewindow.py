@@ -18,7 +18,7 @@ from echo_runs import NAME, figure, lanes_of, pipeline_of
 
 from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.recording import Recording, RecordingStore
-from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import Conditioning, EchoQueue
 from wearcap.systems.echo.rewindow import Rewindow
@@ -80,9 +80,9 @@ def _errors(conveyor: Echo, windows: Echo, recordings: int, seconds: float) -> l
     shown = [_beginning(store.load(name), seconds) for name in store.names("test")[:recordings]]
     means = []
     for pipeline in (conveyor, windows):
-        on = EchoOnDataset(pipeline, DATASET)
-        motions = on.capture(shown, [0] * len(shown))
-        scores = [on.score(motion, recording, recording.name, 0).scores for motion, recording in zip(motions, shown)]
+        sources = [CaptureInput(recording, store.root) for recording in shown]
+        motions = pipeline.motions(sources, [0] * len(shown))
+        scores = [pipeline.score(motion, source, 0).scores for motion, source in zip(motions, sources)]
         means.append(
             {name: statistics.mean(score[name] for score in scores if name in score) for name in ("v2v_cm", "mpjpe_mm")}
         )

@@ -14,9 +14,9 @@ from wearcap.cli.load import load_pipeline
 from wearcap.geometry.trajectory import resample
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.acts import Act, true_acts
+from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
-from wearcap.systems.echo.dataset import EchoOnDataset
 from wearcap.systems.echo.objects import ObjectShape
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.viewer.objects import with_objects
@@ -33,24 +33,26 @@ def draw(
     config = compose("evaluate", ["pipeline=echo", *overrides])
     pipeline, store = load_pipeline(checkpoint, config.pipeline, "cpu"), RecordingStore.open(dataset)
     assert isinstance(pipeline, Echo)
-    on, reader = EchoOnDataset(pipeline, store.root), pipeline.reader()
+    reader = pipeline.reader()
     found: dict[str, list[tuple[float, int, Act]]] = {kind: [] for kind in kinds}
     shown = [
-        (recording, acts) for recording in map(store.load, store.names(split)) if (acts := _acts(on, recording, kinds))
+        (source, acts)
+        for source in (CaptureInput(store.load(name), store.root) for name in store.names(split))
+        if (acts := _acts(pipeline, source, kinds))
     ]
-    recordings = [recording for recording, _ in shown]
-    motions = on.capture(recordings, [0] * len(recordings))
-    for number, (recording, acts) in enumerate(shown):
+    sources = [source for source, _ in shown]
+    motions = pipeline.motions(sources, [0] * len(sources))
+    for number, (source, acts) in enumerate(shown):
         for act, item in acts:
-            error = _apart(motions[number], recording, act, reader(item))
+            error = _apart(motions[number], source.recording, act, reader(item))
             found[item.category].append((error, number, act))
     for kind, acts in found.items():
         if not acts:
             print(f"{kind}: none in this split")
             continue
         error, number, act = sorted(acts, key=lambda one: one[0])[len(acts) // 2]
-        recording, motion = recordings[number], motions[number]
-        environment = on.environment(recording)
+        recording, motion = sources[number].recording, motions[number]
+        environment = pipeline.objects(sources[number])
         assert environment is not None
         save_png(
             folder / f"{kind}.png",
@@ -61,11 +63,11 @@ def draw(
         )
 
 
-def _acts(on: EchoOnDataset, recording: Recording, kinds: tuple[str, ...]) -> list[tuple[Act, SceneObject]]:
+def _acts(echo: Echo, source: CaptureInput, kinds: tuple[str, ...]) -> list[tuple[Act, SceneObject]]:
     """With objects of some kinds."""
-    environment = on.environment(recording)
+    environment = echo.objects(source)
     assert environment is not None
-    acts = [(act, environment.by_name(act.object)) for act in true_acts(recording)]
+    acts = [(act, environment.by_name(act.object)) for act in true_acts(source.recording)]
     return [(act, item) for act, item in acts if item.category in kinds]
 
 

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
 from wearcap.recording import Motion, RecordingStore
-from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.scores import Truth, observed_share
@@ -48,29 +49,29 @@ def captured(
 ) -> Iterator[Captured]:
     """Every recording with every seed, `items` of them at a time: those of like length side by side, so that none waits
     long for another."""
-    on = EchoOnDataset(pipeline_of(method), store.root)
-    reader = on.echo.reader()
+    echo = pipeline_of(method)
+    reader = echo.reader()
     ordered = sorted(names, key=lambda name: store.entries[name].frames)
     jobs = [(name, seed) for name in ordered for seed in seeds]
     for start in range(0, len(jobs), items):
         batch = jobs[start : start + items]
-        observed_parts = {name: on.scenario(store.load(name)) for name, _ in batch}
-        scenarios = [_observing(method, on, observed_parts[name], seed) for name, seed in batch]
-        motions = on.echo.capture_scenarios(scenarios, [seed for _, seed in batch])
+        observed_parts = {name: echo.scenario_of(CaptureInput(store.load(name), store.root)) for name, _ in batch}
+        scenarios = [_observing(method, echo, observed_parts[name], store.root, seed) for name, seed in batch]
+        motions = echo.capture_scenarios(scenarios, [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):
             scenario = observed_parts[name]
-            item = batch_item_of(scenario, head_path(scenario.recording, on.echo.skeleton, on.echo.fps), reader)
-            yield Captured(name, seed, motion, on.truth(motion, scenario.recording), item)
+            item = batch_item_of(scenario, head_path(scenario.recording, echo.skeleton, echo.fps), reader)
+            yield Captured(name, seed, motion, echo.truth(motion, CaptureInput(scenario.recording, store.root)), item)
 
 
-def _observing(method: Method, on: EchoOnDataset, scenario: Scenario, seed: int) -> Scenario:
+def _observing(method: Method, echo: Echo, scenario: Scenario, root: Path, seed: int) -> Scenario:
     """The scenario with what the row observes, other frames for every seed."""
     if method.observed is None:
         return scenario
     recording = scenario.recording
-    path = head_path(recording, on.echo.skeleton, on.echo.fps)
+    path = head_path(recording, echo.skeleton, echo.fps)
     blank = Motion(path.timestamps, path.skeleton, *_still(len(path.timestamps), len(path.skeleton)))
-    truth = on.truth(blank, recording)
+    truth = echo.truth(blank, CaptureInput(recording, root))
     return replace(scenario, observed=observed_share(truth, *method.observed, seed))
 
 

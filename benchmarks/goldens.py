@@ -28,13 +28,14 @@ from safetensors.torch import load_file
 
 from wearcap.cli import capture, evaluate, export, prepare, train
 from wearcap.cli.conf import compose
-from wearcap.cli.load import environment_of, load_pipeline
+from wearcap.cli.load import load_pipeline
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import true_acts
-from wearcap.recording.locate import load_recording
+from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.recording.serialize import flatten
 from wearcap.recording.timing import joined
+from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.stream import EchoSession, EchoWearer
 from wearcap.systems.hmd2.stream import Sensed, Session, Wearer
 from wearcap.systems.hps.stream import follow
@@ -306,7 +307,7 @@ def echo_streamed() -> Motion | None:
     head, motion = recording.head, recording.motion
     assert head is not None
     assert motion is not None
-    environment = environment_of(recording, place, None)
+    environment = CaptureInput(recording, dataset_folder(place)).objects()
     wearer = EchoWearer(recording.skeleton, recording.shape, head.R_head_device, head.t_head_device)
     session = EchoSession(pipeline, wearer, environment, seed=3)
     for act in true_acts(recording):

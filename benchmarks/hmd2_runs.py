@@ -7,14 +7,15 @@ from pathlib import Path
 import torch
 
 from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline, load_realism
-from wearcap.evaluation.baselines import MeanPose, NearestWindow
+from wearcap.cli.load import load_pipeline
+from wearcap.evaluation.baselines import BASELINES
 from wearcap.evaluation.evaluate import evaluate
+from wearcap.evaluation.realism import Realism
 from wearcap.metrics.scores import score
 from wearcap.metrics.table import Row, Summary, aggregate
-from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.recording import Motion, RecordingStore
+from wearcap.runtime.system import CaptureInput
 
-BASELINES = {"mean pose": MeanPose, "nearest window": NearestWindow}
 STRIDE_S = 0.5
 """Windows of FID and Diversity are this far apart."""
 
@@ -63,7 +64,7 @@ def run_method(method: Method, case: Case) -> Result:
         pipeline, seeds = load_pipeline(method.checkpoint, config.pipeline, case.device), case.seeds
         if "pipeline=pose_regressor" in method.pipeline:
             seeds = seeds[:1]
-    realism = None if case.realism is None else load_realism(case.realism, STRIDE_S)
+    realism = None if case.realism is None else Realism.load(case.realism, STRIDE_S)
     measure = scored if realism is None else realism.beside(scored, method.name)
     rows = list(evaluate(pipeline, store, case.names, seeds, batch_size=8, measure=measure))
     scores = aggregate(rows)
@@ -72,9 +73,9 @@ def run_method(method: Method, case: Case) -> Result:
     return Result(method.name, scores, _by_activity(rows, store))
 
 
-def scored(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
+def scored(motion: Motion, source: CaptureInput, seed: int) -> Row:
     """`score`, and how much more it jerks where windows meet than elsewhere."""
-    row = score(motion, recording, name, seed)
+    row = score(motion, source.recording, source.recording.name, seed)
     if (ratio := seam_ratio(motion)) is not None:
         row.scores["seam_ratio"] = ratio
     return row

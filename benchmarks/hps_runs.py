@@ -15,7 +15,8 @@ from hydra.utils import instantiate
 from wearcap.cli.conf import compose
 from wearcap.metrics.surface import FootSurface
 from wearcap.recording import Motion
-from wearcap.runtime.stages import Source, run_stages
+from wearcap.runtime.stages import run_stages
+from wearcap.runtime.system import CaptureInput
 from wearcap.simulation.recordings.localization_noise import with_outage
 from wearcap.systems.hps.scores import HpsScores, HpsTruth, Outage, disturbance, planted_outages, score_hps
 
@@ -113,7 +114,7 @@ def _captured(session: Session, pipeline: str, run: SeedRun) -> tuple[Motion, di
     if "solver" in config and "jobs" in config.solver:
         config.solver.jobs = run.solver_jobs
     made = instantiate(config, _convert_="all")
-    results, stages = run_stages(made.stages(Source(session.recording, scan=session.scan)))
+    results, stages = run_stages(made.stages(CaptureInput(session.recording, scan=session.scan)))
     error = clock.error_s(results["synchronize"])
     return made.motion_of(results), {stage.stage: stage.seconds for stage in stages}, error
 

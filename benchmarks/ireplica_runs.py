@@ -17,7 +17,7 @@ from wearcap.io.formats.environment import read_environment
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.interactions import Interactions
 from wearcap.recording.timing import resampled
-from wearcap.runtime.stages import Source
+from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import CONTACT_CLASSES
 from wearcap.sensors.noise import smooth_noise
@@ -63,7 +63,7 @@ class Case:
 
     recording: Recording
     environment: Environment
-    source: Source
+    source: CaptureInput
 
     @classmethod
     def load(cls, dataset: Path, name: str) -> "Case":
@@ -72,7 +72,7 @@ class Case:
         assert recording.environment is not None
         assert recording.scene is not None
         environment = read_environment(store.root / recording.environment)
-        return cls(recording, environment, Source(recording, store.root, store.root / recording.scene))
+        return cls(recording, environment, CaptureInput.in_dataset(recording, store.root))
 
 
 def pipeline_of(name: str, checkpoints: tuple[str, ...], jobs: int = 1) -> IReplica:

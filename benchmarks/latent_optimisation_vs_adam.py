@@ -17,9 +17,8 @@ from planted import swinging
 
 from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose
-from wearcap.cli.load import load_system
 from wearcap.geometry import rotation
-from wearcap.models.checkpoint import shared_checkpoints
+from wearcap.models.checkpoint import load_trained, shared_checkpoints
 from wearcap.recording import Motion, Recording
 from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
 from wearcap.systems.mocap_every.energy import LatentSolver
@@ -75,7 +74,7 @@ def _seen(duration_s: float) -> tuple[Motion, Recording]:
 
 def _manifold() -> MotionManifold:
     if NAME in shared_checkpoints():
-        return load_system(NAME)[0].net
+        return load_trained(NAME)[0].net
     torch.manual_seed(0)
     print(f"no checkpoint {NAME!r}: drawn weights", file=sys.stderr)
     config = compose("train", [f"experiment={NAME}"]).model.net

@@ -12,7 +12,7 @@ from mocap_every_runs import figure, pipeline_of, watched
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Recording
-from wearcap.runtime.onnx import undisturbed
+from wearcap.runtime.graphs import undisturbed
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.stream import MocapEverySession, WatchSample, Wearing
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline, load_visual_cues
+from wearcap.cli.load import load_pipeline
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.metrics.floor import floor_error_m, stood_on
@@ -21,8 +21,8 @@ from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
 from wearcap.sensors.noise import smooth_noise
 from wearcap.systems.mocap_every.energy import LatentSolver
-from wearcap.systems.mocap_every.pipeline import Captured, MocapEvery
-from wearcap.systems.mocap_every.visual_cues import at_frames
+from wearcap.systems.mocap_every.pipeline import CapturedWithFloor, MocapEvery
+from wearcap.systems.mocap_every.visual_cues import at_frames, load_visual_cues
 
 NEAR_M = 0.03
 SLAM_DEG, SLAM_M, SLAM_PERIOD_S = 2.4, 0.05, 4.0
@@ -50,7 +50,7 @@ def pipeline_of(method: Method) -> MocapEvery:
 
 def captures(
     method: Method, store: RecordingStore, names: Sequence[str], step: Callable[[], None]
-) -> Iterator[tuple[Recording, Captured]]:
+) -> Iterator[tuple[Recording, CapturedWithFloor]]:
     pipeline = pipeline_of(method)
     for name in names:
         recording = store.load(name)
@@ -71,12 +71,12 @@ def with_slam(recording: Recording) -> Recording:
     return replace(recording, head=replace(head, R_world_device=head.R_world_device @ turn, t_world_device=moved))
 
 
-def body_row(recording: Recording, captured: Captured, seed: int = 0) -> Row:
+def body_row(recording: Recording, captured: CapturedWithFloor, seed: int = 0) -> Row:
     """Scores in the world, the paper's metrics among them."""
     return score_in_world(captured.motion, recording, recording.name, seed)
 
 
-def floor_row(recording: Recording, captured: Captured) -> Row:
+def floor_row(recording: Recording, captured: CapturedWithFloor) -> Row:
     """Body and floor: where the floor is against the recording's, and against what is stood on."""
     row = body_row(recording, captured)
     assert recording.floor is not None

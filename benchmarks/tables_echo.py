@@ -22,7 +22,7 @@ from wearcap.cli.conf import compose
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
 from wearcap.recording import RecordingStore
-from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.published import NearestEcho, RigidWrist
 from wearcap.systems.echo.scores import MEASURES, score_echo
 
@@ -199,12 +199,12 @@ def _captured(
 
 def _baseline(method: NearestEcho, store: RecordingStore, names: list[str], like: Method) -> dict[str, Summary]:
     """Scores of what draws nothing."""
-    on = EchoOnDataset(pipeline_of(like), store.root)
+    echo = pipeline_of(like)
     made = []
     for name in names:
-        scenario = on.scenario(store.load(name))
-        motion = method.capture_scenarios([scenario], [0])[0]
-        made.append(score_echo(motion, on.truth(motion, scenario.recording), name, 0))
+        source = CaptureInput(store.load(name), store.root)
+        motion = method.capture_scenarios([echo.scenario_of(source)], [0])[0]
+        made.append(echo.score(motion, source, 0))
     return aggregate(made)
 
 

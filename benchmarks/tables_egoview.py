@@ -10,9 +10,9 @@ from rich.progress import track
 from tabling import finite, new_table
 from torch.utils.data import DataLoader
 
-from wearcap.cli.load import load_system
 from wearcap.data.windows import Source
 from wearcap.files import write_text
+from wearcap.models.checkpoint import load_trained
 from wearcap.systems.hmd2.egoview_frames import POINTS, EgoFrame, EgoFrames
 from wearcap.systems.hmd2.egoview_training import EgoView, view_scores
 
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 @torch.inference_mode()
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write the table; returns the file."""
-    system = load_system(options.checkpoint)[0].eval()
+    system = load_trained(options.checkpoint)[0].eval()
     assert isinstance(system, EgoView)
     table = new_table(f"Hands in the head camera's pictures, {options.split} split", ["", *COLUMNS.values()])
     rows = {}

@@ -16,11 +16,11 @@ from rich.console import Console
 from rich.progress import Progress
 from tabling import finite, recordings_of
 
-from wearcap.cli.load import load_visual_cues
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.systems.mocap_every.energy import LatentSolver
+from wearcap.systems.mocap_every.visual_cues import load_visual_cues
 
 BODY = (
     "r_mpjpe_cm",

@@ -18,8 +18,8 @@ from tabling import finite, new_table
 from torch import Tensor
 from torch.nn import functional as F
 
-from wearcap.cli.load import load_system
 from wearcap.files import write_text
+from wearcap.models.checkpoint import load_trained
 from wearcap.models.point_encoder import bounds, to_unit_sphere
 from wearcap.simulation.places.object_clouds import generate_clouds
 from wearcap.systems.echo.object_clouds import CloudAugmentation
@@ -78,7 +78,7 @@ def scored(system: ObjectEncoding, clouds: Tensor, labels: Tensor) -> tuple[dict
 @torch.inference_mode()
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     torch.set_num_threads(1)
-    system, _ = load_system(options.checkpoint)
+    system, _ = load_trained(options.checkpoint)
     assert isinstance(system, ObjectEncoding)
     classes, per_class = list(system.net.classes), 10 if options.quick else options.per_class
     clouds, labels = generate_clouds("test", classes, per_class)

@@ -13,11 +13,12 @@ import torch
 from carried_box import WINDOW, carried_dataset, carrying, drawn_echo, scenario_of, small_features, small_net
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
-from wearcap.export import echo as export
-from wearcap.export.echo import encoder_path, export_echo, load_exported_echo
+from wearcap.export.read import load_exported
+from wearcap.export.write import write_exports
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording.store import RecordingFile
+from wearcap.systems.echo.export import condition_channels
 from wearcap.systems.echo.guidance import Guidance
 from wearcap.systems.echo.pipeline import Echo
 
@@ -38,7 +39,10 @@ def exports(tmp_path_factory):
     """A pipeline's file in both formats, with its report."""
     folder = tmp_path_factory.mktemp("echo")
     pipeline = drawn(guidance=Guidance(object=2.0))
-    return {format: export_echo(pipeline, folder / format / f"net.{format}", format) for format in FORMATS}
+    return {
+        format: write_exports(pipeline.exports(), folder / format / f"net.{format}", format)["step"]
+        for format in FORMATS
+    }
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -47,7 +51,7 @@ def test_the_file_predicts_what_the_network_predicts(exports, format):
     assert report.max_abs_error < 1e-4
     # Long enough for windows that fill, run and end, and a batch item that ends before the other.
     scenarios = [scenario_of(carrying(1.3)), scenario_of(carrying(0.9))]
-    there = replace(load_exported_echo(report.path), guidance=None)
+    there = replace(load_exported(report.path), guidance=None)
     for motion, expected in zip(*(echo.capture_scenarios(scenarios, [3, 4]) for echo in (there, eager))):
         torch.testing.assert_close(motion.T_world_joint.t, expected.T_world_joint.t, atol=1e-3, rtol=0)
         torch.testing.assert_close(motion.body_contact_prob, expected.body_contact_prob, atol=1e-3, rtol=0)
@@ -58,7 +62,7 @@ def test_the_file_predicts_what_the_network_predicts(exports, format):
 
 
 def test_the_sidecar_has_everything_else(exports):
-    pipeline, there = drawn(guidance=Guidance(object=2.0)), load_exported_echo(exports["pt2"].path)
+    pipeline, there = drawn(guidance=Guidance(object=2.0)), load_exported(exports["pt2"].path)
     assert isinstance(there.schedule, CosineSchedule)
     assert (there.net.window, there.context, there.per_frame) == (WINDOW, 8, 1)
     assert (there.settings(), there.fps, there.skeleton) == (pipeline.settings(), 30.0, pipeline.skeleton)
@@ -75,14 +79,14 @@ def test_channels_are_named_for_every_frame_of_reference():
     for frame in ("own", "window", "world"):
         for body in (True, False):
             features = small_features(frame, body=body)
-            assert len(export.condition_channels(features)) == features.condition_size
+            assert len(condition_channels(features)) == features.condition_size
 
 
 def test_it_runs_without_lightning_and_hydra(exports, tmp_path):
     root = carried_dataset(tmp_path / "data", splits=("test",))
     source = next((tmp_path / "data" / "recordings").glob("*.safetensors"))
     program = (
-        "import sys; from wearcap.export.echo import main; main(sys.argv[1:]); "
+        "import sys; from wearcap.export.__main__ import main; main(sys.argv[1:]); "
         "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
     )
     run([sys.executable, "-c", program, exports["onnx"].path, source, tmp_path / "out.safetensors"], check=True)
@@ -92,32 +96,32 @@ def test_it_runs_without_lightning_and_hydra(exports, tmp_path):
     assert set(RecordingFile(tmp_path / "out.safetensors").load().object_motion) == {"box_1"}
 
 
-def test_what_was_exported_cannot_be_exported_again(exports, tmp_path):
+def test_what_was_exported_cannot_be_exported_again(exports):
     with pytest.raises(WearcapError, match="exported already"):
-        export_echo(load_exported_echo(exports["pt2"].path), tmp_path / "again.pt2", "pt2")
+        load_exported(exports["pt2"].path).exports()
 
 
 def test_files_that_do_not_belong_are_refused(exports, tmp_path):
     path = shutil.copytree(Path(exports["pt2"].path).parent, tmp_path, dirs_exist_ok=True) / "net.pt2"
-    sidecar, encoder = tmp_path / "net.json", encoder_path(path)
+    sidecar, encoder = tmp_path / "net.json", tmp_path / "net.encoder.safetensors"
     about = json.loads(sidecar.read_text())
     sidecar.write_text(json.dumps(about | {"network": "contact"}))
     with pytest.raises(WearcapError, match="a contact network"):
-        load_exported_echo(path)
+        load_exported(path)
     sidecar.write_text(json.dumps(about))
     kept = encoder.read_bytes()
     encoder.write_bytes(kept[:-4] + b"\0\1\2\3")
     with pytest.raises(WearcapError, match="belongs to another"):
-        load_exported_echo(path)
+        load_exported(path)
     encoder.unlink()
-    with pytest.raises(WearcapError, match=r"net\.objects\.safetensors: a part of the exported model is missing"):
-        load_exported_echo(path)
+    with pytest.raises(WearcapError, match=r"net\.encoder\.safetensors: a part of the exported model is missing"):
+        load_exported(path)
     encoder.write_bytes(kept)
     sidecar.unlink()
     with pytest.raises(WearcapError, match="no such sidecar"):
-        load_exported_echo(path)
+        load_exported(path)
 
 
-def test_other_schedules_are_refused(tmp_path):
+def test_other_schedules_are_refused():
     with pytest.raises(WearcapError, match="cannot be exported"):
-        export_echo(replace(drawn(), schedule=lambda level: 1 - level), tmp_path / "net.pt2", "pt2")
+        replace(drawn(), schedule=lambda level: 1 - level).exports()

@@ -12,12 +12,14 @@ from torch import nn
 from wearcap.body.skeleton import xsens23
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
-from wearcap.export import exported, hmd2, network
+from wearcap.export import write
+from wearcap.export.read import RUN_BY_FORMAT, load_exported, open_pt2
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import CameraStream, HeadStream, PointCloud, Recording
 from wearcap.recording.store import RecordingFile, save_recording
+from wearcap.runtime.graphs import Graph
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
@@ -94,7 +96,7 @@ def exports(pipeline, tmp_path_factory):
     return {
         format: (
             folder / format / f"model.{format}",
-            hmd2.export_hmd2(pipeline, folder / format / f"model.{format}", format),
+            write.write_exports(pipeline.exports(), folder / format / f"model.{format}", format),
         )
         for format in FORMATS
     }
@@ -103,12 +105,12 @@ def exports(pipeline, tmp_path_factory):
 @pytest.mark.parametrize("format", FORMATS)
 def test_toy_network_agrees_at_other_batch_sizes(tmp_path, format):
     net = Toy().train()
-    report = network.export_network(net, toy_example(), tmp_path / f"toy.{format}", format, 1e-4)
+    report = write.export_network(Graph(net, toy_example()), tmp_path / f"toy.{format}", format, 1e-4)
     assert report.max_abs_error < 1e-6
     assert report.latency_ms > 0
     assert report.bytes == (tmp_path / f"toy.{format}").stat().st_size
     assert net.training  # the caller's network is left as it was
-    run = exported.RUN_BY_FORMAT[format](tmp_path / f"toy.{format}")
+    run = RUN_BY_FORMAT[format](tmp_path / f"toy.{format}")
     inputs = {"x": torch.randn(7, 5, 3), "valid": torch.rand(7, 5) > 0.5}
     torch.testing.assert_close(run(**inputs), net(**inputs))
 
@@ -116,7 +118,7 @@ def test_toy_network_agrees_at_other_batch_sizes(tmp_path, format):
 @pytest.mark.parametrize("format", FORMATS)
 def test_pipeline_reports_small_error(exports, format):
     path, reports = exports[format]
-    assert set(reports) == {"step", "conditions", "places"}
+    assert set(reports) == {"step", "plan", "conditions", "places"}
     assert all(0 <= report.max_abs_error < 1e-5 for report in reports.values())
     about = json.loads(path.with_suffix(".json").read_text())
     assert about["window"] == WINDOW
@@ -128,16 +130,16 @@ def test_pipeline_reports_small_error(exports, format):
 @pytest.mark.parametrize("format", FORMATS)
 def test_runner_equals_the_eager_pipeline(pipeline, recording, exports, format):
     eager = pipeline(recording, seed=5)
-    motion = hmd2.load_exported_hmd2(exports[format][0])(recording, seed=5)
+    motion = load_exported(exports[format][0])(recording, seed=5)
     assert pipeline.sense(recording, head_path(recording, xsens23(), 60.0)).points_valid.any()
     torch.testing.assert_close(motion.R_parent_joint, eager.R_parent_joint, atol=1e-4, rtol=0)
     torch.testing.assert_close(motion.t_world_root, eager.t_world_root, atol=1e-4, rtol=0)
-    other = hmd2.load_exported_hmd2(exports[format][0])(recording, seed=6)
+    other = load_exported(exports[format][0])(recording, seed=6)
     assert (other.R_parent_joint - eager.R_parent_joint).abs().max() > 1e-2
 
 
 def test_runner_restores_settings(pipeline, exports):
-    loaded = hmd2.load_exported_hmd2(exports["onnx"][0])
+    loaded = load_exported(exports["onnx"][0])
     assert loaded.skeleton == pipeline.skeleton
     assert loaded.features == pipeline.features
     assert (loaded.fps, loaded.steps, loaded.stride, loaded.eta) == (60.0, 3, 16, 1.0)
@@ -148,7 +150,7 @@ def test_runner_restores_settings(pipeline, exports):
 def test_runner_command_needs_neither_lightning_nor_hydra(recording, exports, tmp_path):
     save_recording(recording, tmp_path / "in.safetensors")
     program = (
-        "import sys; from wearcap.export.hmd2 import main; main(sys.argv[1:]); "
+        "import sys; from wearcap.export.__main__ import main; main(sys.argv[1:]); "
         "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
     )
     model, source, target = exports["onnx"][0], tmp_path / "in.safetensors", tmp_path / "out.safetensors"
@@ -165,7 +167,7 @@ class Moody(nn.Module):
 
 def test_a_deviating_export_is_refused_and_leaves_nothing(tmp_path):
     with pytest.raises(WearcapError, match="differs from the eager one"):
-        network.export_network(Moody(), toy_example(), tmp_path / "toy.pt2", "pt2", 1e-4)
+        write.export_network(Graph(Moody(), toy_example()), tmp_path / "toy.pt2", "pt2", 1e-4)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -173,46 +175,46 @@ def test_not_a_number_is_refused(tmp_path):
     net = Toy()
     nn.init.constant_(net.linear.weight, math.nan)
     with pytest.raises(WearcapError, match="nan"):
-        network.export_network(net, toy_example(), tmp_path / "toy.pt2", "pt2", 1e-4)
+        write.export_network(Graph(net, toy_example()), tmp_path / "toy.pt2", "pt2", 1e-4)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_missing_library_and_wrong_names_are_told(tmp_path, monkeypatch):
     with pytest.raises(WearcapError, match="one of onnx, pt2"):
-        network.export_network(Toy(), toy_example(), tmp_path / "toy.tflite", "tflite", 1e-4)
+        write.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.tflite", "tflite", 1e-4)
     with pytest.raises(WearcapError, match=r"ends in \.pt2"):
-        network.export_network(Toy(), toy_example(), tmp_path / "toy.onnx", "pt2", 1e-4)
+        write.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.onnx", "pt2", 1e-4)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(WearcapError, match=r'onnxscript.*pip install "wearcap\[export\]"'):
-        network.export_network(Toy(), toy_example(), tmp_path / "toy.onnx", "onnx", 1e-4)
+        write.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.onnx", "onnx", 1e-4)
 
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_hostile_model_files_are_named(tmp_path, exports, format):
     path = tmp_path / f"model.{format}"
     with pytest.raises(WearcapError, match="no such exported model"):
-        hmd2.load_exported_hmd2(path)
+        load_exported(path)
     path.write_bytes(exports[format][0].read_bytes()[:1000])
     with pytest.raises(WearcapError, match="not a readable"):
-        hmd2.load_exported_hmd2(path)
+        load_exported(path)
     path.write_bytes(exports[format][0].read_bytes())
     with pytest.raises(WearcapError, match="no such sidecar"):
-        hmd2.load_exported_hmd2(path)
+        load_exported(path)
     path.with_suffix(".json").write_text("{")
     with pytest.raises(WearcapError, match="not readable JSON"):
-        hmd2.load_exported_hmd2(path)
+        load_exported(path)
     about = json.loads(exports[format][0].with_suffix(".json").read_text())
     about["model"]["sha256"] = "0" * 64
     path.with_suffix(".json").write_text(json.dumps(about))
     with pytest.raises(WearcapError, match="belongs to another model"):
-        hmd2.load_exported_hmd2(path)
+        load_exported(path)
     path.with_suffix(".json").write_text(exports[format][0].with_suffix(".json").read_text())
     with pytest.raises(WearcapError, match="a part of the exported model is missing"):
-        hmd2.load_exported_hmd2(path)
+        load_exported(path)
 
 
 def test_archives_with_pickles_are_refused(tmp_path):
     program = torch.export.export(Toy(), (), toy_example())
     torch.export.save(program, tmp_path / "toy.pt2")  # PyTorch pickles the example inputs
     with pytest.raises(WearcapError, match="pickled"):
-        exported.open_pt2(tmp_path / "toy.pt2")
+        open_pt2(tmp_path / "toy.pt2")

@@ -1,4 +1,4 @@
-"""MocapEvery's network leaves the house: the same motion from the file, and files that do not belong are refused."""
+"""Exported MocapEvery: the same motion from the file, and files that do not belong together are refused."""
 
 import json
 import shutil
@@ -11,16 +11,18 @@ import torch
 
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.errors import WearcapError
-from wearcap.export.mocap_every import export_mocap_every, load_exported_mocap_every
+from wearcap.export.read import load_exported
+from wearcap.export.write import write_exports
 from wearcap.recording.store import RecordingFile, save_recording
 
 
 @pytest.fixture(scope="module")
 def exports(tmp_path_factory):
-    """What is told of a pipeline's file in either format."""
+    """Report of a pipeline's file in either format."""
     folder, formats = tmp_path_factory.mktemp("mocap_every"), ("onnx", "pt2")
     return {
-        format: export_mocap_every(drawn_pipeline(), folder / format / f"net.{format}", format) for format in formats
+        format: write_exports(drawn_pipeline().exports(), folder / format / f"net.{format}", format)["network"]
+        for format in formats
     }
 
 
@@ -28,7 +30,7 @@ def exports(tmp_path_factory):
 def test_the_file_says_what_the_network_says(exports, format):
     pipeline, recording, report = drawn_pipeline(), watched_walk(), exports[format]
     assert report.max_abs_error < 1e-4
-    motion = load_exported_mocap_every(report.path)(recording)
+    motion = load_exported(report.path)(recording)
     torch.testing.assert_close(motion.T_world_joint.t, pipeline(recording).T_world_joint.t, atol=1e-4, rtol=0)
     about = json.loads(Path(report.path).with_suffix(".json").read_text())
     assert about["features"]["frame"] == "heading"
@@ -40,7 +42,7 @@ def test_it_runs_without_lightning_and_hydra(exports, tmp_path):
     recording = watched_walk()
     save_recording(recording, tmp_path / "walk.safetensors")
     program = (
-        "import sys; from wearcap.export.mocap_every import main; main(sys.argv[1:]); "
+        "import sys; from wearcap.export.__main__ import main; main(sys.argv[1:]); "
         "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
     )
     run(
@@ -64,4 +66,4 @@ def test_a_sidecar_of_another_network_is_refused(exports, tmp_path):
     about = json.loads((tmp_path / "net.json").read_text())
     (tmp_path / "net.json").write_text(json.dumps(about | {"network": "contact"}))
     with pytest.raises(WearcapError):
-        load_exported_mocap_every(own / "net.pt2")
+        load_exported(own / "net.pt2")

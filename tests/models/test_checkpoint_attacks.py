@@ -13,10 +13,9 @@ import torch
 from safetensors.torch import save_file
 
 from command_line import exit_code
-from wearcap.cli.load import load_system
 from wearcap.errors import WearcapError
 from wearcap.models import build as module
-from wearcap.models.checkpoint import read_checkpoint
+from wearcap.models.checkpoint import load_trained, read_checkpoint
 from wearcap_testing import small_dataset
 
 KINDS = ("ckpt", "safetensors")
@@ -96,7 +95,7 @@ def test_nothing_in_a_config_is_resolved_or_called(form, kind, tmp_path, monkeyp
     path = checkpoint(tmp_path / f"x.{kind}", model_with(FORMS[form], mark))
     monkeypatch.setattr(builtins, "eval", None)
     with pytest.raises(WearcapError, match=r"x\.\w+: the model('s config has| is to be made of)"):
-        load_system(path)
+        load_trained(path)
     assert not mark.exists()
 
 
@@ -168,14 +167,14 @@ def changed(value, path: tuple, number: int):
 
 MEMORY = """
 import resource, sys, json
-from wearcap.cli.load import load_system
+from wearcap.models.checkpoint import load_trained
 import wearcap.systems.echo.training, wearcap.systems.hmd2.training
 from wearcap.errors import WearcapError
-load_system("hmd2")  # what a network of ours takes, with all imports
+load_trained("hmd2")  # what a network of ours takes, with all imports
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 for path in sys.argv[1:]:
     try:
-        load_system(path)
+        load_trained(path)
     except WearcapError:
         pass
 print(json.dumps((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024))
@@ -209,7 +208,7 @@ def test_long_trainings_and_any_seed_are_no_giants(tmp_path):
     config, state = read_checkpoint("hmd2")
     model = config["model"] | {"seed": 2**62}
     model["scheduler"] |= {"total": 10**9}
-    load_system(checkpoint(tmp_path / "x.safetensors", model, state))
+    load_trained(checkpoint(tmp_path / "x.safetensors", model, state))
 
 
 def test_weights_that_repeat_themselves_without_memory_are_refused(tmp_path):

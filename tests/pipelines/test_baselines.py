@@ -129,8 +129,8 @@ def test_saved_and_loaded_is_the_same(store, baseline, tmp_path):
 
 def test_capture_takes_many(store):
     queries = [recorded("a", 0.7), recorded("b", 1.5, frames=40)]
-    motions = MeanPose.fit([store]).capture(queries, [0, 1])
-    assert [len(motion) for motion in motions] == [150, 40]
+    captures = MeanPose.fit([store]).capture(queries, [0, 1])
+    assert [len(captured.motion) for captured in captures] == [150, 40]
 
 
 def test_unfit_training_data_is_refused(tmp_path):

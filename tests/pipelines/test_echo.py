@@ -205,7 +205,7 @@ def test_a_seed_determines_the_sample():
 @pytest.mark.parametrize("rewindow", [None, 3, 8])
 def test_every_frame_is_output_however_short_the_recording(seconds, rewindow):
     recording = carrying(seconds)
-    motion = drawn_echo(rewindow=rewindow).capture([recording], [0])[0]
+    motion = drawn_echo(rewindow=rewindow).capture([recording], [0])[0].motion
     assert torch.equal(motion.timestamps, recording.motion.timestamps)
     assert motion.R_parent_joint.isfinite().all()
     assert motion.object_motion is None
@@ -223,11 +223,11 @@ def test_redrawn_noise_needs_the_conveyor():
 
 def test_the_body_is_anchored_to_the_measured_head():
     recording = carrying(1.0)
-    motion = drawn_echo().capture([recording], [0])[0]
+    motion = drawn_echo().capture([recording], [0])[0].motion
     head, true = motion.joint("head"), recording.motion.joint("head")
     torch.testing.assert_close(head.t, true.t, atol=1e-4, rtol=0)
     torch.testing.assert_close(head.R, true.R, atol=1e-4, rtol=0)
-    standing = drawn_echo(anchor=False).capture([recording], [0])[0]
+    standing = drawn_echo(anchor=False).capture([recording], [0])[0].motion
     assert not torch.allclose(standing.joint("head").t, true.t, atol=1e-2)
 
 
@@ -283,7 +283,7 @@ def test_after_a_gap_of_the_head_the_capture_restarts():
     whole = carrying(2.5)
     broken = with_gap(whole, 25, 55)
     echo = drawn_echo()
-    motion = echo.capture([broken], [5])[0]
+    motion = echo.capture([broken], [5])[0].motion
     assert len(motion) == 75
     assert (motion.R_parent_joint[25:55, 1] == motion.R_parent_joint[24, 1]).all(), "as before"
     cut = replace(
@@ -295,7 +295,7 @@ def test_after_a_gap_of_the_head_the_capture_restarts():
             t_world_device=whole.head.t_world_device[:25],
         ),
     )
-    first = echo.capture([cut], [5])[0]
+    first = echo.capture([cut], [5])[0].motion
     torch.testing.assert_close(motion.R_parent_joint[:25], first.R_parent_joint, atol=1e-4, rtol=0)
 
 

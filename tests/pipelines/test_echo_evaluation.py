@@ -14,7 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.metrics.objects import vertex_error_cm
 from wearcap.recording import RecordingStore
-from wearcap.systems.echo.dataset import EchoOnDataset
+from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.observations import batch_item_of
 from wearcap.systems.echo.published import NearestEcho, RigidWrist
@@ -126,15 +126,15 @@ def test_an_unknown_modality_is_refused(truth):
 
 def test_a_data_set_brings_its_objects(dataset):
     store = dataset.recordings[0][0]
-    on = EchoOnDataset(drawn_echo(), store.root)
-    recordings = [store.load(name) for name in ("c0", "c1")]
-    motions = on.capture(recordings, [0, 0])
+    echo = drawn_echo()
+    sources = [CaptureInput(store.load(name), store.root) for name in ("c0", "c1")]
+    motions = [captured.motion for captured in echo.capture(sources, [0, 0])]
     assert [set(motion.object_motion) for motion in motions] == [{"box_1"}] * 2
-    row = on.score(motions[0], recordings[0], "c0", 0)
+    row = echo.score(motions[0], sources[0], 0)
     assert {"v2v_cm", "mpjpe_mm"} <= set(row.scores)
-    assert on.environment(replace(recordings[0], environment=None)) is None
-    given = EchoOnDataset(drawn_echo(environment=str(store.root / "scene")), Path("elsewhere"))
-    assert given.environment(recordings[0]).by_name("box_1") is not None
+    assert echo.objects(CaptureInput(replace(sources[0].recording, environment=None), store.root)) is None
+    given = drawn_echo(environment=str(store.root / "scene"))
+    assert given.objects(CaptureInput(sources[0].recording, Path("elsewhere"))).by_name("box_1") is not None
 
 
 def test_the_nearest_window_of_what_was_seen_is_itself(dataset):

@@ -107,7 +107,7 @@ def test_objects_in_a_stream_are_static_from_their_first_contact_on():
 def test_a_human_alone_needs_no_objects():
     recording, echo = carrying(1.0), drawn_echo()
     motion, _ = streamed(EchoSession(echo, wearer(recording), seed=1), recording)
-    whole = echo.capture([recording], [1])[0]
+    whole = echo.capture([recording], [1])[0].motion
     torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)
     assert motion.object_motion is None
 
@@ -131,7 +131,7 @@ def test_what_is_final_stays_as_it_was():
     recording, echo = carrying(1.4), drawn_echo()
     session = EchoSession(echo, wearer(recording), boxes(), seed=3)
     motion, _ = streamed(session, recording, lambda frame: session.activate("box_1", 0.0) if frame == 25 else None)
-    alone = echo.capture([recording], [3])[0]
+    alone = echo.capture([recording], [3])[0].motion
     torch.testing.assert_close(motion.T_world_joint.t[:18], alone.T_world_joint.t[:18], atol=1e-3, rtol=0)
     assert motion.object_motion["box_1"].timestamps[0].item() == pytest.approx(18 / 30, abs=1e-6)
 
@@ -225,7 +225,7 @@ def test_wrists_may_come_late_and_in_any_order():
         parts.append(session.poses())
     parts.append(session.poses(ended=True))
     motion = joined([part for part in parts if part is not None])
-    whole = echo.capture([recording], [3])[0]
+    whole = echo.capture([recording], [3])[0].motion
     torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)
     assert session.silent == 0
 
@@ -284,7 +284,7 @@ def test_after_a_gap_it_restarts_as_the_whole_capture_does():
         parts.append(session.poses())
     parts.append(session.poses(ended=True))
     motion = joined([part for part in parts if part is not None])
-    whole = echo.capture([observed], [5])[0]
+    whole = echo.capture([observed], [5])[0].motion
     torch.testing.assert_close(motion.timestamps, whole.timestamps[keep], atol=1e-6, rtol=0)
     torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t[keep], atol=1e-3, rtol=0)
 

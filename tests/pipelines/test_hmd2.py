@@ -74,9 +74,9 @@ def test_the_head_is_where_it_was_measured(frame):
 def test_recordings_in_one_batch_come_out_as_alone():
     recordings = [recording_of(swaying_motion(n, n), f"r{n}") for n in (150, 70, 20)]
     together = pipeline().capture(recordings, [5, 6, 7])
-    for recording, seed, motion in zip(recordings, (5, 6, 7), together):
+    for recording, seed, captured in zip(recordings, (5, 6, 7), together):
         alone = pipeline()(recording, seed)
-        assert torch.allclose(motion.R_parent_joint, alone.R_parent_joint, atol=1e-4)
+        assert torch.allclose(captured.motion.R_parent_joint, alone.R_parent_joint, atol=1e-4)
 
 
 def test_the_same_seed_repeats_and_another_differs():

@@ -22,7 +22,7 @@ from wearcap.optimize.hps import HpsEnergy
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.recording import Motion, Recording
-from wearcap.runtime.stages import StagedCapture
+from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps import pipeline as hps_module
 from wearcap.systems.hps.camera import MapLocalization, Synchronization
@@ -63,6 +63,14 @@ def walk() -> Recording:
     return hps_recording(seconds=12.0)
 
 
+def run(
+    pipeline: System, recording: Recording, folder: Path = Path(), cache: Path | None = None, until: str | None = None
+) -> Captured:
+    """One capture of a recording of a data set."""
+    source = CaptureInput.in_dataset(recording, folder)
+    return pipeline.capture([source], [0], StageOptions(cache, until))[0]
+
+
 def root_error_m(motion: Motion, recording: Recording) -> torch.Tensor:
     assert recording.motion is not None
     frame = torch.searchsorted(recording.motion.timestamps, motion.timestamps - 1e-6)
@@ -71,24 +79,23 @@ def root_error_m(motion: Motion, recording: Recording) -> torch.Tensor:
 
 def test_planted_errors_of_suit_and_clock_go():
     recording = hps_recording(camera_lead_s=1.7)
-    capture = StagedCapture(replace(PIPELINE, synchronization=CLAPPING), Path(), scene=None)
     scanned = replace(recording, scene=None)
     with pytest.raises(WearcapError, match="no scan of the scene, which the energy's term contact_plane needs"):
-        capture.run(scanned)
+        run(replace(PIPELINE, synchronization=CLAPPING), scanned)
     pipeline = replace(PIPELINE, synchronization=CLAPPING)
-    motion = pipeline(recording, Scan(floor_points()))
+    motion = pipeline(CaptureInput(recording, scan=Scan(floor_points())))
     assert motion.timestamps.diff().median().item() == pytest.approx(1 / 30)
     assert root_error_m(motion, recording).mean() < 0.05
     clock = pipeline.synchronize(recording, Path())
     assert clock is not None
     assert clock.offset_s == pytest.approx(1.7, abs=0.002)
-    wrong_clock = PIPELINE(recording, Scan(floor_points()))
+    wrong_clock = PIPELINE(CaptureInput(recording, scan=Scan(floor_points())))
     assert root_error_m(wrong_clock, recording).mean() > 0.5
 
 
 def test_the_report_tells_what_was_found(walk, tmp_path):
     hps_dataset(tmp_path / "data", walk)
-    captured = StagedCapture(PIPELINE, tmp_path / "data").run(walk)
+    captured = run(PIPELINE, walk, tmp_path / "data")
     report = captured.report
     assert [stage["stage"] for stage in report["stages"]] == STAGES
     assert report["clock"] is None
@@ -97,27 +104,27 @@ def test_the_report_tells_what_was_found(walk, tmp_path):
     assert report["energy"][-1]["total"] < report["energy"][0]["total"]
     assert set(report["energy"][0]) == {*ENERGY.weights, "total"}
     assert isinstance(report["stopped"], str)
-    started = StagedCapture(PIPELINE, tmp_path / "data").run(walk, until="initialize")
+    started = run(PIPELINE, walk, tmp_path / "data", until="initialize")
     assert started.motion is not None
     assert "energy" not in started.report
-    assert StagedCapture(PIPELINE, tmp_path / "data").run(walk, until="localize").motion is None
+    assert run(PIPELINE, walk, tmp_path / "data", until="localize").motion is None
 
 
 def test_a_killed_capture_goes_on_to_the_same_motion(walk, tmp_path, monkeypatch):
     hps_dataset(tmp_path / "data", walk)
-    capture = StagedCapture(PIPELINE, tmp_path / "data", cache=tmp_path / "cache")
+    capture = functools.partial(run, PIPELINE, walk, tmp_path / "data", tmp_path / "cache")
     monkeypatch.setattr(hps_module.HPS, "optimize", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        capture.run(walk)
+        capture()
     monkeypatch.undo()
-    resumed = capture.run(walk)
+    resumed = capture()
     assert [stage["reused"] for stage in resumed.report["stages"]] == [True, True, True, True, False]
-    straight = StagedCapture(PIPELINE, tmp_path / "data").run(walk)
+    straight = run(PIPELINE, walk, tmp_path / "data")
     assert resumed.motion is not None
     assert straight.motion is not None
     assert torch.equal(resumed.motion.t_world_root, straight.motion.t_world_root)
     assert torch.equal(resumed.motion.R_parent_joint, straight.motion.R_parent_joint)
-    reused = capture.run(walk)
+    reused = capture()
     assert all(stage["reused"] for stage in reused.report["stages"])
     assert reused.motion is not None
     assert torch.equal(reused.motion.t_world_root, straight.motion.t_world_root)
@@ -142,9 +149,9 @@ def test_a_killed_capture_goes_on_to_the_same_motion(walk, tmp_path, monkeypatch
 )
 def test_only_what_follows_a_change_is_made_again(changed, stale, walk, tmp_path):
     hps_dataset(tmp_path / "data", walk)
-    StagedCapture(PIPELINE, tmp_path / "data", cache=tmp_path / "cache").run(walk)
+    run(PIPELINE, walk, tmp_path / "data", tmp_path / "cache")
     recording, pipeline = changed(walk, tmp_path / "data")
-    runs = StagedCapture(pipeline, tmp_path / "data", cache=tmp_path / "cache").run(recording).report["stages"]
+    runs = run(pipeline, recording, tmp_path / "data", tmp_path / "cache").report["stages"]
     assert [run["stage"] for run in runs if not run["reused"]] == stale
 
 
@@ -156,19 +163,17 @@ def rescanned(recording: Recording, root: Path) -> Recording:
 
 def test_a_baseline_shares_the_first_stages(walk, tmp_path):
     hps_dataset(tmp_path / "data", walk)
-    StagedCapture(PIPELINE, tmp_path / "data", cache=tmp_path / "cache").run(walk)
+    run(PIPELINE, walk, tmp_path / "data", tmp_path / "cache")
     for kind in ("imu", "imu_cam_filtered"):
-        run = StagedCapture(HpsBaseline(kind), tmp_path / "data", cache=tmp_path / "cache").run(walk)
-        assert [stage["reused"] for stage in run.report["stages"]] == [True, True, False]
-        assert run.motion is not None
-        assert run.motion.provenance["pipeline"] == kind
+        placed = run(HpsBaseline(kind), walk, tmp_path / "data", tmp_path / "cache")
+        assert [stage["reused"] for stage in placed.report["stages"]] == [True, True, False]
+        assert placed.motion is not None
+        assert placed.motion.provenance["pipeline"] == kind
 
 
 def test_it_is_scored_in_the_world_and_hung(walk, tmp_path):
     store = hps_dataset(tmp_path, walk)
-    imu, ours = (
-        next(evaluate(StagedCapture(p, tmp_path), store, ["walk"], [0])).scores for p in (HpsBaseline("imu"), PIPELINE)
-    )
+    imu, ours = (next(evaluate(p, store, ["walk"], [0])).scores for p in (HpsBaseline("imu"), PIPELINE))
     assert ours["world_root_cm"] < imu["world_root_cm"]
     assert ours["mpjpe_cm"] < 5
     assert ours["world_mpjpe_cm"] == pytest.approx(ours["world_root_cm"], rel=0.5)
@@ -177,9 +182,7 @@ def test_it_is_scored_in_the_world_and_hung(walk, tmp_path):
 def test_a_path_bent_to_the_camera_is_nearer_than_the_suits_own(walk, tmp_path):
     store = hps_dataset(tmp_path, walk)
     bent = BentSuit(functools.partial(bend, settings=Bending(100.0, free_start=True), solver=bend_banded))
-    imu, ours = (
-        next(evaluate(StagedCapture(p, tmp_path), store, ["walk"], [0])).scores for p in (HpsBaseline("imu"), bent)
-    )
+    imu, ours = (next(evaluate(p, store, ["walk"], [0])).scores for p in (HpsBaseline("imu"), bent))
     assert ours["world_root_cm"] < imu["world_root_cm"]
     assert bent(walk).provenance["pipeline"] == "bent_suit"
 
@@ -249,16 +252,20 @@ def test_poses_that_are_there_are_taken_unless_a_map_is_given(filmed, walk):
 def test_another_map_is_another_result(filmed, tmp_path):
     root, recording, _ = filmed
     cache = tmp_path / "cache"
-    capture = StagedCapture(
-        replace(PIPELINE, localization=MapLocalization(RootSift(400), every=3)), root, scene=root / "0.ply", cache=cache
-    )
+    pipeline = replace(PIPELINE, localization=MapLocalization(RootSift(400), every=3))
     (root / "0.ply").write_bytes(b"")
-    assert not capture.run(recording, until="localize").report["stages"][1]["reused"]
-    assert capture.run(recording, until="localize").report["stages"][1]["reused"]
+    source = CaptureInput.in_dataset(recording, root, root / "0.ply")
+
+    def reused() -> bool:
+        report = pipeline.capture([source], [0], StageOptions(cache, "localize"))[0].report
+        return report["stages"][1]["reused"]
+
+    assert not reused()
+    assert reused()
     path = root / "scene/map.safetensors"
     content = path.read_bytes()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    assert not capture.run(recording, until="localize").report["stages"][1]["reused"]
+    assert not reused()
     path.write_bytes(content)
 
 
@@ -300,7 +307,7 @@ FAULTS = {
 def test_what_is_missing_is_said(fault, walk):
     change, pipeline, message = FAULTS[fault]
     with pytest.raises(WearcapError, match=message):
-        pipeline(change(walk), Scan(floor_points()))
+        pipeline(CaptureInput(change(walk), scan=Scan(floor_points())))
 
 
 def test_settings_that_cannot_be_are_refused():

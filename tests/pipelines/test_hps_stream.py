@@ -11,6 +11,7 @@ from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.recording import Recording
 from wearcap.recording.growing import close_pieces, follow_pieces, piece_path, write_piece
+from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps.pipeline import HPS
 from wearcap.systems.hps.stream import HpsStream, StreamSettings, follow
@@ -78,7 +79,7 @@ def streamed():
 
 def test_every_frame_comes_once_and_in_order_nearly_as_good_as_offline(streamed):
     recording, online, _ = streamed
-    offline = hps()(recording, Scan(floor_points()))
+    offline = hps()(CaptureInput(recording, scan=Scan(floor_points())))
     assert sum(map(len, online)) == len(offline)
     assert len(online) > 10
     late = slice(120, None)

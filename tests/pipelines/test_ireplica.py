@@ -20,7 +20,7 @@ from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.recording import Motion, Recording
 from wearcap.recording.interactions import Interactions
 from wearcap.runtime.digest import digest
-from wearcap.runtime.stages import Source
+from wearcap.runtime.system import CaptureInput, StagedSystem
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.systems.ireplica.attachment import AttachmentSettings
@@ -205,7 +205,7 @@ def test_handlings_outside_of_the_capture_spoil_no_mean(scene, way):
     assert np.isnan(summary([])["end_cm"])
 
 
-class Registered:
+class Registered(StagedSystem):
     """A registration without steps."""
 
     name = "registered"
@@ -231,7 +231,7 @@ def test_objects_are_tracked_again_when_a_mesh_changes_wherever_it_lies(scene, t
         (tmp_path / "objects").rename(tmp_path / f"meshes{size:.0f}")
         file = tmp_path / "environment.json"
         file.write_text(file.read_text().replace("objects/", f"meshes{size:.0f}/"))
-        keys.append(digest(*pipeline.stages(Source(Recording("r", suit=motion)))[-1].reads()))
+        keys.append(digest(*pipeline.stages(CaptureInput(Recording("r", suit=motion)))[-1].reads()))
     assert keys[0] != keys[1]
 
 

@@ -7,7 +7,6 @@ import torch
 
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
-from wearcap.evaluation.evaluate import Pipeline
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, encode_pose
 from wearcap.systems.hmd2.pose_regressor.pipeline import PoseRegressorCapture
@@ -61,10 +60,9 @@ def test_behind_a_jump_of_the_tracking_a_new_past_begins():
 
 def test_passes_and_company_change_nothing():
     recordings = [recording_of(swaying_motion(n, n), f"r{n}") for n in (150, 20)]
-    assert isinstance(pipeline(), Pipeline)
     together = pipeline(frames_per_pass=64).capture(recordings, [0, 1])
-    for recording, motion in zip(recordings, together):
-        assert torch.allclose(motion.R_parent_joint, pipeline()(recording).R_parent_joint, atol=1e-5)
+    for recording, captured in zip(recordings, together):
+        assert torch.allclose(captured.motion.R_parent_joint, pipeline()(recording).R_parent_joint, atol=1e-5)
 
 
 def test_hands_need_a_true_motion_and_the_head_does_not():

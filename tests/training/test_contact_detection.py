@@ -12,10 +12,10 @@ import torch
 from contact_motion import CLASSES, bending_dataset
 from wearcap.cli import export, train
 from wearcap.cli.conf import compose, conf_dir
-from wearcap.cli.load import load_pipeline, load_system
+from wearcap.cli.load import load_pipeline
 from wearcap.errors import WearcapError
 from wearcap.metrics.detection import average_precision
-from wearcap.models.checkpoint import read_checkpoint
+from wearcap.models.checkpoint import load_trained, read_checkpoint
 from wearcap.recording import RecordingStore
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 
@@ -100,7 +100,7 @@ def test_what_was_learned_is_told_of_a_recording(learned, people):
 def test_the_checkpoint_carries_its_temperatures(learned):
     _, state = read_checkpoint(learned)
     assert (state["net.temperature"] != 1.0).all()
-    system, config = load_system(learned)
+    system, config = load_trained(learned)
     assert torch.equal(system.net.temperature, state["net.temperature"])
     assert config["name"] == "contact_sequence"
 
@@ -130,7 +130,7 @@ def test_resumed_equals_straight_through(data, tmp_path):
 FORMATS = ("onnx", "pt2")
 RUN = """
 import sys
-from wearcap.export.contact_runner import main
+from wearcap.export.__main__ import main
 
 recording, *exported = sys.argv[1:]
 for model in exported:

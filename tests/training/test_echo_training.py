@@ -12,7 +12,6 @@ from carried_box import WINDOW, carried_dataset, carrying, small_features, small
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import conf_dir
-from wearcap.cli.load import load_system
 from wearcap.data.statistics import collate
 from wearcap.data.windows import Source
 from wearcap.diffusion.levels import LevelMix
@@ -20,6 +19,7 @@ from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.motion_npz import read_motion
+from wearcap.models.checkpoint import load_trained
 from wearcap.systems.echo.features import OBJECT_SIZE
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.training import EchoDiffusion
@@ -250,7 +250,7 @@ def losses_of(run: Path) -> dict[int, str]:
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_runs(experiment, data, people, tmp_path):
     train.main(arguments(experiment, data, people, tmp_path / "run", "trainer.max_steps=2"))
-    system, _ = load_system(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    system, _ = load_trained(tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert isinstance(system, EchoDiffusion)
     assert not torch.equal(system.net.motion_normalizer.scale, torch.ones(sum(system.net.sizes)))
 
@@ -282,7 +282,7 @@ def test_with_the_encoder_it_trains_is_evaluated_and_captures(data, people, tmp_
     ]
     train.main(given)
     checkpoint = run / "checkpoints" / "last.ckpt"
-    assert load_system(checkpoint)[0].features.shape_size == 256
+    assert load_trained(checkpoint)[0].features.shape_size == 256
     common = [f"checkpoint={checkpoint}", "pipeline=echo_online", "pipeline.context=12"]
     evaluate.main(
         [

@@ -9,11 +9,11 @@ import torch
 
 from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import conf_dir
-from wearcap.cli.load import load_system
 from wearcap.data.place_codes import PlaceCodes
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.io.formats.motion_npz import read_motion
+from wearcap.models.checkpoint import load_trained
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
 from wearcap_testing import recording_of, swaying_motion
 
@@ -116,7 +116,7 @@ def test_every_experiment_takes_a_step(experiment, data, places, tmp_path):
 
 
 def test_the_checkpoint_carries_the_place_encoder_and_its_statistics(checkpoint, places):
-    system, _ = load_system(checkpoint)
+    system, _ = load_trained(checkpoint)
     own, given = system.place_encoder.state_dict(), PlaceCodes(places).encoder.state_dict()
     assert all(torch.allclose(own[name], given[name], atol=1e-6) for name in given)
     encoder = system.net.condition_encoder
@@ -172,7 +172,7 @@ def test_windows_and_model_must_see_the_same(data, places, tmp_path):
 def test_rows_of_the_ablation_train_by_themselves(surroundings, data, places, tmp_path):
     more = ["callbacks.capture=null", f"surroundings={surroundings}"]
     run = trained("hmd2", data, places if surroundings == "points" else None, tmp_path / "run", *more)
-    system = load_system(run)[0]
+    system = load_trained(run)[0]
     sizes = (system.net.points_size > 0, system.net.image_size > 0)
     assert sizes == (surroundings == "points", surroundings == "images")
     assert system.image_encoder == ("egoview-01234567" if surroundings == "images" else None), "as the data names it"

@@ -9,8 +9,10 @@ import torch
 
 from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline, load_realism, load_system
+from wearcap.cli.load import load_pipeline
 from wearcap.errors import WearcapError
+from wearcap.evaluation.realism import Realism
+from wearcap.models.checkpoint import load_trained
 from wearcap.training.motion_autoencoder import MotionEncoding
 from wearcap_testing import small_dataset
 
@@ -59,14 +61,14 @@ def test_it_learns_and_carries_its_statistics(checkpoint):
     losses = logged(run, "train/loss")
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
     assert logged(run, "val/joints_cm")
-    system, config = load_system(checkpoint)
+    system, config = load_trained(checkpoint)
     assert isinstance(system, MotionEncoding)
     assert config["name"] == "motion_autoencoder"
     assert not torch.equal(system.net.normalizer.mean, torch.zeros(143))
 
 
 def test_its_checkpoint_measures_realism_and_nothing_else(checkpoint):
-    realism = load_realism(checkpoint)
+    realism = Realism.load(checkpoint)
     assert not realism.net.training
     assert (realism.net.frames, realism.stride) == (24, 20)
     config = compose("evaluate", ["pipeline=hmd2", "paths.run=x"])

@@ -9,7 +9,7 @@ import torch
 
 from wearcap.cli import export, train
 from wearcap.cli.conf import conf_dir
-from wearcap.cli.load import load_system
+from wearcap.models.checkpoint import load_trained
 from wearcap.models.point_encoder import load_object_encoder
 from wearcap.systems.echo.object_training import ObjectEncoding, instance_loss
 from wearcap.training.run import resume_path
@@ -56,7 +56,7 @@ def test_it_learns_and_its_checkpoint_encodes(experiment, data, tmp_path):
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
     last = [row for row in rows if row["val/accuracy_1"]][-1]
     assert 0 <= float(last["val/accuracy_2"]) <= 1
-    system, _ = load_system(checkpoint)
+    system, _ = load_trained(checkpoint)
     assert isinstance(system, ObjectEncoding)
     assert system.net.classes == ("box", "chair", "bottle")
     export.main(

@@ -12,10 +12,10 @@ from torch import nn
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
-from wearcap.cli.load import load_system
 from wearcap.data.statistics import collate
 from wearcap.data.windows import Source, WindowDataset
 from wearcap.errors import WearcapError
+from wearcap.models.checkpoint import load_trained
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, encode_pose
 from wearcap.systems.hmd2.pose_regressor.training import PoseRegression
@@ -133,7 +133,7 @@ def test_trained_evaluated_and_refused(data, tmp_path):
     run = tmp_path / "run"
     train.main(arguments("pose_regressor_hands", data, run))
     checkpoint = run / "checkpoints" / "last.ckpt"
-    loaded, config = load_system(checkpoint)
+    loaded, config = load_trained(checkpoint)
     assert isinstance(loaded, PoseRegression)
     assert loaded.points.size == 54
     assert config["model"]["points"]["points"] == list(HANDS)

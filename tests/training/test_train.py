@@ -13,9 +13,8 @@ import torch
 
 from wearcap.cli import capture, evaluate, export, train
 from wearcap.cli.conf import compose, conf_dir
-from wearcap.cli.load import load_system
 from wearcap.errors import WearcapError
-from wearcap.models.checkpoint import read_checkpoint
+from wearcap.models.checkpoint import load_trained, read_checkpoint
 from wearcap_testing import small_dataset
 
 EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("motion_diffusion*.yaml"))
@@ -92,7 +91,7 @@ def test_a_run_leaves_its_record(checkpoint):
 
 
 def test_the_checkpoint_rebuilds_the_system(checkpoint):
-    system, config = load_system(checkpoint)
+    system, config = load_trained(checkpoint)
     assert config["name"] == "debug_fast"
     assert not torch.equal(system.net.motion_normalizer.scale, torch.ones_like(system.net.motion_normalizer.scale))
 
@@ -244,7 +243,7 @@ def test_a_checkpoint_of_another_model_is_named(checkpoint, tmp_path):
     saved["state_dict"].pop("net.head.weight")
     torch.save(saved, tmp_path / "other.ckpt")
     with pytest.raises(WearcapError, match="do not fit this model, such as 'net.head.weight'"):
-        load_system(tmp_path / "other.ckpt")
+        load_trained(tmp_path / "other.ckpt")
 
 
 @pytest.mark.parametrize("group", ["data", "features", "model", "optimizer", "trainer", "callbacks", "logger", "debug"])

@@ -12,7 +12,7 @@ from wearcap.body.anny_body import anny_body
 from wearcap.body.retarget import retarget
 from wearcap.body.skeletons import smplh52
 from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import LearnedPipeline, environment_of, load_pipeline, staged
+from wearcap.cli.load import load_pipeline
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass
@@ -22,13 +22,9 @@ from wearcap.io.formats.motion_npz import write_motion
 from wearcap.io.formats.scan import read_scan
 from wearcap.io.formats.scene_folder import cloud_file
 from wearcap.recording import Motion, Recording
-from wearcap.recording.growing import follow_pieces
 from wearcap.recording.locate import dataset_folder, load_recording
+from wearcap.runtime.system import CaptureInput, StageOptions, System
 from wearcap.scene.environment import Environment
-from wearcap.systems.echo.dataset import EchoOnDataset
-from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.hps.pipeline import HPS
-from wearcap.systems.hps.stream import follow
 from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
 from wearcap.viewer.video import write_video
@@ -41,40 +37,36 @@ def run(config: DictConfig) -> Motion | None:
 
     A pipeline with stages also writes report.json, and only that if `until` names a stage before the motion exists.
     """
-    pipeline = load_pipeline(config.checkpoint, config.pipeline, config.device)
+    system = load_pipeline(config.checkpoint, config.pipeline, config.device)
     folder = Path(config.output)
     if config.live:
-        return _live(pipeline, config, folder)
-    recording = load_recording(config.recording)
-    if isinstance(pipeline, LearnedPipeline):
-        if config.samples < 1:
-            raise WearcapError(f"samples={config.samples}", expected="at least 1")
-        if config.until is not None or config.cache is not None:
-            raise WearcapError(
-                f"until={config.until} cache={config.cache}", expected="a pipeline with stages, such as pipeline=hps"
-            )
-        seeds = range(config.seed, config.seed + config.samples)
-        capturing = pipeline
-        if isinstance(pipeline, Echo):
-            capturing = EchoOnDataset(pipeline, dataset_folder(config.recording))
-        draws = capturing.capture([recording] * config.samples, seeds)
-        motion = draws[0]
-        if len(draws) > 1:
-            _write_samples(draws, recording, folder, config)
-    else:
-        captured = staged(pipeline, config, config.recording, Console(stderr=True)).run(recording, config.until)
-        write_text(folder / "report.json", json.dumps(captured.report, indent=1) + "\n")
-        motion = captured.motion
+        return _live(system, config, folder)
+    if config.samples < 1:
+        raise WearcapError(f"samples={config.samples}", expected="at least 1")
+    recording, dataset = load_recording(config.recording), dataset_folder(config.recording)
+    source = CaptureInput.in_dataset(recording, dataset, config.scene, config.metres_per_unit)
+    seeds = range(config.seed, config.seed + (config.samples if system.draws else 1))
+    cache = None if config.cache is None else Path(config.cache)
+    options = StageOptions(cache, config.until, Console(stderr=True))
+    captures = system.capture([source] * len(seeds), seeds, options)
+    motion, report = captures[0].motion, captures[0].report
+    if report is not None:
+        write_text(folder / "report.json", json.dumps(report, indent=1) + "\n")
     if motion is not None:
+        environment = None if motion.object_motion is None else system.objects(source)
+        if len(captures) > 1:
+            _write_samples([c.motion for c in captures if c.motion is not None], recording, environment, folder)
         if config.checkpoint is not None:
             motion.provenance.update(checkpoint=str(config.checkpoint))
         motion.provenance.update(recording=str(config.recording))
-        _write(motion, recording, folder, config)
+        _write(motion, recording, environment, folder, config)
     show(f"{'motion' if motion is not None else 'report'}: {folder}")
     return motion
 
 
-def _write(motion: Motion, recording: Recording, folder: Path, config: DictConfig) -> None:
+def _write(
+    motion: Motion, recording: Recording, environment: Environment | None, folder: Path, config: DictConfig
+) -> None:
     write_motion(motion, folder / "motion.npz")
     write_bvh(motion, folder / "motion.bvh")
     if config.smpl:
@@ -85,7 +77,6 @@ def _write(motion: Motion, recording: Recording, folder: Path, config: DictConfi
     body = anny_body(motion.skeleton, recording.shape or None) if config.body else None
     write_glb(motion, folder / "motion.glb", body=body)
     if config.video:
-        environment = _objects(motion, recording, config)
         truth = with_objects(recording, environment)
         shown = {"truth": truth} if truth is not None else {}
         write_video(
@@ -96,29 +87,19 @@ def _write(motion: Motion, recording: Recording, folder: Path, config: DictConfi
         )
 
 
-def _write_samples(draws: list[Motion], recording: Recording, folder: Path, config: DictConfig) -> None:
+def _write_samples(draws: list[Motion], recording: Recording, environment: Environment | None, folder: Path) -> None:
     """Write sample-0.npz, …, and samples.png: the variety of motions from one input (thesis Fig. 6.6)."""
     shown = {f"sample {number}": motion for number, motion in enumerate(draws)}
     for label, motion in shown.items():
         write_motion(motion, folder / f"{label.replace(' ', '-')}.npz")
-    environment = _objects(draws[0], recording, config)
     truth = with_objects(recording, environment)
     body = anny_body(draws[0].skeleton, recording.shape or None)
     sheet = contact_sheet(({} if truth is None else {"truth": truth}) | shown, body=body, environment=environment)
     save_png(folder / "samples.png", sheet)
 
 
-def _objects(motion: Motion, recording: Recording, config: DictConfig) -> Environment | None:
-    """Environment with the objects that a motion with object poses is shown with."""
-    if motion.object_motion is None:
-        return None
-    return environment_of(recording, config.recording, config.pipeline.get("environment"))
-
-
-def _live(pipeline: object, config: DictConfig, folder: Path) -> None:
+def _live(system: System, config: DictConfig, folder: Path) -> None:
     """Follow a growing recording: motion-000000.npz, … appear as frames become final."""
-    if not isinstance(pipeline, HPS):
-        raise WearcapError("this pipeline cannot follow a growing recording", expected="pipeline=hps")
     source = Path(config.recording)
     if not source.is_dir():
         raise WearcapError("no such folder", where=source, expected="a growing recording: piece-000000.safetensors, …")
@@ -126,8 +107,7 @@ def _live(pipeline: object, config: DictConfig, folder: Path) -> None:
     if config.scene is not None:
         scan = read_scan(cloud_file(config.scene), metres_per_unit=config.metres_per_unit)
     refused: Counter[str] = Counter()
-    pieces = follow_pieces(source, refused=refused)
-    for number, motion in enumerate(follow(pipeline, pieces, scan, source, refused=refused)):
+    for number, motion in enumerate(system.follow(source, scan, refused)):
         write_motion(motion, folder / f"motion-{number:06d}.npz")
         show(f"{motion.timestamps[-1].item():9.2f} s", flush=True)
     for reason, count in refused.items():

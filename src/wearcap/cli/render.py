@@ -7,11 +7,11 @@ import numpy as np
 from rich import print as show
 
 from wearcap.body.anny_body import anny_body
-from wearcap.cli.load import environment_of
 from wearcap.cli.motions import read_motions
 from wearcap.errors import WearcapError
-from wearcap.recording.locate import load_recording
+from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.recording.motion import Motion
+from wearcap.runtime.system import CaptureInput
 from wearcap.viewer.head_path import draw_head_path
 from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png, shared_frames
@@ -46,7 +46,7 @@ def main(arguments: list[str]) -> None:
         raise WearcapError(
             f"cannot draw a {out.suffix or 'file without an ending'}", where=out, expected=".png or .mp4"
         )
-    environment = environment_of(recording, options.recording, options.environment)
+    environment = CaptureInput(recording, dataset_folder(options.recording)).objects(options.environment)
     truth = with_objects(recording, environment)
     motions = ({} if truth is None else {"truth": truth}) | read_motions(options.motion)
     motions = {label: _between(motion, options.start, options.stop) for label, motion in motions.items()}

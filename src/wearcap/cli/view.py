@@ -26,9 +26,9 @@ def main(arguments: list[str]) -> None:
     if not 0 < options.port < 65536:
         raise WearcapError(f"port {options.port}", expected="1 to 65535")
 
-    from wearcap.cli.load import environment_of
     from wearcap.cli.motions import read_motions
     from wearcap.recording.locate import dataset_folder, load_recording
+    from wearcap.runtime.system import CaptureInput
     from wearcap.viewer.page import Page
 
     # Browsers open connections in advance and drop them; the server's log of that is of no use to a user.
@@ -40,7 +40,7 @@ def main(arguments: list[str]) -> None:
         folder=dataset_folder(options.recording),
         host=options.host,
         port=options.port,
-        environment=environment_of(recording, options.recording, options.environment),
+        environment=CaptureInput(recording, dataset_folder(options.recording)).objects(options.environment),
     )
     print(f"{recording.name}: open {page.url} (Ctrl+C ends; space plays, J and L jump by a second)")
     try:

@@ -4,6 +4,7 @@ Both have HMD²'s inputs (the head's path, the floor, the body's size) and are a
 """
 
 import json
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import HeadPath, head_path
@@ -27,19 +29,27 @@ from wearcap.tracking.head_path import HeadPath, head_path
 QUERY_BATCH = 256
 
 
-class _Baseline:
-    """The interface that `evaluation.evaluate` expects."""
+class Baseline(System):
+    """A method that is fitted to a training split and captures each recording by itself; seeds have no effect."""
 
-    def __call__(self, recording: Recording) -> Motion:
-        raise NotImplementedError
+    @classmethod
+    @abstractmethod
+    def fit(cls, stores: Sequence[RecordingStore]) -> "Baseline":
+        """Fit to the training splits of data sets."""
 
-    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per recording; seeds have no effect."""
-        return [self(recording) for recording in recordings]
+    @abstractmethod
+    def motion(self, recording: Recording) -> Motion:
+        """Motion of one recording."""
+
+    def capture(
+        self, recordings: Sequence[Recording | CaptureInput], seeds: Sequence[int], options: StageOptions | None = None
+    ) -> list[Captured]:
+        """One capture per recording."""
+        return [Captured(self.motion(CaptureInput.of(recording).recording)) for recording in recordings]
 
 
 @dataclass(frozen=True, eq=False)
-class MeanPose(_Baseline):
+class MeanPose(Baseline):
     """One pose for every frame: the chordal mean over the training split, turned to the head's heading."""
 
     joint_names: tuple[str, ...]
@@ -57,7 +67,7 @@ class MeanPose(_Baseline):
             names, fps = path.skeleton.joint_names, _fps_of(path)
         return cls(names, fps, torch.stack([rotation.mean_rotation(R[None]) for R in total]).float())
 
-    def __call__(self, recording: Recording) -> Motion:
+    def motion(self, recording: Recording) -> Motion:
         """The mean pose anchored to the recording's head."""
         path = _query_path(recording, self.joint_names, self.fps)
         R = self.R_parent_joint.repeat(len(path.timestamps), 1, 1, 1)
@@ -74,7 +84,7 @@ class MeanPose(_Baseline):
 
 
 @dataclass(frozen=True, eq=False)
-class NearestWindow(_Baseline):
+class NearestWindow(Baseline):
     """Pastes, for each window of the head's path, the poses of the training window with the nearest head path.
 
     Windows overlap by half and are cross-faded. A path is described in the frame of its window's first head (yaw and
@@ -123,7 +133,7 @@ class NearestWindow(_Baseline):
             names, fps, window, sample, mean, scale, descriptor, torch.cat(first), torch.cat(last), torch.cat(poses)
         )
 
-    def __call__(self, recording: Recording) -> Motion:
+    def motion(self, recording: Recording) -> Motion:
         """The pasted motion anchored to the recording's head."""
         path = _query_path(recording, self.joint_names, self.fps)
         count = len(path.timestamps)
@@ -265,3 +275,7 @@ def _load(path: str | Path, kind: str) -> tuple[tuple[str, ...], float, dict[str
     if about.get("kind") != kind:
         raise WearcapError(f"holds {about.get('kind', 'no baseline')}", where=path, expected=kind)
     return tuple(about["joint_names"]), about["fps"], tensors
+
+
+BASELINES: dict[str, type[Baseline]] = {"mean pose": MeanPose, "nearest window": NearestWindow}
+"""Trivial methods by their names in tables."""

@@ -2,17 +2,23 @@
 
 import math
 from collections import defaultdict
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.data.motion_features import MotionFeatures, Movement
+from wearcap.errors import WearcapError
+from wearcap.evaluation.evaluate import Measure
 from wearcap.metrics.distribution import diversity, frechet_distance
-from wearcap.metrics.scores import Measure, comparable
-from wearcap.metrics.table import Summary, summarize
+from wearcap.metrics.scores import comparable
+from wearcap.metrics.table import Row, Summary, summarize
+from wearcap.models.checkpoint import load_trained
 from wearcap.models.motion_autoencoder import MotionAutoencoder
 from wearcap.recording import Motion, Recording
+from wearcap.runtime.system import CaptureInput
 
 MIN_WINDOWS = 2000
 """Fewest windows that FID and Diversity are computed from."""
@@ -33,12 +39,27 @@ class Realism:
         self._seen: defaultdict[str, dict[int, dict[str, tuple[Tensor, Tensor]]]]
         self._seen = defaultdict(lambda: defaultdict(dict))
 
+    @classmethod
+    def load(cls, checkpoint: str | Path, stride_s: float = 1.0) -> "Realism":
+        """The collector in the latent space of a checkpoint of experiment=motion_autoencoder.
+
+        Raises WearcapError for another checkpoint.
+        """
+        module: Any = load_trained(checkpoint)[0]
+        if not isinstance(module.net, MotionAutoencoder):
+            raise WearcapError(
+                "realism needs a motion autoencoder",
+                where=checkpoint,
+                expected="a checkpoint of experiment=motion_autoencoder",
+            )
+        return cls(module.net, module.features, stride_s)
+
     def beside(self, measure: Measure, method: str) -> Measure:
         """A measure that also adds every motion it scores to the distribution of `method`."""
 
-        def both(motion: Motion, recording: Recording, name: str, seed: int):
-            self.add(motion, recording, name, seed, method)
-            return measure(motion, recording, name, seed)
+        def both(motion: Motion, source: CaptureInput, seed: int) -> Row:
+            self.add(motion, source.recording, source.recording.name, seed, method)
+            return measure(motion, source, seed)
 
         return both
 

@@ -1,6 +1,5 @@
-"""Export of networks to ONNX or torch.export archives, and pipelines that run the exported files.
+"""Export of a system's networks to ONNX or torch.export, and systems that run the exported files.
 
-`network.py` writes any network and compares it with the eager one; `sidecar.py` writes the metadata beside it. Each
-system has a module of its name; iReplica's are `contact.py` and `contact_runner.py`. Open `mocap_every.py` first: the
-shortest complete export and import.
+A system says in its `export.py` what it exports (`exports`) and how it runs from files (`from_export`). `write.py`
+writes the graphs and compares them with the eager networks; `read.py` opens them.
 """

@@ -1,7 +1,5 @@
 """Scores of one capture against its recording's ground truth."""
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Bool
 from torch import Tensor
@@ -14,9 +12,6 @@ from wearcap.metrics.table import Row, evaluate_motion
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import at_times
 from wearcap.tracking.anchor import anchored_to_head
-
-Measure = Callable[[Motion, Recording, str, int], Row]
-"""Function that scores a captured motion against its recording, given the recording's name and the seed."""
 
 
 def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:

@@ -240,3 +240,17 @@ def _shareable(config: dict[str, Any]) -> dict[str, Any]:
         if roots and not any(Path(source["root"]).is_absolute() for source in roots.values()):
             kept.setdefault("data", {})[key] = roots
     return kept
+
+
+def load_trained(checkpoint: str | Path) -> tuple[nn.Module, dict[str, Any]]:
+    """The trained module of a checkpoint (averaged weights, evaluation mode) and the config it was trained with.
+
+    Raises WearcapError for a checkpoint that `wearcap train` did not write.
+    """
+    config, state = read_checkpoint(checkpoint)
+    module = build(config["model"], state, checkpoint)
+    if not hasattr(module, "training_step"):
+        raise WearcapError(
+            f"a checkpoint of {type(module).__name__} alone", where=checkpoint, expected="one of `wearcap train`"
+        )
+    return module, config

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import safetensors
 from rich.console import Console
@@ -18,14 +18,10 @@ from safetensors.torch import load, save
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
-from wearcap.io.formats.scan import read_scan
-from wearcap.io.formats.scene_folder import cloud_file
 from wearcap.optimize.hps import HpsState
 from wearcap.optimize.solution import Solution
-from wearcap.recording import Motion, Recording
 from wearcap.recording.serialize import KNOWN, dumps, flatten, unflatten
 from wearcap.runtime.digest import code_digest, digest, modules_of
-from wearcap.scene.scan import Scan
 from wearcap.sensors.clock import Clock
 from wearcap.sensors.initialization import Initialization
 
@@ -45,45 +41,6 @@ class Stage:
     cache."""
     after: tuple[str, ...] = ()
     """Names of the earlier stages whose results it takes."""
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A recording, and the files that belong to it."""
-
-    recording: Recording
-    folder: Path = Path()
-    """Folder of the data set."""
-    scan: Path | Scan | None = None
-    """The scene's point cloud, or its file."""
-    metres_per_unit: float | int | None = None
-    """Unit of that file (m); None: metres."""
-
-    def read_scan(self) -> Scan | None:
-        if isinstance(self.scan, Path):
-            unit = None if self.metres_per_unit is None else float(self.metres_per_unit)
-            return read_scan(self.scan, metres_per_unit=unit)
-        return self.scan
-
-
-@runtime_checkable
-class StagedPipeline(Protocol):
-    """A pipeline that consists of stages."""
-
-    @property
-    def name(self) -> str: ...
-
-    def stages(self, source: Source) -> list[Stage]:
-        """The stages in order. Raises WearcapError when the recording lacks an input of the pipeline."""
-        ...
-
-    def motion_of(self, results: dict[str, Any]) -> Motion | None:
-        """The motion after the stages that were run; None if there is none yet."""
-        ...
-
-    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
-        """Findings of the stages, as plain data for JSON."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -194,44 +151,3 @@ def _kept(stage: Stage, key: str, cache: StageCache | None, console: Console) ->
     except WearcapError as error:
         console.print(f"{stage.name}: {error.where} is {error.what}; it is made again", markup=False, soft_wrap=True)
         return None
-
-
-@dataclass(frozen=True, eq=False)
-class Captured:
-    """The motion and the report after the stages that were run."""
-
-    motion: Motion | None
-    report: dict[str, Any]
-
-
-@dataclass(frozen=True, eq=False)
-class StagedCapture:
-    """Runs a staged pipeline on recordings of a data set, by the interface that evaluation expects."""
-
-    pipeline: StagedPipeline
-    folder: Path
-    """Folder of the data set."""
-    scene: Path | None = None
-    """The scene's folder or point cloud; None: the one that each recording names."""
-    metres_per_unit: float | int | None = None
-    cache: Path | None = None
-    console: Console | None = None
-
-    def run(self, recording: Recording, until: str | None = None) -> Captured:
-        """Capture one recording, up to and including the stage `until`."""
-        source = Source(recording, self.folder, self._scan(recording), self.metres_per_unit)
-        cache = None if self.cache is None else StageCache(self.cache / recording.name)
-        results, runs = run_stages(self.pipeline.stages(source), cache, until, self.console)
-        report = {"pipeline": self.pipeline.name, "recording": recording.name, "stages": [vars(run) for run in runs]}
-        return Captured(self.pipeline.motion_of(results), report | self.pipeline.report(source, results))
-
-    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per recording; seeds have no effect."""
-        motions = [self.run(recording).motion for recording in recordings]
-        return [motion for motion in motions if motion is not None]
-
-    def _scan(self, recording: Recording) -> Path | None:
-        """The scene's point cloud. Raises WearcapError when the given scene has none."""
-        if self.scene is None:
-            return self.folder / recording.scene if recording.scene else None
-        return cloud_file(self.scene)

@@ -1,9 +1,8 @@
 """Callbacks, which observe a training run and do not change it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import lightning
 import torch
@@ -12,6 +11,7 @@ from lightning.pytorch import Callback
 from wearcap.metrics.scores import score
 from wearcap.metrics.table import aggregate
 from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.runtime.system import System
 from wearcap.training.base import Measured
 
 
@@ -22,12 +22,6 @@ def is_due(trainer: lightning.Trainer, every_n_epochs: int) -> bool:
     return due and trainer.is_global_zero and not trainer.sanity_checking
 
 
-class Captures(Protocol):
-    """A pipeline around the network in training."""
-
-    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]: ...
-
-
 class CaptureValidation(Callback):
     """Captures some validation recordings with the current weights; logs metrics and draws them beside ground truth.
 
@@ -36,7 +30,7 @@ class CaptureValidation(Callback):
 
     def __init__(
         self,
-        pipeline: Callable[..., Captures],
+        pipeline: Callable[..., System],
         folder: str,
         recordings: int = 4,
         max_seconds: float = 20.0,
@@ -53,7 +47,7 @@ class CaptureValidation(Callback):
             return
         pipeline = self.pipeline(**pl_module.pipeline_parts(), device=str(pl_module.device))
         recordings = self._recordings(trainer.datamodule.val_sources[0].root)  # pyright: ignore[reportAttributeAccessIssue]
-        motions = pipeline.capture(recordings, [0] * len(recordings))
+        motions = [captured.motion for captured in pipeline.capture(recordings, [0] * len(recordings))]
         rows = [score(m, r, r.name, 0) for m, r in zip(motions, recordings)]
         for key, summary in aggregate(rows).items():
             pl_module.log(f"capture/{key}", summary.mean, rank_zero_only=True)

@@ -1,8 +1,6 @@
 """ECHO's denoiser (ECHO §3.2): a diffusion transformer over human, object and contacts, with an independent noise level
 for each frame and modality."""
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -17,17 +15,10 @@ from wearcap.models.layers import (
     Widening,
     attention_mask,
 )
+from wearcap.runtime.denoising import LevelPlan, PlanGraph, StepGraph
+from wearcap.runtime.graphs import Call, Graph
 
 MODALITIES = ("human", "object", "contact")
-
-
-class EchoPlan(NamedTuple):
-    """The part of a denoising step that depends on the noise levels alone."""
-
-    worth: tuple[Float[Tensor, "batch token width"], ...]
-    """Level-dependent input scaling of each modality's encoder (`MotionEncoder.plan`)."""
-    blocks: tuple[Float[Tensor, "batch token modulation"], ...]
-    """Adaptive layer-norm modulation of each block."""
 
 
 class EchoDenoiser(nn.Module):
@@ -37,6 +28,9 @@ class EchoDenoiser(nn.Module):
     sharing the frame's position. The active object conditions each frame (ours: ECHO has one object per window), so
     that it may change within a window; frames without one get a learned null vector. `blend`: see `MotionDenoiser`.
     """
+
+    exported = False
+    """Whether the weights are in exported files, which take full windows."""
 
     def __init__(
         self,
@@ -94,17 +88,17 @@ class EchoDenoiser(nn.Module):
         scene_object = torch.where(has_object[..., None], scene_object, self.no_object)
         return self.narrow(F.gelu(wide + scene_object))
 
-    def plan(self, level: Float[Tensor, "batch time modality"]) -> EchoPlan:
+    def plan(self, level: Float[Tensor, "batch time modality"]) -> LevelPlan:
         """The part of a step that depends on the levels alone; a conveyor in steady state repeats its levels."""
         embedded = [embed(level[..., k]) for k, embed in enumerate(self.levels)]
         worth = tuple(encoder.plan(each) for encoder, each in zip(self.motion_encoders, embedded))
         together = torch.stack(embedded).sum(0)
-        return EchoPlan(worth, tuple(block.plan(together).repeat(1, self.streams, 1) for block in self.blocks))
+        return LevelPlan(worth, tuple(block.plan(together) for block in self.blocks))
 
     def step(
         self,
         x_t: Float[Tensor, "batch time feature"],
-        plan: EchoPlan,
+        plan: LevelPlan,
         encoded: Float[Tensor, "batch time width"],
         valid: Bool[Tensor, "batch time"],
     ) -> Float[Tensor, "batch time feature"]:
@@ -117,7 +111,7 @@ class EchoDenoiser(nn.Module):
         else:
             token = torch.cat([encoded + part + own for part, own in zip(tokens, self.stream)], 1)
         for block, modulation in zip(self.blocks, plan.blocks):
-            token = block(token, modulation, mask)
+            token = block(token, modulation.repeat(1, self.streams, 1), mask)
         outputs = self.norm(token).chunk(self.streams, 1)
         x0_hat = torch.cat([head(outputs[k % self.streams]) for k, head in enumerate(self.heads)], -1)
         return x0_hat if self.blend is None else self.blend(x0_hat, valid)
@@ -136,3 +130,35 @@ class EchoDenoiser(nn.Module):
         """Each modality's level, repeated for its features."""
         sizes = torch.tensor(self.sizes, device=level.device)
         return level.repeat_interleave(sizes, -1, output_size=sum(self.sizes))
+
+    def graphs(self) -> dict[str, Graph]:
+        """The parts as graphs of full windows, whose padding frames are not `valid`.
+
+        "step": x̂0 from x_t, plan, encoded and valid. "plan": columns from levels "batch 1 modality". "conditions": `encode`.
+        "objects": embedded codes of objects.
+        """
+        random, shape = torch.Generator().manual_seed(0), (2, self.window)
+        normalizer, embedded = self.condition_normalizer, len(self.no_object)
+        noise = torch.randn(*shape, len(normalizer.mean), generator=random)
+        valid = torch.arange(self.window).expand(shape) < self.window - 3
+        level = torch.rand(2, 1, len(MODALITIES), generator=random)
+        step = StepGraph(self, torch.zeros(1, 1, len(MODALITIES), device=normalizer.mean.device))
+        step_inputs = {
+            "x_t": torch.randn(*shape, sum(self.sizes), generator=random),
+            "plan": 0.1 * torch.randn(*shape, step.columns, generator=random),
+            "encoded": torch.randn(*shape, self.narrow.out_features, generator=random),
+            "valid": valid,
+        }
+        condition_inputs = {
+            "condition": normalizer.mean.cpu() + normalizer.scale.cpu() * noise,
+            "scene_object": torch.randn(*shape, embedded, generator=random),
+            "has_object": torch.rand(shape, generator=random) < 0.7,
+            "valid": valid,
+        }
+        codes = torch.randn(*shape, self.object[0].in_features, generator=random)
+        return {
+            "step": Graph(step, step_inputs),
+            "plan": Graph(PlanGraph(self), {"level": level}),
+            "conditions": Graph(Call(self, "encode"), condition_inputs),
+            "objects": Graph(self.object, {"input": codes}),
+        }

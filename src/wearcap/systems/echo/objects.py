@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.skeleton import MIRROR
+from wearcap.body.skeleton import FOOT_PATCHES, MIRROR
 from wearcap.data.surface_points import object_cloud
+from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.triangle_distance import TriangleIndex
@@ -132,3 +133,17 @@ def body_contact(
         distance, _ = shape.surface.nearest(np.ascontiguousarray(flat[near]))
         touches[torch.from_numpy(near)] = torch.from_numpy(distance) <= within_m
     return touches.unflatten(0, local.shape[:2])
+
+
+def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
+    """Recorded contact of `FOOT_PATCHES` with the floor. Raises WearcapError for a recording without it."""
+    track, motion = recording.contacts, recording.motion
+    assert motion is not None
+    if track is None or not set(FOOT_PATCHES) <= set(track.parts) or len(track.contact) != len(motion):
+        raise WearcapError(
+            "no foot contacts beside the motion",
+            where=recording.name,
+            expected=f"contacts of {', '.join(FOOT_PATCHES)}",
+            fix="Prepare the data set again.",
+        )
+    return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]

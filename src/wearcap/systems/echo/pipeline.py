@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,9 +16,13 @@ from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.formats.environment import read_environment
+from wearcap.metrics.table import Row
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import Act, true_acts
+from wearcap.runtime.graphs import chosen
+from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.environment import Environment
 from wearcap.systems.echo.features import EchoFeatures
 from wearcap.systems.echo.guidance import Guidance, GuidedScene
@@ -26,14 +31,15 @@ from wearcap.systems.echo.objects import ObjectReader, ObjectShape
 from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
 from wearcap.systems.echo.queue import Conditioning, Correction, EchoQueue, Outputs
 from wearcap.systems.echo.rewindow import Rewindow
+from wearcap.systems.echo.scores import Truth, score_echo, truth_of
 from wearcap.systems.echo.static_objects import with_static_objects
-from wearcap.systems.echo.step_runner import EchoRunner, require_runtime
+from wearcap.systems.echo.step_runner import EchoRunner
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import HeadPath, head_path
 
 
 @dataclass
-class Echo:
+class Echo(LearnedSystem):
     """Captures recordings with a rolling schedule over frames (the conveyor); batching does not change results."""
 
     net: EchoDenoiser
@@ -70,9 +76,18 @@ class Echo:
     placed: bool = False
     """Whether the objects' initial poses in the environment count as observed (ours; ECHO has no initial poses)."""
     runtime: str = "eager"
-    """How denoising steps are run: see `systems.echo.step_runner`."""
+    """Backend of the denoising steps (`runtime.graphs.RUNTIMES`)."""
+    precision: str = "float32"
+    """Number format of the steps' matrix products (`runtime.graphs.PRECISIONS`)."""
     device: str = "cpu"
     _runner: EchoRunner | None = field(default=None, init=False, repr=False, compare=False)
+    _environments: dict[Path, Environment] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _reader: ObjectReader | None = field(default=None, init=False, repr=False, compare=False)
+
+    name = "echo"
+    experiment = "experiment=echo"
+    shared = ("echo",)
+    baselines = ()
 
     def __post_init__(self):
         if isinstance(self.acts, str) and self.acts not in ("truth", "none"):
@@ -88,7 +103,7 @@ class Echo:
             raise WearcapError(
                 "step=redraw with windows that are denoised from scratch", expected="step=posterior, or rewindow=null"
             )
-        require_runtime(self.runtime, self.device)
+        chosen(self.runtime, self.precision, self.device)
 
     @property
     def rolling(self) -> RollingSchedule:
@@ -119,16 +134,40 @@ class Echo:
         """Move the network to its device and set up its runtime; exporting or compiling happens once."""
         self.net.to(self.device).eval()
         if self._runner is None or self.runtime == "eager":
-            self._runner = EchoRunner(self.net, self.runtime)
+            self._runner = EchoRunner(self.net, self.runtime, self.precision)
 
     def reader(self) -> ObjectReader:
         """A reader that turns objects into embedded conditions for the network, each once."""
         self.prepare()
         return ObjectReader(self.features, self.encoder, lambda codes: self.net.object(codes.to(self.device)).cpu())
 
-    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
-        """One motion of the human alone per (recording, seed); with objects: `capture_scenarios`."""
-        return self.capture_scenarios([Scenario(recording) for recording in recordings], seeds)
+    def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
+        """One motion per recording and seed, with the objects of the recordings' environments."""
+        once = {id(source): self.scenario_of(source) for source in sources}
+        return self.capture_scenarios([once[id(source)] for source in sources], seeds)
+
+    def scenario_of(self, source: CaptureInput) -> Scenario:
+        """A recording of a data set with its active objects, according to `acts`. Raises WearcapError as `objects`."""
+        return self.scenario(source.recording, self.objects(source))
+
+    def objects(self, source: CaptureInput) -> Environment | None:
+        """The objects of a recording; each file is read once. Raises WearcapError for a file that cannot be read."""
+        path = source.environment_file(self.environment)
+        if path is not None and path not in self._environments:
+            self._environments[path] = read_environment(path)
+        return None if path is None else self._environments[path]
+
+    def truth(self, motion: Motion, source: CaptureInput) -> Truth:
+        """The ground truth at a capture's frames, whichever active objects the capture was conditioned on."""
+        self._reader = self._reader or self.reader()
+        environment, recording = self.objects(source), source.recording
+        has_objects = environment is not None and bool(recording.object_motion)
+        acts = tuple(true_acts(recording)) if has_objects else ()
+        return truth_of(Scenario(recording, environment, acts), motion.timestamps, self._reader)
+
+    def score(self, motion: Motion, source: CaptureInput, seed: int) -> Row:
+        """ECHO's metrics of one capture (ECHO §4.1)."""
+        return score_echo(motion, self.truth(motion, source), source.recording.name, seed)
 
     def _listed_acts(self) -> tuple[Act, ...]:
         if isinstance(self.acts, str) or callable(self.acts):

@@ -30,9 +30,8 @@ from wearcap.recording.acts import active_at
 from wearcap.recording.timing import at_times
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact
+from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact, foot_patches
 from wearcap.systems.echo.observations import Observed, Scenario
-from wearcap.systems.echo.training_windows import foot_patches
 
 MEASURES = (
     "mpjpe_mm",

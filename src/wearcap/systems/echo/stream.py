@@ -21,7 +21,7 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
 from wearcap.recording.acts import SAME_S
 from wearcap.recording.timing import joined
-from wearcap.runtime.onnx import undisturbed
+from wearcap.runtime.graphs import undisturbed
 from wearcap.scene.environment import Environment
 from wearcap.scene.object_mesh import check_object
 from wearcap.sensors.packets import (

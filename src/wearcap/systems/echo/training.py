@@ -19,6 +19,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, Body, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser
+from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.training_windows import EchoDataset, EchoWindow
 from wearcap.training import losses
 from wearcap.training.base import SeededSteps, WeighedTerms
@@ -33,6 +34,9 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
     "skate" are distances in metres (its last three); "velocity" of the joints is ours. Frames without an active
     object do not count in the object terms.
     """
+
+    system = Echo
+    """The system that captures with the network."""
 
     def __init__(
         self,

@@ -26,7 +26,7 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.scene.environment import Environment
 from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, POINTS, Body, EchoFeatures, ThreePoints
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact, object_poses
+from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact, foot_patches, object_poses
 
 MIN_FRAMES = 6
 """Length of the shortest training window (frames)."""
@@ -147,20 +147,6 @@ def echo_track(
         active,
         Rigid(R, t),
     )
-
-
-def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
-    """Recorded contact of `FOOT_PATCHES` with the floor. Raises WearcapError for a recording without it."""
-    track, motion = recording.contacts, recording.motion
-    assert motion is not None
-    if track is None or not set(FOOT_PATCHES) <= set(track.parts) or len(track.contact) != len(motion):
-        raise WearcapError(
-            "no foot contacts beside the motion",
-            where=recording.name,
-            expected=f"contacts of {', '.join(FOOT_PATCHES)}",
-            fix="Prepare the data set again.",
-        )
-    return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]
 
 
 class EchoDataset(Dataset):

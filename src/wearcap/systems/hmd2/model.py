@@ -16,6 +16,8 @@ from wearcap.models.layers import (
     Widening,
     attention_mask,
 )
+from wearcap.runtime.denoising import LevelPlan, PlanGraph, StepGraph
+from wearcap.runtime.graphs import Graph
 
 
 class Conditions(NamedTuple):
@@ -76,15 +78,6 @@ class ConditionEncoder(nn.Module):
         if self.image is not None:
             wide = wide + self.image(conditions.image, conditions.image_valid & valid)
         return self.narrow(F.gelu(wide))
-
-
-class LevelPlan(NamedTuple):
-    """The part of a step that depends on the noise level alone; with one level per step all windows share it."""
-
-    worth: Float[Tensor, "batch #token width"]
-    """Per-channel scale of the encoded x_t (`MotionEncoder.plan`)."""
-    blocks: tuple[Float[Tensor, "batch #token modulation"], ...]
-    """Modulation of every adaptive transformer block."""
 
 
 class MotionDenoiser(nn.Module):
@@ -160,7 +153,7 @@ class MotionDenoiser(nn.Module):
         k = self.frames_per_token
         token_level = level if level.shape[1] == 1 else level.unflatten(1, (-1, k)).mean(-1)
         embedded = self.level(token_level)
-        return LevelPlan(self.motion_encoder.plan(embedded), tuple(block.plan(embedded) for block in self.blocks))
+        return LevelPlan((self.motion_encoder.plan(embedded),), tuple(block.plan(embedded) for block in self.blocks))
 
     def step(
         self,
@@ -175,8 +168,28 @@ class MotionDenoiser(nn.Module):
         mask = attention_mask(valid.unflatten(1, (-1, self.frames_per_token)).any(-1))
         if self.self_conditioning:
             x_t = torch.cat([x_t, torch.zeros_like(x_t) if last is None else last], -1)
-        token = encoded + self.motion_encoder(x_t, plan.worth, valid)
+        token = encoded + self.motion_encoder(x_t, plan.worth[0], valid)
         for block, modulation in zip(self.blocks, plan.blocks):
             token = block(token, modulation, mask)
         x0_hat = self.head(self.norm(token)).reshape(batch, time, -1)
         return x0_hat if self.blend is None else self.blend(x0_hat, valid)
+
+    def graphs(self) -> dict[str, Graph]:
+        """The parts of a denoising step as graphs.
+
+        "step": x̂0 from x_t, plan (that all windows share), encoded, valid, and last with self-conditioning. "plan":
+        columns from levels "batch 1".
+        """
+        random = torch.Generator().manual_seed(0)
+        tokens, width = self.window // self.frames_per_token, self.motion_encoder.linear.out_features
+        x_t, last = torch.randn(2, 2, self.window, self.motion_size, generator=random)
+        level = torch.rand(2, 1, generator=random)
+        step = StepGraph(self, torch.zeros(1, 1, device=self.motion_normalizer.mean.device))
+        inputs = {
+            "x_t": x_t,
+            "plan": 0.1 * torch.randn(1, 1, step.columns, generator=random),
+            "encoded": torch.randn(2, tokens, width, generator=random),
+            "valid": torch.arange(self.window).expand(2, -1) < self.window - 3,
+        }
+        inputs |= {"last": last} if self.self_conditioning else {}
+        return {"step": Graph(step, inputs, shared=("plan",)), "plan": Graph(PlanGraph(self), {"level": level})}

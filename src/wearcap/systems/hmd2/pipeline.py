@@ -19,6 +19,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import Motion, Recording
+from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.voxels import voxelize
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
@@ -32,7 +33,7 @@ MODALITIES = ("points", "images")
 
 
 @dataclass
-class HMD2:
+class HMD2(LearnedSystem):
     """Captures whole recordings in overlapping windows (thesis eq. 6.5); its fields also set up streams."""
 
     net: MotionDenoiser
@@ -66,11 +67,15 @@ class HMD2:
     """Frames that must follow a pose before it is final (ours): the next frames show where the feet are going.
     None: half of the overlap, so that poses come from the windows' middle; with `inpaint` none."""
     runtime: str = "eager"
-    """Backend of the denoising steps (`systems.hmd2.step_runner.RUNTIMES`); all but eager take seconds to start."""
+    """Backend of the denoising steps (`runtime.graphs.RUNTIMES`)."""
     precision: str = "auto"
-    """Number format of the steps' matrix products (`systems.hmd2.step_runner.PRECISIONS`)."""
+    """Number format of the steps' matrix products (`runtime.graphs.PRECISIONS`)."""
     device: str = "cpu"
     _steps: StepRunner | None = field(default=None, init=False, repr=False, compare=False)
+
+    name = "hmd2"
+    experiment = "experiment=hmd2"
+    shared = ("hmd2",)
 
     def __post_init__(self):
         if unknown := set(self.use) - set(MODALITIES):
@@ -99,9 +104,6 @@ class HMD2:
             )
         return lookahead_frames
 
-    def __call__(self, recording: Recording, seed: int = 0) -> Motion:
-        return self.capture([recording], [seed])[0]
-
     def prepare(self) -> None:
         """Move the network to its device and set up its runtime, as every capture does first.
 
@@ -118,9 +120,10 @@ class HMD2:
         return self._steps.undisturbed()
 
     @torch.inference_mode()
-    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per (recording, seed); recordings share batches, which does not change the results."""
+    def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
+        """One motion per recording and seed."""
         self.prepare()
+        recordings = [source.recording for source in sources]
         # 1. head path and floor; 2. codes of the points around the body; 3. image embeddings; once for all seeds
         once = {id(recording): recording for recording in recordings}
         path_of = {key: head_path(recording, self.skeleton, self.fps) for key, recording in once.items()}

@@ -17,6 +17,7 @@ from wearcap.errors import WearcapError
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.systems.hmd2.features import HeadFeatures, feature_statistics
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.training import losses
 from wearcap.training.base import SeededSteps, WeighedTerms
 
@@ -33,6 +34,9 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
     by their null vector with probability `drop` per window, so that one checkpoint runs with any subset of them.
     A window's last frames weigh up to 1 + `tail` in the loss (ours): with small strides they are the output.
     """
+
+    system = HMD2
+    """The system that captures with the network."""
 
     def __init__(
         self,

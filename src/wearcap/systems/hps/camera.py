@@ -16,7 +16,8 @@ from wearcap.localization.localizer import Localizer, LocalizerSettings, localiz
 from wearcap.localization.visual_map import VisualMap
 from wearcap.recording import CameraStream, Recording
 from wearcap.recording.recording import Localization
-from wearcap.runtime.stages import Source, Stage
+from wearcap.runtime.stages import Stage
+from wearcap.runtime.system import CaptureInput
 from wearcap.sensors.claps import camera_claps, detect_claps
 from wearcap.sensors.clock import Clock, fit_clock, retime
 from wearcap.sensors.imu import synthesize_imu
@@ -181,9 +182,9 @@ class MapLocalization:
         )
 
 
-def camera_stages(source: Source, synchronization: Synchronization, localize: Localize) -> list[Stage]:
+def camera_stages(source: CaptureInput, synchronization: Synchronization, localize: Localize) -> list[Stage]:
     """Stages `synchronize` and `localize`. Raises WearcapError when localisation is impossible."""
-    recording, folder = source.recording, source.folder
+    recording, folder = source.recording, source.folder or Path()
     localize.reads(recording, folder)
     return [
         Stage(

@@ -4,7 +4,8 @@ The steps of the thesis in order: synchronize → localize → align → initial
 called alone, and a stage whose result can be cached.
 """
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,11 @@ from wearcap.optimize.feet import FootPatches
 from wearcap.optimize.hps import HpsData, HpsEnergy, HpsState
 from wearcap.optimize.solution import Solution
 from wearcap.recording import Motion, Recording
+from wearcap.recording.growing import follow_pieces
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import resampled
-from wearcap.runtime.stages import Source, Stage, run_stages
+from wearcap.runtime.stages import Stage
+from wearcap.runtime.system import CaptureInput, StagedSystem
 from wearcap.scene.scan import Scan
 from wearcap.sensors.alignment import align_suit, estimate_head_camera, inliers, yaw_between
 from wearcap.sensors.clock import Clock
@@ -56,7 +59,7 @@ class Evidence:
 
 
 @dataclass(eq=False)
-class HPS:
+class HPS(StagedSystem):
     """Registers the suit's motion of a recording with the scene."""
 
     energy: HpsEnergy
@@ -68,14 +71,7 @@ class HPS:
     synchronization: Synchronization = field(default_factory=Synchronization)
     localization: Localize = field(default_factory=MapLocalization)
 
-    def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
-        """Return the wearer's motion in the scene at `fps`; `folder` is the data set's. Raises WearcapError as
-        `stages`."""
-        source = Source(recording, folder, scan)
-        results, _ = run_stages(self.stages(source))
-        return self.motion(results["initialize"], results["optimize"])
-
-    def stages(self, source: Source) -> list[Stage]:
+    def stages(self, source: CaptureInput) -> list[Stage]:
         """The steps from a recording to the solution.
 
         Raises WearcapError without suit, head camera, localisation or map, or a scan where the energy asks for one.
@@ -124,7 +120,7 @@ class HPS:
             return self.motion(results["initialize"], results["optimize"])
         return results["initialize"].motion if "initialize" in results else results.get("align")
 
-    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
+    def report(self, source: CaptureInput, results: dict[str, Any]) -> dict[str, Any]:
         """Clock, share of localised frames, alignment angle, energy by term and iteration, and the stopping reason."""
         about = camera_report(results)
         if "align" in results:
@@ -134,6 +130,11 @@ class HPS:
         if "optimize" in results:
             about |= {"stopped": results["optimize"].reason, "energy": results["optimize"].history}
         return about
+
+    def follow(self, folder: Path, scan: Scan | None, refused: Counter[str]) -> Iterator[Motion]:
+        """Final pieces of motion of a recording that still grows in a folder; `refused` counts unusable pieces."""
+        pieces = follow_pieces(folder, refused=refused)
+        return self._room("stream", "captures streams").follow(self, pieces, scan, folder, refused=refused)
 
     def synchronize(self, recording: Recording, folder: Path) -> Clock | None:
         """Map from the camera's clock to the suit's, by claps (thesis §4.3.4); None where they share one clock."""
@@ -191,7 +192,7 @@ class HPS:
             scan.surface if scan else None,
         )
 
-    def _problem_of(self, source: Source, results: dict[str, Any]) -> HpsData:
+    def _problem_of(self, source: CaptureInput, results: dict[str, Any]) -> HpsData:
         recording = on_one_clock(source.recording, results)
         return self.problem(recording, results["align"], results["initialize"], source.read_scan())
 

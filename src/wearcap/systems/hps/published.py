@@ -1,16 +1,15 @@
 """Baselines of HPS (thesis §4.5.1): the suit alone, and the suit translated by the camera."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory, filled, interpolate
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
-from wearcap.runtime.stages import Source, Stage, run_stages
-from wearcap.scene.scan import Scan
+from wearcap.runtime.stages import Stage
+from wearcap.runtime.system import CaptureInput, StagedSystem
 from wearcap.sensors.alignment import align_suit, body_camera, inliers
 from wearcap.systems.hps.camera import (
     Localize,
@@ -25,7 +24,7 @@ from wearcap.systems.hps.pipeline import mount, require, required
 KINDS = ("imu", "imu_cam", "imu_cam_filtered")
 
 
-class PlacedSuit(ABC):
+class PlacedSuit(StagedSystem):
     """A pipeline that places the suit's motion in the scene in one step after the first two of HPS."""
 
     fps: float
@@ -41,11 +40,7 @@ class PlacedSuit(ABC):
     def place(self, recording: Recording) -> Motion:
         """The suit's motion in the scene."""
 
-    def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
-        """Return the suit's motion in the scene. Raises WearcapError as `stages`."""
-        return run_stages(self.stages(Source(recording, folder, scan)))[0]["place"]
-
-    def stages(self, source: Source) -> list[Stage]:
+    def stages(self, source: CaptureInput) -> list[Stage]:
         """The first two stages of HPS, then `place`. Raises WearcapError as HPS does."""
         recording = source.recording
         require(recording, "suit", "camera")
@@ -63,7 +58,7 @@ class PlacedSuit(ABC):
         """The motion, once it has been placed."""
         return results.get("place")
 
-    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
+    def report(self, source: CaptureInput, results: dict[str, Any]) -> dict[str, Any]:
         """Clock and share of localised frames."""
         return camera_report(results)
 

@@ -12,7 +12,7 @@ from wearcap.metrics.scores import score
 from wearcap.metrics.surface import foot_surface, foot_vertices
 from wearcap.recording import Motion, Recording
 from wearcap.recording.locate import dataset_folder, load_recording
-from wearcap.runtime.stages import Source, run_stages
+from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps.camera import Localize
 from wearcap.systems.hps.pipeline import HPS
@@ -58,8 +58,8 @@ class HpsValidation(Callback):
 def validated(pipeline: HPS, where: str) -> dict[str, float]:
     """Scores of one recording by name with unit; NaN for those whose ground truth or scan is missing."""
     recording, folder = load_recording(where), dataset_folder(where)
-    source = Source(recording, folder, folder / recording.scene if recording.scene else None)
-    results, _ = run_stages(pipeline.stages(source))
+    source = CaptureInput.in_dataset(recording, folder)
+    results = pipeline.results(source)
     motion, nan = pipeline.motion(results["initialize"], results["optimize"]), float("nan")
     feet = surface_scores(motion, recording, source.read_scan())
     scores = score(motion, recording, where, 0).scores if recording.motion is not None else {}

@@ -32,6 +32,10 @@ class ContactNetwork(nn.Module):
         """Calibrated probabilities: sigmoid of the logits divided by a temperature fitted on validation data."""
         return (self(pose) / self.temperature).sigmoid()
 
+    def middle_probability(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch hand class"]:
+        """Calibrated probabilities of the middle one of 61 frames."""
+        return self.probability(pose)[:, 0]
+
     def normalize_on(self, pose: Float[Tensor, "batch time feature"]) -> None:
         """Set the statistics that normalise the inputs; the thesis's network has none."""
 

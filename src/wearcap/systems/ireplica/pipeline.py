@@ -3,7 +3,7 @@
 The steps of the thesis in order, each a stage: those of the registration (HPS) → contacts → interact.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,23 +12,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.io.formats.environment import FILE_NAME, read_environment
-from wearcap.recording import Motion, Recording
+from wearcap.io.formats.environment import read_environment
+from wearcap.metrics.table import Row
+from wearcap.recording import Motion
 from wearcap.recording.timing import resampled
-from wearcap.runtime.stages import Source, Stage, StagedPipeline, run_stages
+from wearcap.runtime.stages import Stage, run_stages
+from wearcap.runtime.system import CaptureInput, StagedSystem
 from wearcap.scene.environment import Environment
-from wearcap.scene.scan import Scan
+from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.object_tracker import ObjectTracker
+from wearcap.systems.ireplica.scores import with_interactions
 
 Predictor = Callable[[Motion], dict[str, Float[Tensor, "time hand"]]]
 """Contact probabilities by class, at a motion's frames, from its pose alone."""
 
 
 @dataclass(eq=False)
-class IReplica:
+class IReplica(StagedSystem):
     """Captures the wearer and the objects that the wearer moves."""
 
-    registration: StagedPipeline
+    registration: StagedSystem
     """HPS, or another pipeline that registers the wearer in the scene."""
     predictor: Predictor
     tracker: ObjectTracker
@@ -38,13 +41,16 @@ class IReplica:
     """Frame rate of contacts, objects and output motion, independent of the registration's."""
     name: str = "ireplica"
 
-    def __call__(self, recording: Recording, scan: Scan | None = None, folder: Path = Path()) -> Motion:
-        """Return the wearer's motion with `object_motion` and `interactions` at `fps`. Raises WearcapError as
-        `stages`."""
-        results, _ = run_stages(self.stages(Source(recording, folder, scan)))
-        return results["interact"]
+    experiment = "experiment=contact_sequence, or of the contact transformers, one for each class"
+    shared = ("contact_sequence",)
+    joins_checkpoints = True
 
-    def stages(self, source: Source) -> list[Stage]:
+    @classmethod
+    def trained(cls, make: Callable[..., "IReplica"], checkpoints: Sequence[str | Path], device: str) -> "IReplica":
+        """`make`, the configured constructor, with the contact networks of checkpoints, one per class of interaction."""
+        return make(predictor=ContactPredictor.load(*checkpoints))
+
+    def stages(self, source: CaptureInput) -> list[Stage]:
         """The registration's stages, then `contacts` and `interact`. Raises WearcapError as those, and without
         environment."""
         environment = read_environment(self.environment_file(source))
@@ -61,25 +67,23 @@ class IReplica:
             ),
         ]
 
-    def environment_file(self, source: Source) -> Path:
+    def environment_file(self, source: CaptureInput) -> Path:
         """Path of the environment file. Raises WearcapError if neither the pipeline nor the recording names one."""
-        if self.environment is not None:
-            path = Path(self.environment)
-            return path / FILE_NAME if path.is_dir() else path
-        if source.recording.environment is None:
+        path = source.environment_file(self.environment)
+        if path is None:
             raise WearcapError(
                 "no objects that can be moved",
                 where=source.recording.name,
                 expected="a recording that names its environment, or pipeline.environment=FILE",
                 fix="Make one with `wearcap scene`.",
             )
-        return source.folder / source.recording.environment
+        return path
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
         """Motion with objects after the last stage; before it, the registration's motion."""
         return results["interact"] if "interact" in results else self.registration.motion_of(results)
 
-    def report(self, source: Source, results: dict[str, Any]) -> dict[str, Any]:
+    def report(self, source: CaptureInput, results: dict[str, Any]) -> dict[str, Any]:
         """The registration's report, and the list of interactions."""
         about = self.registration.report(source, results)
         if "interact" in results:
@@ -91,7 +95,11 @@ class IReplica:
             ]
         return about
 
-    def registered(self, source: Source) -> Motion:
+    def score(self, motion: Motion, source: CaptureInput, seed: int) -> Row:
+        """The common scores, and means over handlings for recordings with true interactions (thesis Tables 5.1, 5.2)."""
+        return with_interactions(super().score(motion, source, seed), motion, source, self.environment)
+
+    def registered(self, source: CaptureInput) -> Motion:
         """The wearer's motion in the scene, without objects. Raises WearcapError as the registration does."""
         results, _ = run_stages(self.registration.stages(source))
         motion = self.registration.motion_of(results)

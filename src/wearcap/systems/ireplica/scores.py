@@ -21,15 +21,13 @@ from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.io.formats.environment import read_environment
 from wearcap.metrics.interaction import Handling, contact_mean, handlings, object_error, summary
 from wearcap.metrics.position import mpjpe_cm
-from wearcap.metrics.scores import Measure, score
 from wearcap.metrics.table import Row
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import at_times
-from wearcap.runtime.stages import Source
+from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
 from wearcap.systems.ireplica.object_tracker import PALMS
-from wearcap.systems.ireplica.pipeline import IReplica
 
 SETTLED_S = 0.6
 """Time (s) after an object's release at which its final pose is scored, or when it is taken again if that is earlier:
@@ -83,18 +81,13 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
     return InteractionScores(tuple(scored), joints, body, objects, _false_moves(environment, held.objects, found))
 
 
-def with_interactions(pipeline: IReplica, folder: Path) -> Measure:
-    """Measure of the common scores, and of means over handlings for recordings with true interactions."""
-
-    def measure(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
-        row = score(motion, recording, name, seed)
-        if recording.interactions is None:
-            return row
-        environment = read_environment(pipeline.environment_file(Source(recording, folder)))
-        scores = score_interactions(motion, recording, environment)
-        return replace(row, scores=row.scores | summary(scores.handlings))
-
-    return measure
+def with_interactions(row: Row, motion: Motion, source: CaptureInput, environment: str | Path | None) -> Row:
+    """A row of scores with means over handlings, for recordings with true interactions and objects."""
+    path = source.environment_file(environment)
+    if source.recording.interactions is None or path is None:
+        return row
+    scores = score_interactions(motion, source.recording, read_environment(path))
+    return replace(row, scores=row.scores | summary(scores.handlings))
 
 
 def poses_at(track: Trajectory | None, scene_object: SceneObject, timestamps: Float64[Tensor, "time"]) -> Rigid:

@@ -10,7 +10,10 @@ from torch.nn import functional as F
 from wearcap.data.statistics import collate
 from wearcap.geometry import rotation
 from wearcap.metrics.detection import mean_detection_scores
+from wearcap.runtime.graphs import Exports
 from wearcap.systems.ireplica.contact_network import REACH, ContactNetwork
+from wearcap.systems.ireplica.contact_prediction import ContactDetector
+from wearcap.systems.ireplica.export import exports
 from wearcap.systems.ireplica.features import PoseFeatures
 from wearcap.systems.ireplica.training_windows import ContactDataset, ContactWindow
 from wearcap.training.base import GivenOptimizer, SeededSteps
@@ -34,6 +37,10 @@ class ContactDetection(SeededSteps, GivenOptimizer):
         self.features, self.classes, self.fps, self.seed = features, tuple(classes), fps, seed
         self._optimizer, self._scheduler = optimizer, scheduler
         self._validated: list[tuple[Tensor, Tensor]] = []
+
+    def exports(self) -> Exports:
+        """The contact network as a graph."""
+        return exports(ContactDetector(self.net.eval(), self.features, self.classes, self.fps))
 
     def set_statistics(self, dataset: ContactDataset, limit: int = 400) -> None:
         """Set the input normalisation from a training split; a resumed run restores it with the weights."""

@@ -10,7 +10,7 @@ from lightning.pytorch import Callback
 from wearcap.io.formats.environment import read_environment
 from wearcap.metrics.interaction import summary
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.runtime.stages import Source
+from wearcap.runtime.system import CaptureInput
 from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactPredictor
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.scores import score_interactions
@@ -29,7 +29,7 @@ class IReplicaValidation(Callback):
     def __init__(self, pipeline: Callable[..., IReplica], recordings: int = 2, every_n_epochs: int = 10):
         """`pipeline` builds iReplica for a `predictor`."""
         self.pipeline, self.recordings, self.every_n_epochs = pipeline, recordings, every_n_epochs
-        self._registered: list[tuple[Recording, Source, Motion]] | None = None
+        self._registered: list[tuple[Recording, CaptureInput, Motion]] | None = None
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: ContactDetection) -> None:
         if not is_due(trainer, self.every_n_epochs):
@@ -48,7 +48,7 @@ class IReplicaValidation(Callback):
         for name, value in summary(rows).items() if rows else ():
             pl_module.log(f"ireplica/{name}", value, rank_zero_only=True)
 
-    def _motions(self, pipeline: IReplica, store: RecordingStore) -> list[tuple[Recording, Source, Motion]]:
+    def _motions(self, pipeline: IReplica, store: RecordingStore) -> list[tuple[Recording, CaptureInput, Motion]]:
         """The first recordings of the validation split, registered by HPS."""
         if self._registered is None:
             self._registered = []
@@ -58,13 +58,12 @@ class IReplicaValidation(Callback):
                 recording = store.load(name)
                 if not fit(recording, store.root):
                     continue
-                scan = store.root / recording.scene if recording.scene else None
-                source = Source(recording, store.root, scan)
+                source = CaptureInput.in_dataset(recording, store.root)
                 self._registered.append((recording, source, pipeline.registered(source)))
         return self._registered
 
     @staticmethod
-    def _tracked(pipeline: IReplica, recording: Recording, source: Source, motion: Motion):
+    def _tracked(pipeline: IReplica, recording: Recording, source: CaptureInput, motion: Motion):
         environment = read_environment(pipeline.environment_file(source))
         assert recording.suit is not None
         captured = pipeline.interact(motion, pipeline.contacts(recording.suit), environment)

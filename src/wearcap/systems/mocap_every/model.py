@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from wearcap.models.layers import Normalizer, TemporalBlend
 from wearcap.models.pose_regressor import PoseRegressor
+from wearcap.runtime.graphs import Graph
 
 ENDS_SIZE = 12
 """Size of the positions of two hands and two feet."""
@@ -145,3 +146,22 @@ class LastPoseEstimator(WatchEstimator):
 
 
 TrainedEstimator = TwoStageEstimator | LastPoseEstimator
+
+
+class EstimatorOutput(nn.Module):
+    """Motion and contact logits of an estimator's last frames, in one tensor."""
+
+    def __init__(self, net: WatchEstimator):
+        super().__init__()
+        self.net = net
+
+    def forward(self, features: Float[Tensor, "batch window feature"]) -> Float[Tensor, "batch predicted value"]:
+        output = self.net(features)
+        return torch.cat([output.motion, output.contact_logit], -1)
+
+
+def estimator_graph(net: WatchEstimator, size: int) -> Graph:
+    """An estimator as a graph of unnormalised features, `size` per frame."""
+    normalizer, random = net.feature_normalizer, torch.Generator().manual_seed(0)
+    noise = torch.randn(2, net.window, size, generator=random)
+    return Graph(EstimatorOutput(net), {"features": normalizer.mean.cpu() + normalizer.scale.cpu() * noise})

@@ -10,15 +10,19 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import interpolate_clamped
+from wearcap.metrics.scores import score_in_world
+from wearcap.metrics.table import Row
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import FloorTrack
 from wearcap.recording.timing import at_times
-from wearcap.runtime.onnx import Runner, missing_libraries, onnx_runner
+from wearcap.runtime.graphs import Run, chosen, run_of
+from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.floor_update import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
 from wearcap.sensors.watches import watches_at
 from wearcap.systems.mocap_every.energy import LatentSolution
 from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists
-from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
+from wearcap.systems.mocap_every.model import FEET as CONTACTS
+from wearcap.systems.mocap_every.model import Estimate, WatchEstimator, estimator_graph
 from wearcap.systems.mocap_every.visual_cues import VisualCues
 from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
 from wearcap.tracking.anchor import anchored_to_head
@@ -29,8 +33,8 @@ FLOORS = ("follow", "update", "points", "fixed")
 
 
 @dataclass(frozen=True, eq=False)
-class Captured:
-    """Result of capturing one recording."""
+class CapturedWithFloor:
+    """Motion of one recording, with the floor and the edits that it came from."""
 
     motion: Motion
     floor: FloorTrack
@@ -40,7 +44,7 @@ class Captured:
 
 
 @dataclass
-class MocapEvery:
+class MocapEvery(LearnedSystem):
     """Captures recordings: the estimator runs on overlapping windows, the floor is updated from window to window."""
 
     net: WatchEstimator
@@ -62,20 +66,18 @@ class MocapEvery:
     cues: VisualCues | None = None
     """Motion editing by the recording's keypoints (§3.4); None: no editing."""
     runtime: str = "eager"
-    """eager: PyTorch. onnx: ONNX Runtime on the CPU, which takes some seconds to start."""
-    int8: bool = False
-    """Whether ONNX Runtime uses int8 weights and products."""
+    """Backend of the network (`runtime.graphs.RUNTIMES`)."""
+    precision: str = "float32"
+    """Number format of the network's matrix products (`runtime.graphs.PRECISIONS`)."""
     device: str = "cpu"
-    _runner: Runner | None = field(default=None, init=False, repr=False, compare=False)
+    _run: Run | None = field(default=None, init=False, repr=False, compare=False)
+
+    name = "mocap_every"
+    experiment = "experiment=mocap_every"
+    shared = ("mocap_every",)
 
     def __post_init__(self):
-        if self.runtime not in ("eager", "onnx"):
-            raise WearcapError(f"no runtime {self.runtime!r}", expected="eager or onnx")
-        if self.runtime == "onnx" and (missing := missing_libraries()):
-            raise WearcapError(
-                f"runtime 'onnx' needs {', '.join(missing)}",
-                fix='Run: pip install "wearcap[export]", or choose pipeline.runtime=eager.',
-            )
+        self._backend = chosen(self.runtime, self.precision, self.device)
         if self.floor not in FLOORS:
             raise WearcapError(f"no floor {self.floor!r}", expected=f"one of {', '.join(FLOORS)}")
         if not 0 < self.stride <= self.net.window or not 0 <= self.lookahead <= self.net.window - self.stride:
@@ -84,26 +86,22 @@ class MocapEvery:
                 expected="a stride from 1 to the window, and a lookahead of at most the overlap of two windows",
             )
 
-    def __call__(self, recording: Recording, seed: int = 0) -> Motion:
-        return self.capture([recording], [seed])[0]
-
     def prepare(self) -> None:
-        """Move the network to its device and build the ONNX runner if needed (once)."""
+        """Move the network to its device and set up its runtime, compiled or exported once."""
         self.net.to(self.device).eval()
-        if self.runtime == "onnx" and self._runner is None:
-            size, window = self.features.size, self.net.window
-            self._runner = onnx_runner(self.net, {"features": torch.zeros(2, window, size)}, int8=self.int8)
+        if self._run is None and self._backend != ("eager", "float32"):
+            self._run = run_of(estimator_graph(self.net, self.features.size), *self._backend)
 
     @torch.inference_mode()
-    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
+    def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
         """One motion per recording; the seeds have no effect.
 
         Raises WearcapError for a recording without head poses, or whose watches are missing, silent or swapped.
         """
-        return [self.run(recording).motion for recording in recordings]
+        return [self.run(source.recording).motion for source in sources]
 
     @torch.inference_mode()
-    def run(self, recording: Recording) -> Captured:
+    def run(self, recording: Recording) -> CapturedWithFloor:
         """Capture one recording, with floor and editing results. Raises as `capture` does."""
         self.prepare()
         # 1. head path and watches on a common clock
@@ -127,13 +125,17 @@ class MocapEvery:
         edits: list[LatentSolution] = []
         if self.cues is not None:
             motion, edits = self.cues.edit(motion, recording, path.T_world_head)
-        return Captured(motion, FloorTrack(path.timestamps, whole.floor_height), edits)
+        return CapturedWithFloor(motion, FloorTrack(path.timestamps, whole.floor_height), edits)
+
+    def score(self, motion: Motion, source: CaptureInput, seed: int) -> Row:
+        """All metrics in the world, without anchoring or alignment (MocapEvery §4.1)."""
+        return score_in_world(motion, source.recording, source.recording.name, seed)
 
     def estimate(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
         """Run the network; the prediction is on the CPU."""
-        if self._runner is not None:
-            motion, contact, *ends = self._runner(features)
-            return Estimate(motion, contact, ends[0] if ends else None)
+        if self._run is not None:
+            output = self._run(features=features.to(self.device)).cpu()
+            return Estimate(output[..., :-CONTACTS], output[..., -CONTACTS:], None)
         output = self.net(features.to(self.device))
         return Estimate(*(part if part is None else part.cpu() for part in output))
 

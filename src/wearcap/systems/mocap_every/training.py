@@ -13,6 +13,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.data.statistics import MIN_SCALE, collate
 from wearcap.systems.mocap_every.features import ENDS, Canonical, WatchFeatures, to_world
 from wearcap.systems.mocap_every.model import TrainedEstimator
+from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.training_windows import WatchDataset, WatchWindow
 from wearcap.training.base import SeededSteps, WeighedTerms
 from wearcap.training.losses import EPSILON_M2
@@ -27,6 +28,9 @@ class WatchRegression(SeededSteps, WeighedTerms):
     """
 
     _joint_weights: Tensor
+
+    system = MocapEvery
+    """The system that captures with the network."""
 
     def __init__(
         self,

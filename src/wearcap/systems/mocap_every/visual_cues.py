@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Float64, Int64
@@ -11,6 +12,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import nearest_frames
+from wearcap.models.checkpoint import load_network
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Cue
 from wearcap.systems.mocap_every.energy import (
@@ -223,3 +225,14 @@ def _foot_contact(motion: Motion) -> Float[Tensor, "time foot"]:
     if motion.contact_prob is None:
         return torch.zeros(len(motion), FEET)
     return motion.contact_prob.unflatten(-1, (FEET, -1)).amax(-1)
+
+
+def load_visual_cues(
+    manifold: str, weights: LatentWeights | None = None, solver: LatentSolver | None = None, **settings: Any
+) -> VisualCues:
+    """An editor in the manifold of a checkpoint of experiment=motion_manifold; see `VisualCues` for the settings.
+
+    Raises WearcapError for another checkpoint.
+    """
+    net = load_network(manifold, MotionManifold, "motion_manifold")
+    return VisualCues(net, weights or LatentWeights(), solver or LatentSolver(), **settings)

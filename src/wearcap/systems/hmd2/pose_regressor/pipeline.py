@@ -14,13 +14,14 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import at_times
+from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, pasts
 from wearcap.tracking.anchor import anchored_to_head, with_hand_moved
 from wearcap.tracking.head_path import HeadPath, head_path
 
 
 @dataclass
-class PoseRegressorCapture:
+class PoseRegressorCapture(LearnedSystem):
     """Captures whole recordings frame by frame, deterministically and without lookahead."""
 
     net: PoseRegressor
@@ -33,17 +34,18 @@ class PoseRegressorCapture:
     frames_per_pass: int = 4096
     device: str = "cpu"
 
-    def __call__(self, recording: Recording, seed: int = 0) -> Motion:
-        return self.capture([recording], [seed])[0]
+    name = "pose_regressor"
+    experiment = "experiment=pose_regressor_head or pose_regressor_hands"
+    shared = ("pose_regressor_hands",)
 
     @torch.inference_mode()
-    def capture(self, recordings: Sequence[Recording], seeds: Sequence[int]) -> list[Motion]:
+    def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
         """One motion per recording; seeds have no effect.
 
         Raises WearcapError for a recording without head poses, or without true motion when hands are tracked.
         """
         self.net.to(self.device).eval()
-        return [self._captured(recording) for recording in recordings]
+        return [self._captured(source.recording) for source in sources]
 
     def _captured(self, recording: Recording) -> Motion:
         path = head_path(recording, self.skeleton, self.fps)

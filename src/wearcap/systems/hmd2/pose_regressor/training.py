@@ -14,6 +14,7 @@ from wearcap.data.windows import Window, WindowDataset
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, encode_pose, pasts
+from wearcap.systems.hmd2.pose_regressor.pipeline import PoseRegressorCapture
 from wearcap.training.base import SeededSteps, WeighedTerms
 from wearcap.training.losses import joint_velocity, masked_mean
 
@@ -25,6 +26,9 @@ class PoseRegression(SeededSteps, WeighedTerms):
     positions with both bodies anchored to the same head (m). "velocity" is that of our HMD²: without it (as in
     AvatarPoser) predictions follow every tremor of the head, with ten times the jitter of real motion.
     """
+
+    system = PoseRegressorCapture
+    """The system that captures with the network."""
 
     def __init__(
         self,

@@ -1,0 +1,116 @@
+"""Opens exported networks: each graph as a function from named tensors to a tensor, and the systems that run them."""
+
+import importlib
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.export.archive import check_archive
+from wearcap.files import parse_json, sha256_of
+from wearcap.runtime.graphs import Run, open_onnx
+
+VERSION = 6
+"""Version of the sidecars: JSON files beside models with statistics, features, skeleton and more."""
+
+
+def open_pt2(path: str | Path) -> Run:
+    """A torch.export archive on the CPU. Raises WearcapError when it is missing, not readable, or refused by
+    `check_archive`: PyTorch by itself would run code from it.
+    """
+    if not Path(path).is_file():
+        raise WearcapError("no such exported model", where=path, fix="Make one with `wearcap export`.")
+    try:
+        check_archive(path)
+        module = torch.export.load(str(path)).module()
+    except WearcapError:
+        raise
+    except Exception as error:  # PyTorch raises arbitrary exceptions on a graph that it did not write
+        why = (str(error).splitlines() or [type(error).__name__])[0][:120]
+        fix = "Copy it again, or export it again with `wearcap export`."
+        raise WearcapError(f"not a readable .pt2 archive ({why})", where=path, fix=fix) from error
+    return lambda **inputs: module(**inputs)
+
+
+RUN_BY_FORMAT: dict[str, Callable[[str | Path], Run]] = {"onnx": open_onnx, "pt2": open_pt2}
+
+
+def open_exported(path: str | Path) -> Run:
+    """An exported network of either format, chosen by the file's suffix."""
+    format = Path(path).suffix.removeprefix(".")
+    if format not in RUN_BY_FORMAT:
+        raise WearcapError("not an exported model", where=path, expected="a file that ends in .onnx or .pt2")
+    return RUN_BY_FORMAT[format](path)
+
+
+def load_exported(path: str | Path, network: str | None = None) -> Any:
+    """The system (for iReplica: the contact detector) of an exported model, from its files.
+
+    `network`: the expected system's name. Raises WearcapError when a file is missing, unreadable, of another system, or
+    does not belong to the others.
+    """
+    runs, about = {"model": open_exported(path)}, read_sidecar(path, network)
+    runs |= {name: open_exported(part_path(path, name)) for name in about["parts"]}
+    weights = {name: weights_of(path, name) for name in about["weights"]}
+    return importlib.import_module(f"wearcap.systems.{about['network']}.export").from_export(runs, weights, about)
+
+
+def weights_of(path: str | Path, name: str) -> dict[str, Tensor]:
+    """Weights that are written beside a model."""
+    return load_file(_file_of(path, name, weights=True))
+
+
+def part_path(path: str | Path, part: str) -> Path:
+    """Path of another part's file, beside the model's own."""
+    path = Path(path)
+    return path.with_name(f"{path.stem}.{part}{path.suffix}")
+
+
+def sidecar_path(path: str | Path) -> Path:
+    return Path(path).with_suffix(".json")
+
+
+def read_sidecar(path: str | Path, network: str | None = None) -> dict[str, Any]:
+    """The sidecar of a model file. Raises WearcapError when it is missing, foreign, or of another network or file."""
+    sidecar = sidecar_path(path)
+    try:
+        tree = parse_json(sidecar.read_bytes(), sidecar)
+    except FileNotFoundError as error:
+        raise WearcapError(
+            "no such sidecar",
+            where=sidecar,
+            expected="the .json file that `wearcap export` wrote beside the model",
+            fix="Copy both files.",
+        ) from error
+    if not isinstance(tree, dict) or tree.get("wearcap_export") != VERSION:
+        raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
+    name = str(tree.get("network"))
+    if (network or name) != name or not _exports(name):
+        raise WearcapError(f"a {name[:40]} network", where=path, expected=f"a {network or 'known'} network")
+    files = {Path(path): tree["model"]}
+    files |= {_file_of(path, part): entry for part, entry in tree["parts"].items()}
+    files |= {_file_of(path, part, weights=True): entry for part, entry in tree["weights"].items()}
+    for file, entry in files.items():
+        if not file.is_file():
+            raise WearcapError(
+                "a part of the exported model is missing", where=file, fix="Copy all files of the export."
+            )
+        if entry["sha256"] != sha256_of(file):
+            raise WearcapError("its sidecar belongs to another model file", where=file, fix="Export the model again.")
+    return tree
+
+
+def _exports(name: str) -> bool:
+    """Whether a system of this name exports networks."""
+    package = f"wearcap.systems.{name}"
+    return name.isidentifier() and all(map(importlib.util.find_spec, (package, f"{package}.export")))
+
+
+def _file_of(path: str | Path, part: str, weights: bool = False) -> Path:
+    file = part_path(path, Path(part).name)
+    return file.with_suffix(".safetensors") if weights else file

@@ -1,0 +1,206 @@
+"""Networks as graphs: one description of a network's parts, which are run eagerly, compiled or in ONNX Runtime.
+
+`wearcap export` writes the same graphs that `run_of` runs.
+"""
+
+import contextlib
+import copy
+import importlib.util
+import logging
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from wearcap.errors import WearcapError, nearest
+
+RUNTIMES = ("auto", "eager", "compile", "onnx")
+"""Backends; auto: compiled (CUDA graphs) on a GPU, else ONNX Runtime where it is installed, else eager. All but eager
+take some seconds to start."""
+PRECISIONS = ("auto", "narrowest", "float32", "bfloat16", "int8")
+"""Number formats; auto: bfloat16 on a GPU, else float32; narrowest: as auto, but int8 with ONNX Runtime.
+int8 (weights, and dynamically quantised activations) needs ONNX Runtime."""
+LIBRARIES = ("onnx", "onnxscript", "onnxruntime")
+Run = Callable[..., Tensor]
+"""A network's output from its inputs by name."""
+_INSTALL = 'Run: pip install "wearcap[export]"'
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """A network, or a part of one, as a function of named tensors that returns one tensor."""
+
+    module: nn.Module | Run
+    inputs: dict[str, Tensor]
+    """Example inputs by name, with a batch axis of 2 or more; all other axes are fixed."""
+    shared: tuple[str, ...] = ()
+    """Names of inputs without a batch axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Exports:
+    """What a system exports: its graphs, and everything else that running them needs."""
+
+    network: str
+    """Name of the system's folder."""
+    graphs: dict[str, Graph]
+    """Graphs by name; the first is the model's own file, the others are files beside it."""
+    about: dict[str, Any]
+    """Entries of the sidecar."""
+    max_error: float = 1e-4
+    """Largest difference of an output from eager's."""
+    weights: Mapping[str, nn.Module] = field(default_factory=dict)
+    """Modules that are not exported as graphs, whose weights are written beside the model."""
+
+
+class Call(nn.Module):
+    """A module whose `forward` is another method of a network."""
+
+    def __init__(self, net: nn.Module, method: str):
+        super().__init__()
+        self.net = net
+        self.forward = getattr(net, method)
+
+
+def chosen(runtime: str, precision: str, device: torch.device | str) -> tuple[str, str]:
+    """Backend and number format for a device, without "auto" and "narrowest".
+
+    Raises WearcapError for those that are unknown, not installed, or that do not go together.
+    """
+    device = torch.device(device)
+    for what, value, allowed in (("runtime", runtime, RUNTIMES), ("precision", precision, PRECISIONS)):
+        if value not in allowed:
+            raise WearcapError(
+                f"no {what} {value!r}", expected=f"one of {', '.join(allowed)}", fix=nearest(value, allowed)
+            )
+    missing = missing_libraries()
+    if runtime == "auto":
+        plain = "eager" if missing or precision == "bfloat16" else "onnx"
+        runtime = "compile" if device.type == "cuda" else plain
+    if precision in ("auto", "narrowest"):
+        plain = "int8" if runtime == "onnx" and precision == "narrowest" else "float32"
+        precision = "bfloat16" if device.type == "cuda" else plain
+    if runtime == "onnx" and (missing or device.type != "cpu"):
+        raise WearcapError(
+            f"runtime 'onnx' needs {', '.join(missing)}" if missing else f"runtime 'onnx' on {device}",
+            expected="ONNX Runtime on the CPU",
+            fix=f"{_INSTALL}, or choose pipeline.runtime=eager.",
+        )
+    if (precision == "int8") > (runtime == "onnx") or (precision == "bfloat16" and runtime == "onnx"):
+        raise WearcapError(
+            f"no {precision} with runtime {runtime!r}", expected="int8 with onnx; bfloat16 with eager or compile"
+        )
+    return runtime, precision
+
+
+def run_of(graph: Graph, runtime: str = "eager", precision: str = "float32") -> Run:
+    """A graph with its current weights in a backend and number format, as `chosen` returns them."""
+    if runtime == "onnx":
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "network.onnx"
+            write_onnx(graph, path)
+            return open_onnx(_narrowed(path) if precision == "int8" else path)
+    run: Run = graph.module
+    if runtime == "compile":
+        # Static shapes; on a GPU replayed as CUDA graphs, whose outputs are overwritten by the next replay.
+        assert isinstance(graph.module, nn.Module)
+        cuda = any(weight.device.type == "cuda" for weight in graph.module.parameters())
+        mode = "reduce-overhead" if cuda else None
+        compiled = torch.compile(graph.module, dynamic=False, fullgraph=True, mode=mode)
+        run = lambda **inputs: compiled(**inputs).clone()  # noqa: E731
+    if precision == "float32":
+        return run
+
+    def narrow(**inputs: Tensor) -> Tensor:
+        # Norms stay in float32 under autocast; callers get float32.
+        with torch.autocast(next(iter(inputs.values())).device.type, torch.bfloat16):
+            return run(**inputs).float()
+
+    return narrow
+
+
+def program(graph: Graph) -> torch.export.ExportedProgram:
+    """The graph as an exported program on the CPU, with a dynamic batch axis."""
+    batch_axis = {0: torch.export.Dim("batch", min=1)}
+    dynamic = {name: None if name in graph.shared else batch_axis for name in graph.inputs}
+    with quiet(), torch.inference_mode():
+        assert isinstance(graph.module, nn.Module)
+        module = copy.deepcopy(graph.module).cpu().eval()
+        return torch.export.export(module, (), graph.inputs, dynamic_shapes=dynamic)
+
+
+def write_onnx(graph: Graph, path: Path) -> None:
+    """Write a graph as an ONNX file."""
+    exported = program(graph)
+    with quiet(), torch.inference_mode():
+        torch.onnx.export(exported, (), path, kwargs=graph.inputs, dynamo=True, external_data=False)
+
+
+def open_onnx(path: str | Path) -> Run:
+    """An ONNX file in ONNX Runtime on the CPU. Raises WearcapError when it is missing or not readable."""
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise WearcapError("running ONNX files needs onnxruntime", fix=_INSTALL) from error
+    if not Path(path).is_file():
+        raise WearcapError("no such exported model", where=path, fix="Make one with `wearcap export`.")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.log_severity_level = 3
+    # Threads spin between the operations of a step; after it they yield the cores to other work.
+    options.add_session_config_entry("session.force_spinning_stop", "1")
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions share no base of their own
+        why = (str(error).splitlines() or [type(error).__name__])[0][:120]
+        fix = "Copy it again, or export it again with `wearcap export`."
+        raise WearcapError(f"not a readable ONNX file ({why})", where=path, fix=fix) from error
+
+    def run(**inputs: Tensor) -> Tensor:
+        arrays = {name: value.contiguous().numpy() for name, value in inputs.items()}
+        return torch.from_numpy(session.run(None, arrays)[0])
+
+    return run
+
+
+def missing_libraries() -> list[str]:
+    """Names of the packages for ONNX Runtime and its exporter that are not installed."""
+    return [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
+
+
+@contextlib.contextmanager
+def undisturbed(onnx: bool = True) -> Iterator[None]:
+    """A context for small batches in which PyTorch's spinning threads leave the cores to ONNX Runtime's."""
+    threads = torch.get_num_threads()
+    if onnx:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """A context that silences the exporters' messages about optional libraries and constant folding."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(None):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
+
+
+def _narrowed(path: Path) -> Path:
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+
+    narrow = path.with_name("network8.onnx")
+    quantize_dynamic(path, narrow, weight_type=QuantType.QInt8, per_channel=True, reduce_range=True)
+    return narrow

@@ -1,0 +1,240 @@
+"""The interface of every capture system, learned or optimised: what commands, evaluation, callbacks and notebooks use.
+
+A system's folder has the same rooms by name: `pipeline.py` defines the `System`, `stream.py` its `Session`, `export.py`
+its graphs (`exports`, `from_export`). A further system is a further folder under `systems/` with its configs.
+"""
+
+import importlib
+import importlib.util
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar
+
+from rich.console import Console
+
+from wearcap.errors import WearcapError
+from wearcap.io.formats.environment import FILE_NAME, read_environment
+from wearcap.io.formats.scan import read_scan
+from wearcap.io.formats.scene_folder import cloud_file
+from wearcap.metrics.scores import score
+from wearcap.metrics.table import Row
+from wearcap.models.checkpoint import load_trained
+from wearcap.recording import Motion, Recording
+from wearcap.runtime.graphs import Exports
+from wearcap.runtime.session import Session
+from wearcap.runtime.stages import Stage, StageCache, run_stages
+from wearcap.scene.environment import Environment
+from wearcap.scene.scan import Scan
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureInput:
+    """A recording, and the files that belong to it."""
+
+    recording: Recording
+    folder: Path | None = None
+    """Folder of the data set, to which the recording's file names are relative; None: the recording has no files."""
+    scan: Path | Scan | None = None
+    """The scene's point cloud, or its file."""
+    metres_per_unit: float | int | None = None
+    """Unit of that file (m); None: metres."""
+
+    @classmethod
+    def of(cls, recording: "Recording | CaptureInput") -> "CaptureInput":
+        """A recording without files as a source; a source is returned as it is."""
+        return recording if isinstance(recording, CaptureInput) else cls(recording)
+
+    @classmethod
+    def in_dataset(
+        cls,
+        recording: Recording,
+        folder: Path,
+        scene: str | Path | None = None,
+        metres_per_unit: float | int | None = None,
+    ) -> "CaptureInput":
+        """A recording of a data set, with the scan that it names, or that of another scene (its folder or cloud).
+
+        Raises WearcapError when the given scene has no point cloud.
+        """
+        named = folder / recording.scene if recording.scene else None
+        return cls(recording, folder, named if scene is None else cloud_file(Path(scene)), metres_per_unit)
+
+    def read_scan(self) -> Scan | None:
+        """The scene's point cloud (m). Raises WearcapError for a file that cannot be read."""
+        if isinstance(self.scan, Path):
+            unit = None if self.metres_per_unit is None else float(self.metres_per_unit)
+            return read_scan(self.scan, metres_per_unit=unit)
+        return self.scan
+
+    def environment_file(self, given: str | Path | None = None) -> Path | None:
+        """File of the objects: the given one (or in the given folder), else the one that the recording names."""
+        if given is not None:
+            path = Path(given)
+            return path / FILE_NAME if path.is_dir() else path
+        if self.folder is None or self.recording.environment is None:
+            return None
+        return self.folder / self.recording.environment
+
+    def objects(self, given: str | Path | None = None) -> Environment | None:
+        """The objects of `environment_file`; None where the recording names none, or its file is missing."""
+        path = self.environment_file(given)
+        return read_environment(path) if path is not None and (given is not None or path.is_file()) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Captured:
+    """What a system returns for one recording."""
+
+    motion: Motion | None
+    """None if a stage before the motion was the last one to run."""
+    report: dict[str, Any] | None = None
+    """Findings of the stages as plain data for JSON; None for a system without stages."""
+
+
+@dataclass(frozen=True, eq=False)
+class StageOptions:
+    """How the stages of a system are run."""
+
+    cache: Path | None = None
+    """Folder in which results are kept, a folder per recording; None: nothing is kept."""
+    until: str | None = None
+    """Name of the last stage to run; None: all are run."""
+    console: Console | None = None
+    """Where a line per stage is shown; None: nowhere."""
+
+
+class System(ABC):
+    """Turns recordings into motion."""
+
+    name: str
+    """Name in tables and in a motion's provenance."""
+    environment: str | Path | None = None
+    """File of the objects; None: the file that each recording names."""
+    experiment: ClassVar[str | None] = None
+    """Experiments that train the network, as the command line names them; None: the system has no network."""
+    shared: ClassVar[tuple[str, ...]] = ()
+    """Shared checkpoints of the networks, which `wearcap.load` takes unless others are given."""
+    joins_checkpoints: ClassVar[bool] = False
+    """Whether several checkpoints make one system; otherwise each of them makes its own."""
+    draws: ClassVar[bool] = True
+    """Whether captures depend on the seed."""
+    baselines: ClassVar[tuple[str, ...]] = ()
+    """Names of the trivial methods that an evaluation scores beside the system (`evaluation.baselines`)."""
+
+    @classmethod
+    def trained(cls, make: Callable[..., "System"], checkpoints: Sequence[str | Path], device: str) -> "System":
+        """`make`, the configured constructor, with the network of a checkpoint.
+
+        Raises WearcapError for a checkpoint that this system did not train.
+        """
+        module, _ = load_trained(checkpoints[0])
+        if getattr(module, "system", None) is not cls:
+            raise WearcapError(
+                f"{cls.__name__} cannot run {type(module).__name__}'s network",
+                where=checkpoints[0],
+                expected=f"a checkpoint of {cls.experiment}",
+            )
+        return make(**module.pipeline_parts(), device=device)
+
+    @abstractmethod
+    def capture(
+        self, recordings: Sequence[Recording | CaptureInput], seeds: Sequence[int], options: StageOptions | None = None
+    ) -> list[Captured]:
+        """One capture per recording and seed. Raises WearcapError when a recording lacks an input of the system."""
+
+    def __call__(self, recording: Recording | CaptureInput, seed: int = 0) -> Motion:
+        """Motion of one recording. Raises WearcapError as `capture` does."""
+        motion = self.capture([recording], [seed])[0].motion
+        assert motion is not None
+        return motion
+
+    def score(self, motion: Motion, source: CaptureInput, seed: int) -> Row:
+        """The paper's metrics of one capture. Raises WearcapError for a recording without a true motion."""
+        return score(motion, source.recording, source.recording.name, seed)
+
+    def objects(self, source: CaptureInput) -> Environment | None:
+        """The objects that a motion is shown with; None where there are none."""
+        return source.objects(self.environment)
+
+    def stream(self, *args: Any, **kwargs: Any) -> Session:
+        """A streaming capture of one or several wearers: `Session` in the system's `stream.py`."""
+        return self._room("stream", "captures streams").Session(self, *args, **kwargs)
+
+    def follow(self, folder: Path, scan: Scan | None, refused: Counter[str]) -> Iterator[Motion]:
+        """Final pieces of motion of a recording that still grows in a folder; `refused` counts unusable pieces."""
+        raise WearcapError("this pipeline cannot follow a growing recording", expected="pipeline=hps")
+
+    def exports(self) -> Exports:
+        """The networks as graphs for ONNX and torch.export. Raises WearcapError for a system without any."""
+        return self._room("export", "has a network to export").exports(self)
+
+    def _room(self, name: str, ability: str) -> ModuleType:
+        package, _, module = type(self).__module__.rpartition(".")
+        if module != "pipeline" or importlib.util.find_spec(f"{package}.{name}") is None:
+            raise WearcapError(f"pipeline {self.name!r} is none that {ability}", fix="Choose another pipeline=….")
+        return importlib.import_module(f"{package}.{name}")
+
+
+class LearnedSystem(System):
+    """A system around one trained network."""
+
+    baselines = ("mean pose", "nearest window")
+
+    @abstractmethod
+    def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
+        """One motion per recording and seed. Raises WearcapError when a recording lacks an input of the network."""
+
+    def capture(
+        self, recordings: Sequence[Recording | CaptureInput], seeds: Sequence[int], options: StageOptions | None = None
+    ) -> list[Captured]:
+        """One capture per recording and seed; recordings share batches, which does not change the results.
+
+        Raises WearcapError as `motions` does, and for options of stages, which a network does not have.
+        """
+        options = options or StageOptions()
+        if options.until is not None or options.cache is not None:
+            raise WearcapError(
+                f"until={options.until} cache={options.cache}", expected="a pipeline with stages, such as pipeline=hps"
+            )
+        once = {id(recording): CaptureInput.of(recording) for recording in recordings}
+        motions = self.motions([once[id(recording)] for recording in recordings], seeds)
+        return [Captured(motion) for motion in motions]
+
+
+class StagedSystem(System):
+    """A system that runs in stages, each of which can be cached; seeds have no effect."""
+
+    draws = False
+
+    @abstractmethod
+    def stages(self, source: CaptureInput) -> list[Stage]:
+        """The stages in order. Raises WearcapError when the recording lacks an input of the system."""
+
+    @abstractmethod
+    def motion_of(self, results: dict[str, Any]) -> Motion | None:
+        """The motion after the stages that were run; None if there is none yet."""
+
+    def report(self, source: CaptureInput, results: dict[str, Any]) -> dict[str, Any]:
+        """Findings of the stages that were run, as plain data for JSON."""
+        return {}
+
+    def results(self, recording: Recording | CaptureInput) -> dict[str, Any]:
+        """Results of all stages by name, without a cache."""
+        return run_stages(self.stages(CaptureInput.of(recording)))[0]
+
+    def capture(
+        self, recordings: Sequence[Recording | CaptureInput], seeds: Sequence[int], options: StageOptions | None = None
+    ) -> list[Captured]:
+        """One capture per recording, with a report of its stages. Raises WearcapError as `stages` and the stages do."""
+        return [self._captured(CaptureInput.of(recording), options or StageOptions()) for recording in recordings]
+
+    def _captured(self, source: CaptureInput, options: StageOptions) -> Captured:
+        name = source.recording.name
+        cache = None if options.cache is None else StageCache(options.cache / name)
+        results, runs = run_stages(self.stages(source), cache, options.until, options.console)
+        report = {"pipeline": self.name, "recording": name, "stages": [vars(run) for run in runs]}
+        return Captured(self.motion_of(results), report | self.report(source, results))

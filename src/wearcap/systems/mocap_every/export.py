@@ -1,0 +1,59 @@
+"""MocapEvery's estimator as an exported graph; coordinate frames, floor and windows are the pipeline's own."""
+
+from dataclasses import asdict
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.errors import WearcapError
+from wearcap.runtime.describe import skeleton_from_json, skeleton_to_json
+from wearcap.runtime.graphs import Exports, Run
+from wearcap.systems.mocap_every.features import WatchFeatures
+from wearcap.systems.mocap_every.model import FEET, Estimate, WatchEstimator, estimator_graph
+from wearcap.systems.mocap_every.pipeline import MocapEvery
+
+SETTINGS = ("stride", "lookahead", "floor", "anchor", "mirror_average")
+
+
+def exports(pipeline: MocapEvery) -> Exports:
+    """Input: unnormalised `features` "batch window feature". Output: motion and contact logits "batch predicted motion+2".
+
+    Raises WearcapError for a network that is exported already.
+    """
+    net, features = pipeline.net, pipeline.features
+    if isinstance(net, ExportedEstimator):
+        raise WearcapError("a network that is exported already", expected="one of a checkpoint")
+    about = {
+        "features": asdict(features),
+        "feature_size": features.size,
+        "motion_size": features.motion_size,
+        "window": net.window,
+        "fps": pipeline.fps,
+        "skeleton": skeleton_to_json(pipeline.skeleton),
+        "settings": {name: getattr(pipeline, name) for name in SETTINGS},
+    }
+    return Exports("mocap_every", {"network": estimator_graph(net, features.size)}, about)
+
+
+class ExportedEstimator(WatchEstimator):
+    """An estimator whose weights are in an exported file, run on the CPU."""
+
+    def __init__(self, run: Run, window: int):
+        super().__init__()
+        self._run, self.window = (run,), window
+
+    def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
+        output = self._run[0](features=features)
+        return Estimate(output[..., :-FEET], output[..., -FEET:], None)
+
+
+def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> MocapEvery:
+    """The pipeline of an exported model."""
+    return MocapEvery(
+        ExportedEstimator(runs["model"], about["window"]),
+        WatchFeatures(**about["features"]),
+        skeleton_from_json(about["skeleton"]),
+        about["fps"],
+        **about["settings"],
+    )
