@@ -17,7 +17,7 @@ from wearcap.simulation.places.movables import make_movable
 from wearcap.systems.echo.observations import Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import Conditioning
-from wearcap.systems.echo.stream import EchoSession, EchoWearer
+from wearcap.systems.echo.stream import EchoStream, EchoWearer
 from wearcap.tracking.head_path import head_path
 
 NAME = "echo"
@@ -52,7 +52,7 @@ class Streamed:
 
     def __init__(self, pipeline: Echo):
         box = make_movable("box", "box", np.random.default_rng(0)).object
-        self.session = EchoSession(pipeline, EchoWearer(xsens23(), floor_m=0.0), Environment((box,)))
+        self.session = EchoStream(pipeline, EchoWearer(xsens23(), floor_m=0.0), Environment((box,)))
         self.number, self.outputs = 0, 0
         motion = swinging("walk", LAP_S / 2, 0, fps=FPS).motion
         assert motion is not None

@@ -39,7 +39,7 @@ from wearcap.recording import RecordingStore
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
-from wearcap.systems.hmd2.stream import Sensed, Session, Wearer
+from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
 from wearcap.training.checkpoint import RunCheckpointIO
 from wearcap.training.loggers import read_metrics
 from wearcap.viewer.annotation_file import AnnotationFile
@@ -225,12 +225,12 @@ def _pipeline() -> HMD2:
 
 def _stream(folder: Path, finished: Finished) -> None:
     path, recording, pipeline = folder / "session.safetensors", _recording(0), _pipeline()
-    session = Session.load(path, pipeline) if path.is_file() else Session(pipeline, [Wearer(xsens23())], [0])
+    session = HMD2Session.load(path, pipeline) if path.is_file() else HMD2Session(pipeline, [Wearer(xsens23())], [0])
     frame = int(json.loads((folder / "frame.json").read_text())) if (folder / "frame.json").is_file() else 0
     while True:
         head, at = recording.head, frame % FRAMES
         pose = Rigid(head.R_world_device[at], head.t_world_device[at])
-        session.push([[Sensed(frame / 60.0, pose)]])
+        session.push([[HeadSample(frame / 60.0, pose)]])
         frame += 1
         session.save(path)
         finished(frame)
@@ -239,7 +239,7 @@ def _stream(folder: Path, finished: Finished) -> None:
 def _check_stream(folder: Path, least: int) -> None:
     path = folder / "session.safetensors"
     if least or path.is_file():
-        Session.load(path, _pipeline()).flush()
+        HMD2Session.load(path, _pipeline()).flush()
 
 
 WRITERS = {

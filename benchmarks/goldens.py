@@ -36,10 +36,10 @@ from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.recording.serialize import flatten
 from wearcap.recording.timing import joined
 from wearcap.runtime.system import CaptureInput
-from wearcap.systems.echo.stream import EchoSession, EchoWearer
-from wearcap.systems.hmd2.stream import Sensed, Session, Wearer
+from wearcap.systems.echo.stream import EchoStream, EchoWearer
+from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
 from wearcap.systems.hps.stream import follow
-from wearcap.systems.mocap_every.stream import MocapEverySession, WatchSample, Wearing
+from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample, Wearing
 from wearcap.training.loggers import read_metrics
 
 FOLDER = Path(__file__).resolve().parent
@@ -265,7 +265,7 @@ def hmd2_streamed() -> Motion | None:
     assert head is not None
     assert points is not None
     assert points.first_seen is not None
-    session = Session(pipeline, [Wearer(recording.skeleton, head.R_head_device, head.t_head_device)], [3])
+    session = HMD2Session(pipeline, [Wearer(recording.skeleton, head.R_head_device, head.t_head_device)], [3])
     parts, before = [], -np.inf
     for number, now in enumerate(head.timestamps.tolist()):
         new = (points.first_seen > before) & (points.first_seen <= now)
@@ -275,20 +275,22 @@ def hmd2_streamed() -> Motion | None:
             else (camera.timestamps > before) & (camera.timestamps <= now)
         )
         embedding = camera.embedding[shown][-1] if shown is not None and bool(shown.any()) else None
-        parts += session.push([[Sensed(now, head.T_world_device[number], points.points_world[new], embedding)]])
+        parts += session.push([[HeadSample(now, head.T_world_device[number], points.points_world[new], embedding)]])
         before = now
         if number == len(head.timestamps) // 2:
             session.save("streams/hmd2.safetensors")
-            session = Session.load("streams/hmd2.safetensors", pipeline)
+            session = HMD2Session.load("streams/hmd2.safetensors", pipeline)
     return joined([part for part in (*parts, *session.flush()) if part is not None])
 
 
 def mocap_every_streamed() -> Motion | None:
-    pipeline, recording, _ = _pipeline("mocap_every_online", "keyed", "pipeline.runtime=eager", "pipeline.int8=false")
+    pipeline, recording, _ = _pipeline(
+        "mocap_every_online", "keyed", "pipeline.runtime=eager", "pipeline.precision=float32"
+    )
     head = recording.head
     assert head is not None
     mounts = {joint: stream.R_joint_imu for joint, stream in recording.imu.items() if "wrist" in joint}
-    session = MocapEverySession(pipeline, Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts))
+    session = MocapEveryStream(pipeline, Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts))
     parts, before = [], -np.inf
     for number, now in enumerate(head.timestamps.tolist()):
         session.head(now, head.T_world_device[number])
@@ -309,7 +311,7 @@ def echo_streamed() -> Motion | None:
     assert motion is not None
     environment = CaptureInput(recording, dataset_folder(place)).objects()
     wearer = EchoWearer(recording.skeleton, recording.shape, head.R_head_device, head.t_head_device)
-    session = EchoSession(pipeline, wearer, environment, seed=3)
+    session = EchoStream(pipeline, wearer, environment, seed=3)
     for act in true_acts(recording):
         session.activate(act.object, act.start_s)
         session.activate(None, act.stop_s)

@@ -17,7 +17,7 @@ from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
-from wearcap.systems.hmd2.stream import Session, Wearer
+from wearcap.systems.hmd2.stream import HMD2Session, Wearer
 
 
 def measure(minutes: int = 60, settle: int = 10, max_points: int = 100_000) -> list[dict]:
@@ -38,7 +38,7 @@ def measure(minutes: int = 60, settle: int = 10, max_points: int = 100_000) -> l
     pipeline = HMD2(
         net, features, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any", steps=1, stride=60, lookahead=0
     )
-    session = Session(pipeline, [Wearer(xsens23())], [0], Memory(max_points=max_points))
+    session = HMD2Session(pipeline, [Wearer(xsens23())], [0], Memory(max_points=max_points))
     walk, early, predicted = Walk(pipeline, new_points=10, forever=True), 0.0, 0
     for second in range(60 * minutes):
         motion = session.push([[walk.moment(60 * second + i) for i in range(60)]])[0]

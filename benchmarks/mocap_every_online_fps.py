@@ -14,7 +14,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Recording
 from wearcap.runtime.graphs import undisturbed
 from wearcap.systems.mocap_every.pipeline import MocapEvery
-from wearcap.systems.mocap_every.stream import MocapEverySession, WatchSample, Wearing
+from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample, Wearing
 
 
 def measure(duration_s: float = 30.0, repeats: int = 3) -> list[dict]:
@@ -32,7 +32,7 @@ def _rate(pipeline: MocapEvery, recording: Recording) -> float:
     head = recording.head
     assert head is not None
     assert recording.motion is not None
-    session = MocapEverySession(
+    session = MocapEveryStream(
         pipeline, Wearing(recording.motion.skeleton, head.R_head_device, head.t_head_device, floor_m=0.0)
     )
     full, begin = 2 * pipeline.net.window, 0.0

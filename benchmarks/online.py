@@ -20,7 +20,7 @@ from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
-from wearcap.systems.hmd2.stream import Sensed, Session, Wearer
+from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
 
 EXPERIMENTS = {"small": "hmd2", "full": "hmd2_full"}
 """Of the same name: configs, and checkpoints where they exist."""
@@ -82,20 +82,20 @@ class Walk:
         self.lap = Rigid(torch.cat([there.R, there.R.flip(0)]), torch.cat([there.t, there.t.flip(0)]))
         self._random = torch.Generator().manual_seed(0)
 
-    def moment(self, number: int) -> Sensed:
+    def moment(self, number: int) -> HeadSample:
         place = number % len(self.lap.t)
         pose = self.lap[place]
         count = self.new_points if self.forever or number < len(self.lap.t) else 0
         points = pose.t + 4 * torch.rand(count, 3, generator=self._random) - torch.tensor([2.0, 2.0, 3.0])
         shown = torch.randn(self.pipeline.net.image_size, generator=self._random) if number % 2 == 0 else None
-        return Sensed(number / 60, pose, points, shown)
+        return HeadSample(number / 60, pose, points, shown)
 
 
 class Streamed:
     """A session that is fed a walk; seconds of work per push that gives poses."""
 
     def __init__(self, pipeline: HMD2):
-        self.session, self.walk, self.number = Session(pipeline, [Wearer(xsens23())], [0]), Walk(pipeline), 0
+        self.session, self.walk, self.number = HMD2Session(pipeline, [Wearer(xsens23())], [0]), Walk(pipeline), 0
         self.stride, self.seconds = pipeline.advance, []
 
     def step(self) -> None:

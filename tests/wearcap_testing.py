@@ -18,6 +18,7 @@ from wearcap.recording import (
     Recording,
     RecordingStore,
 )
+from wearcap.runtime.session import Session
 
 
 def swaying_motion(frames: int, seed: int = 0, fps: float = 60.0, skeleton: Skeleton | None = None) -> Motion:
@@ -70,3 +71,9 @@ def suited(root: Path, short: bool = False, **parts) -> Path:
     sensed = {"suit": suit, "camera": camera, "localization": found} | parts
     RecordingStore(root).add(replace(recording_of(motion, "r"), **sensed), split="test", config_hash="x")
     return root
+
+
+def pushed(session: Session, samples: list) -> list[Motion | None]:
+    """Each wearer's poses after its new samples."""
+    session.push(samples)
+    return session.poses()

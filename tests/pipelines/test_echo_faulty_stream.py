@@ -9,7 +9,7 @@ from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 from wearcap.sensors.packets import AGREEING
 from wearcap.systems.echo import stream as echo_stream
-from wearcap.systems.echo.stream import WRISTS, EchoSession, EchoWearer
+from wearcap.systems.echo.stream import WRISTS, EchoStream, EchoWearer
 
 FRAMES, FAULT = 45, 21
 
@@ -24,10 +24,10 @@ def echo():
     return drawn_echo()
 
 
-def opened(echo, recording) -> EchoSession:
+def opened(echo, recording) -> EchoStream:
     head = recording.head
     wearer = EchoWearer(recording.skeleton, {}, head.R_head_device, head.t_head_device, floor_m=0.0)
-    return EchoSession(echo, wearer, boxes(), seed=3)
+    return EchoStream(echo, wearer, boxes(), seed=3)
 
 
 def feed(session, recording, frame: int, shift: float = 0.0, tracked: bool = True) -> list[Motion]:

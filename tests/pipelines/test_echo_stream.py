@@ -13,7 +13,7 @@ from wearcap.recording import Motion
 from wearcap.recording.acts import active_at
 from wearcap.recording.timing import joined
 from wearcap.scene.environment import Environment
-from wearcap.systems.echo.stream import EchoSession, EchoWearer
+from wearcap.systems.echo.stream import EchoStream, EchoWearer
 
 TWO = (("box_1", "left", 0.1, 0.4), ("box_2", "right", 0.7, 0.9))
 WRISTS = ("left_wrist", "right_wrist")
@@ -25,7 +25,7 @@ def wearer(recording, **changes) -> EchoWearer:
     return EchoWearer(recording.skeleton, {}, head.R_head_device, head.t_head_device, **{"floor_m": 0.0} | changes)
 
 
-def feed(session: EchoSession, recording, frame: int, wrists=WRISTS) -> None:
+def feed(session: EchoStream, recording, frame: int, wrists=WRISTS) -> None:
     head = recording.head
     time = head.timestamps[frame].item()
     session.head(time, head.T_world_device[frame])
@@ -33,7 +33,7 @@ def feed(session: EchoSession, recording, frame: int, wrists=WRISTS) -> None:
         session.wrist(joint, time, recording.motion.joint(joint)[frame])
 
 
-def streamed(session: EchoSession, recording, before=None, frames=None, wrists=WRISTS) -> tuple[Motion, list[int]]:
+def streamed(session: EchoStream, recording, before=None, frames=None, wrists=WRISTS) -> tuple[Motion, list[int]]:
     """The joined poses, and how many had come out after each frame; `before(frame)` happens first."""
     parts, counts = [], []
     for frame in frames or range(len(recording.motion)):
@@ -46,7 +46,7 @@ def streamed(session: EchoSession, recording, before=None, frames=None, wrists=W
     return joined([part for part in parts if part is not None]), counts
 
 
-def activate_acts(session: EchoSession, scenario) -> None:
+def activate_acts(session: EchoStream, scenario) -> None:
     for act in scenario.acts:
         session.activate(act.object, act.start_s)
         session.activate(None, act.stop_s)
@@ -71,7 +71,7 @@ def test_a_stream_equals_a_capture_of_the_whole_recording(settings):
     """Two objects, one after the other, with nothing between."""
     recording, echo = carrying(1.2, carried=TWO), drawn_echo(**settings)
     scenario = replace(scenario_of(recording, TWO), placed=echo.placed)
-    session = EchoSession(echo, wearer(recording), boxes(TWO), seed=3)
+    session = EchoStream(echo, wearer(recording), boxes(TWO), seed=3)
     activate_acts(session, scenario)
     motion, counts = streamed(session, recording)
     assert_same(motion, echo.capture_scenarios([scenario], [3])[0], scenario)
@@ -88,7 +88,7 @@ def test_objects_in_a_stream_are_static_from_their_first_contact_on():
     drawn = drawn_echo().capture_scenarios([scenario], [3])[0]
     likely = drawn.body_contact_prob.amax(1)
     threshold = likely[likely > 0].median().item()
-    session = EchoSession(drawn_echo(static_threshold=threshold), wearer(recording), boxes(TWO), seed=3)
+    session = EchoStream(drawn_echo(static_threshold=threshold), wearer(recording), boxes(TWO), seed=3)
     activate_acts(session, scenario)
     motion, _ = streamed(session, recording)
     for act in scenario.acts:
@@ -106,7 +106,7 @@ def test_objects_in_a_stream_are_static_from_their_first_contact_on():
 
 def test_a_human_alone_needs_no_objects():
     recording, echo = carrying(1.0), drawn_echo()
-    motion, _ = streamed(EchoSession(echo, wearer(recording), seed=1), recording)
+    motion, _ = streamed(EchoStream(echo, wearer(recording), seed=1), recording)
     whole = echo.capture([recording], [1])[0].motion
     torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)
     assert motion.object_motion is None
@@ -116,7 +116,7 @@ def test_a_human_alone_needs_no_objects():
 def test_an_object_may_be_activated_until_its_frames_are_final(late):
     """The act begins at frame 20; frames that were output already do not change."""
     recording, echo = carrying(1.4), drawn_echo()
-    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     start = recording.motion.timestamps[20].item()
     motion, _ = streamed(
         session, recording, lambda frame: session.activate("box_1", start) if frame == 21 + late else None
@@ -129,7 +129,7 @@ def test_an_object_may_be_activated_until_its_frames_are_final(late):
 
 def test_what_is_final_stays_as_it_was():
     recording, echo = carrying(1.4), drawn_echo()
-    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     motion, _ = streamed(session, recording, lambda frame: session.activate("box_1", 0.0) if frame == 25 else None)
     alone = echo.capture([recording], [3])[0].motion
     torch.testing.assert_close(motion.T_world_joint.t[:18], alone.T_world_joint.t[:18], atol=1e-3, rtol=0)
@@ -138,7 +138,7 @@ def test_what_is_final_stays_as_it_was():
 
 def test_an_observed_object_is_at_its_observed_pose():
     recording, echo = carrying(1.4), drawn_echo(anchor=False)
-    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     session.activate("box_1", 0.0)
     track = recording.object_motion["box_1"]
 
@@ -156,7 +156,7 @@ def test_an_observed_object_is_at_its_observed_pose():
 
 def test_the_observation_nearest_in_time_counts():
     recording, echo = carrying(1.0), drawn_echo(anchor=False)
-    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     session.activate("box_1", 0.0)
     track = recording.object_motion["box_1"]
     away = Rigid(torch.eye(3), torch.full((3,), 5.0))
@@ -174,7 +174,7 @@ def test_the_observation_nearest_in_time_counts():
 
 def test_observations_of_one_object_do_not_apply_to_another():
     recording, echo = carrying(1.4, carried=TWO), drawn_echo(anchor=False)
-    session = EchoSession(echo, wearer(recording), boxes(TWO), seed=3)
+    session = EchoStream(echo, wearer(recording), boxes(TWO), seed=3)
     session.activate("box_1", 0.0)
     far = Rigid(torch.eye(3), torch.tensor([50.0, 0.0, 0.0]))
 
@@ -191,7 +191,7 @@ def test_observations_of_one_object_do_not_apply_to_another():
 @pytest.mark.parametrize("broken", [NAN, Rigid(torch.eye(3), torch.tensor([0.0, torch.inf, 0.0]))])
 def test_what_is_not_finite_is_left_out(broken):
     recording, echo = carrying(1.0), drawn_echo()
-    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     session.activate("box_1", 0.0)
 
     def happen(frame: int) -> None:
@@ -205,7 +205,7 @@ def test_what_is_not_finite_is_left_out(broken):
             session.see_object("box_1", float("nan"), Rigid.identity())
 
     motion, _ = streamed(session, recording, happen)
-    plain = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    plain = EchoStream(echo, wearer(recording), boxes(), seed=3)
     plain.activate("box_1", 0.0)
     expected, _ = streamed(plain, recording)
     torch.testing.assert_close(motion.T_world_joint.t, expected.T_world_joint.t, atol=1e-3, rtol=0)
@@ -214,7 +214,7 @@ def test_what_is_not_finite_is_left_out(broken):
 
 def test_wrists_may_come_late_and_in_any_order():
     recording, echo = carrying(1.4), drawn_echo()
-    session, parts = EchoSession(echo, wearer(recording), seed=3), []
+    session, parts = EchoStream(echo, wearer(recording), seed=3), []
     count = len(recording.motion)
     for frame in range(count):
         feed(session, recording, frame, ())
@@ -232,7 +232,7 @@ def test_wrists_may_come_late_and_in_any_order():
 
 def test_a_pose_that_comes_twice_is_left_out_however_late():
     recording, echo = carrying(1.0), drawn_echo()
-    session = EchoSession(echo, wearer(recording), seed=3)
+    session = EchoStream(echo, wearer(recording), seed=3)
 
     def repeat(frame: int) -> None:
         if frame > 8:
@@ -253,7 +253,7 @@ def test_a_pose_that_comes_twice_is_left_out_however_late():
 
 def test_a_silent_wrist_is_counted_and_does_not_block():
     recording = carrying(2.0)
-    session = EchoSession(drawn_echo(), wearer(recording), seed=3)
+    session = EchoStream(drawn_echo(), wearer(recording), seed=3)
     motion, _ = streamed(session, recording, wrists=("left_wrist",))
     assert len(motion) == len(recording.motion)
     assert session.silent == len(motion)
@@ -273,7 +273,7 @@ def test_after_a_gap_it_restarts_as_the_whole_capture_does():
             t_world_device=head.t_world_device[keep],
         ),
     )
-    session = EchoSession(echo, wearer(recording), seed=5)
+    session = EchoStream(echo, wearer(recording), seed=5)
     parts = []
     for frame in range(90):
         time = frame / 30
@@ -291,7 +291,7 @@ def test_after_a_gap_it_restarts_as_the_whole_capture_does():
 
 def test_a_lost_head_does_not_block_output():
     recording = carrying(2.0)
-    session = EchoSession(drawn_echo(), wearer(recording), seed=5)
+    session = EchoStream(drawn_echo(), wearer(recording), seed=5)
     count = 0
     for frame in range(60):
         head = recording.head.T_world_device[frame] if frame < 30 else None
@@ -307,7 +307,7 @@ def test_a_lost_head_does_not_block_output():
 
 def test_a_streams_memory_is_bounded():
     recording, echo = carrying(2.0), drawn_echo()
-    session = EchoSession(echo, wearer(recording), boxes(), seed=3)
+    session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     sizes = []
     for lap in range(4):
         for frame in range(40):
@@ -333,7 +333,7 @@ def test_a_streams_memory_is_bounded():
 
 def test_the_floor_follows_from_a_standing_wearer():
     recording = carrying(0.6)
-    session = EchoSession(drawn_echo(), wearer(recording, floor_m=None), seed=0)
+    session = EchoStream(drawn_echo(), wearer(recording, floor_m=None), seed=0)
     streamed(session, recording)
     floor = (
         session._queue.conditioning.floor_height
@@ -345,7 +345,7 @@ def test_the_floor_follows_from_a_standing_wearer():
 
 def test_the_floor_is_found_after_sitting_and_standing_up():
     recording = carrying(0.6)
-    session = EchoSession(drawn_echo(), wearer(recording, floor_m=None), seed=0)
+    session = EchoStream(drawn_echo(), wearer(recording, floor_m=None), seed=0)
     head, low = recording.motion.joint("head")[:1], torch.tensor([0.0, 0.0, 0.5])
     sitting = [session._frame(k / 30, Rigid(head.R, head.t - low)).floor_height.item() for k in range(30)]
     standing = [session._frame(1 + k / 30, head).floor_height.item() for k in range(60)]
@@ -354,7 +354,7 @@ def test_the_floor_is_found_after_sitting_and_standing_up():
 
 
 def test_unknown_names_are_refused():
-    session = EchoSession(drawn_echo(), EchoWearer(carrying(0.6).skeleton), boxes())
+    session = EchoStream(drawn_echo(), EchoWearer(carrying(0.6).skeleton), boxes())
     for call in (lambda: session.activate("ghost", 0.0), lambda: session.see_object("ghost", 0.0, Rigid.identity())):
         with pytest.raises(WearcapError, match="no object 'ghost'. Expected one of box_1"):
             call()
@@ -366,7 +366,7 @@ def test_objects_that_cannot_be_used_are_refused_when_they_are_named():
     mesh = boxes(CARRIED).by_name("box_1").mesh
     huge = Mesh(mesh.vertices * 1000, mesh.faces, mesh.color)
     things = Environment((scene_object("a", mesh=huge), scene_object("b", "piano")))
-    session = EchoSession(drawn_echo(), EchoWearer(carrying(0.6).skeleton), things)
+    session = EchoStream(drawn_echo(), EchoWearer(carrying(0.6).skeleton), things)
     with pytest.raises(WearcapError, match="object 'a': .*looks like millimetres"):
         session.activate("a", 0.0)
     with pytest.raises(WearcapError, match="has no object class 'piano'"):
@@ -377,4 +377,4 @@ def test_objects_that_cannot_be_used_are_refused_when_they_are_named():
 
 def test_windows_from_scratch_are_no_stream():
     with pytest.raises(WearcapError, match="rewindow=3. Expected a conveyor"):
-        EchoSession(drawn_echo(rewindow=3), EchoWearer(carrying(0.6).skeleton))
+        EchoStream(drawn_echo(rewindow=3), EchoWearer(carrying(0.6).skeleton))

@@ -17,8 +17,8 @@ from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
-from wearcap.systems.hmd2.stream import Sensed, Session, Wearer
-from wearcap_testing import recording_of, swaying_motion
+from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
+from wearcap_testing import pushed, recording_of, swaying_motion
 
 WINDOW, IMAGE = 60, 8
 STEPS, STRIDE = 3, 10
@@ -89,14 +89,14 @@ def surrounded(frames: int, seed: int = 0) -> Recording:
     return replace(recording, points=PointCloud(points, first_seen=first_seen), camera=camera)
 
 
-def moments(recording: Recording) -> list[Sensed]:
+def moments(recording: Recording) -> list[HeadSample]:
     """A recording as it was sensed, moment by moment."""
     head, points, camera = recording.head, recording.points, recording.camera
     conditions = []
     for i, time in enumerate(head.timestamps.tolist()):
         new = points.points_world[points.first_seen == time] if points is not None else None
         shown = camera is not None and i % 2 == 0
-        conditions.append(Sensed(time, head.T_world_device[i], new, camera.embedding[i // 2] if shown else None))
+        conditions.append(HeadSample(time, head.T_world_device[i], new, camera.embedding[i // 2] if shown else None))
     return conditions
 
 
@@ -104,13 +104,13 @@ def wearer(recording: Recording) -> Wearer:
     return Wearer(recording.skeleton, recording.head.R_head_device, recording.head.t_head_device)
 
 
-def stream(session: Session, *conditions: list[Sensed], ended: bool = True) -> list[Motion]:
+def stream(session: HMD2Session, *conditions: list[HeadSample], ended: bool = True) -> list[Motion]:
     """One motion per wearer, from one moment of each per push."""
     predicted = [[] for _ in conditions]
     for i in range(max(len(part) for part in conditions)):
-        for parts, motion in zip(predicted, session.push([part[i : i + 1] for part in conditions])):
+        for parts, motion in zip(predicted, pushed(session, [part[i : i + 1] for part in conditions])):
             parts += [] if motion is None else [motion]
-    for parts, motion in zip(predicted, session.flush() if ended else [None] * len(conditions)):
+    for parts, motion in zip(predicted, session.poses(ended=True) if ended else [None] * len(conditions)):
         parts += [] if motion is None else [motion]
     return [together(parts) for parts in predicted]
 
@@ -147,30 +147,30 @@ def assert_same(motion: Motion, other: Motion, atol: float | None = None) -> Non
 @pytest.mark.parametrize("windows", [{"inpaint": True}, {}, {"lookahead": None}])
 def test_streaming_equals_the_capture_of_the_whole(pipeline, stride, frames, windows):
     recording, hmd2 = surrounded(frames), pipeline(stride, **windows)
-    streamed = stream(Session(hmd2, [wearer(recording)], [3]), moments(recording))[0]
+    streamed = stream(HMD2Session(hmd2, [wearer(recording)], [3]), moments(recording))[0]
     assert len(streamed) == frames
     assert_same(streamed, hmd2(recording, seed=3))
 
 
 def test_poses_wait_for_the_stride(pipeline):
-    session = Session(pipeline(), [Wearer(xsens23())], [0])
-    predicted = [session.push([[moment]])[0] for moment in moments(surrounded(25))]
+    session = HMD2Session(pipeline(), [Wearer(xsens23())], [0])
+    predicted = [pushed(session, [[moment]])[0] for moment in moments(surrounded(25))]
     assert [i for i, motion in enumerate(predicted) if motion is not None] == [9, 19]
     assert [len(motion) for motion in predicted if motion is not None] == [10, 10]
-    rest = session.flush()[0]
+    rest = session.poses(ended=True)[0]
     assert len(rest) == 5
-    assert session.flush() == [None]
+    assert session.poses(ended=True) == [None]
 
 
 def test_poses_wait_for_what_they_look_ahead_to(pipeline):
-    session = Session(pipeline(lookahead=13), [Wearer(xsens23())], [0])
-    predicted = [session.push([[moment]])[0] for moment in moments(surrounded(45))]
+    session = HMD2Session(pipeline(lookahead=13), [Wearer(xsens23())], [0])
+    predicted = [pushed(session, [[moment]])[0] for moment in moments(surrounded(45))]
     assert [(i, len(motion)) for i, motion in enumerate(predicted) if motion is not None] == [
         (19, 7),
         (29, 10),
         (39, 10),
     ]
-    rest = session.flush()[0]
+    rest = session.poses(ended=True)[0]
     assert len(rest) == 18
     times = torch.cat([motion.timestamps for motion in [*predicted, rest] if motion is not None])
     assert torch.allclose(times * 60, torch.arange(45, dtype=torch.float64))
@@ -178,7 +178,7 @@ def test_poses_wait_for_what_they_look_ahead_to(pipeline):
 
 def test_the_head_is_where_it_was_measured(pipeline):
     recording = surrounded(50)
-    motion = stream(Session(pipeline(), [wearer(recording)], [0]), moments(recording))[0]
+    motion = stream(HMD2Session(pipeline(), [wearer(recording)], [0]), moments(recording))[0]
     assert torch.allclose(motion.joint("head").t, recording.head.T_world_head.t, atol=1e-4)
     assert torch.allclose(motion.joint("head").R, recording.head.T_world_head.R, atol=1e-4)
 
@@ -187,11 +187,11 @@ def test_several_wearers_are_as_alone(pipeline):
     """One starts later and has a clock of their own; they share batches where both are ready."""
     hmd2, recordings = pipeline(), [surrounded(90, 1), surrounded(80, 2)]
     late = [moment._replace(timestamp=moment.timestamp + 500.0) for moment in moments(recordings[1])]
-    session = Session(hmd2, [wearer(recording) for recording in recordings], [5, 6])
+    session = HMD2Session(hmd2, [wearer(recording) for recording in recordings], [5, 6])
     early = moments(recordings[0])
     predicted = [[], []]
     for i in range(90):
-        now = session.push([[early[i]], late[i - 10 : i - 9] if i >= 10 else []])
+        now = pushed(session, [[early[i]], late[i - 10 : i - 9] if i >= 10 else []])
         for parts, motion in zip(predicted, now):
             parts += [] if motion is None else [motion]
     first, second = (together(parts) for parts in predicted)
@@ -203,10 +203,10 @@ def test_several_wearers_are_as_alone(pipeline):
 def test_saved_and_restored_it_goes_on_bit_for_bit(pipeline, tmp_path, lookahead, given):
     recording, hmd2 = surrounded(120), pipeline(lookahead=lookahead)
     conditions = moments(recording)
-    whole, first = (Session(hmd2, [wearer(recording)], [4]) for _ in range(2))
+    whole, first = (HMD2Session(hmd2, [wearer(recording)], [4]) for _ in range(2))
     stream(first, conditions[:57], ended=False)
     first.save(tmp_path / "session.safetensors")
-    again = Session.load(tmp_path / "session.safetensors", hmd2)
+    again = HMD2Session.load(tmp_path / "session.safetensors", hmd2)
     expected = stream(whole, conditions)[0]
     resumed = stream(again, conditions[57:])[0]
     for name in ("timestamps", "R_parent_joint", "t_world_root", "contact_prob"):
@@ -215,12 +215,12 @@ def test_saved_and_restored_it_goes_on_bit_for_bit(pipeline, tmp_path, lookahead
 
 def test_a_session_is_loaded_with_its_own_pipeline_alone(pipeline, tmp_path):
     path = tmp_path / "session.safetensors"
-    Session(pipeline(), [Wearer(xsens23())], [0]).save(path)
+    HMD2Session(pipeline(), [Wearer(xsens23())], [0]).save(path)
     with pytest.raises(WearcapError, match="a session with stride 10, not 20"):
-        Session.load(path, pipeline(20))
+        HMD2Session.load(path, pipeline(20))
     path.write_bytes(b"nothing")
     with pytest.raises(WearcapError, match="not a saved session"):
-        Session.load(path, pipeline())
+        HMD2Session.load(path, pipeline())
 
 
 @pytest.mark.parametrize("missing", [range(33, 37), range(20, 29), range(0)])
@@ -231,20 +231,20 @@ def test_missing_poses_within_a_chunk_are_interpolated(pipeline, missing):
     ]
     keep = [i for i in range(75) if i not in missing]
     observed = replace(recording, head=head_of(recording, keep))
-    assert_same(stream(Session(hmd2, [wearer(recording)], [2]), conditions)[0], hmd2(observed, seed=2), 5e-5)
+    assert_same(stream(HMD2Session(hmd2, [wearer(recording)], [2]), conditions)[0], hmd2(observed, seed=2), 5e-5)
 
 
 def test_poses_that_are_missing_at_a_chunks_end_are_held_and_put_right(pipeline):
     recording = surrounded(70)
     conditions = moments(recording)
     conditions[38], conditions[39] = (moment._replace(T_world_device=None) for moment in conditions[38:40])
-    session = Session(pipeline(), [wearer(recording)], [2])
+    session = HMD2Session(pipeline(), [wearer(recording)], [2])
     motion = stream(session, conditions)[0]
     head = motion.joint("head").t
     assert len(motion) == 70
     assert torch.allclose(head[38:40], head[37].expand(2, 3), atol=1e-4)
     assert torch.allclose(head[40:], recording.head.T_world_head.t[40:], atol=1e-4)
-    window = session._wearers[0].sampler.frames.t_world_head[0]
+    window = session.streams[0].sampler.frames.t_world_head[0]
     true = recording.head.T_world_head.t[70 - 60 : 70]
     assert torch.allclose(window[:60], true, atol=2e-4)
 
@@ -253,11 +253,11 @@ def test_moments_out_of_order_are_sorted_in_and_late_ones_dropped(pipeline):
     recording, hmd2 = surrounded(60), pipeline()
     conditions = moments(recording)
     mixed = [*conditions[:12], conditions[14], conditions[13], conditions[12], *conditions[15:]]
-    session = Session(hmd2, [wearer(recording)], [1])
+    session = HMD2Session(hmd2, [wearer(recording)], [1])
     assert_same(stream(session, mixed)[0], hmd2(recording, seed=1))
     assert session.dropped == [0]
     late = [*conditions[:15], *conditions[16:], conditions[15], conditions[59]]
-    session = Session(hmd2, [wearer(recording)], [1])
+    session = HMD2Session(hmd2, [wearer(recording)], [1])
     assert len(stream(session, late)[0]) == 60
     assert session.dropped == [2]
 
@@ -266,7 +266,7 @@ def test_moments_out_of_order_are_sorted_in_and_late_ones_dropped(pipeline):
 def test_other_rates_are_brought_to_the_pipelines(pipeline, fps):
     motion = swaying_motion(120, fps=fps)
     recording, hmd2 = recording_of(motion, "a"), pipeline(points=False)
-    assert_same(stream(Session(hmd2, [wearer(recording)], [1]), moments(recording))[0], hmd2(recording, seed=1))
+    assert_same(stream(HMD2Session(hmd2, [wearer(recording)], [1]), moments(recording))[0], hmd2(recording, seed=1))
 
 
 @pytest.mark.parametrize("broken", ["gap", "jump"])
@@ -282,7 +282,7 @@ def test_after_gaps_and_jumps_it_begins_anew_as_offline(pipeline, broken, lookah
         )
     recording = replace(recording, head=head, points=None, camera=None)
     whole = hmd2(recording, seed=7)
-    motion = stream(Session(hmd2, [wearer(recording)], [7]), moments(recording))[0]
+    motion = stream(HMD2Session(hmd2, [wearer(recording)], [7]), moments(recording))[0]
     predicted = torch.tensor([i for i in range(150) if broken == "jump" or not 44 <= i < 90])
     kept = replace(
         whole,
@@ -302,8 +302,8 @@ def test_what_is_not_finite_counts_as_missing(pipeline):
         T_world_device=nan, embedding=torch.full((IMAGE,), torch.inf), floor_height=torch.nan
     )
     conditions[31] = conditions[31]._replace(points_world=torch.full((5, 3), torch.nan))
-    conditions.insert(40, Sensed(float("nan"), Rigid.identity()))
-    session = Session(hmd2, [wearer(recording)], [1])
+    conditions.insert(40, HeadSample(float("nan"), Rigid.identity()))
+    session = HMD2Session(hmd2, [wearer(recording)], [1])
     motion = stream(session, conditions)[0]
     assert len(motion) == 60
     assert motion.R_parent_joint.isfinite().all()
@@ -312,24 +312,27 @@ def test_what_is_not_finite_counts_as_missing(pipeline):
 
 def test_embeddings_of_another_length_are_refused(pipeline):
     with pytest.raises(WearcapError, match="an embedding of 9 features at 0.500 s"):
-        Session(pipeline(), [Wearer(xsens23())], [0]).push([[Sensed(0.5, Rigid.identity(), None, torch.zeros(9))]])
+        pushed(
+            HMD2Session(pipeline(), [Wearer(xsens23())], [0]),
+            [[HeadSample(0.5, Rigid.identity(), None, torch.zeros(9))]],
+        )
 
 
 def test_a_floor_that_is_told_is_believed(pipeline):
     recording = surrounded(40)
-    session = Session(pipeline(), [wearer(recording)], [0])
+    session = HMD2Session(pipeline(), [wearer(recording)], [0])
     stream(session, [moment._replace(floor_height=0.01 * i) for i, moment in enumerate(moments(recording))])
-    assert torch.allclose(session._wearers[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5)
+    assert torch.allclose(session.streams[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5)
 
 
 def test_points_beyond_the_memory_are_forgotten(pipeline):
-    session = Session(pipeline(), [Wearer(xsens23())], [0], Memory(radius_m=5.0, max_points=2000))
+    session = HMD2Session(pipeline(), [Wearer(xsens23())], [0], Memory(radius_m=5.0, max_points=2000))
     random = torch.Generator().manual_seed(0)
     for i in range(120):
         at = torch.tensor([0.1 * i, 0.0, 1.6])
         points = at + 8 * torch.rand(100, 3, generator=random) - 4
-        session.push([[Sensed(i / 60, Rigid(torch.eye(3), at), points)]])
-    places = session._wearers[0].places
+        pushed(session, [[HeadSample(i / 60, Rigid(torch.eye(3), at), points)]])
+    places = session.streams[0].places
     kept = torch.cat([points for points, _ in places._tracked + places._new])
     assert len(kept) == len(places._map) <= 2000 + 1000
     assert (kept - at)[:, :2].norm(dim=-1).min() < 1.0
@@ -337,10 +340,10 @@ def test_points_beyond_the_memory_are_forgotten(pipeline):
 
 def test_a_long_stream_needs_no_more_than_a_short_one(pipeline, tmp_path):
     """A minute in which the map is full after a few seconds: what would be saved does not grow."""
-    session = Session(pipeline(60, steps=1), [Wearer(xsens23())], [0], Memory(5.0, 1000))
+    session = HMD2Session(pipeline(60, steps=1), [Wearer(xsens23())], [0], Memory(5.0, 1000))
     conditions, sizes = moments(surrounded(120))[::6], []
     for lap in range(30):
-        session.push([[moment._replace(timestamp=moment.timestamp + 2 * lap) for moment in conditions]])
+        pushed(session, [[moment._replace(timestamp=moment.timestamp + 2 * lap) for moment in conditions]])
         if lap % 5 == 4:
             session.save(tmp_path / "session.safetensors")
             sizes.append((tmp_path / "session.safetensors").stat().st_size)

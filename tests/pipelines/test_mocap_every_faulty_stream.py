@@ -15,7 +15,7 @@ from wearcap.recording.timing import joined
 from wearcap.sensors.packets import AGREEING
 from wearcap.sensors.watches import WRISTS
 from wearcap.systems.mocap_every import stream as mocap_every_stream
-from wearcap.systems.mocap_every.stream import MocapEverySession, WatchSample, Wearing
+from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample, Wearing
 
 FRAMES, FAULT = 60, 33
 
@@ -30,9 +30,9 @@ def pipeline():
     return drawn_pipeline(stride=8)
 
 
-def opened(pipeline, recording) -> MocapEverySession:
+def opened(pipeline, recording) -> MocapEveryStream:
     head, mounts = recording.head, {joint: stream.R_joint_imu for joint, stream in recording.imu.items()}
-    return MocapEverySession(pipeline, Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts, 0.0))
+    return MocapEveryStream(pipeline, Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts, 0.0))
 
 
 def feed(session, recording, frame: int, shift: float = 0.0, watched: bool = True) -> list[Motion]:
@@ -66,7 +66,7 @@ def assert_equal(motion: Motion, expected: Motion) -> None:
         assert torch.equal(getattr(motion, name), getattr(expected, name)), name
 
 
-def disturbed(pipeline, recording, undisturbed, happen, streams) -> MocapEverySession:
+def disturbed(pipeline, recording, undisturbed, happen, streams) -> MocapEveryStream:
     session = opened(pipeline, recording)
     assert_equal(whole(session, recording, happen), undisturbed)
     assert {reason.split(":")[0] for reason in session.refused} == set(streams)

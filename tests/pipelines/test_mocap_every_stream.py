@@ -6,7 +6,7 @@ import torch
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.systems.mocap_every.stream import MocapEverySession, WatchSample, Wearing
+from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample, Wearing
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +23,9 @@ def samples(stream):
     return [WatchSample(*row) for row in zip(stream.timestamps.tolist(), stream.R_world_imu, stream.acc_world)]
 
 
-def streamed(pipeline, recording, late_s: float = 0.0, without: str | None = None) -> tuple[Motion, MocapEverySession]:
+def streamed(pipeline, recording, late_s: float = 0.0, without: str | None = None) -> tuple[Motion, MocapEveryStream]:
     """Poses of a session that is fed moment by moment, the watches `late_s` behind the camera."""
-    session, head = MocapEverySession(pipeline, wearing(recording)), recording.head
+    session, head = MocapEveryStream(pipeline, wearing(recording)), recording.head
     waiting = {joint: samples(stream) for joint, stream in recording.imu.items()}
     given = []
     for number, time in enumerate(head.timestamps.tolist()):
@@ -72,7 +72,7 @@ def test_a_silent_watch_is_counted_and_holds_nothing_up(recording):
 
 
 def test_samples_that_are_not_finite_are_left_out(recording):
-    session = MocapEverySession(drawn_pipeline(), wearing(recording))
+    session = MocapEveryStream(drawn_pipeline(), wearing(recording))
     broken = WatchSample(0.1, torch.eye(3), torch.tensor([0.0, torch.nan, 0.0]))
     session.watch("left_wrist", [broken, WatchSample(0.2, torch.eye(3), torch.zeros(3))])
     assert [sample.timestamp for sample in session._samples["left_wrist"]] == [0.2]

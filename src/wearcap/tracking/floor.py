@@ -74,20 +74,14 @@ class FloorTracker:
         """Number of frames so far."""
         self._height = 0.0
 
-    def state(self) -> dict[str, Tensor]:
-        """The state as tensors, without the points, which must be added again."""
-        return {
-            "heights": torch.tensor(list(self._heights), dtype=torch.float64),
-            "path": torch.from_numpy(np.array(self._path).reshape(-1, 3)),
-            "now": torch.tensor([self.frames, self._height], dtype=torch.float64),
-        }
+    transient = ("_tiles",)
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Continue from what `state` returned."""
-        self._heights.extend(state["heights"].tolist())
-        self._path.extend(state["path"].numpy())
-        frames, self._height = state["now"].tolist()
-        self.frames = int(frames)
+    def forget(self) -> None:
+        """Forget all points."""
+        self._tiles = defaultdict(list)
+
+    restored = forget
+    """A saved tracker comes back without points, which must be added again."""
 
     def see(self, points_world: Float[Tensor, "point 3"]) -> None:
         """Add points (m); points that are not finite are left out."""

@@ -51,28 +51,6 @@ class HeadTrack:
         self.newest = -math.inf
         self._poses: list[tuple[float, Tensor, Tensor]] = []
 
-    def state(self) -> dict[str, Tensor]:
-        start = math.nan if self._start is None else self._start
-        numbers = [start, self._next, self.inside, self._provisional, self.newest, self.dropped]
-        times, R, t = zip(*self._poses) if self._poses else ((), (torch.zeros(0, 3, 3),), (torch.zeros(0, 3),))
-        return {
-            "numbers": torch.tensor(numbers, dtype=torch.float64),
-            "times": torch.tensor(times, dtype=torch.float64),
-            "R": torch.stack(R).reshape(-1, 3, 3),
-            "t": torch.stack(t).reshape(-1, 3),
-        }
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        start, next_frame, inside, provisional, self.newest, dropped = state["numbers"].tolist()
-        self._start = None if math.isnan(start) else start
-        self._next, self.inside, self._provisional, self.dropped = (
-            int(next_frame),
-            bool(inside),
-            int(provisional),
-            int(dropped),
-        )
-        self._poses = list(zip(state["times"].tolist(), state["R"], state["t"]))
-
     def take(self, timestamp: float, T_world_device: Rigid | None) -> None:
         """Add a timestamp with the device's pose, if there is one; older than the newest until their chunk is out.
 

@@ -103,6 +103,12 @@ class EchoQueue:
         self._random = [torch.Generator().manual_seed(seed) for seed in seeds]
         self._frame: Rigid | None = None
 
+    transient = ("guided",)
+
+    def restored(self) -> None:
+        """A saved queue comes back without the bodies and objects that guidance needs."""
+        self.guided = None
+
     @torch.no_grad()
     def push(self, fresh: Conditioning) -> Outputs | None:
         """Add one frame of every batch item (padding after a batch item's end); returns the frame that became final, if

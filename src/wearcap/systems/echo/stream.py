@@ -5,29 +5,39 @@ latency of a pose is `Echo.latency_s`. Memory use is bounded.
 """
 
 import math
+import sys
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body import skeleton
 from wearcap.body.skeleton import Skeleton
+from wearcap.diffusion import conveyor
 from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
+from wearcap.geometry import rigid, rotation, trajectory
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
+from wearcap.recording import motion as motion_types
 from wearcap.recording.acts import SAME_S
 from wearcap.recording.timing import joined
 from wearcap.runtime.graphs import undisturbed
+from wearcap.runtime.session import Session, WearerStream
+from wearcap.runtime.snapshot import classes_of
 from wearcap.scene.environment import Environment
 from wearcap.scene.object_mesh import check_object
+from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import (
     CONNECTED_S,
     MAX_WAITING,
     OFF_THE_CLOCK,
+    WRONG_TYPE,
     Admitted,
     Clock,
     HeadInput,
@@ -36,6 +46,8 @@ from wearcap.sensors.packets import (
     pose_fault,
     time_fault,
 )
+from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WristSample
+from wearcap.systems.echo import queue, static_objects
 from wearcap.systems.echo.features import CONTACTS, POINTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.objects import ObjectShape
@@ -43,6 +55,7 @@ from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, wrist_poses
 from wearcap.systems.echo.pipeline import Echo, motion_of, pulled_by, stretch_seed
 from wearcap.systems.echo.queue import Conditioning, EchoQueue, Outputs
 from wearcap.systems.echo.static_objects import StaticObjects
+from wearcap.tracking import floor, head_track
 from wearcap.tracking.floor import FloorTracker
 from wearcap.tracking.head_path import HeadPath
 from wearcap.tracking.head_track import Chunk, HeadTrack
@@ -67,7 +80,7 @@ class EchoWearer:
     standing head. A capture of the whole recording uses later frames, too."""
 
 
-class EchoSession:
+class EchoStream(WearerStream):
     """A streaming capture of one wearer and some objects.
 
     Invalid packets (`sensors.packets`) are counted as `refused`. If the head device's clock is set back for good, the
@@ -82,9 +95,10 @@ class EchoSession:
         self.pipeline, self.wearer, self.seed = pipeline, wearer, seed
         self.silent = 0
         """Wrist poses that were missing, counted per frame and wrist."""
-        self._environment, self._reader = environment, pipeline.reader()
-        self._shapes: dict[str, ObjectShape] = {}
+        self._names: list[str] = []
         """Objects that were named so far, in order of their first use."""
+        self._queue: EchoQueue | None = None
+        self.bring(environment)
         self._entry, self._track = HeadInput(), HeadTrack(pipeline.fps, 1)
         self._wrists: dict[str, list[tuple[float, Tensor, Tensor]]] = {joint: [] for joint in WRISTS}
         self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
@@ -93,6 +107,22 @@ class EchoSession:
         self._finished: list[Motion] = []
         """Final motions with times of a previous clock, not returned yet."""
         self._begin()
+
+    transient = ("_environment", "_reader", "_shapes")
+
+    def bring(self, environment: Environment | None) -> None:
+        """Give the stream its environment, and read the objects that were named. Raises WearcapError without them."""
+        self._environment, self._reader = environment, self.pipeline.reader()
+        self._shapes: dict[str, ObjectShape] = {}
+        for name in self._names:
+            self._shape(name)
+        self._guide()
+
+    def _guide(self) -> None:
+        """Give the queue the bodies and objects that guidance needs, if any."""
+        if self._queue is not None and self.pipeline.guided_by is not None:
+            shape, objects = dict(self.wearer.shape), list(self._shapes.values())
+            self._queue.guided = pulled_by([self.wearer.skeleton], [shape], [objects])
 
     def _begin(self) -> None:
         """Restart the capture; wrist poses, object events and counts are kept."""
@@ -171,6 +201,20 @@ class EchoSession:
                 poses.insert(place, (time, T.R, T.t))
                 del poses[:-MAX_WAITING]
 
+    def take(self, sample: Any) -> None:
+        """Take in one sample of the head device, a wrist or an object, or the choice of the active object."""
+        match sample:
+            case HeadSample():
+                self.head(sample.timestamp, sample.T_world_device)
+            case WristSample() if sample.joint in self._wrists:
+                self.wrist(*sample)
+            case ActiveObject():
+                self.activate(*sample)
+            case ObjectSample():
+                self.see_object(*sample)
+            case _:
+                self._entry.refuse("sample", WRONG_TYPE)
+
     def activate(self, name: str | None, timestamp: float) -> None:
         """Make an object the active one from `timestamp` (s) on; None: no object is active.
 
@@ -217,10 +261,9 @@ class EchoSession:
             item = self._environment.by_name(name)
             check_object(item, f"object {name!r}")
             self._shapes[name] = self._reader(item)
-            if self._queue is not None and self._queue.guided is not None:
-                self._queue.guided = pulled_by(
-                    [self.wearer.skeleton], [dict(self.wearer.shape)], [list(self._shapes.values())]
-                )
+            if name not in self._names:
+                self._names.append(name)
+            self._guide()
         return self._shapes[name]
 
     def poses(self, ended: bool = False) -> Motion | None:
@@ -402,6 +445,65 @@ class EchoSession:
         self._seen = [row for row in self._seen if row[0] > time - 1.0]
         past = [k for k, (start, _) in enumerate(self._acts) if start <= time]
         self._acts = self._acts[past[-1] :] if past else self._acts
+
+
+class EchoSession(Session):
+    """A streaming capture of one or several wearers and the objects of one environment, each by an `EchoStream`."""
+
+    stream_class = EchoStream
+    classes = classes_of(
+        skeleton,
+        motion_types,
+        trajectory,
+        rigid,
+        head_track,
+        packets,
+        samples,
+        floor,
+        conveyor,
+        queue,
+        static_objects,
+        sys.modules[__name__],
+    )
+
+    def __init__(
+        self,
+        pipeline: Echo,
+        wearers: Sequence[EchoWearer],
+        seeds: Sequence[int] | None = None,
+        environment: Environment | None = None,
+    ):
+        """Raises WearcapError without wearers, and for a pipeline without a conveyor."""
+        seeds = [0] * len(wearers) if seeds is None else seeds
+        super().__init__(
+            pipeline, [EchoStream(pipeline, who, environment, seed) for who, seed in zip(wearers, seeds, strict=True)]
+        )
+
+    @classmethod
+    def settings(cls, system: Echo) -> dict[str, Any]:
+        """The settings of a pipeline that a session's state depends on."""
+        return {**system.settings(), "window": system.net.window, "features": str(system.features)}
+
+    @classmethod
+    def shared(cls, system: Echo) -> dict[str, Any]:
+        """Parts of the pipeline that a session's state refers to, by name."""
+        return super().shared(system) | {"schedule": system.schedule}
+
+    @classmethod
+    def load(cls, path: str | Path, system: Echo, environment: Environment | None = None) -> "EchoSession":
+        """Restore a saved session with the pipeline and the environment that it ran with.
+
+        Raises WearcapError for a file that is no session or is damaged, for a pipeline with other settings, and for an
+        environment without the session's objects.
+        """
+        session = super().load(path, system)
+        assert isinstance(session, EchoSession)
+        for stream in session.streams:
+            stream.bring(environment)
+        return session
+
+
+SESSION = EchoSession
 
 
 def _time(pose: tuple[float, Tensor, Tensor]) -> float:

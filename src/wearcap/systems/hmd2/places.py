@@ -40,7 +40,6 @@ class Places:
         self.grid, self.memory = grid, memory
         self.mapped = False
         """Whether any packet of points arrived, even an empty one."""
-        self._about = stature, fps
         self._map, self._floor = VoxelMap(grid), FloorTracker(stature, fps)
         self._tracked: list[tuple[Tensor, Tensor]] = []
         """Points and the times they were first seen, as far as the floor tracker has them."""
@@ -49,21 +48,14 @@ class Places:
         self._center: Tensor | None = None
         """Head position at which distant points were dropped last (m)."""
 
-    def state(self) -> dict[str, Tensor]:
-        points, seen = _joined(self._tracked + self._new)
-        counts = torch.tensor([len(_joined(self._tracked)[0]), self.mapped])
-        center = torch.zeros(0) if self._center is None else self._center
-        here = {"points": points, "seen": seen, "known": counts, "center": center}
-        return here | {f"floor.{name}": part for name, part in self._floor.state().items()}
+    transient = ("_map",)
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        tracked, mapped = state["known"].tolist()
-        self.mapped, points, seen = bool(mapped), state["points"], state["seen"]
-        self._center = state["center"] if len(state["center"]) else None
-        self._new = [(points[tracked:], seen[tracked:])]
-        self._map.add(*self._new[0])
-        floor = {name.removeprefix("floor."): part for name, part in state.items() if name.startswith("floor.")}
-        self._begin([(points[:tracked], seen[:tracked])], floor)
+    def restored(self) -> None:
+        """Rebuild the map and the floor tracker's points after loading."""
+        self._map = VoxelMap(self.grid)
+        for part in self._new:
+            self._map.add(*part)
+        self._begin([_joined(self._tracked)])
 
     def add(self, points_world: Float[Tensor, "point 3"], first_seen: float) -> None:
         """Add points (m) that were first seen at a time (s); points that are not finite are left out."""
@@ -86,7 +78,7 @@ class Places:
         self._map, self._new = VoxelMap(self.grid), kept[::-1]
         for part in self._new:
             self._map.add(*part)
-        self._begin(tracked, self._floor.state())
+        self._begin(tracked)
 
     def grids(self, T_world_device: Rigid, timestamps: Float64[Tensor, "time"]) -> Float[Tensor, "time x y z"]:
         """Voxel grids (m) around the device at each frame, of the points seen by then."""
@@ -131,12 +123,12 @@ class Places:
         self._map = VoxelMap(self.grid)
         for part in self._new:
             self._map.add(*part)
-        self._begin([(points, seen)], self._floor.state())
+        self._begin([(points, seen)])
 
-    def _begin(self, tracked: list[tuple[Tensor, Tensor]], floor: dict[str, Tensor]) -> None:
-        """Restart the floor tracker from its state with these points, and add them to the map."""
-        self._tracked, self._floor = tracked, FloorTracker(*self._about)
-        self._floor.restore(floor)
+    def _begin(self, tracked: list[tuple[Tensor, Tensor]]) -> None:
+        """Replace the floor tracker's points by these, and add them to the map."""
+        self._tracked = tracked
+        self._floor.forget()
         for points, seen in tracked:
             self._map.add(points, seen)
             self._floor.see(points)

@@ -5,125 +5,130 @@ uses earlier data only), the poses are the same. Memory is bounded by a window a
 """
 
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from wearcap.body import skeleton
 from wearcap.errors import WearcapError
+from wearcap.geometry import rigid
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
+from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
+from wearcap.runtime.session import Session
+from wearcap.runtime.snapshot import classes_of
+from wearcap.scene import voxels
+from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import Admitted, time_fault
+from wearcap.sensors.samples import HeadSample
+from wearcap.systems.hmd2 import places, wearer, windows
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
-from wearcap.systems.hmd2.saved import read, write
-from wearcap.systems.hmd2.wearer import Sensed, Wearer, WearerState
+from wearcap.systems.hmd2.wearer import Wearer, WearerState
 from wearcap.systems.hmd2.windows import advance
+from wearcap.tracking import floor, head_track
 from wearcap.tracking.head_track import Chunk
 
-__all__ = ["Sensed", "Session", "Wearer", "joined"]
 
+class HMD2Session(Session):
+    """A streaming capture of one or several wearers with one pipeline, whose windows share batches.
 
-class Session:
-    """A streaming capture of one or several wearers with one pipeline; every wearer has their own clock.
-
-    Poses are output once `stride` frames, and `lookahead_frames` after them, have arrived; poses pending at a gap are
-    output with the next ones. Packets may be late or out of order within those frames; poses that are later still count
-    as `dropped` (their points and embeddings are used). A missing or refused head pose is interpolated; at a chunk's
-    end, before a newer one has arrived, the last pose is repeated, and corrected for the windows that follow.
+    Poses are final once `stride` frames, and `lookahead_frames` after them, have arrived; poses pending at a gap are
+    returned with the next ones. Samples may be late or out of order within those frames; poses that are later still
+    count as `dropped` (their points and embeddings are used). A missing or refused head pose is interpolated; at a
+    chunk's end, before a newer one has arrived, the last pose is repeated, and corrected for the windows that follow.
     After a gap or jump (`tracking.head_path.MAX_GAP_S`, `MAX_SPEED_M_S`) the capture restarts; gaps get no poses.
-    Implausible values (`sensors.packets`) are `refused` without affecting other wearers. When a wearer's clock is
-    reset, that wearer's capture restarts as in a new session.
+    When a wearer's clock is reset, that wearer's capture restarts as in a new session.
     """
+
+    stream_class = WearerState
+    classes = classes_of(
+        skeleton, motion_types, rigid, head_track, packets, samples, floor, voxels, places, windows, wearer
+    )
 
     def __init__(self, pipeline: HMD2, wearers: Sequence[Wearer], seeds: Sequence[int], memory: Memory | None = None):
         """Raises WearcapError when there is not one seed per wearer, or for a stride or lookahead that does not fit."""
         if len(wearers) != len(seeds) or not wearers:
             raise WearcapError(f"{len(seeds)} seeds for {len(wearers)} wearers", expected="one for each wearer")
         pipeline.prepare()
-        self.pipeline, self.memory, self._lookahead_frames = (pipeline, memory or Memory(), pipeline.lookahead_frames)
-        self._wearers = [WearerState(pipeline, wearer, seed, self.memory) for wearer, seed in zip(wearers, seeds)]
-        self._embedded = False
+        memory = memory or Memory()
+        super().__init__(pipeline, [WearerState(pipeline, who, seed, memory) for who, seed in zip(wearers, seeds)])
+        self.embedded = False
         """Whether an embedding of the right length has arrived."""
 
-    @property
-    def dropped(self) -> list[int]:
-        """Number of each wearer's poses that were late, duplicated or refused."""
-        return [state.dropped for state in self._wearers]
+    def push(self, samples: Sequence[Sequence[HeadSample]]) -> None:
+        """Take in each wearer's new samples, any number of them.
 
-    @property
-    def refused(self) -> list[dict[str, int]]:
-        """Number of each wearer's refused packets, or parts of packets, by reason ("head: not a rotation")."""
-        return [dict(state.door.refused) for state in self._wearers]
-
-    def push(self, sensed: Sequence[Sequence[Sensed]]) -> list[Motion | None]:
-        """Process each wearer's new packets (any number, also none); returns each wearer's newly final poses or None.
-
-        When a clock was reset, these are the poses before the reset; poses at the new times follow with the next push.
-        Raises WearcapError, without processing anything, for an embedding of another length than the network's as long
-        as none of the right length has arrived; later ones are refused.
+        Raises WearcapError for samples of another number of wearers and, without taking anything in, for an embedding
+        of another length than the network's as long as none of the right length has arrived; later ones are refused.
         """
-        if len(sensed) != len(self._wearers):
+        if len(samples) != len(self.streams):
             raise WearcapError(
-                f"packets of {len(sensed)} wearers", expected=f"of {len(self._wearers)}, as the session has"
+                f"samples of {len(samples)} wearers", expected=f"of {len(self.streams)}, as the session has"
             )
-        if not self._embedded:
-            self._require_embeddings(sensed)
-        before: dict[int, list[Motion]] = {}
-        for i, moments in enumerate(sensed):
-            for moment in moments:
-                before.setdefault(i, []).extend(self._take(i, self._wearers[i].admit(moment)))
-        begun = {i for i, parts in before.items() if parts}
-        predicted = self._run([i for i in range(len(self._wearers)) if i not in begun], ended=False)
-        return [joined(before[i]) if i in begun else motion for i, motion in enumerate(predicted)]
+        if not self.embedded:
+            self._require_embeddings(samples)
+        for number, part in enumerate(samples):
+            for sample in part:
+                self._take(number, self.streams[number].admit(sample))
 
-    def flush(self) -> list[Motion | None]:
-        """Poses of all remaining frames, at the end of the stream."""
-        for state in self._wearers:
-            for _, moment in state.door.end():
-                state.take(moment)
-        return self._run(range(len(self._wearers)), ended=True)
+    def poses(self, ended: bool = False) -> list[Motion | None]:
+        """Each wearer's frames that became final since the last call; `ended`: no more samples will come.
 
-    def _take(self, number: int, admitted: Admitted) -> list[Motion]:
-        """Process one wearer's accepted packets; returns the poses that remained before a reset of the clock."""
-        state, left = self._wearers[number], []
+        After a wearer's clock was set back, the frames before that come first, and the next call returns those after
+        it.
+        """
+        begun = [number for number, state in enumerate(self.streams) if state.finished]
+        others = [number for number in range(len(self.streams)) if number not in begun]
+        for number in others if ended else ():
+            for _, sample in self.streams[number].door.end():
+                self.streams[number].take(sample)
+        motions = self._run(others, ended)
+        for number in begun:
+            motions[number] = joined(self.streams[number].finished)
+            self.streams[number].finished = []
+        return motions
+
+    def _take(self, number: int, admitted: Admitted) -> None:
+        """Process one wearer's accepted samples; at a reset of the clock the remaining poses are finished."""
+        state = self.streams[number]
         if admitted.begins:
-            last = self._run([number], ended=True)[number] if admitted.again else None
-            left = [] if last is None else [last]
+            if admitted.again and (last := self._run([number], ended=True)[number]) is not None:
+                state.finished.append(last)
             state.begin()
-        for _, moment in admitted.packets:
-            state.take(moment)
-        return left
+        for _, sample in admitted.packets:
+            state.take(sample)
 
-    def _require_embeddings(self, sensed: Sequence[Sequence[Sensed]]) -> None:
-        size = self.pipeline.net.image_size
-        for state, moments in zip(self._wearers, sensed):
-            for moment in moments:
-                embedding = getattr(moment, "embedding", None)
+    def _require_embeddings(self, samples: Sequence[Sequence[HeadSample]]) -> None:
+        size = self.system.net.image_size
+        for state, part in zip(self.streams, samples):
+            for sample in part:
+                embedding = getattr(sample, "embedding", None)
                 if not state.shows_pictures or not isinstance(embedding, Tensor) or embedding.ndim != 1:
                     continue
                 if embedding.shape == (size,):
-                    self._embedded = True
+                    self.embedded = True
                     return
                 raise WearcapError(
-                    f"an embedding of {len(embedding)} features at {_time(moment)}",
-                    expected=f"{size} of {self.pipeline.image_encoder!r}, which the network was trained on",
+                    f"an embedding of {len(embedding)} features at {_time(sample)}",
+                    expected=f"{size} of {self.system.image_encoder!r}, which the network was trained on",
                 )
 
     def _run(self, wearers: Sequence[int], ended: bool) -> list[Motion | None]:
         """The next poses of some wearers; None for the others."""
-        predicted: list[list[Motion]] = [[] for _ in self._wearers]
-        while chunks := {i: chunk for i in wearers if (chunk := self._wearers[i].track.next(ended))}:
+        predicted: list[list[Motion]] = [[] for _ in self.streams]
+        while chunks := {i: chunk for i in wearers if (chunk := self.streams[i].track.next(ended))}:
             for i, chunk in chunks.items():
                 if chunk.begins:
-                    predicted[i] += self._wearers[i].finalize(0)
-            with self.pipeline.undisturbed():
+                    predicted[i] += self.streams[i].finalize(0)
+            with self.system.undisturbed():
                 self._advance(chunks)
             for i in chunks:
-                predicted[i] += self._wearers[i].finalize(self._lookahead_frames)
+                predicted[i] += self.streams[i].finalize(self.system.lookahead_frames)
         for i in wearers if ended else ():
-            predicted[i] += self._wearers[i].finalize(0)
+            predicted[i] += self.streams[i].finalize(0)
         return [joined(parts) for parts in predicted]
 
     @torch.inference_mode()
@@ -131,33 +136,44 @@ class Session:
         """Sample the next chunk of some wearers, in one batch."""
         samplers, fresh = [], []
         for i, chunk in chunks.items():
-            state = self._wearers[i]
+            state = self.streams[i]
             T_device_head = Rigid(state.wearer.R_head_device, state.wearer.t_head_device).inverse()
             fresh.append(state.frames(chunk, chunk.T_world_device @ T_device_head))
             state.times = torch.cat([state.times, chunk.timestamps])
             if chunk.begins or state.sampler is None:
-                state.sampler = self.pipeline.sampler(state.wearer.skeleton, state.seed, chunk.first)
+                state.sampler = self.system.sampler(state.wearer.skeleton, state.seed, chunk.first)
             elif len(chunk.corrected.t):
                 state.sampler.correct(chunk.corrected @ T_device_head)
             samplers.append(state.sampler)
         advance(samplers, fresh)
 
-    def save(self, path: str | Path) -> None:
-        """Write everything that future poses depend on, except the pipeline (.safetensors)."""
-        write(path, self.pipeline, self._wearers, self._embedded)
-
     @classmethod
-    def load(cls, path: str | Path, pipeline: HMD2) -> "Session":
-        """Restore a saved session with the pipeline that it ran with.
+    def settings(cls, system: HMD2) -> dict[str, Any]:
+        """The settings of a pipeline that a session's state depends on."""
+        net = system.net
+        return {
+            "window": net.window,
+            "stride": system.advance,
+            "steps": system.steps,
+            "fps": system.fps,
+            "inpaint": system.inpaint,
+            "fade": system.fade,
+            "lookahead": system.lookahead_frames,
+            "eta": system.eta,
+            "spacing": system.spacing,
+            "motion_size": net.motion_size,
+            "points_size": net.points_size,
+            "image_size": net.image_size,
+            "features": str(system.features),
+        }
 
-        Raises WearcapError for a file that is no session or is damaged, and for a pipeline with other settings.
-        """
-        saved = read(path, pipeline)
-        wearers, seeds = zip(*((state.wearer, state.seed) for state in saved.wearers))
-        session = cls(pipeline, wearers, seeds, saved.memory)
-        session._wearers, session._embedded = saved.wearers, saved.embedded
-        return session
+    def state(self) -> dict[str, Any]:
+        """Everything that future poses depend on, except the pipeline."""
+        return super().state() | {"embedded": self.embedded}
 
 
-def _time(sensed: Sensed) -> str:
-    return "an unknown time" if time_fault(sensed.timestamp) else f"{sensed.timestamp:.3f} s"
+SESSION = HMD2Session
+
+
+def _time(sample: HeadSample) -> str:
+    return "an unknown time" if time_fault(sample.timestamp) else f"{sample.timestamp:.3f} s"

@@ -2,7 +2,7 @@
 
 from bisect import insort
 from dataclasses import dataclass, field
-from typing import NamedTuple, SupportsFloat
+from typing import SupportsFloat
 
 import torch
 from jaxtyping import Float, Float64
@@ -15,7 +15,6 @@ from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording import Motion
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.sensors.packets import (
-    AGREEING,
     MAX_POSITION_M,
     WRONG_TYPE,
     Admitted,
@@ -24,6 +23,7 @@ from wearcap.sensors.packets import (
     number_fault,
     owned,
 )
+from wearcap.sensors.samples import HeadSample
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory, Places
 from wearcap.systems.hmd2.windows import Frames, Poses, WindowSampler
@@ -31,21 +31,6 @@ from wearcap.tracking.head_track import Chunk, HeadTrack
 
 MAX_WAITING = 1000
 """Most image embeddings, and most floor heights, that are buffered for coming head poses; the oldest are dropped."""
-
-
-class Sensed(NamedTuple):
-    """One packet of a wearer's device; a field is None where the device measured nothing."""
-
-    timestamp: float
-    """Seconds, on the wearer's own clock."""
-    T_world_device: Rigid | None = None
-    """R "3 3", t "3" (m); the device's axes are the head's."""
-    points_world: Float[Tensor, "point 3"] | None = None
-    """New points of the surroundings (m), in the world of the poses; zero rows: there is a map, but nothing new."""
-    embedding: Float[Tensor, "feature"] | None = None
-    """Embedding of the head camera's image at this timestamp."""
-    floor_height: float | None = None
-    """Floor height (m) from another source; without it, it is estimated from the points or the head's path."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +48,8 @@ class WearerState:
     def __init__(self, pipeline: HMD2, wearer: Wearer, seed: int, memory: Memory):
         self.pipeline, self.wearer, self.seed, self.memory = pipeline, wearer, seed, memory
         self.door = HeadInput()
+        self.finished: list[Motion] = []
+        """Motions from before the clock was set back that were not returned yet."""
         self.track = HeadTrack(pipeline.fps, pipeline.advance)
         self.begin()
 
@@ -87,10 +74,15 @@ class WearerState:
         """Number of poses that were late, duplicated or refused."""
         return self.track.dropped + self.door.dropped
 
+    @property
+    def refused(self) -> dict[str, int]:
+        """Number of refused samples, or parts of samples, by reason."""
+        return dict(self.door.refused)
+
     def admit(self, sensed: object) -> Admitted:
         """Check a packet; returns the packets that are accepted now."""
         door = self.door
-        if not isinstance(sensed, Sensed):
+        if not isinstance(sensed, HeadSample):
             door.refuse("head", WRONG_TYPE)
             return Admitted([])
         if not door.timely(sensed.timestamp):
@@ -99,7 +91,7 @@ class WearerState:
         if self.pipeline.net.points_size and "points" in self.pipeline.use:
             points = door.points(sensed.points_world)
         parts = points, self._embedding(sensed.embedding), self._floor_height(sensed.floor_height)
-        return door.admit(time, Sensed(time, door.pose(sensed.T_world_device), *parts))
+        return door.admit(time, HeadSample(time, door.pose(sensed.T_world_device), *parts))
 
     @property
     def shows_pictures(self) -> bool:
@@ -127,7 +119,7 @@ class WearerState:
         assert isinstance(height, SupportsFloat)
         return float(height)
 
-    def take(self, sensed: Sensed) -> None:
+    def take(self, sensed: HeadSample) -> None:
         """Add a checked packet to the buffers."""
         self.track.take(sensed.timestamp, sensed.T_world_device)
         if sensed.points_world is not None:
@@ -177,66 +169,6 @@ class WearerState:
         times, self.times = self.times.tensor_split([len(T_world_head.t)])
         poses = Poses(*(part[0] for part in poses))
         return [self.pipeline.motion(times, self.wearer.skeleton, T_world_head, poses)]
-
-    def state(self) -> dict[str, Tensor]:
-        shown, pictures = zip(*self.pictures) if self.pictures else ((), ())
-        parts = {
-            "track": self.track.state(),
-            "places": self.places.state(),
-            "sampler": self.sampler.state() if self.sampler is not None else {},
-            "waiting": {"times": self.times},
-            "pictures": {
-                "time": torch.tensor(shown, dtype=torch.float64),
-                "embedding": torch.stack(pictures) if pictures else torch.zeros(0, self.pipeline.net.image_size),
-            },
-            "floors": {"known": torch.tensor(self.floors, dtype=torch.float64).reshape(-1, 2)},
-            "door": self._door_state(),
-        }
-        return {f"{part}.{name}": value for part, inner in parts.items() for name, value in inner.items()}
-
-    def _door_state(self) -> dict[str, Tensor]:
-        clock, place = self.door.clock, self.door.place or ()
-        numbers = [clock.newest, clock.taken, self.door.dropped, self.door.far, *place]
-        state = {"numbers": torch.tensor(numbers, dtype=torch.float64)}
-        for k, (_, sensed) in enumerate(clock.waiting):
-            T, height = sensed.T_world_device, sensed.floor_height
-            parts = {
-                "timestamp": torch.tensor(sensed.timestamp, dtype=torch.float64),
-                "R": None if T is None else T.R,
-                "t": None if T is None else T.t,
-                "points": sensed.points_world,
-                "embedding": sensed.embedding,
-                "height": None if height is None else torch.tensor(height, dtype=torch.float64),
-            }
-            state |= {f"{k}.{name}": part for name, part in parts.items() if part is not None}
-        return state
-
-    def _restore_door(self, state: dict[str, Tensor]) -> None:
-        clock = self.door.clock
-        clock.newest, taken, dropped, far, *place = state["numbers"].tolist()
-        clock.taken, self.door.dropped, self.door.far = int(taken), int(dropped), int(far)
-        self.door.place = (place[0], place[1], place[2]) if place else None
-        while (k := len(clock.waiting)) < AGREEING and f"{k}.timestamp" in state:
-            part = {name.partition(".")[2]: value for name, value in state.items() if name.startswith(f"{k}.")}
-            T = Rigid(part["R"], part["t"]) if "R" in part else None
-            height = part["height"].item() if "height" in part else None
-            time = part["timestamp"].item()
-            sensed = Sensed(time, T, part.get("points"), part.get("embedding"), height)
-            clock.waiting.append((time, sensed))
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        parts: dict[str, dict[str, Tensor]] = {}
-        for key, value in state.items():
-            part, _, name = key.partition(".")
-            parts.setdefault(part, {})[name] = value
-        self.track.restore(parts["track"])
-        self.places.restore(parts["places"])
-        self._restore_door(parts["door"])
-        self.times = parts["waiting"]["times"]
-        if "sampler" in parts:
-            self.sampler = WindowSampler.restored(self.pipeline, parts["sampler"])
-        self.pictures = list(zip(parts["pictures"]["time"].tolist(), parts["pictures"]["embedding"]))
-        self.floors = [(time, height) for time, height in parts["floors"]["known"].tolist()]
 
 
 def _newest(times: Float64[Tensor, "sample"], time: float) -> int:

@@ -97,23 +97,6 @@ class WindowSampler:
         """Number of the last window's frames whose poses are final; the next windows re-denoise the others."""
         self._random = torch.Generator().manual_seed(seed)
 
-    def state(self) -> dict[str, Tensor]:
-        """Everything that the next windows depend on, as tensors by name."""
-        tensors = {"size": self.size, "random": self._random.get_state(), "noise": self.noise}
-        tensors |= {"given": torch.tensor(self.final), **self.predicted._asdict()}
-        return tensors | (self.frames._asdict() if self.frames is not None else {})
-
-    @classmethod
-    def restored(cls, pipeline: Model, state: dict[str, Tensor]) -> "WindowSampler":
-        """A sampler that continues from what `state` returned."""
-        sampler = cls(pipeline, state["size"], 0)
-        sampler._random.set_state(state["random"].contiguous())
-        sampler.noise, sampler.final = state["noise"], int(state["given"])
-        sampler.predicted = Poses(*(state[name] for name in Poses._fields))
-        if "valid" in state:
-            sampler.frames = Frames(*(state[name] for name in Frames._fields))
-        return sampler
-
     def correct(self, T_world_head: Rigid) -> None:
         """Replace the last frames' extrapolated head poses by the measured ones."""
         if self.frames is not None:

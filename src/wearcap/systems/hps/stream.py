@@ -4,26 +4,35 @@ A window of the newest seconds is re-solved as frames arrive; frames older than 
 that follow. Memory is bounded by the window, however long the recording.
 """
 
+import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from wearcap.body import skeleton
 from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
+from wearcap.geometry import rigid, rotation, trajectory
 from wearcap.geometry.rigid import Rigid
 from wearcap.optimize.hps import HpsData, HpsState
 from wearcap.recording import Motion, Recording
+from wearcap.recording import motion as motion_types
+from wearcap.recording import recording as recording_types
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import at_times, joined
+from wearcap.runtime.digest import digest
+from wearcap.runtime.session import Session
+from wearcap.runtime.snapshot import classes_of
 from wearcap.scene.scan import Scan
 from wearcap.sensors.alignment import align_suit, estimate_head_camera, inliers
 from wearcap.sensors.initialization import Initialization, initialize
 from wearcap.sensors.packets import OFF_THE_CLOCK, WRONG_TYPE
+from wearcap.sensors.samples import SuitPiece
 from wearcap.systems.hps.pieces import cut, follows, localization_fault, more, suit_fault
 from wearcap.systems.hps.pipeline import HPS
 
@@ -72,11 +81,36 @@ class HpsStream:
         """Number of refused pieces, or localisations of pieces, by reason such as "suit: off the clock"."""
         self._alone: tuple[Motion, Localization | None] | None = None
         """The last piece, if it did not follow those before."""
+        self._finished: list[Motion] = []
+        """Motions that `take` finished and `poses` did not return yet."""
         self._any_returned = False
         """Whether any motion was returned."""
         self._like: Motion | None = None
         """The first valid piece; later ones must have the same joints and contacts."""
         self._begin()
+
+    transient = ("about", "scan")
+
+    @property
+    def dropped(self) -> int:
+        """Number of refused localisations."""
+        return sum(count for reason, count in self.refused.items() if reason.startswith("localization"))
+
+    def take(self, sample: Any) -> None:
+        """Take in a `SuitPiece`; anything else is refused."""
+        if not isinstance(sample, SuitPiece):
+            self.refused[f"sample: {WRONG_TYPE}"] += 1
+        elif (motion := self.push(*sample)) is not None:
+            self._finished.append(motion)
+
+    def poses(self, ended: bool = False) -> Motion | None:
+        """Frames that became final since the last call, or None; `ended`: no more pieces will come.
+
+        Raises WearcapError as `finish` does.
+        """
+        if ended and not self._finished:
+            return self.finish()
+        return self._finished.pop(0) if self._finished else None
 
     def _begin(self) -> None:
         """Begin a new stretch."""
@@ -276,6 +310,44 @@ class HpsStream:
         if self.seen is not None:  # two are kept: they determine the frame rate
             first = int(torch.searchsorted(self.seen.timestamps, before_s))
             self.seen = cut(self.seen, max(min(first, len(self.seen.timestamps) - 2), 0))
+
+
+class HpsSession(Session):
+    """A streaming capture of one or several wearers in one scene, each by an `HpsStream`."""
+
+    stream_class = HpsStream
+    classes = classes_of(skeleton, motion_types, trajectory, rigid, recording_types, sys.modules[__name__])
+
+    def __init__(
+        self, hps: HPS, wearers: Sequence[Recording], scan: Scan | None, settings: StreamSettings | None = None
+    ):
+        """`wearers`: each one's shape and camera (`HpsStream`). Raises WearcapError as `HpsStream` does."""
+        super().__init__(hps, [HpsStream(hps, about, scan, settings) for about in wearers])
+
+    @classmethod
+    def settings(cls, system: HPS) -> dict[str, Any]:
+        """The settings of a pipeline that a session's state depends on."""
+        return {"fps": system.fps, "code": digest(system.energy, system.initialization, system.evidence)}
+
+    @classmethod
+    def load(
+        cls, path: str | Path, system: HPS, wearers: Sequence[Recording] = (), scan: Scan | None = None
+    ) -> "HpsSession":
+        """Restore a saved session with the pipeline, the wearers and the scan that it ran with.
+
+        Raises WearcapError for a file that is no session or is damaged, for a pipeline with other settings, and for
+        another number of wearers.
+        """
+        session = super().load(path, system)
+        assert isinstance(session, HpsSession)
+        if len(wearers) != len(session.streams):
+            raise WearcapError(f"{len(wearers)} wearers", where=path, expected=f"the session's {len(session.streams)}")
+        for stream, about in zip(session.streams, wearers):
+            stream.about, stream.scan = about, scan
+        return session
+
+
+SESSION = HpsSession
 
 
 def follow(

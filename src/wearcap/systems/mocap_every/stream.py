@@ -5,20 +5,29 @@ the same. Beyond the lookahead, a stream's latency includes the three future fra
 """
 
 import math
+import sys
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body import skeleton
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
+from wearcap.geometry import rigid
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import ImuStream, Motion
+from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
+from wearcap.runtime.session import Session, WearerStream
+from wearcap.runtime.snapshot import classes_of
+from wearcap.scene import floor_update
+from wearcap.sensors import packets
+from wearcap.sensors import samples as sample_types
 from wearcap.sensors.packets import (
     MAX_ACC_M_S2,
     MAX_WAITING,
@@ -33,25 +42,18 @@ from wearcap.sensors.packets import (
     time_fault,
     vector_fault,
 )
+from wearcap.sensors.samples import HeadSample, WatchSample
 from wearcap.sensors.watches import FILTER, MAX_GAP_S, WRISTS, filtered
+from wearcap.systems.mocap_every import features, windows
 from wearcap.systems.mocap_every.features import Sensed
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
+from wearcap.tracking import head_track
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_track import Chunk, HeadTrack
 
 MAX_POINTS = 1_000_000
 """Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""
-
-
-class WatchSample(NamedTuple):
-    """One sample of a watch."""
-
-    timestamp: float
-    """Seconds, on the camera's clock."""
-    R_world_imu: Float[Tensor, "3 3"]
-    acc_world: Float[Tensor, "3"]
-    """Free acceleration (m/s²)."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Wearing:
     """Initial floor height (the paper's h_0); None: the first head height minus the standing head height."""
 
 
-class MocapEverySession:
+class MocapEveryStream(WearerStream):
     """A streaming capture of one wearer.
 
     Frames are processed once both watches have delivered the samples that they need. A watch without samples for longer
@@ -145,6 +147,16 @@ class MocapEverySession:
     def _refuse(self, joint: str, count: int) -> None:
         if count:
             self._head_input.refuse(joint, OFF_THE_CLOCK, count)
+
+    def take(self, sample: Any) -> None:
+        """Take in one sample of the head camera or of a watch."""
+        match sample:
+            case HeadSample():
+                self.head(sample.timestamp, sample.T_world_device, sample.points_world)
+            case WatchSample() if sample.joint in self._samples:
+                self.watch(sample.joint, [sample])
+            case _:
+                self._head_input.refuse("sample", WRONG_TYPE)
 
     def watch(self, joint: str, samples: Sequence[WatchSample]) -> None:
         """Take in samples of a watch; repeated samples are ignored.
@@ -279,6 +291,36 @@ class MocapEverySession:
             provenance=self.pipeline.settings(),
         )
         return [anchored_to_head(motion, heads) if self.pipeline.anchor else motion]
+
+
+class MocapEverySession(Session):
+    """A streaming capture of one or several wearers, each by a `MocapEveryStream`."""
+
+    stream_class = MocapEveryStream
+    classes = classes_of(
+        skeleton,
+        motion_types,
+        rigid,
+        head_track,
+        packets,
+        sample_types,
+        floor_update,
+        features,
+        windows,
+        sys.modules[__name__],
+    )
+
+    def __init__(self, pipeline: MocapEvery, wearers: Sequence[Wearing]):
+        """Raises WearcapError without wearers."""
+        super().__init__(pipeline, [MocapEveryStream(pipeline, wearing) for wearing in wearers])
+
+    @classmethod
+    def settings(cls, system: MocapEvery) -> dict[str, Any]:
+        """The settings of a pipeline that a session's state depends on."""
+        return {**system.settings(), "window": system.net.window, "fps": system.fps, "features": str(system.features)}
+
+
+SESSION = MocapEverySession
 
 
 def _time(sample: WatchSample) -> float:

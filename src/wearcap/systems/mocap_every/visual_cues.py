@@ -9,10 +9,11 @@ from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
+from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import nearest_frames
-from wearcap.models.checkpoint import load_network
+from wearcap.models.checkpoint import load_trained
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Cue
 from wearcap.systems.mocap_every.energy import (
@@ -234,5 +235,9 @@ def load_visual_cues(
 
     Raises WearcapError for another checkpoint.
     """
-    net = load_network(manifold, MotionManifold, "motion_manifold")
+    net = getattr(load_trained(manifold)[0], "net", None)
+    if not isinstance(net, MotionManifold):
+        raise WearcapError(
+            "cues need a motion manifold", where=manifold, expected="a checkpoint of experiment=motion_manifold"
+        )
     return VisualCues(net, weights or LatentWeights(), solver or LatentSolver(), **settings)
