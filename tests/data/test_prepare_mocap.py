@@ -15,10 +15,8 @@ from wearcap.geometry import rotation
 from wearcap.io.datasets.amass import write_amass
 from wearcap.io.formats.text import read_bytes
 from wearcap.prepare import check_recording, read_splits
-from wearcap.prepare.amass import amass_tasks
-from wearcap.prepare.clean import CleaningLimits, without_glitches
-from wearcap.prepare.cmu import BvhSettings, Trial, cmu_tasks
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
+from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, mocap_recording, without_glitches
+from wearcap.prepare.mocap_sources import BvhSettings, Trial, amass_tasks, cmu_tasks
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled
 

@@ -69,6 +69,13 @@ def content_hash(*parts: Any) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def source_folder(source: str | Path) -> Path:
+    """The folder of a source's files. Raises WearcapError if it does not exist."""
+    if not Path(source).is_dir():
+        raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
+    return Path(source)
+
+
 def prepare(
     tasks: list[Task],
     output: str | Path,

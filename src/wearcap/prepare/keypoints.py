@@ -7,6 +7,7 @@ import os
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -113,20 +114,6 @@ class Simulated:
         return ["simulated", asdict(self)]
 
 
-@dataclass(frozen=True)
-class WithKeypoints:
-    """One recording and the source of its keypoints; picklable, callable as a task."""
-
-    file: Path
-    folder: Path
-    output: Path
-    source: Source
-
-    def __call__(self) -> Recording:
-        recording = self.source(RecordingFile(self.file).load(), self.folder)
-        return _from_elsewhere(recording, os.path.relpath(self.folder, self.output))
-
-
 def keypoints_dataset(
     dataset: str | Path,
     output: str | Path,
@@ -155,7 +142,7 @@ def keypoints_dataset(
     tasks = []
     for name in store.names():
         entry = store.entries[name]
-        make = WithKeypoints(store.root / entry.file, store.root, Path(output), detector)
+        make = partial(_with_keypoints, store.root / entry.file, store.root, Path(output), detector)
         tasks.append(Task(name, make, entry.split, content_hash(entry.sha256, *detector.settings(name))))
     return prepare(
         tasks, output, jobs=jobs, backend=backend, scheduler=scheduler, overwrite=overwrite, progress=progress
@@ -170,8 +157,10 @@ def _camera(recording: Recording) -> CameraStream:
     return recording.camera
 
 
-def _from_elsewhere(recording: Recording, prefix: str) -> Recording:
-    """The recording with `prefix` prepended to the paths of its files, for use from another folder."""
+def _with_keypoints(file: Path, folder: Path, output: Path, source: Source) -> Recording:
+    """One recording with its keypoints; the paths of its files are made relative to the new data set's folder."""
+    recording = source(RecordingFile(file).load(), folder)
+    prefix = os.path.relpath(folder, output)
 
     def moved(name: str | None) -> str | None:
         return name and Path(prefix, name).as_posix()
@@ -179,9 +168,6 @@ def _from_elsewhere(recording: Recording, prefix: str) -> Recording:
     camera = recording.camera
     if camera is not None:
         files = camera.image_files
-        camera = replace(
-            camera,
-            video=moved(camera.video),
-            image_files=None if files is None else tuple(Path(prefix, name).as_posix() for name in files),
-        )
+        files = None if files is None else tuple(Path(prefix, name).as_posix() for name in files)
+        camera = replace(camera, video=moved(camera.video), image_files=files)
     return replace(recording, camera=camera, scene=moved(recording.scene), environment=moved(recording.environment))

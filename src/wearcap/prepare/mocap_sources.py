@@ -1,8 +1,9 @@
-"""CMU's motion capture (ASF/AMC and BVH), and any folder of BVH files."""
+"""Motion capture without sensors: CMU's (ASF/AMC and BVH), any folder of BVH files, and AMASS (SMPL-H or SMPL-X files)."""
 
 import csv
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import torch
@@ -10,18 +11,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.head_level import head_level, with_head_face
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, nearest
+from wearcap.io.datasets.amass import read_amass
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.io.formats.bvh import read_bvh, read_cmu_bvh
 from wearcap.io.formats.text import read_text
-from wearcap.prepare.engine import Task, content_hash
+from wearcap.prepare.engine import Task, content_hash, source_folder
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording, on_xsens23
 from wearcap.prepare.splits import Splits
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 
-VERSION = 2
-"""Version of the conversion, increased when the same source and settings yield another recording."""
+CMU_VERSION, AMASS_VERSION = 2, 1
+"""Versions of the conversions, increased when the same source and settings yield another recording."""
 
 MOTION_SUFFIXES = (".amc", ".amc.xz", ".amc.gz", ".bvh", ".bvh.xz", ".bvh.gz")
 HEAD_TRIALS, HEAD_FRAME_STEP = 6, 12
@@ -29,6 +31,9 @@ HEAD_TRIALS, HEAD_FRAME_STEP = 6, 12
 
 CGSPEED_JOINT = "LHipJoint"
 """Joint by which cgspeed's conversions of CMU are recognised."""
+
+NO_MOTION = ("shape.npz", "stagei.npz")
+"""Name suffixes of AMASS's files that hold no motion."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,7 @@ class Trial:
                     expected=f"{self.file.name.split('_')[0]}.asf, or one .asf file",
                 )
             return read_amc(read_asf(self.asf), self.file, self.amc_fps)
-        if _is_cgspeed(self.file):
+        if CGSPEED_JOINT in read_text(self.file)[:4096]:
             return read_cmu_bvh(self.file)
         return read_bvh(self.file, unit_m=self.bvh.unit_m, up=self.bvh.up, forward=self.bvh.forward)
 
@@ -109,10 +114,11 @@ def cmu_tasks(
     Files are named SUBJECT_TRIAL.amc or .bvh (also .xz, .gz); an .amc needs SUBJECT.asf in its folder. Where a
     trial exists as both, the AMC is taken. `index.csv` (columns trial, category) provides activities if it exists.
     """
-    source = Path(source)
-    if not source.is_dir():
-        raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
-    activities = _activities(source / "index.csv")
+    source = source_folder(source)
+    index, activities = source / "index.csv", {}
+    if index.is_file():
+        with open(index, newline="", encoding="utf-8") as file:
+            activities = {row["trial"]: row.get("category") for row in csv.DictReader(file) if row.get("trial")}
     trials = {
         name: (path, _asf_for(path) if ".amc" in path.name.lower() else None) for name, path in _trials(source).items()
     }
@@ -122,11 +128,11 @@ def cmu_tasks(
     tasks = []
     for name, (path, asf) in trials.items():
         subject = _subject(name)
-        about = About(name, subject, "cmu", license, activities.get(name, ""))
+        about = About(name, subject, "cmu", license, activities.get(name) or "")
         others = same[subject, asf]
         spread = tuple(others[:: -(-len(others) // HEAD_TRIALS)]) if asf is not None else ()
         trial = Trial(path, asf, about, amc_fps, bvh, settings, spread)
-        described = [asdict(about), asdict(settings), asdict(bvh), amc_fps, VERSION]
+        described = [asdict(about), asdict(settings), asdict(bvh), amc_fps, CMU_VERSION]
         sources = [path] if asf is None else [path, asf, *spread]
         tasks.append(Task(name, trial, splits.of(subject), content_hash(*described, *sources)))
     return tasks
@@ -158,14 +164,40 @@ def _asf_for(amc: Path) -> Path | None:
     return (own or skeletons)[0] if len(own or skeletons) == 1 else None
 
 
-def _activities(index: Path) -> dict[str, str]:
-    if not index.is_file():
-        return {}
-    with open(index, newline="", encoding="utf-8") as file:
-        return {
-            row["trial"]: row["category"] for row in csv.DictReader(file) if row.get("trial") and row.get("category")
-        }
+def _amass(file: Path, about: About, settings: MocapSettings) -> Recording:
+    source = read_amass(file)
+    assert source.motion is not None
+    return replace(mocap_recording(source.motion, about, settings), shape=source.shape)
 
 
-def _is_cgspeed(bvh: Path) -> bool:
-    return CGSPEED_JOINT in read_text(bvh)[:4096]
+def amass_tasks(
+    source: str | Path, splits: Splits, settings: MocapSettings, license: str, subsets: Sequence[str] | None = None
+) -> list[Task]:
+    """One task per motion file below `source`, laid out DATASET/SUBJECT/MOTION.npz, of all data sets or of `subsets`.
+
+    A row of the split list that names a file (DATASET/SUBJECT/MOTION) takes precedence over its subject's. Raises
+    WearcapError for a missing subset, and for a file that is not laid out so.
+    """
+    source = source_folder(source)
+    files = sorted(path for path in source.rglob("*.npz") if not path.name.endswith(NO_MOTION))
+    if subsets is not None:
+        there = {path.relative_to(source).parts[0] for path in files}
+        for name in subsets:
+            if name not in there:
+                raise WearcapError(f"no data set {name!r}", where=source, fix=nearest(name, there))
+        files = [path for path in files if path.relative_to(source).parts[0] in set(subsets)]
+    by_file = {row for row, _ in splits.rows if row.count("/") > 1}
+    tasks = []
+    for path in files:
+        parts = path.relative_to(source).with_suffix("").parts
+        if len(parts) < 3:
+            expected = f"{source}/DATASET/SUBJECT/{path.name}"
+            raise WearcapError("not below a data set's and a subject's folder", where=path, expected=expected)
+        name, subject, file = "__".join(parts).replace(" ", "_"), "/".join(parts[:2]), "/".join(parts)
+        about = About(name, subject, "amass", license)
+        key = content_hash(asdict(about), asdict(settings), AMASS_VERSION, path)
+        split = splits.of(file if file in by_file else subject)
+        tasks.append(Task(name, partial(_amass, path, about, settings), split, key))
+    if not tasks:
+        raise WearcapError("no motion files (.npz)", where=source, expected="AMASS as it unpacks")
+    return tasks
