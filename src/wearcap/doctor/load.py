@@ -7,11 +7,10 @@ from pathlib import Path
 
 import torch
 
-from wearcap.doctor.environment import is_environment, read_environment_file
-from wearcap.doctor.localized import check_files
-from wearcap.doctor.report import Finding
-from wearcap.doctor.scene import is_map, is_scene, read_map, read_scene
-from wearcap.doctor.timing import check_clock
+from wearcap.doctor.agreement import check_files
+from wearcap.doctor.places import is_map, is_place, read_environment_file, read_map, read_place
+from wearcap.doctor.report import Check, Finding
+from wearcap.doctor.streams import check_clock
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.adt import is_adt, read_adt
@@ -89,20 +88,12 @@ def _read_file(path: Path) -> Loaded:
     if isinstance(content, Motion):
         return Recording(name=name, motion=content, skeleton=content.skeleton), []
     if isinstance(content, Trajectory):
-        return Recording(name=name, head=_as_head(content)), [
-            Finding(
-                "note",
-                "head: axes",
-                "taken as the head's own pose",
-                "a trajectory file does not name its axes",
-                "x forward, y left, z up is assumed.",
-            )
+        head = HeadStream(content.timestamps, content.R_world_body, content.t_world_body, torch.eye(3), torch.zeros(3))
+        evidence, fix = "a trajectory file does not name its axes", "x forward, y left, z up is assumed."
+        return Recording(name=name, head=head), [
+            Check("head: axes").note("taken as the head's own pose", evidence, fix)
         ]
     return Recording(name=name, points=PointCloud(torch.from_numpy(content.points))), []
-
-
-def _as_head(track: Trajectory) -> HeadStream:
-    return HeadStream(track.timestamps, track.R_world_body, track.t_world_body, torch.eye(3), torch.zeros(3))
 
 
 def _read_stored(store: RecordingStore, name: str) -> Loaded:
@@ -117,12 +108,6 @@ def _read_hps(root: Path, name: str) -> Loaded:
     return recording, check_files(recording, root)
 
 
-def _read_place(folder: Path) -> Loaded:
-    """A scene, an environment, or both in one folder."""
-    recording, findings = read_scene(folder) if is_scene(folder) else (Recording(folder.resolve().name), [])
-    return recording, [*findings, *(read_environment_file(folder)[1] if is_environment(folder) else [])]
-
-
 def _read_mps(folder: Path) -> Loaded:
     """An MPS folder at 60 Hz, with findings about the raw file's clock, its quality score and the service's own report."""
     path = find_mps_file(folder, ("closed_loop_trajectory.csv",))
@@ -131,37 +116,29 @@ def _read_mps(folder: Path) -> Loaded:
     findings = check_clock("closed-loop file", raw.T_world_aria.timestamps)
     quality = raw.quality.median().item()
     low = (raw.quality < 0.5).float().mean().item()
-    findings.append(
-        Finding(
-            "warning" if low > 0.1 else "ok",
-            "closed-loop file: quality",
-            "MPS trusts its poses little" if low > 0.1 else "MPS trusts its poses",
-            f"median score {quality:.2f}, {100 * low:.0f} % below 0.5",
-        )
-    )
-    findings.append(Finding("ok", "closed-loop file: gravity", "points along -z", "9.81 m/s²"))
+    check, evidence = Check("closed-loop file: quality"), f"median score {quality:.2f}, {100 * low:.0f} % below 0.5"
+    if low > 0.1:
+        findings.append(check.warning("MPS trusts its poses little", evidence))
+    else:
+        findings.append(check.ok("MPS trusts its poses", evidence))
+    findings.append(Check("closed-loop file: gravity").ok("points along -z", "9.81 m/s²"))
     return read_mps(folder), [*findings, *_mps_summary(folder)]
 
 
 def _mps_summary(folder: Path) -> list[Finding]:
-    path = find_mps_file(folder, ("summary.json",))
+    check, path = Check("MPS summary"), find_mps_file(folder, ("summary.json",))
     if path is None:
         return []
     try:
         parts = read_json_object(path)
     except WearcapError as error:
-        return [Finding("warning", "MPS summary", "cannot be read", str(error))]
+        return [check.warning("cannot be read", str(error))]
     failed = [
         name for name, part in parts.items() if isinstance(part, dict) and part.get("status", "SUCCESS") != "SUCCESS"
     ]
     if failed:
-        return [Finding("error", "MPS summary", "MPS reports failures", ", ".join(failed), "Request MPS again.")]
-    return [Finding("ok", "MPS summary", "MPS reports success", ", ".join(name for name in parts if name != "version"))]
-
-
-def _read_recording(path: Path) -> Recording | Loaded:
-    """A recording, or a visual map."""
-    return read_map(path) if is_map(path) else RecordingFile(path).load()
+        return [check.error("MPS reports failures", ", ".join(failed), "Request MPS again.")]
+    return [check.ok("MPS reports success", ", ".join(name for name in parts if name != "version"))]
 
 
 def _read_amc(path: Path) -> Motion:
@@ -192,12 +169,12 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Loaded]], ...] = 
     (is_nymeria, lambda folder: (read_nymeria(folder), [])),
     (is_mps_folder, _read_mps),
     (is_adt, lambda folder: (read_adt(folder), [])),
-    (lambda folder: is_scene(folder) or is_environment(folder), _read_place),
+    (is_place, read_place),
 )
 _MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _read_npz}
 _READERS: dict[str, Callable] = {
     **_MOTIONS,
-    ".safetensors": _read_recording,
+    ".safetensors": lambda path: read_map(path) if is_map(path) else RecordingFile(path).load(),
     ".csv": _read_csv,
     ".txt": read_tum,
     ".tum": read_tum,
