@@ -21,8 +21,7 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.viewer.annotate import take_of
 from wearcap.viewer.annotate_server import AnnotationServer, byte_range
-from wearcap.viewer.annotation_file import AnnotationFile, Conflict
-from wearcap.viewer.annotation_start import starting_labels
+from wearcap.viewer.annotation_file import AnnotationFile, Conflict, starting_labels
 from wearcap_testing import recording_of, swaying_motion
 
 

@@ -253,7 +253,7 @@ def test_another_sites_websocket_presses_no_button_of_the_scene_editor(tmp_path)
     try:
         page.editing.select_box(Box((1.0, 1.0, 0.3), (0.6, 0.6, 0.6)))
         page.cut()
-        page._refresh()
+        page.refresh()
         page.save()
         file, delete = tmp_path / FILE_NAME, page.objects.delete._impl.uuid
         before = file.read_bytes()

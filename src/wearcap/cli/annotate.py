@@ -76,7 +76,7 @@ def _annotate(options: argparse.Namespace) -> None:
 def _start_from(desk: "Desk", source: str) -> None:
     """Write labels to start from; labels that are there already are never replaced."""
     from wearcap.io.formats.contact_labels import annotation_of
-    from wearcap.viewer.annotation_start import starting_labels
+    from wearcap.viewer.annotation_file import starting_labels
 
     if len(desk.names) > 1 and source != "recording":
         raise WearcapError(f"labels from {source} for {len(desk.names)} recordings", expected="one recording")

@@ -31,9 +31,7 @@ def check_motion(stream: str, motion: Motion, floor: FloorTrack | None) -> list[
     except WearcapError as error:
         return [*findings, Check(f"{stream}: skeleton").note("limbs are not recognised by name", str(error))]
     findings += _check_posture(stream, motion, parts)
-    if has_error(findings):
-        return findings
-    return [*findings, *_check_knees(stream, motion, parts), *_check_feet(stream, motion, root, parts, floor)]
+    return findings if has_error(findings) else [*findings, *_check_feet(stream, motion, root, parts, floor)]
 
 
 def _check_size(check: Check, skeleton: Skeleton) -> Finding:
@@ -83,7 +81,7 @@ def _check_joint_angles(check: Check, motion: Motion) -> Finding:
 
 
 def _check_posture(stream: str, motion: Motion, parts: Landmarks) -> list[Finding]:
-    """Head above feet along z; toes ahead of the ankles, so left and right are not exchanged."""
+    """Head above feet along z; toes ahead of the ankles, so left and right are not exchanged; knees that bend backwards."""
     check, position = Check(f"{stream}: up axis"), motion.T_world_joint.t.double()
     (left_hip, _, left_ankle), (right_hip, _, right_ankle) = parts.limb["left_leg"], parts.limb["right_leg"]
     upward = position[:, parts.head] - position[:, [left_ankle, right_ankle]].mean(1)
@@ -97,34 +95,29 @@ def _check_posture(stream: str, motion: Motion, parts: Landmarks) -> list[Findin
             fix = f"Read it with up='{name.lstrip('+')}', or turn the world so."
             return [check.error(f"the body stands along {name}", evidence, fix)]
         fix = "Lying, crawling and handstands look like this too."
-        return [check.warning("the body is not upright", evidence, fix)]
-    findings = [check.ok("z is up", evidence)]
-    forward = torch.linalg.cross(position[:, left_hip] - position[:, right_hip], upward)
-    toes = [(parts.limb[f"{side}_leg"][2], parts.toe[side]) for side in ("left", "right")]
-    ahead = [(forward * (position[:, toe] - position[:, ankle])).sum(-1) > 0 for ankle, toe in toes if toe is not None]
-    if ahead and torch.stack(ahead).double().mean() < 0.3:
-        evidence = "the toes point backwards as seen from the hips"
-        fix = "Exchange left and right joints, or undo a mirrored axis."
-        findings.append(Check(f"{stream}: sides").error("left and right are exchanged", evidence, fix))
-    return findings
-
-
-def _check_knees(stream: str, motion: Motion, parts: Landmarks) -> list[Finding]:
-    """Knees bend backwards."""
-    position, bad = motion.T_world_joint.t.double(), []
-    across = position[:, parts.limb["left_leg"][0]] - position[:, parts.limb["right_leg"][0]]
+        findings = [check.warning("the body is not upright", evidence, fix)]
+    else:
+        findings = [check.ok("z is up", evidence)]
+        forward = torch.linalg.cross(position[:, left_hip] - position[:, right_hip], upward)
+        toes = [(parts.limb[f"{side}_leg"][2], parts.toe[side]) for side in ("left", "right")]
+        ahead = [(forward * (position[:, toe] - position[:, a])).sum(-1) > 0 for a, toe in toes if toe is not None]
+        if ahead and torch.stack(ahead).double().mean() < 0.3:
+            evidence = "the toes point backwards as seen from the hips"
+            fix = "Exchange left and right joints, or undo a mirrored axis."
+            return [*findings, Check(f"{stream}: sides").error("left and right are exchanged", evidence, fix)]
+    bad, across = [], torch.nn.functional.normalize(position[:, left_hip] - position[:, right_hip], dim=-1)
     for side in ("left", "right"):
         hip, knee, ankle = (position[:, joint] for joint in parts.limb[f"{side}_leg"])
         thigh, shank = (torch.nn.functional.normalize(v, dim=-1) for v in (knee - hip, ankle - knee))
         bent = (thigh * shank).sum(-1) < math.cos(math.radians(25))
         # Flexion rotates the shank about the axis to the left, so thigh × shank points to the right of the body.
-        wrong = (torch.linalg.cross(thigh, shank) * torch.nn.functional.normalize(across, dim=-1)).sum(-1) < -0.2
+        wrong = (torch.linalg.cross(thigh, shank) * across).sum(-1) < -0.2
         if bent.sum() > 10 and (wrong & bent).sum() > 0.3 * bent.sum():
             bad.append(f"{side} ({100 * (wrong & bent).sum() / bent.sum():.0f} % of bent frames)")
-    if not bad:
-        return []
-    fix = "Check joint axes and rotation order."
-    return [Check(f"{stream}: knees").warning("knees bend forwards", ", ".join(bad), fix)]
+    if bad:
+        fix = "Check joint axes and rotation order."
+        findings.append(Check(f"{stream}: knees").warning("knees bend forwards", ", ".join(bad), fix))
+    return findings
 
 
 def _check_feet(

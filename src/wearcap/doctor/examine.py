@@ -35,14 +35,14 @@ def examine(source: Recording | str | Path, progress: Callable[[int, int], None]
         return Report(source.name, {source.name: tuple(examine_recording(source))})
     found = patients(Path(source))
     findings: dict[str, tuple[Finding, ...]] = {}
-    for done, patient in enumerate(found, 1):
+    for done, (name, load) in enumerate(found.items(), 1):
         try:
-            recording, read = patient.load()
+            recording, read = load()
         except WearcapError as error:
-            findings[patient.name] = (refusal(error),)
+            findings[name] = (refusal(error),)
         else:
             only_read = read and recording.points is None and not _clocks(recording)  # with the reader's errors
-            findings[patient.name] = tuple(read if only_read else [*read, *examine_recording(recording)])
+            findings[name] = tuple(read if only_read else [*read, *examine_recording(recording)])
         if progress:
             progress(done, len(found))
     return Report(str(source), findings)

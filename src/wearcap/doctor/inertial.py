@@ -31,22 +31,18 @@ def check_imu(stream: str, imu: ImuStream, joint: Trajectory | None) -> list[Fin
     if imu.acc_imu is not None:
         findings.append(_specific_force(Check(f"{stream}: accelerometer"), imu.acc_imu, imu.R_world_imu))
     if imu.acc_world is not None:
-        findings.append(_free_acceleration(Check(f"{stream}: free acceleration"), imu.acc_world))
+        check, mean = Check(f"{stream}: free acceleration"), imu.acc_world.double().mean(0)
+        evidence = f"mean ({', '.join(f'{v:+.2f}' for v in mean.tolist())}) m/s²"
+        if mean.norm() > 0.6 * GRAVITY:
+            fix = f"Subtract ({', '.join(f'{v:.2f}' for v in (GRAVITY * mean / mean.norm()).tolist())}) m/s²."
+            findings.append(check.error("gravity is still in it", evidence, fix))
+        elif mean.norm() > 1.0:
+            findings.append(check.warning("has a mean", evidence, "Orientation or bias is off."))
+        else:
+            findings.append(check.ok("free of gravity", evidence))
     if imu.gyro_imu is not None:
         findings.append(_gyroscope(Check(f"{stream}: gyroscope"), imu, imu.gyro_imu.double()))
     return findings if joint is None else findings + _against_motion(stream, imu, joint)
-
-
-def _free_acceleration(check: Check, acc_world: Tensor) -> Finding:
-    """Free acceleration has no mean."""
-    mean = acc_world.double().mean(0)
-    evidence = f"mean ({', '.join(f'{v:+.2f}' for v in mean.tolist())}) m/s²"
-    if mean.norm() > 0.6 * GRAVITY:
-        fix = f"Subtract ({', '.join(f'{v:.2f}' for v in (GRAVITY * mean / mean.norm()).tolist())}) m/s²."
-        return check.error("gravity is still in it", evidence, fix)
-    if mean.norm() > 1.0:
-        return check.warning("has a mean", evidence, "Orientation or bias is off.")
-    return check.ok("free of gravity", evidence)
 
 
 def _specific_force(check: Check, acc_imu: Tensor, R_world_imu: Tensor | None) -> Finding:

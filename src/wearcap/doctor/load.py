@@ -1,7 +1,6 @@
 """Recordings that can be examined in a path: data sets, files, MPS folders, scenes, environments, motion capture."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -34,34 +33,29 @@ from wearcap.recording.store import RecordingFile
 Loaded = tuple[Recording, list[Finding]]
 
 
-@dataclass(frozen=True)
-class Patient:
-    """One recording to examine; `load` returns it with the reader's findings (a file's raw clock, a service's report)."""
+def patients(path: Path) -> dict[str, Callable[[], Loaded]]:
+    """What loads each recording in a path, by name; it returns the reader's findings, too (of a file's raw clock, say).
 
-    name: str
-    load: Callable[[], Loaded]
-
-
-def patients(path: Path) -> list[Patient]:
-    """All recordings in a path, in order of name. Raises WearcapError when there is none."""
+    Raises WearcapError when there is nothing to examine.
+    """
     if not path.exists() and (path.parent / "manifest.json").is_file():
         store = RecordingStore.open(path.parent)
         store.require(path.name)
-        return [Patient(path.name, partial(_read_stored, store, path.name))]
+        return {path.name: partial(_read_stored, store, path.name)}
     if not path.exists():
         raise WearcapError("no such file or folder", where=path)
     if path.is_file():
         if _kind(path) is None:
             raise WearcapError("a kind of file that the doctor does not know", where=path, expected=", ".join(_READERS))
-        return [Patient(path.name, partial(_read_file, path))]
+        return {path.name: partial(_read_file, path)}
     if (path / "manifest.json").is_file():
         store = RecordingStore.open(path)
-        return [Patient(name, partial(_read_stored, store, name)) for name in store.names()]
+        return {name: partial(_read_stored, store, name) for name in store.names()}
     for is_kind, read in _FOLDERS:
         if is_kind(path):
-            return [Patient(path.resolve().name, partial(read, path))]
+            return {path.resolve().name: partial(read, path)}
     if is_hps(path):
-        return [Patient(name, partial(_read_hps, path, name)) for name in hps_names(path)]
+        return {name: partial(_read_hps, path, name) for name in hps_names(path)}
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) in _MOTIONS]
     if not files:
         raise WearcapError(
@@ -69,7 +63,7 @@ def patients(path: Path) -> list[Patient]:
             where=path,
             expected=f"a data set (manifest.json), an MPS, Nymeria, ADT or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), or files like {', '.join(_MOTIONS)}",
         )
-    return [Patient(file.relative_to(path).as_posix(), partial(_read_file, file)) for file in files]
+    return {file.relative_to(path).as_posix(): partial(_read_file, file) for file in files}
 
 
 def _kind(path: Path) -> str | None:
@@ -122,23 +116,20 @@ def _read_mps(folder: Path) -> Loaded:
     else:
         findings.append(check.ok("MPS trusts its poses", evidence))
     findings.append(Check("closed-loop file: gravity").ok("points along -z", "9.81 m/s²"))
-    return read_mps(folder), [*findings, *_mps_summary(folder)]
-
-
-def _mps_summary(folder: Path) -> list[Finding]:
+    recording = read_mps(folder)
     check, path = Check("MPS summary"), find_mps_file(folder, ("summary.json",))
     if path is None:
-        return []
+        return recording, findings
     try:
         parts = read_json_object(path)
     except WearcapError as error:
-        return [check.warning("cannot be read", str(error))]
-    failed = [
-        name for name, part in parts.items() if isinstance(part, dict) and part.get("status", "SUCCESS") != "SUCCESS"
-    ]
+        return recording, [*findings, check.warning("cannot be read", str(error))]
+    states = {name: part.get("status", "SUCCESS") for name, part in parts.items() if isinstance(part, dict)}
+    failed = [name for name, state in states.items() if state != "SUCCESS"]
     if failed:
-        return [check.error("MPS reports failures", ", ".join(failed), "Request MPS again.")]
-    return [check.ok("MPS reports success", ", ".join(name for name in parts if name != "version"))]
+        return recording, [*findings, check.error("MPS reports failures", ", ".join(failed), "Request MPS again.")]
+    services = ", ".join(name for name in parts if name != "version")
+    return recording, [*findings, check.ok("MPS reports success", services)]
 
 
 def _read_amc(path: Path) -> Motion:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,11 @@ def source_folder(source: str | Path) -> Path:
     if not Path(source).is_dir():
         raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
     return Path(source)
+
+
+def changed(read: Callable[[], Recording], **changes: Any) -> Recording:
+    """The recording that `read` returns, with fields replaced; a partial of it is a task's `make`."""
+    return replace(read(), **changes)
 
 
 def prepare(
@@ -160,7 +165,10 @@ def _is_current(store: RecordingStore, task: Task) -> bool:
 
 def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
     """In a worker: make, check and write one recording; returns (name, entry or reason of failure, note)."""
-    with _one_thread():
+    threads = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(1)  # recordings are the unit of parallelism, and sums over threads differ in their last bits
+    numba.set_num_threads(1)
+    try:
         try:
             recording = task.make()
             if recording.name != task.name:
@@ -172,19 +180,9 @@ def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
         save_recording(recording, recording_path(root, task.name))
         note = recording.motion.provenance.get(NOTE, "") if recording.motion else ""
         return task.name, entry_for(recording, root, task.split, task.hash), note
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Use one thread: recordings are the unit of parallelism, and sums over threads differ in their last bits."""
-    before = torch.get_num_threads(), numba.get_num_threads()
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    try:
-        yield
     finally:
-        torch.set_num_threads(before[0])
-        numba.set_num_threads(before[1])
+        torch.set_num_threads(threads[0])
+        numba.set_num_threads(threads[1])
 
 
 def _outcomes(

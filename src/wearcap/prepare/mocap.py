@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
@@ -60,14 +60,25 @@ class About:
 def mocap_recording(motion: Motion, about: About, settings: MocapSettings) -> Recording:
     """Retarget to xsens23, cut glitches, resample, level the floor, find contacts, put a device on the head.
 
-    The source's floor height is kept in the motion's provenance as `floor_m`. On ground that is not level
-    (steps, ladders) there is no `floor`, and contacts follow from the patches' speed alone.
+    The floor is at the median height of the lowest of `FOOT_PATCHES` while that patch is planted. On ground that is not
+    level (steps, ladders) there is no `floor`, contacts follow from the patches' speed alone, and z = 0 is the 5th
+    percentile of these heights, the lowest ground trodden. The source's height is kept in the provenance as `floor_m`.
     """
     motion, note = without_glitches(on_xsens23(motion), settings.limits)
     motion = resampled(motion, settings.fps)
     positions, speed = foot_patches(motion)
-    floor, level = floor_height(positions, speed, settings.limits)
-    contact = foot_contacts(positions, speed, floor if level else None, settings.limits)
+    height, patch = positions[..., 2].min(1)
+    slow = speed < settings.limits.contact_speed
+    planted = height[slow.gather(1, patch[:, None])[:, 0]]
+    planted = planted if len(planted) else height
+    low, middle, high = planted.quantile(torch.tensor([0.05, 0.5, 0.95])).tolist()
+    level = high - low <= settings.limits.level_within
+    floor = middle if level else low
+    if level:
+        slow &= positions[..., 2] < floor + settings.limits.contact_height
+    # Single frames follow their neighbours.
+    votes = torch.nn.functional.pad(slow.float().T[None], (1, 1), mode="replicate")[0]
+    contact = votes.unfold(-1, 3, 1).sum(-1).T >= 2
     provenance = motion.provenance | {"floor_m": f"{floor:.4f}", "floor": "level" if level else "uneven"}
     motion = replace(
         motion,
@@ -137,33 +148,3 @@ def foot_patches(motion: Motion) -> tuple[Float[Tensor, "time patch 3"], Float[T
     step_s = (motion.timestamps[2:] - motion.timestamps[:-2]).to(positions.dtype)
     speed = (positions[2:] - positions[:-2]).norm(dim=-1) / step_s[:, None]
     return positions, torch.cat([speed[:1], speed, speed[-1:]])
-
-
-def floor_height(
-    positions: Float[Tensor, "time patch 3"], speed: Float[Tensor, "time patch"], limits: CleaningLimits
-) -> tuple[float, bool]:
-    """Height (m) of the floor in the motion's own world, and whether it is level.
-
-    Level: the median height of the lowest patch while that patch is planted. Else (steps, uneven ground) its
-    5th percentile: the lowest ground trodden.
-    """
-    height, patch = positions[..., 2].min(1)
-    planted = height[speed.gather(1, patch[:, None])[:, 0] < limits.contact_speed]
-    planted = planted if len(planted) else height
-    low, middle, high = planted.quantile(torch.tensor([0.05, 0.5, 0.95])).tolist()
-    level = high - low <= limits.level_within
-    return (middle if level else low), level
-
-
-def foot_contacts(
-    positions: Float[Tensor, "time patch 3"],
-    speed: Float[Tensor, "time patch"],
-    floor: float | None,
-    limits: CleaningLimits,
-) -> Bool[Tensor, "time patch"]:
-    """Contacts of `FOOT_PATCHES`: slow and, if the floor is level (else None), low; single frames follow their neighbours."""
-    contact = speed < limits.contact_speed
-    if floor is not None:
-        contact &= positions[..., 2] < floor + limits.contact_height
-    votes = torch.nn.functional.pad(contact.float().T[None], (1, 1), mode="replicate")[0]
-    return votes.unfold(-1, 3, 1).sum(-1).T >= 2

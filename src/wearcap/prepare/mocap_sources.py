@@ -119,9 +119,7 @@ def cmu_tasks(
     if index.is_file():
         with open(index, newline="", encoding="utf-8") as file:
             activities = {row["trial"]: row.get("category") for row in csv.DictReader(file) if row.get("trial")}
-    trials = {
-        name: (path, _asf_for(path) if ".amc" in path.name.lower() else None) for name, path in _trials(source).items()
-    }
+    trials = _trials(source)
     same: dict[tuple[str, Path | None], list[Path]] = {}
     for name, (path, asf) in trials.items():
         same.setdefault((_subject(name), asf), []).append(path)
@@ -138,14 +136,21 @@ def cmu_tasks(
     return tasks
 
 
-def _trials(source: Path) -> dict[str, Path]:
-    """Motion files by trial; if a folder has a trial in several formats, AMC takes precedence over BVH."""
-    files: dict[str, Path] = {}
+def _trials(source: Path) -> dict[str, tuple[Path, Path | None]]:
+    """(Motion file, skeleton file of an AMC) by trial; where a folder has a trial in several formats, AMC is taken.
+
+    An AMC's skeleton is its subject's .asf, else the only one in the folder.
+    """
+    files: dict[str, tuple[Path, Path | None]] = {}
     for path in sorted(p for p in source.rglob("*") if p.name.lower().endswith(MOTION_SUFFIXES)):
-        name = path.name.split(".")[0]
-        if name in files and path.parent != files[name].parent:
-            raise WearcapError(f"two trials are called {name!r}: {files[name]} and {path}", fix="Rename one.")
-        files.setdefault(name, path)
+        name, asf = path.name.split(".")[0], None
+        if name in files and path.parent != files[name][0].parent:
+            raise WearcapError(f"two trials are called {name!r}: {files[name][0]} and {path}", fix="Rename one.")
+        if ".amc" in path.name.lower():
+            skeletons = sorted(p for p in path.parent.iterdir() if p.name.lower().split(".")[1:2] == ["asf"])
+            own = [p for p in skeletons if p.name.split(".")[0] == path.name.split("_")[0]]
+            asf = (own or skeletons)[0] if len(own or skeletons) == 1 else None
+        files.setdefault(name, (path, asf))
     if not files:
         raise WearcapError("no .amc or .bvh files", where=source, expected="motion files, plain or .xz or .gz")
     return files
@@ -155,13 +160,6 @@ def _subject(name: str) -> str:
     """ "07" of "07_12" → "7"; a name without a subject's number is its own subject."""
     first = name.split("_")[0]
     return str(int(first)) if first.isdigit() and "_" in name else name
-
-
-def _asf_for(amc: Path) -> Path | None:
-    """The skeleton of an AMC file: its subject's, else the only one in the folder."""
-    skeletons = sorted(p for p in amc.parent.iterdir() if p.name.lower().split(".")[1:2] == ["asf"])
-    own = [p for p in skeletons if p.name.split(".")[0] == amc.name.split("_")[0]]
-    return (own or skeletons)[0] if len(own or skeletons) == 1 else None
 
 
 def _amass(file: Path, about: About, settings: MocapSettings) -> Recording:

@@ -20,15 +20,7 @@ from wearcap.io.datasets.omomo import OmomoSequence, omomo_mesh_path, omomo_take
 from wearcap.io.datasets.one_object import OneObject
 from wearcap.io.formats.environment import FILE_NAME, write_environment
 from wearcap.prepare.engine import NOTE, Task, content_hash
-from wearcap.prepare.mocap import (
-    About,
-    CleaningLimits,
-    MocapSettings,
-    foot_patches,
-    mocap_recording,
-    on_xsens23,
-    without_glitches,
-)
+from wearcap.prepare.mocap import About, MocapSettings, foot_patches, mocap_recording, on_xsens23, without_glitches
 from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
@@ -59,7 +51,7 @@ _MIN_STEPS = 10
 _UPSIDE_DOWN_M = 0.2
 
 
-def one_object_recording(take: OneObject, about: About, settings: MocapSettings, output: str | Path) -> Recording:
+def _one_object(take: OneObject, about: About, settings: MocapSettings, output: str | Path) -> Recording:
     """Like `mocap_recording`, with the object's path on the motion's clock and an environment of that one object.
 
     The environment is written to `output`/scenes/NAME; the object is free to move and handled throughout, so there
@@ -67,7 +59,13 @@ def one_object_recording(take: OneObject, about: About, settings: MocapSettings,
     provenance. Raises WearcapError for an object of unknown class and for a body that is upside down.
     """
     kind = object_class(take.object_name)
-    kept, cut = _longest_stretch(take)
+    kept, cut, frames = take, "", len(take.motion)
+    gaps = (take.motion.timestamps.diff() > MAX_GAP_S).nonzero()[:, 0].tolist()
+    if gaps:
+        edges = [0, *(frame + 1 for frame in gaps), frames]
+        start, stop = max(pairwise(edges), key=lambda span: span[1] - span[0])
+        kept = take.frames(slice(start, stop))
+        cut = f"kept frames {start} to {stop - 1} of {frames}: {len(gaps)} gaps of more than {MAX_GAP_S} s"
     motion, note = without_glitches(on_xsens23(kept.motion), settings.limits)
     feet = torch.stack([motion.joint(f"{side}_ankle").t[:, 2] for side in ("left", "right")]).mean(0)
     above = float((motion.joint("head").t[:, 2] - feet).median())
@@ -99,38 +97,6 @@ def one_object_recording(take: OneObject, about: About, settings: MocapSettings,
     )
 
 
-def _longest_stretch(take: OneObject) -> tuple[OneObject, str]:
-    """The longest part of a take without gaps beyond `MAX_GAP_S`, and a note about the cut ("" if there was none)."""
-    gaps = (take.motion.timestamps.diff() > MAX_GAP_S).nonzero()[:, 0].tolist()
-    if not gaps:
-        return take, ""
-    edges = [0, *(frame + 1 for frame in gaps), len(take.motion)]
-    start, stop = max(pairwise(edges), key=lambda span: span[1] - span[0])
-    return take.frames(slice(start, stop)), (
-        f"kept frames {start} to {stop - 1} of {len(take.motion)}: {len(gaps)} gaps of more than {MAX_GAP_S} s"
-    )
-
-
-def on_level_ground(take: OneObject, limits: CleaningLimits) -> OneObject:
-    """The take on xsens23, rotated so that the ground below the planted feet is level; provenance notes the tilt.
-
-    Raises WearcapError for a ground tilted by more than `MAX_TILT_DEG`.
-    """
-    motion = on_xsens23(take.motion)
-    positions, speed = foot_patches(motion)
-    R = ground_rotation(positions[speed < limits.contact_speed])
-    tilt = float(torch.rad2deg(torch.arccos(R[2, 2].clamp(max=1.0))))
-    if tilt > MAX_TILT_DEG:
-        raise WearcapError(
-            f"the ground below the feet is tilted by {tilt:.0f}°",
-            where=take.name,
-            expected=f"at most {MAX_TILT_DEG:g}°",
-            fix="Check which of the source's axes is up.",
-        )
-    motion = replace(motion, provenance=motion.provenance | {"tilt_deg": f"{tilt:.2f}"})
-    return replace(take, motion=motion).turned(R)
-
-
 def ground_rotation(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "3 3"]:
     """Smallest rotation that levels the plane through positions of planted feet.
 
@@ -159,10 +125,27 @@ def ground_rotation(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "3 
 
 
 def _behave(root: Path, name: str, settings: MocapSettings, license: str, output: Path) -> Recording:
-    """Body and object on level ground at z = 0; the environment is written beside the recording."""
-    take = on_level_ground(read_behave(root, name), settings.limits)
+    """Body and object on level ground at z = 0; the environment is written beside the recording.
+
+    The take is rotated so that the ground below the planted feet is level; provenance notes the tilt. Raises WearcapError
+    for a ground tilted by more than `MAX_TILT_DEG`.
+    """
+    take = read_behave(root, name)
+    motion = on_xsens23(take.motion)
+    positions, speed = foot_patches(motion)
+    R = ground_rotation(positions[speed < settings.limits.contact_speed])
+    tilt = float(torch.rad2deg(torch.arccos(R[2, 2].clamp(max=1.0))))
+    if tilt > MAX_TILT_DEG:
+        raise WearcapError(
+            f"the ground below the feet is tilted by {tilt:.0f}°",
+            where=take.name,
+            expected=f"at most {MAX_TILT_DEG:g}°",
+            fix="Check which of the source's axes is up.",
+        )
+    motion = replace(motion, provenance=motion.provenance | {"tilt_deg": f"{tilt:.2f}"})
+    take = replace(take, motion=motion).turned(R)
     about = About(name, take.subject, "BEHAVE", license, take.activity)
-    return one_object_recording(take, about, settings, output)
+    return _one_object(take, about, settings, output)
 
 
 def behave_tasks(
@@ -189,7 +172,7 @@ def _omomo(
     """Body and object with the floor at z = 0; the environment is written beside the recording."""
     take = omomo_take(sequence, root, source_fps)
     about = About(take.name, take.subject, "OMOMO", license, take.activity)
-    return one_object_recording(take, about, settings, output)
+    return _one_object(take, about, settings, output)
 
 
 def omomo_tasks(

@@ -6,11 +6,12 @@ One source per system's data: `simulated` (HMD², MocapEvery), `simulated_hps`, 
 
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +33,11 @@ from wearcap.simulation.places.changes import changed_world
 from wearcap.simulation.places.surround import surround
 from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
 from wearcap.simulation.recordings.hps_session import Protocol
-from wearcap.simulation.recordings.interaction_session import InteractionConfig, simulate_interactions
+from wearcap.simulation.recordings.interaction_session import (
+    InteractionConfig,
+    SimulatedInteractions,
+    simulate_interactions,
+)
 from wearcap.simulation.recordings.object_session import ObjectConfig, simulate_objects
 from wearcap.simulation.recordings.scene_files import SceneSettings, write_scene
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
@@ -54,8 +59,16 @@ def source_files() -> str:
     return content_hash(*(path for folder in folders for path in sorted(folder.rglob("*.py"))))
 
 
-def _numbered(prefix: str, recordings: Mapping[str, int], seed: int, splits: Splits) -> list[tuple[str, str, int]]:
-    """(name, split, seed) of each of `recordings[split]` recordings.
+def _tasks(
+    prefix: str,
+    recordings: Mapping[str, int],
+    seed: int,
+    splits: Splits,
+    output: str,
+    make: Callable[[str, str, int, Path], Recording],
+    *settings: Any,
+) -> list[Task]:
+    """`recordings[split]` tasks of each split: `make` of (name, split, seed, output), hashed with settings and simulator.
 
     Raises WearcapError for an unknown split, or when a simulated person's name belongs to another split's list.
     """
@@ -68,11 +81,13 @@ def _numbered(prefix: str, recordings: Mapping[str, int], seed: int, splits: Spl
                 where=splits.path,
                 expected=f"a line sim-{split}-*,{split}",
             )
-    return [
-        (f"{prefix}-{split}-{seed}-{index:04d}", split, seed * 1_000_000 + index)
-        for split, count in recordings.items()
-        for index in range(count)
-    ]
+    simulator, tasks = source_files(), []
+    for split, count in recordings.items():
+        for index in range(count):
+            name, number = f"{prefix}-{split}-{seed}-{index:04d}", seed * 1_000_000 + index
+            key = content_hash(*settings, number, split, simulator)
+            tasks.append(Task(name, partial(make, name, split, number, Path(output)), split, key))
+    return tasks
 
 
 def simulated_tasks(
@@ -105,16 +120,8 @@ def simulated_tasks(
     )
     if not config.duration_s > 0 or not config.fps > 0:
         raise WearcapError(f"recordings of {duration_s} s at {fps} Hz", expected="positive numbers")
-    numbered, simulator = _numbered("sim", recordings, seed, splits), source_files()
-    return [
-        Task(
-            name,
-            partial(simulate_recording, config, name, split, number, Path(output)),
-            split,
-            content_hash(asdict(config), number, split, simulator),
-        )
-        for name, split, number in numbered
-    ]
+    make = partial(simulate_recording, config)
+    return _tasks("sim", recordings, seed, splits, output, make, asdict(config))
 
 
 @dataclass(frozen=True)
@@ -179,44 +186,43 @@ def simulated_hps_tasks(
     distances = [0.0, *map(float, returns_m), float(end_m)]
     if any(b <= a for a, b in pairwise(distances)):
         raise WearcapError(f"returns at {returns_m} m, end at {end_m} m", expected="distances that rise")
-    numbered, simulator = _numbered("hps", recordings, seed, splits), source_files()
     protocol = Protocol(returns_m=tuple(distances[1:-1]), end_m=distances[-1])
     config = HpsConfig(fps=float(fps), camera_fps=float(camera_fps), protocol=protocol)
     scene = None if spacing_m is None else SceneSettings(spacing_m=float(spacing_m), photo_m=float(photo_m))
     video = Video(None if video_s is None else float(video_s), float(video_fps), float(changed))
     made = [asdict(part) if part else None for part in (config, scene, video)]
-    return [
-        Task(
-            name,
-            partial(_hps, config, scene, video, name, split, number, Path(output)),
-            split,
-            content_hash(*made, number, split, simulator),
-        )
-        for name, split, number in numbered
-    ]
+    return _tasks("hps", recordings, seed, splits, output, partial(_hps, config, scene, video), *made)
 
 
-def _is_made(folder: Path, wanted: str, *files: str) -> bool:
-    """Whether a scene's files exist and were made with the settings `wanted`."""
-    note = folder / MADE
-    current = note.is_file() and note.read_text(encoding="utf-8") == wanted
-    return current and all((folder / file).is_file() for file in files)
-
-
-def _interactions(
-    config: InteractionConfig, spacing_m: float, simulator: str, name: str, split: str, seed: int, root: Path
+def _in_flat(
+    simulate: Callable[..., Any],
+    config: InteractionConfig | ObjectConfig,
+    spacing_m: float | None,
+    simulator: str,
+    name: str,
+    split: str,
+    seed: int,
+    root: Path,
 ) -> Recording:
-    """One session; the scan with everything at its initial pose and the objects are written unless they exist."""
-    simulated = simulate_interactions(config, name, split, seed)
+    """One session in a flat; its environment and, with `spacing_m`, its scan with everything at its initial pose are written.
+
+    Files that were made with the same settings by the same simulator are left as they are.
+    """
+    simulated = simulate(config, name, split, seed)
     place = Path("scenes") / simulated.recording.location
-    folder, wanted = root / place, json.dumps({"spacing_m": spacing_m, "simulator": simulator})
-    if not _is_made(folder, wanted, CLOUD, FILE_NAME):
-        rng = np.random.default_rng(12)
-        scan = scan_world(Scenery.of(simulated.world), spacing_m, rng, walked=simulated.static)
-        write_ply(Ply(scan.points, scan.colors), folder / CLOUD)
+    folder, note = root / place, root / place / MADE
+    wanted = json.dumps(({} if spacing_m is None else {"spacing_m": spacing_m}) | {"simulator": simulator})
+    files = [FILE_NAME] if spacing_m is None else [CLOUD, FILE_NAME]
+    current = note.is_file() and note.read_text(encoding="utf-8") == wanted
+    if not current or not all((folder / file).is_file() for file in files):
+        if spacing_m is not None:
+            scenery, rng = Scenery.of(simulated.world), np.random.default_rng(12)
+            scan = scan_world(scenery, spacing_m, rng, walked=simulated.static)
+            write_ply(Ply(scan.points, scan.colors), folder / CLOUD)
         write_environment(simulated.environment, folder / FILE_NAME)
-        write_text(folder / MADE, wanted)
-    return replace(simulated.recording, scene=(place / CLOUD).as_posix(), environment=(place / FILE_NAME).as_posix())
+        write_text(note, wanted)
+    scene = {} if spacing_m is None else {"scene": (place / CLOUD).as_posix()}
+    return replace(simulated.recording, environment=(place / FILE_NAME).as_posix(), **scene)
 
 
 def simulated_interactions_tasks(
@@ -234,30 +240,11 @@ def simulated_interactions_tasks(
     Scenes go to `output`/scenes, with points `spacing_m` apart. Raises WearcapError for an unknown split, or when a
     simulated person's name belongs to another split's list.
     """
-    numbered, simulator = _numbered("interactions", recordings, seed, splits), source_files()
     if not spacing_m > 0:
         raise WearcapError(f"points {spacing_m} m apart", expected="a positive spacing")
     config = InteractionConfig(fps=float(fps), camera_fps=float(camera_fps), minutes=float(minutes))
-    return [
-        Task(
-            name,
-            partial(_interactions, config, float(spacing_m), simulator, name, split, number, Path(output)),
-            split,
-            content_hash(asdict(config), float(spacing_m), number, split, simulator),
-        )
-        for name, split, number in numbered
-    ]
-
-
-def _objects(config: ObjectConfig, simulator: str, name: str, split: str, seed: int, root: Path) -> Recording:
-    """One session; its environment is written unless it exists."""
-    simulated = simulate_objects(config, name, split, seed)
-    place = Path("scenes") / simulated.recording.location
-    wanted = json.dumps({"simulator": simulator})
-    if not _is_made(root / place, wanted, FILE_NAME):
-        write_environment(simulated.environment, root / place / FILE_NAME)
-        write_text(root / place / MADE, wanted)
-    return replace(simulated.recording, environment=(place / FILE_NAME).as_posix())
+    make = partial(_in_flat, simulate_interactions, config, float(spacing_m), source_files())
+    return _tasks("interactions", recordings, seed, splits, output, make, asdict(config), float(spacing_m))
 
 
 def simulated_objects_tasks(
@@ -268,17 +255,9 @@ def simulated_objects_tasks(
     Environments go to `output`/scenes. Raises WearcapError for an unknown split, or when a simulated person's name
     belongs to another split's list.
     """
-    numbered, simulator = _numbered("objects", recordings, seed, splits), source_files()
     config = ObjectConfig(fps=float(fps), minutes=float(minutes))
-    return [
-        Task(
-            name,
-            partial(_objects, config, simulator, name, split, number, Path(output)),
-            split,
-            content_hash(asdict(config), number, split, simulator),
-        )
-        for name, split, number in numbered
-    ]
+    make = partial(_in_flat, simulate_objects, config, None, source_files())
+    return _tasks("objects", recordings, seed, splits, output, make, asdict(config))
 
 
 def _surrounded(file: Path, name: str, root: Path, camera: bool, look_round: bool, seed: int) -> Recording:

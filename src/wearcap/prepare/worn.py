@@ -26,7 +26,7 @@ from wearcap.io.datasets.mocap_every_folder import (
 from wearcap.io.datasets.nymeria import head_vrs, is_nymeria, read_metadata, read_nymeria
 from wearcap.io.devices.aria_mps import is_mps_folder, mps_files, read_mps
 from wearcap.io.formats.environment import FILE_NAME, write_environment
-from wearcap.prepare.engine import NOTE, Task, content_hash, source_folder
+from wearcap.prepare.engine import NOTE, Task, changed, content_hash, source_folder
 from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
@@ -160,10 +160,6 @@ def hcontact_tasks(
     return tasks
 
 
-def _nymeria(folder: Path, name: str, fps: float | int, license: str, video: Path | None) -> Recording:
-    return replace(read_nymeria(folder, fps=float(fps), video=video), name=name, license=license)
-
-
 def nymeria_tasks(
     source: str | Path, splits: Splits, fps: float | int, license: str, camera: bool = False, output: str = "."
 ) -> list[Task]:
@@ -182,12 +178,9 @@ def nymeria_tasks(
         files = [folder / "body" / "xdata.npz", *mps_files(folder / "recording_head")]
         filmed_bytes = vrs.stat().st_size if video else 0
         key = content_hash(name, float(fps), VERSION["nymeria"], about, *files, filmed_bytes)
-        tasks.append(Task(name, partial(_nymeria, folder, name, fps, license, video), splits.of(about["subject"]), key))
+        read = partial(read_nymeria, folder, fps=float(fps), video=video)
+        tasks.append(Task(name, partial(changed, read, name=name, license=license), splits.of(about["subject"]), key))
     return tasks
-
-
-def _aria(folder: Path, name: str, subject: str, fps: float, license: str) -> Recording:
-    return replace(read_mps(folder, fps=fps), name=name, subject=subject, license=license)
 
 
 def aria_tasks(source: str | Path, splits: Splits, subject: str, fps: float | int, license: str) -> list[Task]:
@@ -203,7 +196,8 @@ def aria_tasks(source: str | Path, splits: Splits, subject: str, fps: float | in
     for folder in folders.values():
         name = folder.resolve().name
         key = content_hash(name, subject, float(fps), VERSION["aria"], *mps_files(folder))
-        make = partial(_aria, folder, name, subject, float(fps), license)
+        read = partial(read_mps, folder, fps=float(fps))
+        make = partial(changed, read, name=name, subject=subject, license=license)
         tasks.append(Task(name, make, splits.of(subject), key))
     return tasks
 

@@ -35,6 +35,16 @@ class Video:
     times: Float64[np.ndarray, "point 2"]
     """Rising pairs of recording time and video time (s), interpolated linearly."""
 
+    @classmethod
+    def starting(cls, path: Path, start_s: float) -> "Video":
+        """A video whose first picture was taken at `start_s` of the recording, on the same clock from there on.
+
+        Raises WearcapError when it is missing or damaged.
+        """
+        info = video_info(path)
+        length = max(info.frames, 1) / info.fps
+        return cls(path, np.array([[start_s, 0.0], [start_s + length, length]]))
+
 
 @dataclass(frozen=True)
 class Take:
@@ -105,21 +115,14 @@ def take_of(recording: Recording, folder: Path, motion: Motion | None = None, vi
         _floor(recording, shown, points),
         names,
         bones,
-        _hands(shown, names),
+        tuple(  # the palm, else the wrist
+            names.index(f"{hand}_palm") if f"{hand}_palm" in names else shown.skeleton.index(f"{hand}_wrist")
+            for hand in HANDS
+        ),
         _objects(recording, folder),
         video,
         notice,
     )
-
-
-def video_from(path: str | Path, start_s: float) -> Video:
-    """A video whose first picture was taken at `start_s` of the recording, on the same clock from there on.
-
-    Raises WearcapError when it is missing or damaged.
-    """
-    info = video_info(path)
-    length = max(info.frames, 1) / info.fps
-    return Video(Path(path), np.array([[start_s, 0.0], [start_s + length, length]]))
 
 
 def _drawn(motion: Motion) -> tuple[tuple[str, ...], Float32[np.ndarray, "time point 3"], tuple]:
@@ -138,14 +141,6 @@ def _drawn(motion: Motion) -> tuple[tuple[str, ...], Float32[np.ndarray, "time p
         names.append("nose")
         bones.append((head, len(names) - 1))
     return tuple(names), torch.cat(parts, 1).float().numpy(), tuple(bones)
-
-
-def _hands(motion: Motion, names: tuple[str, ...]) -> tuple[int, ...]:
-    """The point that stands for each hand: the palm, else the wrist."""
-    return tuple(
-        names.index(f"{hand}_palm") if f"{hand}_palm" in names else motion.skeleton.index(f"{hand}_wrist")
-        for hand in HANDS
-    )
 
 
 def _floor(recording: Recording, motion: Motion, points: np.ndarray) -> Float32[np.ndarray, "time"]:
@@ -216,7 +211,7 @@ class Desk:
             recording = recordings(index)
             shown = motion or recording.motion or recording.suit
             start = video_start_s if video_start_s is not None else float(shown.timestamps[0]) if shown else 0.0
-            return take_of(recording, folder, motion, video_from(video, start) if video else None)
+            return take_of(recording, folder, motion, Video.starting(video, start) if video else None)
 
         names = tuple(Path(place).name for place in places)
         if len(places) == 1:

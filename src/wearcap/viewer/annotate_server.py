@@ -168,11 +168,10 @@ class _Handler(BaseHTTPRequestHandler):
         self.server.begin_idle(self.connection)
         super().handle_one_request()
 
-    def do_HEAD(self) -> None:
-        self._answer(self._get)
-
     def do_GET(self) -> None:
         self._answer(self._get)
+
+    do_HEAD = do_GET
 
     def do_POST(self) -> None:
         self._answer(self._post)
@@ -206,7 +205,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _get(self, path: str) -> None:
         if path == "/recordings":
-            return self._send_json(self._listing())
+            desk = self.server.desk
+            return self._send_json([{"name": name, "annotated": desk.path(name).is_file()} for name in desk.names])
         if match := re.fullmatch(r"/recordings/(\d{1,6})(?:/(\w+))?", path):
             return self._get_recording(int(match[1]), match[2] or "")
         file = PAGE / (path[1:] or "index.html")
@@ -232,10 +232,6 @@ class _Handler(BaseHTTPRequestHandler):
         if part == "video" and take.video is not None:
             return self._send_video(take.video.path)
         return self._send_error(HTTPStatus.NOT_FOUND, f"recording {index} has no {part}")
-
-    def _listing(self) -> list[dict]:
-        desk = self.server.desk
-        return [{"name": name, "annotated": desk.path(name).is_file()} for name in desk.names]
 
     def _post(self, path: str) -> None:
         match = re.fullmatch(r"/recordings/(\d{1,6})/labels", path)

@@ -60,7 +60,8 @@ class Guard:
         cookie = f"wearcap_token_{match[2] or 80}"  # cookies ignore ports, and several pages may be open
         if self._is_token(parse_qs(target.partition("?")[2]).get("token", [])):
             return HEADERS | {"Set-Cookie": f"{cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"}
-        if self._is_token(_cookies(headers, cookie)):
+        pairs = [pair.partition("=") for line in headers.get_all("Cookie") or [] for pair in line.split(";")]
+        if self._is_token([value.strip() for key, _, value in pairs if key.strip() == cookie]):
             return HEADERS
         raise Refused("the token is missing or of an earlier start: open the whole address that was printed")
 
@@ -87,11 +88,6 @@ def _single(headers: Headers, name: str) -> str | None:
     if len(values) > 1:
         raise Refused(f"{len(values)} headers {name}")
     return values[0] if values else None
-
-
-def _cookies(headers: Headers, name: str) -> list[str]:
-    pairs = (pair.partition("=") for line in headers.get_all("Cookie") or [] for pair in line.split(";"))
-    return [value.strip() for key, _, value in pairs if key.strip() == name]
 
 
 def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

@@ -54,9 +54,7 @@ class ObjectEditor:
         self.server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         self.view = EditorView(self.server, scan)
         self._add_controls(title)
-        self._wire_select()
-        self._wire_objects()
-        self._wire_view()
+        self._wire()
         self._look_at_the_middle()
         self.current: str | None = None
         self._tried: Rigid | None = None
@@ -114,37 +112,32 @@ class ObjectEditor:
                     action()
                 except WearcapError as error:
                     event.client.add_notification("That does not go", str(error), color="red", auto_close_seconds=10)
-                self._refresh()
+                self.refresh()
 
         return act
 
-    def _wire_select(self) -> None:
-        panel, act = self.select, self._acting
-        for slider in panel.shape_sliders:
+    def _wire(self) -> None:
+        """Let controls and view call their actions."""
+        select, objects, view, act = self.select, self.objects, self.view, self._acting
+        for slider in select.shape_sliders:
             slider.on_update(act(self._show_box))
-        panel.take.on_click(act(lambda: self.editing.select_box(self.box)))
-        panel.leave.on_click(act(lambda: self.editing.select_box(self.box, add=False)))
-        panel.clear.on_click(act(self.editing.clear_selection))
-        panel.radius.on_update(act(lambda: self.view.show_brush(None, panel.radius.value)))
-        panel.category.on_update(act(self._suggest_name))
-        panel.cut.on_click(act(self.cut))
-
-    def _wire_objects(self) -> None:
-        panel, act = self.objects, self._acting
-        panel.choice.on_update(act(lambda: self.choose(panel.current)))
-        panel.rename.on_click(act(self.rename))
-        panel.kind.on_update(act(lambda: self.editing.set_kind(self._item().name, panel.chosen_kind)))
-        panel.next_end.on_click(act(self.next_hinge))
-        panel.direction.on_update(act(self._turn_axis))
-        for slider in panel.limit_sliders:
-            slider.on_update(act(self._set_limits))
-        for slider in (panel.try_deg, panel.try_m):
+        select.take.on_click(act(lambda: self.editing.select_box(self.box)))
+        select.leave.on_click(act(lambda: self.editing.select_box(self.box, add=False)))
+        select.clear.on_click(act(self.editing.clear_selection))
+        select.radius.on_update(act(lambda: view.show_brush(None, select.radius.value)))
+        select.category.on_update(act(self._suggest_name))
+        select.cut.on_click(act(self.cut))
+        objects.choice.on_update(act(lambda: self.choose(objects.current)))
+        objects.rename.on_click(act(self.rename))
+        objects.kind.on_update(act(lambda: self.editing.set_kind(self._item().name, objects.chosen_kind)))
+        objects.next_end.on_click(act(self.next_hinge))
+        objects.direction.on_update(act(self.turn_axis))
+        for slider in objects.limit_sliders:
+            slider.on_update(act(self.set_limits))
+        for slider in (objects.try_deg, objects.try_m):
             slider.on_update(act(self.try_value))
-        panel.back.on_click(act(self.put_back))
-        panel.delete.on_click(act(self.delete))
-
-    def _wire_view(self) -> None:
-        view, act = self.view, self._acting
+        objects.back.on_click(act(self.put_back))
+        objects.delete.on_click(act(self.delete))
 
         @self.server.scene.on_click()
         def _(event: viser.SceneClickEvent) -> None:
@@ -157,13 +150,14 @@ class ObjectEditor:
                 ray = ray_to(event.end_position, event.client.camera)
                 act(lambda: self.paint(*ray, fresh=event.phase == "start"))(event)
 
-        view.box_handle.on_update(act(self._box_dragged))
-        view.freedom_handle.on_update(self._when_released(self._freedom_dragged))
-        view.try_handle.on_update(act(self._try_dragged))
+        @view.freedom_handle.on_update
+        def _(event: viser.TransformControlsEvent) -> None:
+            if event.phase == "end":
+                place = np.array(view.freedom_handle.position, np.float64)
+                act(lambda: self._place_freedom(place, level=False))(event)
 
-    def _when_released(self, action: Callable[[], None]) -> Callable[[viser.TransformControlsEvent], None]:
-        act = self._acting(action)
-        return lambda event: act(event) if event.phase == "end" else None
+        view.box_handle.on_update(act(self.move_box))
+        view.try_handle.on_update(act(self.try_pose))
 
     @property
     def box(self):
@@ -259,18 +253,17 @@ class ObjectEditor:
     def _suggest_name(self) -> None:
         self.select.name.value = self.editing.free_name(self.select.category.value)
 
-    def _set_limits(self) -> None:
+    def set_limits(self) -> None:
+        """Set the current object's limits as the sliders say."""
         item = self._item()
         limits = self.objects.limits(item.freedom.kind)
         self.editing.set_freedom(item.name, replace(item.freedom, limits=limits), stroke=("limits", item.name))
 
-    def _turn_axis(self) -> None:
+    def turn_axis(self) -> None:
+        """Point the current object's slide as the slider says."""
         item, angle = self._item(), np.deg2rad(self.objects.direction.value)
         freedom = replace(item.freedom, axis=(float(np.cos(angle)), float(np.sin(angle)), 0.0))
         self.editing.set_freedom(item.name, freedom, stroke=("axis", item.name))
-
-    def _freedom_dragged(self) -> None:
-        self._place_freedom(np.array(self.view.freedom_handle.position, np.float64), level=False)
 
     def _place_freedom(self, place: Float[np.ndarray, "3"], level: bool) -> None:
         """Place the hinge at a position (snapped to a near edge of the object), or point the slide's axis toward it."""
@@ -303,7 +296,8 @@ class ObjectEditor:
             )
         self.editing.set_freedom(item.name, freedom)
 
-    def _box_dragged(self) -> None:
+    def move_box(self) -> None:
+        """Move the box to its handle."""
         x, y, z = np.asarray(self.view.box_handle.position, np.float64).tolist()
         self.box_center = x, y, z
         self.view.box.position = self.box_center
@@ -311,7 +305,7 @@ class ObjectEditor:
     def _show_box(self) -> None:
         self.view.show_box(self.box, self.tool.value == "box")
 
-    def _try_dragged(self) -> None:
+    def try_pose(self) -> None:
         """Pose of a dragged object: on the floor, shifted and turned about z; carried, any pose."""
         item, pose = self._item(), pose_of(self.view.try_handle)
         self._tried = pose
@@ -320,7 +314,7 @@ class ObjectEditor:
     def _show_scan(self) -> None:
         self.view.show_scan(self.editing.left(), float(self.top.value))
 
-    def _refresh(self) -> None:
+    def refresh(self) -> None:
         """Update view and panels to the state of the editing; unchanged parts are not sent again."""
         if self.editing.selected is not self._selection:
             self._selection = self.editing.selected

@@ -14,6 +14,7 @@ from wearcap.scene.editing import points_world
 from wearcap.scene.objects import SceneObject
 from wearcap.scene.scan import Scan
 from wearcap.scene.selection import Box, first_hit
+from wearcap.viewer.page_layers import by_height
 
 SHOWN_POINTS, SHOWN_SELECTED, SHOWN_OF_OBJECT = 250_000, 80_000, 40_000
 SELECTED_COLOR, BOX_COLOR, BRUSH_COLOR, HINGE_COLOR = ((255, 120, 20), (30, 120, 240), (255, 120, 20), (220, 30, 120))
@@ -43,7 +44,10 @@ class EditorView:
         rng = np.random.default_rng(0)
         count = min(len(scan.points), SHOWN_POINTS)
         self._thinned = np.sort(rng.choice(len(scan.points), count, replace=False))
-        self._colors = scan.colors if scan.colors is not None else by_height(scan.points)
+        self._colors = scan.colors
+        if self._colors is None:
+            low, high = np.quantile(scan.points[:: max(1, len(scan.points) // 10_000), 2], [0.02, 0.98])
+            self._colors = by_height(scan.points, low, high).astype(np.uint8)
         self.point_m = 1.9 * typical_spacing(scan.points[self._thinned])
         self._center = scan.points.mean(0, dtype=np.float64)
         self.visible = scan.points[:0]
@@ -197,13 +201,6 @@ def axis_toward(item: SceneObject, place: Float[np.ndarray, "3"]) -> tuple[float
     direction = place - (points.min(0) + points.max(0)) / 2
     length = float(np.linalg.norm(direction))
     return None if length < 1e-3 else tuple((direction / length).tolist())
-
-
-def by_height(points: Float[np.ndarray, "point 3"]) -> UInt8[np.ndarray, "point 3"]:
-    """Colours for a scan without colours: from blue at the floor to sand at the ceiling."""
-    low, high = np.quantile(points[:: max(1, len(points) // 10_000), 2], [0.02, 0.98])
-    share = np.clip((points[:, 2:] - low) / max(high - low, 1e-6), 0, 1)
-    return ((1 - share) * np.array([60, 90, 130]) + share * np.array([220, 170, 90])).astype(np.uint8)
 
 
 def typical_spacing(points: Float[np.ndarray, "point 3"]) -> float:

@@ -4,6 +4,7 @@ Python runs the clock and sends poses; the browser skins, draws and moves the ca
 """
 
 import time as wall
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,36 @@ from wearcap.viewer.objects import ObjectsLayer
 from wearcap.viewer.page_layers import HeadLayer, Layer, Placed, add_points, read_scene
 from wearcap.viewer.page_motions import TRUTH, motions_shown, moving_objects, placed_motions, spacing_m
 from wearcap.viewer.page_server import start_server
-from wearcap.viewer.page_timeline import SPEEDS, Timeline
 
 UPDATES_PER_S = 30.0
 OVER, BESIDE = "over", "beside"
+SPEEDS = ("0.1×", "0.25×", "0.5×", "1×", "2×", "4×")
+
+
+@dataclass
+class Timeline:
+    """A time that runs between start and stop (s) when playing, at `speed` times real time."""
+
+    start: float
+    stop: float
+    time: float
+    playing: bool = False
+    speed: float = 1.0
+
+    def advance(self, elapsed_s: float) -> bool:
+        """Advance by wall time; returns whether the shown time changed. It loops at the end."""
+        if not self.playing or self.stop <= self.start:
+            return False
+        self.time += elapsed_s * self.speed
+        if self.time > self.stop:
+            self.time = self.start
+        return True
+
+    def seek(self, time: float) -> None:
+        self.time = min(max(time, self.start), self.stop)
+
+    def step(self, seconds: float) -> None:
+        self.seek(self.time + seconds)
 
 
 class Page:
@@ -65,7 +92,8 @@ class Page:
             self.layers.append(ObjectsLayer(self.server, "surroundings", still, recording.object_motion))
         self.layout = BESIDE if len(self.bodies) - (TRUTH in self.bodies) > 1 else OVER
         self._followed = np.zeros(3)
-        self._add_floor(recording)
+        floor_z = _floor_height(recording)
+        self.server.scene.add_grid("/floor", infinite_grid=True, position=(0.0, 0.0, floor_z), fade_distance=25.0)
         self._add_controls(recording)
         self.arrange(self.layout)
         self._point_camera()
@@ -74,11 +102,6 @@ class Page:
     def url(self) -> str:
         """Address to open; it contains the token without which the page does not answer."""
         return self.guard.url(self.server.get_port())
-
-    def _add_floor(self, recording: Recording) -> None:
-        self.server.scene.add_grid(
-            "/floor", infinite_grid=True, position=(0.0, 0.0, _floor_height(recording)), fade_distance=25.0
-        )
 
     def _add_controls(self, recording: Recording) -> None:
         gui, clock = self.server.gui, self.timeline
@@ -94,7 +117,7 @@ class Page:
         around = gui.add_checkbox("Surroundings", initial_value=self._surroundings.visible)
         around.on_update(lambda _: setattr(self._surroundings, "visible", around.value))
         self._play.on_click(lambda _: self.toggle())
-        self._slider.on_update(self._scrubbed)
+        self._slider.on_update(self.scrubbed)
         self._speed.on_update(lambda _: setattr(clock, "speed", float(self._speed.value[:-1])))
         if len(self.bodies) > 1:
             layout = gui.add_dropdown("Truth and captures", self._layouts(), initial_value=self.layout)
@@ -132,8 +155,9 @@ class Page:
             placed.place(np.array([0.0, aside, 0.0]), visible, named=visible and layout != OVER)
         self.show()
 
-    def _scrubbed(self, event: viser.GuiEvent) -> None:
-        if event.client is not None:  # not the page's own update of the slider while playing
+    def scrubbed(self, event: viser.GuiEvent) -> None:
+        """Seek to the slider's time, if a person moved it and not the page while playing."""
+        if event.client is not None:
             self.timeline.seek(self._slider.value)
             self.show()
 
@@ -142,7 +166,12 @@ class Page:
         with self.server.atomic():
             for layer in self.layers:
                 layer.show(self.timeline.time)
-            self._follow_camera()
+            focus = self._focus()
+            moved, self._followed = focus - self._followed, focus
+            if self._follow.value and moved.any():
+                for client in self.server.get_clients().values():
+                    # Moving the camera carries its look-at point along.
+                    client.camera.position = client.camera.position + moved
         self.server.flush()
 
     def _focus(self) -> np.ndarray:
@@ -164,15 +193,6 @@ class Page:
         camera = self.server.initial_camera
         camera.look_at = tuple(self._followed)
         camera.position = tuple(self._followed + direction)
-
-    def _follow_camera(self) -> None:
-        focus = self._focus()
-        moved, self._followed = focus - self._followed, focus
-        if not self._follow.value or not moved.any():
-            return
-        for client in self.server.get_clients().values():
-            # Moving the camera carries its look-at point along.
-            client.camera.position = client.camera.position + moved
 
     def run(self, seconds: float = np.inf) -> None:
         """Run the clock until interrupted, or for the given seconds."""

@@ -14,8 +14,7 @@ from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.recording import Motion, Recording
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
-from wearcap.viewer.body_points import BodyPointsLayer
-from wearcap.viewer.objects import ObjectsLayer, poses_at, with_objects
+from wearcap.viewer.objects import BodyPointsLayer, ObjectsLayer, poses_at, with_objects
 from wearcap.viewer.page_layers import BodyLayer, FeetLayer, LabelLayer, Placed, surface_or_sticks
 
 TRUTH = "truth"

@@ -6,7 +6,6 @@ viser itself answers every page of every site, and has no setting for that. Requ
 
 import socket
 import threading
-from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
@@ -19,7 +18,6 @@ from websockets.http11 import Request, Response
 from wearcap.errors import WearcapError
 from wearcap.viewer.guard import Guard, Refused
 
-_Answer = Callable[[ServerConnection, Request], Response | None]
 _starting = threading.Lock()
 
 
@@ -33,10 +31,22 @@ def start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
 
     def serve(*arguments: Any, **options: Any) -> Any:
         nonlocal hooked
-        answer = options.get("process_request")
+        answer: Any = options.get("process_request")
+
+        def guarded(connection: ServerConnection, request: Request) -> Response | None:
+            """The answer to a page request or a WebSocket handshake (None: go on), after the guard has admitted it."""
+            try:
+                granted = guard.admit(request.path, request.headers)
+            except Refused as refused:
+                return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
+            response = answer(connection, request)
+            if response is not None:
+                response.headers.update(granted)
+            return response
+
         # Another thread may start a server of its own meanwhile.
         if getattr(answer, "__module__", "").startswith("viser."):
-            options["process_request"] = _guarded(guard, answer)
+            options["process_request"] = guarded
             hooked = True
         return original(*arguments, **options)
 
@@ -78,19 +88,3 @@ def _check_host(host: str) -> None:
         expected="a name or address of this machine",
         fix="Leave out --host for this machine alone, or give 0.0.0.0 for all of its addresses.",
     )
-
-
-def _guarded(guard: Guard, answer: _Answer) -> _Answer:
-    """An answer to page requests and WebSocket handshakes (None: go on), after the guard has admitted them."""
-
-    def process_request(connection: ServerConnection, request: Request) -> Response | None:
-        try:
-            granted = guard.admit(request.path, request.headers)
-        except Refused as refused:
-            return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
-        response = answer(connection, request)
-        if response is not None:
-            response.headers.update(granted)
-        return response
-
-    return process_request

@@ -1,4 +1,4 @@
-"""Pictures of motion without a screen: ground truth and captures side by side, shaded, with foot contacts."""
+"""Pictures without a screen: ground truth and captures side by side, shaded, with contacts; a head's path."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh, capsules, checker_floor
-from wearcap.geometry.render import Light, render
+from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.interactions import HANDS
 from wearcap.recording.motion import Motion
+from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
-from wearcap.viewer.body_points import lit_points
-from wearcap.viewer.objects import posed_meshes
-from wearcap.viewer.page_layers import stick_body
+from wearcap.viewer.objects import lit_points, posed_meshes
+from wearcap.viewer.page_layers import by_height, stick_body
 
 PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], [0.62, 0.45, 0.62]])
 """Colours of the motions, in order."""
@@ -37,6 +37,11 @@ TILES = np.array([[0.90, 0.90, 0.89], [0.80, 0.81, 0.82]])
 SKY = (0.965, 0.97, 0.975)
 VIEW = (-0.62, 0.78)
 """Direction in which the camera looks at someone facing +x: from the front left."""
+PATH_COLOR, LOOK_COLOR = (0.85, 0.35, 0.12), (0.15, 0.35, 0.70)
+LOOKS = 12
+"""Number of viewing directions drawn along the path."""
+HEIGHT_COLORS = ((0.35, 0.45, 0.55), (0.80, 0.68, 0.45))
+"""Colours (RGB) of points at the lowest and the highest height."""
 
 
 @dataclass(frozen=True)
@@ -107,16 +112,16 @@ def actors(
     return shown
 
 
-def follow_camera(target: Float[np.ndarray, "3"], size: tuple[int, int], distance: float = 4.2) -> tuple[Camera, Rigid]:
-    """A camera of `size` (width, height) that looks down at a point (m) from the front left of the world."""
+def looking(
+    direction: Sequence[float], target: Float[np.ndarray, "3"], distance: float, size: tuple[int, int], focal: float
+) -> tuple[Camera, Rigid]:
+    """A camera of `size` (width, height) that looks in a direction of the world at a point from a distance (m)."""
     width, height = size
-    focal = 1.75 * min(height, width * 1.3)
-    camera = Camera("pinhole", width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-    forward = np.array([*VIEW, -0.30])
-    forward /= np.linalg.norm(forward)
+    forward = np.array(direction) / np.linalg.norm(direction)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     R = np.stack([right, np.cross(forward, right), forward], 1)
+    camera = Camera("pinhole", width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     return camera, Rigid(torch.from_numpy(R).float(), torch.from_numpy(target - distance * forward).float())
 
 
@@ -131,7 +136,7 @@ def panel(
     distance: float = 4.2,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """One actor at one frame, on a chequered floor or in a world."""
-    camera, T_world_cam = follow_camera(target, size, distance)
+    camera, T_world_cam = looking((*VIEW, -0.30), target, distance, size, 1.75 * min(size[1], size[0] * 1.3))
     ground = np.array([target[0], target[1], actor.floor_z])
     stage = world or checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
     below = (float(target[0]), float(target[1]), float(ground[2]))
@@ -201,6 +206,39 @@ def shared_frames(motions: dict[str, Motion], count: int) -> list[int]:
 def focus(motion: Motion, frame: int) -> Float[np.ndarray, "3"]:
     """Target of the camera: a point slightly below the root (m)."""
     return motion.t_world_root[frame].double().numpy() - np.array([0.0, 0.0, 0.08])
+
+
+def draw_head_path(recording: Recording, size: tuple[int, int] = (640, 520)) -> UInt8[np.ndarray, "height width 3"]:
+    """Two panels of `size` (width, height). Raises WearcapError if there is no head path either."""
+    if recording.head is None:
+        raise WearcapError("nothing to draw", where=recording.name, expected="a motion, or a head's path")
+    path = recording.head.t_world_device.double().numpy()
+    points = np.zeros((0, 3)) if recording.points is None else recording.points.points_world.double().numpy()
+    cloud = np.concatenate([path, points])
+    low, high = np.quantile(cloud, 0.02, 0), np.quantile(cloud, 0.98, 0)
+    centre, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1.0)
+    splats = Splats(
+        points.astype(np.float32), by_height(points, low[2], high[2], HEIGHT_COLORS).astype(np.float32), 0.8
+    )
+    panels = []
+    for caption, direction in (("from above", (0.02, 0.05, -1.0)), ("aside", (-0.6, 0.75, -0.35))):
+        camera, T_world_cam = looking(direction, centre, 2.4 * radius, size, 1.0 * size[1])
+        frame = render(camera, T_world_cam, [_path_mesh(recording, path, radius)], [splats], background=SKY)
+        panels.append(np.asarray(captioned(frame.color, f"{recording.name}, {caption}")))
+    return np.asarray(Image.fromarray(np.concatenate(panels, 1)))
+
+
+def _path_mesh(recording: Recording, path: np.ndarray, radius: float) -> Mesh:
+    """The path as a tube, with short rods along the viewing directions."""
+    assert recording.head is not None
+    steps = path[:: max(1, len(path) // 300)]
+    at = np.linspace(0, len(path) - 1, LOOKS).astype(int)
+    ahead = recording.head.R_world_device[torch.from_numpy(at)][:, :, 0].double().numpy()
+    start = np.concatenate([steps[:-1], path[at]])
+    end = np.concatenate([steps[1:], path[at] + 0.12 * radius * ahead])
+    thick = np.full(len(start), 0.006 * radius)
+    colors = np.concatenate([np.tile(PATH_COLOR, (len(steps) - 1, 1)), np.tile(LOOK_COLOR, (LOOKS, 1))])
+    return capsules(start, end, thick, thick, colors, 8)
 
 
 def captioned(image: UInt8[np.ndarray, "height width 3"], text: str) -> Image.Image:
