@@ -32,9 +32,8 @@ from wearcap.viewer.objects import (
     true_body_contact,
     with_objects,
 )
-from wearcap.viewer.page import Page
+from wearcap.viewer.page import FLESH_M, Page, spacing_m
 from wearcap.viewer.page_layers import stick_body
-from wearcap.viewer.page_motions import FLESH_M, spacing_m
 from wearcap.viewer.picture import actors, contact_sheet
 from wearcap_testing import swaying_motion
 

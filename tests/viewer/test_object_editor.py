@@ -22,7 +22,8 @@ from wearcap.scene.scan import Scan
 from wearcap.scene.selection import Box
 from wearcap.viewer.object_editor import ObjectEditor
 from wearcap.viewer.object_editor_panels import HINTS, TOOLS
-from wearcap.viewer.object_editor_view import by_height, typical_spacing
+from wearcap.viewer.object_editor_view import typical_spacing
+from wearcap.viewer.page_layers import by_height
 from wearcap_browser import CONTROL, Chromium, chromium
 
 DOOR = Box((DOOR_X, DOOR_Y, 1.03), (0.94, 0.1, 2.0))
@@ -192,7 +193,7 @@ def test_an_environment_of_another_scene_is_refused(page, scan):
 
 
 def test_a_scan_without_colour_is_coloured_by_height(scan):
-    colors = by_height(scan.points)
+    colors = by_height(scan.points, 0.0, 2.4).astype(np.uint8)
     low, high = colors[scan.points[:, 2] < 0.02].mean(0), colors[scan.points[:, 2] > 2.0].mean(0)
     assert low[2] > low[0]
     assert high[0] > high[2]

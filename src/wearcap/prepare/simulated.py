@@ -33,11 +33,7 @@ from wearcap.simulation.places.changes import changed_world
 from wearcap.simulation.places.surround import surround
 from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
 from wearcap.simulation.recordings.hps_session import Protocol
-from wearcap.simulation.recordings.interaction_session import (
-    InteractionConfig,
-    SimulatedInteractions,
-    simulate_interactions,
-)
+from wearcap.simulation.recordings.interaction_session import InteractionConfig, simulate_interactions
 from wearcap.simulation.recordings.object_session import ObjectConfig, simulate_objects
 from wearcap.simulation.recordings.scene_files import SceneSettings, write_scene
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording

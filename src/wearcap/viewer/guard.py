@@ -24,7 +24,7 @@ _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?")
 
 
 @runtime_checkable
-class Headers(Protocol):
+class _Headers(Protocol):
     """Headers of a request, the common interface of `http.server` and `websockets`."""
 
     def get_all(self, name: str, /) -> list[str] | None: ...
@@ -48,7 +48,7 @@ class Guard:
             name = "::1" if name == "::" else "127.0.0.1"
         return f"http://{f'[{name}]' if ':' in name else name}:{port}/?token={self.token}"
 
-    def admit(self, target: str, headers: Headers) -> dict[str, str]:
+    def admit(self, target: str, headers: _Headers) -> dict[str, str]:
         """Headers to send with the answer to a request for `target`. Raises Refused where it must not be answered."""
         host = _single(headers, "Host") or ""
         match = _HOST.fullmatch(host)
@@ -82,7 +82,7 @@ class Guard:
         return any(secrets.compare_digest(each.encode(errors="replace"), wanted) for each in given)
 
 
-def _single(headers: Headers, name: str) -> str | None:
+def _single(headers: _Headers, name: str) -> str | None:
     """A header's value. Raises Refused if there are two, of which different readers may take different ones."""
     values = headers.get_all(name) or []
     if len(values) > 1:

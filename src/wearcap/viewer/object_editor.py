@@ -16,16 +16,16 @@ from jaxtyping import Float
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.io.formats.environment import MAX_HINGE_GAP_M, read_environment, write_environment
 from wearcap.scene.editing import ObjectEditing, points_world
 from wearcap.scene.environment import hinge_gap_m
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.scene.placing import hinge_places, snapped
 from wearcap.scene.scan import Scan
-from wearcap.viewer.guard import Guard
 from wearcap.viewer.object_editor_panels import HINTS, TOOLS, ObjectPanel, SelectPanel
-from wearcap.viewer.object_editor_view import EditorView, axis_toward, pose_of, ray_to
-from wearcap.viewer.page_server import start_server
+from wearcap.viewer.object_editor_view import EditorView
+from wearcap.viewer.page_server import ServedPage
 
 SNAP_M = 0.12
 SAVE_AFTER_S, TRY_AGAIN_S = 0.7, 10.0
@@ -34,7 +34,7 @@ _CEILING_M = 2.1
 _SIDE_M = 4.0
 
 
-class ObjectEditor:
+class ObjectEditor(ServedPage):
     """The page of one scan. `run` serves until interrupted and saves what changes; `stop` saves and closes."""
 
     def __init__(self, scan: Scan, file: Path, title: str = "scene", host: str = "127.0.0.1", port: int = 8080):
@@ -44,29 +44,25 @@ class ObjectEditor:
             self.editing = ObjectEditing(scan, environment)
         except WearcapError as error:
             raise WearcapError(error.what, where=file, expected=error.expected, fix=error.fix) from error
-        self.file, self._stopped, self._lock = file, False, threading.RLock()
+        self.file, self._lock = file, threading.RLock()
         self._saved = self._shown = self.editing.revision
         self._selection = self.editing.selected
         self._changed_at, self._problem, self._stroke = 0.0, "", 0
-        self.guard = Guard(host)
-        self.server = start_server(self.guard, port, "wearcap scene")
-        self.server.scene.set_up_direction("+z")
-        self.server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        super().__init__("wearcap scene", host, port, "large")
         self.view = EditorView(self.server, scan)
         self._add_controls(title)
         self._wire()
-        self._look_at_the_middle()
+        low, high = np.quantile(scan.points[:: max(1, len(scan.points) // 100_000)], [0.02, 0.98], axis=0)
+        middle = np.array([*(low + high)[:2] / 2, low[2] + 0.5])
+        far = 0.75 * max(float(np.linalg.norm((high - low)[:2])), _SIDE_M)
+        self.server.initial_camera.look_at = tuple(middle)
+        self.server.initial_camera.position = tuple(middle + far * np.array([-0.4, -0.4, 1.0]))
         self.current: str | None = None
         self._tried: Rigid | None = None
         self._show_scan()
         self._show_box()
         self._show_objects()
         self._show_status()
-
-    @property
-    def url(self) -> str:
-        """Address to open; it contains the token without which the page does not answer."""
-        return self.guard.url(self.server.get_port())
 
     def _add_controls(self, title: str) -> None:
         gui, points = self.server.gui, self.editing.scan.points
@@ -147,8 +143,9 @@ class ObjectEditor:
         @view.brush.on_drag
         def _(event: viser.SceneNodeDragEvent) -> None:
             if event.phase != "end":
-                ray = ray_to(event.end_position, event.client.camera)
-                act(lambda: self.paint(*ray, fresh=event.phase == "start"))(event)
+                origin = np.asarray(event.client.camera.position, np.float64)
+                direction = np.asarray(event.end_position, np.float64) - origin
+                act(lambda: self.paint(origin, direction, fresh=event.phase == "start"))(event)
 
         @view.freedom_handle.on_update
         def _(event: viser.TransformControlsEvent) -> None:
@@ -274,9 +271,11 @@ class ObjectEditor:
         elif item.freedom.kind == "axis":
             box = points_world(item)
             height = (box[:, 2].min() + box[:, 2].max()) / 2
-            axis = axis_toward(item, np.array([*place[:2], height if level else place[2]]))
-            if axis is not None:
-                self.editing.set_freedom(item.name, replace(item.freedom, axis=axis))
+            direction = np.array([*place[:2], height if level else place[2]]) - (box.min(0) + box.max(0)) / 2
+            length = float(np.linalg.norm(direction))
+            if length >= 1e-3:
+                x, y, z = (direction / length).tolist()
+                self.editing.set_freedom(item.name, replace(item.freedom, axis=(x, y, z)))
         else:
             raise WearcapError(
                 f"{item.name} {'is carried' if item.freedom.kind == 'free' else 'slides on the floor'}",
@@ -307,9 +306,10 @@ class ObjectEditor:
 
     def try_pose(self) -> None:
         """Pose of a dragged object: on the floor, shifted and turned about z; carried, any pose."""
-        item, pose = self._item(), pose_of(self.view.try_handle)
-        self._tried = pose
-        self.view.place(item.name, pose)
+        handle = self.view.try_handle
+        R = matrix_from_quat_wxyz(torch.tensor(np.asarray(handle.wxyz, np.float64)))
+        self._tried = Rigid(R.float(), torch.tensor(np.asarray(handle.position, np.float64)).float())
+        self.view.place(self._item().name, self._tried)
 
     def _show_scan(self) -> None:
         self.view.show_scan(self.editing.left(), float(self.top.value))
@@ -345,15 +345,6 @@ class ObjectEditor:
         chosen = f"{len(self.editing.selected):,} points selected"
         self._status.content = f"{chosen} · {count} object{'s' * (count != 1)} · {state}"
 
-    def _look_at_the_middle(self) -> None:
-        points = self.editing.scan.points
-        low, high = np.quantile(points[:: max(1, len(points) // 100_000)], [0.02, 0.98], axis=0)
-        middle = np.array([*(low + high)[:2] / 2, low[2] + 0.5])
-        far = 0.75 * max(float(np.linalg.norm((high - low)[:2])), _SIDE_M)
-        camera = self.server.initial_camera
-        camera.look_at = tuple(middle)
-        camera.position = tuple(middle + far * np.array([-0.4, -0.4, 1.0]))
-
     def save(self) -> None:
         """Write the environment if it has changed. Raises WearcapError if it cannot be written."""
         with self._lock:
@@ -381,4 +372,4 @@ class ObjectEditor:
         try:
             self.save()
         finally:
-            self.server.stop()
+            super().stop()

@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 import viser
 from jaxtyping import Bool, Float, Int64, UInt8
 from scipy.spatial import KDTree
 
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
+from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.scene.editing import points_world
 from wearcap.scene.objects import SceneObject
 from wearcap.scene.scan import Scan
@@ -195,28 +194,8 @@ class EditorView:
         return best
 
 
-def axis_toward(item: SceneObject, place: Float[np.ndarray, "3"]) -> tuple[float, float, float] | None:
-    """Unit vector from the middle of an object to a position; None if they coincide."""
-    points = points_world(item)
-    direction = place - (points.min(0) + points.max(0)) / 2
-    length = float(np.linalg.norm(direction))
-    return None if length < 1e-3 else tuple((direction / length).tolist())
-
-
 def typical_spacing(points: Float[np.ndarray, "point 3"]) -> float:
     """Median distance (m) of neighbours in a cloud, over a sample."""
     sample = points[:: max(1, len(points) // 500)]
     distance, _ = KDTree(points).query(sample, k=2)
     return float(np.clip(np.median(distance[:, -1]), 0.002, 0.2)) if len(points) > 1 else 0.02
-
-
-def ray_to(place: tuple[float, float, float], camera: viser.CameraHandle) -> tuple[np.ndarray, np.ndarray]:
-    """Origin and direction of the ray from a client's camera to a position."""
-    origin = np.asarray(camera.position, np.float64)
-    return origin, np.asarray(place, np.float64) - origin
-
-
-def pose_of(handle: viser.TransformControlsHandle) -> Rigid:
-    """Pose that a handle was dragged to."""
-    R = matrix_from_quat_wxyz(torch.tensor(np.asarray(handle.wxyz, np.float64)))
-    return Rigid(R.float(), torch.tensor(np.asarray(handle.position, np.float64)).float())

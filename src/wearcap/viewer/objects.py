@@ -36,13 +36,8 @@ DIM, BRIGHT = np.array([0.55, 0.16, 0.02]), np.array([1.0, 0.86, 0.10])
 """Colours (RGB) at the threshold and at probability 1."""
 
 
-def pose_at(track: Trajectory | None, item: SceneObject, time_s: float) -> Rigid:
-    """Displayed pose of an object: at the nearest frame of its track, or the initial pose without a track."""
-    return poses_at(track, item, torch.tensor([time_s], dtype=torch.float64))[0]
-
-
 def poses_at(track: Trajectory | None, item: SceneObject, times: Float64[Tensor, "time"]) -> Rigid:
-    """`pose_at` for many times (s)."""
+    """Displayed poses of an object at times (s): of the nearest frames of its track, or the initial one without a track."""
     if track is None or not len(track):
         T = item.T_world_object
         return Rigid(T.R.expand(len(times), 3, 3), T.t.expand(len(times), 3))
@@ -50,7 +45,7 @@ def poses_at(track: Trajectory | None, item: SceneObject, times: Float64[Tensor,
 
 
 @lru_cache(maxsize=1024)
-def shown_mesh(item: SceneObject) -> Mesh:
+def _shown_mesh(item: SceneObject) -> Mesh:
     """An object's triangles in its own axes; small balls at the points of a cloud."""
     if len(item.mesh.faces):
         return item.mesh
@@ -61,13 +56,12 @@ def shown_mesh(item: SceneObject) -> Mesh:
 
 def posed_meshes(environment: Environment, tracks: dict[str, Trajectory], time_s: float) -> list[Mesh]:
     """Meshes of all objects at a time (s), in the world."""
-    return [moved(shown_mesh(item), pose_at(tracks.get(item.name), item, time_s)) for item in environment.objects]
-
-
-def moved(mesh: Mesh, T_world_object: Rigid) -> Mesh:
-    """A mesh transformed from an object's axes to the world."""
-    R, t = T_world_object.R.double().numpy(), T_world_object.t.double().numpy()
-    return replace(mesh, vertices=(mesh.vertices @ R.T + t).astype(np.float32))
+    meshes, times = [], torch.tensor([time_s], dtype=torch.float64)
+    for item in environment.objects:
+        T = poses_at(tracks.get(item.name), item, times)[0]
+        R, t, mesh = T.R.double().numpy(), T.t.double().numpy(), _shown_mesh(item)
+        meshes.append(replace(mesh, vertices=(mesh.vertices @ R.T + t).astype(np.float32)))
+    return meshes
 
 
 def with_objects(recording: Recording, environment: Environment | None = None) -> Motion | None:
@@ -184,7 +178,7 @@ class ObjectsLayer(MotionLayer):
         """`tint` is the RGB colour (0…255) that the objects' own colours are mixed with equally."""
         self.objects, self.tracks, handles = tuple(objects), tracks, []
         for item in self.objects:
-            mesh = shown_mesh(item)
+            mesh = _shown_mesh(item)
             color = 255 * np.atleast_2d(mesh.color).mean(0)
             if tint is not None:
                 color = (color + tint) / 2
@@ -200,7 +194,7 @@ class ObjectsLayer(MotionLayer):
 
     def show(self, time: float) -> None:
         for item, handle in zip(self.objects, self.handles):
-            pose = pose_at(self.tracks.get(item.name), item, time)
+            pose = poses_at(self.tracks.get(item.name), item, torch.tensor([time], dtype=torch.float64))[0]
             wxyz, position = (quat_wxyz_from_matrix(pose.R.double()).numpy(), pose.t.double().numpy() + self.offset)
             if not (np.array_equal(wxyz, handle.wxyz) and np.array_equal(position, handle.position)):
                 handle.wxyz, handle.position = wxyz, position

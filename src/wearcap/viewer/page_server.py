@@ -7,7 +7,7 @@ viser itself answers every page of every site, and has no setting for that. Requ
 import socket
 import threading
 from http import HTTPStatus
-from typing import Any
+from typing import Any, Literal
 
 import rich
 import viser
@@ -88,3 +88,23 @@ def _check_host(host: str) -> None:
         expected="a name or address of this machine",
         fix="Leave out --host for this machine alone, or give 0.0.0.0 for all of its addresses.",
     )
+
+
+class ServedPage:
+    """A guarded page of viser with z up; `stop` ends its `run`."""
+
+    def __init__(self, label: str, host: str, port: int, control_width: Literal["medium", "large"]):
+        self.guard = Guard(host)
+        self.server = start_server(self.guard, port, label)
+        self.server.scene.set_up_direction("+z")
+        self.server.gui.configure_theme(control_width=control_width, show_logo=False, show_share_button=False)
+        self._stopped = False
+
+    @property
+    def url(self) -> str:
+        """Address to open; it contains the token without which the page does not answer."""
+        return self.guard.url(self.server.get_port())
+
+    def stop(self) -> None:
+        self._stopped = True
+        self.server.stop()

@@ -112,7 +112,7 @@ def actors(
     return shown
 
 
-def looking(
+def _looking(
     direction: Sequence[float], target: Float[np.ndarray, "3"], distance: float, size: tuple[int, int], focal: float
 ) -> tuple[Camera, Rigid]:
     """A camera of `size` (width, height) that looks in a direction of the world at a point from a distance (m)."""
@@ -136,7 +136,7 @@ def panel(
     distance: float = 4.2,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """One actor at one frame, on a chequered floor or in a world."""
-    camera, T_world_cam = looking((*VIEW, -0.30), target, distance, size, 1.75 * min(size[1], size[0] * 1.3))
+    camera, T_world_cam = _looking((*VIEW, -0.30), target, distance, size, 1.75 * min(size[1], size[0] * 1.3))
     ground = np.array([target[0], target[1], actor.floor_z])
     stage = world or checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
     below = (float(target[0]), float(target[1]), float(ground[2]))
@@ -220,17 +220,7 @@ def draw_head_path(recording: Recording, size: tuple[int, int] = (640, 520)) -> 
     splats = Splats(
         points.astype(np.float32), by_height(points, low[2], high[2], HEIGHT_COLORS).astype(np.float32), 0.8
     )
-    panels = []
-    for caption, direction in (("from above", (0.02, 0.05, -1.0)), ("aside", (-0.6, 0.75, -0.35))):
-        camera, T_world_cam = looking(direction, centre, 2.4 * radius, size, 1.0 * size[1])
-        frame = render(camera, T_world_cam, [_path_mesh(recording, path, radius)], [splats], background=SKY)
-        panels.append(np.asarray(captioned(frame.color, f"{recording.name}, {caption}")))
-    return np.asarray(Image.fromarray(np.concatenate(panels, 1)))
-
-
-def _path_mesh(recording: Recording, path: np.ndarray, radius: float) -> Mesh:
-    """The path as a tube, with short rods along the viewing directions."""
-    assert recording.head is not None
+    # The path is a tube, with short rods along the viewing directions.
     steps = path[:: max(1, len(path) // 300)]
     at = np.linspace(0, len(path) - 1, LOOKS).astype(int)
     ahead = recording.head.R_world_device[torch.from_numpy(at)][:, :, 0].double().numpy()
@@ -238,7 +228,13 @@ def _path_mesh(recording: Recording, path: np.ndarray, radius: float) -> Mesh:
     end = np.concatenate([steps[1:], path[at] + 0.12 * radius * ahead])
     thick = np.full(len(start), 0.006 * radius)
     colors = np.concatenate([np.tile(PATH_COLOR, (len(steps) - 1, 1)), np.tile(LOOK_COLOR, (LOOKS, 1))])
-    return capsules(start, end, thick, thick, colors, 8)
+    tube = capsules(start, end, thick, thick, colors, 8)
+    panels = []
+    for caption, direction in (("from above", (0.02, 0.05, -1.0)), ("aside", (-0.6, 0.75, -0.35))):
+        camera, T_world_cam = _looking(direction, centre, 2.4 * radius, size, 1.0 * size[1])
+        frame = render(camera, T_world_cam, [tube], [splats], background=SKY)
+        panels.append(np.asarray(captioned(frame.color, f"{recording.name}, {caption}")))
+    return np.asarray(Image.fromarray(np.concatenate(panels, 1)))
 
 
 def captioned(image: UInt8[np.ndarray, "height width 3"], text: str) -> Image.Image:

@@ -41,7 +41,8 @@ def write_video(
     times = start + np.arange(int((stop - start) * fps) + 1) / fps
     clocks = [actor.motion.timestamps.numpy() for actor in shown]
     with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
-        stream = container.add_stream(_codec(), rate=round(fps))
+        codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"  # H.264 where PyAV was built with it
+        stream = container.add_stream(codec, rate=round(fps))
         assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = size[0] * len(shown), size[1], "yuv420p"
         for time in track(times, f"video {Path(path).name}", console=Console(stderr=True), disable=not progress):
@@ -54,8 +55,3 @@ def write_video(
             picture = av.VideoFrame.from_ndarray(np.concatenate(panels, 1), format="rgb24")
             container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
-
-
-def _codec() -> str:
-    """H.264 where PyAV was built with it, else MPEG-4 part 2."""
-    return "libx264" if "libx264" in av.codecs_available else "mpeg4"
