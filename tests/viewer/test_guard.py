@@ -75,7 +75,7 @@ def an_editor(folder: Path) -> ObjectEditor:
 def an_annotator(folder: Path) -> AnnotationServer:
     store = RecordingStore(folder / "flat")
     store.add(recording_of(swaying_motion(600, 0, 60.0), "r0"), split="test", config_hash="x")
-    return AnnotationServer(Desk.of(folder / "flat", folder), port=18740)
+    return AnnotationServer(Desk(folder / "flat", folder), port=18740)
 
 
 def a_film_to_annotate(folder: Path, film: bytes) -> AnnotationServer:

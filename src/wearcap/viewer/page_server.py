@@ -4,6 +4,8 @@ viser itself answers every page of every site, and has no setting for that. Requ
 `process_request` that it passes to `websockets`; while it starts, the guard's is put in front of it.
 """
 
+import logging
+import math
 import socket
 import threading
 from http import HTTPStatus
@@ -104,6 +106,19 @@ class ServedPage:
     def url(self) -> str:
         """Address to open; it contains the token without which the page does not answer."""
         return self.guard.url(self.server.get_port())
+
+    def run(self, seconds: float = math.inf) -> None:
+        """Follow the clock and save until interrupted, or for the given seconds."""
+        raise NotImplementedError
+
+    def serve(self) -> None:
+        """Run until interrupted, then stop."""
+        # Browsers open connections in advance and drop them; the server's log of that is of no use to a user.
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+        try:
+            self.run()
+        finally:
+            self.stop()
 
     def stop(self) -> None:
         self._stopped = True
