@@ -9,7 +9,8 @@ from pathlib import Path
 
 from wearcap.data.embeddings import embed_camera, embedding_name
 from wearcap.errors import WearcapError
-from wearcap.files import folder_lock, remove_leftovers
+from wearcap.files import remove_leftovers
+from wearcap.locks import folder_lock
 from wearcap.models.image_encoder import ImageEncoder
 from wearcap.prepare.check import check_recording
 from wearcap.prepare.engine import REGISTER_EVERY_S, Report, progress_bar

@@ -23,7 +23,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from wearcap.errors import WearcapError
-from wearcap.files import folder_lock, remove_leftovers, sha256_of
+from wearcap.files import remove_leftovers, sha256_of
+from wearcap.locks import folder_lock
 from wearcap.prepare.check import check_recording
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import Entry, RecordingStore, entry_for, recording_path, save_recording

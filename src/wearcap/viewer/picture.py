@@ -131,14 +131,13 @@ def panel(
     target: Float[np.ndarray, "3"],
     size: tuple[int, int],
     *,
-    world: Mesh | None = None,
     supersample: int = 2,
     distance: float = 4.2,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """One actor at one frame, on a chequered floor or in a world."""
+    """One actor at one frame, on a chequered floor."""
     camera, T_world_cam = _looking((*VIEW, -0.30), target, distance, size, 1.75 * min(size[1], size[0] * 1.3))
     ground = np.array([target[0], target[1], actor.floor_z])
-    stage = world or checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
+    stage = checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
     below = (float(target[0]), float(target[1]), float(ground[2]))
     light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
     return render(
@@ -153,7 +152,6 @@ def contact_sheet(
     columns: int = 6,
     size: tuple[int, int] = (200, 240),
     body: BodyModel | None = None,
-    world: Mesh | None = None,
     environment: Environment | None = None,
     distance: float = 4.2,
 ) -> UInt8[np.ndarray, "height width 3"]:
@@ -178,7 +176,7 @@ def contact_sheet(
             target = focus(shown[0].motion, frame)
             for row, (actor, clock) in enumerate(zip(shown, clocks)):
                 nearest = frame if row == 0 else int(np.abs(clock - clocks[0][frame]).argmin())
-                image = panel(actor, nearest, target, size, world=world, distance=distance)
+                image = panel(actor, nearest, target, size, distance=distance)
                 seconds = clock[nearest] - clocks[0][0]
                 text = f"{actor.label}  {seconds:.2f} s" if column == 0 else f"{seconds:.2f} s"
                 sheet.paste(captioned(image, text), (column * width, (band * len(shown) + row) * height))

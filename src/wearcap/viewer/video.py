@@ -10,7 +10,6 @@ from rich.progress import track
 from wearcap.body.model import BodyModel
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
-from wearcap.geometry.mesh import Mesh
 from wearcap.recording.motion import Motion
 from wearcap.scene.environment import Environment
 from wearcap.viewer.picture import actors, captioned, focus, panel, shared_time
@@ -23,7 +22,6 @@ def write_video(
     fps: float = 30.0,
     size: tuple[int, int] = (480, 400),
     body: BodyModel | None = None,
-    world: Mesh | None = None,
     environment: Environment | None = None,
     max_seconds: float | None = None,
     progress: bool = True,
@@ -49,7 +47,7 @@ def write_video(
             frames = [int(np.abs(clock - time).argmin()) for clock in clocks]
             target = focus(shown[0].motion, frames[0])
             panels = [
-                np.asarray(captioned(panel(actor, frame, target, size, world=world, supersample=1), actor.label))
+                np.asarray(captioned(panel(actor, frame, target, size, supersample=1), actor.label))
                 for actor, frame in zip(shown, frames)
             ]
             picture = av.VideoFrame.from_ndarray(np.concatenate(panels, 1), format="rgb24")
