@@ -3,7 +3,6 @@
 import math
 
 import torch
-from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.landmarks import Landmarks, landmarks
@@ -149,29 +148,20 @@ def _check_feet(
     else:
         where = "sink into" if low < -0.1 else "float above" if usual > 0.1 else "are below"
         found = check.warning(f"feet {where} the floor", evidence, "Check the floor's height and the foot's size.")
-    slide = _sliding_cm_s(motion, feet, lowest) if len(motion) >= 30 else None
-    if slide is None:
+    near = (lowest - quantile(lowest, 0.05)).abs() < 0.03
+    if len(motion) < 30 or near.sum() < 20:
         return [found]
+    R = torch.eye(3, dtype=torch.float64).expand(len(feet), 3, 3)
+    tracks = [Trajectory(motion.timestamps, R, feet[:, point]) for point in range(feet.shape[1])]
+    speed = torch.stack([linear_velocity(track) for track in tracks], 1)
+    speed = speed[torch.arange(len(feet)), feet[..., 2].argmin(1), :2].norm(dim=-1)  # of the lowest point
+    slide = 100 * quantile(speed[near], 0.5)
     check, pace = Check(f"{stream}: foot sliding"), 100 * quantile(linear_velocity(root)[:, :2].norm(dim=-1), 0.5)
     if slide > max(20.0, 0.15 * pace):
         evidence = f"{slide:.0f} cm/s while within 3 cm of the floor (half of the frames)"
         fix = "Frame rate, unit of the root's path, or legs' lengths may be wrong."
         return [found, check.warning("standing feet slide", evidence, fix)]
     return [found, check.ok("standing feet stand", f"{slide:.1f} cm/s in the median")]
-
-
-def _sliding_cm_s(motion: Motion, feet: Tensor, lowest: Tensor) -> float | None:
-    """Median horizontal speed of the lowest foot point while it is near its usual lowest height; None if hardly ever."""
-    point = feet[..., 2].argmin(1)
-    near = (lowest - quantile(lowest, 0.05)).abs() < 0.03
-    if near.sum() < 20:
-        return None
-    R = torch.eye(3, dtype=torch.float64).expand(len(feet), 3, 3)
-    speed = torch.stack(
-        [linear_velocity(Trajectory(motion.timestamps, R, feet[:, i])) for i in range(feet.shape[1])], 1
-    )
-    lowest_speed = speed[torch.arange(len(point)), point, :2].norm(dim=-1)
-    return 100 * quantile(lowest_speed[near], 0.5)
 
 
 def check_contact_prob(stream: str, motion: Motion) -> list[Finding]:

@@ -99,7 +99,13 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
         findings.append(check_head_cue(head, recording.cues["head"]))
     for name, imu in recording.imu.items():
         if f"imu {name}" in usable:
-            findings += check_imu(f"imu {name}", imu, _joint_path(imu.joint, body, head))
+            path = None
+            if body is not None and imu.joint in body.skeleton:
+                T, times = body.joint(imu.joint), body.timestamps
+                path = Trajectory(times, T.R, T.t)
+            elif head is not None and imu.joint == "head":
+                path = Trajectory(head.timestamps, head.T_world_head.R, head.T_world_head.t)
+            findings += check_imu(f"imu {name}", imu, path)
     if recording.points is not None:
         findings += check_points(recording.points, head)
     if recording.camera is not None:
@@ -107,13 +113,3 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
     if recording.localization is not None and "localization" in usable:
         findings += check_localization(recording.localization, bodies.get("suit", body))
     return [*findings, *check_claps(recording)]
-
-
-def _joint_path(joint: str, body, head) -> Trajectory | None:
-    if body is not None and joint in body.skeleton:
-        pose = body.joint(joint)
-        return Trajectory(body.timestamps, pose.R, pose.t)
-    if head is not None and joint == "head":
-        T_world_head = head.T_world_head
-        return Trajectory(head.timestamps, T_world_head.R, T_world_head.t)
-    return None

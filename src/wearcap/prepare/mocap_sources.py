@@ -19,7 +19,6 @@ from wearcap.io.formats.text import read_text
 from wearcap.prepare.engine import Task, content_hash, source_folder
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording, on_xsens23
 from wearcap.prepare.splits import Splits
-from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 
 CMU_VERSION, AMASS_VERSION = 2, 1
@@ -45,42 +44,38 @@ class BvhSettings:
     forward: str
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One file of motion, with its skeleton file where the format needs one; picklable, callable as a task."""
+def cmu_recording(
+    file: Path,
+    asf: Path | None,
+    about: About,
+    amc_fps: float | int,
+    bvh: BvhSettings,
+    settings: MocapSettings,
+    same_subject: tuple[Path, ...] = (),
+) -> Recording:
+    """One file of motion, with its skeleton file where the format needs one.
 
-    file: Path
-    asf: Path | None
-    about: About
-    amc_fps: float | int
-    bvh: BvhSettings
-    settings: MocapSettings
-    same_subject: tuple[Path, ...] = ()
-    """Trials of the same subject and skeleton file from which the tilt of the head's markers is estimated."""
-
-    def __call__(self) -> Recording:
-        motion = on_xsens23(self.read())
-        if self.asf is not None:
-            face = _head_face(self.asf, self.same_subject, self.amc_fps)
-            if face is not None:
-                R = with_head_face(motion.skeleton, motion.R_parent_joint, face)
-                motion = replace(motion, R_parent_joint=R)
-        return mocap_recording(motion, self.about, self.settings)
-
-    def read(self) -> Motion:
-        """The motion in the file's own skeleton."""
-        if ".amc" in self.file.name.lower():
-            if self.asf is None:
-                raise WearcapError(
-                    "no skeleton beside it",
-                    where=self.file,
-                    fix="An AMC file needs its subject's .asf.",
-                    expected=f"{self.file.name.split('_')[0]}.asf, or one .asf file",
-                )
-            return read_amc(read_asf(self.asf), self.file, self.amc_fps)
-        if CGSPEED_JOINT in read_text(self.file)[:4096]:
-            return read_cmu_bvh(self.file)
-        return read_bvh(self.file, unit_m=self.bvh.unit_m, up=self.bvh.up, forward=self.bvh.forward)
+    The tilt of the head's markers is estimated from `same_subject`, trials of the same subject and skeleton file. Raises
+    WearcapError for an AMC file without a skeleton.
+    """
+    if ".amc" in file.name.lower():
+        if asf is None:
+            raise WearcapError(
+                "no skeleton beside it",
+                where=file,
+                fix="An AMC file needs its subject's .asf.",
+                expected=f"{file.name.split('_')[0]}.asf, or one .asf file",
+            )
+        motion = read_amc(read_asf(asf), file, amc_fps)
+    elif CGSPEED_JOINT in read_text(file)[:4096]:
+        motion = read_cmu_bvh(file)
+    else:
+        motion = read_bvh(file, unit_m=bvh.unit_m, up=bvh.up, forward=bvh.forward)
+    motion = on_xsens23(motion)
+    face = None if asf is None else _head_face(asf, same_subject, amc_fps)
+    if face is not None:
+        motion = replace(motion, R_parent_joint=with_head_face(motion.skeleton, motion.R_parent_joint, face))
+    return mocap_recording(motion, about, settings)
 
 
 @cache
@@ -129,10 +124,10 @@ def cmu_tasks(
         about = About(name, subject, "cmu", license, activities.get(name) or "")
         others = same[subject, asf]
         spread = tuple(others[:: -(-len(others) // HEAD_TRIALS)]) if asf is not None else ()
-        trial = Trial(path, asf, about, amc_fps, bvh, settings, spread)
+        make = partial(cmu_recording, path, asf, about, amc_fps, bvh, settings, spread)
         described = [asdict(about), asdict(settings), asdict(bvh), amc_fps, CMU_VERSION]
         sources = [path] if asf is None else [path, asf, *spread]
-        tasks.append(Task(name, trial, splits.of(subject), content_hash(*described, *sources)))
+        tasks.append(Task(name, make, splits.of(subject), content_hash(*described, *sources)))
     return tasks
 
 

@@ -106,9 +106,17 @@ class _Server(ThreadingHTTPServer):
 
     def process_request(self, request: Any, client_address) -> None:
         """Answer a connection in its own thread; if there are too many, close the one that has been idle longest."""
-        if not self._free.acquire(blocking=False) and not (
-            self._close_longest_idle() and self._free.acquire(timeout=_CLOSE_S)
-        ):
+        free = self._free.acquire(blocking=False)
+        if not free:
+            with self._idle_lock:
+                idle = next(iter(self._idle), None)
+                if idle is not None:
+                    del self._idle[idle]
+            if idle is not None:
+                with contextlib.suppress(OSError):  # its thread wakes up and ends
+                    idle.shutdown(socket.SHUT_RDWR)
+                free = self._free.acquire(timeout=_CLOSE_S)
+        if not free:
             with contextlib.suppress(OSError):
                 request.sendall(b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
             return self.shutdown_request(request)
@@ -134,16 +142,6 @@ class _Server(ThreadingHTTPServer):
         """Mark a connection as busy; returns False if it has already been closed in favour of another one."""
         with self._idle_lock:
             return self._idle.pop(connection, False) is None
-
-    def _close_longest_idle(self) -> bool:
-        with self._idle_lock:
-            connection = next(iter(self._idle), None)
-            if connection is None:
-                return False
-            del self._idle[connection]
-        with contextlib.suppress(OSError):  # its thread wakes up and ends
-            connection.shutdown(socket.SHUT_RDWR)
-        return True
 
     def _release(self, connection: socket.socket) -> None:
         self.end_idle(connection)

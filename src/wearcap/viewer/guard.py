@@ -52,7 +52,11 @@ class Guard:
         """Headers to send with the answer to a request for `target`. Raises Refused where it must not be answered."""
         host = _single(headers, "Host") or ""
         match = _HOST.fullmatch(host)
-        if match is None or not self._is_ours(_plain(match[1])):
+        name = "" if match is None else _plain(match[1])
+        ours = name in LOOPBACK or name == _plain(self.host)
+        # A foreign name cannot be an IP address, so any IP address may be right.
+        ours = ours or (self._everywhere and (_address(name) is not None or name == socket.gethostname().lower()))
+        if match is None or not ours:
             raise Refused(f"this page has another address than {host[:80]!a}: open the one that was printed")
         origin = _single(headers, "Origin")
         if origin is not None and origin.lower() not in (f"http://{host}".lower(), f"https://{host}".lower()):
@@ -70,12 +74,6 @@ class Guard:
         """Whether the page is served on all of the machine's addresses."""
         address = _address(_plain(self.host))
         return self.host == "" or (address is not None and address.is_unspecified)
-
-    def _is_ours(self, name: str) -> bool:
-        """Whether a name is one of the page's. A foreign name cannot be an IP address, so any IP address may be right."""
-        if name in LOOPBACK or name == _plain(self.host):
-            return True
-        return self._everywhere and (_address(name) is not None or name == socket.gethostname().lower())
 
     def _is_token(self, given: list[str]) -> bool:
         wanted = self.token.encode()

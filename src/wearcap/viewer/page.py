@@ -15,7 +15,6 @@ import viser
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.recording import Motion, Recording
@@ -28,7 +27,7 @@ from wearcap.viewer.page_layers import (
     HeadLayer,
     LabelLayer,
     Layer,
-    Placed,
+    MotionLayer,
     add_points,
     read_scene,
     surface_or_sticks,
@@ -91,6 +90,59 @@ class Timeline:
         self.seek(self.time + seconds)
 
 
+@dataclass
+class Placed:
+    """Layers of one motion, which are shown, hidden and shifted together."""
+
+    body: BodyLayer
+    feet: FeetLayer | None
+    points: MotionLayer | None = None
+    objects: MotionLayer | None = None
+    label: LabelLayer | None = None
+
+    @classmethod
+    def of(
+        cls,
+        server: viser.ViserServer,
+        name: str,
+        motion: Motion,
+        recording: Recording,
+        items: Sequence[SceneObject],
+        color: tuple[int, int, int],
+        several: bool,
+    ) -> "Placed":
+        """A motion with its own moving objects; one of `several` is labelled, and its objects are tinted like its body."""
+        body, points, objects = surface_or_sticks(motion.skeleton, recording.shape), None, None
+        if motion.body_contact_prob is not None:
+            points = BodyPointsLayer(server, f"{name}_points", motion, body)
+        if items and motion.object_motion:
+            tint = color if several else None
+            objects = ObjectsLayer(server, f"{name}_objects", items, motion.object_motion, tint)
+        feet = FeetLayer.of(server, f"{name}_feet", motion, recording.contacts if name == TRUTH else None)
+        label = LabelLayer(server, name, motion) if several else None
+        return cls(BodyLayer(server, name, motion, body, color), feet, points, objects, label)
+
+    @property
+    def layers(self) -> list[MotionLayer]:
+        every = (self.body, self.feet, self.points, self.objects)
+        return [layer for layer in every if layer is not None]
+
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool, named: bool = False) -> None:
+        """`named` also shows the motion's label, if it has one."""
+        for layer in self.layers:
+            layer.place(offset, visible)
+        if self.label is not None:
+            self.label.place(offset, named)
+
+    def show(self, time: float) -> None:
+        if not self.body.handle.visible:
+            return
+        for layer in self.layers:
+            layer.show(time)
+        if self.label is not None:
+            self.label.show(time)
+
+
 class Page(ServedPage):
     """One recording's page. `run` plays until interrupted; `stop` closes the server."""
 
@@ -115,8 +167,14 @@ class Page(ServedPage):
         self.timeline = Timeline.of(recording, motions)
         scene = read_scene(folder / recording.scene) if recording.scene and folder is not None else None
         super().__init__("wearcap", host, port, "medium")
-        moving = moving_objects(list(motions.values()), environment)
-        self.bodies: dict[str, Placed] = placed_motions(self.server, recording, motions, moving)
+        moving, tracks = [], [motion.object_motion or {} for motion in motions.values()]
+        if environment is not None:
+            moving = [item for item in environment.objects if any(_moves(of.get(item.name), item) for of in tracks)]
+        self.bodies: dict[str, Placed] = {}
+        for name, motion in motions.items():
+            captures = len(self.bodies) - (TRUTH in self.bodies)
+            color = TRUTH_COLOR if name == TRUTH else COLORS[captures % len(COLORS)]
+            self.bodies[name] = Placed.of(self.server, name, motion, recording, moving, color, len(motions) > 1)
         self.layers: list[Layer] = list(self.bodies.values())
         self.aside_m = spacing_m(list(motions.values()), moving) if len(motions) > 1 else 0.0
         if recording.head is not None and len(recording.head.timestamps):
@@ -247,14 +305,6 @@ def _floor_height(recording: Recording) -> float:
     return 0.0
 
 
-def moving_objects(motions: Sequence[Motion], environment: Environment | None) -> list[SceneObject]:
-    """Objects that move in any of the motions."""
-    if environment is None:
-        return []
-    tracks = [motion.object_motion or {} for motion in motions]
-    return [item for item in environment.objects if any(_moves(of.get(item.name), item) for of in tracks)]
-
-
 def _moves(track: Trajectory | None, item: SceneObject) -> bool:
     if track is None or not len(track):
         return False
@@ -263,44 +313,6 @@ def _moves(track: Trajectory | None, item: SceneObject) -> bool:
     shifted = (t - item.t_world_object.to(t)).norm(dim=1).max()
     # A small angle is the matrices' distance divided by √2.
     return float(shifted) > STILL_M or float(turned) > 2**0.5 * STILL_RAD
-
-
-def placed_motions(
-    server: viser.ViserServer, recording: Recording, motions: dict[str, Motion], items: Sequence[SceneObject]
-) -> dict[str, Placed]:
-    """All motions by name, each with its own moving objects, tinted like its body if there are several motions."""
-    placed, captures = {}, 0
-    for name, motion in motions.items():
-        color = TRUTH_COLOR if name == TRUTH else COLORS[captures % len(COLORS)]
-        captures += name != TRUTH
-        body = surface_or_sticks(motion.skeleton, recording.shape)
-        several, points, objects = len(motions) > 1, None, None
-        if motion.body_contact_prob is not None:
-            points = BodyPointsLayer(server, f"{name}_points", motion, body)
-        if items and motion.object_motion:
-            tint = color if several else None
-            objects = ObjectsLayer(server, f"{name}_objects", items, motion.object_motion, tint)
-        placed[name] = Placed(
-            BodyLayer(server, name, motion, body, color),
-            _feet(server, name, motion, recording),
-            points,
-            objects,
-            LabelLayer(server, name, motion) if several else None,
-        )
-    return placed
-
-
-def _feet(server: viser.ViserServer, name: str, motion: Motion, recording: Recording) -> FeetLayer | None:
-    """Foot contacts: the motion's own, or the recording's for the ground truth."""
-    if not set(FOOT_PATCHES) <= set(motion.skeleton.sites):
-        return None
-    if motion.contact_prob is not None:
-        return FeetLayer(server, f"{name}_feet", motion, motion.contact_prob > 0.5, motion.timestamps)
-    track = recording.contacts if name == TRUTH else None
-    if track is None or not set(FOOT_PATCHES) <= set(track.parts):
-        return None
-    columns = [track.parts.index(patch) for patch in FOOT_PATCHES]
-    return FeetLayer(server, f"{name}_feet", motion, track.contact[:, columns], track.timestamps)
 
 
 def spacing_m(motions: Sequence[Motion], items: Sequence[SceneObject] = ()) -> float:

@@ -1,7 +1,6 @@
 """Layers of the page; each moves to a time by sending poses, without resending meshes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -19,7 +18,9 @@ from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import capsules
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
+from wearcap.geometry.trajectory import nearest_frames
 from wearcap.recording import HeadStream, Motion, PointCloud
+from wearcap.recording.recording import ContactTrack
 
 MAX_POINTS = 200_000
 LABEL_ABOVE_M = 0.3
@@ -49,10 +50,7 @@ class MotionLayer(Layer):
 
 def nearest_frame(timestamps: Float64[Tensor, "time"], time: float) -> int:
     """Index of the frame nearest in time."""
-    after = int(torch.searchsorted(timestamps, time).clamp(1, max(len(timestamps) - 1, 1)))
-    if len(timestamps) == 1:
-        return 0
-    return after if timestamps[after] - time < time - timestamps[after - 1] else after - 1
+    return int(nearest_frames(timestamps, torch.tensor([time], dtype=torch.float64))[0])
 
 
 def stick_body(skeleton: Skeleton) -> BodyModel:
@@ -135,6 +133,18 @@ class FeetLayer(MotionLayer):
             server.scene.add_icosphere(f"/{name}/{patch}", 0.028, AIR_COLOR, subdivisions=2) for patch in FOOT_PATCHES
         ]
         super().__init__(*self.balls)
+
+    @classmethod
+    def of(cls, server: viser.ViserServer, name: str, motion: Motion, track: ContactTrack | None) -> "FeetLayer | None":
+        """The motion's own contacts, else those of a track; None without contacts, or without these sites."""
+        if not set(FOOT_PATCHES) <= set(motion.skeleton.sites):
+            return None
+        if motion.contact_prob is not None:
+            return cls(server, name, motion, motion.contact_prob > 0.5, motion.timestamps)
+        if track is None or not set(FOOT_PATCHES) <= set(track.parts):
+            return None
+        columns = [track.parts.index(patch) for patch in FOOT_PATCHES]
+        return cls(server, name, motion, track.contact[:, columns], track.timestamps)
 
     def show(self, time: float) -> None:
         frame = nearest_frame(self.motion.timestamps, time)
@@ -219,34 +229,3 @@ class LabelLayer(MotionLayer):
         joints = self.motion.T_world_joint.t[nearest_frame(self.motion.timestamps, time)].double().numpy()
         top = np.array([*joints[0, :2], joints[:, 2].max() + LABEL_ABOVE_M])
         self.handle.position = top + self.offset
-
-
-@dataclass
-class Placed:
-    """Layers of one motion, which are shown, hidden and shifted together."""
-
-    body: BodyLayer
-    feet: FeetLayer | None
-    points: MotionLayer | None = None
-    objects: MotionLayer | None = None
-    label: LabelLayer | None = None
-
-    @property
-    def layers(self) -> list[MotionLayer]:
-        every = (self.body, self.feet, self.points, self.objects)
-        return [layer for layer in every if layer is not None]
-
-    def place(self, offset: Float[np.ndarray, "3"], visible: bool, named: bool = False) -> None:
-        """`named` also shows the motion's label, if it has one."""
-        for layer in self.layers:
-            layer.place(offset, visible)
-        if self.label is not None:
-            self.label.place(offset, named)
-
-    def show(self, time: float) -> None:
-        if not self.body.handle.visible:
-            return
-        for layer in self.layers:
-            layer.show(time)
-        if self.label is not None:
-            self.label.show(time)
