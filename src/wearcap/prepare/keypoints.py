@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -26,19 +26,6 @@ from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
 
 CAMERA_FPS = 30.0
 """Rate (Hz) of the simulated camera of a recording without one."""
-
-
-@runtime_checkable
-class Source(Protocol):
-    """Source of keypoints; picklable."""
-
-    def __call__(self, recording: Recording, folder: Path) -> Recording:
-        """The recording, of the data set at `folder`, with cues added."""
-        ...
-
-    def settings(self, name: str) -> list[Any]:
-        """Content that the cues of the recording of this name depend on (for `engine.content_hash`)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -112,6 +99,11 @@ class Simulated:
 
     def settings(self, name: str) -> list[Any]:
         return ["simulated", asdict(self)]
+
+
+Source = Found | Recorded | Simulated
+"""Source of keypoints, picklable: called with a recording and its data set's folder, it returns the recording with cues;
+`settings(name)` is the content that the cues of the recording of this name depend on (for `engine.content_hash`)."""
 
 
 def keypoints_dataset(

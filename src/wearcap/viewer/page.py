@@ -118,9 +118,10 @@ class Placed:
         if items and motion.object_motion:
             tint = color if several else None
             objects = ObjectsLayer(server, f"{name}_objects", items, motion.object_motion, tint)
+        surface = BodyLayer(server, name, motion, body, color)
         feet = FeetLayer.of(server, f"{name}_feet", motion, recording.contacts if name == TRUTH else None)
         label = LabelLayer(server, name, motion) if several else None
-        return cls(BodyLayer(server, name, motion, body, color), feet, points, objects, label)
+        return cls(surface, feet, points, objects, label)
 
     @property
     def layers(self) -> list[MotionLayer]:
@@ -172,8 +173,8 @@ class Page(ServedPage):
             moving = [item for item in environment.objects if any(_moves(of.get(item.name), item) for of in tracks)]
         self.bodies: dict[str, Placed] = {}
         for name, motion in motions.items():
-            captures = len(self.bodies) - (TRUTH in self.bodies)
-            color = TRUTH_COLOR if name == TRUTH else COLORS[captures % len(COLORS)]
+            number = len(self.bodies) - (TRUTH in self.bodies)
+            color = TRUTH_COLOR if name == TRUTH else COLORS[number % len(COLORS)]
             self.bodies[name] = Placed.of(self.server, name, motion, recording, moving, color, len(motions) > 1)
         self.layers: list[Layer] = list(self.bodies.values())
         self.aside_m = spacing_m(list(motions.values()), moving) if len(motions) > 1 else 0.0
