@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from wearcap.cli.conf import splits_dir
+from wearcap.cli.conf import compose, splits_dir
 from wearcap.cli.prepare import sources, usage
 from wearcap.prepare import read_splits
 
@@ -20,7 +20,9 @@ def test_the_page_tells_what_a_source_needs(source):
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert len(cells) == 6, f"no complete row for {source} in data_prep/README.md"
     assert all(cells)
-    assert f"`wearcap prepare {source} " in cells[4]
+    command = cells[4].split("`")[1].split()
+    assert command[:3] == ["wearcap", "prepare", source]
+    compose("prepare", [f"prepare={source}", *command[3:]])
     config = sources()[source].read_text(encoding="utf-8")
     if "rework:" not in config:  # these keep the splits of the data set that they change
         listed = re.search(r"^splits: (\S+)", config, re.MULTILINE)

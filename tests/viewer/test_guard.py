@@ -82,7 +82,7 @@ def a_film_to_annotate(folder: Path, film: bytes) -> AnnotationServer:
     """An annotator whose recording has a video of these bytes."""
     server, file = an_annotator(folder), folder / "film.mp4"
     file.write_bytes(film)
-    desk = server._server.desk
+    desk = server.desk
     take = replace(desk.take(0), video=Video(file, np.zeros((2, 2))))
     desk.take = lambda _: take  # pyright: ignore[reportAttributeAccessIssue]
     return server

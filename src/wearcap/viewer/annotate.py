@@ -65,6 +65,45 @@ class Take:
     notice: str = ""
     """Notice for the annotator, such as a missing video."""
 
+    @classmethod
+    def of(cls, recording: Recording, folder: Path, motion: Motion | None = None, video: Video | None = None) -> "Take":
+        """Data of a recording with its true motion, else the suit's, and its camera's video; `motion` and `video` replace these.
+
+        `folder` is the data set's. Raises WearcapError without a motion, or for a body without hands.
+        """
+        shown = motion or recording.motion or recording.suit
+        if shown is None:
+            raise WearcapError(
+                f"recording {recording.name!r} has no motion",
+                expected="one to look at",
+                fix="Give a captured one with --motion.",
+            )
+        clock = LabelClock.of(recording.name, shown.timestamps)
+        names, points, bones = _drawn(shown)
+        notice = ""
+        if video is None and recording.camera is not None and recording.camera.video:
+            path = folder / recording.camera.video
+            if path.is_file():
+                stamps = recording.camera.timestamps.numpy()
+                video = Video(path, np.stack([stamps, np.arange(len(stamps)) / video_info(path).fps], 1))
+            else:
+                notice = f"The video {path} is not there: give it with --video."
+        return cls(
+            clock,
+            shown.timestamps.numpy(),
+            points,
+            _floor(recording, shown, points),
+            names,
+            bones,
+            tuple(  # the palm, else the wrist
+                names.index(f"{hand}_palm") if f"{hand}_palm" in names else shown.skeleton.index(f"{hand}_wrist")
+                for hand in HANDS
+            ),
+            _objects(recording, folder),
+            video,
+            notice,
+        )
+
     def header(self) -> dict:
         """All data except the numbers per frame, for JSON."""
         clock = self.clock
@@ -85,45 +124,6 @@ class Take:
         """Little-endian bytes of all frames: float64 timestamps, then float32 floor heights, then float32 points."""
         parts = ((self.timestamps, "<f8"), (self.floor_z, "<f4"), (self.points_world, "<f4"))
         return b"".join(np.ascontiguousarray(array, dtype).tobytes() for array, dtype in parts)
-
-
-def take_of(recording: Recording, folder: Path, motion: Motion | None = None, video: Video | None = None) -> Take:
-    """Data of a recording with its true motion, else the suit's, and its camera's video; `motion` and `video` replace these.
-
-    `folder` is the data set's. Raises WearcapError without a motion, or for a body without hands.
-    """
-    shown = motion or recording.motion or recording.suit
-    if shown is None:
-        raise WearcapError(
-            f"recording {recording.name!r} has no motion",
-            expected="one to look at",
-            fix="Give a captured one with --motion.",
-        )
-    clock = LabelClock.of(recording.name, shown.timestamps)
-    names, points, bones = _drawn(shown)
-    notice = ""
-    if video is None and recording.camera is not None and recording.camera.video:
-        path = folder / recording.camera.video
-        if path.is_file():
-            stamps = recording.camera.timestamps.numpy()
-            video = Video(path, np.stack([stamps, np.arange(len(stamps)) / video_info(path).fps], 1))
-        else:
-            notice = f"The video {path} is not there: give it with --video."
-    return Take(
-        clock,
-        shown.timestamps.numpy(),
-        points,
-        _floor(recording, shown, points),
-        names,
-        bones,
-        tuple(  # the palm, else the wrist
-            names.index(f"{hand}_palm") if f"{hand}_palm" in names else shown.skeleton.index(f"{hand}_wrist")
-            for hand in HANDS
-        ),
-        _objects(recording, folder),
-        video,
-        notice,
-    )
 
 
 def _drawn(motion: Motion) -> tuple[tuple[str, ...], Float32[np.ndarray, "time point 3"], tuple]:
@@ -195,7 +195,7 @@ class Desk:
             recording = self.recording(index)
             shown = motion or recording.motion or recording.suit
             start = video_start_s if video_start_s is not None else float(shown.timestamps[0]) if shown else 0.0
-            return take_of(recording, folder, motion, Video.starting(video, start) if video else None)
+            return Take.of(recording, folder, motion, Video.starting(video, start) if video else None)
 
         self.recording = lru_cache(maxsize=2)(lambda index: load_recording(places[index]))
         self.take = lru_cache(maxsize=2)(open_take)

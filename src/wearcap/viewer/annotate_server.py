@@ -51,27 +51,33 @@ _PORTS_TRIED = 50
 _GONE = (ConnectionError, TimeoutError)
 
 
-class AnnotationServer:
+class AnnotationServer(ThreadingHTTPServer):
     """Serves a desk until stopped; `port` is the first free one from the requested one on."""
+
+    daemon_threads = True
+    request_queue_size = 128  # queued requests of a burst are served in turn, instead of being retried after a second
+    allow_reuse_address = os.name == "posix"
 
     def __init__(self, desk: Desk, port: int = 8090):
         """Raises WearcapError when no port is free."""
-        self.guard = Guard("127.0.0.1")
+        self.desk, self.guard, self.stopped = desk, Guard("127.0.0.1"), False
+        self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        self._idle: dict[socket.socket, None] = {}
+        self._idle_lock = threading.Lock()
         for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
             try:
-                self._server = _Server((self.guard.host, candidate), _Handler)
+                super().__init__((self.guard.host, candidate), _Handler)
                 break
             except OSError:
                 continue
         else:
             raise WearcapError(f"no free port from {port} on", fix="Give another one with --port.")
-        self._server.desk, self._server.guard = desk, self.guard
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread = threading.Thread(target=self.serve_forever, daemon=True)
         self._thread.start()
 
     @property
     def port(self) -> int:
-        return self._server.server_port
+        return self.server_port
 
     @property
     def url(self) -> str:
@@ -85,24 +91,9 @@ class AnnotationServer:
 
     def stop(self) -> None:
         """Stop serving, on open connections too."""
-        self._server.stopped = True
-        self._server.shutdown()
-        self._server.server_close()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    request_queue_size = 128  # queued requests of a burst are served in turn, instead of being retried after a second
-    allow_reuse_address = os.name == "posix"
-    desk: Desk
-    guard: Guard
-    stopped = False
-
-    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]):
-        super().__init__(address, handler)
-        self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
-        self._idle: dict[socket.socket, None] = {}
-        self._idle_lock = threading.Lock()
+        self.stopped = True
+        self.shutdown()
+        self.server_close()
 
     def process_request(self, request: Any, client_address) -> None:
         """Answer a connection in its own thread; if there are too many, close the one that has been idle longest."""
@@ -155,7 +146,7 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    server: _Server  # pyright: ignore[reportIncompatibleVariableOverride]
+    server: AnnotationServer  # pyright: ignore[reportIncompatibleVariableOverride]
     timeout = IDLE_S
 
     def log_message(self, format: str, *args) -> None:

@@ -43,10 +43,9 @@ class EditorView:
         rng = np.random.default_rng(0)
         count = min(len(scan.points), SHOWN_POINTS)
         self._thinned = np.sort(rng.choice(len(scan.points), count, replace=False))
-        self._colors = scan.colors
-        if self._colors is None:
-            low, high = np.quantile(scan.points[:: max(1, len(scan.points) // 10_000), 2], [0.02, 0.98])
-            self._colors = by_height(scan.points, low, high).astype(np.uint8)
+        low, high = np.quantile(scan.points[:: max(1, len(scan.points) // 10_000), 2], [0.02, 0.98])
+        plain = scan.colors is None
+        self._colors = by_height(scan.points, low, high).astype(np.uint8) if plain else scan.colors
         self.point_m = 1.9 * typical_spacing(scan.points[self._thinned])
         self._center = scan.points.mean(0, dtype=np.float64)
         self.visible = scan.points[:0]

@@ -91,7 +91,7 @@ class Timeline:
 
 
 @dataclass
-class Placed:
+class _Placed:
     """Layers of one motion, which are shown, hidden and shifted together."""
 
     body: BodyLayer
@@ -110,7 +110,7 @@ class Placed:
         items: Sequence[SceneObject],
         color: tuple[int, int, int],
         several: bool,
-    ) -> "Placed":
+    ) -> "_Placed":
         """A motion with its own moving objects; one of `several` is labelled, and its objects are tinted like its body."""
         body, points, objects = surface_or_sticks(motion.skeleton, recording.shape), None, None
         if motion.body_contact_prob is not None:
@@ -171,11 +171,11 @@ class Page(ServedPage):
         moving, tracks = [], [motion.object_motion or {} for motion in motions.values()]
         if environment is not None:
             moving = [item for item in environment.objects if any(_moves(of.get(item.name), item) for of in tracks)]
-        self.bodies: dict[str, Placed] = {}
+        self.bodies: dict[str, _Placed] = {}
         for name, motion in motions.items():
             number = len(self.bodies) - (TRUTH in self.bodies)
             color = TRUTH_COLOR if name == TRUTH else COLORS[number % len(COLORS)]
-            self.bodies[name] = Placed.of(self.server, name, motion, recording, moving, color, len(motions) > 1)
+            self.bodies[name] = _Placed.of(self.server, name, motion, recording, moving, color, len(motions) > 1)
         self.layers: list[Layer] = list(self.bodies.values())
         self.aside_m = spacing_m(list(motions.values()), moving) if len(motions) > 1 else 0.0
         if recording.head is not None and len(recording.head.timestamps):
