@@ -175,9 +175,8 @@ def simulated_hps_tasks(
     """`recordings[split]` sessions each; people and sites of the splits never meet, and a split's sites are few.
 
     Scenes go to `output`/scenes: points `spacing_m` apart (None: no scene at all), photo stations `photo_m` apart
-    (0: no photos). The first `video_s` (None: all) of each head camera are filmed at `video_fps`. Raises
-    WearcapError for an unknown split, distances that do not rise, or when a simulated person's name belongs to
-    another split's list.
+    (0: no photos). The first `video_s` (None: all) of each head camera are filmed at `video_fps`. Raises WearcapError
+    as `simulated_tasks` does, and for distances that do not rise.
     """
     distances = [0.0, *map(float, returns_m), float(end_m)]
     if any(b <= a for a, b in pairwise(distances)):
@@ -233,8 +232,7 @@ def simulated_interactions_tasks(
 ) -> list[Task]:
     """`recordings[split]` recordings of some minutes each; people and flats of the splits never meet.
 
-    Scenes go to `output`/scenes, with points `spacing_m` apart. Raises WearcapError for an unknown split, or when a
-    simulated person's name belongs to another split's list.
+    Scenes go to `output`/scenes, with points `spacing_m` apart. Raises WearcapError as `simulated_tasks` does.
     """
     if not spacing_m > 0:
         raise WearcapError(f"points {spacing_m} m apart", expected="a positive spacing")
@@ -248,8 +246,7 @@ def simulated_objects_tasks(
 ) -> list[Task]:
     """`recordings[split]` recordings of some minutes each; people and flats of the splits never meet.
 
-    Environments go to `output`/scenes. Raises WearcapError for an unknown split, or when a simulated person's name
-    belongs to another split's list.
+    Environments go to `output`/scenes. Raises WearcapError as `simulated_tasks` does.
     """
     config = ObjectConfig(fps=float(fps), minutes=float(minutes))
     make = partial(_in_flat, simulate_objects, config, None, source_files())
