@@ -44,8 +44,8 @@ class EditorView:
         count = min(len(scan.points), SHOWN_POINTS)
         self._thinned = np.sort(rng.choice(len(scan.points), count, replace=False))
         low, high = np.quantile(scan.points[:: max(1, len(scan.points) // 10_000), 2], [0.02, 0.98])
-        plain = scan.colors is None
-        self._colors = by_height(scan.points, low, high).astype(np.uint8) if plain else scan.colors
+        colors = scan.colors
+        self._colors = by_height(scan.points, low, high).astype(np.uint8) if colors is None else colors
         self.point_m = 1.9 * typical_spacing(scan.points[self._thinned])
         self._center = scan.points.mean(0, dtype=np.float64)
         self.visible = scan.points[:0]
