@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from wearcap import files
+from wearcap import files, locks
 from wearcap.errors import WearcapError
-from wearcap.files import LOCK, atomic_path, folder_lock, remove_leftovers, write_text
+from wearcap.files import atomic_path, remove_leftovers, write_text
+from wearcap.locks import LOCK, folder_lock
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and file locks as of POSIX")
 
@@ -30,7 +31,7 @@ with atomic_path(sys.argv[1]) as temporary:
 """
 HOLDER = """
 import sys, time
-from wearcap.files import folder_lock
+from wearcap.locks import folder_lock
 with folder_lock(sys.argv[1], "prepare"):
     print("ready", flush=True)
     time.sleep(60)
@@ -133,7 +134,7 @@ def test_a_folder_is_looked_through_once_in_a_process(tmp_path, monkeypatch):
 
 
 def test_a_folder_has_one_writer_and_any_number_of_readers(tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "LOCK_PATIENCE_S", 0.1)
+    monkeypatch.setattr(locks, "LOCK_PATIENCE_S", 0.1)
     write_text(tmp_path / "manifest.json", "{}")
     with running(HOLDER, tmp_path) as holder:
         said = rf"another run writes here \(process {holder.pid} on .+, prepare, since \d{{4}}-.+\).+kill {holder.pid}"

@@ -4,11 +4,8 @@ import errno
 import hashlib
 import json
 import os
-import platform
 import re
-import time
 import uuid
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -20,18 +17,10 @@ from wearcap.errors import WearcapError
 try:
     import fcntl
 except ModuleNotFoundError:  # Windows
-    import msvcrt
-
     fcntl = None
 
 MAX_JSON_DEPTH = 64
 """Deepest nesting of JSON that is read; what wearcap writes stays below 16."""
-
-LOCK = ".wearcap.lock"
-"""Lock file in a folder that one process writes into; it names that process."""
-
-LOCK_PATIENCE_S, ORPHANS_PATIENCE_S = 2.0, 20.0
-"""Time (s) to wait for a lock that is taken, and for one that only workers of an ended process still hold."""
 
 _TEMPORARY = re.compile(r"\..+\.tmp-[0-9a-f]{8}(\.[^.]+)?")
 _OF_WRITES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
@@ -49,13 +38,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.tmp-{uuid.uuid4().hex[:8]}{path.suffix}")
     claim = None
     try:
-        with _explaining(path):
+        with explaining_writes(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             _remove_leftovers_once(str(path.parent.absolute()))
             claim = _claim(temporary)
-        with _explaining(path, only_about=(temporary, path, path.parent)):
+        with explaining_writes(path, only_about=(temporary, path, path.parent)):
             yield temporary
-        with _explaining(path):
+        with explaining_writes(path):
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
             os.replace(temporary, path)
@@ -68,7 +57,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _explaining(path: Path, only_about: tuple[Path, ...] | None = None) -> Iterator[None]:
+def explaining_writes(path: Path, only_about: tuple[Path, ...] | None = None) -> Iterator[None]:
     """Turn an OSError into a WearcapError with the reason why `path` cannot be written.
 
     With `only_about`, only errors that name one of those paths, or that name none and can only come from a write.
@@ -77,17 +66,15 @@ def _explaining(path: Path, only_about: tuple[Path, ...] | None = None) -> Itera
         yield
     except OSError as error:
         named = isinstance(error.filename, str | os.PathLike) and Path(error.filename) in (only_about or ())
-        if only_about is None or named or (error.filename is None and error.errno in _OF_WRITES):
-            raise _explained(error, path) from error
-        raise
-
-
-def _explained(error: OSError, path: Path) -> WearcapError:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return WearcapError("the disk is full", where=path, fix="Free some space and run again.")
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return WearcapError("no permission to write here", where=path, fix="Choose another output folder.")
-    return WearcapError(f"cannot be written ({error.strerror or error})", where=path)
+        if not (only_about is None or named or (error.filename is None and error.errno in _OF_WRITES)):
+            raise
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            what, fix = "the disk is full", "Free some space and run again."
+        elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+            what, fix = "no permission to write here", "Choose another output folder."
+        else:
+            what, fix = f"cannot be written ({error.strerror or error})", ""
+        raise WearcapError(what, where=path, fix=fix) from error
 
 
 def _sync_folder(folder: Path) -> None:
@@ -153,152 +140,6 @@ def _remove_unless_locked(path: Path) -> None:
             path.unlink()
         finally:
             os.close(descriptor)
-
-
-@contextmanager
-def folder_lock(folder: str | Path, purpose: str) -> Iterator[int | None]:
-    """Lock a folder for one writer; readers are not affected. The lock ends with its process, however that one dies.
-
-    Yields the lock's descriptor: workers that inherit it (`wearcap.workers`) hold the lock until they end, too, so that
-    none writes after another run has taken the folder. Forked children do not hold it. If the file system has no locks,
-    it warns and yields None. Raises WearcapError that names the holder when another process has the folder,
-    and when the folder cannot be written.
-    """
-    path = Path(folder) / LOCK
-    with _explaining(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = _wait_for_lock(path)
-    if descriptor is None:
-        yield None
-        return
-    _HELD.add(descriptor)
-    try:
-        holder = {
-            "pid": os.getpid(),
-            "host": platform.node(),
-            "purpose": purpose,
-            "since": time.strftime("%Y-%m-%d %H:%M:%S"),
-        }
-        with _explaining(path.parent):
-            path.write_text(json.dumps(holder), encoding="utf-8")
-        yield descriptor
-    finally:
-        if descriptor in _HELD:  # a forked child does not hold it
-            _HELD.remove(descriptor)
-            _unlock(path, descriptor)
-
-
-_HELD: set[int] = set()
-"""Descriptors of the locks that this process has taken."""
-
-
-def _let_go_after_fork() -> None:
-    while _HELD:
-        os.close(_HELD.pop())  # the parent's own descriptor keeps the lock
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_let_go_after_fork)
-
-
-def _wait_for_lock(path: Path) -> int | None:
-    """Open and lock a file; None where files cannot be locked. Raises WearcapError when it stays locked by another."""
-    start = time.monotonic()
-    while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            _lock(descriptor)
-            if os.path.samestat(os.fstat(descriptor), path.stat()):
-                return descriptor
-        except (BlockingIOError, FileNotFoundError):  # locked, or removed by its holder, which has just ended
-            pass
-        except OSError as error:
-            os.close(descriptor)
-            path.unlink(missing_ok=True)
-            warnings.warn(
-                f"{path.parent}: this file system has no locks ({error.strerror}). "
-                "Let no other run write into this folder meanwhile.",
-                stacklevel=4,
-            )
-            return None
-        os.close(descriptor)
-        holder = _holder(path)
-        if time.monotonic() - start > (ORPHANS_PATIENCE_S if _has_ended(holder) else LOCK_PATIENCE_S):
-            raise _held_by(holder, path.parent)
-        time.sleep(0.05)
-
-
-def _lock(descriptor: int) -> None:
-    """Lock a file for this process. Raises BlockingIOError when another has it."""
-    if fcntl is not None:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    else:
-        try:
-            _lock_on_windows(descriptor, msvcrt.LK_NBLCK)
-        except PermissionError as error:
-            raise BlockingIOError(*error.args) from error
-
-
-def _unlock(path: Path, descriptor: int) -> None:
-    """Remove a lock's file, if it is still the one in the folder, and release the lock for all processes that share it."""
-    with suppress(OSError):
-        if fcntl is not None and os.path.samestat(os.fstat(descriptor), path.stat()):
-            path.unlink()
-    with suppress(OSError):
-        if fcntl is not None:
-            fcntl.flock(descriptor, fcntl.LOCK_UN)
-        else:
-            _lock_on_windows(descriptor, msvcrt.LK_UNLCK)
-    os.close(descriptor)
-    with suppress(OSError):
-        if fcntl is None:
-            path.unlink()  # Windows removes no open file
-
-
-def _lock_on_windows(descriptor: int, mode: int) -> None:
-    os.lseek(descriptor, 1 << 20, os.SEEK_SET)  # a byte beyond the text, which others must be able to read
-    msvcrt.locking(descriptor, mode, 1)
-
-
-def _holder(path: Path) -> dict[str, Any]:
-    """Content of a lock's file about its holder; empty while it is being written."""
-    try:
-        holder = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return holder if isinstance(holder, dict) and isinstance(holder.get("pid"), int) else {}
-
-
-def _has_ended(holder: dict[str, Any]) -> bool:
-    """Whether the process that took a lock has certainly ended, while its workers still hold the lock."""
-    if os.name != "posix" or holder.get("host") != platform.node() or holder["pid"] <= 0:
-        return False
-    try:
-        os.kill(holder["pid"], 0)
-    except (ProcessLookupError, OverflowError):
-        return True
-    except PermissionError:
-        return False
-    return False
-
-
-def _held_by(holder: dict[str, Any], folder: Path) -> WearcapError:
-    pid, host = holder.get("pid", "unknown"), holder.get("host", "unknown")
-    who = f"process {pid} on {host}, {holder.get('purpose', 'unknown')}, since {holder.get('since', 'unknown')}"
-    if _has_ended(holder):
-        return WearcapError(
-            f"workers of a run that has ended still write here ({who})",
-            where=folder,
-            expected="one run at a time in a folder",
-            fix="Run again when they have ended, or end them.",
-        )
-    end = f"end it (kill {pid})" if host == platform.node() else f"end it on {host}"
-    return WearcapError(
-        f"another run writes here ({who})",
-        where=folder,
-        expected="one run at a time in a folder",
-        fix=f"Wait until it has ended, {end}, or choose another folder.",
-    )
 
 
 def write_text(path: str | Path, text: str) -> None:

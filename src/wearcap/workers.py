@@ -38,7 +38,7 @@ def _inherited(shared: Any) -> Inherited:
 def bound_to_this_process(lock: int | None) -> dict[str, Any]:
     """Values of loky's `initializer` and `initargs` for workers that end with this process.
 
-    Until they end, they hold `lock` (`wearcap.files.folder_lock`). The pool must be shut down before the thread
+    Until they end, they hold `lock` (`wearcap.locks.folder_lock`). The pool must be shut down before the thread
     that uses it ends: Linux ends a worker with the thread that started it.
     """
     return {"initializer": end_with_parent, "initargs": (os.getpid(), Inherited(lock))}

@@ -16,9 +16,10 @@ import prepare_tasks
 import pytest
 from prepare_tasks import tasks
 
-from wearcap import files
+from wearcap import locks
 from wearcap.errors import WearcapError
-from wearcap.files import LOCK, sha256_of, write_text
+from wearcap.files import sha256_of, write_text
+from wearcap.locks import LOCK
 from wearcap.prepare import engine, prepare
 from wearcap.recording import RecordingStore
 
@@ -28,7 +29,7 @@ linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="/proc t
 UNBOUND_WORKER = """
 import sys, time
 from joblib.externals.loky import get_reusable_executor
-from wearcap.files import folder_lock
+from wearcap.locks import folder_lock
 from wearcap.workers import Inherited
 
 def nothing(lock):
@@ -162,7 +163,7 @@ def test_an_interrupted_run_ends_its_workers_before_it_gives_the_folder_up(tmp_p
 
     @contextmanager
     def noted(*arguments):
-        with files.folder_lock(*arguments) as lock:
+        with locks.folder_lock(*arguments) as lock:
             try:
                 yield lock
             finally:
@@ -187,7 +188,7 @@ def test_nothing_to_do_starts_no_workers(tmp_path, monkeypatch):
 
 @posix
 def test_a_second_run_into_the_folder_is_refused_and_harms_nothing(alone, tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "LOCK_PATIENCE_S", 0.1)
+    monkeypatch.setattr(locks, "LOCK_PATIENCE_S", 0.1)
     with preparing(tmp_path, 12, 0.2, 1) as (process, _):
         with pytest.raises(WearcapError, match=rf"another run writes here \(process {process.pid} on "):
             prepare(tasks(12), tmp_path, jobs=1, progress=False)
@@ -198,7 +199,7 @@ def test_a_second_run_into_the_folder_is_refused_and_harms_nothing(alone, tmp_pa
 
 @posix
 def test_a_folder_in_which_orphans_write_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "ORPHANS_PATIENCE_S", 0.1)
+    monkeypatch.setattr(locks, "ORPHANS_PATIENCE_S", 0.1)
     process = subprocess.Popen([sys.executable, "-c", UNBOUND_WORKER, tmp_path], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     with process.stdout:
@@ -210,7 +211,7 @@ def test_a_folder_in_which_orphans_write_is_refused(tmp_path, monkeypatch):
             prepare(tasks(1), tmp_path, jobs=1, progress=False)
     finally:
         os.kill(orphan, signal.SIGKILL)
-    monkeypatch.setattr(files, "ORPHANS_PATIENCE_S", 20.0)
+    monkeypatch.setattr(locks, "ORPHANS_PATIENCE_S", 20.0)
     prepare(tasks(1), tmp_path, jobs=1, progress=False)
     assert LOCK not in digests(tmp_path)
 

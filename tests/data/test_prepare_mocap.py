@@ -15,10 +15,8 @@ from wearcap.geometry import rotation
 from wearcap.io.datasets.amass import write_amass
 from wearcap.io.formats.text import read_bytes
 from wearcap.prepare import check_recording, read_splits
-from wearcap.prepare.amass import amass_tasks
-from wearcap.prepare.clean import CleaningLimits, without_glitches
-from wearcap.prepare.cmu import BvhSettings, Trial, cmu_tasks
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
+from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, mocap_recording, without_glitches
+from wearcap.prepare.mocap_sources import BvhSettings, amass_tasks, cmu_recording, cmu_tasks
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled
 
@@ -332,11 +330,10 @@ def test_xz_and_plain_give_the_same_recording(real_data, tmp_path):
     folder = real_data / "cmu_mocap/trials/035"
     plain = tmp_path / "35_20.amc"
     plain.write_bytes(read_bytes(folder / "35_20.amc.xz"))
-    make = [
-        Trial(path, folder / "35.asf", ABOUT, 120, BvhSettings(0.01, "y", "z"), SETTINGS)
+    first, second = (
+        cmu_recording(path, folder / "35.asf", ABOUT, 120, BvhSettings(0.01, "y", "z"), SETTINGS).motion
         for path in (folder / "35_20.amc.xz", plain)
-    ]
-    first, second = (trial().motion for trial in make)
+    )
     assert first is not None
     assert second is not None
     assert torch.equal(first.R_parent_joint, second.R_parent_joint)

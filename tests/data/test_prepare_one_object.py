@@ -14,8 +14,7 @@ from wearcap.geometry import rotation
 from wearcap.io.datasets.omomo import read_omomo
 from wearcap.io.formats.environment import read_environment
 from wearcap.prepare import check_recording, read_splits
-from wearcap.prepare.omomo import check_rate
-from wearcap.prepare.one_object import ground_rotation
+from wearcap.prepare.one_object import check_rate, ground_rotation
 from wearcap.recording.store import RecordingStore
 
 

@@ -9,7 +9,7 @@ from wearcap.cli.conf import compose, splits_dir
 from wearcap.errors import WearcapError
 from wearcap.io.formats.photos import read_photos
 from wearcap.prepare.engine import prepare
-from wearcap.prepare.simulated_hps import simulated_hps_tasks
+from wearcap.prepare.simulated import simulated_hps_tasks
 from wearcap.prepare.splits import read_splits
 from wearcap.recording.store import RecordingStore
 

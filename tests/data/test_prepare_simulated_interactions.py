@@ -8,7 +8,7 @@ from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.ply import read_ply
 from wearcap.prepare.engine import prepare
-from wearcap.prepare.simulated_interactions import simulated_interactions_tasks
+from wearcap.prepare.simulated import simulated_interactions_tasks
 from wearcap.prepare.splits import read_splits
 from wearcap.recording.store import RecordingStore
 

@@ -7,7 +7,7 @@ import pytest
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import read_environment
 from wearcap.prepare.engine import prepare
-from wearcap.prepare.simulated_objects import simulated_objects_tasks
+from wearcap.prepare.simulated import simulated_objects_tasks
 from wearcap.prepare.splits import read_splits
 from wearcap.recording.store import RecordingStore
 

@@ -13,8 +13,8 @@ from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.hcontact import activity_of, hcontact_names, location_of, read_hcontact, read_hcontact_split
 from wearcap.io.formats.smpl_json import read_smpl_json
-from wearcap.prepare.hcontact import hcontact_tasks
 from wearcap.prepare.splits import read_splits
+from wearcap.prepare.worn import hcontact_tasks
 from wearcap.recording.store import RecordingStore
 
 DOOR, SOFA = "SUB5_TUB_2OG_door.00", "SUB9_TUB_2OG_sofamove.00"

@@ -10,7 +10,7 @@ import torch
 from boxes import box_mesh
 from wearcap.cli.main import run_verb
 from wearcap.doctor import Finding, examine
-from wearcap.doctor.environment import check_environment
+from wearcap.doctor.places import check_environment
 from wearcap.io.formats.environment import write_environment
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject

@@ -12,7 +12,7 @@ from small_scene import LEVEL, inverted, room_cloud, write_room
 
 from walking_person import sound_recording
 from wearcap.doctor import Finding, examine
-from wearcap.doctor.localized import check_contact_prob
+from wearcap.doctor.body import check_contact_prob
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.formats.photos import write_photos

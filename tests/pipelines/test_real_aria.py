@@ -28,8 +28,7 @@ from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.tracking.anchor import anchor
-from wearcap.viewer.head_path import draw_head_path
-from wearcap.viewer.picture import contact_sheet
+from wearcap.viewer.picture import contact_sheet, draw_head_path
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ import pytest
 import captured_motion as captured
 from wearcap.geometry.triangle_distance import TriangleIndex
 from wearcap.io.formats.asf_amc import read_amc, read_asf
-from wearcap.prepare.clean import CleaningLimits
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
+from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, mocap_recording
 from wearcap.simulation.people.body_space import LIMBS, BodySpace, limb_ends
 from wearcap.simulation.places.outline import points_in_convex
 from wearcap.simulation.places.supports import PELVIS_OVER_SEAT_M, find_sits, find_treads

@@ -66,7 +66,7 @@ def write_flat(root: Path) -> Path:
 
 @contextmanager
 def served(dataset: Path, output: Path, where: str = "", **options) -> Iterator[AnnotationServer]:
-    server = AnnotationServer(Desk.of(dataset / where, output, **options), port=18300)
+    server = AnnotationServer(Desk(dataset / where, output, **options), port=18300)
     try:
         yield server
     finally:

@@ -19,10 +19,9 @@ from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.viewer.annotate import take_of
+from wearcap.viewer.annotate import Take
 from wearcap.viewer.annotate_server import AnnotationServer, byte_range
-from wearcap.viewer.annotation_file import AnnotationFile, Conflict
-from wearcap.viewer.annotation_start import starting_labels
+from wearcap.viewer.annotation_file import AnnotationFile, Conflict, starting_labels
 from wearcap_testing import recording_of, swaying_motion
 
 
@@ -206,7 +205,7 @@ def test_recordings_that_cannot_be_annotated(dataset, tmp_path):
     still = Motion(TIMES[:2], worm, torch.eye(3).expand(2, 2, 3, 3), torch.zeros(2, 3))
     for recording, message in ((Recording("bare"), "no motion"), (Recording("worm", motion=still), "left_wrist")):
         with pytest.raises(WearcapError, match=message):
-            take_of(recording, tmp_path)
+            Take.of(recording, tmp_path)
     for arguments, message in (
         ([str(dataset), "--video", str(dataset / "r0.mp4")], "several recordings"),
         ([str(dataset / "r9")], "r9"),
@@ -217,9 +216,9 @@ def test_recordings_that_cannot_be_annotated(dataset, tmp_path):
         with pytest.raises(WearcapError, match=message):
             annotate([*arguments, "--no-browser", "--output", str(tmp_path)])
     r0 = RecordingStore.open(dataset).load("r0")
-    assert "r0.mp4 is not there" in take_of(r0, tmp_path).notice
+    assert "r0.mp4 is not there" in Take.of(r0, tmp_path).notice
     suit = Recording("suit", suit=swaying_motion(30, skeleton=xsens23()))
-    assert take_of(suit, tmp_path).clock.frames == 30
+    assert Take.of(suit, tmp_path).clock.frames == 30
 
 
 def test_objects_of_the_environment_can_be_named(tmp_path):
@@ -228,4 +227,4 @@ def test_objects_of_the_environment_can_be_named(tmp_path):
     write_environment(Environment((door,)), tmp_path / "environment.json")
     recording = replace(recording_of(swaying_motion(30), "r"), environment="environment.json")
     seen = replace(recording, interactions=held([0.1], [0.2], [[True, False]], "sofa"))
-    assert take_of(seen, tmp_path).objects == {"door_1": "hinged", "sofa": "sliding"}
+    assert Take.of(seen, tmp_path).objects == {"door_1": "hinged", "sofa": "sliding"}

@@ -21,11 +21,19 @@ from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.interactions import Interactions
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.viewer.body_points import BALL_M, BRIGHT, DIM, lit_color, lit_points
-from wearcap.viewer.objects import TOUCH_M, poses_at, true_body_contact, with_objects
-from wearcap.viewer.page import Page
+from wearcap.viewer.objects import (
+    BALL_M,
+    BRIGHT,
+    DIM,
+    TOUCH_M,
+    lit_color,
+    lit_points,
+    poses_at,
+    true_body_contact,
+    with_objects,
+)
+from wearcap.viewer.page import FLESH_M, Page, spacing_m
 from wearcap.viewer.page_layers import stick_body
-from wearcap.viewer.page_motions import FLESH_M, spacing_m
 from wearcap.viewer.picture import actors, contact_sheet
 from wearcap_testing import swaying_motion
 

@@ -75,14 +75,14 @@ def an_editor(folder: Path) -> ObjectEditor:
 def an_annotator(folder: Path) -> AnnotationServer:
     store = RecordingStore(folder / "flat")
     store.add(recording_of(swaying_motion(600, 0, 60.0), "r0"), split="test", config_hash="x")
-    return AnnotationServer(Desk.of(folder / "flat", folder), port=18740)
+    return AnnotationServer(Desk(folder / "flat", folder), port=18740)
 
 
 def a_film_to_annotate(folder: Path, film: bytes) -> AnnotationServer:
     """An annotator whose recording has a video of these bytes."""
     server, file = an_annotator(folder), folder / "film.mp4"
     file.write_bytes(film)
-    desk = server._server.desk
+    desk = server.desk
     take = replace(desk.take(0), video=Video(file, np.zeros((2, 2))))
     desk.take = lambda _: take  # pyright: ignore[reportAttributeAccessIssue]
     return server
@@ -253,7 +253,7 @@ def test_another_sites_websocket_presses_no_button_of_the_scene_editor(tmp_path)
     try:
         page.editing.select_box(Box((1.0, 1.0, 0.3), (0.6, 0.6, 0.6)))
         page.cut()
-        page._refresh()
+        page.refresh()
         page.save()
         file, delete = tmp_path / FILE_NAME, page.objects.delete._impl.uuid
         before = file.read_bytes()
@@ -423,7 +423,9 @@ def test_too_many_connections_at_work_are_told_so(tmp_path, monkeypatch):
     monkeypatch.setattr(annotate_server, "MAX_CONNECTIONS", 2)
     page = an_annotator(tmp_path)
     going, done = threading.Barrier(3), threading.Event()
-    monkeypatch.setattr(annotate_server._Handler, "_listing", lambda self: (going.wait(20), done.wait(20), [])[2])
+    monkeypatch.setattr(
+        annotate_server._Handler, "_get", lambda self, path: (going.wait(20), done.wait(20), self._send_json([]))
+    )
     target = f"/recordings?token={page.guard.token}"
     threads = [threading.Thread(target=status, args=(page, target)) for _ in range(2)]
     try:

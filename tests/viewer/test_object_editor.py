@@ -22,7 +22,8 @@ from wearcap.scene.scan import Scan
 from wearcap.scene.selection import Box
 from wearcap.viewer.object_editor import ObjectEditor
 from wearcap.viewer.object_editor_panels import HINTS, TOOLS
-from wearcap.viewer.object_editor_view import by_height, typical_spacing
+from wearcap.viewer.object_editor_view import typical_spacing
+from wearcap.viewer.page_layers import by_height
 from wearcap_browser import CONTROL, Chromium, chromium
 
 DOOR = Box((DOOR_X, DOOR_Y, 1.03), (0.94, 0.1, 2.0))
@@ -44,7 +45,7 @@ def cut_door(page: ObjectEditor) -> None:
     page.editing.select_box(DOOR)
     page.select.name.value = "door_1"
     page.cut()
-    page._refresh()
+    page.refresh()
 
 
 def ray(aim, eye=(2.0, 1.5, 6.0)) -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +95,7 @@ def test_tools_do_what_they_say(page):
     page.select.name.value = "sofa_1"
     page.select.category.value = "sofa"
     page.cut()
-    page._refresh()
+    page.refresh()
     assert page.current == "sofa_1"
     page.clicked(*ray((DOOR_X, DOOR_Y - 0.02, 1.6), eye=(1.4, 0.5, 1.8)))
     assert page.current == "door_1"
@@ -135,7 +136,7 @@ def test_trying_moves_the_object_within_its_limits_and_not_in_the_file(page):
     page.use("try")
     assert page.view.try_handle.visible
     page.view.try_handle.position = np.array([2.0, 2.0, 0.0])
-    page._try_dragged()
+    page.try_pose()
     assert node.position[0] == pytest.approx(2.0)
     page.use("look")
     np.testing.assert_allclose(node.position, item.t_world_object.numpy(), atol=1e-6)
@@ -146,27 +147,27 @@ def test_trying_moves_the_object_within_its_limits_and_not_in_the_file(page):
 def test_slides_limits_and_undo(page):
     cut_door(page)
     page.editing.set_kind("door_1", "axis")
-    page._refresh()
+    page.refresh()
     page.objects.direction.value = 90
-    page._turn_axis()
+    page.turn_axis()
     assert page._item().freedom.axis == pytest.approx((0.0, 1.0, 0.0))
     page.objects.greatest_m.value = 0.75
-    page._set_limits()
+    page.set_limits()
     assert page._item().freedom.limits == (0.0, 0.75)
     page._place_freedom(np.array([DOOR_X - 2.0, DOOR_Y, 0.0]), level=True)
     assert page._item().freedom.axis == pytest.approx((-1.0, 0.0, 0.0), abs=0.02)
     page.objects.name.value = "hatch"
     page.rename()
-    page._refresh()
+    page.refresh()
     assert page.objects.current == "hatch"
     page.delete()
-    page._refresh()
+    page.refresh()
     assert page.current is None
     assert not page.objects.delete.visible
     page.undo()
     page.undo()
     page.undo()
-    page._refresh()
+    page.refresh()
     assert page._item().freedom.axis == pytest.approx((0.0, 1.0, 0.0))
     page.view.show_freedom(page._item(), handled=True)
 
@@ -192,7 +193,7 @@ def test_an_environment_of_another_scene_is_refused(page, scan):
 
 
 def test_a_scan_without_colour_is_coloured_by_height(scan):
-    colors = by_height(scan.points)
+    colors = by_height(scan.points, 0.0, 2.4).astype(np.uint8)
     low, high = colors[scan.points[:, 2] < 0.02].mean(0), colors[scan.points[:, 2] > 2.0].mean(0)
     assert low[2] > low[0]
     assert high[0] > high[2]

@@ -14,10 +14,8 @@ from wearcap.geometry import rotation
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import ContactTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.locate import dataset_folder
-from wearcap.viewer.page import Page
+from wearcap.viewer.page import CAPTURE_COLOR, Page, Timeline
 from wearcap.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
-from wearcap.viewer.page_motions import CAPTURE_COLOR
-from wearcap.viewer.page_timeline import Timeline
 from wearcap_browser import chromium
 
 

@@ -12,9 +12,7 @@ from wearcap.cli import render as render_verb
 from wearcap.errors import WearcapError
 from wearcap.recording import Motion, PointCloud, Recording
 from wearcap.recording.timing import at_times
-from wearcap.viewer.head_path import draw_head_path
-from wearcap.viewer.picture import SKY, contact_sheet, save_png, shared_frames
-from wearcap.viewer.video import write_video
+from wearcap.viewer.picture import SKY, contact_sheet, draw_head_path, save_png, shared_frames, write_video
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 SKY_8BIT = np.round(255 * np.array(SKY))

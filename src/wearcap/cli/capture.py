@@ -26,8 +26,7 @@ from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput, StageOptions, System
 from wearcap.scene.environment import Environment
 from wearcap.viewer.objects import with_objects
-from wearcap.viewer.picture import contact_sheet, save_png
-from wearcap.viewer.video import write_video
+from wearcap.viewer.picture import contact_sheet, save_png, write_video
 
 HELP = "turn a recording into motion: wearcap capture recording=DATASET/NAME, checkpoint=… or pipeline=hps"
 

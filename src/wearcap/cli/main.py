@@ -83,6 +83,14 @@ def explain(error: WearcapError | OSError) -> str:
     return f"{where}{error.strerror or error}."
 
 
+def port_number(text: str) -> int:
+    """Type of a page's `--port` argument. Raises WearcapError for a number that is no port."""
+    number = int(text)
+    if not 0 < number < 65536:
+        raise WearcapError(f"port {number}", expected="1 to 65535")
+    return number
+
+
 def _lift_limit(arguments: list[str]) -> list[str]:
     """Apply `--max-file-gib` as the limit of file sizes, for worker processes too; returns the other arguments."""
     option = "--max-file-gib"

@@ -25,19 +25,17 @@ def run(config: DictConfig) -> Report:
                 fix="Leave output=… out, or copy the data set first.",
             )
         report = instantiate(config.rework, _convert_="all")
-        _show_report(report, RecordingStore.open(config.output))
-        return report
-    listed = splits_dir() / config.splits
-    splits = read_splits(listed if listed.is_file() else Path(config.splits))
-    tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits)
-    report = prepare(
-        tasks,
-        config.output,
-        jobs=config.jobs,
-        backend=config.backend,
-        scheduler=config.scheduler,
-        overwrite=config.overwrite,
-    )
+    else:
+        listed = splits_dir() / config.splits
+        splits = read_splits(listed if listed.is_file() else Path(config.splits))
+        report = prepare(
+            instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits),
+            config.output,
+            jobs=config.jobs,
+            backend=config.backend,
+            scheduler=config.scheduler,
+            overwrite=config.overwrite,
+        )
     _show_report(report, RecordingStore.open(config.output))
     return report
 
@@ -73,21 +71,22 @@ def usage() -> str:
             if line.startswith("# ") and not line.startswith("# @")
         )
         lines.append(f"  {name:10} {about}")
-    return "\n".join([*lines, "", (conf_dir() / "prepare.yaml").read_text(encoding="utf-8").split("\n\n")[1]])
+    return "\n".join([*lines, "", _shared_settings()])
 
 
 def main(arguments: list[str]) -> None:
     """Exits with 1 when a recording could not be made."""
     source = next((argument for argument in arguments if "=" not in argument and argument[0] != "-"), None)
+    help_wanted = bool({"--help", "-h"} & set(arguments))
     if source is None:
         print(usage())
-        if not {"--help", "-h"} & set(arguments):
+        if not help_wanted:
             raise WearcapError("no source given", expected=f"one of {', '.join(sources())}")
     elif source not in sources():
         raise WearcapError(f"no source {source!r}", fix=nearest(source, sources()))
-    elif {"--help", "-h"} & set(arguments):
+    elif help_wanted:
         print(sources()[source].read_text(encoding="utf-8"))
-        print((conf_dir() / "prepare.yaml").read_text(encoding="utf-8").split("\n\n")[1])
+        print(_shared_settings())
     else:
         overrides = [f"prepare={source}", *(argument for argument in arguments if argument != source)]
         with explained("prepare", overrides):
@@ -96,3 +95,8 @@ def main(arguments: list[str]) -> None:
             report = run(config)
         if report.failed:
             sys.exit(1)
+
+
+def _shared_settings() -> str:
+    """Settings of every source, as the config has them."""
+    return (conf_dir() / "prepare.yaml").read_text(encoding="utf-8").split("\n\n")[1]

@@ -12,10 +12,8 @@ from wearcap.errors import WearcapError
 from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.recording.motion import Motion
 from wearcap.runtime.system import CaptureInput
-from wearcap.viewer.head_path import draw_head_path
 from wearcap.viewer.objects import with_objects
-from wearcap.viewer.picture import contact_sheet, save_png, shared_frames
-from wearcap.viewer.video import write_video
+from wearcap.viewer.picture import contact_sheet, draw_head_path, save_png, shared_frames, write_video
 
 HELP = "pictures without a screen: wearcap render DATASET/NAME --out sheet.png|motion.mp4"
 

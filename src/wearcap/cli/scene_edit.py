@@ -1,9 +1,9 @@
 """`wearcap scene edit`: the page on which objects are cut out of a scan and their degrees of freedom are set."""
 
 import argparse
-import logging
 from pathlib import Path
 
+from wearcap.cli.main import port_number
 from wearcap.errors import WearcapError
 
 
@@ -18,11 +18,11 @@ def main(arguments: list[str]) -> None:
         "--environment", help="the file to make or to go on with (default: environment.json beside the scan)"
     )
     parser.add_argument("--metres-per-unit", type=float, help="of a scan in another unit (0.001 for millimetres)")
-    parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080, else the next free)")
+    parser.add_argument(
+        "--port", type=port_number, default=8080, help="port of the page (default 8080, else the next free)"
+    )
     parser.add_argument("--host", default="127.0.0.1", help="address to serve on (default: this machine only)")
     options = parser.parse_args(arguments)
-    if not 0 < options.port < 65536:
-        raise WearcapError(f"port {options.port}", expected="1 to 65535")
 
     from wearcap.io.formats.environment import FILE_NAME
     from wearcap.io.formats.scan import read_scan
@@ -35,12 +35,7 @@ def main(arguments: list[str]) -> None:
         file /= FILE_NAME
     if file.suffix != ".json":
         raise WearcapError("an environment is a .json file", where=file, expected="environment.json or a folder")
-    # Browsers open connections in advance and drop them; the server's log of that is of no use to a user.
-    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     scan = read_scan(cloud, metres_per_unit=options.metres_per_unit)
     page = ObjectEditor(scan, file, title=cloud.parent.resolve().name, host=options.host, port=options.port)
     print(f"{cloud}: open {page.url} (Ctrl+C ends; objects are saved in {file})")
-    try:
-        page.run()
-    finally:
-        page.stop()
+    page.serve()

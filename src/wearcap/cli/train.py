@@ -13,7 +13,7 @@ from rich import print as show
 
 from wearcap.cli.conf import hydra_main
 from wearcap.data.surroundings import embeddings_of
-from wearcap.files import folder_lock
+from wearcap.locks import folder_lock
 from wearcap.recording.store import RecordingStore
 from wearcap.training.checkpoint import ConfigInCheckpoint, RunCheckpointIO
 from wearcap.training.run import fit, keep_freed_memory, record_run, resume_path

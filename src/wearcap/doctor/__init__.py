@@ -1,4 +1,8 @@
-"""The doctor: reports the content of a recording, likely problems, and how to fix them."""
+"""The doctor: reports the content of a recording, likely problems, and how to fix them.
+
+Open `examine.py` first: `load.py` reads what is examined; `streams.py`, `body.py`, `inertial.py`, `agreement.py` and `places.py`
+check it, by the measurements of `signals.py`; `report.py` holds checks, findings and their report.
+"""
 
 from wearcap.doctor.examine import examine, examine_recording
 from wearcap.doctor.report import Finding, Report

@@ -1,16 +1,25 @@
-"""Streams against each other: head device and head joint, points, floor, camera."""
+"""Streams against each other and against their files: head device and head joint, points, floor, camera, localisation, claps."""
 
 import math
+from pathlib import Path
 
-from wearcap.doctor.inertial import offset_finding
-from wearcap.doctor.report import Finding
+import torch
+
+from wearcap.doctor.inertial import check_offset
+from wearcap.doctor.report import Check, Finding, has_error, refusal
 from wearcap.doctor.signals import lag_between, quantile, spin_of
+from wearcap.doctor.streams import check_rotations
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.recording import CameraStream, Cue, FloorTrack, HeadStream, Motion, PointCloud
+from wearcap.geometry.trajectory import Trajectory, angular_velocity, outlier_mask, resample, smooth
+from wearcap.io.formats.video import video_info
+from wearcap.recording import CameraStream, Cue, FloorTrack, HeadStream, Localization, Motion, PointCloud, Recording
 from wearcap.scene.floor import estimate_floor
+from wearcap.sensors.alignment import MAX_SPEED
+from wearcap.sensors.claps import detect_claps
+
+LONG_OUTAGE_S = 30.0
 
 
 def check_head_against_body(head: HeadStream, motion: Motion) -> list[Finding]:
@@ -20,84 +29,48 @@ def check_head_against_body(head: HeadStream, motion: Motion) -> list[Finding]:
     joint = motion.joint("head")
     body = Trajectory(motion.timestamps, joint.R, joint.t)
     device = Trajectory(head.timestamps, head.R_world_device, head.t_world_device)
-    findings = []
     lag = lag_between(body.timestamps, spin_of(body).norm(dim=-1), device.timestamps, spin_of(device).norm(dim=-1))
-    offset = offset_finding(lag, "the head stream")
-    if offset:
-        findings.append(
-            Finding(offset.severity, "head against body: clock offset", offset.what, offset.evidence, offset.fix)
-        )
+    findings = check_offset("head against body: clock offset", lag, "the head stream")
     inside = (body.timestamps >= device.timestamps[0]) & (body.timestamps <= device.timestamps[-1])
     if inside.sum() < 10:
-        return [
-            *findings,
-            Finding(
-                "error",
-                "head against body",
-                "hardly overlap in time",
-                f"{int(inside.sum())} shared frames",
-                "Bring both to one clock.",
-            ),
-        ]
+        evidence = f"{int(inside.sum())} shared frames"
+        apart = Check("head against body").error("hardly overlap in time", evidence, "Bring both to one clock.")
+        return [*findings, apart]
     at = resample(device, body.timestamps[inside])
     T_head_device = Rigid(body.R_world_body[inside].double(), body.t_world_body[inside].double()).inverse() @ Rigid(
         at.R_world_body.double(), at.t_world_body.double()
     )
-    return [*findings, _check_mounting(T_head_device, head)]
+    return [*findings, _check_seat(Check("head against body: seat"), T_head_device, head)]
 
 
-def _check_mounting(T_head_device: Rigid, head: HeadStream) -> Finding:
+def _check_seat(check: Check, T_head_device: Rigid, head: HeadStream) -> Finding:
+    """The device keeps a constant pose on the head joint, the stated one."""
     mean_R, mean_t = rotation.mean_rotation(T_head_device.R), T_head_device.t.median(0).values
     turn = math.degrees(quantile(rotation.geodesic(T_head_device.R, mean_R.expand_as(T_head_device.R)), 0.9))
     shift = quantile((T_head_device.t - mean_t).norm(dim=-1), 0.9)
-    check, evidence = (
-        "head against body: seat",
-        f"90 % of the time within {100 * shift:.1f} cm and {turn:.1f}° of a constant seat",
-    )
+    evidence = f"90 % of the time within {100 * shift:.1f} cm and {turn:.1f}° of a constant seat"
     if shift > 0.3 or turn > 30:
-        return Finding(
-            "error",
-            check,
-            "the device does not ride on the head",
-            evidence,
-            "Head and body are in different worlds (align them), on different clocks, or of different people.",
-        )
+        fix = "Head and body are in different worlds (align them), on different clocks, or of different people."
+        return check.error("the device does not ride on the head", evidence, fix)
     off_m = (mean_t - head.t_head_device.double()).norm().item()
     off_deg = math.degrees(rotation.geodesic(mean_R, head.R_head_device.double()).item())
     evidence += f"; mean {100 * off_m:.1f} cm and {off_deg:.1f}° from the stated one"
     if off_m > 0.08 or off_deg > 15:
-        return Finding(
-            "warning",
-            check,
-            "the stated seat of the device is off",
-            evidence,
-            f"t_head_device = ({', '.join(f'{v:.3f}' for v in mean_t.tolist())}) m fits this recording.",
-        )
-    severity = "warning" if shift > 0.06 or turn > 12 else "ok"
-    return Finding(
-        severity,
-        check,
-        "the device moves on the head" if severity == "warning" else "constant",
-        evidence,
-        "A drifting alignment or a slipping device." if severity == "warning" else "",
-    )
+        fix = f"t_head_device = ({', '.join(f'{v:.3f}' for v in mean_t.tolist())}) m fits this recording."
+        return check.warning("the stated seat of the device is off", evidence, fix)
+    if shift > 0.06 or turn > 12:
+        return check.warning("the device moves on the head", evidence, "A drifting alignment or a slipping device.")
+    return check.ok("constant", evidence)
 
 
-def check_head_cue(head: HeadStream, cue: Cue) -> list[Finding]:
+def check_head_cue(head: HeadStream, cue: Cue) -> Finding:
     """A head joint tracked by another system moves with the device: same clock, same world, same wearer."""
-    check = "head against cues"
+    check = Check("head against cues")
     inside = (cue.timestamps >= head.timestamps[0]) & (cue.timestamps <= head.timestamps[-1])
     inside &= (cue.confidence > 0) & cue.points.isfinite().all(-1)
     if cue.points.shape[-1] != 3 or inside.sum() < 2:
-        return [
-            Finding(
-                "error",
-                check,
-                "hardly overlap in time",
-                f"{int(inside.sum())} shared keypoints",
-                "Bring both to one clock.",
-            )
-        ]
+        evidence = f"{int(inside.sum())} shared keypoints"
+        return check.error("hardly overlap in time", evidence, "Bring both to one clock.")
     track = Trajectory(head.timestamps, head.R_world_device, head.t_world_device)
     at = resample(track, cue.timestamps[inside])
     t_device_joint = (at.R_world_body.mT @ (cue.points[inside] - at.t_world_body)[..., None])[..., 0]
@@ -108,81 +81,46 @@ def check_head_cue(head: HeadStream, cue: Cue) -> list[Finding]:
         f"({', '.join(f'{v:.3f}' for v in mean.tolist())}) m of the device"
     )
     if shift > 0.1 or mean.norm() > 0.4:
-        return [
-            Finding(
-                "error",
-                check,
-                "the tracked head does not ride with the device",
-                evidence,
-                "They are in different worlds, on different clocks, or of different people.",
-            )
-        ]
-    return [Finding("ok", check, "the tracked head rides with the device", evidence)]
+        fix = "They are in different worlds, on different clocks, or of different people."
+        return check.error("the tracked head does not ride with the device", evidence, fix)
+    return check.ok("the tracked head rides with the device", evidence)
 
 
 def check_points(points: PointCloud, head: HeadStream | None) -> list[Finding]:
     """A cloud in metres around the wearer, with a floor at standing height below the head."""
-    cloud = points.points_world
+    check, cloud = Check("points"), points.points_world
     if not cloud.isfinite().all():
-        return [
-            Finding(
-                "error",
-                "points",
-                "points are NaN",
-                f"{int((~cloud.isfinite()).any(-1).sum())} of {len(cloud)}",
-                "Drop them.",
-            )
-        ]
+        evidence = f"{int((~cloud.isfinite()).any(-1).sum())} of {len(cloud)}"
+        return [check.error("points are NaN", evidence, "Drop them.")]
     if len(cloud) < 50:
-        return [
-            Finding(
-                "warning",
-                "points",
-                "hardly any points",
-                f"{len(cloud)} points",
-                "If few were sure enough to keep, loosen the thresholds.",
-            )
-        ]
+        fix = "If few were sure enough to keep, loosen the thresholds."
+        return [check.warning("hardly any points", f"{len(cloud)} points", fix)]
     spread = quantile((cloud - cloud.median(0).values).norm(dim=-1), 0.5)
     evidence = f"{len(cloud)} points, half of them within {spread:.3g} m"
     if not 0.2 < spread < 200:
-        return [Finding("error", "points", "not a surrounding in metres", evidence, "Check the cloud's unit.")]
-    findings = [Finding("ok", "points", "a surrounding in metres", evidence)]
-    return findings if head is None else [*findings, _floor_below(points, head)]
+        return [check.error("not a surrounding in metres", evidence, "Check the cloud's unit.")]
+    found = check.ok("a surrounding in metres", evidence)
+    return [found] if head is None else [found, _check_floor(Check("points: floor"), points, head)]
 
 
-def _floor_below(points: PointCloud, head: HeadStream) -> Finding:
-    check = "points: floor"
+def _check_floor(check: Check, points: PointCloud, head: HeadStream) -> Finding:
+    """The floor in the points is clear, and at the distance of a standing or sitting person's head."""
     try:
         floor = estimate_floor(points.points_world, head.t_world_device)
     except WearcapError as error:
-        return Finding(
-            "error",
-            check,
-            "no points below the head",
-            str(error),
-            "Points and head are in different worlds, or z is not up.",
+        fix = "Points and head are in different worlds, or z is not up."
+        return check.error("no points below the head", str(error), fix)
+    usual, confidence = quantile(head.t_world_device[:, 2] - floor.height, 0.8), floor.confidence.median()
+    evidence = f"the head is {usual:.2f} m above it (80 % of the time less), confidence {confidence:.2f}"
+    if confidence < 0.1:
+        fix = (
+            "Check that points and head share a world with z up; else give the floor's height or the wearer's stature."
         )
-    clearance = head.t_world_device[:, 2] - floor.height
-    usual = quantile(clearance, 0.8)
-    evidence = f"the head is {usual:.2f} m above it (80 % of the time less), confidence {floor.confidence.median():.2f}"
-    if floor.confidence.median() < 0.1:
-        return Finding(
-            "note",
-            check,
-            "no clear floor",
-            evidence,
-            "Check that points and head share a world with z up; else give the floor's height or the wearer's stature.",
-        )
+        return check.note("no clear floor", evidence, fix)
     if not 0.9 < usual < 2.1:
-        return Finding(
-            "warning",
-            check,
-            "the floor is at no standing or sitting distance",
-            evidence,
-            "Check unit and up axis of both.",
-        )
-    return Finding("ok", check, "a floor below the head", evidence)
+        fix = "Check unit and up axis of both."
+        return check.warning("the floor is at no standing or sitting distance", evidence, fix)
+    return check.ok("a floor below the head", evidence)
 
 
 def floor_below(points: PointCloud, head: HeadStream) -> FloorTrack | None:
@@ -197,48 +135,118 @@ def floor_below(points: PointCloud, head: HeadStream) -> FloorTrack | None:
 def check_camera(stream: CameraStream) -> list[Finding]:
     """The camera looks ahead and is upright on the head; it has as many images as timestamps."""
     findings = []
-    count = len(stream.image_files) if stream.image_files is not None else None
-    if stream.embedding is not None:
-        count = len(stream.embedding)
-    if count is not None and count != len(stream.timestamps):
-        findings.append(
-            Finding(
-                "error",
-                "camera: frames",
-                "images and timestamps differ in number",
-                f"{count} and {len(stream.timestamps)}",
-                "Pair them again.",
-            )
-        )
-    view, down = stream.R_head_cam[:, 2], stream.R_head_cam[:, 1]
+    images = stream.embedding if stream.embedding is not None else stream.image_files
+    if images is not None and len(images) != len(stream.timestamps):
+        evidence = f"{len(images)} and {len(stream.timestamps)}"
+        check = Check("camera: frames")
+        findings.append(check.error("images and timestamps differ in number", evidence, "Pair them again."))
+    view, down, check = stream.R_head_cam[:, 2], stream.R_head_cam[:, 1], Check("camera: axes")
     evidence = f"view {100 * view[0]:.0f} % forward, image's down {-100 * down[2]:.0f} % downward in head axes"
     if view[0] < 0.3:
-        findings.append(
-            Finding(
-                "warning",
-                "camera: axes",
-                "the camera does not look ahead",
-                evidence,
-                "R_head_cam turns camera axes (x right, y down, z forward) into head axes.",
-            )
-        )
+        fix = "R_head_cam turns camera axes (x right, y down, z forward) into head axes."
+        findings.append(check.warning("the camera does not look ahead", evidence, fix))
     elif down[2] > -0.5:
-        findings.append(
-            Finding(
-                "note", "camera: axes", "the camera is rolled", evidence, "Turn the images upright, or keep it in mind."
-            )
-        )
+        fix = "Turn the images upright, or keep it in mind."
+        findings.append(check.note("the camera is rolled", evidence, fix))
     else:
-        findings.append(Finding("ok", "camera: axes", "looks ahead, upright", evidence))
-    focal = stream.camera.fx / stream.camera.width
-    if not 0.1 < focal < 5:
-        findings.append(
-            Finding(
-                "warning",
-                "camera: intrinsics",
-                "a focal length of no camera",
-                f"fx {stream.camera.fx:g} px at {stream.camera.width} px width",
-                "fx is in pixels of the stored image size.",
-            )
-        )
+        findings.append(check.ok("looks ahead, upright", evidence))
+    if not 0.1 < stream.camera.fx / stream.camera.width < 5:
+        evidence = f"fx {stream.camera.fx:g} px at {stream.camera.width} px width"
+        fix = "fx is in pixels of the stored image size."
+        findings.append(Check("camera: intrinsics").warning("a focal length of no camera", evidence, fix))
     return findings
+
+
+def check_localization(found: Localization, body: Motion | None) -> list[Finding]:
+    """Share of localised frames, plausibility of the camera's path for a head, and its clock."""
+    check, known = Check("localization"), found.confidence > 0
+    share = known.float().mean().item()
+    edges = torch.cat([found.timestamps[:1], found.timestamps[known], found.timestamps[-1:]])
+    outage_s = edges.diff().max().item()
+    evidence = f"{100 * share:.0f} % of {len(known)} frames, longest outage {outage_s:.1f} s"
+    if int(known.sum()) < 2:
+        fix = "Check that map, camera intrinsics and video belong together."
+        return [check.error("hardly any frame was found", evidence, fix)]
+    fix = "Add database photos where the wearer walked."
+    if share < 0.5:
+        findings = [check.warning("few frames were found", evidence, fix)]
+    elif outage_s > LONG_OUTAGE_S:
+        findings = [check.note("the camera was found", evidence, fix)]
+    else:
+        findings = [check.ok("the camera was found", evidence)]
+    if not found.t_world_cam[known].isfinite().all():
+        return [*findings, check.error("found positions are NaN", "", "Their confidence should be 0.")]
+    track = Trajectory(found.timestamps[known], found.R_world_cam[known], found.t_world_cam[known])
+    turned = check_rotations("localization", track.R_world_body)
+    findings += turned
+    if has_error(turned):
+        return findings
+    good = outlier_mask(track, MAX_SPEED)
+    wrong, check = 1 - good.float().mean().item(), Check("localization: speed")
+    evidence = f"{100 * wrong:.1f} % lie further off than {MAX_SPEED:g} m/s allow"
+    if wrong > 0.1:
+        fix = "Raise the number of inliers that a pose needs."
+        findings.append(check.warning("positions jump", evidence, fix))
+    else:
+        findings.append(check.ok("a path that a head takes", evidence))
+    if track.R_world_body[:, 2, 1].median() > 0:  # an OpenCV camera's y axis points down
+        evidence = "its y axis points up in the world"
+        fix = "Poses are of OpenCV's camera in the world (x right, y down, z forward), the world's z up."
+        findings.append(Check("localization: axes").warning("the camera is mounted upside down", evidence, fix))
+    track = track[good]
+    if body is None or "head" not in body.skeleton or share < 0.5 or len(track) < 30:
+        return findings
+    head, seen = body.joint("head"), smooth(track, 0.05)
+    # Turns about the vertical, which suit and scene share, depend on neither mount nor heading.
+    turning = angular_velocity(Trajectory(body.timestamps, head.R, head.t))[:, 2]
+    lag = lag_between(body.timestamps, turning, seen.timestamps, angular_velocity(seen)[:, 2])
+    return findings + check_offset("localization: clock offset", lag, "the camera")
+
+
+def check_claps(recording: Recording) -> list[Finding]:
+    """Whether the wrist sensors recorded a clap, by which camera and suit can be synchronised."""
+    filmed = recording.localization is not None or (recording.camera is not None and recording.camera.video)
+    wrists = [
+        recording.imu[name]
+        for name in ("left_wrist", "right_wrist")
+        if name in recording.imu
+        and len(recording.imu[name].timestamps) > 9
+        and not (recording.imu[name].acc_world is None and recording.imu[name].acc_imu is None)
+    ]
+    if not filmed or not wrists:
+        return []
+    try:
+        claps = detect_claps(*wrists)
+    except WearcapError as error:
+        fix = "Where camera and suit are not on one clock already, give the clap's time by hand."
+        return [Check("claps").note(error.what, str(error.where or ""), fix)]
+    return [Check("claps").ok(f"{len(claps)} found", ", ".join(f"{t:.2f} s" for t in claps[:5].tolist()))]
+
+
+def check_files(recording: Recording, root: Path) -> list[Finding]:
+    """Existence of the video and the scan that a recording names, relative to its data set's folder."""
+    findings = []
+    stream = recording.camera
+    if stream is not None and stream.video:
+        findings.append(_check_video(Check("camera: video"), root / stream.video, stream))
+    if recording.scene and not (root / recording.scene).is_file():
+        fix = "Put it there, or prepare the data set again."
+        findings.append(Check("scene: file").error("the scan is missing", str(root / recording.scene), fix))
+    return findings
+
+
+def _check_video(check: Check, path: Path, stream: CameraStream) -> Finding:
+    """The video has the calibrated size and as many frames as there are timestamps."""
+    frames, width, height = len(stream.timestamps), stream.camera.width, stream.camera.height
+    try:
+        video = video_info(path)
+    except WearcapError as error:
+        return refusal(error, check.name)
+    if (video.width, video.height) != (width, height):
+        evidence = f"{video.width}x{video.height} pixels, calibrated at {width}x{height}"
+        fix = "Calibrate at the video's size (wearcap calibrate), or scale the intrinsics (Camera.scaled)."
+        return check.error("image size and calibration differ", evidence, fix)
+    if video.frames and abs(video.frames - frames) > 1:
+        evidence = f"{video.frames} and {frames}"
+        return check.error("frames and timestamps differ in number", evidence, "Pair them again.")
+    return check.ok("fits its calibration", f"{video.frames} frames of {width}x{height}")

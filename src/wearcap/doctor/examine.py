@@ -6,14 +6,20 @@ from pathlib import Path
 from jaxtyping import Float64
 from torch import Tensor
 
-from wearcap.doctor.agreement import check_camera, check_head_against_body, check_head_cue, check_points, floor_below
-from wearcap.doctor.body import check_motion
+from wearcap.doctor.agreement import (
+    check_camera,
+    check_claps,
+    check_head_against_body,
+    check_head_cue,
+    check_localization,
+    check_points,
+    floor_below,
+)
+from wearcap.doctor.body import check_contact_prob, check_motion
 from wearcap.doctor.inertial import check_imu
-from wearcap.doctor.load import Patient, patients
-from wearcap.doctor.localized import check_claps, check_contact_prob, check_localization
-from wearcap.doctor.poses import check_facing, check_rotations, check_speed, check_upright
-from wearcap.doctor.report import Finding, Report, refusal
-from wearcap.doctor.timing import check_clock, check_spans
+from wearcap.doctor.load import patients
+from wearcap.doctor.report import SEVERITIES, Check, Finding, Report, has_error, refusal
+from wearcap.doctor.streams import check_clock, check_spans, check_track
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Recording
@@ -29,41 +35,32 @@ def examine(source: Recording | str | Path, progress: Callable[[int, int], None]
         return Report(source.name, {source.name: tuple(examine_recording(source))})
     found = patients(Path(source))
     findings: dict[str, tuple[Finding, ...]] = {}
-    for done, patient in enumerate(found, 1):
-        findings[patient.name] = tuple(_examine_file(patient))
+    for done, (name, load) in enumerate(found.items(), 1):
+        try:
+            recording, read = load()
+        except WearcapError as error:
+            findings[name] = (refusal(error),)
+        else:
+            only_read = read and recording.points is None and not _clocks(recording)  # with the reader's errors
+            findings[name] = tuple(read if only_read else [*read, *examine_recording(recording)])
         if progress:
             progress(done, len(found))
     return Report(str(source), findings)
 
 
-def _examine_file(patient: Patient) -> list[Finding]:
-    try:
-        recording, findings = patient.load()
-    except WearcapError as error:
-        return [refusal(error)]
-    if findings and recording.points is None and not _clocks(recording):
-        return findings  # the reader's errors are already reported
-    return [*findings, *examine_recording(recording)]
-
-
 def examine_recording(recording: Recording) -> list[Finding]:
     """All findings of one recording, the worst first."""
     clocks = _clocks(recording)
+    if not clocks and recording.points is None:
+        return [Check("recording").error("is empty", "", "It holds no stream.")]
     if not clocks:
-        findings = (
-            []
-            if recording.points is not None
-            else [Finding("error", "recording", "is empty", "", "It holds no stream.")]
-        )
-        findings += check_points(recording.points, None) if recording.points is not None else []
-        return findings
+        return check_points(recording.points, None)
     findings = [finding for name, times in clocks.items() for finding in check_clock(name, times)]
     broken = {f.check.split(":")[0] for f in findings if f.severity == "error" and f.what != "dropped frames"}
     usable = {name for name, times in clocks.items() if name not in broken and len(times) > 1}
     findings += check_spans({name: times for name, times in clocks.items() if name in usable})
     findings += _streams(recording, usable)
-    order = {"error": 0, "warning": 1, "note": 2, "ok": 3}
-    return sorted(findings, key=lambda finding: order[finding.severity])
+    return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
 
 
 def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:
@@ -83,10 +80,8 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
     findings: list[Finding] = []
     head = recording.head if "head" in usable else None
     if head is not None:
-        track = Trajectory(head.timestamps, head.R_world_device, head.t_world_device)
-        found = _track("head", track)
-        findings += found
-        head = head if _sound(found) else None
+        findings += check_track("head", Trajectory(head.timestamps, head.R_world_device, head.t_world_device))
+        head = None if has_error(findings) else head
     floor = recording.floor
     if floor is None and recording.points is not None and head is not None:
         floor = floor_below(recording.points, head)
@@ -95,16 +90,22 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
         if motion is not None and name in usable:
             found = [*check_motion(name, motion, floor), *check_contact_prob(name, motion)]
             findings += found
-            if _sound(found):
+            if not has_error(found):
                 bodies[name] = motion
     body = bodies.get("motion", bodies.get("suit"))
     if head is not None and body is not None:
         findings += check_head_against_body(head, body)
     if head is not None and "head" in recording.cues:
-        findings += check_head_cue(head, recording.cues["head"])
+        findings.append(check_head_cue(head, recording.cues["head"]))
     for name, imu in recording.imu.items():
         if f"imu {name}" in usable:
-            findings += check_imu(f"imu {name}", imu, _joint_path(imu.joint, body, head))
+            path = None
+            if body is not None and imu.joint in body.skeleton:
+                T, times = body.joint(imu.joint), body.timestamps
+                path = Trajectory(times, T.R, T.t)
+            elif head is not None and imu.joint == "head":
+                path = Trajectory(head.timestamps, head.T_world_head.R, head.T_world_head.t)
+            findings += check_imu(f"imu {name}", imu, path)
     if recording.points is not None:
         findings += check_points(recording.points, head)
     if recording.camera is not None:
@@ -112,25 +113,3 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
     if recording.localization is not None and "localization" in usable:
         findings += check_localization(recording.localization, bodies.get("suit", body))
     return [*findings, *check_claps(recording)]
-
-
-def _track(name: str, track: Trajectory) -> list[Finding]:
-    findings = [*check_rotations(name, track.R_world_body), *check_speed(name, track)]
-    if any("NaN" in f.what or "no rotations" in f.what for f in findings):
-        return findings
-    findings += check_upright(name, track)
-    return findings + check_facing(name, track) if _sound(findings) else findings
-
-
-def _sound(findings: list[Finding]) -> bool:
-    return not any(finding.severity == "error" for finding in findings)
-
-
-def _joint_path(joint: str, body, head) -> Trajectory | None:
-    if body is not None and joint in body.skeleton:
-        pose = body.joint(joint)
-        return Trajectory(body.timestamps, pose.R, pose.t)
-    if head is not None and joint == "head":
-        T_world_head = head.T_world_head
-        return Trajectory(head.timestamps, T_world_head.R, T_world_head.t)
-    return None

@@ -1,17 +1,15 @@
 """Recordings that can be examined in a path: data sets, files, MPS folders, scenes, environments, motion capture."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import torch
 
-from wearcap.doctor.environment import is_environment, read_environment_file
-from wearcap.doctor.localized import check_files
-from wearcap.doctor.report import Finding
-from wearcap.doctor.scene import is_map, is_scene, read_map, read_scene
-from wearcap.doctor.timing import check_clock
+from wearcap.doctor.agreement import check_files
+from wearcap.doctor.places import is_map, is_place, read_environment_file, read_map, read_place
+from wearcap.doctor.report import Check, Finding
+from wearcap.doctor.streams import check_clock
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.adt import is_adt, read_adt
@@ -35,34 +33,29 @@ from wearcap.recording.store import RecordingFile
 Loaded = tuple[Recording, list[Finding]]
 
 
-@dataclass(frozen=True)
-class Patient:
-    """One recording to examine; `load` returns it with the reader's findings (a file's raw clock, a service's report)."""
+def patients(path: Path) -> dict[str, Callable[[], Loaded]]:
+    """What loads each recording in a path, by name; it returns the reader's findings, too (of a file's raw clock, say).
 
-    name: str
-    load: Callable[[], Loaded]
-
-
-def patients(path: Path) -> list[Patient]:
-    """All recordings in a path, in order of name. Raises WearcapError when there is none."""
+    Raises WearcapError when there is nothing to examine.
+    """
     if not path.exists() and (path.parent / "manifest.json").is_file():
         store = RecordingStore.open(path.parent)
         store.require(path.name)
-        return [Patient(path.name, partial(_read_stored, store, path.name))]
+        return {path.name: partial(_read_stored, store, path.name)}
     if not path.exists():
         raise WearcapError("no such file or folder", where=path)
     if path.is_file():
         if _kind(path) is None:
             raise WearcapError("a kind of file that the doctor does not know", where=path, expected=", ".join(_READERS))
-        return [Patient(path.name, partial(_read_file, path))]
+        return {path.name: partial(_read_file, path)}
     if (path / "manifest.json").is_file():
         store = RecordingStore.open(path)
-        return [Patient(name, partial(_read_stored, store, name)) for name in store.names()]
+        return {name: partial(_read_stored, store, name) for name in store.names()}
     for is_kind, read in _FOLDERS:
         if is_kind(path):
-            return [Patient(path.resolve().name, partial(read, path))]
+            return {path.resolve().name: partial(read, path)}
     if is_hps(path):
-        return [Patient(name, partial(_read_hps, path, name)) for name in hps_names(path)]
+        return {name: partial(_read_hps, path, name) for name in hps_names(path)}
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) in _MOTIONS]
     if not files:
         raise WearcapError(
@@ -70,7 +63,7 @@ def patients(path: Path) -> list[Patient]:
             where=path,
             expected=f"a data set (manifest.json), an MPS, Nymeria, ADT or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), or files like {', '.join(_MOTIONS)}",
         )
-    return [Patient(file.relative_to(path).as_posix(), partial(_read_file, file)) for file in files]
+    return {file.relative_to(path).as_posix(): partial(_read_file, file) for file in files}
 
 
 def _kind(path: Path) -> str | None:
@@ -89,20 +82,12 @@ def _read_file(path: Path) -> Loaded:
     if isinstance(content, Motion):
         return Recording(name=name, motion=content, skeleton=content.skeleton), []
     if isinstance(content, Trajectory):
-        return Recording(name=name, head=_as_head(content)), [
-            Finding(
-                "note",
-                "head: axes",
-                "taken as the head's own pose",
-                "a trajectory file does not name its axes",
-                "x forward, y left, z up is assumed.",
-            )
+        head = HeadStream(content.timestamps, content.R_world_body, content.t_world_body, torch.eye(3), torch.zeros(3))
+        evidence, fix = "a trajectory file does not name its axes", "x forward, y left, z up is assumed."
+        return Recording(name=name, head=head), [
+            Check("head: axes").note("taken as the head's own pose", evidence, fix)
         ]
     return Recording(name=name, points=PointCloud(torch.from_numpy(content.points))), []
-
-
-def _as_head(track: Trajectory) -> HeadStream:
-    return HeadStream(track.timestamps, track.R_world_body, track.t_world_body, torch.eye(3), torch.zeros(3))
 
 
 def _read_stored(store: RecordingStore, name: str) -> Loaded:
@@ -117,12 +102,6 @@ def _read_hps(root: Path, name: str) -> Loaded:
     return recording, check_files(recording, root)
 
 
-def _read_place(folder: Path) -> Loaded:
-    """A scene, an environment, or both in one folder."""
-    recording, findings = read_scene(folder) if is_scene(folder) else (Recording(folder.resolve().name), [])
-    return recording, [*findings, *(read_environment_file(folder)[1] if is_environment(folder) else [])]
-
-
 def _read_mps(folder: Path) -> Loaded:
     """An MPS folder at 60 Hz, with findings about the raw file's clock, its quality score and the service's own report."""
     path = find_mps_file(folder, ("closed_loop_trajectory.csv",))
@@ -131,37 +110,26 @@ def _read_mps(folder: Path) -> Loaded:
     findings = check_clock("closed-loop file", raw.T_world_aria.timestamps)
     quality = raw.quality.median().item()
     low = (raw.quality < 0.5).float().mean().item()
-    findings.append(
-        Finding(
-            "warning" if low > 0.1 else "ok",
-            "closed-loop file: quality",
-            "MPS trusts its poses little" if low > 0.1 else "MPS trusts its poses",
-            f"median score {quality:.2f}, {100 * low:.0f} % below 0.5",
-        )
-    )
-    findings.append(Finding("ok", "closed-loop file: gravity", "points along -z", "9.81 m/s²"))
-    return read_mps(folder), [*findings, *_mps_summary(folder)]
-
-
-def _mps_summary(folder: Path) -> list[Finding]:
-    path = find_mps_file(folder, ("summary.json",))
+    check, evidence = Check("closed-loop file: quality"), f"median score {quality:.2f}, {100 * low:.0f} % below 0.5"
+    if low > 0.1:
+        findings.append(check.warning("MPS trusts its poses little", evidence))
+    else:
+        findings.append(check.ok("MPS trusts its poses", evidence))
+    findings.append(Check("closed-loop file: gravity").ok("points along -z", "9.81 m/s²"))
+    recording = read_mps(folder)
+    check, path = Check("MPS summary"), find_mps_file(folder, ("summary.json",))
     if path is None:
-        return []
+        return recording, findings
     try:
         parts = read_json_object(path)
     except WearcapError as error:
-        return [Finding("warning", "MPS summary", "cannot be read", str(error))]
-    failed = [
-        name for name, part in parts.items() if isinstance(part, dict) and part.get("status", "SUCCESS") != "SUCCESS"
-    ]
+        return recording, [*findings, check.warning("cannot be read", str(error))]
+    states = {name: part.get("status", "SUCCESS") for name, part in parts.items() if isinstance(part, dict)}
+    failed = [name for name, state in states.items() if state != "SUCCESS"]
     if failed:
-        return [Finding("error", "MPS summary", "MPS reports failures", ", ".join(failed), "Request MPS again.")]
-    return [Finding("ok", "MPS summary", "MPS reports success", ", ".join(name for name in parts if name != "version"))]
-
-
-def _read_recording(path: Path) -> Recording | Loaded:
-    """A recording, or a visual map."""
-    return read_map(path) if is_map(path) else RecordingFile(path).load()
+        return recording, [*findings, check.error("MPS reports failures", ", ".join(failed), "Request MPS again.")]
+    services = ", ".join(name for name in parts if name != "version")
+    return recording, [*findings, check.ok("MPS reports success", services)]
 
 
 def _read_amc(path: Path) -> Motion:
@@ -192,12 +160,12 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Loaded]], ...] = 
     (is_nymeria, lambda folder: (read_nymeria(folder), [])),
     (is_mps_folder, _read_mps),
     (is_adt, lambda folder: (read_adt(folder), [])),
-    (lambda folder: is_scene(folder) or is_environment(folder), _read_place),
+    (is_place, read_place),
 )
 _MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _read_npz}
 _READERS: dict[str, Callable] = {
     **_MOTIONS,
-    ".safetensors": _read_recording,
+    ".safetensors": lambda path: read_map(path) if is_map(path) else RecordingFile(path).load(),
     ".csv": _read_csv,
     ".txt": read_tum,
     ".tum": read_tum,

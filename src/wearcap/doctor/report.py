@@ -1,5 +1,6 @@
 """The doctor's findings by recording, the worst first."""
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 
 from wearcap.errors import WearcapError
@@ -23,6 +24,34 @@ class Finding:
     def __post_init__(self):
         if self.severity not in SEVERITIES:
             raise ValueError(f"severity {self.severity!r} is none of {SEVERITIES}")
+
+
+@dataclass(frozen=True)
+class Check:
+    """A check by its name; its methods make its findings, of the severity that they are called after."""
+
+    name: str
+
+    def found(self, severity: str, what: str, evidence: str = "", fix: str = "") -> Finding:
+        """A finding of a severity that the evidence decides."""
+        return Finding(severity, self.name, what, evidence, fix)
+
+    def ok(self, what: str, evidence: str = "") -> Finding:
+        return self.found("ok", what, evidence)
+
+    def note(self, what: str, evidence: str = "", fix: str = "") -> Finding:
+        return self.found("note", what, evidence, fix)
+
+    def warning(self, what: str, evidence: str = "", fix: str = "") -> Finding:
+        return self.found("warning", what, evidence, fix)
+
+    def error(self, what: str, evidence: str = "", fix: str = "") -> Finding:
+        return self.found("error", what, evidence, fix)
+
+
+def has_error(findings: Iterable[Finding]) -> bool:
+    """Whether any finding is an error."""
+    return any(finding.severity == "error" for finding in findings)
 
 
 def refusal(error: WearcapError, check: str = "reading") -> Finding:

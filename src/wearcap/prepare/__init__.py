@@ -1,4 +1,8 @@
-"""Preparation: sources in, a data set of recordings out."""
+"""Preparation: sources in, a data set of recordings out.
+
+Open `engine.py` first. Sources: `worn.py` (worn sensors), `mocap_sources.py` (motion capture), `one_object.py` (people with an
+object), `simulated.py`; `embeddings.py` and `keypoints.py` add to a data set. `conf/prepare/` names what `wearcap prepare` runs.
+"""
 
 from wearcap.prepare.check import check_recording
 from wearcap.prepare.engine import Report, Task, content_hash, prepare

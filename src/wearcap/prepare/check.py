@@ -1,7 +1,6 @@
 """Checks of a recording before it enters a data set."""
 
 import torch
-from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.recording.recording import MIN_DURATION_S, Recording
@@ -18,65 +17,40 @@ def check_recording(recording: Recording) -> None:
 
     Every stream needs rising timestamps; `motion` and `head` a plausible rate and at least `MIN_DURATION_S`.
     """
+    where = recording.name
     _, tensors = flatten(recording)
     for key, tensor in tensors.items():
-        if tensor.is_floating_point() and not key.startswith(MAY_BE_UNKNOWN):
-            _require_finite(recording.name, key, tensor)
-        if key.endswith("timestamps"):
-            _require_rising(recording.name, key, tensor)
-        if key.rpartition(".")[2].startswith("R_") and not key.startswith(MAY_BE_UNKNOWN):
-            _require_rotations(recording.name, key, tensor)
+        known = not key.startswith(MAY_BE_UNKNOWN)
+        if known and tensor.is_floating_point() and (bad := ~torch.isfinite(tensor)).any():
+            row = int(bad.reshape(len(bad), -1).any(1).nonzero()[0])
+            wrong = f"{int(bad.sum())} values of {key} are not finite, the first in row {row}"
+            raise WearcapError(wrong, where=where, expected="numbers", fix="Mend or drop the source.")
+        if key.endswith("timestamps") and len(still := (tensor.diff() <= 0).nonzero()):
+            wrong = f"{key} do not rise at row {int(still[0]) + 1} (frame rate 0?)"
+            raise WearcapError(wrong, where=where, expected="strictly rising seconds")
+        if known and key.rpartition(".")[2].startswith("R_"):
+            R = tensor.double().reshape(-1, 3, 3)
+            away = (R.transpose(-1, -2) @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
+            bad = (away > ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)
+            if bad.any():
+                expected = f"orthogonal within {ORTHOGONAL_WITHIN}, determinant +1"
+                raise WearcapError(
+                    f"{int(bad.sum())} matrices of {key} are no rotations", where=where, expected=expected
+                )
     for part in ("motion", "head"):
-        if f"{part}.timestamps" in tensors:
-            _require_clock(recording.name, part, tensors[f"{part}.timestamps"])
+        times = tensors.get(f"{part}.timestamps")
+        if times is None:
+            continue
+        if len(times) < 2 or (duration := (times[-1] - times[0]).item()) < MIN_DURATION_S:
+            expected = f"at least {MIN_DURATION_S} s of motion"
+            raise WearcapError(f"{part} has {len(times)} frames", where=where, expected=expected)
+        fps = (len(times) - 1) / duration
+        if not RATES_HZ[0] <= fps <= RATES_HZ[1]:
+            raise WearcapError(
+                f"{part} runs at {fps:.4g} frames per second",
+                where=where,
+                expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g}",
+                fix="Give the true frame rate of the source.",
+            )
     if recording.motion is None and recording.head is None:
-        raise WearcapError("neither a motion nor a head path", where=recording.name, expected="one at least")
-
-
-def _require_finite(name: str, key: str, tensor: Tensor) -> None:
-    bad = ~torch.isfinite(tensor)
-    if bad.any():
-        frame = int(bad.flatten(1).any(1).nonzero()[0]) if tensor.ndim > 1 else int(bad.nonzero()[0])
-        raise WearcapError(
-            f"{int(bad.sum())} values of {key} are not finite, the first in row {frame}",
-            where=name,
-            expected="numbers",
-            fix="Mend or drop the source.",
-        )
-
-
-def _require_rising(name: str, key: str, timestamps: Tensor) -> None:
-    still = (timestamps.diff() <= 0).nonzero()
-    if len(still):
-        raise WearcapError(
-            f"{key} do not rise at row {int(still[0]) + 1} (frame rate 0?)",
-            where=name,
-            expected="strictly rising seconds",
-        )
-
-
-def _require_rotations(name: str, key: str, R: Tensor) -> None:
-    R = R.double().reshape(-1, 3, 3)
-    away = (R.transpose(-1, -2) @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
-    bad = (away > ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)
-    if bad.any():
-        raise WearcapError(
-            f"{int(bad.sum())} matrices of {key} are no rotations",
-            where=name,
-            expected=f"orthogonal within {ORTHOGONAL_WITHIN}, determinant +1",
-        )
-
-
-def _require_clock(name: str, part: str, timestamps: Tensor) -> None:
-    if len(timestamps) < 2 or (duration := (timestamps[-1] - timestamps[0]).item()) < MIN_DURATION_S:
-        raise WearcapError(
-            f"{part} has {len(timestamps)} frames", where=name, expected=f"at least {MIN_DURATION_S} s of motion"
-        )
-    fps = (len(timestamps) - 1) / duration
-    if not RATES_HZ[0] <= fps <= RATES_HZ[1]:
-        raise WearcapError(
-            f"{part} runs at {fps:.4g} frames per second",
-            where=name,
-            expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g}",
-            fix="Give the true frame rate of the source.",
-        )
+        raise WearcapError("neither a motion nor a head path", where=where, expected="one at least")

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from wearcap.data.embeddings import embed_camera, embedding_name
 from wearcap.errors import WearcapError
-from wearcap.files import folder_lock, remove_leftovers
+from wearcap.files import remove_leftovers
+from wearcap.locks import folder_lock
 from wearcap.models.image_encoder import ImageEncoder
 from wearcap.prepare.check import check_recording
 from wearcap.prepare.engine import REGISTER_EVERY_S, Report, progress_bar
@@ -32,37 +33,32 @@ def embed_dataset(
     into the data set.
     """
     root = RecordingStore.open(dataset).root
-    with folder_lock(root, "prepare embeddings"):
-        remove_leftovers(root, below=True)
-        return _embed_all(RecordingStore.open(root), encoder, cache, overwrite, progress)
-
-
-def _embed_all(
-    store: RecordingStore, encoder: ImageEncoder, cache: str | Path | None, overwrite: bool, progress: bool
-) -> Report:
     name_of_all = embedding_name(encoder)
     report, pending, written_at = Report(), dict[str, Entry](), time.monotonic()
-    try:
-        with progress_bar(len(store.entries), 0, progress) as advance:
-            for name in store.names():
-                try:
-                    file = RecordingFile(store.path_of(name), verify=_is_registered(store, name))
-                    camera = file.part("camera")
-                    if not isinstance(camera, CameraStream) or not (camera.video or camera.image_files):
-                        report.notes[name] = "no head camera's pictures"
-                    elif not overwrite and _is_current(store, name, camera, name_of_all):
-                        report.current.append(name)
-                    else:
-                        pending[name] = _embed(store, name, file, encoder, None if cache is None else Path(cache))
-                        report.written.append(name)
-                except WearcapError as error:
-                    report.failed[name] = str(error)
-                if time.monotonic() - written_at > REGISTER_EVERY_S:
-                    store.register(pending)
-                    pending, written_at = {}, time.monotonic()
-                advance()
-    finally:
-        store.register(pending)
+    with folder_lock(root, "prepare embeddings"):
+        remove_leftovers(root, below=True)
+        store = RecordingStore.open(root)
+        try:
+            with progress_bar(len(store.entries), 0, progress) as advance:
+                for name in store.names():
+                    try:
+                        file = RecordingFile(store.path_of(name), verify=_is_registered(store, name))
+                        camera = file.part("camera")
+                        if not isinstance(camera, CameraStream) or not (camera.video or camera.image_files):
+                            report.notes[name] = "no head camera's pictures"
+                        elif not overwrite and _is_current(store, name, camera, name_of_all):
+                            report.current.append(name)
+                        else:
+                            pending[name] = _embed(store, name, file, encoder, cache)
+                            report.written.append(name)
+                    except WearcapError as error:
+                        report.failed[name] = str(error)
+                    if time.monotonic() - written_at > REGISTER_EVERY_S:
+                        store.register(pending)
+                        pending, written_at = {}, time.monotonic()
+                    advance()
+        finally:
+            store.register(pending)
     if len(report.notes) == len(store.entries):
         raise WearcapError(
             "no recording has a head camera's pictures",
@@ -85,10 +81,14 @@ def _is_registered(store: RecordingStore, name: str) -> bool:
     return not path.is_file() or path.stat().st_mtime_ns <= store.manifest_path.stat().st_mtime_ns
 
 
-def _embed(store: RecordingStore, name: str, file: RecordingFile, encoder: ImageEncoder, cache: Path | None) -> Entry:
+def _embed(
+    store: RecordingStore, name: str, file: RecordingFile, encoder: ImageEncoder, cache: str | Path | None
+) -> Entry:
     recording, entry = file.load(), store.entries[name]
     assert recording.camera is not None
-    recording = replace(recording, camera=embed_camera(recording.camera, store.root, encoder, cache))
+    recording = replace(
+        recording, camera=embed_camera(recording.camera, store.root, encoder, None if cache is None else Path(cache))
+    )
     check_recording(recording)
     save_recording(recording, store.path_of(name))
     return entry_for(recording, store.root, entry.split, entry.config_hash)

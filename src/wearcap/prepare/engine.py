@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from wearcap.errors import WearcapError
-from wearcap.files import folder_lock, remove_leftovers, sha256_of
+from wearcap.files import remove_leftovers, sha256_of
+from wearcap.locks import folder_lock
 from wearcap.prepare.check import check_recording
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import Entry, RecordingStore, entry_for, recording_path, save_recording
@@ -67,6 +68,18 @@ def content_hash(*parts: Any) -> str:
     """Hex digest (16 digits) of settings (anything JSON can hold) and of the bytes of files given as Path."""
     plain = [sha256_of(part) if isinstance(part, Path) else part for part in parts]
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def source_folder(source: str | Path) -> Path:
+    """The folder of a source's files. Raises WearcapError if it does not exist."""
+    if not Path(source).is_dir():
+        raise WearcapError("no such folder", where=source, fix="Give it as source=DIR.")
+    return Path(source)
+
+
+def changed(read: Callable[[], Recording], **changes: Any) -> Recording:
+    """The recording that `read` returns, with fields replaced; a partial of it is a task's `make`."""
+    return replace(read(), **changes)
 
 
 def prepare(
@@ -153,7 +166,10 @@ def _is_current(store: RecordingStore, task: Task) -> bool:
 
 def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
     """In a worker: make, check and write one recording; returns (name, entry or reason of failure, note)."""
-    with _one_thread():
+    threads = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(1)  # recordings are the unit of parallelism, and sums over threads differ in their last bits
+    numba.set_num_threads(1)
+    try:
         try:
             recording = task.make()
             if recording.name != task.name:
@@ -165,19 +181,9 @@ def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
         save_recording(recording, recording_path(root, task.name))
         note = recording.motion.provenance.get(NOTE, "") if recording.motion else ""
         return task.name, entry_for(recording, root, task.split, task.hash), note
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Use one thread: recordings are the unit of parallelism, and sums over threads differ in their last bits."""
-    before = torch.get_num_threads(), numba.get_num_threads()
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    try:
-        yield
     finally:
-        torch.set_num_threads(before[0])
-        numba.set_num_threads(before[1])
+        torch.set_num_threads(threads[0])
+        numba.set_num_threads(threads[1])
 
 
 def _outcomes(

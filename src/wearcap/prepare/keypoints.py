@@ -7,8 +7,9 @@ import os
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -25,19 +26,6 @@ from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
 
 CAMERA_FPS = 30.0
 """Rate (Hz) of the simulated camera of a recording without one."""
-
-
-@runtime_checkable
-class Source(Protocol):
-    """Source of keypoints; picklable."""
-
-    def __call__(self, recording: Recording, folder: Path) -> Recording:
-        """The recording, of the data set at `folder`, with cues added."""
-        ...
-
-    def settings(self, name: str) -> list[Any]:
-        """Content that the cues of the recording of this name depend on (for `engine.content_hash`)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -113,18 +101,9 @@ class Simulated:
         return ["simulated", asdict(self)]
 
 
-@dataclass(frozen=True)
-class WithKeypoints:
-    """One recording and the source of its keypoints; picklable, callable as a task."""
-
-    file: Path
-    folder: Path
-    output: Path
-    source: Source
-
-    def __call__(self) -> Recording:
-        recording = self.source(RecordingFile(self.file).load(), self.folder)
-        return _from_elsewhere(recording, os.path.relpath(self.folder, self.output))
+Source = Found | Recorded | Simulated
+"""Source of keypoints, picklable: called with a recording and its data set's folder, it returns the recording with cues;
+`settings(name)` is the content that the cues of the recording of this name depend on (for `engine.content_hash`)."""
 
 
 def keypoints_dataset(
@@ -155,7 +134,7 @@ def keypoints_dataset(
     tasks = []
     for name in store.names():
         entry = store.entries[name]
-        make = WithKeypoints(store.root / entry.file, store.root, Path(output), detector)
+        make = partial(_with_keypoints, store.root / entry.file, store.root, Path(output), detector)
         tasks.append(Task(name, make, entry.split, content_hash(entry.sha256, *detector.settings(name))))
     return prepare(
         tasks, output, jobs=jobs, backend=backend, scheduler=scheduler, overwrite=overwrite, progress=progress
@@ -170,8 +149,10 @@ def _camera(recording: Recording) -> CameraStream:
     return recording.camera
 
 
-def _from_elsewhere(recording: Recording, prefix: str) -> Recording:
-    """The recording with `prefix` prepended to the paths of its files, for use from another folder."""
+def _with_keypoints(file: Path, folder: Path, output: Path, source: Source) -> Recording:
+    """One recording with its keypoints; the paths of its files are made relative to the new data set's folder."""
+    recording = source(RecordingFile(file).load(), folder)
+    prefix = os.path.relpath(folder, output)
 
     def moved(name: str | None) -> str | None:
         return name and Path(prefix, name).as_posix()
@@ -179,9 +160,6 @@ def _from_elsewhere(recording: Recording, prefix: str) -> Recording:
     camera = recording.camera
     if camera is not None:
         files = camera.image_files
-        camera = replace(
-            camera,
-            video=moved(camera.video),
-            image_files=None if files is None else tuple(Path(prefix, name).as_posix() for name in files),
-        )
+        files = None if files is None else tuple(Path(prefix, name).as_posix() for name in files)
+        camera = replace(camera, video=moved(camera.video), image_files=files)
     return replace(recording, camera=camera, scene=moved(recording.scene), environment=moved(recording.environment))

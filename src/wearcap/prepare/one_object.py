@@ -1,9 +1,12 @@
-"""Conversion of a take of a person and one object to a recording with the object's path and its environment."""
+"""People who handle one object, BEHAVE and OMOMO: a recording with the object's path, and its environment."""
 
-from dataclasses import replace
+import hashlib
+from dataclasses import asdict, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,16 +15,28 @@ from wearcap.data.object_classes import object_class
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.io.datasets.behave import BODY_FILE, INFO_FILE, OBJECT_FILE, behave_folder, behave_names, read_behave
+from wearcap.io.datasets.omomo import OmomoSequence, omomo_mesh_path, omomo_take, read_omomo
 from wearcap.io.datasets.one_object import OneObject
 from wearcap.io.formats.environment import FILE_NAME, write_environment
-from wearcap.prepare.clean import CleaningLimits, foot_patches, without_glitches
-from wearcap.prepare.engine import NOTE
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording, on_xsens23
-from wearcap.recording.motion import Motion
+from wearcap.prepare.engine import NOTE, Task, content_hash
+from wearcap.prepare.mocap import About, MocapSettings, foot_patches, mocap_recording, on_xsens23, without_glitches
+from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 
+VERSION = 1
+"""Version of both conversions, increased when the same source and settings yield another recording."""
+
+LOOKED_AT = 20
+"""Number of evenly chosen sequences whose speeds are used to check the frame rate."""
+FAST_PELVIS, FAST_FOOT = 2.5, 9.0
+"""Speeds (m/s) that nobody carrying objects exceeds for long: 95th percentile of the pelvis, 99th of the toes."""
+SLOW_PELVIS, SLOW_FOOT = 0.4, 1.2
+"""Speeds (m/s) of pelvis and toes, one of which any walking person exceeds; a step lifts a foot at some 3 m/s."""
+WALKED_M = 1.0
+"""Least walked distance (m) of sequences from which too low a rate can be concluded."""
 MAX_GAP_S = 0.2
 """Longest gap (s) that is interpolated; at longer ones the take is cut."""
 MAX_TILT_DEG = 30.0
@@ -36,7 +51,7 @@ _MIN_STEPS = 10
 _UPSIDE_DOWN_M = 0.2
 
 
-def one_object_recording(take: OneObject, about: About, settings: MocapSettings, output: str | Path) -> Recording:
+def _one_object(take: OneObject, about: About, settings: MocapSettings, output: str | Path) -> Recording:
     """Like `mocap_recording`, with the object's path on the motion's clock and an environment of that one object.
 
     The environment is written to `output`/scenes/NAME; the object is free to move and handled throughout, so there
@@ -44,14 +59,31 @@ def one_object_recording(take: OneObject, about: About, settings: MocapSettings,
     provenance. Raises WearcapError for an object of unknown class and for a body that is upside down.
     """
     kind = object_class(take.object_name)
-    kept, cut = longest_stretch(take)
+    kept, cut, frames = take, "", len(take.motion)
+    gaps = (take.motion.timestamps.diff() > MAX_GAP_S).nonzero()[:, 0].tolist()
+    if gaps:
+        edges = [0, *(frame + 1 for frame in gaps), frames]
+        start, stop = max(pairwise(edges), key=lambda span: span[1] - span[0])
+        kept = take.frames(slice(start, stop))
+        cut = f"kept frames {start} to {stop - 1} of {frames}: {len(gaps)} gaps of more than {MAX_GAP_S} s"
     motion, note = without_glitches(on_xsens23(kept.motion), settings.limits)
-    _require_upright(motion, about.name)
+    feet = torch.stack([motion.joint(f"{side}_ankle").t[:, 2] for side in ("left", "right")]).mean(0)
+    above = float((motion.joint("head").t[:, 2] - feet).median())
+    if above < -_UPSIDE_DOWN_M:
+        raise WearcapError(
+            f"the head is {-above:.2f} m below the feet",
+            where=about.name,
+            expected="a world whose z is up",
+            fix="The source's axes are others than published.",
+        )
     recording = mocap_recording(motion, about, settings)
     assert recording.motion is not None
     notes = "; ".join(text for text in (cut, note) if text)
     provenance = recording.motion.provenance | ({NOTE: notes} if notes else {})
-    path = _on_clock(kept.path, motion, recording.motion)
+    after = recording.motion  # the object's path goes to its clock, with the same shift by the floor's height
+    track = resample(kept.path, motion.timestamps[0] + after.timestamps)
+    shift = after.t_world_root[0] - motion.t_world_root[0]
+    path = Trajectory(after.timestamps, track.R_world_body, track.t_world_body + shift)
     item = SceneObject(take.object_name, kind, take.mesh, path.R_world_body[0], path.t_world_body[0], Freedom("free"))
     file = Path("scenes") / about.name / FILE_NAME
     write_environment(Environment((item,)), Path(output) / file)
@@ -63,38 +95,6 @@ def one_object_recording(take: OneObject, about: About, settings: MocapSettings,
         shape=take.shape,
         location=take.location,
     )
-
-
-def longest_stretch(take: OneObject) -> tuple[OneObject, str]:
-    """The longest part of a take without gaps beyond `MAX_GAP_S`, and a note about the cut ("" if there was none)."""
-    gaps = (take.motion.timestamps.diff() > MAX_GAP_S).nonzero()[:, 0].tolist()
-    if not gaps:
-        return take, ""
-    edges = [0, *(frame + 1 for frame in gaps), len(take.motion)]
-    start, stop = max(pairwise(edges), key=lambda span: span[1] - span[0])
-    return take.frames(slice(start, stop)), (
-        f"kept frames {start} to {stop - 1} of {len(take.motion)}: {len(gaps)} gaps of more than {MAX_GAP_S} s"
-    )
-
-
-def on_level_ground(take: OneObject, limits: CleaningLimits) -> OneObject:
-    """The take on xsens23, rotated so that the ground below the planted feet is level; provenance notes the tilt.
-
-    Raises WearcapError for a ground tilted by more than `MAX_TILT_DEG`.
-    """
-    motion = on_xsens23(take.motion)
-    positions, speed = foot_patches(motion)
-    R = ground_rotation(positions[speed < limits.contact_speed])
-    tilt = float(torch.rad2deg(torch.arccos(R[2, 2].clamp(max=1.0))))
-    if tilt > MAX_TILT_DEG:
-        raise WearcapError(
-            f"the ground below the feet is tilted by {tilt:.0f}°",
-            where=take.name,
-            expected=f"at most {MAX_TILT_DEG:g}°",
-            fix="Check which of the source's axes is up.",
-        )
-    motion = replace(motion, provenance=motion.provenance | {"tilt_deg": f"{tilt:.2f}"})
-    return replace(take, motion=motion).turned(R)
 
 
 def ground_rotation(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "3 3"]:
@@ -124,20 +124,117 @@ def ground_rotation(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "3 
     return rotation.exp(axis / axis.norm().clamp(min=1e-12) * angle).to(points_world.dtype)
 
 
-def _on_clock(path: Trajectory, before: Motion, after: Motion) -> Trajectory:
-    """The object's path on the prepared motion's clock, with the same shift by the floor's height."""
-    moved = after.t_world_root[0] - before.t_world_root[0]
-    track = resample(path, before.timestamps[0] + after.timestamps)
-    return Trajectory(after.timestamps, track.R_world_body, track.t_world_body + moved)
+def _behave(root: Path, name: str, settings: MocapSettings, license: str, output: Path) -> Recording:
+    """Body and object on level ground at z = 0; the environment is written beside the recording.
 
-
-def _require_upright(motion: Motion, name: str) -> None:
-    feet = torch.stack([motion.joint(f"{side}_ankle").t[:, 2] for side in ("left", "right")]).mean(0)
-    above = float((motion.joint("head").t[:, 2] - feet).median())
-    if above < -_UPSIDE_DOWN_M:
+    The take is rotated so that the ground below the planted feet is level; provenance notes the tilt. Raises WearcapError
+    for a ground tilted by more than `MAX_TILT_DEG`.
+    """
+    take = read_behave(root, name)
+    motion = on_xsens23(take.motion)
+    positions, speed = foot_patches(motion)
+    R = ground_rotation(positions[speed < settings.limits.contact_speed])
+    tilt = float(torch.rad2deg(torch.arccos(R[2, 2].clamp(max=1.0))))
+    if tilt > MAX_TILT_DEG:
         raise WearcapError(
-            f"the head is {-above:.2f} m below the feet",
-            where=name,
-            expected="a world whose z is up",
-            fix="The source's axes are others than published.",
+            f"the ground below the feet is tilted by {tilt:.0f}°",
+            where=take.name,
+            expected=f"at most {MAX_TILT_DEG:g}°",
+            fix="Check which of the source's axes is up.",
+        )
+    motion = replace(motion, provenance=motion.provenance | {"tilt_deg": f"{tilt:.2f}"})
+    take = replace(take, motion=motion).turned(R)
+    about = About(name, take.subject, "BEHAVE", license, take.activity)
+    return _one_object(take, about, settings, output)
+
+
+def behave_tasks(
+    source: str | Path, output: str | Path, splits: Splits, settings: MocapSettings, license: str
+) -> list[Task]:
+    """One task per sequence of `source`; environments go to `output`/scenes. The split list's rows are sequences.
+
+    Raises WearcapError without sequences.
+    """
+    source = Path(source)
+    meshes = sorted(source.glob("objects/*/*_f*.ply"))
+    shared = content_hash(asdict(settings), license, VERSION, *meshes)
+    tasks, sequences = [], behave_folder(source)
+    for name in behave_names(source):
+        files = [sequences / name / file for file in (BODY_FILE, OBJECT_FILE, INFO_FILE)]
+        key = content_hash(name, shared, *(file for file in files if file.is_file()))
+        tasks.append(Task(name, partial(_behave, source, name, settings, license, Path(output)), splits.of(name), key))
+    return tasks
+
+
+def _omomo(
+    sequence: OmomoSequence, root: Path, source_fps: float | int, settings: MocapSettings, license: str, output: Path
+) -> Recording:
+    """Body and object with the floor at z = 0; the environment is written beside the recording."""
+    take = omomo_take(sequence, root, source_fps)
+    about = About(take.name, take.subject, "OMOMO", license, take.activity)
+    return _one_object(take, about, settings, output)
+
+
+def omomo_tasks(
+    source: str | Path,
+    output: str | Path,
+    splits: Splits,
+    settings: MocapSettings,
+    source_fps: float | int,
+    license: str,
+) -> list[Task]:
+    """One task per sequence of `source`'s files; environments go to `output`/scenes.
+
+    `source_fps` is the frame rate, which the files lack. Raises WearcapError without sequences, for a rate that is no
+    positive number, and for one at which the people would not move at human speeds.
+    """
+    source = Path(source)
+    if not 0 < source_fps < 1e4:
+        raise WearcapError(f"a frame rate of {source_fps} Hz", expected="source_fps=30 or another positive number")
+    sequences = read_omomo(source)
+    check_rate(sequences, source, source_fps)
+    shared = content_hash(asdict(settings), float(source_fps), license, VERSION)
+    meshes = {sequence.object_name: omomo_mesh_path(source, sequence.object_name) for sequence in sequences}
+    of_mesh = {name: content_hash(path) if path.is_file() else "" for name, path in meshes.items()}
+    tasks = []
+    for sequence in sequences:
+        arrays = hashlib.sha256()  # of this sequence alone, so that changes of others do not make it out of date
+        for name, array in sorted(sequence.arrays.items()):
+            arrays.update(f"{name} {array.dtype} {array.shape}".encode())
+            arrays.update(np.ascontiguousarray(array).tobytes())
+        key = content_hash(sequence.name, shared, of_mesh[sequence.object_name], arrays.hexdigest())
+        make = partial(_omomo, sequence, source, source_fps, settings, license, Path(output))
+        tasks.append(Task(sequence.name, make, splits.of(sequence.subject), key))
+    return tasks
+
+
+def check_rate(sequences: list[OmomoSequence], root: str | Path, fps: float | int) -> None:
+    """Raise WearcapError if, at this frame rate, people would run all the time or walk in slow motion.
+
+    The check uses medians over `LOOKED_AT` sequences of the speeds over ground of the pelvis (95th percentile) and of
+    the faster toes (99th); unreadable sequences are reported by their own tasks.
+    """
+    speeds = []
+    for index in sorted({int(k) for k in np.linspace(0, len(sequences) - 1, LOOKED_AT)}):
+        try:
+            motion = omomo_take(sequences[index], root, fps).motion
+        except WearcapError:
+            continue
+        if len(motion) > 2:
+            motion = on_xsens23(motion)
+            steps = motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1)
+            speed = torch.quantile(steps / motion.timestamps.diff().to(steps.dtype), 0.95)
+            toes = torch.quantile(foot_patches(motion)[1].amax(1), 0.99)
+            speeds.append((float(speed), float(toes), float(steps.sum())))
+    if not speeds:
+        return
+    pelvis, foot, walked = np.median(np.array(speeds), axis=0)
+    fast = pelvis > FAST_PELVIS or foot > FAST_FOOT
+    slow = walked > WALKED_M and pelvis < SLOW_PELVIS and foot < SLOW_FOOT
+    if fast or slow:
+        raise WearcapError(
+            f"at {fps:g} frames per second people walk at {pelvis:.2f} m/s and swing their feet at {foot:.2f} m/s",
+            where=root,
+            expected="some 1 and 3 m/s",
+            fix=f"The true rate is {'lower' if fast else 'higher'} (public loaders use 30 or 120): give it as source_fps=….",
         )

@@ -1,31 +1,89 @@
-"""The simulated wearer's recordings: nothing to download, the same bytes for the same seed."""
+"""The simulated wearers' recordings: nothing to download, the same bytes for the same seed.
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+One source per system's data: `simulated` (HMD², MocapEvery), `simulated_hps`, `simulated_interactions` (iReplica) and
+`simulated_objects` (ECHO). `cmu_surrounded` adds simulated surroundings to captured motion.
+"""
+
+import json
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
 
 import wearcap.sensors
 import wearcap.simulation
 from wearcap.errors import WearcapError
+from wearcap.files import write_text
+from wearcap.geometry import rotation
+from wearcap.io.formats.environment import FILE_NAME, write_environment
+from wearcap.io.formats.ply import Ply, write_ply
+from wearcap.io.formats.scene_folder import CLOUD
 from wearcap.prepare.engine import Task, content_hash
 from wearcap.prepare.splits import Splits
-from wearcap.recording.recording import Recording
-from wearcap.recording.store import SPLITS
+from wearcap.recording.recording import HeadStream, Recording
+from wearcap.recording.store import SPLITS, RecordingFile, RecordingStore
+from wearcap.sensors.slam import semidense_points
+from wearcap.simulation.places.changes import changed_world
+from wearcap.simulation.places.surround import surround
+from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
+from wearcap.simulation.recordings.hps_session import Protocol
+from wearcap.simulation.recordings.interaction_session import InteractionConfig, simulate_interactions
+from wearcap.simulation.recordings.object_session import ObjectConfig, simulate_objects
+from wearcap.simulation.recordings.scene_files import SceneSettings, write_scene
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
+from wearcap.simulation.rendering.ego_view import write_ego_video
+from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH
+from wearcap.simulation.rendering.head_video import Filming, write_head_video
+from wearcap.simulation.rendering.scan import scan_world
+from wearcap.simulation.rendering.views import Scenery
+
+MADE = "made.json"
+"""File in a scene's folder that holds the settings with which it was made."""
+TURNS, DOWN_DEG, VIEW_S = 12, (0.0, 38.0), 0.25
+"""Steps per turn, pitch of each turn (°), duration of a step (s) of the wearer's turns on the spot before the recording."""
 
 
-@dataclass(frozen=True)
-class Simulated:
-    """One recording by seed; picklable, callable as a task."""
+def source_files() -> str:
+    """Digest of the simulator's source code."""
+    folders = [Path(package.__file__ or "").parent for package in (wearcap.simulation, wearcap.sensors)]
+    return content_hash(*(path for folder in folders for path in sorted(folder.rglob("*.py"))))
 
-    config: SimulationConfig
-    name: str
-    split: str
-    seed: int
-    root: Path
 
-    def __call__(self) -> Recording:
-        return simulate_recording(self.config, self.name, self.split, self.seed, self.root)
+def _tasks(
+    prefix: str,
+    recordings: Mapping[str, int],
+    seed: int,
+    splits: Splits,
+    output: str,
+    make: Callable[[str, str, int, Path], Recording],
+    *settings: Any,
+) -> list[Task]:
+    """`recordings[split]` tasks of each split: `make` of (name, split, seed, output), hashed with settings and simulator.
+
+    Raises WearcapError for an unknown split, or when a simulated person's name belongs to another split's list.
+    """
+    if unknown := set(recordings) - set(SPLITS):
+        raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
+    for split in recordings:
+        if splits.of(f"sim-{split}-person-000") != split:
+            raise WearcapError(
+                f"people of the simulated {split} split are listed elsewhere",
+                where=splits.path,
+                expected=f"a line sim-{split}-*,{split}",
+            )
+    simulator, tasks = source_files(), []
+    for split, count in recordings.items():
+        for index in range(count):
+            name, number = f"{prefix}-{split}-{seed}-{index:04d}", seed * 1_000_000 + index
+            key = content_hash(*settings, number, split, simulator)
+            tasks.append(Task(name, partial(make, name, split, number, Path(output)), split, key))
+    return tasks
 
 
 def simulated_tasks(
@@ -58,31 +116,193 @@ def simulated_tasks(
     )
     if not config.duration_s > 0 or not config.fps > 0:
         raise WearcapError(f"recordings of {duration_s} s at {fps} Hz", expected="positive numbers")
-    checked_splits(recordings, splits)
-    simulator = source_files()
+    make = partial(simulate_recording, config)
+    return _tasks("sim", recordings, seed, splits, output, make, asdict(config))
+
+
+@dataclass(frozen=True)
+class Video:
+    """Settings of the head camera's rendered video."""
+
+    seconds: float | None
+    """Rendered duration (s) from the recording's start; 0: nothing, None: all of it."""
+    fps: float
+    changed: float
+    """Share of the movable objects that have been moved or removed since the scan when the video is filmed."""
+
+
+def _hps(
+    config: HpsConfig, scene: SceneSettings | None, video: Video, name: str, split: str, seed: int, root: Path
+) -> Recording:
+    """One session, the missing files of its scene, and its video; the camera's timestamps become those of the frames."""
+    simulated = simulate_hps(config, name, split, seed)
+    recording = simulated.recording
+    if scene is not None:
+        folder = Path("scenes") / recording.location
+        write_scene(Scenery.of(simulated.world), root / folder, scene, 0, turn=seed)
+        recording = replace(recording, scene=(folder / CLOUD).as_posix())
+    if video.seconds == 0:
+        return recording
+    rng = np.random.default_rng([21, seed])
+    share = video.changed
+    world = changed_world(simulated.world, rng, 0.7 * share, 0.3 * share) if share else simulated.world
+    camera, path = recording.camera, recording.object_motion[HEAD_CAMERA_TRUTH]
+    assert camera is not None
+    times = camera.timestamps[:: max(1, round(config.camera_fps / video.fps))]
+    stop = np.inf if video.seconds is None else camera.timestamps[0].item() + video.seconds
+    times = times[times < stop]
+    claps = [simulated.to_camera(clap) for clap in simulated.session.claps_s]
+    file = Path("videos") / f"{name}.mp4"
+    write_head_video(root / file, Scenery.of(world), camera.camera, path, times, Filming(), rng, claps)
+    return replace(recording, camera=replace(camera, timestamps=times, video=file.as_posix()))
+
+
+def simulated_hps_tasks(
+    splits: Splits,
+    output: str,
+    recordings: dict[str, int],
+    fps: float | int,
+    camera_fps: float | int,
+    returns_m: list[float],
+    end_m: float | int,
+    spacing_m: float | None,
+    photo_m: float | int,
+    video_s: float | None,
+    video_fps: float | int,
+    changed: float | int,
+    seed: int,
+) -> list[Task]:
+    """`recordings[split]` sessions each; people and sites of the splits never meet, and a split's sites are few.
+
+    Scenes go to `output`/scenes: points `spacing_m` apart (None: no scene at all), photo stations `photo_m` apart
+    (0: no photos). The first `video_s` (None: all) of each head camera are filmed at `video_fps`. Raises WearcapError
+    as `simulated_tasks` does, and for distances that do not rise.
+    """
+    distances = [0.0, *map(float, returns_m), float(end_m)]
+    if any(b <= a for a, b in pairwise(distances)):
+        raise WearcapError(f"returns at {returns_m} m, end at {end_m} m", expected="distances that rise")
+    protocol = Protocol(returns_m=tuple(distances[1:-1]), end_m=distances[-1])
+    config = HpsConfig(fps=float(fps), camera_fps=float(camera_fps), protocol=protocol)
+    scene = None if spacing_m is None else SceneSettings(spacing_m=float(spacing_m), photo_m=float(photo_m))
+    video = Video(None if video_s is None else float(video_s), float(video_fps), float(changed))
+    made = [asdict(part) if part else None for part in (config, scene, video)]
+    return _tasks("hps", recordings, seed, splits, output, partial(_hps, config, scene, video), *made)
+
+
+def _in_flat(
+    simulate: Callable[..., Any],
+    config: InteractionConfig | ObjectConfig,
+    spacing_m: float | None,
+    simulator: str,
+    name: str,
+    split: str,
+    seed: int,
+    root: Path,
+) -> Recording:
+    """One session in a flat; its environment and, with `spacing_m`, its scan with everything at its initial pose are written.
+
+    Files that were made with the same settings by the same simulator are left as they are.
+    """
+    simulated = simulate(config, name, split, seed)
+    place = Path("scenes") / simulated.recording.location
+    folder, note = root / place, root / place / MADE
+    wanted = json.dumps(({} if spacing_m is None else {"spacing_m": spacing_m}) | {"simulator": simulator})
+    files = [FILE_NAME] if spacing_m is None else [CLOUD, FILE_NAME]
+    current = note.is_file() and note.read_text(encoding="utf-8") == wanted
+    if not current or not all((folder / file).is_file() for file in files):
+        if spacing_m is not None:
+            scenery, rng = Scenery.of(simulated.world), np.random.default_rng(12)
+            scan = scan_world(scenery, spacing_m, rng, walked=simulated.static)
+            write_ply(Ply(scan.points, scan.colors), folder / CLOUD)
+        write_environment(simulated.environment, folder / FILE_NAME)
+        write_text(note, wanted)
+    scene = {} if spacing_m is None else {"scene": (place / CLOUD).as_posix()}
+    return replace(simulated.recording, environment=(place / FILE_NAME).as_posix(), **scene)
+
+
+def simulated_interactions_tasks(
+    splits: Splits,
+    output: str,
+    recordings: dict[str, int],
+    minutes: float | int,
+    fps: float | int,
+    camera_fps: float | int,
+    spacing_m: float | int,
+    seed: int,
+) -> list[Task]:
+    """`recordings[split]` recordings of some minutes each; people and flats of the splits never meet.
+
+    Scenes go to `output`/scenes, with points `spacing_m` apart. Raises WearcapError as `simulated_tasks` does.
+    """
+    if not spacing_m > 0:
+        raise WearcapError(f"points {spacing_m} m apart", expected="a positive spacing")
+    config = InteractionConfig(fps=float(fps), camera_fps=float(camera_fps), minutes=float(minutes))
+    make = partial(_in_flat, simulate_interactions, config, float(spacing_m), source_files())
+    return _tasks("interactions", recordings, seed, splits, output, make, asdict(config), float(spacing_m))
+
+
+def simulated_objects_tasks(
+    splits: Splits, output: str, recordings: dict[str, int], minutes: float | int, fps: float | int, seed: int
+) -> list[Task]:
+    """`recordings[split]` recordings of some minutes each; people and flats of the splits never meet.
+
+    Environments go to `output`/scenes. Raises WearcapError as `simulated_tasks` does.
+    """
+    config = ObjectConfig(fps=float(fps), minutes=float(minutes))
+    make = partial(_in_flat, simulate_objects, config, None, source_files())
+    return _tasks("objects", recordings, seed, splits, output, make, asdict(config))
+
+
+def _surrounded(file: Path, name: str, root: Path, camera: bool, look_round: bool, seed: int) -> Recording:
+    """One recording in its simulated surroundings, with semi-dense points along the head's path and, with `camera`, a video.
+
+    With `look_round`, points that the wearer sees from the start of the path are available from its first frame.
+    """
+    recording = RecordingFile(file).load()
+    motion, head = recording.motion, recording.head
+    if motion is None or head is None:
+        raise WearcapError("no motion or no head path", where=file, expected="motion capture with both")
+    key = [seed, zlib.crc32(name.encode())]
+    of_world, of_points, of_camera = (np.random.default_rng([number, *key]) for number in (31, 32, 33))
+    world = surround(motion, of_world, f"cmu-room-{name}")
+    points = semidense_points(world.mesh, world.face_texture, _turned_round(head) if look_round else head, of_points)
+    assert points.first_seen is not None
+    points = replace(points, first_seen=points.first_seen.clamp(min=head.timestamps[0].item()))
+    recording = replace(recording, points=points, location=world.name)
+    if not camera:
+        return recording
+    video = root / "videos" / f"{name}.mp4"
+    stream = write_ego_video(video, world, motion, recording.shape, head.t_head_device, of_camera)
+    return replace(recording, camera=stream)
+
+
+def _turned_round(head: HeadStream) -> HeadStream:
+    """The path preceded by two turns on the spot, one level and one looking down."""
+    ahead = head.R_world_device[0, :, 0]
+    yaw = torch.atan2(ahead[1], ahead[0]) + torch.arange(TURNS) * (2 * torch.pi / TURNS)
+    down = torch.tensor(DOWN_DEG).deg2rad().to(yaw.dtype)
+    R = (rotation.about_axis("z", yaw)[None] @ rotation.about_axis("y", down)[:, None]).flatten(0, 1)
+    before = head.timestamps[0] - VIEW_S * torch.arange(len(R), 0, -1, dtype=torch.float64)
+    return replace(
+        head,
+        timestamps=torch.cat([before, head.timestamps]),
+        R_world_device=torch.cat([R.to(head.R_world_device.dtype), head.R_world_device]),
+        t_world_device=torch.cat([head.t_world_device[:1].expand(len(R), 3), head.t_world_device]),
+    )
+
+
+def cmu_surrounded_tasks(
+    source: str | Path, output: str | Path, splits: Splits, camera: bool, look_round: bool, seed: int
+) -> list[Task]:
+    """One task per recording of the data set `source`, which `wearcap prepare cmu` made (floors at z = 0).
+
+    Videos of the head camera go to `output`/videos. The hash covers the recording and the simulator's own source.
+    """
+    store, simulator = RecordingStore.open(source), source_files()
     tasks = []
-    for split, count in recordings.items():
-        for index in range(count):
-            name = f"sim-{split}-{seed}-{index:04d}"
-            make = Simulated(config, name, split, seed * 1_000_000 + index, Path(output))
-            tasks.append(Task(name, make, split, content_hash(asdict(config), make.seed, split, simulator)))
+    for name in store.names():
+        entry = store.entries[name]
+        make = partial(_surrounded, store.root / entry.file, name, Path(output), camera, look_round, seed)
+        key = content_hash(entry.sha256, camera, look_round, seed, simulator)
+        tasks.append(Task(name, make, splits.of(entry.subject), key))
     return tasks
-
-
-def checked_splits(recordings: Mapping[str, int], splits: Splits) -> None:
-    """Raises WearcapError for an unknown split, or when a simulated person's name belongs to another split's list."""
-    if unknown := set(recordings) - set(SPLITS):
-        raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
-    for split in recordings:
-        if splits.of(f"sim-{split}-person-000") != split:
-            raise WearcapError(
-                f"people of the simulated {split} split are listed elsewhere",
-                where=splits.path,
-                expected=f"a line sim-{split}-*,{split}",
-            )
-
-
-def source_files() -> str:
-    """Digest of the simulator's source code."""
-    folders = [Path(package.__file__ or "").parent for package in (wearcap.simulation, wearcap.sensors)]
-    return content_hash(*(path for folder in folders for path in sorted(folder.glob("*.py"))))

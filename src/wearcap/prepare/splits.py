@@ -24,7 +24,10 @@ class Splits:
         """Split of a subject. Raises WearcapError when no row matches."""
         for pattern, split in self.rows:
             if fnmatchcase(subject, pattern):
-                return _by_hash(subject) if split == BY_HASH else split
+                if split != BY_HASH:
+                    return split
+                share = int.from_bytes(hashlib.sha256(subject.encode()).digest()[:4], "big") / 2**32
+                return "val" if share < 0.05 else "test" if share < 0.20 else "train"
         raise WearcapError(
             f"subject {subject!r} is in no split",
             where=self.path,
@@ -51,8 +54,3 @@ def read_splits(path: str | Path) -> Splits:
                 f"no split {row['split']!r}", where=path, expected=f"one of {', '.join((*SPLITS, BY_HASH))}"
             )
     return Splits(path, tuple((row["subject"], row["split"]) for row in table))
-
-
-def _by_hash(subject: str) -> str:
-    share = int.from_bytes(hashlib.sha256(subject.encode()).digest()[:4], "big") / 2**32
-    return "val" if share < 0.05 else "test" if share < 0.20 else "train"

@@ -1,7 +1,7 @@
 """Visualisation: the 3D page in the browser, pictures and videos without a screen, annotator and object editor.
 
-Open `page.py` first (`wearcap view`): it stacks `page_layers.py` and `page_motions.py` on one clock. `picture.py` and
-`video.py` draw without a browser (`wearcap render`); `annotate*.py` serve the page on which contacts are marked
+Open `page.py` first (`wearcap view`): it shows the layers of `page_layers.py` and `objects.py` on one clock. `picture.py`
+draws without a browser (`wearcap render`); `annotate*.py` serve the page on which contacts are marked
 (`wearcap annotate`, `annotator/`), `object_editor*.py` the one on which objects are cut out of a scan (`wearcap scene
-edit`).
+edit`). `guard.py` admits a page's own requests only.
 """

@@ -1,7 +1,7 @@
 """A recording as shown in the annotator (thesis §5.4.1): points of the body over time, a video, objects, labels."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -12,7 +12,8 @@ from jaxtyping import Float32, Float64
 
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
-from wearcap.io.formats.contact_labels import LabelClock
+from wearcap.files import write_text
+from wearcap.io.formats.contact_labels import LabelClock, annotation_of, hcontact_text
 from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.video import video_info
 from wearcap.recording.interactions import HANDS
@@ -20,7 +21,7 @@ from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingStore
-from wearcap.viewer.annotation_file import AnnotationFile, label_path
+from wearcap.viewer.annotation_file import AnnotationFile, label_path, starting_labels
 
 _DRAWN_SITES = ("heel", "toe_tip", "fingertip")
 _NOSE = torch.tensor([0.13, 0.0, 0.09])
@@ -34,6 +35,16 @@ class Video:
     path: Path
     times: Float64[np.ndarray, "point 2"]
     """Rising pairs of recording time and video time (s), interpolated linearly."""
+
+    @classmethod
+    def starting(cls, path: Path, start_s: float) -> "Video":
+        """A video whose first picture was taken at `start_s` of the recording, on the same clock from there on.
+
+        Raises WearcapError when it is missing or damaged.
+        """
+        info = video_info(path)
+        length = max(info.frames, 1) / info.fps
+        return cls(path, np.array([[start_s, 0.0], [start_s + length, length]]))
 
 
 @dataclass(frozen=True)
@@ -53,6 +64,45 @@ class Take:
     video: Video | None = None
     notice: str = ""
     """Notice for the annotator, such as a missing video."""
+
+    @classmethod
+    def of(cls, recording: Recording, folder: Path, motion: Motion | None = None, video: Video | None = None) -> "Take":
+        """Data of a recording with its true motion, else the suit's, and its camera's video; `motion` and `video` replace these.
+
+        `folder` is the data set's. Raises WearcapError without a motion, or for a body without hands.
+        """
+        shown = motion or recording.motion or recording.suit
+        if shown is None:
+            raise WearcapError(
+                f"recording {recording.name!r} has no motion",
+                expected="one to look at",
+                fix="Give a captured one with --motion.",
+            )
+        clock = LabelClock.of(recording.name, shown.timestamps)
+        names, points, bones = _drawn(shown)
+        notice = ""
+        if video is None and recording.camera is not None and recording.camera.video:
+            path = folder / recording.camera.video
+            if path.is_file():
+                stamps = recording.camera.timestamps.numpy()
+                video = Video(path, np.stack([stamps, np.arange(len(stamps)) / video_info(path).fps], 1))
+            else:
+                notice = f"The video {path} is not there: give it with --video."
+        return cls(
+            clock,
+            shown.timestamps.numpy(),
+            points,
+            _floor(recording, shown, points),
+            names,
+            bones,
+            tuple(  # the palm, else the wrist
+                names.index(f"{hand}_palm") if f"{hand}_palm" in names else shown.skeleton.index(f"{hand}_wrist")
+                for hand in HANDS
+            ),
+            _objects(recording, folder),
+            video,
+            notice,
+        )
 
     def header(self) -> dict:
         """All data except the numbers per frame, for JSON."""
@@ -76,52 +126,6 @@ class Take:
         return b"".join(np.ascontiguousarray(array, dtype).tobytes() for array, dtype in parts)
 
 
-def take_of(recording: Recording, folder: Path, motion: Motion | None = None, video: Video | None = None) -> Take:
-    """Data of a recording with its true motion, else the suit's, and its camera's video; `motion` and `video` replace these.
-
-    `folder` is the data set's. Raises WearcapError without a motion, or for a body without hands.
-    """
-    shown = motion or recording.motion or recording.suit
-    if shown is None:
-        raise WearcapError(
-            f"recording {recording.name!r} has no motion",
-            expected="one to look at",
-            fix="Give a captured one with --motion.",
-        )
-    clock = LabelClock.of(recording.name, shown.timestamps)
-    names, points, bones = _drawn(shown)
-    notice = ""
-    if video is None and recording.camera is not None and recording.camera.video:
-        path = folder / recording.camera.video
-        if path.is_file():
-            stamps = recording.camera.timestamps.numpy()
-            video = Video(path, np.stack([stamps, np.arange(len(stamps)) / video_info(path).fps], 1))
-        else:
-            notice = f"The video {path} is not there: give it with --video."
-    return Take(
-        clock,
-        shown.timestamps.numpy(),
-        points,
-        _floor(recording, shown, points),
-        names,
-        bones,
-        _hands(shown, names),
-        _objects(recording, folder),
-        video,
-        notice,
-    )
-
-
-def video_from(path: str | Path, start_s: float) -> Video:
-    """A video whose first picture was taken at `start_s` of the recording, on the same clock from there on.
-
-    Raises WearcapError when it is missing or damaged.
-    """
-    info = video_info(path)
-    length = max(info.frames, 1) / info.fps
-    return Video(Path(path), np.array([[start_s, 0.0], [start_s + length, length]]))
-
-
 def _drawn(motion: Motion) -> tuple[tuple[str, ...], Float32[np.ndarray, "time point 3"], tuple]:
     """Joints, and hands, feet and face if the skeleton has them: names, positions, and pairs to connect."""
     skeleton, T = motion.skeleton, motion.T_world_joint
@@ -138,14 +142,6 @@ def _drawn(motion: Motion) -> tuple[tuple[str, ...], Float32[np.ndarray, "time p
         names.append("nose")
         bones.append((head, len(names) - 1))
     return tuple(names), torch.cat(parts, 1).float().numpy(), tuple(bones)
-
-
-def _hands(motion: Motion, names: tuple[str, ...]) -> tuple[int, ...]:
-    """The point that stands for each hand: the palm, else the wrist."""
-    return tuple(
-        names.index(f"{hand}_palm") if f"{hand}_palm" in names else motion.skeleton.index(f"{hand}_wrist")
-        for hand in HANDS
-    )
 
 
 def _floor(recording: Recording, motion: Motion, points: np.ndarray) -> Float32[np.ndarray, "time"]:
@@ -175,53 +171,40 @@ class Desk:
 
     def __init__(
         self,
-        names: tuple[str, ...],
-        recording: Callable[[int], Recording],
-        open_take: Callable[[int], Take],
-        output: Path,
-    ):
-        self.names, self.recording, self.output = names, recording, output
-        self._files: dict[int, AnnotationFile] = {}
-        self._lock = threading.Lock()
-        self.take = lru_cache(maxsize=2)(open_take)
-
-    @classmethod
-    def of(
-        cls,
         where: str | Path,
         output: Path | None = None,
         motion: Motion | None = None,
         video: Path | None = None,
         video_start_s: float | None = None,
-    ) -> "Desk":
+    ):
         """A recording, or all of a data set's; labels go to `output` or outputs/annotate/<data set>.
 
         A motion and a video require a single recording. Raises WearcapError if there is nothing to annotate.
         """
-        folder = dataset_folder(where)
+        self.where, folder = where, dataset_folder(where)
         places: list[str | Path] = [where]
         if (Path(where) / "manifest.json").is_file():
             places = [Path(where) / name for name in RecordingStore.open(where).names()]
         if not places:
             raise WearcapError("a data set without recordings", where=where, fix="Prepare some first.")
         if len(places) > 1 and (motion is not None or video is not None):
-            raise WearcapError(
-                "a motion or a video for several recordings",
-                where=where,
-                expected=f"one recording, such as {places[0]}",
-            )
-        recordings = lru_cache(maxsize=2)(lambda index: load_recording(places[index]))
+            expected = f"one recording, such as {places[0]}"
+            raise WearcapError("a motion or a video for several recordings", where=where, expected=expected)
 
         def open_take(index: int) -> Take:
-            recording = recordings(index)
+            recording = self.recording(index)
             shown = motion or recording.motion or recording.suit
             start = video_start_s if video_start_s is not None else float(shown.timestamps[0]) if shown else 0.0
-            return take_of(recording, folder, motion, video_from(video, start) if video else None)
+            return Take.of(recording, folder, motion, Video.starting(video, start) if video else None)
 
-        names = tuple(Path(place).name for place in places)
+        self.recording = lru_cache(maxsize=2)(lambda index: load_recording(places[index]))
+        self.take = lru_cache(maxsize=2)(open_take)
+        self.names = tuple(Path(place).name for place in places)
         if len(places) == 1:
-            names = (recordings(0).name,)
-        return cls(names, recordings, open_take, output or Path("outputs") / "annotate" / folder.resolve().name)
+            self.names = (self.recording(0).name,)
+        self.output = output or Path("outputs") / "annotate" / folder.resolve().name
+        self._files: dict[int, AnnotationFile] = {}
+        self._lock = threading.Lock()
 
     def path(self, name: str) -> Path:
         """Path of the labels of a recording of that name, which need not exist yet."""
@@ -233,3 +216,39 @@ class Desk:
             if index not in self._files:
                 self._files[index] = AnnotationFile(self.output, self.take(index).clock)
             return self._files[index]
+
+    def start_from(self, source: str) -> None:
+        """Write labels to start from (see `starting_labels`). Raises WearcapError where there are labels already."""
+        if len(self.names) > 1 and source != "recording":
+            raise WearcapError(f"labels from {source} for {len(self.names)} recordings", expected="one recording")
+        for index in range(len(self.names)):
+            file = self.file(index)
+            if file.path.exists():
+                raise WearcapError(
+                    "there are labels already, which are never replaced",
+                    where=file.path,
+                    fix="Leave out --from to go on with them, or give another --output.",
+                )
+            labels = starting_labels(source, self.recording(index), file.clock)
+            file.save(annotation_of(labels, file.clock), "")
+
+    def export(self, to: Path | None) -> Iterator[tuple[Path, int, int]]:
+        """Write the labels as H-contact's JSON, to a file, or to NAME.json in a folder (None: the current one).
+
+        Yields the files with their numbers of contacts of the left and of the right hand. Raises WearcapError without
+        labels, and if a file would replace the labels it comes from.
+        """
+        annotated = [index for index, name in enumerate(self.names) if self.path(name).is_file()]
+        if not annotated:
+            expected = self.path(self.names[0]).name
+            fix = f"Make them with `wearcap annotate {self.where}`."
+            raise WearcapError("no labels to export", where=self.output, expected=expected, fix=fix)
+        for index in annotated:
+            file, target = self.file(index), Path(f"{self.names[index]}.json")
+            labels, _ = file.read()
+            if to is not None:
+                target = to / target if len(self.names) > 1 or to.is_dir() else to
+            if target.resolve() == file.path.resolve():
+                raise WearcapError("the export would replace the labels it comes from", where=target)
+            write_text(target, hcontact_text(labels, file.clock))
+            yield target, len(labels["left"]), len(labels["right"])

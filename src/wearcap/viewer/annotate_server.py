@@ -51,27 +51,33 @@ _PORTS_TRIED = 50
 _GONE = (ConnectionError, TimeoutError)
 
 
-class AnnotationServer:
+class AnnotationServer(ThreadingHTTPServer):
     """Serves a desk until stopped; `port` is the first free one from the requested one on."""
+
+    daemon_threads = True
+    request_queue_size = 128  # queued requests of a burst are served in turn, instead of being retried after a second
+    allow_reuse_address = os.name == "posix"
 
     def __init__(self, desk: Desk, port: int = 8090):
         """Raises WearcapError when no port is free."""
-        self.guard = Guard("127.0.0.1")
+        self.desk, self.guard, self.stopped = desk, Guard("127.0.0.1"), False
+        self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        self._idle: dict[socket.socket, None] = {}
+        self._idle_lock = threading.Lock()
         for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
             try:
-                self._server = _Server((self.guard.host, candidate), _Handler)
+                super().__init__((self.guard.host, candidate), _Handler)
                 break
             except OSError:
                 continue
         else:
             raise WearcapError(f"no free port from {port} on", fix="Give another one with --port.")
-        self._server.desk, self._server.guard = desk, self.guard
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread = threading.Thread(target=self.serve_forever, daemon=True)
         self._thread.start()
 
     @property
     def port(self) -> int:
-        return self._server.server_port
+        return self.server_port
 
     @property
     def url(self) -> str:
@@ -85,30 +91,23 @@ class AnnotationServer:
 
     def stop(self) -> None:
         """Stop serving, on open connections too."""
-        self._server.stopped = True
-        self._server.shutdown()
-        self._server.server_close()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    request_queue_size = 128  # queued requests of a burst are served in turn, instead of being retried after a second
-    allow_reuse_address = os.name == "posix"
-    desk: Desk
-    guard: Guard
-    stopped = False
-
-    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]):
-        super().__init__(address, handler)
-        self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
-        self._idle: dict[socket.socket, None] = {}
-        self._idle_lock = threading.Lock()
+        self.stopped = True
+        self.shutdown()
+        self.server_close()
 
     def process_request(self, request: Any, client_address) -> None:
         """Answer a connection in its own thread; if there are too many, close the one that has been idle longest."""
-        if not self._free.acquire(blocking=False) and not (
-            self._close_longest_idle() and self._free.acquire(timeout=_CLOSE_S)
-        ):
+        free = self._free.acquire(blocking=False)
+        if not free:
+            with self._idle_lock:
+                idle = next(iter(self._idle), None)
+                if idle is not None:
+                    del self._idle[idle]
+            if idle is not None:
+                with contextlib.suppress(OSError):  # its thread wakes up and ends
+                    idle.shutdown(socket.SHUT_RDWR)
+                free = self._free.acquire(timeout=_CLOSE_S)
+        if not free:
             with contextlib.suppress(OSError):
                 request.sendall(b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
             return self.shutdown_request(request)
@@ -135,16 +134,6 @@ class _Server(ThreadingHTTPServer):
         with self._idle_lock:
             return self._idle.pop(connection, False) is None
 
-    def _close_longest_idle(self) -> bool:
-        with self._idle_lock:
-            connection = next(iter(self._idle), None)
-            if connection is None:
-                return False
-            del self._idle[connection]
-        with contextlib.suppress(OSError):  # its thread wakes up and ends
-            connection.shutdown(socket.SHUT_RDWR)
-        return True
-
     def _release(self, connection: socket.socket) -> None:
         self.end_idle(connection)
         self._free.release()
@@ -157,7 +146,7 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    server: _Server  # pyright: ignore[reportIncompatibleVariableOverride]
+    server: AnnotationServer  # pyright: ignore[reportIncompatibleVariableOverride]
     timeout = IDLE_S
 
     def log_message(self, format: str, *args) -> None:
@@ -168,11 +157,10 @@ class _Handler(BaseHTTPRequestHandler):
         self.server.begin_idle(self.connection)
         super().handle_one_request()
 
-    def do_HEAD(self) -> None:
-        self._answer(self._get)
-
     def do_GET(self) -> None:
         self._answer(self._get)
+
+    do_HEAD = do_GET
 
     def do_POST(self) -> None:
         self._answer(self._post)
@@ -206,7 +194,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _get(self, path: str) -> None:
         if path == "/recordings":
-            return self._send_json(self._listing())
+            desk = self.server.desk
+            return self._send_json([{"name": name, "annotated": desk.path(name).is_file()} for name in desk.names])
         if match := re.fullmatch(r"/recordings/(\d{1,6})(?:/(\w+))?", path):
             return self._get_recording(int(match[1]), match[2] or "")
         file = PAGE / (path[1:] or "index.html")
@@ -232,10 +221,6 @@ class _Handler(BaseHTTPRequestHandler):
         if part == "video" and take.video is not None:
             return self._send_video(take.video.path)
         return self._send_error(HTTPStatus.NOT_FOUND, f"recording {index} has no {part}")
-
-    def _listing(self) -> list[dict]:
-        desk = self.server.desk
-        return [{"name": name, "annotated": desk.path(name).is_file()} for name in desk.names]
 
     def _post(self, path: str) -> None:
         match = re.fullmatch(r"/recordings/(\d{1,6})/labels", path)

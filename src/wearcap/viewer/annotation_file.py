@@ -1,4 +1,4 @@
-"""One recording's labels on disk: written atomically, never over other content, with backups of earlier states."""
+"""One recording's labels on disk: written atomically, never over other content, with backups; and labels to start from."""
 
 import hashlib
 import json
@@ -6,10 +6,17 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
-from wearcap.io.formats.contact_labels import LabelClock, Labels, annotation_of, parse_labels
+from wearcap.io.formats.contact_labels import LabelClock, Labels, annotation_of, labels_of, parse_labels
 from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.motion_npz import read_motion
+from wearcap.recording.interactions import HANDS, Interactions
+from wearcap.recording.motion import Motion
+from wearcap.recording.recording import Recording
+from wearcap.systems.ireplica.contact_intervals import ContactSettings, active, contact_intervals
 
 
 def label_path(output: str | Path, name: str) -> Path:
@@ -61,7 +68,10 @@ class AnnotationFile:
                     expected="the state that this page loaded or saved last",
                 )
             if there and there not in self._ours:
-                self._back_up(there)
+                copy = self.path.parent / "backups" / f"{self.clock.name}.{there}.contacts.json"
+                if not copy.exists():
+                    with atomic_path(copy) as temporary:
+                        temporary.write_bytes(self.path.read_bytes())
             write_text(self.path, text)
             self._writer = (client, new)
             self._ours.add(new)
@@ -73,12 +83,54 @@ class AnnotationFile:
         except FileNotFoundError:
             return ""
 
-    def _back_up(self, revision: str) -> None:
-        copy = self.path.parent / "backups" / f"{self.clock.name}.{revision}.contacts.json"
-        if not copy.exists():
-            with atomic_path(copy) as temporary:
-                temporary.write_bytes(self.path.read_bytes())
-
 
 def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
+
+
+def starting_labels(source: str | Path, recording: Recording, clock: LabelClock) -> Labels:
+    """Labels of a label file (.json), of a captured motion (.npz), or for "recording" the recording's own.
+
+    Raises WearcapError if the source has no contacts, or impossible ones.
+    """
+    if str(source) == "recording":
+        if recording.interactions is None:
+            raise WearcapError(
+                "no interactions to start from",
+                where=recording.name,
+                expected="a recording that has them",
+                fix="Start from a label file (.json), from a captured motion (.npz), or from nothing.",
+            )
+        return labels_of(recording.interactions, clock)
+    if Path(source).suffix == ".json":
+        return parse_labels(read_json(source), clock, where=source)
+    motion = read_motion(source)
+    found = motion.interactions or _predicted(motion)
+    if found is None:
+        raise WearcapError(
+            "a motion without contacts of the hands",
+            where=source,
+            expected="one that a pipeline with a contact network captured",
+        )
+    return labels_of(found, clock)
+
+
+def _predicted(motion: Motion) -> Interactions | None:
+    """Contacts of each hand by itself, from probabilities with short gaps filled."""
+    prob = motion.hand_contact_prob
+    if prob is None:
+        return None
+    if prob.shape != (len(motion), len(HANDS)):
+        raise WearcapError(f"hand contacts of shape {tuple(prob.shape)}", expected=f"({len(motion)}, {len(HANDS)})")
+    contact = active(prob, motion.timestamps, ContactSettings())
+    # Start times of frames, and the end of the last.
+    edges = torch.cat([motion.timestamps, motion.timestamps[-1:] + motion.timestamps.diff().median()])
+    spans, hands = [], []
+    for hand in range(len(HANDS)):
+        alone = contact & (torch.arange(len(HANDS)) == hand)
+        for held in contact_intervals(alone):
+            spans.append((edges[held.start].item(), edges[held.stop].item()))
+            hands.append(held.hands)
+    table = torch.tensor(spans, dtype=torch.float64).reshape(-1, 2)
+    which = torch.tensor(hands, dtype=torch.bool).reshape(-1, len(HANDS))
+    return Interactions(table[:, 0], table[:, 1], which, ("",) * len(spans), ("",) * len(spans))

@@ -24,7 +24,7 @@ _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?")
 
 
 @runtime_checkable
-class Headers(Protocol):
+class _Headers(Protocol):
     """Headers of a request, the common interface of `http.server` and `websockets`."""
 
     def get_all(self, name: str, /) -> list[str] | None: ...
@@ -48,11 +48,15 @@ class Guard:
             name = "::1" if name == "::" else "127.0.0.1"
         return f"http://{f'[{name}]' if ':' in name else name}:{port}/?token={self.token}"
 
-    def admit(self, target: str, headers: Headers) -> dict[str, str]:
+    def admit(self, target: str, headers: _Headers) -> dict[str, str]:
         """Headers to send with the answer to a request for `target`. Raises Refused where it must not be answered."""
         host = _single(headers, "Host") or ""
         match = _HOST.fullmatch(host)
-        if match is None or not self._is_ours(_plain(match[1])):
+        name = "" if match is None else _plain(match[1])
+        ours = name in LOOPBACK or name == _plain(self.host)
+        # A foreign name cannot be an IP address, so any IP address may be right.
+        ours = ours or (self._everywhere and (_address(name) is not None or name == socket.gethostname().lower()))
+        if match is None or not ours:
             raise Refused(f"this page has another address than {host[:80]!a}: open the one that was printed")
         origin = _single(headers, "Origin")
         if origin is not None and origin.lower() not in (f"http://{host}".lower(), f"https://{host}".lower()):
@@ -60,7 +64,8 @@ class Guard:
         cookie = f"wearcap_token_{match[2] or 80}"  # cookies ignore ports, and several pages may be open
         if self._is_token(parse_qs(target.partition("?")[2]).get("token", [])):
             return HEADERS | {"Set-Cookie": f"{cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"}
-        if self._is_token(_cookies(headers, cookie)):
+        pairs = [pair.partition("=") for line in headers.get_all("Cookie") or [] for pair in line.split(";")]
+        if self._is_token([value.strip() for key, _, value in pairs if key.strip() == cookie]):
             return HEADERS
         raise Refused("the token is missing or of an earlier start: open the whole address that was printed")
 
@@ -70,28 +75,17 @@ class Guard:
         address = _address(_plain(self.host))
         return self.host == "" or (address is not None and address.is_unspecified)
 
-    def _is_ours(self, name: str) -> bool:
-        """Whether a name is one of the page's. A foreign name cannot be an IP address, so any IP address may be right."""
-        if name in LOOPBACK or name == _plain(self.host):
-            return True
-        return self._everywhere and (_address(name) is not None or name == socket.gethostname().lower())
-
     def _is_token(self, given: list[str]) -> bool:
         wanted = self.token.encode()
         return any(secrets.compare_digest(each.encode(errors="replace"), wanted) for each in given)
 
 
-def _single(headers: Headers, name: str) -> str | None:
+def _single(headers: _Headers, name: str) -> str | None:
     """A header's value. Raises Refused if there are two, of which different readers may take different ones."""
     values = headers.get_all(name) or []
     if len(values) > 1:
         raise Refused(f"{len(values)} headers {name}")
     return values[0] if values else None
-
-
-def _cookies(headers: Headers, name: str) -> list[str]:
-    pairs = (pair.partition("=") for line in headers.get_all("Cookie") or [] for pair in line.split(";"))
-    return [value.strip() for key, _, value in pairs if key.strip() == name]
 
 
 def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

@@ -16,16 +16,16 @@ from jaxtyping import Float
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.io.formats.environment import MAX_HINGE_GAP_M, read_environment, write_environment
 from wearcap.scene.editing import ObjectEditing, points_world
 from wearcap.scene.environment import hinge_gap_m
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.scene.placing import hinge_places, snapped
 from wearcap.scene.scan import Scan
-from wearcap.viewer.guard import Guard
 from wearcap.viewer.object_editor_panels import HINTS, TOOLS, ObjectPanel, SelectPanel
-from wearcap.viewer.object_editor_view import EditorView, axis_toward, pose_of, ray_to
-from wearcap.viewer.page_server import start_server
+from wearcap.viewer.object_editor_view import EditorView
+from wearcap.viewer.page_server import ServedPage
 
 SNAP_M = 0.12
 SAVE_AFTER_S, TRY_AGAIN_S = 0.7, 10.0
@@ -34,7 +34,7 @@ _CEILING_M = 2.1
 _SIDE_M = 4.0
 
 
-class ObjectEditor:
+class ObjectEditor(ServedPage):
     """The page of one scan. `run` serves until interrupted and saves what changes; `stop` saves and closes."""
 
     def __init__(self, scan: Scan, file: Path, title: str = "scene", host: str = "127.0.0.1", port: int = 8080):
@@ -44,31 +44,25 @@ class ObjectEditor:
             self.editing = ObjectEditing(scan, environment)
         except WearcapError as error:
             raise WearcapError(error.what, where=file, expected=error.expected, fix=error.fix) from error
-        self.file, self._stopped, self._lock = file, False, threading.RLock()
+        self.file, self._lock = file, threading.RLock()
         self._saved = self._shown = self.editing.revision
         self._selection = self.editing.selected
         self._changed_at, self._problem, self._stroke = 0.0, "", 0
-        self.guard = Guard(host)
-        self.server = start_server(self.guard, port, "wearcap scene")
-        self.server.scene.set_up_direction("+z")
-        self.server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        super().__init__("wearcap scene", host, port, "large")
         self.view = EditorView(self.server, scan)
         self._add_controls(title)
-        self._wire_select()
-        self._wire_objects()
-        self._wire_view()
-        self._look_at_the_middle()
+        self._wire()
+        low, high = np.quantile(scan.points[:: max(1, len(scan.points) // 100_000)], [0.02, 0.98], axis=0)
+        middle = np.array([*(low + high)[:2] / 2, low[2] + 0.5])
+        far = 0.75 * max(float(np.linalg.norm((high - low)[:2])), _SIDE_M)
+        self.server.initial_camera.look_at = tuple(middle)
+        self.server.initial_camera.position = tuple(middle + far * np.array([-0.4, -0.4, 1.0]))
         self.current: str | None = None
         self._tried: Rigid | None = None
         self._show_scan()
         self._show_box()
         self._show_objects()
         self._show_status()
-
-    @property
-    def url(self) -> str:
-        """Address to open; it contains the token without which the page does not answer."""
-        return self.guard.url(self.server.get_port())
 
     def _add_controls(self, title: str) -> None:
         gui, points = self.server.gui, self.editing.scan.points
@@ -114,37 +108,32 @@ class ObjectEditor:
                     action()
                 except WearcapError as error:
                     event.client.add_notification("That does not go", str(error), color="red", auto_close_seconds=10)
-                self._refresh()
+                self.refresh()
 
         return act
 
-    def _wire_select(self) -> None:
-        panel, act = self.select, self._acting
-        for slider in panel.shape_sliders:
+    def _wire(self) -> None:
+        """Let controls and view call their actions."""
+        select, objects, view, act = self.select, self.objects, self.view, self._acting
+        for slider in select.shape_sliders:
             slider.on_update(act(self._show_box))
-        panel.take.on_click(act(lambda: self.editing.select_box(self.box)))
-        panel.leave.on_click(act(lambda: self.editing.select_box(self.box, add=False)))
-        panel.clear.on_click(act(self.editing.clear_selection))
-        panel.radius.on_update(act(lambda: self.view.show_brush(None, panel.radius.value)))
-        panel.category.on_update(act(self._suggest_name))
-        panel.cut.on_click(act(self.cut))
-
-    def _wire_objects(self) -> None:
-        panel, act = self.objects, self._acting
-        panel.choice.on_update(act(lambda: self.choose(panel.current)))
-        panel.rename.on_click(act(self.rename))
-        panel.kind.on_update(act(lambda: self.editing.set_kind(self._item().name, panel.chosen_kind)))
-        panel.next_end.on_click(act(self.next_hinge))
-        panel.direction.on_update(act(self._turn_axis))
-        for slider in panel.limit_sliders:
-            slider.on_update(act(self._set_limits))
-        for slider in (panel.try_deg, panel.try_m):
+        select.take.on_click(act(lambda: self.editing.select_box(self.box)))
+        select.leave.on_click(act(lambda: self.editing.select_box(self.box, add=False)))
+        select.clear.on_click(act(self.editing.clear_selection))
+        select.radius.on_update(act(lambda: view.show_brush(None, select.radius.value)))
+        select.category.on_update(act(self._suggest_name))
+        select.cut.on_click(act(self.cut))
+        objects.choice.on_update(act(lambda: self.choose(objects.current)))
+        objects.rename.on_click(act(self.rename))
+        objects.kind.on_update(act(lambda: self.editing.set_kind(self._item().name, objects.chosen_kind)))
+        objects.next_end.on_click(act(self.next_hinge))
+        objects.direction.on_update(act(self.turn_axis))
+        for slider in objects.limit_sliders:
+            slider.on_update(act(self.set_limits))
+        for slider in (objects.try_deg, objects.try_m):
             slider.on_update(act(self.try_value))
-        panel.back.on_click(act(self.put_back))
-        panel.delete.on_click(act(self.delete))
-
-    def _wire_view(self) -> None:
-        view, act = self.view, self._acting
+        objects.back.on_click(act(self.put_back))
+        objects.delete.on_click(act(self.delete))
 
         @self.server.scene.on_click()
         def _(event: viser.SceneClickEvent) -> None:
@@ -154,16 +143,18 @@ class ObjectEditor:
         @view.brush.on_drag
         def _(event: viser.SceneNodeDragEvent) -> None:
             if event.phase != "end":
-                ray = ray_to(event.end_position, event.client.camera)
-                act(lambda: self.paint(*ray, fresh=event.phase == "start"))(event)
+                origin = np.asarray(event.client.camera.position, np.float64)
+                direction = np.asarray(event.end_position, np.float64) - origin
+                act(lambda: self.paint(origin, direction, fresh=event.phase == "start"))(event)
 
-        view.box_handle.on_update(act(self._box_dragged))
-        view.freedom_handle.on_update(self._when_released(self._freedom_dragged))
-        view.try_handle.on_update(act(self._try_dragged))
+        @view.freedom_handle.on_update
+        def _(event: viser.TransformControlsEvent) -> None:
+            if event.phase == "end":
+                place = np.array(view.freedom_handle.position, np.float64)
+                act(lambda: self._place_freedom(place, level=False))(event)
 
-    def _when_released(self, action: Callable[[], None]) -> Callable[[viser.TransformControlsEvent], None]:
-        act = self._acting(action)
-        return lambda event: act(event) if event.phase == "end" else None
+        view.box_handle.on_update(act(self.move_box))
+        view.try_handle.on_update(act(self.try_pose))
 
     @property
     def box(self):
@@ -259,18 +250,17 @@ class ObjectEditor:
     def _suggest_name(self) -> None:
         self.select.name.value = self.editing.free_name(self.select.category.value)
 
-    def _set_limits(self) -> None:
+    def set_limits(self) -> None:
+        """Set the current object's limits as the sliders say."""
         item = self._item()
         limits = self.objects.limits(item.freedom.kind)
         self.editing.set_freedom(item.name, replace(item.freedom, limits=limits), stroke=("limits", item.name))
 
-    def _turn_axis(self) -> None:
+    def turn_axis(self) -> None:
+        """Point the current object's slide as the slider says."""
         item, angle = self._item(), np.deg2rad(self.objects.direction.value)
         freedom = replace(item.freedom, axis=(float(np.cos(angle)), float(np.sin(angle)), 0.0))
         self.editing.set_freedom(item.name, freedom, stroke=("axis", item.name))
-
-    def _freedom_dragged(self) -> None:
-        self._place_freedom(np.array(self.view.freedom_handle.position, np.float64), level=False)
 
     def _place_freedom(self, place: Float[np.ndarray, "3"], level: bool) -> None:
         """Place the hinge at a position (snapped to a near edge of the object), or point the slide's axis toward it."""
@@ -281,9 +271,11 @@ class ObjectEditor:
         elif item.freedom.kind == "axis":
             box = points_world(item)
             height = (box[:, 2].min() + box[:, 2].max()) / 2
-            axis = axis_toward(item, np.array([*place[:2], height if level else place[2]]))
-            if axis is not None:
-                self.editing.set_freedom(item.name, replace(item.freedom, axis=axis))
+            direction = np.array([*place[:2], height if level else place[2]]) - (box.min(0) + box.max(0)) / 2
+            length = float(np.linalg.norm(direction))
+            if length >= 1e-3:
+                x, y, z = (direction / length).tolist()
+                self.editing.set_freedom(item.name, replace(item.freedom, axis=(x, y, z)))
         else:
             raise WearcapError(
                 f"{item.name} {'is carried' if item.freedom.kind == 'free' else 'slides on the floor'}",
@@ -303,7 +295,8 @@ class ObjectEditor:
             )
         self.editing.set_freedom(item.name, freedom)
 
-    def _box_dragged(self) -> None:
+    def move_box(self) -> None:
+        """Move the box to its handle."""
         x, y, z = np.asarray(self.view.box_handle.position, np.float64).tolist()
         self.box_center = x, y, z
         self.view.box.position = self.box_center
@@ -311,16 +304,17 @@ class ObjectEditor:
     def _show_box(self) -> None:
         self.view.show_box(self.box, self.tool.value == "box")
 
-    def _try_dragged(self) -> None:
+    def try_pose(self) -> None:
         """Pose of a dragged object: on the floor, shifted and turned about z; carried, any pose."""
-        item, pose = self._item(), pose_of(self.view.try_handle)
-        self._tried = pose
-        self.view.place(item.name, pose)
+        handle = self.view.try_handle
+        R = matrix_from_quat_wxyz(torch.tensor(np.asarray(handle.wxyz, np.float64)))
+        self._tried = Rigid(R.float(), torch.tensor(np.asarray(handle.position, np.float64)).float())
+        self.view.place(self._item().name, self._tried)
 
     def _show_scan(self) -> None:
         self.view.show_scan(self.editing.left(), float(self.top.value))
 
-    def _refresh(self) -> None:
+    def refresh(self) -> None:
         """Update view and panels to the state of the editing; unchanged parts are not sent again."""
         if self.editing.selected is not self._selection:
             self._selection = self.editing.selected
@@ -351,15 +345,6 @@ class ObjectEditor:
         chosen = f"{len(self.editing.selected):,} points selected"
         self._status.content = f"{chosen} · {count} object{'s' * (count != 1)} · {state}"
 
-    def _look_at_the_middle(self) -> None:
-        points = self.editing.scan.points
-        low, high = np.quantile(points[:: max(1, len(points) // 100_000)], [0.02, 0.98], axis=0)
-        middle = np.array([*(low + high)[:2] / 2, low[2] + 0.5])
-        far = 0.75 * max(float(np.linalg.norm((high - low)[:2])), _SIDE_M)
-        camera = self.server.initial_camera
-        camera.look_at = tuple(middle)
-        camera.position = tuple(middle + far * np.array([-0.4, -0.4, 1.0]))
-
     def save(self) -> None:
         """Write the environment if it has changed. Raises WearcapError if it cannot be written."""
         with self._lock:
@@ -387,4 +372,4 @@ class ObjectEditor:
         try:
             self.save()
         finally:
-            self.server.stop()
+            super().stop()

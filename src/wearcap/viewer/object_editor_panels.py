@@ -110,10 +110,8 @@ class ObjectPanel:
         for control in (self.direction, self.least_m, self.greatest_m, self.try_m):
             control.visible = kind == "axis"
         self.back.visible = current is not None
-        if current is not None:
-            self._show_properties(current)
-
-    def _show_properties(self, current: SceneObject) -> None:
+        if current is None:
+            return
         freedom = current.freedom
         _write(self.name, current.name)
         _write(self.kind, _NAMES_OF_KINDS[freedom.kind])

@@ -3,17 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 import viser
 from jaxtyping import Bool, Float, Int64, UInt8
 from scipy.spatial import KDTree
 
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
+from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.scene.editing import points_world
 from wearcap.scene.objects import SceneObject
 from wearcap.scene.scan import Scan
 from wearcap.scene.selection import Box, first_hit
+from wearcap.viewer.page_layers import by_height
 
 SHOWN_POINTS, SHOWN_SELECTED, SHOWN_OF_OBJECT = 250_000, 80_000, 40_000
 SELECTED_COLOR, BOX_COLOR, BRUSH_COLOR, HINGE_COLOR = ((255, 120, 20), (30, 120, 240), (255, 120, 20), (220, 30, 120))
@@ -43,7 +43,9 @@ class EditorView:
         rng = np.random.default_rng(0)
         count = min(len(scan.points), SHOWN_POINTS)
         self._thinned = np.sort(rng.choice(len(scan.points), count, replace=False))
-        self._colors = scan.colors if scan.colors is not None else by_height(scan.points)
+        low, high = np.quantile(scan.points[:: max(1, len(scan.points) // 10_000), 2], [0.02, 0.98])
+        colors = scan.colors
+        self._colors = by_height(scan.points, low, high).astype(np.uint8) if colors is None else colors
         self.point_m = 1.9 * typical_spacing(scan.points[self._thinned])
         self._center = scan.points.mean(0, dtype=np.float64)
         self.visible = scan.points[:0]
@@ -191,35 +193,8 @@ class EditorView:
         return best
 
 
-def axis_toward(item: SceneObject, place: Float[np.ndarray, "3"]) -> tuple[float, float, float] | None:
-    """Unit vector from the middle of an object to a position; None if they coincide."""
-    points = points_world(item)
-    direction = place - (points.min(0) + points.max(0)) / 2
-    length = float(np.linalg.norm(direction))
-    return None if length < 1e-3 else tuple((direction / length).tolist())
-
-
-def by_height(points: Float[np.ndarray, "point 3"]) -> UInt8[np.ndarray, "point 3"]:
-    """Colours for a scan without colours: from blue at the floor to sand at the ceiling."""
-    low, high = np.quantile(points[:: max(1, len(points) // 10_000), 2], [0.02, 0.98])
-    share = np.clip((points[:, 2:] - low) / max(high - low, 1e-6), 0, 1)
-    return ((1 - share) * np.array([60, 90, 130]) + share * np.array([220, 170, 90])).astype(np.uint8)
-
-
 def typical_spacing(points: Float[np.ndarray, "point 3"]) -> float:
     """Median distance (m) of neighbours in a cloud, over a sample."""
     sample = points[:: max(1, len(points) // 500)]
     distance, _ = KDTree(points).query(sample, k=2)
     return float(np.clip(np.median(distance[:, -1]), 0.002, 0.2)) if len(points) > 1 else 0.02
-
-
-def ray_to(place: tuple[float, float, float], camera: viser.CameraHandle) -> tuple[np.ndarray, np.ndarray]:
-    """Origin and direction of the ray from a client's camera to a position."""
-    origin = np.asarray(camera.position, np.float64)
-    return origin, np.asarray(place, np.float64) - origin
-
-
-def pose_of(handle: viser.TransformControlsHandle) -> Rigid:
-    """Pose that a handle was dragged to."""
-    R = matrix_from_quat_wxyz(torch.tensor(np.asarray(handle.wxyz, np.float64)))
-    return Rigid(R.float(), torch.tensor(np.asarray(handle.position, np.float64)).float())

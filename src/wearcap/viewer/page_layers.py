@@ -1,8 +1,8 @@
 """Layers of the page; each moves to a time by sending poses, without resending meshes."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -18,7 +18,9 @@ from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import capsules
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
+from wearcap.geometry.trajectory import nearest_frames
 from wearcap.recording import HeadStream, Motion, PointCloud
+from wearcap.recording.recording import ContactTrack
 
 MAX_POINTS = 200_000
 LABEL_ABOVE_M = 0.3
@@ -29,22 +31,26 @@ _R_DEVICE_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0
 
 
 class Layer(Protocol):
+    """Part of the page that follows the clock."""
+
     def show(self, time: float) -> None: ...
 
 
-@runtime_checkable
-class MotionLayer(Layer, Protocol):
-    """Layer of one motion, which can be shifted by an offset (m) and hidden."""
+class MotionLayer(Layer):
+    """Layer of one motion, which can be shifted by an offset (m) and hidden; `handles` are its nodes."""
 
-    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None: ...
+    def __init__(self, *handles: viser.SceneNodeHandle):
+        self.handles, self.offset = handles, np.zeros(3)
+
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
+        self.offset = offset
+        for handle in self.handles:
+            handle.visible = visible
 
 
 def nearest_frame(timestamps: Float64[Tensor, "time"], time: float) -> int:
     """Index of the frame nearest in time."""
-    after = int(torch.searchsorted(timestamps, time).clamp(1, max(len(timestamps) - 1, 1)))
-    if len(timestamps) == 1:
-        return 0
-    return after if timestamps[after] - time < time - timestamps[after - 1] else after - 1
+    return int(nearest_frames(timestamps, torch.tensor([time], dtype=torch.float64))[0])
 
 
 def stick_body(skeleton: Skeleton) -> BodyModel:
@@ -79,14 +85,13 @@ def surface_or_sticks(skeleton: Skeleton, shape: dict[str, float]) -> BodyModel:
         return stick_body(skeleton)
 
 
-class BodyLayer:
+class BodyLayer(MotionLayer):
     """One motion as a skinned mesh. The browser does the skinning: a frame is one pose per joint."""
 
     def __init__(
         self, server: viser.ViserServer, name: str, motion: Motion, body: BodyModel, color: tuple[int, int, int]
     ):
-        self.motion, self.offset = motion, np.zeros(3)
-        joints = len(motion.skeleton)
+        self.motion, joints = motion, len(motion.skeleton)
         weights = np.zeros((len(body.rest_vertices), joints), dtype=np.float32)
         rows = np.arange(len(weights))[:, None]
         np.add.at(weights, (rows, body.skin_joints.numpy()), body.skin_weights.numpy())
@@ -99,10 +104,7 @@ class BodyLayer:
             skin_weights=weights,
             color=color,
         )
-
-    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
-        self.offset = offset
-        self.handle.visible = visible
+        super().__init__(self.handle)
 
     def show(self, time: float) -> None:
         frame = nearest_frame(self.motion.timestamps, time)
@@ -115,7 +117,7 @@ class BodyLayer:
             bone.wxyz, bone.position = wxyz, position
 
 
-class FeetLayer:
+class FeetLayer(MotionLayer):
     """Balls at heels and toe tips, coloured by contact."""
 
     def __init__(
@@ -126,15 +128,23 @@ class FeetLayer:
         contact: Bool[Tensor, "frame patch"],
         clock: Float64[Tensor, "frame"],
     ):
-        self.motion, self.contact, self.clock, self.offset = motion, contact, clock, np.zeros(3)
+        self.motion, self.contact, self.clock = motion, contact, clock
         self.balls = [
             server.scene.add_icosphere(f"/{name}/{patch}", 0.028, AIR_COLOR, subdivisions=2) for patch in FOOT_PATCHES
         ]
+        super().__init__(*self.balls)
 
-    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
-        self.offset = offset
-        for ball in self.balls:
-            ball.visible = visible
+    @classmethod
+    def of(cls, server: viser.ViserServer, name: str, motion: Motion, track: ContactTrack | None) -> "FeetLayer | None":
+        """The motion's own contacts, else those of a track; None without contacts, or without these sites."""
+        if not set(FOOT_PATCHES) <= set(motion.skeleton.sites):
+            return None
+        if motion.contact_prob is not None:
+            return cls(server, name, motion, motion.contact_prob > 0.5, motion.timestamps)
+        if track is None or not set(FOOT_PATCHES) <= set(track.parts):
+            return None
+        columns = [track.parts.index(patch) for patch in FOOT_PATCHES]
+        return cls(server, name, motion, track.contact[:, columns], track.timestamps)
 
     def show(self, time: float) -> None:
         frame = nearest_frame(self.motion.timestamps, time)
@@ -165,20 +175,29 @@ class HeadLayer:
         self.frustum.position = self.head.t_world_device[frame].double().numpy()
 
 
+def by_height(
+    points: Float[np.ndarray, "point 3"],
+    low: float,
+    high: float,
+    colors: Sequence[Sequence[float]] = ((60, 90, 130), (220, 170, 90)),
+) -> Float[np.ndarray, "point 3"]:
+    """Colours of points without colours: from blue at the height `low` (m) to sand at `high`."""
+    share = np.clip((points[:, 2:] - low) / max(high - low, 1e-6), 0, 1)
+    return (1 - share) * np.array(colors[0]) + share * np.array(colors[1])
+
+
 def add_points(server: viser.ViserServer, cloud: PointCloud) -> None:
     """A point cloud coloured by height; a large one is subsampled evenly."""
     points = cloud.points_world[:: max(1, -(-len(cloud.points_world) // MAX_POINTS))].double().numpy()
     if not len(points):
         return
     low, high = np.quantile(points[:, 2], [0.02, 0.98])
-    share = np.clip((points[:, 2:] - low) / max(high - low, 1e-6), 0, 1)
-    colors = (1 - share) * np.array([60, 90, 130]) + share * np.array([220, 170, 90])
     # Half precision is exact to a millimetre only near the node, so the node is in the points' middle.
     centre = points.mean(0)
     server.scene.add_point_cloud(
         "/surroundings/points",
         (points - centre).astype(np.float32),
-        colors.astype(np.uint8),
+        by_height(points, low, high).astype(np.uint8),
         point_size=0.012,
         position=centre,
         precision="float32",
@@ -196,16 +215,13 @@ def read_scene(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-class LabelLayer:
+class LabelLayer(MotionLayer):
     """A motion's name above its head."""
 
     def __init__(self, server: viser.ViserServer, name: str, motion: Motion):
-        self.motion, self.offset = motion, np.zeros(3)
+        self.motion = motion
         self.handle = server.scene.add_label(f"/{name}_label", name, anchor="bottom-center")
-
-    def place(self, offset: Float[np.ndarray, "3"], visible: bool) -> None:
-        self.offset = offset
-        self.handle.visible = visible
+        super().__init__(self.handle)
 
     def show(self, time: float) -> None:
         if not self.handle.visible:
@@ -213,34 +229,3 @@ class LabelLayer:
         joints = self.motion.T_world_joint.t[nearest_frame(self.motion.timestamps, time)].double().numpy()
         top = np.array([*joints[0, :2], joints[:, 2].max() + LABEL_ABOVE_M])
         self.handle.position = top + self.offset
-
-
-@dataclass
-class Placed:
-    """Layers of one motion, which are shown, hidden and shifted together."""
-
-    body: BodyLayer
-    feet: FeetLayer | None
-    points: MotionLayer | None = None
-    objects: MotionLayer | None = None
-    label: LabelLayer | None = None
-
-    @property
-    def layers(self) -> list[MotionLayer]:
-        every = (self.body, self.feet, self.points, self.objects)
-        return [layer for layer in every if layer is not None]
-
-    def place(self, offset: Float[np.ndarray, "3"], visible: bool, named: bool = False) -> None:
-        """`named` also shows the motion's label, if it has one."""
-        for layer in self.layers:
-            layer.place(offset, visible)
-        if self.label is not None:
-            self.label.place(offset, named)
-
-    def show(self, time: float) -> None:
-        if not self.body.handle.visible:
-            return
-        for layer in self.layers:
-            layer.show(time)
-        if self.label is not None:
-            self.label.show(time)

@@ -4,11 +4,12 @@ viser itself answers every page of every site, and has no setting for that. Requ
 `process_request` that it passes to `websockets`; while it starts, the guard's is put in front of it.
 """
 
+import logging
+import math
 import socket
 import threading
-from collections.abc import Callable
 from http import HTTPStatus
-from typing import Any
+from typing import Any, Literal
 
 import rich
 import viser
@@ -19,7 +20,6 @@ from websockets.http11 import Request, Response
 from wearcap.errors import WearcapError
 from wearcap.viewer.guard import Guard, Refused
 
-_Answer = Callable[[ServerConnection, Request], Response | None]
 _starting = threading.Lock()
 
 
@@ -33,10 +33,22 @@ def start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
 
     def serve(*arguments: Any, **options: Any) -> Any:
         nonlocal hooked
-        answer = options.get("process_request")
+        answer: Any = options.get("process_request")
+
+        def guarded(connection: ServerConnection, request: Request) -> Response | None:
+            """The answer to a page request or a WebSocket handshake (None: go on), after the guard has admitted it."""
+            try:
+                granted = guard.admit(request.path, request.headers)
+            except Refused as refused:
+                return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
+            response = answer(connection, request)
+            if response is not None:
+                response.headers.update(granted)
+            return response
+
         # Another thread may start a server of its own meanwhile.
         if getattr(answer, "__module__", "").startswith("viser."):
-            options["process_request"] = _guarded(guard, answer)
+            options["process_request"] = guarded
             hooked = True
         return original(*arguments, **options)
 
@@ -80,17 +92,34 @@ def _check_host(host: str) -> None:
     )
 
 
-def _guarded(guard: Guard, answer: _Answer) -> _Answer:
-    """An answer to page requests and WebSocket handshakes (None: go on), after the guard has admitted them."""
+class ServedPage:
+    """A guarded page of viser with z up; `stop` ends its `run`."""
 
-    def process_request(connection: ServerConnection, request: Request) -> Response | None:
+    def __init__(self, label: str, host: str, port: int, control_width: Literal["medium", "large"]):
+        self.guard = Guard(host)
+        self.server = start_server(self.guard, port, label)
+        self.server.scene.set_up_direction("+z")
+        self.server.gui.configure_theme(control_width=control_width, show_logo=False, show_share_button=False)
+        self._stopped = False
+
+    @property
+    def url(self) -> str:
+        """Address to open; it contains the token without which the page does not answer."""
+        return self.guard.url(self.server.get_port())
+
+    def run(self, seconds: float = math.inf) -> None:
+        """Follow the clock and save until interrupted, or for the given seconds."""
+        raise NotImplementedError
+
+    def serve(self) -> None:
+        """Run until interrupted, then stop."""
+        # Browsers open connections in advance and drop them; the server's log of that is of no use to a user.
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         try:
-            granted = guard.admit(request.path, request.headers)
-        except Refused as refused:
-            return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
-        response = answer(connection, request)
-        if response is not None:
-            response.headers.update(granted)
-        return response
+            self.run()
+        finally:
+            self.stop()
 
-    return process_request
+    def stop(self) -> None:
+        self._stopped = True
+        self.server.stop()

@@ -1,14 +1,17 @@
-"""Pictures of motion without a screen: ground truth and captures side by side, shaded, with foot contacts."""
+"""Pictures and videos without a screen: ground truth and captures side by side, shaded, with contacts; a head's path."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import av
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
+from rich.console import Console
+from rich.progress import track
 from torch import Tensor
 
 from wearcap.body.contact_points import contact_points
@@ -19,14 +22,14 @@ from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh, capsules, checker_floor
-from wearcap.geometry.render import Light, render
+from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.interactions import HANDS
 from wearcap.recording.motion import Motion
+from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
-from wearcap.viewer.body_points import lit_points
-from wearcap.viewer.objects import posed_meshes
-from wearcap.viewer.page_layers import stick_body
+from wearcap.viewer.objects import lit_points, posed_meshes
+from wearcap.viewer.page_layers import by_height, stick_body
 
 PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], [0.62, 0.45, 0.62]])
 """Colours of the motions, in order."""
@@ -37,6 +40,11 @@ TILES = np.array([[0.90, 0.90, 0.89], [0.80, 0.81, 0.82]])
 SKY = (0.965, 0.97, 0.975)
 VIEW = (-0.62, 0.78)
 """Direction in which the camera looks at someone facing +x: from the front left."""
+PATH_COLOR, LOOK_COLOR = (0.85, 0.35, 0.12), (0.15, 0.35, 0.70)
+LOOKS = 12
+"""Number of viewing directions drawn along the path."""
+HEIGHT_COLORS = ((0.35, 0.45, 0.55), (0.80, 0.68, 0.45))
+"""Colours (RGB) of points at the lowest and the highest height."""
 
 
 @dataclass(frozen=True)
@@ -107,16 +115,16 @@ def actors(
     return shown
 
 
-def follow_camera(target: Float[np.ndarray, "3"], size: tuple[int, int], distance: float = 4.2) -> tuple[Camera, Rigid]:
-    """A camera of `size` (width, height) that looks down at a point (m) from the front left of the world."""
+def _looking(
+    direction: Sequence[float], target: Float[np.ndarray, "3"], distance: float, size: tuple[int, int], focal: float
+) -> tuple[Camera, Rigid]:
+    """A camera of `size` (width, height) that looks in a direction of the world at a point from a distance (m)."""
     width, height = size
-    focal = 1.75 * min(height, width * 1.3)
-    camera = Camera("pinhole", width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-    forward = np.array([*VIEW, -0.30])
-    forward /= np.linalg.norm(forward)
+    forward = np.array(direction) / np.linalg.norm(direction)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     R = np.stack([right, np.cross(forward, right), forward], 1)
+    camera = Camera("pinhole", width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     return camera, Rigid(torch.from_numpy(R).float(), torch.from_numpy(target - distance * forward).float())
 
 
@@ -126,14 +134,13 @@ def panel(
     target: Float[np.ndarray, "3"],
     size: tuple[int, int],
     *,
-    world: Mesh | None = None,
     supersample: int = 2,
     distance: float = 4.2,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """One actor at one frame, on a chequered floor or in a world."""
-    camera, T_world_cam = follow_camera(target, size, distance)
+    """One actor at one frame, on a chequered floor."""
+    camera, T_world_cam = _looking((*VIEW, -0.30), target, distance, size, 1.75 * min(size[1], size[0] * 1.3))
     ground = np.array([target[0], target[1], actor.floor_z])
-    stage = world or checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
+    stage = checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
     below = (float(target[0]), float(target[1]), float(ground[2]))
     light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
     return render(
@@ -148,7 +155,6 @@ def contact_sheet(
     columns: int = 6,
     size: tuple[int, int] = (200, 240),
     body: BodyModel | None = None,
-    world: Mesh | None = None,
     environment: Environment | None = None,
     distance: float = 4.2,
 ) -> UInt8[np.ndarray, "height width 3"]:
@@ -173,7 +179,7 @@ def contact_sheet(
             target = focus(shown[0].motion, frame)
             for row, (actor, clock) in enumerate(zip(shown, clocks)):
                 nearest = frame if row == 0 else int(np.abs(clock - clocks[0][frame]).argmin())
-                image = panel(actor, nearest, target, size, world=world, distance=distance)
+                image = panel(actor, nearest, target, size, distance=distance)
                 seconds = clock[nearest] - clocks[0][0]
                 text = f"{actor.label}  {seconds:.2f} s" if column == 0 else f"{seconds:.2f} s"
                 sheet.paste(captioned(image, text), (column * width, (band * len(shown) + row) * height))
@@ -203,6 +209,35 @@ def focus(motion: Motion, frame: int) -> Float[np.ndarray, "3"]:
     return motion.t_world_root[frame].double().numpy() - np.array([0.0, 0.0, 0.08])
 
 
+def draw_head_path(recording: Recording, size: tuple[int, int] = (640, 520)) -> UInt8[np.ndarray, "height width 3"]:
+    """Two panels of `size` (width, height). Raises WearcapError if there is no head path either."""
+    if recording.head is None:
+        raise WearcapError("nothing to draw", where=recording.name, expected="a motion, or a head's path")
+    path = recording.head.t_world_device.double().numpy()
+    points = np.zeros((0, 3)) if recording.points is None else recording.points.points_world.double().numpy()
+    cloud = np.concatenate([path, points])
+    low, high = np.quantile(cloud, 0.02, 0), np.quantile(cloud, 0.98, 0)
+    centre, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1.0)
+    splats = Splats(
+        points.astype(np.float32), by_height(points, low[2], high[2], HEIGHT_COLORS).astype(np.float32), 0.8
+    )
+    # The path is a tube, with short rods along the viewing directions.
+    steps = path[:: max(1, len(path) // 300)]
+    at = np.linspace(0, len(path) - 1, LOOKS).astype(int)
+    ahead = recording.head.R_world_device[torch.from_numpy(at)][:, :, 0].double().numpy()
+    start = np.concatenate([steps[:-1], path[at]])
+    end = np.concatenate([steps[1:], path[at] + 0.12 * radius * ahead])
+    thick = np.full(len(start), 0.006 * radius)
+    colors = np.concatenate([np.tile(PATH_COLOR, (len(steps) - 1, 1)), np.tile(LOOK_COLOR, (LOOKS, 1))])
+    tube = capsules(start, end, thick, thick, colors, 8)
+    panels = []
+    for caption, direction in (("from above", (0.02, 0.05, -1.0)), ("aside", (-0.6, 0.75, -0.35))):
+        camera, T_world_cam = _looking(direction, centre, 2.4 * radius, size, 1.0 * size[1])
+        frame = render(camera, T_world_cam, [tube], [splats], background=SKY)
+        panels.append(np.asarray(captioned(frame.color, f"{recording.name}, {caption}")))
+    return np.asarray(Image.fromarray(np.concatenate(panels, 1)))
+
+
 def captioned(image: UInt8[np.ndarray, "height width 3"], text: str) -> Image.Image:
     """The picture with a line of text in its upper left corner."""
     picture = Image.fromarray(image)
@@ -219,3 +254,43 @@ def save_png(path: str | Path, image: UInt8[np.ndarray, "height width 3"]) -> No
 def save_sheet(path: str | Path, motions: dict[str, Motion]) -> None:
     """Write a contact sheet of motions, by their labels, as PNG."""
     save_png(path, contact_sheet(motions))
+
+
+def write_video(
+    path: str | Path,
+    motions: dict[str, Motion],
+    *,
+    fps: float = 30.0,
+    size: tuple[int, int] = (480, 400),
+    body: BodyModel | None = None,
+    environment: Environment | None = None,
+    max_seconds: float | None = None,
+    progress: bool = True,
+) -> None:
+    """Write panels of `size` (width, height) side by side, one per motion, on their shared clock.
+
+    The camera follows the first motion. Raises WearcapError when the motions share no time, or for odd sizes.
+    """
+    if size[0] % 2 or size[1] % 2 or fps <= 0:
+        raise WearcapError(f"a video of {size[0]}x{size[1]} at {fps} fps", expected="even sizes, a positive rate")
+    shown = actors(motions, body, environment)
+    start, stop = shared_time(motions.values())
+    if max_seconds is not None:
+        stop = min(stop, start + max_seconds)
+    times = start + np.arange(int((stop - start) * fps) + 1) / fps
+    clocks = [actor.motion.timestamps.numpy() for actor in shown]
+    with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
+        codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"  # H.264 where PyAV was built with it
+        stream = container.add_stream(codec, rate=round(fps))
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = size[0] * len(shown), size[1], "yuv420p"
+        for time in track(times, f"video {Path(path).name}", console=Console(stderr=True), disable=not progress):
+            frames = [int(np.abs(clock - time).argmin()) for clock in clocks]
+            target = focus(shown[0].motion, frames[0])
+            panels = [
+                np.asarray(captioned(panel(actor, frame, target, size, supersample=1), actor.label))
+                for actor, frame in zip(shown, frames)
+            ]
+            picture = av.VideoFrame.from_ndarray(np.concatenate(panels, 1), format="rgb24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))

@@ -7,7 +7,6 @@ what was not calibrated is absent.
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +22,11 @@ from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment
 from wearcap.sensors.clock import Clock
 from wearcap.sensors.stillness import StepCheck
 from wearcap.sensors.watch_calibration import WatchCalibration
+from wearcap.sensors.watch_session import WornCalibration
 
 EXAMPLE = '{"watches": {"left_wrist": {"R_world_ref_wxyz": […], "R_joint_imu_wxyz": […], …}, "right_wrist": {…}}, …}'
 _WATCH = ("board_still_deg", "board_tilt_deg", "pose_still_deg")
 _CAMERA = ("scale", "residual_m", "scale_spread", "corner_deg")
-
-
-@dataclass(frozen=True)
-class WornCalibration:
-    """Result of a guided calibration."""
-
-    watches: dict[str, WatchCalibration]
-    clocks: dict[str, SwingClock] = field(default_factory=dict)
-    """Clock relation of the camera and each watch."""
-    camera: SlamAlignment | None = None
-    head: HeadMount | None = None
 
 
 def write_watch_calibration(

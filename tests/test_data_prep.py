@@ -1,0 +1,38 @@
+"""`data_prep/` stays in step with `wearcap prepare`: a script and a row of its page for every source, a split list where one is read."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from wearcap.cli.conf import compose, splits_dir
+from wearcap.cli.prepare import sources, usage
+from wearcap.prepare import read_splits
+
+DATA_PREP = Path(__file__).parents[1] / "data_prep"
+PAGE = (DATA_PREP / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("source", sources())
+def test_the_page_tells_what_a_source_needs(source):
+    assert f"\n  {source} " in usage()
+    row = next((line for line in PAGE.splitlines() if line.startswith(f"| `{source}` |")), "")
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert len(cells) == 6, f"no complete row for {source} in data_prep/README.md"
+    assert all(cells)
+    command = cells[4].split("`")[1].split()
+    assert command[:3] == ["wearcap", "prepare", source]
+    compose("prepare", [f"prepare={source}", *command[3:]])
+    config = sources()[source].read_text(encoding="utf-8")
+    if "rework:" not in config:  # these keep the splits of the data set that they change
+        listed = re.search(r"^splits: (\S+)", config, re.MULTILINE)
+        name = listed[1] if listed else f"{source}.csv"
+        assert f"`{name}`" in cells[5]
+        assert read_splits(splits_dir() / name).rows
+
+
+def test_every_source_has_its_script_and_every_list_its_source():
+    scripts = {path.stem: path.read_text(encoding="utf-8") for path in DATA_PREP.glob("*.py")}
+    assert scripts.keys() == sources().keys()
+    assert all(f'"prepare", ["{name}", ' in text for name, text in scripts.items())
+    assert {path.stem for path in (DATA_PREP / "splits").glob("*.csv")} <= sources().keys()
