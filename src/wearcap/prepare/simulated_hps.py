@@ -17,7 +17,7 @@ from wearcap.simulation.recordings.hps import HpsConfig, Simulated, simulate_hps
 from wearcap.simulation.recordings.hps_session import Protocol
 from wearcap.simulation.recordings.scene_files import SceneSettings, write_scene
 from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH
-from wearcap.simulation.rendering.head_video import Filming, write_head_video
+from wearcap.simulation.rendering.head_camera import Filming, write_head_video
 from wearcap.simulation.rendering.views import Scenery
 
 

@@ -14,9 +14,10 @@ from wearcap.simulation.places.outline import points_in_convex
 from wearcap.simulation.places.world import World
 from wearcap.simulation.rendering import texture_kernels as kernels
 
-LIGHT = (0.35, 0.5, 1.0)
-"""Direction to the key light."""
+_TO_LIGHT = np.array((0.35, 0.5, 1.0))
 KEY, AMBIENT_BELOW, AMBIENT_ABOVE = 0.26, 0.66, 0.90
+LIGHT: Float[np.ndarray, "6"] = np.array([*_TO_LIGHT / np.linalg.norm(_TO_LIGHT), KEY, AMBIENT_BELOW, AMBIENT_ABOVE])
+"""Unit direction to the key light, its strength, the ambient light from below and from above."""
 
 _TEXTILE = ("sofa", "armchair", "bed")
 _WOODEN = ("table", "desk", "coffee_table", "shelf", "wardrobe", "cabinet", "chair", "bench", "door_frame", "railing")
@@ -61,7 +62,7 @@ class Paint:
 
     @property
     def tables(self) -> tuple[np.ndarray, ...]:
-        return self.frames, self.extents, self.colors, self.materials, self.seeds, light_table()
+        return self.frames, self.extents, self.colors, self.materials, self.seeds
 
     def colors_of(
         self,
@@ -73,13 +74,8 @@ class Paint:
         light = np.zeros((len(points), 3), np.float32)
         front = np.ones(len(points), np.float32)
         footprint = footprint.astype(np.float32)
-        kernels.color_points(points, face.astype(np.int32), front, footprint, *self.tables, light)
+        kernels.color_points(points, face.astype(np.int32), front, footprint, self.tables, LIGHT, light)
         return np.minimum(light, 255).astype(np.uint8)
-
-
-def light_table() -> Float[np.ndarray, "6"]:
-    direction = np.array(LIGHT) / np.linalg.norm(LIGHT)
-    return np.array([*direction, KEY, AMBIENT_BELOW, AMBIENT_ABOVE])
 
 
 def _headings(world: World) -> Float[np.ndarray, "face"]:
