@@ -12,12 +12,10 @@ from wearcap.prepare.engine import Task, content_hash
 from wearcap.prepare.simulated import checked_splits, source_files
 from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
-from wearcap.simulation.places.changes import changed_world
-from wearcap.simulation.recordings.hps import HpsConfig, Simulated, simulate_hps
-from wearcap.simulation.recordings.hps_session import Protocol
+from wearcap.simulation.places.site import changed_world
+from wearcap.simulation.recordings.hps import HpsConfig, Protocol, Simulated, simulate_hps
 from wearcap.simulation.recordings.scene_files import SceneSettings, write_scene
-from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH
-from wearcap.simulation.rendering.head_camera import Filming, write_head_video
+from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, Filming, write_head_video
 from wearcap.simulation.rendering.views import Scenery
 
 

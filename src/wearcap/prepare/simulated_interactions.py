@@ -15,11 +15,8 @@ from wearcap.prepare.engine import Task, content_hash
 from wearcap.prepare.simulated import checked_splits, source_files
 from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
-from wearcap.simulation.recordings.interaction_session import (
-    InteractionConfig,
-    SimulatedInteractions,
-    simulate_interactions,
-)
+from wearcap.simulation.places.interactive_flat import InteractiveFlat
+from wearcap.simulation.recordings.interaction_session import InteractionConfig, simulate_interactions
 from wearcap.simulation.rendering.scan import scan_world
 from wearcap.simulation.rendering.views import Scenery
 
@@ -39,22 +36,20 @@ class SimulatedInteractionsTask:
     root: Path
 
     def __call__(self) -> Recording:
-        simulated = simulate_interactions(self.config, self.name, self.split, self.seed)
-        folder = Path("scenes") / simulated.recording.location
-        self._write_scene(simulated, self.root / folder)
-        return replace(
-            simulated.recording, scene=(folder / CLOUD).as_posix(), environment=(folder / FILE_NAME).as_posix()
-        )
+        recording, flat = simulate_interactions(self.config, self.name, self.split, self.seed)
+        folder = Path("scenes") / recording.location
+        self._write_scene(flat, self.root / folder)
+        return replace(recording, scene=(folder / CLOUD).as_posix(), environment=(folder / FILE_NAME).as_posix())
 
-    def _write_scene(self, simulated: SimulatedInteractions, folder: Path) -> None:
+    def _write_scene(self, flat: InteractiveFlat, folder: Path) -> None:
         """Write the scan with everything at its initial pose and the objects, unless they exist already."""
         wanted = json.dumps({"spacing_m": self.spacing_m, "simulator": self.simulator})
         if is_made(folder, wanted, CLOUD, FILE_NAME):
             return
         rng = np.random.default_rng(12)
-        scan = scan_world(Scenery.of(simulated.world), self.spacing_m, rng, walked=simulated.static)
+        scan = scan_world(Scenery.of(flat.world), self.spacing_m, rng, walked=flat.static)
         write_ply(Ply(scan.points, scan.colors), folder / CLOUD)
-        write_environment(simulated.environment, folder / FILE_NAME)
+        write_environment(flat.environment, folder / FILE_NAME)
         write_text(folder / MADE, wanted)
 
 

@@ -11,7 +11,7 @@ from wearcap.prepare.simulated import checked_splits, source_files
 from wearcap.prepare.simulated_interactions import MADE, is_made
 from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
-from wearcap.simulation.recordings.object_session import ObjectConfig, simulate_objects
+from wearcap.simulation.recordings.interaction_session import ObjectConfig, simulate_objects
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,13 @@ class SimulatedObjectsTask:
     root: Path
 
     def __call__(self) -> Recording:
-        simulated = simulate_objects(self.config, self.name, self.split, self.seed)
-        file = Path("scenes") / simulated.recording.location / FILE_NAME
+        recording, flat = simulate_objects(self.config, self.name, self.split, self.seed)
+        file = Path("scenes") / recording.location / FILE_NAME
         wanted = json.dumps({"simulator": self.simulator})
         if not is_made(self.root / file.parent, wanted, FILE_NAME):
-            write_environment(simulated.environment, self.root / file)
+            write_environment(flat.environment, self.root / file)
             write_text(self.root / file.parent / MADE, wanted)
-        return replace(simulated.recording, environment=file.as_posix())
+        return replace(recording, environment=file.as_posix())
 
 
 def simulated_objects_tasks(
