@@ -73,11 +73,11 @@ def hue(rng: np.random.Generator, saturation: tuple[float, float] = (0.15, 0.7))
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(0.45, 0.9))
 
 
-def entered(table: dict[str, Callable], *names: str) -> Callable:
-    """Decorator that enters a maker in a table."""
+def entered(table: dict[str, Callable], name: str) -> Callable:
+    """Decorator that enters a maker in a table under a name."""
 
     def enter(maker: Callable) -> Callable:
-        table.update(dict.fromkeys(names, maker))
+        table[name] = maker
         return maker
 
     return enter
@@ -172,17 +172,9 @@ class WorldBuilder:
 
     def add_object(self, kind: str, outline, z_range: tuple[float, float], position, heading: float = 0.0) -> int:
         """Add an obstacle without triangles; returns its index for `add_box(item=…)`."""
-        number = len(self.objects)
-        self.objects.append(
-            w.WorldObject(
-                f"{kind}_{number:03d}",
-                kind,
-                self.to_world(outline),
-                z_range,
-                self.point(*position),
-                self.heading + heading,
-            )
-        )
+        number, place = len(self.objects), self.point(*position)
+        name, footprint = f"{kind}_{number:03d}", self.to_world(outline)
+        self.objects.append(w.WorldObject(name, kind, footprint, z_range, place, self.heading + heading))
         return number
 
     def add_block(self, kind: str, center, size, color, texture: float = 6.0, heading: float = 0.0) -> int:

@@ -175,7 +175,7 @@ def _cabinet(rng: np.random.Generator) -> Piece:
 
 
 @entered(MAKERS, "counter")
-def _counter(rng: np.random.Generator) -> Piece:
+def _kitchen_counter(rng: np.random.Generator) -> Piece:
     """A kitchen counter: worktop with props on it, cupboards above."""
     width, color = rng.uniform(1.6, 2.8), hue(rng, (0.0, 0.35))
     handles = np.arange(-width / 2 + 0.3, width / 2, 0.6)
@@ -295,7 +295,7 @@ def _bollard(rng: np.random.Generator) -> Piece:
 
 
 @entered(MAKERS, "board")
-def _board(rng: np.random.Generator) -> Piece:
+def _notice_board(rng: np.random.Generator) -> Piece:
     """A notice board or map on two posts, pointed at from the front."""
     width, low, tall = rng.uniform(0.9, 1.4), rng.uniform(0.85, 1.0), rng.uniform(0.7, 1.0)
     high = low + tall

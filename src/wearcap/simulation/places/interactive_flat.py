@@ -230,7 +230,19 @@ def _leaf_in(
     heading, sense = float(np.arctan2(along[1], along[0])), float(np.sign(along[0] * ahead[1] - along[1] * ahead[0]))
     level = (0.01, DOOR_HEIGHT - 0.04) if category == "door" else (WINDOW[0] + 0.035, WINDOW[1] - 0.035)
     leaf = hinged(category, foot, heading, sense, width - 0.02, level, builder.rng)
-    most = _free_angle(leaf, static, builder.movables, gap.position)
+    # The angle to which it opens before it touches something, its own frame left aside.
+    solid = [item for item in static.objects if np.linalg.norm(np.array(item.position[:2]) - gap.position[:2]) < 4.0]
+    solid += [obstacle(movable, None) for movable in builder.movables]
+    solid = [item for item in solid if item.z_range[0] < leaf.z_range[1] and item.z_range[1] > leaf.z_range[0]]
+    angles = np.deg2rad(np.arange(15.0, 106.0, 5.0))
+    edge = np.linspace(0.3, 1.0, 12)[:, None] * leaf.outline[1]  # along the leaf, away from the frame
+    points = np.einsum("aij,ej->aei", leaf.pose(leaf.closed + leaf.opening_sign * angles).R[:, :2, :2].numpy(), edge)
+    points = points + np.array(leaf.object.t_world_object[:2].tolist())
+    apart = np.min([distance_to_convex(points, item.footprint).min(1) for item in solid], 0)
+    hit = np.flatnonzero(apart < 0.02)
+    most = MOST_OPEN
+    if len(hit):
+        most = float(min(angles[hit[0] - 1], MOST_OPEN)) if hit[0] > 0 else 0.0
     if most < LEAST_OPEN:
         return None
     opened = leaf.opening_sign * most
@@ -246,17 +258,3 @@ def _room_at(static: World, gap: Door, side: float) -> str:
     point = np.array(gap.position[:2]) + side * 0.5 * turn(gap.heading)[:, 0]
     names = [room.name for room in static.rooms if points_in_convex(point[None], room.polygon)[0]]
     return names[0] if names else ""
-
-
-def _free_angle(leaf: Openable, static: World, movables: list[Movable], gap: tuple[float, float, float]) -> float:
-    """Angle to which a leaf opens before it touches something (rad), its own frame left aside."""
-    solid = [item for item in static.objects if np.linalg.norm(np.array(item.position[:2]) - gap[:2]) < 4.0]
-    solid += [obstacle(movable, None) for movable in movables]
-    solid = [item for item in solid if item.z_range[0] < leaf.z_range[1] and item.z_range[1] > leaf.z_range[0]]
-    angles = np.deg2rad(np.arange(15.0, 106.0, 5.0))
-    edge = np.linspace(0.3, 1.0, 12)[:, None] * leaf.outline[1]  # along the leaf, away from the frame
-    points = np.einsum("aij,ej->aei", leaf.pose(leaf.closed + leaf.opening_sign * angles).R[:, :2, :2].numpy(), edge)
-    points = points + np.array(leaf.object.t_world_object[:2].tolist())
-    apart = np.min([distance_to_convex(points, item.footprint).min(1) for item in solid], 0)
-    hit = np.flatnonzero(apart < 0.02)
-    return float(min(angles[hit[0] - 1] if len(hit) and hit[0] > 0 else (0.0 if len(hit) else MOST_OPEN), MOST_OPEN))

@@ -7,6 +7,7 @@ The floor is at z = 0.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, product
 
 import numpy as np
@@ -226,9 +227,7 @@ def _pedestal(rng: np.random.Generator, wide: float = 0.30) -> Piece:
     return _seat(wide, seat, rows)
 
 
-@entered(STOOLS, "small pedestal")
-def _small_pedestal(rng: np.random.Generator) -> Piece:
-    return _pedestal(rng, 0.18)
+STOOLS["small pedestal"] = partial(_pedestal, wide=0.18)
 
 
 def _seat(wide: float, seat: float, rows: list[tuple]) -> Piece:

@@ -1,6 +1,7 @@
 """Borders of a place: walls with doors and windows, stairs, railings, house fronts, and barriers along a kerb."""
 
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
@@ -58,14 +59,24 @@ def build_wall(builder: WorldBuilder, wall: Wall, color: Color, rng: np.random.G
             _add_panel(builder, wall, (start, stop), (0.0, low), color)
         gap = w.Door(builder.point(*wall.at(middle), wall.z), builder.heading + wall.heading + np.pi / 2, width)
         (builder.doors if is_door else builder.windows).append(gap)
-        _add_frame(builder, wall, middle, width, (low, high))
-        place = stop
-        if is_door and stop + 0.18 <= wall.length - 0.1:
-            for side in (-1, 1):
-                _add_switch(builder, wall, stop + 0.18, side)
+        edges = [(middle + side * (width / 2 + 0.03), (low + high) / 2, 0.06, high - low) for side in (-1, 1)]
+        edges += [(middle, edge, width + 0.12, 0.06) for edge in ((high,) if is_door else (low, high))]
+        for along, z, long, tall in edges:  # posts and bars of the frame, slightly in front of the wall
+            center, size = (*wall.at(along), wall.z + z), (long, THICKNESS + 0.03, tall)
+            builder.add_box(center, size, (0.85, 0.83, 0.78), 6.0, wall.heading)
+        place, along = stop, stop + 0.18
+        for side in (-1, 1) if is_door and along <= wall.length - 0.1 else ():
+            switch = (*wall.at(along, side * (THICKNESS / 2 + 0.005)), wall.z + 1.1)
+            builder.add_box(switch, (0.08, 0.01, 0.08), (0.95, 0.95, 0.95), 100.0, wall.heading)
+            stand = (*wall.at(along, side * (THICKNESS / 2 + 0.42)), wall.z)
+            builder.add_reach(switch, stand, wall.heading - side * np.pi / 2)
     _add_panel(builder, wall, (place, wall.length + THICKNESS / 2), (0.0, HEIGHT), color)
-    for side in (-1, 1):
-        _add_pictures(builder, wall, openings, side, rng)
+    for side, distance in product((-1, 1), np.arange(0.6, wall.length - 0.6, 1.1)):
+        if rng.uniform() < 0.6 or any(abs(distance - middle) < width / 2 + 0.5 for middle, width, _ in openings):
+            continue
+        picture = (*wall.at(float(distance), side * (THICKNESS / 2 + 0.01)), wall.z + 1.55)
+        size = (float(rng.uniform(0.3, 0.7)), 0.02, float(rng.uniform(0.3, 0.8)))
+        builder.add_box(picture, size, tuple(rng.uniform(0.2, 0.9, 3)), 150.0, wall.heading)
 
 
 def _add_panel(builder: WorldBuilder, wall: Wall, span: tuple, z_range: tuple, color: Color) -> None:
@@ -74,35 +85,6 @@ def _add_panel(builder: WorldBuilder, wall: Wall, span: tuple, z_range: tuple, c
     tall = z_range[1] - z_range[0]
     center = (*wall.at((span[0] + span[1]) / 2), wall.z + z_range[0] + tall / 2)
     builder.add_block("wall", center, (span[1] - span[0], THICKNESS, tall), color, BLANK, wall.heading)
-
-
-def _add_frame(builder: WorldBuilder, wall: Wall, middle: float, width: float, level: tuple[float, float]) -> None:
-    """Posts beside an opening and bars along its level edges, slightly in front of the wall."""
-    color, (low, high) = (0.85, 0.83, 0.78), level
-    for side in (-1, 1):
-        center = (*wall.at(middle + side * (width / 2 + 0.03)), wall.z + (low + high) / 2)
-        builder.add_box(center, (0.06, THICKNESS + 0.03, high - low), color, 6.0, wall.heading)
-    for edge in (high,) if low == 0.0 else (low, high):
-        center = (*wall.at(middle), wall.z + edge)
-        builder.add_box(center, (width + 0.12, THICKNESS + 0.03, 0.06), color, 6.0, wall.heading)
-
-
-def _add_switch(builder: WorldBuilder, wall: Wall, distance: float, side: int) -> None:
-    """A light switch to reach for, on one side of the wall."""
-    center = (*wall.at(distance, side * (THICKNESS / 2 + 0.005)), wall.z + 1.1)
-    builder.add_box(center, (0.08, 0.01, 0.08), (0.95, 0.95, 0.95), 100.0, wall.heading)
-    stand = wall.at(distance, side * (THICKNESS / 2 + 0.42))
-    builder.add_reach(center, (*stand, wall.z), wall.heading - side * np.pi / 2)
-
-
-def _add_pictures(builder: WorldBuilder, wall: Wall, openings: list, side: int, rng: np.random.Generator) -> None:
-    """Prints on the wall beside the openings."""
-    for distance in np.arange(0.6, wall.length - 0.6, 1.1):
-        if rng.uniform() < 0.6 or any(abs(distance - middle) < width / 2 + 0.5 for middle, width, _ in openings):
-            continue
-        center = (*wall.at(float(distance), side * (THICKNESS / 2 + 0.01)), wall.z + 1.55)
-        size = (float(rng.uniform(0.3, 0.7)), 0.02, float(rng.uniform(0.3, 0.8)))
-        builder.add_box(center, size, tuple(rng.uniform(0.2, 0.9, 3)), 150.0, wall.heading)
 
 
 def before_gap(builder: WorldBuilder, gap: w.Door, deep: float = 0.95, beside: float = 0.15) -> Box:

@@ -11,7 +11,7 @@ over the step.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -217,42 +217,30 @@ def _watch(
     side = 1.0 if joint.startswith("left") else -1.0
     reach = torch.tensor([0.0, 0.55 * side, 0.0], dtype=torch.float64)
     position = (R_world_joint @ reach) * torch.from_numpy(worn)[:, None]
-    stream = _logged(time, joint, R_world_imu, position, R_world_ref, noise, rng)
-    offset, rate = rng.uniform(-1, 1) * noise.clock[0], 1 + 1e-6 * noise.clock[1] * rng.standard_normal()
-
-    def clock(true_s: float) -> float:
-        return 1.7e9 + offset + rate * true_s
-
-    times = torch.tensor([clock(t) for t in time.tolist()], dtype=torch.float64)
-    return replace(stream, timestamps=times), R_world_ref, R_joint_imu, clock
-
-
-def _logged(
-    time: np.ndarray,
-    joint: str,
-    R_world_imu: Tensor,
-    position: Tensor,
-    R_world_ref: Tensor,
-    noise: SessionNoise,
-    rng: np.random.Generator,
-) -> ImuStream:
-    """Core Motion's log in its reference frame: attitude that errs more when moved, and the measured acceleration."""
-    fps = 1 / (time[1] - time[0])
+    # Core Motion's log in its reference frame: attitude that errs more when moved, and the measured acceleration.
+    step_fps = 1 / (time[1] - time[0])
     R, times = R_world_imu, torch.from_numpy(time)
     acc = finite_difference(finite_difference(position, times), times).roll(-1, 0)
     up = torch.tensor([0.0, 0.0, GRAVITY], dtype=torch.float64)
     felt = (R.mT @ (acc + up)[..., None])[..., 0] + torch.from_numpy(
         noise.acc_bias * rng.standard_normal(3) + noise.acc_noise * rng.standard_normal((len(time), 3))
     )
-    rate = angular_rate(R, fps)
-    turning = np.convolve(rate.norm(dim=-1).numpy(), np.ones(int(fps)) / fps, "same")
+    rate = angular_rate(R, step_fps)
+    turning = np.convolve(rate.norm(dim=-1).numpy(), np.ones(int(step_fps)) / step_fps, "same")
     # Slower than 0.2 rad/s on average counts as rest for the filter.
     moved = torch.from_numpy((turning - 0.2).clip(0, 1))
-    error = noise.still[0] * smooth_noise(rng, len(time), 3, noise.still[1], fps).double()
-    error += noise.moving[0] * smooth_noise(rng, len(time), 3, noise.moving[1], fps).double() * moved[:, None]
+    error = noise.still[0] * smooth_noise(rng, len(time), 3, noise.still[1], step_fps).double()
+    error += noise.moving[0] * smooth_noise(rng, len(time), 3, noise.moving[1], step_fps).double() * moved[:, None]
     R_ref_imu = R_world_ref.mT @ R @ rotation.exp(torch.deg2rad(error) / np.sqrt(3))
     acc_ref = (R_ref_imu @ felt[..., None])[..., 0] - up
-    return ImuStream(times, joint, R_ref_imu.float(), acc_ref.float(), felt.float(), rate.float())
+    offset, clock_rate = rng.uniform(-1, 1) * noise.clock[0], 1 + 1e-6 * noise.clock[1] * rng.standard_normal()
+
+    def clock(true_s: float) -> float:
+        return 1.7e9 + offset + clock_rate * true_s
+
+    times = torch.tensor([clock(t) for t in time.tolist()], dtype=torch.float64)
+    log = ImuStream(times, joint, R_ref_imu.float(), acc_ref.float(), felt.float(), rate.float())
+    return log, R_world_ref, R_joint_imu, clock
 
 
 def _camera_path(

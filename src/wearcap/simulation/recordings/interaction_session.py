@@ -78,12 +78,27 @@ def flat_of(split: str, number: int) -> InteractiveFlat:
 
 @lru_cache(maxsize=2)
 def object_flat_of(split: str, number: int) -> InteractiveFlat:
-    """A split's interactive flat with hand-held objects by number, always the same."""
+    """A split's interactive flat with hand-held objects by number, always the same.
+
+    Most of its doors are open, and one or two objects of each kind stand at reachable places, clear of doors, drawers
+    and walkers; where a kind finds no place, the next flat is taken.
+    """
     rng = seeded(8, split, number)
     while True:
         flat = build_interactive_flat(rng, f"sim-{split}-object_flat-{number:03d}")
-        if (furnished := _with_handhelds(flat, rng)) is not None:
-            return furnished
+        openables = tuple(
+            at(item, item.opening_sign * float(rng.uniform(WIDE, item.openness(item.opened))))
+            if item.category == "door" and item.blocks(0.0) and rng.random() < OPEN_SHARE
+            else item
+            for item in flat.openables
+        )
+        flat = InteractiveFlat(flat.static, flat.movables, openables)
+        names = [f"{category}_{number}" for category in HANDHELDS for number in range(1, 2 + int(rng.random() < TWICE))]
+        for name in names:
+            if (placed := _placed(flat, make_movable(name.rpartition("_")[0], name, rng), rng)) is not None:
+                flat = InteractiveFlat(flat.static, (*flat.movables, placed), openables)
+        if {movable.category for movable in flat.movables}.issuperset(HANDHELDS):
+            return flat
 
 
 def simulate_interactions(
@@ -142,26 +157,6 @@ def _handled(
         interactions=house.interactions(60.0 * minutes),
         **parts,
     )
-
-
-def _with_handhelds(flat: InteractiveFlat, rng: np.random.Generator) -> InteractiveFlat | None:
-    """The flat with most doors open and one or two of each hand-held kind at reachable places.
-
-    They are clear of doors, drawers and walkers. None where a kind finds no place.
-    """
-    openables = tuple(
-        at(item, item.opening_sign * float(rng.uniform(WIDE, item.openness(item.opened))))
-        if item.category == "door" and item.blocks(0.0) and rng.random() < OPEN_SHARE
-        else item
-        for item in flat.openables
-    )
-    flat = InteractiveFlat(flat.static, flat.movables, openables)
-    names = [f"{category}_{number}" for category in HANDHELDS for number in range(1, 2 + int(rng.random() < TWICE))]
-    for name in names:
-        if (placed := _placed(flat, make_movable(name.rpartition("_")[0], name, rng), rng)) is not None:
-            flat = InteractiveFlat(flat.static, (*flat.movables, placed), openables)
-    kinds = {movable.category for movable in flat.movables}
-    return flat if kinds.issuperset(HANDHELDS) else None
 
 
 def _placed(flat: InteractiveFlat, movable: Movable, rng: np.random.Generator) -> Movable | None:

@@ -113,7 +113,10 @@ def _dressed(skeleton: Skeleton, shape: dict[str, float], rng: np.random.Generat
         skin_joints=whole.skin_joints[vertices],
         skin_weights=whole.skin_weights[vertices],
     )
-    skin = _skin_tone(skeleton)
+    own = np.random.default_rng(zlib.crc32(skeleton.t_parent_joint.numpy().tobytes()))  # the same for the same bones
+    place = own.uniform(0, len(_SKIN) - 1)
+    tone = [np.interp(place, np.arange(len(_SKIN)), _SKIN[:, channel]) for channel in range(3)]
+    skin = (np.array(tone) * own.uniform(0.94, 1.06)).astype(np.float32)
     shirt, trousers, shoe = (np.array(hue(rng, (0.0, 0.75))) * rng.uniform(0.25, 1.1) for _ in range(3))
     worn = {"skin": skin, "shirt": shirt, "trousers": trousers, "shoe": shoe}
     bare = rng.uniform(size=3)
@@ -124,14 +127,6 @@ def _dressed(skeleton: Skeleton, shape: dict[str, float], rng: np.random.Generat
     table = np.stack([worn[_WORN.get(part, "shirt")] for part in parts])[dominant[vertices].numpy()]
     color = np.clip(table * (1 + _MOTTLE * rng.standard_normal((len(table), 1))), 0.02, 0.98).astype(np.float32)
     return _Body(body, body.faces.numpy().astype(np.int32), color)
-
-
-def _skin_tone(skeleton: Skeleton) -> Float32[np.ndarray, "3"]:
-    """Skin tone, RGB 0…1, always the same for the same bones."""
-    own = np.random.default_rng(zlib.crc32(skeleton.t_parent_joint.numpy().tobytes()))
-    place = own.uniform(0, len(_SKIN) - 1)
-    tone = [np.interp(place, np.arange(len(_SKIN)), _SKIN[:, channel]) for channel in range(3)]
-    return (np.array(tone) * own.uniform(0.94, 1.06)).astype(np.float32)
 
 
 def write_ego_video(

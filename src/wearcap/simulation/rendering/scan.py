@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.compiled import compiled
@@ -64,7 +64,16 @@ def scan_world(
     for station, views in zip(stations, nearness):
         for view, R in zip(views, CUBE):
             view[:] = visible(scenery, R, station, View(R, size / 2, (size - 1) / 2, (size - 1) / 2, size, size))[0]
-    survey = (stations, *_near_stations(scenery.vertices, stations, scanner), nearness)
+    # For every cell of the plan the nearest stations in reach, in order, and the index of each cell's first.
+    origin = scenery.vertices[:, :2].min(0).astype(np.float64) - 0.1
+    shape = np.ceil((scenery.vertices[:, :2].max(0) + 0.1 - origin) / CELL_M).astype(np.int64)
+    grid = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 2)
+    middle = origin + (grid + 0.5) * CELL_M
+    distance = np.linalg.norm(middle[:, None] - stations[None, :, :2], axis=-1)
+    order = np.argsort(distance, axis=1)[:, :TRIED]
+    within = np.take_along_axis(distance, order, 1) < scanner.max_m + CELL_M
+    first = np.concatenate([[0], within.sum(1).cumsum()])
+    survey = (stations, order[within], first, CELL_M, origin, shape, nearness)
     # Most faces of a world are inside or below others: a face is sampled if some of a few random points are seen.
     probed = np.repeat(np.arange(len(scenery.faces)), PROBES)
     _, kept = _measured(scenery, survey, scanner, probed, _on_faces(scenery, probed, rng), rng)
@@ -97,21 +106,6 @@ def place_stations(world: World, spacing_m: float, clearance_m: float = 0.45) ->
         chosen.append(int(left.argmax()))
         left &= np.linalg.norm(points - points[chosen[-1]], axis=1) >= spacing_m
     return points[chosen]
-
-
-def _near_stations(
-    vertices: Float32[np.ndarray, "vertex 3"], stations: Float[np.ndarray, "station 3"], scanner: Scanner
-) -> tuple[Int[np.ndarray, "entry"], Int[np.ndarray, "slot"], float, np.ndarray, np.ndarray]:
-    """For every cell of the plan the nearest stations in reach, in order: entries, each cell's first, and the grid."""
-    origin = vertices[:, :2].min(0).astype(np.float64) - 0.1
-    shape = np.ceil((vertices[:, :2].max(0) + 0.1 - origin) / CELL_M).astype(np.int64)
-    grid = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 2)
-    middle = origin + (grid + 0.5) * CELL_M
-    distance = np.linalg.norm(middle[:, None] - stations[None, :, :2], axis=-1)
-    order = np.argsort(distance, axis=1)[:, :TRIED]
-    within = np.take_along_axis(distance, order, 1) < scanner.max_m + CELL_M
-    first = np.concatenate([[0], within.sum(1).cumsum()])
-    return order[within], first, CELL_M, origin, shape
 
 
 def _samples(scenery: Scenery, spacing_m: float, wanted: Bool[np.ndarray, "face"], rng: np.random.Generator):
