@@ -96,10 +96,13 @@ class _Builder(WorldBuilder):
     """A builder that keeps movable objects out of the world."""
 
     rng: np.random.Generator
-    movables: list[Movable]
-    openables: list[Openable]
-    shut: set[int]
-    """Indices of windows that cannot be opened."""
+
+    def __init__(self, *frame):
+        super().__init__(*frame)
+        self.movables: list[Movable] = []
+        self.openables: list[Openable] = []
+        self.shut: set[int] = set()
+        """Indices of windows that cannot be opened."""
 
     def place(self, piece: Piece, position: tuple[float, float, float], heading: float) -> int:
         if isinstance(piece, _Loose):
@@ -119,19 +122,17 @@ def build_interactive_flat(rng: np.random.Generator, name: str) -> InteractiveFl
     while True:
         draws = np.random.default_rng(rng.integers(2**63))
         builder = _Builder.drawn(name, draws)
-        builder.rng, builder.movables, builder.openables, builder.shut = draws, [], [], set()
+        builder.rng = draws
         lay_out(builder, draws, stairs=False, furnish=_furnish)
         static = builder.finish()
         leaves = _door_leaves(builder, static) + _sashes(builder, static)
-        flat = InteractiveFlat(
-            static, tuple(_numbered(builder.movables)), tuple(_numbered([*leaves, *builder.openables]))
-        )
+        flat = InteractiveFlat(static, _numbered(builder.movables), _numbered([*leaves, *builder.openables]))
         kinds = Counter(item.category for item in (*flat.movables, *flat.openables))
         if all(kinds[kind] >= least for kind, least in FEWEST.items()) and kinds.total() >= FEWEST_OBJECTS:
             return flat
 
 
-def _numbered(items: list) -> list:
+def _numbered(items: list) -> tuple:
     """The same items with names: door_1, door_2 …"""
     count: Counter[str] = Counter()
     out = []
@@ -139,7 +140,7 @@ def _numbered(items: list) -> list:
         count[item.category] += 1
         name = f"{item.category}_{count[item.category]}"
         out.append(replace(item, object=replace(item.object, name=name)))
-    return out
+    return tuple(out)
 
 
 def _furnish(plan: Plan, kind: str, rng: np.random.Generator) -> None:

@@ -115,19 +115,19 @@ def hinged(
 
     `opening_sign` is the sense of opening about z; `z_range` is above the foot (m).
     """
-    thick = PANEL_M if category == "cabinet_door" else LEAF_M
+    thick, is_door = PANEL_M if category == "cabinet_door" else LEAF_M, category == "door"
     low, high = z_range
-    edge = rng.uniform(0.06, 0.08) if category == "door" else rng.uniform(0.03, 0.05)
+    edge = rng.uniform(0.06, 0.08) if is_door else rng.uniform(0.03, 0.05)
     level = {"door": float(rng.uniform(1.0, 1.05)), "window": float(np.clip((low + high) / 2, 1.2, 1.5))}.get(
         category, float(np.clip(high - 0.15, low + 0.1, rng.uniform(1.0, 1.1)))
     )
     rows, handles = _leaf(category, width, thick, z_range, opening_sign, rng), []
-    for side in (opening_sign, -opening_sign) if category == "door" else (opening_sign,):
+    place, size = width - edge, (0.02, 0.02, 0.12)
+    if is_door:
+        place, size = width - edge - 0.11 / 2, (0.11, 0.02, 0.02)
+    for side in (opening_sign, -opening_sign) if is_door else (opening_sign,):
         face = 0.0 if side == opening_sign else thick
         out = side * (face + 0.05)
-        place, size = (
-            (width - edge - 0.11 / 2, (0.11, 0.02, 0.02)) if category == "door" else (width - edge, (0.02, 0.02, 0.12))
-        )
         rows.append((place, out, level, *size, METAL, PATTERNED))
         rows.append((width - edge, side * (face + 0.02), level, 0.02, 0.06, 0.02, METAL, PATTERNED))
         handles.append(_hook((place, out, level), (0.0, -side)))

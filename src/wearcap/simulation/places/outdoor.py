@@ -16,19 +16,10 @@ from wearcap.simulation.places.world import Flight, World
 
 KERB_STONE_M = 0.15
 LONGEST_RAMP_M = 9.5
-SQUARE_KINDS = [
-    "tree",
-    "bench",
-    "board",
-    "bin",
-    "tree",
-    "low_wall",
-    "bench",
-    "planter",
-    "street_lamp",
-    "bush",
-    "bollard",
-]
+SQUARE_KINDS = (
+    *("tree", "bench", "board", "bin", "tree", "low_wall"),
+    *("bench", "planter", "street_lamp", "bush", "bollard"),
+)
 PAVEMENT_KINDS = ("street_lamp", "letter_box", "bench", "bollard", "tree", "bin")
 TERRACE_KINDS = ("bench", "planter", "bin")
 """Furniture of each part, in order of preference."""

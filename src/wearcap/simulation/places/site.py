@@ -31,44 +31,17 @@ RISE_M, RISERS, TREAD_M = 0.16, 2, 0.31
 BASE = -RISERS * RISE_M
 """Height of the yard."""
 RAMP_SLOPE = 0.08
-HALL_KINDS = ["shelf", "board", "cabinet", "plant", "shelf", "desk", "sofa", "shelf", "board", "plant", "shelf"]
-YARD_KINDS = [
-    "tree",
-    "bench",
-    "board",
-    "planter",
-    "bush",
-    "tree",
-    "low_wall",
-    "street_lamp",
-    "bin",
-    "bench",
-    "letter_box",
-    "tree",
-    "bush",
-    "planter",
-    "bollard",
-    "tree",
-    "low_wall",
-    "street_lamp",
-]
+HALL_KINDS = ("shelf", "board", "cabinet", "plant", "shelf", "desk", "sofa", "shelf", "board", "plant", "shelf")
+YARD_KINDS = (
+    *("tree", "bench", "board", "planter", "bush", "tree", "low_wall", "street_lamp", "bin"),
+    *("bench", "letter_box", "tree", "bush", "planter", "bollard", "tree", "low_wall", "street_lamp"),
+)
 TERRACE_KINDS = ("bench", "planter", "bin", "board")
 """Furniture of each part, in order of preference."""
-MOVABLE = [
-    "chair",
-    "armchair",
-    "plant",
-    "lamp",
-    "board",
-    "bin",
-    "bench",
-    "coffee_table",
-    "table",
-    "desk",
-    "cabinet",
-    "sofa",
-    "planter",
-]
+MOVABLE = (
+    *("chair", "armchair", "plant", "lamp", "board", "bin", "bench", "coffee_table", "table"),
+    *("desk", "cabinet", "sofa", "planter"),
+)
 """Kinds of objects that may stand elsewhere, or be gone, some days later."""
 
 

@@ -93,7 +93,7 @@ def object_flat_of(split: str, number: int) -> InteractiveFlat:
             for item in flat.openables
         )
         flat = InteractiveFlat(flat.static, flat.movables, openables)
-        names = [f"{category}_{number}" for category in HANDHELDS for number in range(1, 2 + int(rng.random() < TWICE))]
+        names = [f"{category}_{copy}" for category in HANDHELDS for copy in range(1, 2 + int(rng.random() < TWICE))]
         for name in names:
             if (placed := _placed(flat, make_movable(name.rpartition("_")[0], name, rng), rng)) is not None:
                 flat = InteractiveFlat(flat.static, (*flat.movables, placed), openables)
