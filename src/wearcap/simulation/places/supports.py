@@ -199,7 +199,7 @@ def meets(
 
 
 STOOLS: dict[str, Callable[[np.random.Generator], Piece]] = {}
-"""Makers of seats without a back, of which those in `MAKERS` are too large or too low."""
+"""Makers of seats without a back by kind."""
 
 
 @entered(STOOLS, "stool")
@@ -264,9 +264,7 @@ def _clear(body: BodySpace, tread: Tread, solid: bool) -> bool:
 
 def _grown(body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator) -> Tread:
     """The tread widened on all sides while the body is clear of it, up to a drawn size."""
-    most = (
-        np.array([rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)]) if solid else np.array([0.0, rng.uniform(0.45, 0.6)])
-    )
+    most = (rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)) if solid else (0.0, rng.uniform(0.45, 0.6))
     open_sides = [(axis, sign) for axis in (1, 0) for sign in (-1, 1)]
     while open_sides:
         for axis, sign in list(open_sides):
