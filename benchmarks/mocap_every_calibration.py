@@ -44,7 +44,7 @@ def calibration_scores(sessions: int, step: Callable[[], None]) -> Scores:
                 errors[name] += found
             ways = (
                 by_head_imu(made.slam, made.head_imu),
-                by_floor(made.slam, made.points_slam, STANDING, made.standing_m),
+                by_floor(made.slam, made.points_slam, STANDING, made.measured.standing_m),
             )
             for of, way in zip(unaided.values(), ways):
                 for name, error in _scale_and_tilt(way, made).items():
@@ -60,26 +60,33 @@ def calibration_scores(sessions: int, step: Callable[[], None]) -> Scores:
 def _errors(made: CalibrationSession, fps: float) -> dict[str, list[float]]:
     watches = calibrate_watches(made.watches, made.board["left_wrist"], made.t_pose["left_wrist"])
     marks, _, _ = mark_positions(made.slam, MARKS)
-    aligned = align_by_marks(marks, made.distances_m, made.mark_height_m)
+    aligned = align_by_marks(marks, made.measured.distances_m, made.measured.mark_height_m)
     mount = mount_by_standing(aligned.apply(made.slam), STANDING)
     middle = torch.tensor([SWINGS_S + 8], dtype=torch.float64)
     clocks = []
     for joint, stream in made.watches.items():
         clock = fit_swing_clock(made.swings_s, swing_peaks(stream) - EPOCH_S, 1 / fps)
-        clocks.append((clock.clock.to_camera(middle - made.offset_s[joint] - EPOCH_S) - middle).abs().item())
+        clocks.append((clock.clock.to_camera(middle - made.planted.offset_s[joint] - EPOCH_S) - middle).abs().item())
     return {
-        "watch_world_deg": [_apart_deg(one.R_world_ref, made.R_world_ref[joint]) for joint, one in watches.items()],
-        "watch_wrist_deg": [_apart_deg(one.R_joint_imu, made.R_joint_imu[joint]) for joint, one in watches.items()],
-        "slam_world_deg": [_apart_deg(aligned.R_world_slam, made.R_world_slam)],
-        "head_camera_deg": [_apart_deg(mount.R_head_cam, made.R_head_cam)],
-        "scale_percent": [100 * abs(aligned.scale / made.scale - 1)],
+        "watch_world_deg": [
+            _apart_deg(one.R_world_ref, made.planted.R_world_ref[joint]) for joint, one in watches.items()
+        ],
+        "watch_wrist_deg": [
+            _apart_deg(one.R_joint_imu, made.planted.R_joint_imu[joint]) for joint, one in watches.items()
+        ],
+        "slam_world_deg": [_apart_deg(aligned.R_world_slam, made.planted.R_world_slam)],
+        "head_camera_deg": [_apart_deg(mount.R_head_cam, made.planted.R_head_cam)],
+        "scale_percent": [100 * abs(aligned.scale / made.planted.scale - 1)],
         "clock_ms": [1000 * error for error in clocks],
     }
 
 
 def _scale_and_tilt(found: GravityScale, made: CalibrationSession) -> dict[str, float]:
-    cos = (found.R_world_slam[2] @ made.R_world_slam[2]).clamp_max(1).item()
-    return {"slam_world_deg": math.degrees(math.acos(cos)), "scale_percent": 100 * abs(found.scale / made.scale - 1)}
+    cos = (found.R_world_slam[2] @ made.planted.R_world_slam[2]).clamp_max(1).item()
+    return {
+        "slam_world_deg": math.degrees(math.acos(cos)),
+        "scale_percent": 100 * abs(found.scale / made.planted.scale - 1),
+    }
 
 
 def _apart_deg(a: torch.Tensor, b: torch.Tensor) -> float:

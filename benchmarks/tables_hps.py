@@ -18,8 +18,7 @@ from rich.table import Table
 from tabling import cell, finite, new_table, summarize
 
 from wearcap.files import write_text
-from wearcap.simulation.recordings.hps import HpsConfig
-from wearcap.simulation.recordings.hps_session import Protocol
+from wearcap.simulation.recordings.hps import HpsConfig, Protocol
 from wearcap.systems.hps.scores import in_order
 
 DOCUMENT = {

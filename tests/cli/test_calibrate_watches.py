@@ -81,8 +81,8 @@ def arguments(made: CalibrationSession, files: Path, out: Path, camera: bool = T
             "camera": f"{files}/camera.txt",
             "marks": f"[{written(*MARKS)}]",
             "standing": written(STANDING),
-            "distances_m": f"[{made.distances_m[0]},{made.distances_m[1]}]",
-            "mark_height_m": str(made.mark_height_m),
+            "distances_m": f"[{made.measured.distances_m[0]},{made.measured.distances_m[1]}]",
+            "mark_height_m": str(made.measured.mark_height_m),
             "swings": f"[{swings}]",
             "camera_fps": "60",
         }
@@ -105,13 +105,13 @@ def test_a_session_becomes_a_calibration_and_a_recording(made, files, tmp_path, 
     assert "no  " not in said.replace("not", "")
     found = read_watch_calibration(tmp_path / "calibration.json")
     for joint in WRISTS:
-        assert apart_deg(found.watches[joint].R_world_ref, made.R_world_ref[joint]) < 0.5
-        assert apart_deg(found.watches[joint].R_joint_imu, made.R_joint_imu[joint]) < 0.5
+        assert apart_deg(found.watches[joint].R_world_ref, made.planted.R_world_ref[joint]) < 0.5
+        assert apart_deg(found.watches[joint].R_joint_imu, made.planted.R_joint_imu[joint]) < 0.5
         middle = torch.tensor([SWINGS_S + 8], dtype=torch.float64)
-        assert (found.clocks[joint].clock.to_camera(middle - made.offset_s[joint]) - middle).abs() < 0.005
-    assert found.camera.scale == pytest.approx(made.scale, rel=0.005)
-    assert apart_deg(found.camera.R_world_slam, made.R_world_slam) < 0.5
-    assert apart_deg(found.head.R_head_cam, made.R_head_cam) < 0.5
+        assert (found.clocks[joint].clock.to_camera(middle - made.planted.offset_s[joint]) - middle).abs() < 0.005
+    assert found.camera.scale == pytest.approx(made.planted.scale, rel=0.005)
+    assert apart_deg(found.camera.R_world_slam, made.planted.R_world_slam) < 0.5
+    assert apart_deg(found.head.R_head_cam, made.planted.R_head_cam) < 0.5
     content = json.loads((tmp_path / "calibration.json").read_text())
     assert all(check["ok"] for check in content["checks"])
     assert content["about"]["left"] == "left.csv"
@@ -121,7 +121,7 @@ def test_a_session_becomes_a_calibration_and_a_recording(made, files, tmp_path, 
     torch.testing.assert_close(R[:, :, 2, 1].mean(0), torch.tensor([-1.0, 1.0]), atol=0.01, rtol=0)
     assert recording.floor.height.tolist() == [0.0]
     upright = (recording.head.timestamps > STANDING[0]) & (recording.head.timestamps < STANDING[1])
-    assert recording.head.t_world_device[upright, 2].mean() == pytest.approx(made.standing_m, abs=0.01)
+    assert recording.head.t_world_device[upright, 2].mean() == pytest.approx(made.measured.standing_m, abs=0.01)
 
 
 def test_watches_alone_go_into_a_data_set(made, files, tmp_path, capsys):
@@ -154,8 +154,8 @@ def test_the_guide_says_the_steps_and_where_the_logs_have_them(made, files, tmp_
     # What is proposed is good enough to calibrate with.
     calibrate(given, *hint)
     found = read_watch_calibration(tmp_path / "calibration.json")
-    assert apart_deg(found.watches["left_wrist"].R_joint_imu, made.R_joint_imu["left_wrist"]) < 1.0
-    assert found.camera.scale == pytest.approx(made.scale, rel=0.01)
+    assert apart_deg(found.watches["left_wrist"].R_joint_imu, made.planted.R_joint_imu["left_wrist"]) < 1.0
+    assert found.camera.scale == pytest.approx(made.planted.scale, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_the_guide_says_the_steps_and_where_the_logs_have_them(made, files, tmp_
     ],
 )
 def test_what_is_wrong_is_said_and_nothing_is_written(made, files, tmp_path, change, match):
-    change = {key: value.replace("D", str(made.distances_m[0])) for key, value in change.items()}
+    change = {key: value.replace("D", str(made.measured.distances_m[0])) for key, value in change.items()}
     with pytest.raises(WearcapError, match=match):
         calibrate(arguments(made, files, tmp_path) | change)
     assert not (tmp_path / "calibration.json").exists()

@@ -9,8 +9,7 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.simulation.recordings.simulate import SimulationConfig
-from wearcap.simulation.recordings.two_wearers import simulate_two_wearers
+from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_two_wearers
 from wearcap.systems.mocap_every.energy import LatentSolver, LatentWeights
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.sessions import capture_session, read_view, simulated_views, write_view

@@ -32,7 +32,7 @@ def test_a_planted_offset_is_recovered(seed, calibrated):
         # Both clocks near each other, as after a timecode
         peaks = swing_peaks(stream) - 1.7e9
         clock = fit_swing_clock(made.swings_s, peaks, 1 / 60)
-        true = made.offset_s[joint] + 1.7e9
+        true = made.planted.offset_s[joint] + 1.7e9
         assert (clock.clock.to_camera(MIDDLE - true) - MIDDLE).abs().item() < 0.005
         assert clock.std_s < 0.004
         require(swing_checks(clock, joint))

@@ -30,14 +30,14 @@ DISTANCES = (0.5, 0.4)
 def test_a_planted_session_is_recovered(seed):
     made = session(seed)
     marks, moved, turned = mark_positions(made.slam, MARKS)
-    found = align_by_marks(marks, made.distances_m, made.mark_height_m)
-    assert found.scale == pytest.approx(made.scale, rel=0.005)
-    assert apart_deg(found.R_world_slam, made.R_world_slam) < 0.5
-    true = made.scale * marks @ made.R_world_slam.mT + made.t_world_slam
+    found = align_by_marks(marks, made.measured.distances_m, made.measured.mark_height_m)
+    assert found.scale == pytest.approx(made.planted.scale, rel=0.005)
+    assert apart_deg(found.R_world_slam, made.planted.R_world_slam) < 0.5
+    true = made.planted.scale * marks @ made.planted.R_world_slam.mT + made.planted.t_world_slam
     assert (found.points(marks) - true).norm(dim=-1).max() < 0.005
     aligned = found.apply(made.slam)
     mount = mount_by_standing(aligned, STANDING)
-    assert apart_deg(mount.R_head_cam, made.R_head_cam) < 0.5
+    assert apart_deg(mount.R_head_cam, made.planted.R_head_cam) < 0.5
     require([*mark_checks(found, found.scale * moved, turned), *mount_checks(mount)])
     head = mount.apply(aligned)
     upright = (head.timestamps > STANDING[0]) & (head.timestamps < STANDING[1])
@@ -122,7 +122,7 @@ def test_walked_distances_give_the_scale():
 
 def test_standing_must_be_still_and_face_ahead():
     made = session(0)
-    aligned = align_by_marks(mark_positions(made.slam, MARKS)[0], made.distances_m).apply(made.slam)
+    aligned = align_by_marks(mark_positions(made.slam, MARKS)[0], made.measured.distances_m).apply(made.slam)
     with pytest.raises(WearcapError, match="optical axis away from straight ahead: 1[5-8].*facing_deg"):
         require(mount_checks(mount_by_standing(aligned, STANDING, facing_deg=-90.0)))
     with pytest.raises(WearcapError, match="standing: not still"):

@@ -23,8 +23,8 @@ def test_planted_frames_and_mountings_are_recovered(seed):
     made = session(seed)
     found = calibrate_watches(made.watches, made.board["left_wrist"], made.t_pose["left_wrist"])
     for joint, one in found.items():
-        assert apart_deg(one.R_world_ref, made.R_world_ref[joint]) < 0.5
-        assert apart_deg(one.R_joint_imu, made.R_joint_imu[joint]) < 0.5
+        assert apart_deg(one.R_world_ref, made.planted.R_world_ref[joint]) < 0.5
+        assert apart_deg(one.R_joint_imu, made.planted.R_joint_imu[joint]) < 0.5
         assert one.board_still_deg < 0.5
         assert one.board_tilt_deg < 1.0
         assert 0.5 < one.pose_still_deg < 3.0

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from wearcap.simulation.places.hillside import build_hillside
+from wearcap.simulation.places.outdoor import build_hillside
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 
 

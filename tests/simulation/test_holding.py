@@ -13,10 +13,9 @@ from wearcap.simulation.handling.holding import put_down, take_options, take_up
 from wearcap.simulation.handling.using import use
 from wearcap.simulation.people.person import draw_person
 from wearcap.simulation.people.walking import walk_along
-from wearcap.simulation.places.handhelds import MAKERS, ball, bottle, drill, hammer, mop
-from wearcap.simulation.places.movables import floor_pose, make_movable
+from wearcap.simulation.places.movables import HANDHELDS, MOVABLES, TOOLS, floor_pose, make_movable
 
-SHAPES = {**MAKERS, "hammer": hammer, "drill": drill, "mop": mop}
+SHAPES = {**{kind: MOVABLES[kind] for kind in HANDHELDS}, **TOOLS}
 START, STOP = np.array([0.0, 0.0, 0.3, 0.0]), np.array([1.4, 0.6, 0.9, 0.0])
 
 
@@ -29,21 +28,21 @@ def floor():
 def test_shapes_are_closed_and_stand_on_the_floor(kind):
     for seed in range(3):
         shape = SHAPES[kind](np.random.default_rng(seed))
-        vertices = shape.mesh.vertices.astype(np.float64)
+        vertices = shape.object.mesh.vertices.astype(np.float64)
         assert abs(vertices[:, 2].min()) < 1e-6
         assert vertices[:, 2].max() == pytest.approx(shape.height, abs=0.01)
-        edges = Counter((int(face[k]), int(face[(k + 1) % 3])) for face in shape.mesh.faces for k in range(3))
+        edges = Counter((int(face[k]), int(face[(k + 1) % 3])) for face in shape.object.mesh.faces for k in range(3))
         assert all(edges[b, a] == count for (a, b), count in edges.items())
-        a, b, c = (vertices[shape.mesh.faces[:, corner]] for corner in range(3))
+        a, b, c = (vertices[shape.object.mesh.faces[:, corner]] for corner in range(3))
         assert (np.cross(a, b) * c).sum() > 0, "faces look outwards"
 
 
 def test_a_ball_is_round_and_a_bottle_has_a_neck():
-    shape = ball(np.random.default_rng(0))
+    shape = MOVABLES["ball"](np.random.default_rng(0))
     radius = shape.height / 2
-    away = np.linalg.norm(shape.mesh.vertices - [0.0, 0.0, radius], axis=1)
+    away = np.linalg.norm(shape.object.mesh.vertices - [0.0, 0.0, radius], axis=1)
     assert np.allclose(away, radius, rtol=1e-3)
-    vertices = bottle(np.random.default_rng(0)).mesh.vertices
+    vertices = MOVABLES["bottle"](np.random.default_rng(0)).object.mesh.vertices
     wide = np.hypot(vertices[:, 0], vertices[:, 1])
     assert wide[vertices[:, 2] > 0.9 * vertices[:, 2].max()].max() < 0.6 * wide.max()
 

@@ -15,8 +15,7 @@ from wearcap.recording.serialize import flatten, unflatten
 from wearcap.sensors.claps import detect_claps
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.places.site import build_site
-from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
-from wearcap.simulation.recordings.hps_session import Protocol
+from wearcap.simulation.recordings.hps import HpsConfig, Protocol, simulate_hps
 from wearcap.simulation.recordings.localization_noise import LocalizationNoise, localize_statistically, with_outage
 from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, view_texture
 

@@ -9,13 +9,7 @@ import torch
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
 from wearcap.simulation.places.outline import distance_to_convex
-from wearcap.simulation.recordings.interaction_session import (
-    FLATS,
-    InteractionConfig,
-    flat_number,
-    flat_of,
-    simulate_interactions,
-)
+from wearcap.simulation.recordings.interaction_session import FLATS, InteractionConfig, flat_of, simulate_interactions
 
 CONFIG = InteractionConfig(minutes=1.0)
 
@@ -27,11 +21,11 @@ def simulated():
 
 @pytest.fixture(scope="module")
 def recording(simulated):
-    return simulated.recording
+    return simulated[0]
 
 
 def test_a_recording_has_all_its_parts(simulated, recording):
-    names = {item.name for item in simulated.environment.objects}
+    names = {item.name for item in simulated[1].environment.objects}
     assert set(recording.object_motion) == names
     assert set(recording.interactions.objects) <= names
     assert len(set(recording.interactions.objects)) >= 2
@@ -73,7 +67,7 @@ def test_palms_in_contact_are_at_the_surface(simulated, recording):
         frame = int(torch.searchsorted(motion.timestamps, (rows.start_s[k] + rows.stop_s[k]) / 2))
         poses = {key: track.T_world_body[frame] for key, track in recording.object_motion.items()}
         for hand in np.flatnonzero(rows.hands[k].numpy()):
-            nearest = simulated.environment.nearest(palms[frame, hand][None], poses, None, 0.5)
+            nearest = simulated[1].environment.nearest(palms[frame, hand][None], poses, None, 0.5)
             assert nearest.distance[0] < 0.03, (name, hand)
 
 
@@ -89,7 +83,7 @@ def test_things_rest_when_nobody_holds_them(recording):
 
 
 def test_things_keep_to_their_freedom(simulated, recording):
-    for item in simulated.environment.objects:
+    for item in simulated[1].environment.objects:
         track, freedom = recording.object_motion[item.name], item.freedom
         up = track.R_world_body[:, 2, 2]
         assert (up > 1 - 1e-5).all(), "objects stay upright"
@@ -102,7 +96,7 @@ def test_things_keep_to_their_freedom(simulated, recording):
 
 
 def test_bodies_are_not_in_walls_or_shut_doors(simulated, recording):
-    flat = flat_of("val", flat_number("val", 3))
+    flat = simulated[1]
     for joint in ("pelvis", "t8"):
         place = recording.motion.joint(joint).t.double().numpy()[::3]
         for wall in (item for item in flat.static.objects if item.kind == "wall"):
@@ -117,7 +111,7 @@ def test_bodies_are_not_in_walls_or_shut_doors(simulated, recording):
 
 def test_a_seed_gives_one_recording_and_another_seed_another():
     short = InteractionConfig(minutes=0.1)
-    one, two, other = (simulate_interactions(short, "x", "val", seed).recording for seed in (1, 1, 2))
+    one, two, other = (simulate_interactions(short, "x", "val", seed)[0] for seed in (1, 1, 2))
     assert torch.equal(one.motion.R_parent_joint, two.motion.R_parent_joint)
     assert torch.equal(one.localization.t_world_cam, two.localization.t_world_cam)
     assert one.interactions.objects == two.interactions.objects

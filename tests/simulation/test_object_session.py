@@ -11,9 +11,8 @@ from wearcap.errors import WearcapError
 from wearcap.simulation.handling.handlings import Handling
 from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.household import HANDHELD, VARIED, Household
-from wearcap.simulation.places.handhelds import MAKERS
-from wearcap.simulation.recordings.interaction_session import flat_of
-from wearcap.simulation.recordings.object_session import ObjectConfig, object_flat_of, simulate_objects
+from wearcap.simulation.places.movables import HANDHELDS
+from wearcap.simulation.recordings.interaction_session import ObjectConfig, flat_of, object_flat_of, simulate_objects
 from wearcap.simulation.recordings.simulate import POOLS, person_of
 
 
@@ -23,11 +22,11 @@ def simulated():
 
 
 def test_a_recording_has_all_its_parts(simulated):
-    recording = simulated.recording
-    categories = {item.category for item in simulated.environment.objects}
+    recording = simulated[0]
+    categories = {item.category for item in simulated[1].environment.objects}
     assert categories >= {*HANDHELD, "door", "sofa", "table", "chair", "box", "drawer"}
-    assert set(HANDHELD) == set(MAKERS)
-    assert set(recording.object_motion) == {item.name for item in simulated.environment.objects}
+    assert set(HANDHELD) == set(HANDHELDS)
+    assert set(recording.object_motion) == {item.name for item in simulated[1].environment.objects}
     assert recording.motion.fps == pytest.approx(30.0)
     assert recording.head.timestamps[-1] == pytest.approx(48.0, abs=0.2)
     assert recording.suit is recording.camera is recording.points is None
@@ -36,7 +35,7 @@ def test_a_recording_has_all_its_parts(simulated):
 
 
 def test_palms_stay_on_what_they_hold(simulated):
-    recording, rows = simulated.recording, simulated.recording.interactions
+    recording, rows = simulated[0], simulated[0].interactions
     motion, times = recording.motion, recording.motion.timestamps
     palms = site_positions(motion.skeleton, motion.T_world_joint, ("left_palm", "right_palm"))
     for k, name in enumerate(rows.objects):
@@ -49,9 +48,9 @@ def test_palms_stay_on_what_they_hold(simulated):
 
 
 def test_things_rest_unless_held_and_nothing_is_below_the_floor(simulated):
-    recording, times = simulated.recording, simulated.recording.motion.timestamps
+    recording, times = simulated[0], simulated[0].motion.timestamps
     rows = recording.interactions
-    for item in simulated.environment.objects:
+    for item in simulated[1].environment.objects:
         track = recording.object_motion[item.name]
         held = torch.zeros(len(times), dtype=torch.bool)
         for k, name in enumerate(rows.objects):
@@ -65,10 +64,10 @@ def test_things_rest_unless_held_and_nothing_is_below_the_floor(simulated):
 
 def test_a_seed_gives_one_recording_and_another_seed_another(simulated):
     short = ObjectConfig(minutes=0.1)
-    one, two = (simulate_objects(short, "x", "val", 1).recording for _ in range(2))
+    one, two = (simulate_objects(short, "x", "val", 1)[0] for _ in range(2))
     assert torch.equal(one.motion.R_parent_joint, two.motion.R_parent_joint)
     assert torch.equal(one.head.t_world_device, two.head.t_world_device)
-    other = simulate_objects(short, "x", "val", 1 + POOLS["val"][1]).recording
+    other = simulate_objects(short, "x", "val", 1 + POOLS["val"][1])[0]
     assert other.location == one.location
     assert not torch.equal(one.motion.t_world_root, other.motion.t_world_root)
 

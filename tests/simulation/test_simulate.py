@@ -63,11 +63,11 @@ def test_parts_can_be_left_out():
     torch.testing.assert_close(recording.head.T_world_head.t, recording.motion.joint("head").t, atol=2e-6, rtol=0)
 
 
-def test_three_in_ten_recordings_are_outdoors_unless_a_world_is_asked_for(monkeypatch):
+def test_three_in_ten_recordings_are_outdoors_unless_a_world_is_asked_for(monkeypatch, stairs_flat):
     monkeypatch.setattr(simulate, "simulate_motion", lambda *_: None)
-    monkeypatch.setattr(simulate, "person_of", lambda *_: None)
-    monkeypatch.setattr(simulate, "world_of", lambda split, number, kind: kind)
-    monkeypatch.setattr(simulate, "sense", lambda config, name, world, *_: Recording(name, location=world))
+    monkeypatch.setattr(simulate, "drawn_person", lambda *_: None)
+    monkeypatch.setattr(simulate, "world_of", lambda split, number, kind: replace(stairs_flat, name=kind))
+    monkeypatch.setattr(simulate, "_sensed", lambda config, name, world, *_: Recording(name, location=world.name))
     drawn = [simulate_recording(SHORT, "one", "train", seed).location for seed in range(300)]
     assert 0.22 < drawn.count("outdoor") / 300 < 0.38
     for kind in simulate.WORLDS:

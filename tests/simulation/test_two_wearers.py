@@ -5,8 +5,7 @@ import torch
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.simulation.recordings.simulate import SimulationConfig
-from wearcap.simulation.recordings.two_wearers import simulate_two_wearers
+from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_two_wearers
 
 CONFIG = SimulationConfig(duration_s=3.0, points=False, suit=None, world="flat")
 

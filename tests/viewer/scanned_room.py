@@ -3,8 +3,8 @@
 import numpy as np
 
 from wearcap.scene.scan import Scan
-from wearcap.simulation.places import furniture
 from wearcap.simulation.places.builder import WorldBuilder
+from wearcap.simulation.places.furniture import MAKERS
 from wearcap.simulation.places.outline import rectangle
 from wearcap.simulation.places.world import Room
 from wearcap.simulation.rendering.scan import Scanner, scan_world
@@ -34,8 +34,8 @@ def scanned_room(spacing_m: float = 0.04) -> Scan:
     ):
         builder.add_block("wall", center, size, WHITE, 2.0)
     builder.add_block("door", (DOOR_X, DOOR_Y, 1.02), (0.86, 0.04, 2.0), LEAF)
-    builder.place(furniture.sofa(rng), SOFA, np.pi / 2)
-    builder.place(furniture.coffee_table(rng), (2.8, 2.0, 0.0), 0.0)
-    builder.place(furniture.chair(rng), CHAIR, 0.6)
+    builder.place(MAKERS["sofa"](rng), SOFA, np.pi / 2)
+    builder.place(MAKERS["coffee_table"](rng), (2.8, 2.0, 0.0), 0.0)
+    builder.place(MAKERS["chair"](rng), CHAIR, 0.6)
     scenery = Scenery.of(builder.finish(cell=0.1))
     return scan_world(scenery, spacing_m, np.random.default_rng(0), Scanner(wrong=0.0, mixed=0.0))

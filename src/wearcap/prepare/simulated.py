@@ -29,17 +29,19 @@ from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import HeadStream, Recording
 from wearcap.recording.store import SPLITS, RecordingFile, RecordingStore
 from wearcap.sensors.slam import semidense_points
-from wearcap.simulation.places.changes import changed_world
+from wearcap.simulation.places.site import changed_world
 from wearcap.simulation.places.surround import surround
-from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
-from wearcap.simulation.recordings.hps_session import Protocol
-from wearcap.simulation.recordings.interaction_session import InteractionConfig, simulate_interactions
-from wearcap.simulation.recordings.object_session import ObjectConfig, simulate_objects
+from wearcap.simulation.recordings.hps import HpsConfig, Protocol, simulate_hps
+from wearcap.simulation.recordings.interaction_session import (
+    InteractionConfig,
+    ObjectConfig,
+    simulate_interactions,
+    simulate_objects,
+)
 from wearcap.simulation.recordings.scene_files import SceneSettings, write_scene
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 from wearcap.simulation.rendering.ego_view import write_ego_video
-from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH
-from wearcap.simulation.rendering.head_video import Filming, write_head_video
+from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, Filming, write_head_video
 from wearcap.simulation.rendering.scan import scan_world
 from wearcap.simulation.rendering.views import Scenery
 
@@ -203,21 +205,21 @@ def _in_flat(
 
     Files that were made with the same settings by the same simulator are left as they are.
     """
-    simulated = simulate(config, name, split, seed)
-    place = Path("scenes") / simulated.recording.location
+    recording, flat = simulate(config, name, split, seed)
+    place = Path("scenes") / recording.location
     folder, note = root / place, root / place / MADE
     wanted = json.dumps(({} if spacing_m is None else {"spacing_m": spacing_m}) | {"simulator": simulator})
     files = [FILE_NAME] if spacing_m is None else [CLOUD, FILE_NAME]
     current = note.is_file() and note.read_text(encoding="utf-8") == wanted
     if not current or not all((folder / file).is_file() for file in files):
         if spacing_m is not None:
-            scenery, rng = Scenery.of(simulated.world), np.random.default_rng(12)
-            scan = scan_world(scenery, spacing_m, rng, walked=simulated.static)
+            scenery, rng = Scenery.of(flat.world), np.random.default_rng(12)
+            scan = scan_world(scenery, spacing_m, rng, walked=flat.static)
             write_ply(Ply(scan.points, scan.colors), folder / CLOUD)
-        write_environment(simulated.environment, folder / FILE_NAME)
+        write_environment(flat.environment, folder / FILE_NAME)
         write_text(note, wanted)
     scene = {} if spacing_m is None else {"scene": (place / CLOUD).as_posix()}
-    return replace(simulated.recording, environment=(place / FILE_NAME).as_posix(), **scene)
+    return replace(recording, environment=(place / FILE_NAME).as_posix(), **scene)
 
 
 def simulated_interactions_tasks(

@@ -1,15 +1,20 @@
 """Collects surfaces, objects and their triangles into a World, in a local frame that is turned and shifted."""
 
 import colorsys
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from wearcap.geometry.mesh import Mesh
 from wearcap.simulation.places import world as w
-from wearcap.simulation.places.outline import rectangle, turn
+from wearcap.simulation.places.outline import Box, middle_and_size, rectangle, turn
 
+Color = tuple[float, float, float]
+"""RGB, 0…1."""
+Place = tuple[float, float, float]
+"""x, y, z (m)."""
 _BOX_FACES = np.array(
     [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5],
      [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]]
@@ -20,13 +25,18 @@ _BOX_FACES = np.array(
 class Part:
     """A box or column of a piece of furniture, in the piece's frame (front +x, origin on the floor)."""
 
-    center: tuple[float, float, float]
+    center: Place
     size: tuple[float, float, float]
-    color: tuple[float, float, float]
+    color: Color
     texture: float = 6.0
     """Visual features per m²."""
     sides: int = 4
     """Number of sides: 4 is a box; more approximate a round column of diameter size[0]."""
+
+    @property
+    def box_size(self) -> tuple[float, float, float]:
+        """Size of the box around the part (m)."""
+        return self.size if self.sides == 4 else (self.size[0], self.size[0], self.size[2])
 
 
 @dataclass(frozen=True)
@@ -39,40 +49,73 @@ class Piece:
     parts: tuple[Part, ...]
     seats: tuple[tuple[float, float, float, float, float], ...] = ()
     """x, y, height, heading, depth to the front edge."""
-    reaches: tuple[tuple[float, float, float], ...] = ()
+    reaches: tuple[Place, ...] = ()
     """Points a hand reaches for from the front."""
 
+    @property
+    def has_front(self) -> bool:
+        """Whether it is used from its front."""
+        return bool(self.seats or self.reaches)
 
-def hue(rng: np.random.Generator, saturation: tuple[float, float] = (0.15, 0.7)) -> tuple[float, float, float]:
+    def stretched(self, factor: float) -> "Piece":
+        """The piece with all its heights times a factor, without points to reach for."""
+        parts = tuple(
+            replace(p, center=(*p.center[:2], p.center[2] * factor), size=(*p.size[:2], p.size[2] * factor))
+            for p in self.parts
+        )
+        seats = tuple((x, y, factor * height, heading, depth) for x, y, height, heading, depth in self.seats)
+        low, high = self.z_range
+        return replace(self, parts=parts, seats=seats, z_range=(factor * low, factor * high), reaches=())
+
+
+def hue(rng: np.random.Generator, saturation: tuple[float, float] = (0.15, 0.7)) -> Color:
     """A random RGB colour (0…1) of medium brightness."""
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(0.45, 0.9))
 
 
-@dataclass
+def entered(table: dict[str, Callable], name: str) -> Callable:
+    """Decorator that enters a maker in a table under a name."""
+
+    def enter(maker: Callable) -> Callable:
+        table[name] = maker
+        return maker
+
+    return enter
+
+
 class WorldBuilder:
     """Collects a world in the builder's frame; the finished world is turned by `heading` and moved by `shift`."""
 
-    name: str
-    heading: float = 0.0
-    shift: tuple[float, float] = (0.0, 0.0)
-    outdoors: bool = False
-    objects: list[w.WorldObject] = field(default_factory=list)
-    surfaces: list[w.Surface] = field(default_factory=list)
-    seats: list[w.Seat] = field(default_factory=list)
-    reach_targets: list[w.ReachTarget] = field(default_factory=list)
-    flights: list[w.Flight] = field(default_factory=list)
-    rooms: list[w.Room] = field(default_factory=list)
-    doors: list[w.Door] = field(default_factory=list)
-    windows: list[w.Door] = field(default_factory=list)
-    """Gaps above a sill, given by the floor point below them."""
-    spots: list[w.CaptureSpot] = field(default_factory=list)
-    _triangles: list[tuple] = field(default_factory=list)
+    def __init__(
+        self, name: str, heading: float = 0.0, shift: tuple[float, float] = (0.0, 0.0), outdoors: bool = False
+    ):
+        self.name, self.heading, self.shift, self.outdoors = name, heading, shift, outdoors
+        self.objects: list[w.WorldObject] = []
+        self.surfaces: list[w.Surface] = []
+        self.seats: list[w.Seat] = []
+        self.reach_targets: list[w.ReachTarget] = []
+        self.flights: list[w.Flight] = []
+        self.rooms: list[w.Room] = []
+        self.doors: list[w.Door] = []
+        self.windows: list[w.Door] = []
+        """Gaps above a sill, given by the floor point below them."""
+        self.spots: list[w.CaptureSpot] = []
+        self._triangles: list[tuple] = []
+
+    @classmethod
+    def drawn(cls, name: str, rng: np.random.Generator, outdoors: bool = False) -> "WorldBuilder":
+        """A builder with a random heading and shift."""
+        return cls(name, rng.uniform(-np.pi, np.pi), tuple(rng.uniform(-5.0, 5.0, 2).tolist()), outdoors)
 
     def to_world(self, points: Float[np.ndarray, "*batch axis"]) -> Float[np.ndarray, "*batch axis"]:
         """Points (x y or x y z) of the builder's frame in the world."""
         out = np.array(points, dtype=np.float64)
         out[..., :2] = out[..., :2] @ turn(self.heading).T + np.array(self.shift)
         return out
+
+    def point(self, *place: float) -> tuple:
+        """A point (x y or x y z) of the builder's frame in the world."""
+        return tuple(self.to_world(np.array(place)).tolist())
 
     def from_world(self, points_xy: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         return (points_xy - np.array(self.shift)) @ turn(self.heading)
@@ -102,32 +145,36 @@ class WorldBuilder:
         polygon = np.asarray(polygon, dtype=np.float64)
         a, b, c = plane
         top = np.concatenate([polygon, polygon @ np.array([[a], [b]]) + c], 1)
-        count = len(polygon)
         if thickness:
-            vertices = np.concatenate([top - [0, 0, thickness], top])
-            self.add_triangles(vertices, _prism_faces(count), color, texture)
+            self.add_prism(np.concatenate([top - [0, 0, thickness], top]), color, texture)
         else:
-            fan = np.array([[0, k, k + 1] for k in range(1, count - 1)])
+            fan = np.array([[0, k, k + 1] for k in range(1, len(polygon) - 1)])
             self.add_triangles(top, fan, color, texture)
         gradient = turn(self.heading) @ np.array([a, b])
         offset = c - gradient @ np.array(self.shift)
         plane_world = (float(gradient[0]), float(gradient[1]), float(offset))
         self.surfaces.append(w.Surface(kind, self.to_world(polygon), plane_world, level))
 
+    def add_slab(
+        self, kind: str, box: Box, z: float, thickness: float, color, texture: float, plane=None, level: int = 0
+    ) -> None:
+        """A rectangle of ground whose top lies at z, or on a plane (of the builder's frame)."""
+        outline = rectangle(*middle_and_size(box))
+        plane = plane or (0.0, 0.0, z)
+        self.add_surface(kind, outline, color, plane=plane, level=level, texture=texture, thickness=thickness)
+
+    def add_room(self, name: str, corners, z: float, open_air: bool = False) -> None:
+        """Name a part of the floor, given by its corners or its box."""
+        if isinstance(corners, tuple):
+            x_low, y_low, x_high, y_high = corners
+            corners = np.array([[x_low, y_low], [x_high, y_low], [x_high, y_high], [x_low, y_high]])
+        self.rooms.append(w.Room(name, self.to_world(corners), z, open_air))
+
     def add_object(self, kind: str, outline, z_range: tuple[float, float], position, heading: float = 0.0) -> int:
         """Add an obstacle without triangles; returns its index for `add_box(item=…)`."""
-        place = self.to_world(np.asarray(position))
-        number = len(self.objects)
-        self.objects.append(
-            w.WorldObject(
-                f"{kind}_{number:03d}",
-                kind,
-                self.to_world(outline),
-                z_range,
-                tuple(place.tolist()),
-                self.heading + heading,
-            )
-        )
+        number, place = len(self.objects), self.point(*position)
+        name, footprint = f"{kind}_{number:03d}", self.to_world(outline)
+        self.objects.append(w.WorldObject(name, kind, footprint, z_range, place, self.heading + heading))
         return number
 
     def add_block(self, kind: str, center, size, color, texture: float = 6.0, heading: float = 0.0) -> int:
@@ -138,20 +185,19 @@ class WorldBuilder:
         self.add_box(center, size, color, texture, heading, item)
         return item
 
-    def place(self, piece: Piece, position: tuple[float, float, float], heading: float) -> int:
+    def place(self, piece: Piece, position: Place, heading: float) -> int:
         """Put a piece of furniture on the floor point `position`, its front turned to `heading`."""
         x, y, z = position
         about = turn(heading)
-        outline = rectangle((x, y), piece.size, heading)
         z_range = (z + piece.z_range[0], z + piece.z_range[1])
-        item = self.add_object(piece.kind, outline, z_range, position, heading)
+        item = self.add_object(piece.kind, rectangle((x, y), piece.size, heading), z_range, position, heading)
         for part in piece.parts:
             xy = about @ np.array(part.center[:2]) + np.array([x, y])
             center = (xy[0], xy[1], z + part.center[2])
             self.add_box(center, part.size, part.color, part.texture, heading, item, part.sides)
         for seat_x, seat_y, height, seat_heading, depth in piece.seats:
-            spot = self.to_world(np.array([*(about @ np.array([seat_x, seat_y]) + (x, y)), z + height]))
-            self.seats.append(w.Seat(tuple(spot.tolist()), self.heading + heading + seat_heading, height, depth))
+            spot = self.point(*(about @ np.array([seat_x, seat_y]) + (x, y)), z + height)
+            self.seats.append(w.Seat(spot, self.heading + heading + seat_heading, height, depth))
         for reach in piece.reaches:
             front = piece.size[0] / 2 + 0.33
             self.add_reach(
@@ -162,11 +208,13 @@ class WorldBuilder:
         return item
 
     def add_reach(self, position, stand, heading: float) -> None:
-        position, stand = (tuple(self.to_world(np.array(p)).tolist()) for p in (position, stand))
-        self.reach_targets.append(w.ReachTarget(position, stand, self.heading + heading))
+        self.reach_targets.append(w.ReachTarget(self.point(*position), self.point(*stand), self.heading + heading))
 
-    def finish(self, cell: float) -> w.World:
-        """The world, without the seats and reach targets that no walker can stand in front of."""
+    def finish(self, cell: float = 0.1) -> w.World:
+        """The world, without the seats and reach targets that no walker can stand in front of.
+
+        `cell` is the side of a cell of its planning grid (m).
+        """
         draft = self._world((), (), cell)
         seats = tuple(s for s in self.seats if _reachable(draft, s.standing_point(), 0.45))
         reaches = tuple(r for r in self.reach_targets if _reachable(draft, np.array(r.stand), 0.15))
@@ -174,31 +222,34 @@ class WorldBuilder:
         world.__dict__["navigation"] = draft.navigation
         return world
 
-    def _world(self, seats: tuple, reaches: tuple, cell: float) -> w.World:
-        counts = np.array([len(vertices) for vertices, *_ in self._triangles])
+    def mesh(self) -> Mesh:
+        """All triangles so far, in the world."""
+        vertices, faces, colors, _, _ = zip(*self._triangles)
+        counts = np.array([len(corners) for corners in vertices])
         starts = np.concatenate([[0], counts.cumsum()[:-1]])
-        faces = np.concatenate([t[1] + start for t, start in zip(self._triangles, starts)]).astype(np.int32)
-        face_counts = [len(t[1]) for t in self._triangles]
-        mesh = Mesh(
-            np.concatenate([t[0] for t in self._triangles]).astype(np.float32),
-            faces,
-            np.repeat(np.array([t[2] for t in self._triangles], np.float32), counts, axis=0),
+        return Mesh(
+            np.concatenate(vertices).astype(np.float32),
+            np.concatenate([each + start for each, start in zip(faces, starts)]).astype(np.int32),
+            np.repeat(np.array(colors, np.float32), counts, axis=0),
         )
+
+    def _world(self, seats: tuple, reaches: tuple, cell: float) -> w.World:
+        face_counts = [len(t[1]) for t in self._triangles]
         return w.World(
-            self.name,
-            mesh,
-            np.repeat([t[4] for t in self._triangles], face_counts),
-            np.repeat(np.array([t[3] for t in self._triangles], np.float64), face_counts),
-            tuple(self.objects),
-            tuple(self.surfaces),
-            seats,
-            reaches,
-            tuple(self.flights),
-            tuple(self.rooms),
-            tuple(self.doors),
-            cell,
-            self.outdoors,
-            tuple(self.spots),
+            name=self.name,
+            mesh=self.mesh(),
+            face_object=np.repeat([t[4] for t in self._triangles], face_counts),
+            face_texture=np.repeat(np.array([t[3] for t in self._triangles], np.float64), face_counts),
+            objects=tuple(self.objects),
+            surfaces=tuple(self.surfaces),
+            seats=seats,
+            reach_targets=reaches,
+            flights=tuple(self.flights),
+            rooms=tuple(self.rooms),
+            doors=tuple(self.doors),
+            cell=cell,
+            outdoors=self.outdoors,
+            spots=tuple(self.spots),
         )
 
 
@@ -206,18 +257,7 @@ def piece_mesh(piece: Piece) -> Mesh:
     """The surface of a piece of furniture in its own frame."""
     builder = WorldBuilder(piece.kind)
     builder.place(piece, (0.0, 0.0, 0.0), 0.0)
-    vertices, faces, colors = [], [], []
-    start = 0
-    for corners, triangles, color, _texture, _item in builder._triangles:
-        vertices.append(corners)
-        faces.append(triangles + start)
-        colors.append(np.tile(np.array(color), (len(corners), 1)))
-        start += len(corners)
-    return Mesh(
-        np.concatenate(vertices).astype(np.float32),
-        np.concatenate(faces).astype(np.int32),
-        np.concatenate(colors).astype(np.float32),
-    )
+    return builder.mesh()
 
 
 def _reachable(world: w.World, point: np.ndarray, within_m: float) -> bool:
@@ -227,10 +267,9 @@ def _reachable(world: w.World, point: np.ndarray, within_m: float) -> bool:
 
 def _prism_faces(sides: int) -> np.ndarray:
     """Triangles of a prism whose vertices are its lower ring, then its upper ring, both counter-clockwise."""
-    ring = range(sides)
     faces = [[0, k + 1, k] for k in range(1, sides - 1)]
     faces += [[sides, sides + k, sides + k + 1] for k in range(1, sides - 1)]
-    for k in ring:
+    for k in range(sides):
         n = (k + 1) % sides
         faces += [[k, n, sides + n], [k, sides + n, sides + k]]
     return np.array(faces)

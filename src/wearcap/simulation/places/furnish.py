@@ -6,12 +6,11 @@ import numpy as np
 
 from wearcap.simulation.places.builder import Piece, WorldBuilder
 from wearcap.simulation.places.furniture import MAKERS
-
-Box = tuple[float, float, float, float]
-"""x_low, y_low, x_high, y_high (m), along the builder's axes."""
+from wearcap.simulation.places.outline import Box, overlaps
 
 FRONT_M = 0.8
 """Free space in front of seats and of furniture that one reaches into."""
+TRIES = 12
 
 ROOM_KINDS: dict[str, tuple[str, ...]] = {
     "living room": ("sofa", "cabinet", "shelf", "armchair", "plant", "lamp", "shelf"),
@@ -22,16 +21,6 @@ ROOM_KINDS: dict[str, tuple[str, ...]] = {
 """Furniture along the walls of each kind of room, in order of preference."""
 
 HAS_TABLE = ("living room", "kitchen")
-
-
-def middle_and_size(box: Box) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Middle and size of a box (m)."""
-    return ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), (box[2] - box[0], box[3] - box[1])
-
-
-def overlaps(a: Box, b: Box, margin: float = 0.0) -> bool:
-    apart = a[0] >= b[2] + margin or b[0] >= a[2] + margin or a[1] >= b[3] + margin or b[1] >= a[3] + margin
-    return not apart
 
 
 @dataclass
@@ -58,41 +47,45 @@ class Plan:
             self.kept_free.append(ahead)
         return True
 
-    def against_wall(
-        self, piece: Piece, rng: np.random.Generator, tries: int = 12, front: float | None = None
-    ) -> tuple | None:
+    def against_wall(self, piece: Piece, rng: np.random.Generator, front: float | None = None) -> tuple | None:
         """Put a piece with its back to a random wall; returns (x, y, heading), or None where nothing fits.
 
         Without `front`, pieces used from their front have `FRONT_M` free before it.
         """
         if front is None:
-            front = FRONT_M if piece.seats or piece.reaches else 0.0
+            front = FRONT_M if piece.has_front else 0.0
         depth, width = piece.size[0] / 2 + 0.02, piece.size[1] / 2 + 0.02
         x_low, y_low, x_high, y_high = self.room
-        for _ in range(tries):
+        for _ in range(TRIES):
             side = int(rng.integers(4))
             along = (y_low, y_high) if side % 2 == 0 else (x_low, x_high)
             if along[1] - along[0] <= 2 * width:
                 continue
             place = rng.uniform(along[0] + width, along[1] - width)
-            x, y = [(x_low + depth, place), (place, y_low + depth), (x_high - depth, place), (place, y_high - depth)][
-                side
-            ]
-            heading = side * np.pi / 2
-            if self.try_place(piece, x, y, heading, front):
-                return x, y, heading
+            backs = [(x_low + depth, place), (place, y_low + depth), (x_high - depth, place), (place, y_high - depth)]
+            spot = (*backs[side], side * np.pi / 2)
+            if self.try_place(piece, *spot, front):
+                return spot
         return None
 
-    def table_with_chairs(self, rng: np.random.Generator, tries: int = 12) -> None:
+    def somewhere(self, kind: str, rng: np.random.Generator) -> None:
+        """Put a piece of furniture at a random place, squarely, with room to use it from its front."""
+        piece = MAKERS[kind](rng)
+        x_low, y_low, x_high, y_high = self.room
+        front = FRONT_M + 0.1 if piece.has_front else 0.0
+        for _ in range(TRIES):
+            place = float(rng.uniform(x_low, x_high)), float(rng.uniform(y_low, y_high))
+            if self.try_place(piece, *place, int(rng.integers(4)) * np.pi / 2, front):
+                return
+
+    def table_with_chairs(self, rng: np.random.Generator) -> None:
         """A table somewhere in the room with chairs on its long sides, each with room to sit down."""
         table = MAKERS["table"](rng)
         x_low, y_low, x_high, y_high = self.room
-        for _ in range(tries):
+        for _ in range(TRIES):
             heading = int(rng.integers(2)) * np.pi / 2
-            x, y = (
-                rng.uniform(x_low + 1.3, max(x_high - 1.3, x_low + 1.3)),
-                rng.uniform(y_low + 1.3, max(y_high - 1.3, y_low + 1.3)),
-            )
+            x = rng.uniform(x_low + 1.3, max(x_high - 1.3, x_low + 1.3))
+            y = rng.uniform(y_low + 1.3, max(y_high - 1.3, y_low + 1.3))
             if self.try_place(table, x, y, heading):
                 break
         else:
@@ -108,31 +101,22 @@ class Plan:
 
     def furnish(self, kind: str, rng: np.random.Generator) -> None:
         """Fill a room of a kind (`ROOM_KINDS`)."""
-        if (
-            kind in HAS_TABLE
-            and rng.uniform() < 0.8
-            and min(self.room[2] - self.room[0], self.room[3] - self.room[1]) > 2.9
-        ):
+        narrow = min(self.room[2] - self.room[0], self.room[3] - self.room[1])
+        if kind in HAS_TABLE and rng.uniform() < 0.8 and narrow > 2.9:
             self.table_with_chairs(rng)
         for name in ROOM_KINDS[kind]:
             if rng.uniform() < 0.15:
                 continue
             spot = self.against_wall(MAKERS[name](rng), rng)
             if spot and name == "desk":
-                self.try_place(
-                    MAKERS["chair"](rng),
-                    *_ahead(*spot, rng.uniform(0.65, 0.8)),
-                    spot[2] + np.pi + rng.uniform(-0.5, 0.5),
-                )
+                chair, place = MAKERS["chair"](rng), _ahead(*spot, rng.uniform(0.65, 0.8))
+                self.try_place(chair, *place, spot[2] + np.pi + rng.uniform(-0.5, 0.5))
             if spot and name == "sofa" and rng.uniform() < 0.5:
-                self.builder_rug(spot, rng)
-
-    def builder_rug(self, spot: tuple[float, float, float], rng: np.random.Generator) -> None:
-        """A patterned rug in front of a sofa: visible, but no obstacle."""
-        x, y = _ahead(*spot, 1.2)
-        size = (float(rng.uniform(1.2, 1.6)), float(rng.uniform(1.6, 2.2)))
-        if _inside(_outline(size, x, y, spot[2]), self.room):
-            self.builder.add_box((x, y, self.z + 0.004), (*size, 0.008), (0.6, 0.3, 0.3), 40.0, spot[2])
+                # A patterned rug in front of the sofa is visible, but no obstacle.
+                x, y = _ahead(*spot, 1.2)
+                size = (float(rng.uniform(1.2, 1.6)), float(rng.uniform(1.6, 2.2)))
+                if _inside(_outline(size, x, y, spot[2]), self.room):
+                    self.builder.add_box((x, y, self.z + 0.004), (*size, 0.008), (0.6, 0.3, 0.3), 40.0, spot[2])
 
 
 def _ahead(x: float, y: float, heading: float, distance: float) -> tuple[float, float]:

@@ -1,43 +1,62 @@
 """Furniture and outdoor objects: each maker draws sizes and colours and returns a Piece (front +x).
 
-To add a kind, write a maker and enter it in `MAKERS`; rooms and gardens ask for pieces by kind.
+To add a kind, write a maker and enter it in `MAKERS`; rooms and gardens ask for pieces by kind. Parts are rows of
+their middle and size (m), colour, texture and, for a column, its number of sides.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from wearcap.simulation.places.builder import Part, Piece, hue
+from wearcap.simulation.places.builder import Color, Part, Piece, entered, hue
 
-PATTERNED, PLAIN = 40.0, 4.0
-"""Visual features per m² of books and prints, and of painted or upholstered surfaces."""
+PATTERNED, PLAIN, PRINTED = 40.0, 4.0, 120.0
+"""Visual features per m² of leaves and handles, of painted or upholstered surfaces, and of book spines and prints."""
+WOOD: Color = (0.55, 0.40, 0.26)
+DARK, GRAY, IRON = (0.1, 0.1, 0.12), (0.3, 0.3, 0.3), (0.3, 0.3, 0.32)
+BOTH = (-1, 1)
 
-WOOD = (0.55, 0.40, 0.26)
+MAKERS: dict[str, Callable[[np.random.Generator], Piece]] = {}
+"""Makers by kind of piece."""
 
 
-def wood(rng: np.random.Generator) -> tuple[float, float, float]:
+def wood(rng: np.random.Generator) -> Color:
+    """A random colour of wood."""
     shade = rng.uniform(0.6, 1.35)
     red, green, blue = (min(shade * c, 1.0) for c in WOOD)
     return red, green, blue
 
 
-def chair(rng: np.random.Generator) -> Piece:
+def parts_of(rows: Iterable[tuple]) -> tuple[Part, ...]:
+    """Parts of rows: middle (3), size (3), colour, texture and, for a column, its number of sides."""
+    return tuple(Part(row[:3], row[3:6], *row[6:]) for row in rows)
+
+
+def legs(depth: float, width: float, height: float, thick: float, color: Color) -> list[tuple]:
+    """Rows of four legs below the corners of an outline (m)."""
+    corners = [(x * (depth - thick) / 2, y * (width - thick) / 2) for x in BOTH for y in BOTH]
+    return [(x, y, height / 2, thick, thick, height, color, 8.0) for x, y in corners]
+
+
+@entered(MAKERS, "chair")
+def _chair(rng: np.random.Generator) -> Piece:
     depth, width, seat = rng.uniform(0.40, 0.46), rng.uniform(0.40, 0.46), rng.uniform(0.43, 0.47)
     color, back = wood(rng), rng.uniform(0.82, 0.95)
-    legs = _legs(depth, width, seat - 0.03, 0.04, color)
-    parts = (
-        *legs,
-        Part((0, 0, seat - 0.02), (depth, width, 0.04), hue(rng), 12.0),
-        Part((-depth / 2 + 0.02, 0, (seat + back) / 2), (0.03, width, back - seat), color, 8.0),
-    )
-    return Piece("chair", (depth, width), (0.0, back), parts, seats=((0.0, 0.0, seat, 0.0, depth / 2),))
+    rows = [
+        *legs(depth, width, seat - 0.03, 0.04, color),
+        (0, 0, seat - 0.02, depth, width, 0.04, hue(rng), 12.0),
+        (-depth / 2 + 0.02, 0, (seat + back) / 2, 0.03, width, back - seat, color, 8.0),
+    ]
+    return Piece("chair", (depth, width), (0.0, back), parts_of(rows), seats=((0.0, 0.0, seat, 0.0, depth / 2),))
 
 
-def armchair(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "armchair")
+def _armchair(rng: np.random.Generator) -> Piece:
     return _upholstered(rng, "armchair", places=1)
 
 
-def sofa(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "sofa")
+def _sofa(rng: np.random.Generator) -> Piece:
     return _upholstered(rng, "sofa", places=int(rng.integers(2, 4)))
 
 
@@ -45,276 +64,280 @@ def _upholstered(rng: np.random.Generator, kind: str, places: int) -> Piece:
     depth, arm, seat = rng.uniform(0.80, 0.90), 0.16, rng.uniform(0.42, 0.46)
     inner, color = 0.62 * places, hue(rng)
     width = inner + 2 * arm
-    parts = [
-        Part((0, 0, seat / 2 + 0.03), (depth, width, seat - 0.06), color, PLAIN),
-        Part((-depth / 2 + 0.12, 0, 0.62), (0.22, width, 0.46), color, PLAIN),
-        *(Part((0, side * (width - arm) / 2, 0.31), (depth, arm, 0.62), color, PLAIN) for side in (-1, 1)),
-    ]
     middles = [(k - (places - 1) / 2) * 0.62 for k in range(places)]
-    parts += [
-        Part((-depth / 2 + 0.28, y, seat + 0.2), (0.1, 0.4, 0.36), hue(rng), PATTERNED)
-        for y in middles
-        if rng.uniform() < 0.6
+    cushions = (
+        (-depth / 2 + 0.28, y, seat + 0.2, 0.1, 0.4, 0.36, hue(rng), PATTERNED) for y in middles if rng.uniform() < 0.6
+    )
+    rows = [
+        (0, 0, seat / 2 + 0.03, depth, width, seat - 0.06, color, PLAIN),
+        (-depth / 2 + 0.12, 0, 0.62, 0.22, width, 0.46, color, PLAIN),
+        *((0, side * (width - arm) / 2, 0.31, depth, arm, 0.62, color, PLAIN) for side in BOTH),
+        *cushions,
     ]
     seats = tuple((depth / 2 - 0.24, y, seat, 0.0, 0.24) for y in middles)
-    return Piece(kind, (depth, width), (0.0, 0.85), tuple(parts), seats=seats)
+    return Piece(kind, (depth, width), (0.0, 0.85), parts_of(rows), seats=seats)
 
 
-def bed(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "bed")
+def _bed(rng: np.random.Generator) -> Piece:
     """A bed; its front, where one sits down, is a long side."""
     width, length, top = rng.uniform(1.0, 1.8), 2.05, rng.uniform(0.43, 0.50)
     cover = hue(rng)
-    parts = (
-        Part((0, 0, (top - 0.2) / 2), (width, length, top - 0.2), wood(rng), PLAIN),
-        Part((0, 0, top - 0.1), (width - 0.04, length - 0.04, 0.2), cover, 10.0),
-        Part((0, length / 2 - 0.02, 0.5), (width, 0.05, 1.0), wood(rng), PLAIN),
-        Part((0, length / 2 - 0.3, top + 0.06), (width * 0.7, 0.4, 0.12), hue(rng, (0.0, 0.2)), 10.0),
-    )
+    rows = [
+        (0, 0, (top - 0.2) / 2, width, length, top - 0.2, wood(rng), PLAIN),
+        (0, 0, top - 0.1, width - 0.04, length - 0.04, 0.2, cover, 10.0),
+        (0, length / 2 - 0.02, 0.5, width, 0.05, 1.0, wood(rng), PLAIN),
+        (0, length / 2 - 0.3, top + 0.06, width * 0.7, 0.4, 0.12, hue(rng, (0.0, 0.2)), 10.0),
+    ]
     seats = ((width / 2 - 0.22, -0.3, top, 0.0, 0.22),)
-    return Piece("bed", (width, length), (0.0, 1.0), parts, seats=seats)
+    return Piece("bed", (width, length), (0.0, 1.0), parts_of(rows), seats=seats)
 
 
-def table(rng: np.random.Generator) -> Piece:
-    return _table(rng, "table", (rng.uniform(0.75, 0.95), rng.uniform(1.1, 1.9)), rng.uniform(0.72, 0.76))
+@entered(MAKERS, "table")
+def _table(rng: np.random.Generator) -> Piece:
+    size = (rng.uniform(0.75, 0.95), rng.uniform(1.1, 1.9))
+    return _laid_table(rng, "table", size, rng.uniform(0.72, 0.76))
 
 
-def desk(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "desk")
+def _desk(rng: np.random.Generator) -> Piece:
     depth, width, top = rng.uniform(0.6, 0.75), rng.uniform(1.2, 1.6), rng.uniform(0.72, 0.76)
-    plain = _table(rng, "desk", (depth, width), top)
-    screen = Part((-depth / 4, 0, top + 0.28), (0.03, 0.55, 0.34), (0.1, 0.1, 0.12), 30.0)
+    plain = _laid_table(rng, "desk", (depth, width), top)
+    screen = Part((-depth / 4, 0, top + 0.28), (0.03, 0.55, 0.34), DARK, 30.0)
     return Piece("desk", plain.size, (0.0, top + 0.45), (*plain.parts, screen), reaches=plain.reaches)
 
 
-def coffee_table(rng: np.random.Generator) -> Piece:
-    return _table(rng, "coffee_table", (rng.uniform(0.5, 0.7), rng.uniform(0.8, 1.2)), rng.uniform(0.38, 0.46))
+@entered(MAKERS, "coffee_table")
+def _coffee_table(rng: np.random.Generator) -> Piece:
+    size = (rng.uniform(0.5, 0.7), rng.uniform(0.8, 1.2))
+    return _laid_table(rng, "coffee_table", size, rng.uniform(0.38, 0.46))
 
 
-def _table(rng: np.random.Generator, kind: str, size: tuple[float, float], top: float) -> Piece:
+def _laid_table(rng: np.random.Generator, kind: str, size: tuple[float, float], top: float) -> Piece:
+    """A table with props on it; its first five parts are the legs and the top."""
     depth, width = size
     color = wood(rng)
-    parts = [
-        *_legs(depth - 0.06, width - 0.06, top - 0.04, 0.06, color),
-        Part((0, 0, top - 0.02), (depth, width, 0.04), color, PLAIN),
+    rows = [
+        *legs(depth - 0.06, width - 0.06, top - 0.04, 0.06, color),
+        (0, 0, top - 0.02, depth, width, 0.04, color, PLAIN),
     ]
     props = [_prop(rng, (rng.uniform(0.0, depth / 2 - 0.12), y, top)) for y in _spread(rng, width - 0.3, 3)]
     reaches = tuple((p.center[0], p.center[1], top + p.size[2] * 0.7) for p in props)
-    return Piece(kind, size, (0.0, top), (*parts, *props), reaches=reaches)
+    return Piece(kind, size, (0.0, top), (*parts_of(rows), *props), reaches=reaches)
 
 
-def shelf(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "shelf")
+def _shelf(rng: np.random.Generator) -> Piece:
+    """Boards between two sides, with blocks of book spines on them."""
     depth, width, height = rng.uniform(0.28, 0.36), rng.uniform(0.6, 1.6), rng.uniform(1.2, 2.1)
     color, boards = wood(rng), int(rng.integers(3, 6))
-    parts = [Part((0, side * (width - 0.03) / 2, height / 2), (depth, 0.03, height), color, PLAIN) for side in (-1, 1)]
-    parts.append(Part((-depth / 2 + 0.01, 0, height / 2), (0.015, width, height), color, PLAIN))
+    rows: list[tuple] = [
+        *((0, side * (width - 0.03) / 2, height / 2, depth, 0.03, height, color, PLAIN) for side in BOTH),
+        (-depth / 2 + 0.01, 0, height / 2, 0.015, width, height, color, PLAIN),
+    ]
     levels = np.linspace(0.08, height - 0.02, boards + 1)
     for z, above in zip(levels, np.append(levels[1:], np.nan)):
-        parts.append(Part((0, 0, z), (depth, width - 0.04, 0.025), color, PLAIN))
-        if np.isfinite(above):
-            parts += _books(rng, z, above, depth, width)
+        rows.append((0, 0, z, depth, width - 0.04, 0.025, color, PLAIN))
+        y = -width / 2 + 0.05
+        while np.isfinite(above) and y < width / 2 - 0.2:
+            run, tall = rng.uniform(0.08, 0.25), min(rng.uniform(0.16, 0.30), above - z - 0.05)
+            if rng.uniform() < 0.75:
+                rows.append((0.0, y + run / 2, z + 0.0125 + tall / 2, depth - 0.08, run, tall, hue(rng), PRINTED))
+            y += run + rng.uniform(0.0, 0.08)
     reaches = tuple((depth / 2 - 0.03, rng.uniform(-0.3, 0.3) * width, z + 0.14) for z in levels[:-1] if 0.3 < z < 1.75)
-    return Piece("shelf", (depth, width), (0.0, height), tuple(parts), reaches=reaches)
+    return Piece("shelf", (depth, width), (0.0, height), parts_of(rows), reaches=reaches)
 
 
-def _books(rng: np.random.Generator, z: float, above: float, depth: float, width: float) -> list[Part]:
-    """Blocks of book spines along a board, with gaps."""
-    blocks, y = [], -width / 2 + 0.05
-    while y < width / 2 - 0.2:
-        run, tall = rng.uniform(0.08, 0.25), min(rng.uniform(0.16, 0.30), above - z - 0.05)
-        if rng.uniform() < 0.75:
-            blocks.append(
-                Part((0.0, y + run / 2, z + 0.0125 + tall / 2), (depth - 0.08, run, tall), hue(rng), 3 * PATTERNED)
-            )
-        y += run + rng.uniform(0.0, 0.08)
-    return blocks
-
-
-def wardrobe(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "wardrobe")
+def _wardrobe(rng: np.random.Generator) -> Piece:
     depth, width, height = 0.6, rng.uniform(0.9, 1.8), rng.uniform(1.9, 2.2)
-    color = wood(rng)
-    parts = [Part((0, 0, height / 2), (depth, width, height), color, 2.0)]
-    handles = [(depth / 2 + 0.015, side * 0.05, 1.05) for side in (-1, 1)]
-    parts += [Part(h, (0.03, 0.02, 0.18), (0.3, 0.3, 0.3), PATTERNED) for h in handles]
-    return Piece("wardrobe", (depth, width), (0.0, height), tuple(parts), reaches=tuple(handles))
+    handles = tuple((depth / 2 + 0.015, side * 0.05, 1.05) for side in BOTH)
+    rows = [
+        (0, 0, height / 2, depth, width, height, wood(rng), 2.0),
+        *((*handle, 0.03, 0.02, 0.18, GRAY, PATTERNED) for handle in handles),
+    ]
+    return Piece("wardrobe", (depth, width), (0.0, height), parts_of(rows), reaches=handles)
 
 
-def cabinet(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "cabinet")
+def _cabinet(rng: np.random.Generator) -> Piece:
     """A low cabinet, with a screen or props on top."""
     depth, width, height = rng.uniform(0.38, 0.45), rng.uniform(1.0, 1.7), rng.uniform(0.45, 0.85)
-    parts = [Part((0, 0, height / 2), (depth, width, height), wood(rng), 3.0)]
-    top = height
+    rows, props, top = [(0, 0, height / 2, depth, width, height, wood(rng), 3.0)], [], height
     if rng.uniform() < 0.5:
         tall = rng.uniform(0.5, 0.7)
-        parts.append(Part((0, 0, height + 0.05 + tall / 2), (0.05, min(1.2, width), tall), (0.08, 0.08, 0.1), 1.0))
+        rows.append((0, 0, height + 0.05 + tall / 2, 0.05, min(1.2, width), tall, (0.08, 0.08, 0.1), 1.0))
         top += 0.05 + tall
     else:
-        parts += [_prop(rng, (0.0, y, height)) for y in _spread(rng, width - 0.2, 3)]
+        props = [_prop(rng, (0.0, y, height)) for y in _spread(rng, width - 0.2, 3)]
     reaches = ((depth / 2, 0.2, height - 0.1), (depth / 2, -0.2, height - 0.25))
-    return Piece("cabinet", (depth, width), (0.0, top), tuple(parts), reaches=reaches)
+    return Piece("cabinet", (depth, width), (0.0, top), (*parts_of(rows), *props), reaches=reaches)
 
 
-def counter(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "counter")
+def _kitchen_counter(rng: np.random.Generator) -> Piece:
     """A kitchen counter: worktop with props on it, cupboards above."""
     width, color = rng.uniform(1.6, 2.8), hue(rng, (0.0, 0.35))
-    parts = [
-        Part((-0.02, 0, 0.43), (0.56, width, 0.86), color, 5.0),
-        Part((0, 0, 0.89), (0.62, width, 0.04), (0.35, 0.33, 0.32), 12.0),
-        Part((-0.14, 0, 1.75), (0.34, width, 0.65), color, 5.0),
+    handles = np.arange(-width / 2 + 0.3, width / 2, 0.6)
+    rows = [
+        (-0.02, 0, 0.43, 0.56, width, 0.86, color, 5.0),
+        (0, 0, 0.89, 0.62, width, 0.04, (0.35, 0.33, 0.32), 12.0),
+        (-0.14, 0, 1.75, 0.34, width, 0.65, color, 5.0),
+        *((0.27, y, 0.78, 0.02, 0.14, 0.02, (0.7, 0.7, 0.7), PATTERNED) for y in handles),
     ]
-    parts += [Part((0.27, y, 0.78), (0.02, 0.14, 0.02), (0.7, 0.7, 0.7), PATTERNED) for y in np.arange(-width / 2 + 0.3, width / 2, 0.6)]  # fmt: skip
     props = [_prop(rng, (rng.uniform(-0.15, 0.2), y, 0.91)) for y in _spread(rng, width - 0.3, 5)]
     reaches = [(p.center[0], p.center[1], 0.91 + p.size[2] * 0.7) for p in props]
     reaches += [(0.05, y, 1.5) for y in _spread(rng, width - 0.6, 2)]
-    return Piece("counter", (0.62, width), (0.0, 2.08), (*parts, *props), reaches=tuple(reaches))
+    return Piece("counter", (0.62, width), (0.0, 2.08), (*parts_of(rows), *props), reaches=tuple(reaches))
 
 
-def plant(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "plant")
+def _plant(rng: np.random.Generator) -> Piece:
     pot, height = rng.uniform(0.25, 0.38), rng.uniform(0.5, 1.3)
-    crown = Part((0, 0, 0.3 + height / 2), (pot * 1.5, 0, height), (0.2, rng.uniform(0.35, 0.6), 0.2), PATTERNED, 7)
-    return Piece(
-        "plant",
-        (pot * 1.5, pot * 1.5),
-        (0.0, 0.3 + height),
-        (Part((0, 0, 0.16), (pot, 0, 0.32), hue(rng), 8.0, 8), crown),
-    )
+    green, wide = (0.2, rng.uniform(0.35, 0.6), 0.2), pot * 1.5
+    rows = [
+        (0, 0, 0.16, pot, 0, 0.32, hue(rng), 8.0, 8),
+        (0, 0, 0.3 + height / 2, wide, 0, height, green, PATTERNED, 7),
+    ]
+    return Piece("plant", (wide, wide), (0.0, 0.3 + height), parts_of(rows))
 
 
-def lamp(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "lamp")
+def _lamp(rng: np.random.Generator) -> Piece:
     height = rng.uniform(1.4, 1.8)
-    parts = (
-        Part((0, 0, 0.015), (0.3, 0, 0.03), (0.2, 0.2, 0.2), PLAIN, 8),
-        Part((0, 0, height / 2), (0.03, 0, height), (0.3, 0.3, 0.3), PLAIN, 6),
-        Part((0, 0, height), (0.36, 0, 0.25), (0.95, 0.9, 0.75), 8.0, 8),
-    )
-    return Piece("lamp", (0.36, 0.36), (0.0, height + 0.13), parts, reaches=((0.1, 0.0, height - 0.25),))
+    rows = [
+        (0, 0, 0.015, 0.3, 0, 0.03, (0.2, 0.2, 0.2), PLAIN, 8),
+        (0, 0, height / 2, 0.03, 0, height, GRAY, PLAIN, 6),
+        (0, 0, height, 0.36, 0, 0.25, (0.95, 0.9, 0.75), 8.0, 8),
+    ]
+    return Piece("lamp", (0.36, 0.36), (0.0, height + 0.13), parts_of(rows), reaches=((0.1, 0.0, height - 0.25),))
 
 
-def bench(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "bench")
+def _bench(rng: np.random.Generator) -> Piece:
     width, seat, color = rng.uniform(1.3, 1.9), rng.uniform(0.43, 0.46), wood(rng)
-    parts = [
-        Part((0.0, 0, seat - 0.025), (0.44, width, 0.05), color, 15.0),
-        Part((-0.2, 0, seat + 0.25), (0.04, width, 0.35), color, 15.0),
-        *(
-            Part((0.0, side * (width / 2 - 0.15), seat / 2 - 0.025), (0.4, 0.08, seat - 0.05), (0.3, 0.3, 0.32))
-            for side in (-1, 1)
-        ),
+    rows = [
+        (0.0, 0, seat - 0.025, 0.44, width, 0.05, color, 15.0),
+        (-0.2, 0, seat + 0.25, 0.04, width, 0.35, color, 15.0),
+        *((0.0, side * (width / 2 - 0.15), seat / 2 - 0.025, 0.4, 0.08, seat - 0.05, IRON) for side in BOTH),
     ]
     seats = tuple((0.0, y, seat, 0.0, 0.22) for y in (-width / 4, width / 4))
-    return Piece("bench", (0.46, width), (0.0, seat + 0.43), tuple(parts), seats=seats)
+    return Piece("bench", (0.46, width), (0.0, seat + 0.43), parts_of(rows), seats=seats)
 
 
-def tree(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "tree")
+def _tree(rng: np.random.Generator) -> Piece:
     trunk, height, crown = rng.uniform(0.2, 0.5), rng.uniform(1.9, 2.6), rng.uniform(1.6, 3.2)
     green = (0.15, rng.uniform(0.35, 0.55), 0.15)
-    parts = (
-        Part((0, 0, height / 2), (trunk, 0, height), (0.35, 0.26, 0.18), PATTERNED, 8),
-        Part((0, 0, height + crown * 0.2), (crown, 0, crown * 0.4), green, 30.0, 9),
-        Part((0, 0, height + crown * 0.5), (crown * 0.7, 0, crown * 0.4), green, 30.0, 7),
-    )
-    return Piece("tree", (trunk, trunk), (0.0, height), parts)
+    rows = [
+        (0, 0, height / 2, trunk, 0, height, (0.35, 0.26, 0.18), PATTERNED, 8),
+        (0, 0, height + crown * 0.2, crown, 0, crown * 0.4, green, 30.0, 9),
+        (0, 0, height + crown * 0.5, crown * 0.7, 0, crown * 0.4, green, 30.0, 7),
+    ]
+    return Piece("tree", (trunk, trunk), (0.0, height), parts_of(rows))
 
 
-def bush(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "bush")
+def _bush(rng: np.random.Generator) -> Piece:
     size, height = rng.uniform(0.5, 1.2), rng.uniform(0.5, 1.2)
-    part = Part((0, 0, height / 2), (size, 0, height), (0.2, rng.uniform(0.35, 0.55), 0.2), PATTERNED, 8)
-    return Piece("bush", (size * 0.9, size * 0.9), (0.0, height), (part,))
+    rows = [(0, 0, height / 2, size, 0, height, (0.2, rng.uniform(0.35, 0.55), 0.2), PATTERNED, 8)]
+    return Piece("bush", (size * 0.9, size * 0.9), (0.0, height), parts_of(rows))
 
 
-def street_lamp(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "street_lamp")
+def _street_lamp(rng: np.random.Generator) -> Piece:
     height = rng.uniform(3.5, 4.5)
-    parts = (
-        Part((0, 0, height / 2), (0.12, 0, height), (0.25, 0.28, 0.28), 8.0, 8),
-        Part((0.2, 0, height), (0.6, 0.2, 0.12), (0.4, 0.4, 0.4), 8.0),
-    )
-    return Piece("street_lamp", (0.14, 0.14), (0.0, height), parts)
+    rows = [
+        (0, 0, height / 2, 0.12, 0, height, (0.25, 0.28, 0.28), 8.0, 8),
+        (0.2, 0, height, 0.6, 0.2, 0.12, (0.4, 0.4, 0.4), 8.0),
+    ]
+    return Piece("street_lamp", (0.14, 0.14), (0.0, height), parts_of(rows))
 
 
-def bin_(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "bin")
+def _bin(rng: np.random.Generator) -> Piece:
     size, height = rng.uniform(0.35, 0.6), rng.uniform(0.8, 1.1)
-    part = Part((0, 0, height / 2), (size, size, height), hue(rng), 15.0)
-    return Piece("bin", (size, size), (0.0, height), (part,), reaches=((size / 2 - 0.05, 0.0, height),))
+    rows = [(0, 0, height / 2, size, size, height, hue(rng), 15.0)]
+    return Piece("bin", (size, size), (0.0, height), parts_of(rows), reaches=((size / 2 - 0.05, 0.0, height),))
 
 
-def low_wall(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "low_wall")
+def _low_wall(rng: np.random.Generator) -> Piece:
     """A low wall to sit on or walk around; its front is a long side."""
     depth, width, height = rng.uniform(0.36, 0.45), rng.uniform(1.4, 2.6), rng.uniform(0.42, 0.47)
-    parts = (
-        Part((0, 0, height / 2 - 0.03), (depth - 0.06, width - 0.06, height - 0.06), (0.55, 0.42, 0.36), 20.0),
-        Part((0, 0, height - 0.03), (depth, width, 0.06), (0.70, 0.69, 0.66), 12.0),
-    )
+    rows = [
+        (0, 0, height / 2 - 0.03, depth - 0.06, width - 0.06, height - 0.06, (0.55, 0.42, 0.36), 20.0),
+        (0, 0, height - 0.03, depth, width, 0.06, (0.70, 0.69, 0.66), 12.0),
+    ]
     seat = (depth / 2 - 0.22, float(rng.uniform(-0.25, 0.25)) * width, height, 0.0, 0.22)
-    return Piece("low_wall", (depth, width), (0.0, height), parts, seats=(seat,))
+    return Piece("low_wall", (depth, width), (0.0, height), parts_of(rows), seats=(seat,))
 
 
-def planter(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "planter")
+def _planter(rng: np.random.Generator) -> Piece:
     depth, width, height = rng.uniform(0.5, 0.8), rng.uniform(0.8, 1.6), rng.uniform(0.45, 0.7)
     green, tall = (0.2, rng.uniform(0.4, 0.6), 0.2), rng.uniform(0.25, 0.6)
-    parts = (
-        Part((0, 0, height / 2), (depth, width, height), (0.62, 0.60, 0.57), 10.0),
-        Part((0, 0, height + tall / 2), (depth - 0.1, width - 0.1, tall), green, PATTERNED),
-    )
-    return Piece("planter", (depth, width), (0.0, height + tall), parts)
+    rows = [
+        (0, 0, height / 2, depth, width, height, (0.62, 0.60, 0.57), 10.0),
+        (0, 0, height + tall / 2, depth - 0.1, width - 0.1, tall, green, PATTERNED),
+    ]
+    return Piece("planter", (depth, width), (0.0, height + tall), parts_of(rows))
 
 
-def bollard(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "bollard")
+def _bollard(rng: np.random.Generator) -> Piece:
     thick, height = rng.uniform(0.10, 0.18), rng.uniform(0.85, 1.05)
-    parts = (
-        Part((0, 0, height / 2), (thick, 0, height), (0.22, 0.24, 0.26), 10.0, 8),
-        Part((0, 0, height - 0.12), (thick + 0.01, 0, 0.08), (0.85, 0.85, 0.8), PATTERNED, 8),
-    )
-    return Piece("bollard", (thick, thick), (0.0, height), parts)
+    rows = [
+        (0, 0, height / 2, thick, 0, height, (0.22, 0.24, 0.26), 10.0, 8),
+        (0, 0, height - 0.12, thick + 0.01, 0, 0.08, (0.85, 0.85, 0.8), PATTERNED, 8),
+    ]
+    return Piece("bollard", (thick, thick), (0.0, height), parts_of(rows))
 
 
-def board(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "board")
+def _notice_board(rng: np.random.Generator) -> Piece:
     """A notice board or map on two posts, pointed at from the front."""
     width, low, tall = rng.uniform(0.9, 1.4), rng.uniform(0.85, 1.0), rng.uniform(0.7, 1.0)
-    posts = [
-        Part((-0.03, side * (width / 2 - 0.06), (low + tall) / 2), (0.06, 0.06, low + tall), (0.3, 0.3, 0.32), 8.0)
-        for side in (-1, 1)
-    ]  # fmt: skip
-    sheet = Part((0.02, 0, low + tall / 2), (0.04, width, tall), hue(rng, (0.05, 0.4)), 3 * PATTERNED)
+    high = low + tall
+    rows = [
+        *((-0.03, side * (width / 2 - 0.06), high / 2, 0.06, 0.06, high, IRON, 8.0) for side in BOTH),
+        (0.02, 0, low + tall / 2, 0.04, width, tall, hue(rng, (0.05, 0.4)), PRINTED),
+    ]
     reaches = tuple((0.04, float(y), low + rng.uniform(0.15, 0.9) * tall) for y in (-0.2, 0.1, 0.3))
-    return Piece("board", (0.12, width), (0.0, low + tall), (*posts, sheet), reaches=reaches)
+    return Piece("board", (0.12, width), (0.0, high), parts_of(rows), reaches=reaches)
 
 
-def letter_box(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "letter_box")
+def _letter_box(rng: np.random.Generator) -> Piece:
     color, slot = hue(rng, (0.7, 0.9)), rng.uniform(1.15, 1.35)
-    parts = (
-        Part((0, 0, 0.4), (0.12, 0.12, 0.8), (0.3, 0.3, 0.3), PLAIN),
-        Part((0, 0, 1.15), (0.32, 0.42, 0.75), color, 12.0),
-        Part((0.165, 0, slot), (0.02, 0.28, 0.05), (0.1, 0.1, 0.1), 3 * PATTERNED),
-    )
-    return Piece("letter_box", (0.34, 0.42), (0.0, 1.53), parts, reaches=((0.17, 0.0, slot),))
+    rows = [
+        (0, 0, 0.4, 0.12, 0.12, 0.8, GRAY, PLAIN),
+        (0, 0, 1.15, 0.32, 0.42, 0.75, color, 12.0),
+        (0.165, 0, slot, 0.02, 0.28, 0.05, (0.1, 0.1, 0.1), PRINTED),
+    ]
+    return Piece("letter_box", (0.34, 0.42), (0.0, 1.53), parts_of(rows), reaches=((0.17, 0.0, slot),))
 
 
-def car(rng: np.random.Generator) -> Piece:
+@entered(MAKERS, "car")
+def _car(rng: np.random.Generator) -> Piece:
     """A parked car; its front is the bonnet."""
     length, width, color = rng.uniform(3.8, 4.5), rng.uniform(1.68, 1.80), hue(rng, (0.0, 0.8))
-    cabin = 0.52 * length
-    parts = [
-        Part((0, 0, 0.52), (length, width, 0.55), color, 5.0),
-        Part((-0.06 * length, 0, 1.10), (cabin, width - 0.22, 0.60), (0.12, 0.14, 0.17), 8.0),
-        Part((-0.06 * length, 0, 1.43), (cabin - 0.1, width - 0.26, 0.06), color, PLAIN),
-        *(Part((x * 0.32 * length, y * (width / 2 - 0.1), 0.31), (0.60, 0.21, 0.60), (0.08, 0.08, 0.08), 20.0)
-          for x in (-1, 1) for y in (-1, 1)),
-        *(Part((length / 2, y * (width / 2 - 0.25), 0.65), (0.04, 0.35, 0.14), (0.9, 0.9, 0.85), 60.0)
-          for y in (-1, 1)),
-    ]  # fmt: skip
-    return Piece("car", (length, width), (0.0, 1.46), tuple(parts))
-
-
-def _legs(depth: float, width: float, height: float, thick: float, color) -> list[Part]:
-    return [
-        Part((x * (depth - thick) / 2, y * (width - thick) / 2, height / 2), (thick, thick, height), color, 8.0)
-        for x in (-1, 1)
-        for y in (-1, 1)
+    cabin, wheel, tyre = 0.52 * length, width / 2 - 0.1, (0.08, 0.08, 0.08)
+    rows = [
+        (0, 0, 0.52, length, width, 0.55, color, 5.0),
+        (-0.06 * length, 0, 1.10, cabin, width - 0.22, 0.60, (0.12, 0.14, 0.17), 8.0),
+        (-0.06 * length, 0, 1.43, cabin - 0.1, width - 0.26, 0.06, color, PLAIN),
+        *((x * 0.32 * length, y * wheel, 0.31, 0.60, 0.21, 0.60, tyre, 20.0) for x in BOTH for y in BOTH),
+        *((length / 2, y * (width / 2 - 0.25), 0.65, 0.04, 0.35, 0.14, (0.9, 0.9, 0.85), 60.0) for y in BOTH),
     ]
+    return Piece("car", (length, width), (0.0, 1.46), parts_of(rows))
 
 
 def _prop(rng: np.random.Generator, base: tuple[float, float, float]) -> Part:
     """A mug, box or vase that stands on something at `base`."""
     wide, tall = rng.uniform(0.07, 0.2), rng.uniform(0.08, 0.28)
     center = (float(base[0]), float(base[1]), base[2] + tall / 2)
-    return Part(center, (wide, wide, tall), hue(rng), 3 * PATTERNED, int(rng.choice([4, 8])))
+    return Part(center, (wide, wide, tall), hue(rng), PRINTED, int(rng.choice([4, 8])))
 
 
 def _spread(rng: np.random.Generator, width: float, most: int) -> np.ndarray:
@@ -322,31 +345,3 @@ def _spread(rng: np.random.Generator, width: float, most: int) -> np.ndarray:
     count = int(rng.integers(1, most + 1))
     slots = (np.arange(count) + 0.5) / count - 0.5
     return slots * width + rng.uniform(-0.25, 0.25, count) * width / count
-
-
-MAKERS: dict[str, Callable[[np.random.Generator], Piece]] = {
-    "chair": chair,
-    "armchair": armchair,
-    "sofa": sofa,
-    "bed": bed,
-    "table": table,
-    "desk": desk,
-    "coffee_table": coffee_table,
-    "shelf": shelf,
-    "wardrobe": wardrobe,
-    "cabinet": cabinet,
-    "counter": counter,
-    "plant": plant,
-    "lamp": lamp,
-    "bench": bench,
-    "tree": tree,
-    "bush": bush,
-    "street_lamp": street_lamp,
-    "bin": bin_,
-    "low_wall": low_wall,
-    "planter": planter,
-    "bollard": bollard,
-    "board": board,
-    "letter_box": letter_box,
-    "car": car,
-}

@@ -61,7 +61,9 @@ class NavigationGrid:
         clearance = np.minimum(_drop_distance(height, cell), FAR_M)
         _keep_off(objects, origin, cell, height, clearance)
         free = np.isfinite(height) & (clearance >= CLEARANCE_M)
-        return cls(origin, cell, height, clearance, _largest_part(height, free))
+        part = _parts(height, free)
+        walkable = part == np.bincount(part[part >= 0], minlength=1).argmax()
+        return cls(origin, cell, height, clearance, walkable)
 
     def barred(self, objects: tuple, around: Float[np.ndarray, "3"]) -> "NavigationGrid":
         """The grid with additional obstacles, walkable where one gets to from a floor point (m)."""
@@ -77,10 +79,6 @@ class NavigationGrid:
         return NavigationGrid(self.origin, self.cell, self.height, clearance, walkable)
 
     @cached_property
-    def _node(self) -> Int[np.ndarray, "layer i j"]:
-        return np.where(self.walkable, np.cumsum(self.walkable).reshape(self.walkable.shape) - 1, -1)
-
-    @cached_property
     def _cells(self) -> Int[np.ndarray, "node 3"]:
         return np.argwhere(self.walkable)
 
@@ -88,7 +86,7 @@ class NavigationGrid:
     def _graph(self) -> tuple[scipy.sparse.csr_array, np.ndarray, np.ndarray]:
         """Links with their lengths (m, climbs included), and the two nodes of each link in the matrix's order."""
         first, second = _links(self.height, self.walkable)
-        nodes = self._node.reshape(-1)
+        nodes = np.cumsum(self.walkable) - 1  # the numbers of walkable cells
         a, b = nodes[first], nodes[second]
         step = self.node_points[a] - self.node_points[b]
         length = np.linalg.norm(step, axis=1) + 1e-6
@@ -103,10 +101,6 @@ class NavigationGrid:
         layer, i, j = self._cells.T
         xy = self.origin + (self._cells[:, 1:] + 0.5) * self.cell
         return np.concatenate([xy, self.height[layer, i, j][:, None]], 1)
-
-    @cached_property
-    def _node_clearance(self) -> Float[np.ndarray, "node"]:
-        return self.clearance[self.walkable]
 
     def layer_of(self, points: Float[np.ndarray, "*batch 3"]) -> Int[np.ndarray, "*batch"]:
         """Index of the layer whose floor is nearest in height to each point."""
@@ -159,7 +153,7 @@ class NavigationGrid:
         if first is None or last is None:
             return None
         graph, source, target = self._graph
-        price = 1 + shyness * np.exp(-(self._node_clearance - CLEARANCE_M) / 0.15)
+        price = 1 + shyness * np.exp(-(self.clearance[self.walkable] - CLEARANCE_M) / 0.15)
         weights = graph.data * (price[source] + price[target]) / 2
         priced = scipy.sparse.csr_array((weights, graph.indices, graph.indptr), shape=graph.shape)
         _, came_from = scipy.sparse.csgraph.dijkstra(priced, indices=last, return_predecessors=True)
@@ -206,12 +200,6 @@ def _links(height: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndar
                 near &= allowed[a][here] & allowed[b][there]
                 pairs.append((index[a][here][near], index[b][there][near]))
     return np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
-
-
-def _largest_part(height: np.ndarray, free: np.ndarray) -> np.ndarray:
-    part = _parts(height, free)
-    sizes = np.bincount(part[part >= 0], minlength=1)
-    return part == sizes.argmax()
 
 
 def _parts(height: np.ndarray, free: np.ndarray) -> np.ndarray:

@@ -15,25 +15,9 @@ from wearcap.simulation.places.interactive_flat import build_interactive_flat
 from wearcap.simulation.places.movables import MOVABLES, make_movable
 
 OPENABLES = ("door", "window", "drawer", "cabinet_door")
-
-
 _SEEDS = {"train": 0, "val": 1, "test": 2}
-
-
 _PER_FLAT = 3
 """Number of instances of a category taken from one flat: more would be much alike."""
-
-
-def check_classes(classes: Sequence[str]) -> None:
-    """Raises WearcapError when a class is not generated."""
-    available = (*MOVABLES, *OPENABLES)
-    for name in classes:
-        if name not in available:
-            raise WearcapError(
-                f"no objects of class {name!r} are generated",
-                expected=f"some of {', '.join(available)}",
-                fix=nearest(name, available),
-            )
 
 
 def generate_clouds(
@@ -43,7 +27,14 @@ def generate_clouds(
 
     Raises WearcapError for an unknown class.
     """
-    check_classes(classes)
+    available = (*MOVABLES, *OPENABLES)
+    for name in classes:
+        if name not in available:
+            raise WearcapError(
+                f"no objects of class {name!r} are generated",
+                expected=f"some of {', '.join(available)}",
+                fix=nearest(name, available),
+            )
     clouds, labels = [], []
     for label, name in enumerate(track(classes, f"objects to {split} on")):
         if name in MOVABLES:

@@ -1,38 +1,60 @@
-"""Seeded places outdoors: a street, kerbs, a pavement, a square, and a terrace that stairs and a ramp lead up to."""
+"""Seeded places outdoors: streets with a pavement, a square and a terrace, and hillsides of three terraces.
+
+Stairs and ramps lead up to the terrace of a street; those of a hillside lie some four metres above each other.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from wearcap.simulation.places.builder import WorldBuilder, hue
-from wearcap.simulation.places.furnish import FRONT_M, Box, Plan
+from wearcap.simulation.places.furnish import Plan
 from wearcap.simulation.places.furniture import MAKERS
-from wearcap.simulation.places.street import STONE, barrier, build_facade, build_kerb, slab, sloped_rail
-from wearcap.simulation.places.walls import build_flight
-from wearcap.simulation.places.world import Room, World
+from wearcap.simulation.places.outline import Box
+from wearcap.simulation.places.walls import KERB_TREAD_M, STONE, barrier, build_facade, build_flight, sloped_rail
+from wearcap.simulation.places.world import Flight, World
 
 KERB_STONE_M = 0.15
 LONGEST_RAMP_M = 9.5
 SQUARE_KINDS = (
-    "tree",
-    "bench",
-    "board",
-    "bin",
-    "tree",
-    "low_wall",
-    "bench",
-    "planter",
-    "street_lamp",
-    "bush",
-    "bollard",
+    *("tree", "bench", "board", "bin", "tree", "low_wall"),
+    *("bench", "planter", "street_lamp", "bush", "bollard"),
 )
 PAVEMENT_KINDS = ("street_lamp", "letter_box", "bench", "bollard", "tree", "bin")
 TERRACE_KINDS = ("bench", "planter", "bin")
 """Furniture of each part, in order of preference."""
+HILL_KINDS = ("bench", "planter", "tree", "bin", "street_lamp", "low_wall")
+HILL_DEPTH_M = 6.2
+"""Depth of a whole hillside, across the slope."""
+HILL_STAIRS_M, HILL_RAMP_M = 2.4, 3.6
+"""Across the slope, stairs and the path after them are below the first, the ramp above the second."""
+PLATEAU_M = 6.0
+PAVING, MEADOW = (0.60, 0.58, 0.54), (0.42, 0.52, 0.32)
 
 
 @dataclass(frozen=True)
-class Layout:
+class _Ramp:
+    box: Box
+    slope: float
+    up: int
+    """Sign of x along which the ramp rises."""
+
+
+@dataclass(frozen=True)
+class _Crossing:
+    """A gap in the barriers along the kerb."""
+
+    x: float
+    """Middle (m)."""
+    width: float
+    drop: float
+    """Length of the ramp to which the kerb may be lowered (m)."""
+    lowered: bool
+    """Whether the kerb is lowered; else it is stepped over."""
+
+
+@dataclass(frozen=True)
+class _Layout:
     """Lengths in m. The street runs along x; y rises from the street over kerb, pavement and square to a facade."""
 
     width: float
@@ -47,174 +69,137 @@ class Layout:
     top: float
     """Height of the terrace."""
     terrace: Box
-    ramp: Box
-    slope: float
-    ramp_up: int
-    """Sign of x along which the ramp rises."""
-    steps: int
-    tread: float
-    stair_x: float
-    stair_width: float
-    crossings: tuple[tuple[float, float], ...]
-    """Gaps in the barriers along the kerb as (middle x, width), from left to right."""
-    dropped: int
-    """Which crossing's kerb is lowered to a ramp; -1: none."""
-    drop: float
-    """Length of that ramp."""
-
-    @property
-    def stair_foot(self) -> float:
-        """y of the first riser."""
-        return self.terrace[1] - (self.steps - 1) * self.tread
-
-    @property
-    def ramp_plane(self) -> tuple[float, float, float]:
-        edge = self.ramp[2] if self.ramp_up > 0 else self.ramp[0]
-        return self.ramp_up * self.slope, 0.0, self.top - self.ramp_up * self.slope * edge
+    ramp: _Ramp
+    stairs: Flight
+    """Stairs from the square to the terrace."""
+    crossings: tuple[_Crossing, ...]
+    """From left to right."""
 
 
 def build_outdoor(rng: np.random.Generator, name: str, ramp_slope: float | None = None) -> World:
     """An open place with kerbs of 10–15 cm, stairs and a ramp of 7–10 % (`ramp_slope` None leaves it to chance)."""
-    builder = WorldBuilder(name, rng.uniform(-np.pi, np.pi), tuple(rng.uniform(-5.0, 5.0, 2).tolist()), outdoors=True)
-    layout = _draw_layout(rng, ramp_slope)
+    builder = WorldBuilder.drawn(name, rng, outdoors=True)
+    layout = _drawn_layout(rng, ramp_slope)
     _build_ground(builder, layout, rng)
     _build_terrace(builder, layout)
-    _line_kerb(builder, layout, rng)
     _build_borders(builder, layout, rng)
     _furnish(builder, layout, rng)
-    return builder.finish(cell=0.1)
+    return builder.finish()
 
 
-def _draw_layout(rng: np.random.Generator, ramp_slope: float | None) -> Layout:
+def _drawn_layout(rng: np.random.Generator, ramp_slope: float | None) -> _Layout:
     kerb, street = rng.uniform(0.10, 0.15), rng.uniform(3.6, 5.5)
     pavement = street + rng.uniform(2.2, 3.2)
     steps, rise, tread = int(rng.integers(3, 7)), rng.uniform(0.15, 0.17), rng.uniform(0.30, 0.32)
     height = steps * rise
     slope = float(np.clip(ramp_slope or rng.uniform(0.07, 0.10), height / LONGEST_RAMP_M, 0.10))
     run, ramp_width = height / slope, rng.uniform(1.6, 2.1)
-    terrace = rng.uniform(4.5, 6.5), rng.uniform(2.8, 3.6)
-    depth = pavement + terrace[1] + (steps - 1) * tread + rng.uniform(2.2, 3.5)
+    long, deep = rng.uniform(4.5, 6.5), rng.uniform(2.8, 3.6)
+    depth = pavement + deep + (steps - 1) * tread + rng.uniform(2.2, 3.5)
     margin, entry = rng.uniform(0.0, 2.5), rng.uniform(2.0, 4.0)
-    width = margin + terrace[0] + run + entry
+    width = margin + long + run + entry
     stair_width = rng.uniform(1.5, 2.4)
-    stair_x = margin + rng.uniform(stair_width / 2 + 0.3, terrace[0] - stair_width / 2 - 0.3)
+    stair_x = margin + rng.uniform(stair_width / 2 + 0.3, long - stair_width / 2 - 0.3)
     ramp_up = int(rng.choice([-1, 1]))  # falls towards larger x from a terrace on the left, or mirrored
     flip = (lambda low, high: (low, high)) if ramp_up < 0 else (lambda low, high: (width - high, width - low))
-    terrace_x, ramp_x = (flip(margin, margin + terrace[0]), flip(margin + terrace[0], margin + terrace[0] + run))
-    crossings = _draw_crossings(rng, width)
-    return Layout(
+    terrace_x, ramp_x = (flip(margin, margin + long), flip(margin + long, margin + long + run))
+    count = int(rng.integers(2, 4))
+    slots = (np.arange(count) + 0.5) * width / count
+    slots += rng.uniform(-0.25, 0.25, count) * width / count
+    crossings = [(float(x), float(rng.uniform(1.6, 2.6))) for x in slots]
+    dropped, drop = int(rng.integers(-1, count)), kerb / rng.uniform(0.08, 0.10)
+    y, top = depth - deep, kerb + height
+    start = (flip(stair_x, stair_x)[0], y - (steps - 1) * tread)
+    return _Layout(
         width,
         street,
         pavement,
         depth,
         kerb,
-        kerb + height,
-        (terrace_x[0], depth - terrace[1], terrace_x[1], depth),
-        (ramp_x[0], depth - ramp_width, ramp_x[1], depth),
-        slope,
-        ramp_up,
-        steps,
-        tread,
-        flip(stair_x, stair_x)[0],
-        stair_width,
-        crossings,
-        int(rng.integers(-1, len(crossings))),
-        kerb / rng.uniform(0.08, 0.10),
+        top,
+        (terrace_x[0], y, terrace_x[1], depth),
+        _Ramp((ramp_x[0], depth - ramp_width, ramp_x[1], depth), slope, ramp_up),
+        Flight(start, np.pi / 2, steps, (top - kerb) / steps, tread, stair_width, kerb),
+        tuple(_Crossing(*place, drop, number == dropped) for number, place in enumerate(crossings)),
     )
 
 
-def _draw_crossings(rng: np.random.Generator, width: float) -> tuple[tuple[float, float], ...]:
-    count = int(rng.integers(2, 4))
-    slots = (np.arange(count) + 0.5) * width / count
-    slots += rng.uniform(-0.25, 0.25, count) * width / count
-    return tuple((float(x), float(rng.uniform(1.6, 2.6))) for x in slots)
-
-
-def _build_ground(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) -> None:
+def _build_ground(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
     """Street, kerb stones, pavement (lowered at one crossing) and square, in a meadow that is only visible."""
     width, street, kerb = layout.width, layout.street, layout.kerb
     shade = rng.uniform(0.30, 0.42)
-    asphalt, paving = (shade, shade, shade * 1.04), (0.60, 0.58, 0.54)
-    slab(builder, "floor", (0.0, 0.0, width, street), 0.0, 0.05, asphalt, 3.0)
+    builder.add_slab("floor", (0.0, 0.0, width, street), 0.0, 0.05, (shade, shade, shade * 1.04), 3.0)
     inner = street + KERB_STONE_M
     pieces = [(0.0, width)]
-    if layout.dropped >= 0:
-        x, wide = layout.crossings[layout.dropped]
-        low, high = x - wide / 2, x + wide / 2
-        pieces = [(0.0, low), (high, width)]
-        slope = kerb / layout.drop
-        plane = (0.0, slope, -slope * street)
-        slab(builder, "ramp", (low, street, high, street + layout.drop), kerb, kerb, paving, 6.0, plane)
+    for crossing in layout.crossings:
+        if not crossing.lowered:
+            continue
+        low, high = crossing.x - crossing.width / 2, crossing.x + crossing.width / 2
+        pieces, end = [(0.0, low), (high, width)], street + crossing.drop
+        slope = kerb / crossing.drop
+        builder.add_slab("ramp", (low, street, high, end), kerb, kerb, PAVING, 6.0, (0.0, slope, -slope * street))
         for a, b in pieces:
-            slab(builder, "floor", (a, inner, b, street + layout.drop), kerb, kerb, paving, 6.0)
-        inner = street + layout.drop
+            builder.add_slab("floor", (a, inner, b, end), kerb, kerb, PAVING, 6.0)
+        inner = end
     for a, b in pieces:
-        slab(builder, "kerb", (a, street, b, street + KERB_STONE_M), kerb, kerb, STONE, 12.0)
-    slab(builder, "floor", (0.0, inner, width, layout.pavement), kerb, kerb, paving, 6.0)
-    square = (0.0, layout.pavement, width, layout.depth)
-    slab(builder, "floor", square, kerb, kerb, _earthy(rng), 5.0)
+        builder.add_slab("kerb", (a, street, b, street + KERB_STONE_M), kerb, kerb, STONE, 12.0)
+    builder.add_slab("floor", (0.0, inner, width, layout.pavement), kerb, kerb, PAVING, 6.0)
+    warm, light = rng.uniform(0.0, 0.16), rng.uniform(0.45, 0.75)  # gravel, clinker or flagstones
+    earthy = light * (1.0 + warm), light, light * (1.0 - warm)
+    builder.add_slab("floor", (0.0, layout.pavement, width, layout.depth), kerb, kerb, earthy, 5.0)
     center = (width / 2, layout.depth / 2, -0.11)
-    builder.add_box(center, (width + 24.0, layout.depth + 24.0, 0.1), (0.42, 0.52, 0.32), 1.0)
+    builder.add_box(center, (width + 24.0, layout.depth + 24.0, 0.1), MEADOW, 1.0)
     for name, low, high, z in (
         ("street", 0.0, street, 0.0),
         ("pavement", street, layout.pavement, kerb),
-        ("square", layout.pavement, layout.stair_foot, kerb),
+        ("square", layout.pavement, layout.stairs.start[1], kerb),
     ):
-        corners = np.array([[0.0, low], [width, low], [width, high], [0.0, high]])
-        builder.rooms.append(Room(name, builder.to_world(corners), z))
+        builder.add_room(name, (0.0, low, width, high), z)
 
 
-def _earthy(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Gravel, clinker or flagstones."""
-    warm, light = rng.uniform(0.0, 0.16), rng.uniform(0.45, 0.75)
-    return light * (1.0 + warm), light, light * (1.0 - warm)
-
-
-def _build_terrace(builder: WorldBuilder, layout: Layout) -> None:
+def _build_terrace(builder: WorldBuilder, layout: _Layout) -> None:
     """A raised floor with railings, open to the stairs before it and to the ramp beside it."""
     top, base, (x_low, y_low, x_high, y_high), ramp = layout.top, layout.kerb, layout.terrace, layout.ramp
-    slab(builder, "floor", layout.terrace, top, top - base, STONE, 6.0)
-    slab(builder, "ramp", ramp, top, top - base, (0.62, 0.60, 0.57), 6.0, layout.ramp_plane)
-    start, wide = (layout.stair_x, layout.stair_foot), layout.stair_width
-    rise = (top - base) / layout.steps
-    build_flight(builder, start, np.pi / 2, layout.steps, rise, layout.tread, wide, base, (-1, 1), STONE)
-    up, level = layout.ramp_up, (top, top)
+    box, up = ramp.box, ramp.up
+    foot, head = (box[0], box[2]) if up > 0 else (box[2], box[0])
+    plane = up * ramp.slope, 0.0, top - up * ramp.slope * head
+    builder.add_slab("floor", layout.terrace, top, top - base, STONE, 6.0)
+    builder.add_slab("ramp", box, top, top - base, (0.62, 0.60, 0.57), 6.0, plane)
+    build_flight(builder, layout.stairs, color=STONE)
+    x, wide = layout.stairs.start[0], layout.stairs.width
     side, far = (x_low, x_high) if up > 0 else (x_high, x_low)
     edge = 0.05
     for a, b in (
-        ((x_low + edge, y_low + edge), (start[0] - wide / 2 - 0.03, y_low + edge)),
-        ((start[0] + wide / 2 + 0.03, y_low + edge), (x_high - edge, y_low + edge)),
-        ((side + up * edge, y_low + edge), (side + up * edge, ramp[1])),
+        ((x_low + edge, y_low + edge), (x - wide / 2 - 0.03, y_low + edge)),
+        ((x + wide / 2 + 0.03, y_low + edge), (x_high - edge, y_low + edge)),
+        ((side + up * edge, y_low + edge), (side + up * edge, box[1])),
         ((far - up * edge, y_low + edge), (far - up * edge, y_high)),
     ):
-        sloped_rail(builder, a, b, base, level)
-    foot, head = (ramp[0], ramp[2]) if up > 0 else (ramp[2], ramp[0])
-    sloped_rail(builder, (foot, ramp[1] + edge), (head, ramp[1] + edge), base, (base, top))
-    corners = np.array([[x_low, y_low], [x_high, y_low], [x_high, y_high], [x_low, y_high]])
-    builder.rooms.append(Room("terrace", builder.to_world(corners), top))
+        sloped_rail(builder, a, b, base, (top, top))
+    sloped_rail(builder, (foot, box[1] + edge), (head, box[1] + edge), base, (base, top))
+    builder.add_room("terrace", layout.terrace, top)
 
 
-def _line_kerb(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) -> None:
-    """Cars, hedges and railings along the kerb, which is stepped over, or walked down, where they leave gaps."""
-    street, kerb, at = layout.street, layout.kerb, 0.0
-    for number, (x, wide) in enumerate(layout.crossings):
-        barrier(builder, at, x - wide / 2, street, (0.0, kerb), rng, street > 4.6)
-        at = x + wide / 2
-        if number != layout.dropped:
-            build_kerb(builder, x, street, wide, kerb)
-            continue
-        for side in (-1, 1):
-            beside = x + side * (wide / 2 + 0.06)
-            sloped_rail(builder, (beside, street), (beside, street + layout.drop), kerb, (kerb, kerb), 0.6)
-    barrier(builder, at, layout.width, street, (0.0, kerb), rng, street > 4.6)
+def _build_borders(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
+    """The kerb, a house behind the square, one across the street or at an end, garden walls and hedges.
 
-
-def _build_borders(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) -> None:
-    """A house behind the square, one across the street or at an end, garden walls and hedges."""
-    width, depth = layout.width, layout.depth
+    Cars, hedges and railings line the kerb, which is stepped over, or walked down, where they leave gaps.
+    """
+    street, kerb, width, depth = layout.street, layout.kerb, layout.width, layout.depth
+    at = 0.0
+    for crossing in layout.crossings:
+        x, half = crossing.x, crossing.width / 2
+        barrier(builder, (at, x - half), street, (0.0, kerb), rng, street > 4.6)
+        at = x + half
+        if not crossing.lowered:
+            start, direction = builder.point(x, street), builder.heading + np.pi / 2
+            builder.flights.append(Flight(start, direction, 1, kerb, KERB_TREAD_M, crossing.width, 0.0))
+        for side in (-1, 1) if crossing.lowered else ():
+            beside = x + side * (half + 0.06)
+            sloped_rail(builder, (beside, street), (beside, street + crossing.drop), kerb, (kerb, kerb), 0.6)
+    barrier(builder, (at, width), street, (0.0, kerb), rng, street > 4.6)
     doors = [(layout.terrace[0] + rng.uniform(0.3, 0.7) * (layout.terrace[2] - layout.terrace[0]), layout.top)]
-    open_end = width - 1.0 if layout.ramp_up < 0 else 1.0
-    doors.append((open_end, layout.kerb))
+    doors.append((width - 1.0 if layout.ramp.up < 0 else 1.0, kerb))
     build_facade(builder, (0.0, depth, width, depth + 0.4), rng.uniform(5.0, 7.5), doors, layout.top, rng)
     for x in np.arange(0.0, width - 2.0, 3.0):
         if rng.uniform() < 0.75:
@@ -224,47 +209,74 @@ def _build_borders(builder: WorldBuilder, layout: Layout, rng: np.random.Generat
             builder.add_block("hedge" if hedge else "wall", center, (rng.uniform(2.0, 3.0), 0.4, tall), color, texture)
     for x in (-0.2, width + 0.2):
         if rng.uniform() < 0.6:
-            tall, low = rng.uniform(0.9, 2.4), rng.uniform(layout.street, layout.pavement)
-            center = (x, (low + depth) / 2, tall / 2 + layout.kerb)
+            tall, low = rng.uniform(0.9, 2.4), rng.uniform(street, layout.pavement)
+            center = (x, (low + depth) / 2, tall / 2 + kerb)
             builder.add_block("wall", center, (0.3, depth - low, tall), hue(rng, (0.1, 0.35)), 9.0)
     for x in rng.uniform(0.0, width, 4):
         tree = MAKERS["tree"](rng)
         builder.place(tree, (float(x), float(rng.uniform(-4.0, -1.5)), -0.06), 0.0)
 
 
-def _furnish(builder: WorldBuilder, layout: Layout, rng: np.random.Generator) -> None:
+def _furnish(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
     """Benches, trees and posts where they block no path."""
-    width, street, kerb, foot = layout.width, layout.street, layout.kerb, layout.stair_foot
-    half = layout.stair_width / 2 + 0.3
-    free: list[Box] = [(layout.stair_x - half, foot - 1.5, layout.stair_x + half, layout.terrace[1])]
-    for x, wide in layout.crossings:
-        free.append((x - wide / 2 - 0.2, street - 1.4, x + wide / 2 + 0.2, street + layout.drop + 1.2))
-    low, high = layout.ramp[0], layout.ramp[2]
-    end = (low - 1.6, low) if layout.ramp_up > 0 else (high, high + 1.6)
-    free.append((end[0], layout.ramp[1] - 0.5, end[1], layout.depth))
-    pavement = (0.3, street + 0.7, width - 0.3, layout.pavement)
-    square = (0.3, layout.pavement, width - 0.3, layout.terrace[1] - 0.2)
-    terrace = (layout.terrace[0] + 0.2, layout.terrace[1] + 0.2, layout.terrace[2] - 0.2, layout.depth - 0.05)
-    inner = (terrace[0], layout.ramp[1] - 0.4, terrace[2], terrace[3])
-    stairs_head = (layout.stair_x - half, layout.terrace[1], layout.stair_x + half, layout.terrace[1] + 1.2)
-    ramp_head = (terrace[2] - 1.2, *inner[1:]) if layout.ramp_up < 0 else (*inner[:2], terrace[0] + 1.2, inner[3])
+    width, street, kerb = layout.width, layout.street, layout.kerb
+    (x, foot), half = layout.stairs.start, layout.stairs.width / 2 + 0.3
+    left, front, right, back = layout.terrace
+    falls, (low, ramp_y, high, _) = layout.ramp.up < 0, layout.ramp.box
+    free: list[Box] = [(x - half, foot - 1.5, x + half, front)]
+    for crossing in layout.crossings:
+        low_x, high_x = crossing.x - crossing.width / 2, crossing.x + crossing.width / 2
+        free.append((low_x - 0.2, street - 1.4, high_x + 0.2, street + crossing.drop + 1.2))
+    end = (high, high + 1.6) if falls else (low - 1.6, low)
+    free.append((end[0], ramp_y - 0.5, end[1], back))
+    terrace = (left + 0.2, front + 0.2, right - 0.2, back - 0.05)
+    stairs_head = (x - half, front, x + half, front + 1.2)
+    ramp_x = (terrace[2] - 1.2, terrace[2]) if falls else (terrace[0], terrace[0] + 1.2)
+    ramp_head = (ramp_x[0], ramp_y - 0.4, ramp_x[1], terrace[3])
     for room, z, kinds in (
-        (square, kerb, SQUARE_KINDS),
-        (pavement, kerb, PAVEMENT_KINDS),
+        ((0.3, layout.pavement, width - 0.3, front - 0.2), kerb, SQUARE_KINDS),
+        ((0.3, street + 0.7, width - 0.3, layout.pavement), kerb, PAVEMENT_KINDS),
         (terrace, layout.top, TERRACE_KINDS),
     ):
         plan = Plan(builder, room, z, [*free, stairs_head, ramp_head])
         for kind in kinds:
             if rng.uniform() < 0.85:
-                put_somewhere(plan, kind, rng)
+                plan.somewhere(kind, rng)
 
 
-def put_somewhere(plan: Plan, kind: str, rng: np.random.Generator, tries: int = 12) -> None:
-    """Put a piece of furniture at a random place, squarely, with room to use it from its front."""
-    piece = MAKERS[kind](rng)
-    x_low, y_low, x_high, y_high = plan.room
-    front = FRONT_M + 0.1 if piece.seats or piece.reaches else 0.0
-    for _ in range(tries):
-        place = float(rng.uniform(x_low, x_high)), float(rng.uniform(y_low, y_high))
-        if plan.try_place(piece, *place, int(rng.integers(4)) * np.pi / 2, front):
-            return
+def build_hillside(rng: np.random.Generator, name: str) -> World:
+    """Terraces at -4 … 4 m (3.4 m apart at least), stairs of 15–17 cm steps and ramps of 10–15 % between them.
+
+    x rises with the slope; the middle terrace lies at z = 0 from x = 0 to `PLATEAU_M`.
+    """
+    builder = WorldBuilder.drawn(name, rng, outdoors=True)
+    steps, riser = int(rng.integers(22, 25)), rng.uniform(0.155, 4.0 / 24)
+    rise, tread, slope = steps * riser, rng.uniform(0.28, 0.32), rng.uniform(0.10, 0.15)
+    stairs, ramp = (steps - 1) * tread, rise / slope
+    _add_hill_terrace(builder, "middle", [(0.0, 0.0, PLATEAU_M, HILL_DEPTH_M)], 0.0, rng)
+    # Above the middle the stairs start where the ramp starts, below it they end where the ramp ends.
+    for x, foot, base in ((PLATEAU_M, PLATEAU_M, 0.0), (-ramp, -stairs, -rise)):
+        box, ends = (x, HILL_RAMP_M, x + ramp, HILL_DEPTH_M), (base, base + rise)
+        builder.add_slab("ramp", box, ends[1], 0.3, PAVING, 6.0, (slope, 0.0, base - slope * x))
+        start = (foot, 0.1 + HILL_STAIRS_M / 2)
+        flight = Flight(start, 0.0, steps, rise / steps, tread, HILL_STAIRS_M - 0.3, base)
+        build_flight(builder, flight, color=STONE)
+        for y in (HILL_RAMP_M - 0.1, HILL_DEPTH_M - 0.05):
+            sloped_rail(builder, (x, y), (x + ramp, y), base, ends)
+    top = PLATEAU_M + ramp
+    path = (PLATEAU_M + stairs, 0.0, top, HILL_STAIRS_M + 0.8)
+    _add_hill_terrace(builder, "upper", [path, (top, 0.0, top + PLATEAU_M, HILL_DEPTH_M)], rise, rng)
+    path = (-ramp, 0.0, -stairs, HILL_STAIRS_M + 0.8)
+    _add_hill_terrace(builder, "lower", [path, (-ramp - PLATEAU_M, 0.0, -ramp, HILL_DEPTH_M)], -rise, rng)
+    return builder.finish()
+
+
+def _add_hill_terrace(builder: WorldBuilder, name: str, boxes: list[Box], z: float, rng: np.random.Generator) -> None:
+    """Level ground; the last box is the place itself, with its furniture, and open to the paths that lead to it."""
+    for box in boxes:
+        builder.add_slab("floor", box, z, 0.3, PAVING, 6.0)
+    x_low, _, x_high, _ = boxes[-1]
+    builder.add_room(name, boxes[-1], z)
+    plan = Plan(builder, (x_low + 1.2, 0.3, x_high - 1.2, HILL_DEPTH_M - 0.3), z)
+    for kind in rng.permutation(HILL_KINDS)[:3]:
+        plan.somewhere(str(kind), rng)

@@ -1,7 +1,10 @@
-"""Convex outlines seen from above."""
+"""Outlines seen from above: convex polygons, and boxes along a builder's axes."""
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+Box = tuple[float, float, float, float]
+"""x_low, y_low, x_high, y_high (m), along the builder's axes."""
 
 
 def rectangle(center: tuple[float, float], size: tuple[float, float], heading: float = 0.0) -> Float[np.ndarray, "4 2"]:
@@ -44,3 +47,25 @@ def distance_to_convex(
         best = np.minimum(best, np.linalg.norm(offset - share[..., None] * edge, axis=-1))
         inside &= edge[0] * offset[..., 1] - edge[1] * offset[..., 0] >= 0
     return np.where(inside, 0.0, best)
+
+
+def middle_and_size(box: Box) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Middle and size of a box (m)."""
+    return ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), (box[2] - box[0], box[3] - box[1])
+
+
+def inset(box: Box, margin: float) -> Box:
+    """The box without a margin on all sides (m)."""
+    return (box[0] + margin, box[1] + margin, box[2] - margin, box[3] - margin)
+
+
+def overlaps(a: Box, b: Box, margin: float = 0.0) -> bool:
+    """Whether two boxes overlap or are nearer to each other than a margin (m)."""
+    apart = a[0] >= b[2] + margin or b[0] >= a[2] + margin or a[1] >= b[3] + margin or b[1] >= a[3] + margin
+    return not apart
+
+
+def around(points: Float[np.ndarray, "point 2"]) -> Box:
+    """The smallest box around points (m)."""
+    low, high = points.min(0), points.max(0)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

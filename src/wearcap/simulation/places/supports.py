@@ -7,6 +7,7 @@ The floor is at z = 0.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, product
 
 import numpy as np
@@ -15,8 +16,8 @@ from jaxtyping import Bool, Float
 
 from wearcap.recording.motion import Motion
 from wearcap.simulation.people.body_space import BodySpace, foot_points, mass_center
-from wearcap.simulation.places.builder import Part, Piece, WorldBuilder, hue
-from wearcap.simulation.places.furniture import MAKERS, wood
+from wearcap.simulation.places.builder import Piece, WorldBuilder, entered, hue
+from wearcap.simulation.places.furniture import BOTH, IRON, MAKERS, parts_of, wood
 from wearcap.simulation.places.outline import rectangle, turn
 
 STILL = 0.3
@@ -85,7 +86,11 @@ def find_sits(motion: Motion) -> list[Sit]:
     off_balance = _outside(mass_center(motion)[:, :2], feet[..., :2]) > OFF_BALANCE_M
     hanging = feet[..., 2].min(1) > LOWEST_STEP_M
     still = _speed(motion, place) < STILL
-    sitting = still & (_thigh_angle(motion) > np.deg2rad(BENT_DEG)) & (off_balance | hanging)
+    angles = []  # of the thighs from vertical
+    for side in ("left", "right"):
+        thigh = (motion.joint(f"{side}_knee").t - motion.joint(f"{side}_hip").t).double().numpy()
+        angles.append(np.arccos(np.clip(-thigh[:, 2] / np.linalg.norm(thigh, axis=1), -1.0, 1.0)))
+    sitting = still & (np.minimum(*angles) > np.deg2rad(BENT_DEG)) & (off_balance | hanging)
     forward = pelvis.R[..., 0].double().numpy()
     sits: list[Sit] = []
     for start, stop in sorted(_stretches(sitting, motion, SIT_S), key=lambda span: span[0] - span[1]):
@@ -140,17 +145,15 @@ def _merged(soles: Float[np.ndarray, "time 2 2 3"], spans: list[tuple[int, int, 
         xy = stance[..., :2].reshape(-1, 2) @ turn(heading)
         z = float(np.quantile(stance[..., 2].min(1), 0.3))
         new = Tread(xy.min(0) - SOLE_WIDTH_M / 2, xy.max(0) + SOLE_WIDTH_M / 2, z, heading)
-        for other in [t for t in treads if _one_step(t, new)]:
+        for other in list(treads):
+            # One step: of one height, and near each other along it or overlapping.
+            apart = np.maximum(np.maximum(other.low - new.high, new.low - other.high), 0.0)
+            if abs(other.z - new.z) >= 0.08 or apart[0] != 0.0 or apart[1] >= 0.4:
+                continue
             treads.remove(other)
             new = Tread(np.minimum(new.low, other.low), np.maximum(new.high, other.high), min(z, other.z), heading)
         treads.append(new)
     return sorted(treads, key=lambda tread: tread.z)
-
-
-def _one_step(a: Tread, b: Tread) -> bool:
-    """Whether two rectangles are one step: of one height, and near each other along it or overlapping."""
-    apart = np.maximum(np.maximum(a.low - b.high, b.low - a.high), 0.0)
-    return abs(a.z - b.z) < 0.08 and bool(apart[0] == 0.0 and apart[1] < 0.4)
 
 
 def build_seat(
@@ -163,12 +166,12 @@ def build_seat(
     kinds = [str(kind) for kind in rng.permutation(SEATS)]
     for soft in SOFT_M:
         for kind in [*kinds, "small pedestal"]:
-            piece = _SEAT_MAKERS.get(kind, MAKERS.get(kind))(rng)  # type: ignore[misc]
+            piece = {**MAKERS, **STOOLS}[kind](rng)
             x, y, height, heading, _ = piece.seats[int(rng.integers(len(piece.seats)))]
             factor = float(sit.place[2]) / height
             if kind in MAKERS and not 0.8 < factor < 1.25:
                 continue
-            piece, about = _of_height(piece, factor), sit.heading - heading
+            piece, about = piece.stretched(factor), sit.heading - heading
             position = np.array([*(sit.place[:2] - turn(about) @ np.array([x, y])), 0.0])
             if not meets(body, piece, position, about, 0.0, {"seat": soft, **NEAR_SEAT}):
                 place = np.array([*builder.from_world(position[:2]), 0.0])
@@ -186,62 +189,49 @@ def meets(
     may_touch: dict[str, float] | None = None,
 ) -> bool:
     """Whether a body comes nearer than `margin` (m) to a piece at a place in the world, as `BodySpace.meets`."""
-    corners = np.array([np.abs(part.center) + np.array(box_size(part)) / 2 for part in piece.parts])
-    reach = float(np.linalg.norm(corners.max(0)))
-    body = body.around(position, reach + margin)
+    corners = np.array([np.abs(part.center) + np.array(part.box_size) / 2 for part in piece.parts])
+    body = body.around(position, float(np.linalg.norm(corners.max(0))) + margin)
     for part in piece.parts:
-        size = np.array(box_size(part))
         center = position + np.append(turn(heading) @ np.array(part.center[:2]), part.center[2])
-        if body.meets(center, size, heading, margin, may_touch):
+        if body.meets(center, np.array(part.box_size), heading, margin, may_touch):
             return True
     return False
 
 
-def box_size(part: Part) -> tuple[float, float, float]:
-    """Size of the box around a part of a piece (m)."""
-    return part.size if part.sides == 4 else (part.size[0], part.size[0], part.size[2])
+STOOLS: dict[str, Callable[[np.random.Generator], Piece]] = {}
+"""Makers of seats without a back by kind."""
 
 
+@entered(STOOLS, "stool")
 def _stool(rng: np.random.Generator) -> Piece:
     """A seat without a back on four legs or a block."""
     wide, seat, color = rng.uniform(0.32, 0.42), 0.45, wood(rng)
-    under = [Part((0, 0, (seat - THICK_M) / 2), (0.8 * wide, 0.8 * wide, seat - THICK_M), color, 8.0)]
+    tall, edge = seat - THICK_M, wide / 2 - 0.03
+    rows = [(0, 0, tall / 2, 0.8 * wide, 0.8 * wide, tall, color, 8.0)]
     if rng.uniform() < 0.7:
-        edge, tall = wide / 2 - 0.03, seat - THICK_M
-        under = [
-            Part((x * edge, y * edge, tall / 2), (0.035, 0.035, tall), color, 8.0) for x in (-1, 1) for y in (-1, 1)
-        ]
-    parts = (*under, Part((0, 0, seat - THICK_M / 2), (wide, wide, THICK_M), hue(rng), 20.0))
-    return Piece("stool", (wide, wide), (0.0, seat), parts, seats=((0.0, 0.0, seat, 0.0, wide / 2),))
+        rows = [(x * edge, y * edge, tall / 2, 0.035, 0.035, tall, color, 8.0) for x in BOTH for y in BOTH]
+    rows.append((0, 0, seat - THICK_M / 2, wide, wide, THICK_M, hue(rng), 20.0))
+    return _seat(wide, seat, rows)
 
 
+@entered(STOOLS, "pedestal")
 def _pedestal(rng: np.random.Generator, wide: float = 0.30) -> Piece:
     """A round seat on a column."""
     seat = 0.45
-    parts = (
-        Part((0, 0, 0.01), (0.8 * wide, 0, 0.02), (0.3, 0.3, 0.32), 8.0, 8),
-        Part((0, 0, (seat - THICK_M) / 2), (0.05, 0, seat - THICK_M), (0.5, 0.5, 0.52), 8.0, 8),
-        Part((0, 0, seat - THICK_M / 2), (wide, 0, THICK_M), hue(rng), 20.0, 8),
-    )
-    return Piece("stool", (wide, wide), (0.0, seat), parts, seats=((0.0, 0.0, seat, 0.0, wide / 2),))
+    tall = seat - THICK_M
+    rows = [
+        (0, 0, 0.01, 0.8 * wide, 0, 0.02, IRON, 8.0, 8),
+        (0, 0, tall / 2, 0.05, 0, tall, (0.5, 0.5, 0.52), 8.0, 8),
+        (0, 0, seat - THICK_M / 2, wide, 0, THICK_M, hue(rng), 20.0, 8),
+    ]
+    return _seat(wide, seat, rows)
 
 
-_SEAT_MAKERS: dict[str, Callable[[np.random.Generator], Piece]] = {
-    "stool": _stool,
-    "pedestal": _pedestal,
-    "small pedestal": lambda rng: _pedestal(rng, 0.18),
-}
+STOOLS["small pedestal"] = partial(_pedestal, wide=0.18)
 
 
-def _of_height(piece: Piece, factor: float) -> Piece:
-    """The piece with all its heights times a factor."""
-    parts = tuple(
-        replace(p, center=(*p.center[:2], p.center[2] * factor), size=(*p.size[:2], p.size[2] * factor))
-        for p in piece.parts
-    )
-    seats = tuple((x, y, factor * height, heading, depth) for x, y, height, heading, depth in piece.seats)
-    low, high = piece.z_range
-    return replace(piece, parts=parts, seats=seats, z_range=(factor * low, factor * high), reaches=())
+def _seat(wide: float, seat: float, rows: list[tuple]) -> Piece:
+    return Piece("stool", (wide, wide), (0.0, seat), parts_of(rows), seats=((0.0, 0.0, seat, 0.0, wide / 2),))
 
 
 def build_tread(builder: WorldBuilder, body: BodySpace, tread: Tread, rng: np.random.Generator) -> Tread | None:
@@ -274,9 +264,7 @@ def _clear(body: BodySpace, tread: Tread, solid: bool) -> bool:
 
 def _grown(body: BodySpace, tread: Tread, solid: bool, rng: np.random.Generator) -> Tread:
     """The tread widened on all sides while the body is clear of it, up to a drawn size."""
-    most = (
-        np.array([rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)]) if solid else np.array([0.0, rng.uniform(0.45, 0.6)])
-    )
+    most = (rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)) if solid else (0.0, rng.uniform(0.45, 0.6))
     open_sides = [(axis, sign) for axis in (1, 0) for sign in (-1, 1)]
     while open_sides:
         for axis, sign in list(open_sides):
@@ -305,15 +293,6 @@ def _add_step(builder: WorldBuilder, body: BodySpace, tread: Tread, solid: bool,
         if not body.meets(np.array([*end, tread.z / 2]), np.array(size), tread.heading, 0.0, ON_STEP):
             x, y = builder.from_world(end).tolist()
             builder.add_box((x, y, tread.z / 2), size, color, 8.0, heading)
-
-
-def _thigh_angle(motion: Motion) -> Float[np.ndarray, "time"]:
-    """Angle of the less bent thigh from vertical (rad)."""
-    angles = []
-    for side in ("left", "right"):
-        thigh = (motion.joint(f"{side}_knee").t - motion.joint(f"{side}_hip").t).double().numpy()
-        angles.append(np.arccos(np.clip(-thigh[:, 2] / np.linalg.norm(thigh, axis=1), -1.0, 1.0)))
-    return np.minimum(*angles)
 
 
 def _speed(motion: Motion, path: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time"]:

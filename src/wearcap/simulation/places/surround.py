@@ -12,15 +12,13 @@ from jaxtyping import Float
 from wearcap.recording.motion import Motion
 from wearcap.simulation.people.body_space import BodySpace, SweptFloor
 from wearcap.simulation.places.builder import Piece, WorldBuilder, hue
-from wearcap.simulation.places.flat import before_door
-from wearcap.simulation.places.furnish import ROOM_KINDS, Box, Plan, middle_and_size
+from wearcap.simulation.places.furnish import ROOM_KINDS, Plan
 from wearcap.simulation.places.furniture import MAKERS, wood
-from wearcap.simulation.places.outdoor import PAVEMENT_KINDS, SQUARE_KINDS, put_somewhere
-from wearcap.simulation.places.outline import rectangle
-from wearcap.simulation.places.street import barrier, build_facade, slab
-from wearcap.simulation.places.supports import box_size, build_seat, build_tread, find_sits, find_treads, meets
-from wearcap.simulation.places.walls import HEIGHT, Wall, build_wall
-from wearcap.simulation.places.world import Room, World
+from wearcap.simulation.places.outdoor import MEADOW, PAVEMENT_KINDS, SQUARE_KINDS
+from wearcap.simulation.places.outline import Box, around, inset, middle_and_size, rectangle
+from wearcap.simulation.places.supports import build_seat, build_tread, find_sits, find_treads, meets
+from wearcap.simulation.places.walls import HEIGHT, Wall, barrier, before_gap, build_facade, build_wall
+from wearcap.simulation.places.world import World
 
 MARGIN_M = 0.12
 """Least distance of anything from the body, except its supports."""
@@ -37,7 +35,7 @@ NEAR_OUTDOORS = ("bench", "bin", "bollard", "planter", "bush", "street_lamp", "l
 
 
 @dataclass(kw_only=True)
-class FreePlan(Plan):
+class _FreePlan(Plan):
     """A plan that also keeps off the space that a moving body occupies."""
 
     body: BodySpace
@@ -53,15 +51,12 @@ class FreePlan(Plan):
         if self.distance(piece, x, y, heading) < MARGIN_M:
             return False
         place = np.array([*self.builder.to_world(np.array([x, y])), self.z])
-        if _overhangs(piece) and meets(self.body, piece, place, heading + self.builder.heading, MARGIN_M):
+        # Parts may reach beyond the piece's outline, or above its height, as the crown of a tree does.
+        within = np.array([*piece.size, 2 * piece.z_range[1]]) / 2 + 0.03
+        overhangs = any((np.abs(part.center) + np.array(part.box_size) / 2 > within).any() for part in piece.parts)
+        if overhangs and meets(self.body, piece, place, heading + self.builder.heading, MARGIN_M):
             return False
         return super().try_place(piece, x, y, heading, front)
-
-
-def _overhangs(piece: Piece) -> bool:
-    """Whether parts reach beyond the piece's outline, or above its height, as the crown of a tree does."""
-    room = np.array([*piece.size, 2 * piece.z_range[1]]) / 2 + 0.03
-    return any((np.abs(part.center) + np.array(box_size(part)) / 2 > room).any() for part in piece.parts)
 
 
 def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
@@ -71,25 +66,28 @@ def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
     """
     body = BodySpace.of(motion)
     path = motion.t_world_root[:, :2].double().numpy()
-    outdoors = _is_outdoors(motion, path, body, rng)
+    duration_s = (motion.timestamps[-1] - motion.timestamps[0]).item()
+    fast = float(np.linalg.norm(path[-1] - path[0])) / max(duration_s, 0.1) > FAST
+    tall = bool((body.points[:, 2] + body.radius).max() > TALL_M)
+    outdoors = bool(rng.uniform() < (0.75 if fast else 0.12)) | tall
     builder = WorldBuilder(name, _heading(path, rng), tuple(path.mean(0).tolist()), outdoors)
     turned = body.points.copy()
     turned[:, :2] = builder.from_world(turned[:, :2])
     here = BodySpace(turned, body.radius, body.part)
     swept = SweptFloor.of(here, BEYOND_M)
-    plan = FreePlan(builder, (0.0, 0.0, 0.0, 0.0), 0.0, body=body, swept=swept)
-    _support(plan, motion, rng)
-    local_path = builder.from_world(path)
-    reach = _extent(here)
-    (_street if outdoors else _room)(plan, reach, local_path, rng)
-    return builder.finish(cell=0.1)
-
-
-def _is_outdoors(motion: Motion, path: np.ndarray, body: BodySpace, rng: np.random.Generator) -> bool:
-    duration_s = (motion.timestamps[-1] - motion.timestamps[0]).item()
-    fast = float(np.linalg.norm(path[-1] - path[0])) / max(duration_s, 0.1) > FAST
-    share = 0.75 if fast else 0.12
-    return bool(rng.uniform() < share) | bool((body.points[:, 2] + body.radius).max() > TALL_M)
+    plan = _FreePlan(builder, (0.0, 0.0, 0.0, 0.0), 0.0, body=body, swept=swept)
+    sits = find_sits(motion)
+    for sit in sits:
+        if (built := build_seat(builder, body, sit, rng)) is not None:
+            piece, place, heading = built
+            plan.solid.append(around(rectangle((place[0], place[1]), piece.size, heading)))
+    for tread in find_treads(motion, sits):
+        if (step := build_tread(builder, body, tread, rng)) is not None:
+            outline = rectangle(tuple(step.center.tolist()), tuple(step.size.tolist()), step.heading)
+            plan.solid.append(around(builder.from_world(outline)))
+    reach = around(np.concatenate([here.points[:, :2] + side * here.radius[:, None] for side in (-1, 1)]))
+    (_build_street if outdoors else _build_room)(plan, reach, builder.from_world(path), rng)
+    return builder.finish()
 
 
 def _heading(path: Float[np.ndarray, "time 2"], rng: np.random.Generator) -> float:
@@ -101,78 +99,41 @@ def _heading(path: Float[np.ndarray, "time 2"], rng: np.random.Generator) -> flo
     return float(np.arctan2(along[1], along[0]) + rng.normal(0.0, 0.12))
 
 
-def _extent(body: BodySpace) -> Box:
-    low = (body.points[:, :2] - body.radius[:, None]).min(0)
-    high = (body.points[:, :2] + body.radius[:, None]).max(0)
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def _support(plan: FreePlan, motion: Motion, rng: np.random.Generator) -> None:
-    """Seats and steps where the motion needs support."""
-    builder, sits = plan.builder, find_sits(motion)
-    for sit in sits:
-        if (built := build_seat(builder, plan.body, sit, rng)) is not None:
-            piece, place, heading = built
-            plan.solid.append(_around(rectangle((place[0], place[1]), piece.size, heading)))
-    for tread in find_treads(motion, sits):
-        if (step := build_tread(builder, plan.body, tread, rng)) is not None:
-            outline = rectangle(tuple(step.center.tolist()), tuple(step.size.tolist()), step.heading)
-            plan.solid.append(_around(builder.from_world(outline)))
-
-
-def _around(points: Float[np.ndarray, "point 2"]) -> Box:
-    low, high = points.min(0), points.max(0)
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def _room(plan: FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator) -> None:
+def _build_room(plan: _FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator) -> None:
     """Four walls with doors and windows, furniture beside the path, then along the walls."""
     builder = plan.builder
     gap = rng.uniform(*WALL_M, 4)
     box = (reach[0] - gap[0], reach[1] - gap[1], reach[2] + gap[2], reach[3] + gap[3])
-    middle, size = middle_and_size(box)
-    builder.add_surface("floor", rectangle(middle, size), wood(rng), texture=1.5, thickness=0.05)
-    builder.rooms.append(Room("room", builder.to_world(rectangle(middle, size)), 0.0))
+    builder.add_slab("floor", box, 0.0, 0.05, wood(rng), 1.5)
+    builder.add_room("room", rectangle(*middle_and_size(box)), 0.0)
     color = hue(rng, (0.0, 0.15))
     with_door = rng.permutation(4)[: rng.integers(1, 3)]
-    for side, wall in enumerate(_walls(box)):
+    corners = [(box[0], box[1]), (box[2], box[1]), (box[2], box[3]), (box[0], box[3])]
+    for side, wall in enumerate(Wall(a, b) for a, b in zip(corners, (*corners[1:], corners[0]))):
         if side in with_door:
             wall.doors.append((float(rng.uniform(0.7, wall.length - 0.7)), float(rng.uniform(0.8, 0.95))))
-            _passage(builder, wall, color, rng)
+            _build_passage(builder, wall, color, rng)
         elif rng.uniform() < 0.7:
             count = max(1, int(wall.length / 3.0))
             wall.windows += [(wall.length * (k + 0.5) / count, float(rng.uniform(0.9, 1.4))) for k in range(count)]
         build_wall(builder, wall, color, rng)
-    plan.room = (box[0] + 0.07, box[1] + 0.07, box[2] - 0.07, box[3] - 0.07)
-    plan.kept_free += [before_door(builder, door) for door in builder.doors]
+    plan.room = inset(box, 0.07)
+    plan.kept_free += [before_gap(builder, door) for door in builder.doors]
     _beside(plan, NEAR_INDOORS, path, rng)
     plan.furnish(str(rng.choice(list(ROOM_KINDS))), rng)
 
 
-def _walls(box: Box) -> list[Wall]:
-    """Walls around a rectangle, its inside to their left."""
-    corners = [(box[0], box[1]), (box[2], box[1]), (box[2], box[3]), (box[0], box[3])]
-    return [Wall(a, b) for a, b in zip(corners, (*corners[1:], corners[0]))]
-
-
-def _passage(builder: WorldBuilder, wall: Wall, color: tuple, rng: np.random.Generator) -> None:
+def _build_passage(builder: WorldBuilder, wall: Wall, color: tuple, rng: np.random.Generator) -> None:
     """The view through a door: a bit of hallway."""
     deep = rng.uniform(1.3, 1.8)
     a, b = wall.at(-0.06, -deep), wall.at(wall.length + 0.06, -deep)
-    outline = np.array(
-        [
-            wall.at(-0.06, -deep),
-            wall.at(wall.length + 0.06, -deep),
-            wall.at(wall.length + 0.06, -0.06),
-            wall.at(-0.06, -0.06),
-        ]
-    )
+    outline = np.array([a, b, wall.at(wall.length + 0.06, -0.06), wall.at(-0.06, -0.06)])
     builder.add_surface("floor", outline, wood(rng), texture=1.5, thickness=0.05)
     for start, end in ((wall.start, a), (a, b), (b, wall.end)):
         build_wall(builder, Wall(start, end), color, rng)
 
 
-def _beside(plan: FreePlan, kinds: tuple[str, ...], path: np.ndarray, rng: np.random.Generator) -> None:
+def _beside(plan: _FreePlan, kinds: tuple[str, ...], path: np.ndarray, rng: np.random.Generator) -> None:
     """Furniture within `NEAR_M` of the body, about one piece per metre and a half of its path."""
     length = float(np.linalg.norm(np.diff(path[::30], axis=0), axis=1).sum())
     for _ in range(int(np.clip(2 + length / 1.5, 2, 7))):
@@ -186,25 +147,26 @@ def _beside(plan: FreePlan, kinds: tuple[str, ...], path: np.ndarray, rng: np.ra
                 break
 
 
-def _street(plan: FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator) -> None:
+def _build_street(plan: _FreePlan, reach: Box, path: np.ndarray, rng: np.random.Generator) -> None:
     """A pavement before a house front, with a row of barriers across, open at its ends."""
     builder = plan.builder
     ends, front, across = rng.uniform(2.5, 5.0, 2), rng.uniform(0.8, 3.0), rng.uniform(1.0, 4.0)
     box = (reach[0] - ends[0], reach[1] - across, reach[2] + ends[1], reach[3] + front)
     light = rng.uniform(0.32, 0.7)
     warm = 1.0 + rng.uniform(0.0, 0.12)
-    slab(builder, "floor", box, 0.0, 0.05, (light * warm, light, light * 0.98), float(rng.choice([3.0, 5.0, 6.0])))
+    color, texture = (light * warm, light, light * 0.98), float(rng.choice([3.0, 5.0, 6.0]))
+    builder.add_slab("floor", box, 0.0, 0.05, color, texture)
     middle, size = middle_and_size(box)
-    builder.rooms.append(Room("street", builder.to_world(rectangle(middle, size)), 0.0, open_air=True))
-    builder.add_box((*middle, -0.11), (size[0] + 24.0, size[1] + 24.0, 0.1), (0.42, 0.52, 0.32), 1.0)
+    builder.add_room("street", rectangle(middle, size), 0.0, open_air=True)
+    builder.add_box((*middle, -0.11), (size[0] + 24.0, size[1] + 24.0, 0.1), MEADOW, 1.0)
     doors = [(float(rng.uniform(box[0] + 1.2, box[2] - 1.2)), 0.0)]
     build_facade(builder, (box[0], box[3], box[2], box[3] + 0.4), rng.uniform(4.5, 7.5), doors, 0.0, rng)
     gap = rng.uniform(box[0], box[2])
     for low, high in ((box[0], gap - 0.8), (gap + 0.8, box[2])):
-        barrier(builder, float(low), float(high), box[1], (0.0, 0.0), rng, True)
+        barrier(builder, (float(low), float(high)), box[1], (0.0, 0.0), rng, True)
     for x in rng.uniform(box[0] - 4.0, box[2] + 4.0, 6):
         builder.place(MAKERS["tree"](rng), (float(x), float(box[1] - rng.uniform(3.0, 9.0)), -0.06), 0.0)
     plan.room = (box[0] + 0.2, box[1] + 0.7, box[2] - 0.2, box[3] - 0.1)
     _beside(plan, NEAR_OUTDOORS, path, rng)
     for kind in (*PAVEMENT_KINDS, *SQUARE_KINDS)[:: int(rng.integers(1, 4))]:
-        put_somewhere(plan, kind, rng)
+        plan.somewhere(kind, rng)

@@ -1,7 +1,7 @@
 """The surroundings of a simulated wearer: surfaces to stand on, seats, reach targets, obstacles and the visible mesh.
 
 World frame: metres, z up, the ground floor at z = 0. Headings are angles (rad) about z, 0 along +x.
-A builder (`flat.build_flat`, `outdoor.build_outdoor`, `site.build_site`) fills the lists; walking and planning use
+A builder (`flat.build_flat`, `outdoor.build_outdoor`, `site.build_site`) fills it; walking and planning use
 `navigation`, which sees only surfaces (stood on) and objects (obstacles), so that a new kind of object
 needs no change there.
 """
@@ -68,14 +68,9 @@ class Seat:
 
     def standing_point(self, calf_to_edge: float = 0.12) -> Float[np.ndarray, "3"]:
         """Floor point below the pelvis of someone who stands in front of the seat, ready to sit down (m)."""
+        x, y, _ = self.position
         reach = self.depth + calf_to_edge
-        return np.array(
-            [
-                self.position[0] + reach * np.cos(self.heading),
-                self.position[1] + reach * np.sin(self.heading),
-                self.floor_z,
-            ]
-        )
+        return np.array([x + reach * np.cos(self.heading), y + reach * np.sin(self.heading), self.floor_z])
 
 
 @dataclass(frozen=True)
@@ -161,7 +156,19 @@ class Door:
 
 
 @dataclass(frozen=True)
-class World:
+class Contents:
+    """What a world offers to its walkers beside objects and surfaces."""
+
+    seats: tuple[Seat, ...] = ()
+    reach_targets: tuple[ReachTarget, ...] = ()
+    flights: tuple[Flight, ...] = ()
+    rooms: tuple[Room, ...] = ()
+    doors: tuple[Door, ...] = ()
+    spots: tuple[CaptureSpot, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class World(Contents):
     """Seeded surroundings. `face_object` gives each face of `mesh` its object (index), or -1 for the shell."""
 
     name: str
@@ -171,15 +178,9 @@ class World:
     """Visual features per m² of each face: near 0 on blank walls, hundreds on book spines."""
     objects: tuple[WorldObject, ...]
     surfaces: tuple[Surface, ...]
-    seats: tuple[Seat, ...] = ()
-    reach_targets: tuple[ReachTarget, ...] = ()
-    flights: tuple[Flight, ...] = ()
-    rooms: tuple[Room, ...] = ()
-    doors: tuple[Door, ...] = ()
     cell: float = 0.1
     """Side of a cell of the planning grid (m)."""
     outdoors: bool = False
-    spots: tuple[CaptureSpot, ...] = ()
 
     def floor_height(
         self, points_xy: Float[np.ndarray, "*batch 2"], near_z: Float[np.ndarray, "*batch"]

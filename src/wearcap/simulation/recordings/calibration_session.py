@@ -46,10 +46,10 @@ _FACING = rotation.about_axis("z", torch.tensor(math.pi / 2, dtype=torch.float64
 class SessionNoise:
     """Errors of the sensors and unsteadiness of the wearer."""
 
-    still_deg: float = 0.25
-    moving_deg: float = 1.5
-    still_period_s: float = 2.0
-    moving_period_s: float = 8.0
+    still: tuple[float, float] = (0.25, 2.0)
+    """Deviation (deg) and period (s) of the attitude's error at rest."""
+    moving: tuple[float, float] = (1.5, 8.0)
+    """Deviation (deg) and period (s) of its additional error when moved."""
     acc_noise: float = 0.04
     acc_bias: float = 0.02
     wobble_deg: float = 1.5
@@ -57,13 +57,37 @@ class SessionNoise:
     jitter_m: float = 0.0015
     jitter_deg: float = 0.12
     jitter_period_s: float = 0.4
-    clock_offset_s: float = 0.3
-    clock_ppm: float = 50.0
+    clock: tuple[float, float] = (0.3, 50.0)
+    """Largest offset (s) and deviation of the rate (ppm) of the watches' clocks."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Lengths that the wearer measures (m)."""
+
+    distances_m: tuple[float, float]
+    mark_height_m: float
+    standing_m: float
+    """Height of the camera above the floor while standing."""
+
+
+@dataclass(frozen=True)
+class Planted:
+    """The answers that a calibration should find."""
+
+    R_world_ref: dict[str, Tensor]
+    R_joint_imu: dict[str, Tensor]
+    R_world_slam: Float64[Tensor, "3 3"]
+    t_world_slam: Float64[Tensor, "3"]
+    scale: float
+    R_head_cam: Float64[Tensor, "3 3"]
+    offset_s: dict[str, float]
+    """Camera clock minus watch clock when the arms begin to swing."""
 
 
 @dataclass(frozen=True)
 class CalibrationSession:
-    """The recorded session, the times of its steps, and the answers that a calibration should find."""
+    """The recorded session and the times of its steps."""
 
     watches: dict[str, ImuStream]
     """Logs of the watches, each in its own reference frame and on its own clock."""
@@ -74,20 +98,10 @@ class CalibrationSession:
     points_slam: Float[Tensor, "point 3"]
     swings_s: Float64[Tensor, "swing"]
     """Times on the camera's clock at which the hands are nearest."""
-    distances_m: tuple[float, float]
-    mark_height_m: float
-    standing_m: float
-    """Height of the camera above the floor while standing."""
-    R_world_ref: dict[str, Tensor]
-    R_joint_imu: dict[str, Tensor]
-    R_world_slam: Float64[Tensor, "3 3"]
-    t_world_slam: Float64[Tensor, "3"]
-    scale: float
-    R_head_cam: Float64[Tensor, "3 3"]
-    offset_s: dict[str, float]
-    """Camera clock minus watch clock when the arms begin to swing."""
     board: dict[str, Stretch]
     t_pose: dict[str, Stretch]
+    measured: Measured
+    planted: Planted
 
 
 def simulate_calibration(
@@ -112,24 +126,24 @@ def simulate_calibration(
     slam = _seen(T_world_cam[::_FINER], scale, R_world_slam, t_world_slam, camera_fps, noise, rng)
     upright = (T_world_cam.timestamps >= STANDING[0]) & (T_world_cam.timestamps <= STANDING[1])
     points = (_floor_and_objects(rng) - t_world_slam) @ R_world_slam / scale
+    logs, R_world_ref, R_joint_imu, clocks = (dict(zip(watches, made)) for made in zip(*watches.values()))
     return CalibrationSession(
-        {joint: made[0] for joint, made in watches.items()},
+        logs,
         slam,
         _head_imu(T_world_cam, watch_fps, noise, rng),
         points.float(),
         torch.from_numpy(np.round(tops * camera_fps) / camera_fps),
-        distances,
-        height,
-        T_world_cam.t_world_body[upright, 2].mean().item(),
-        {joint: made[1] for joint, made in watches.items()},
-        {joint: made[2] for joint, made in watches.items()},
-        R_world_slam,
-        t_world_slam,
-        scale,
-        R_head_cam,
-        {joint: -made[3](SWINGS_S) + SWINGS_S for joint, made in watches.items()},
-        {joint: (made[3](BOARD[0]), made[3](BOARD[1])) for joint, made in watches.items()},
-        {joint: (made[3](T_POSE[0]), made[3](T_POSE[1])) for joint, made in watches.items()},
+        *({joint: (clock(start), clock(stop)) for joint, clock in clocks.items()} for start, stop in (BOARD, T_POSE)),
+        Measured(distances, height, T_world_cam.t_world_body[upright, 2].mean().item()),
+        Planted(
+            R_world_ref,
+            R_joint_imu,
+            R_world_slam,
+            t_world_slam,
+            scale,
+            R_head_cam,
+            {joint: -clock(SWINGS_S) + SWINGS_S for joint, clock in clocks.items()},
+        ),
     )
 
 
@@ -163,17 +177,6 @@ def _centred(wobble: Tensor, time: np.ndarray, stretch: Stretch) -> Tensor:
     return (wobble - wobble[torch.from_numpy(inside)].mean(0)) * torch.from_numpy(edge.clip(0, 1))[:, None]
 
 
-def _elevation(time: np.ndarray, tops: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Elevation (rad) of an arm: hanging, and up at each of `tops`, where the hand is before the head."""
-    middles = np.concatenate([[2 * tops[0] - tops[1]], tops, [2 * tops[-1] - tops[-2]]])
-    dips = (middles[1:] + middles[:-1]) / 2
-    knots = np.sort(np.concatenate([tops, dips]))
-    phase = CubicSpline(knots, np.arange(len(knots)))(time.clip(knots[0], knots[-1]))
-    high = np.deg2rad(rng.uniform(40, 65))
-    # The first knot is a dip: hanging at even, up at odd phases
-    return -np.pi / 2 + (high + np.pi / 2) * 0.5 * (1 - np.cos(np.pi * phase))
-
-
 def _arm(joint: str, tops: np.ndarray, time: np.ndarray, noise: SessionNoise, rng: np.random.Generator) -> Tensor:
     """R_world_joint of a wrist: T-pose, hanging, swinging, hanging while walking with a swing of 20°."""
     side = 1.0 if joint.startswith("left") else -1.0
@@ -183,7 +186,13 @@ def _arm(joint: str, tops: np.ndarray, time: np.ndarray, noise: SessionNoise, rn
     place = _held(time, [(0.0, T_POSE[1] + _MARGIN_S), (T_POSE[1] + 3, np.inf)])
     posed = _between(torch.stack([torch.eye(3, dtype=torch.float64), hanging]), place)
     stepping = ((time - tops[-1] - 3) / 0.5).clip(0, 1) * np.deg2rad(20) * np.sin(2 * np.pi * 0.95 * time)
-    raised = _elevation(time, tops, rng) + np.pi / 2 + stepping
+    # The arm's elevation: hanging (even phases of the knots), and up at each of `tops`, with the hand before the head.
+    middles = np.concatenate([[2 * tops[0] - tops[1]], tops, [2 * tops[-1] - tops[-2]]])
+    knots = np.sort(np.concatenate([tops, (middles[1:] + middles[:-1]) / 2]))
+    phase = CubicSpline(knots, np.arange(len(knots)))(time.clip(knots[0], knots[-1]))
+    high = np.deg2rad(rng.uniform(40, 65))
+    elevation = -np.pi / 2 + (high + np.pi / 2) * 0.5 * (1 - np.cos(np.pi * phase))
+    raised = elevation + np.pi / 2 + stepping
     swung = rotation.about_axis("y", torch.from_numpy(-raised))
     wobble = smooth_noise(rng, len(time), 3, 0.8, fps).double() * np.deg2rad(noise.wobble_deg) / np.sqrt(3)
     return _FACING @ swung @ posed @ rotation.exp(_centred(wobble, time, T_POSE))
@@ -200,8 +209,7 @@ def _watch(
     )
     R_world_ref = rotation.about_axis("z", torch.tensor(rng.uniform(-math.pi, math.pi), dtype=torch.float64))
     R_world_joint = _arm(joint, tops, time, noise, rng)
-    onto = np.array([0.0, BOARD[1] + _MARGIN_S]), (T_POSE[0] - _MARGIN_S, np.inf)
-    worn = _held(time, [tuple(onto[0]), onto[1]])
+    worn = _held(time, [(0.0, BOARD[1] + _MARGIN_S), (T_POSE[0] - _MARGIN_S, np.inf)])
     # From the board, where the watch's axes are the world's, onto the arm
     R_world_imu = R_world_joint @ R_joint_imu
     home = rotation.log(R_world_imu.mT) * torch.from_numpy(1 - worn)[:, None]
@@ -209,43 +217,30 @@ def _watch(
     side = 1.0 if joint.startswith("left") else -1.0
     reach = torch.tensor([0.0, 0.55 * side, 0.0], dtype=torch.float64)
     position = (R_world_joint @ reach) * torch.from_numpy(worn)[:, None]
-    stream = _logged(time, joint, R_world_imu, position, R_world_ref, noise, rng)
-    offset, rate = (rng.uniform(-1, 1) * noise.clock_offset_s, 1 + 1e-6 * noise.clock_ppm * rng.standard_normal())
-
-    def clock(true_s: float) -> float:
-        return 1.7e9 + offset + rate * true_s
-
-    times = torch.tensor([clock(t) for t in time.tolist()], dtype=torch.float64)
-    log = ImuStream(times, joint, stream.R_world_imu, stream.acc_world, stream.acc_imu, stream.gyro_imu)
-    return log, R_world_ref, R_joint_imu, clock
-
-
-def _logged(
-    time: np.ndarray,
-    joint: str,
-    R_world_imu: Tensor,
-    position: Tensor,
-    R_world_ref: Tensor,
-    noise: SessionNoise,
-    rng: np.random.Generator,
-) -> ImuStream:
-    """Core Motion's log in its reference frame: attitude that errs more when moved, and the measured acceleration."""
-    fps = 1 / (time[1] - time[0])
+    # Core Motion's log in its reference frame: attitude that errs more when moved, and the measured acceleration.
+    step_fps = 1 / (time[1] - time[0])
     R, times = R_world_imu, torch.from_numpy(time)
     acc = finite_difference(finite_difference(position, times), times).roll(-1, 0)
     up = torch.tensor([0.0, 0.0, GRAVITY], dtype=torch.float64)
     felt = (R.mT @ (acc + up)[..., None])[..., 0] + torch.from_numpy(
         noise.acc_bias * rng.standard_normal(3) + noise.acc_noise * rng.standard_normal((len(time), 3))
     )
-    rate = angular_rate(R, fps)
-    turning = np.convolve(rate.norm(dim=-1).numpy(), np.ones(int(fps)) / fps, "same")
+    rate = angular_rate(R, step_fps)
+    turning = np.convolve(rate.norm(dim=-1).numpy(), np.ones(int(step_fps)) / step_fps, "same")
     # Slower than 0.2 rad/s on average counts as rest for the filter.
     moved = torch.from_numpy((turning - 0.2).clip(0, 1))
-    error = noise.still_deg * smooth_noise(rng, len(time), 3, noise.still_period_s, fps).double()
-    error += noise.moving_deg * smooth_noise(rng, len(time), 3, noise.moving_period_s, fps).double() * moved[:, None]
+    error = noise.still[0] * smooth_noise(rng, len(time), 3, noise.still[1], step_fps).double()
+    error += noise.moving[0] * smooth_noise(rng, len(time), 3, noise.moving[1], step_fps).double() * moved[:, None]
     R_ref_imu = R_world_ref.mT @ R @ rotation.exp(torch.deg2rad(error) / np.sqrt(3))
     acc_ref = (R_ref_imu @ felt[..., None])[..., 0] - up
-    return ImuStream(times, joint, R_ref_imu.float(), acc_ref.float(), felt.float(), rate.float())
+    offset, clock_rate = rng.uniform(-1, 1) * noise.clock[0], 1 + 1e-6 * noise.clock[1] * rng.standard_normal()
+
+    def clock(true_s: float) -> float:
+        return 1.7e9 + offset + clock_rate * true_s
+
+    times = torch.tensor([clock(t) for t in time.tolist()], dtype=torch.float64)
+    log = ImuStream(times, joint, R_ref_imu.float(), acc_ref.float(), felt.float(), rate.float())
+    return log, R_world_ref, R_joint_imu, clock
 
 
 def _camera_path(
@@ -259,13 +254,8 @@ def _camera_path(
 ) -> Trajectory:
     """True poses of the camera: on the board's four positions, then on the head of someone who stands and walks."""
     time = np.arange(0, end, 1 / fps)
-    first = rng.uniform(0.05, 0.15, 2)
-    marks = [
-        [0, first[0], height],
-        [0, first[0] + distances[0], height],
-        [first[1], 0, height],
-        [first[1] + distances[1], 0, height],
-    ]
+    y, x = rng.uniform(0.05, 0.15, 2)
+    marks = [[0, y, height], [0, y + distances[0], height], [x, 0, height], [x + distances[1], 0, height]]
     head_t = torch.tensor([-0.4, -0.9, rng.uniform(1.45, 1.65)], dtype=torch.float64)
     sway = _centred(smooth_noise(rng, len(time), 6, 2.5, fps).double(), time, STANDING)
     R_head, t_head = _walk(time, end, head_t, rng)

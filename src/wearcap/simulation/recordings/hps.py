@@ -1,26 +1,66 @@
-"""One simulated HPS recording: a long session in a site, recorded by a suit, wrist sensors and a head camera."""
+"""Simulated HPS recordings: long sessions in a site, recorded by a suit, wrist sensors and a head camera.
+
+A session follows the protocol of the HPS thesis' evaluation (§4.5). At a capture spot the wearer claps, stands in an
+A-pose, walks about and leans on the table; then goes through the site and comes back after given distances to do the
+same again.
+"""
 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
-from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.recording.motion import Motion
-from wearcap.recording.recording import ContactTrack, FloorTrack, ImuStream, Recording
+from wearcap.recording.recording import ImuStream, Intervals, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.suit import SuitNoise, suit_motion
-from wearcap.simulation.places.world import World
-from wearcap.simulation.recordings.hps_session import Protocol, SimulatedSession, simulate_session
+from wearcap.simulation.people.actions import ACTIVITIES, FREE_M, follow, on_stairs, path_length
+from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan
+from wearcap.simulation.people.walking import turn_to
+from wearcap.simulation.people.wearer import TAIL_S, SimulatedMotion, Wearer, perform
+from wearcap.simulation.places.world import CaptureSpot, World
 from wearcap.simulation.recordings.localization_noise import LocalizationNoise, localize_statistically
-from wearcap.simulation.recordings.simulate import POOLS, person_of, world_of
+from wearcap.simulation.recordings.simulate import POOLS, drawn_person, seeded, with_truth, world_of
 from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, HeadCameraConfig, head_camera, view_texture
 
 CLAP_WIDTH_S = 0.011
 """Deviation of the shock of two palms, as a wrist's sensor measures it."""
 SITES = {"train": 8, "val": 3, "test": 5}
 """Sites of each split, fewer than flats: each needs a scan and photos."""
+A_POSE = (0.02, 0.46, -0.84, 0.2, 0.0, 0.0)
+"""Hand's pose channel (`HandScore.pose`): the arm hangs 30° off the body."""
+CLAP_HEIGHT, CLAP_AHEAD = 0.02, 0.62
+"""Wrist positions when the palms meet, from the shoulders, as shares of the arm's length: in front of the face."""
+PALMS_M, APART_M = 0.045, 0.13
+"""Distance of each wrist from the middle when the palms meet, and the additional distance before."""
+IDLE = ("stand", "look_around", "gesture", "hold", "crouch", "turn")
+"""Activities between walks, now and then."""
+IDLE_SHARE = 0.3
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Course of a session."""
+
+    returns_m: tuple[float, ...] = (70.0, 200.0, 380.0)
+    """Travelled distances after which the wearer is back at the spot, besides the start."""
+    end_m: float = 410.0
+    """The recording ends, at the spot, when about this distance is travelled."""
+    stand_s: float = 3.0
+    move_s: float = 10.0
+    claps: int = 3
+    clap_every_s: float = 240.0
+    """Claps come at the start, at the end, and at the first stop after this time."""
+
+
+@dataclass(frozen=True)
+class SimulatedSession:
+    """A motion with its stretches at the spot ("stand" and "move") and the times of its claps (s)."""
+
+    simulated: SimulatedMotion
+    intervals: Intervals
+    claps_s: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -58,11 +98,6 @@ class Simulated:
         return suit_s * (1 + self.clock[1] / 3.6e6) + self.clock[0]
 
 
-def site_number(split: str, index: int) -> int:
-    """Number of the split's site in which its index-th recording takes place."""
-    return index % min(SITES[split], POOLS[split][1])
-
-
 def simulate_hps(config: HpsConfig, name: str, split: str, seed: int, world: World | None = None) -> Simulated:
     """The recording of a seed; without a world, in the split's site of the same number.
 
@@ -70,14 +105,17 @@ def simulate_hps(config: HpsConfig, name: str, split: str, seed: int, world: Wor
     `contacts`, `floor`, `intervals` ("stand" and "move" at the capture spot, by distance travelled), the camera's
     poses (`HEAD_CAMERA_TRUTH`); and in the motion's provenance the clock's offset and drift and the claps' times.
     """
-    rng = np.random.default_rng([5, sum(map(ord, split)), seed])
-    person = person_of(split, int(rng.integers(POOLS[split][0])))
-    world = world or world_of(split, site_number(split, seed), "site")
+    rng = seeded(5, split, seed)
+    person = drawn_person(split, rng)
+    world = world or world_of(split, seed % min(SITES[split], POOLS[split][1]), "site")
     session = simulate_session(world, person, rng, config.fps, config.protocol)
     motion = session.simulated.motion
     suit = suit_motion(motion, session.simulated.contact, config.suit, rng)
     strength = rng.uniform(*config.clap_acc, len(session.claps_s))
-    imu = {f"{side}_wrist": _wrist(motion, side, config, session.claps_s, strength, rng) for side in ("left", "right")}
+    imu = {}
+    for side in SIDES:
+        stream = synthesize_imu(motion, f"{side}_wrist", noise=config.imu, rng=rng, n=1)
+        imu[f"{side}_wrist"] = _shaken_by_claps(stream, motion, session.claps_s, strength)
     camera, path, clock = head_camera(motion, person.t_head_device, config, rng)
     localization = None
     if config.localization is not None:
@@ -88,48 +126,191 @@ def simulate_hps(config: HpsConfig, name: str, split: str, seed: int, world: Wor
         "camera_clock_offset_s": f"{clock[0]:.6f}",
         "camera_clock_drift_ms_per_h": f"{clock[1]:.3f}",
     }
-    recording = Recording(
+    documented = replace(motion, provenance=motion.provenance | about)
+    recording = with_truth(
+        replace(session.simulated, motion=documented),
+        person,
         name,
+        world.name,
+        "session",
         imu=imu,
         suit=suit,
         camera=camera,
         localization=localization,
-        motion=replace(motion, provenance=motion.provenance | about),
-        contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, session.simulated.contact),
         object_motion={HEAD_CAMERA_TRUTH: path},
-        floor=FloorTrack(motion.timestamps, session.simulated.floor_height),
         intervals=session.intervals,
-        skeleton=person.skeleton,
-        shape=person.shape,
-        subject=person.name,
-        location=world.name,
-        activity="session",
-        source="wearcap simulation",
-        license="MIT (generated)",
     )
     return Simulated(recording, session, world, clock)
 
 
-def _wrist(
-    motion: Motion,
-    side: str,
-    config: HpsConfig,
-    claps_s: tuple[float, ...],
-    strength: np.ndarray,
-    rng: np.random.Generator,
-) -> ImuStream:
+def _shaken_by_claps(stream: ImuStream, motion: Motion, claps_s: tuple[float, ...], strength: np.ndarray) -> ImuStream:
     """Readings of a wrist's sensor; palms that meet push the wrists apart for some hundredths of a second."""
-    stream = synthesize_imu(motion, f"{side}_wrist", noise=config.imu, rng=rng, n=1)
-    apart = motion.joint(f"{side}_wrist").t - motion.joint("right_wrist" if side == "left" else "left_wrist").t
+    own, other = (f"{side}_wrist" for side in (SIDES if stream.joint == "left_wrist" else SIDES[::-1]))
+    apart = motion.joint(own).t - motion.joint(other).t
     apart = apart / apart.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     times = stream.timestamps[:, None] - torch.tensor(claps_s, dtype=torch.float64)
     pulse = (torch.exp(-0.5 * (times / CLAP_WIDTH_S) ** 2) * torch.from_numpy(strength)).sum(1).float()
     shock = pulse[:, None] * apart
     assert stream.acc_world is not None
     assert stream.acc_imu is not None
-    R = motion.joint(f"{side}_wrist").R
+    R = motion.joint(own).R
     return replace(
         stream,
         acc_world=stream.acc_world + shock,
         acc_imu=stream.acc_imu + (R.transpose(-1, -2) @ shock[..., None])[..., 0],
     )
+
+
+def simulate_session(
+    world: World, person: Wearer, rng: np.random.Generator, fps: float = 60.0, protocol: Protocol = Protocol()
+) -> SimulatedSession:
+    """A session at the world's first capture spot, deterministic for a given state of `rng`."""
+    session = _Session(world, person, rng, protocol)
+    session.visit()
+    for distance in protocol.returns_m:
+        session.wander(distance)
+        session.go_home()
+        session.visit()
+    session.wander(protocol.end_m)
+    session.go_home()
+    session.clap()
+    plan = session.plan
+    plan.time += 1.0
+    duration = plan.time
+    ACTIVITIES["stand"].act(plan, world, rng)
+    plan.time = max(plan.time, duration + TAIL_S)
+    simulated = perform(plan, world, rng, duration, fps)
+    path_so_far = simulated.motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1).cumsum(0).numpy()
+    starts, stops, names = zip(*session.stretches)
+    travelled = np.interp(starts, simulated.motion.timestamps.numpy()[1:], path_so_far)
+    intervals = Intervals(
+        torch.tensor(starts, dtype=torch.float64),
+        torch.tensor(stops, dtype=torch.float64),
+        torch.from_numpy(travelled).float(),
+        names,
+    )
+    return SimulatedSession(simulated, intervals, tuple(session.clap_times))
+
+
+class _Session:
+    """The plan in the making, and the distance walked so far."""
+
+    def __init__(self, world: World, person: Wearer, rng: np.random.Generator, protocol: Protocol):
+        self.world, self.rng, self.protocol = world, rng, protocol
+        self.spot: CaptureSpot = world.spots[0]
+        self.home = np.array(self.spot.position)
+        self.plan = Plan(person.skeleton, person.style, self.home.copy(), self.spot.heading, world.floor_height)
+        self.plan.time = 0.8
+        self.travelled = 0.0
+        self.stretches: list[tuple[float, float, str]] = []
+        self.clap_times: list[float] = []
+        self._length_home = world.navigation.lengths_from(self.home)
+
+    def walk(self, goal: np.ndarray, heading: float | None = None) -> bool:
+        path = self.world.plan_path(self.plan.position, goal, self.rng)
+        if path is None:
+            return False
+        start = self.plan.time
+        follow(self.plan, self.world, self.rng, path, heading)
+        self.plan.label(start, "walk")
+        self.travelled += path_length(path)
+        return True
+
+    def wander(self, until_m: float) -> None:
+        """Walk from place to place as long as the path home leaves room for it."""
+        points = self.world.navigation.node_points
+        free = (self.world.clearance(points) > FREE_M) & ~on_stairs(self.world, points)
+        while True:
+            there = self.world.navigation.lengths_from(self.plan.position)
+            left = until_m - self.travelled
+            fits = np.flatnonzero(free & (there > 2.5) & (there + self._length_home < left + 1.5))
+            if not len(fits):
+                return
+            # the last walk before home uses up what is left; others go anywhere
+            total = there[fits] + self._length_home[fits]
+            last = fits[total > left - 3.0] if left < 1.6 * total.max() else fits
+            goal = points[self.rng.choice(last if len(last) else fits)]
+            if not self.walk(goal) or self.rng.random() < IDLE_SHARE:
+                start, name = self.plan.time, str(self.rng.choice(IDLE))
+                ACTIVITIES[name].act(self.plan, self.world, self.rng)
+                self.plan.label(start, name)
+
+    def go_home(self) -> None:
+        self.walk(self.home, self.spot.heading)
+
+    def visit(self) -> None:
+        """Activities at the spot: claps where due, the A-pose, moving about."""
+        if not self.clap_times or self.plan.time - self.clap_times[-1] > self.protocol.clap_every_s:
+            self.clap()
+        self.stand()
+        self.move_about()
+
+    def clap(self) -> None:
+        """Raise the hands and clap; palms meet at `clap_times`."""
+        plan, rng, start = self.plan, self.rng, self.plan.time
+        wide = float(plan.skeleton.t_parent_joint[plan.skeleton.indices("left_collar", "left_shoulder"), 1].sum())
+        pose = lambda gap: (CLAP_AHEAD, (gap - wide) / plan.arm_length, CLAP_HEIGHT, 0.5, 0.0, 0.0)  # noqa: E731
+        raise_s = 0.8
+        time = start + raise_s + 0.2
+        hands = [plan.hands[side] for side in SIDES]
+        for hand in hands:
+            hand.pose.move(start, start, pose(PALMS_M + APART_M))
+            hand.pose_weight.move(start, start + raise_s, 1.0)
+        for _ in range(self.protocol.claps):
+            quick = float(rng.uniform(0.22, 0.28))
+            for hand in hands:
+                hand.pose.move(time, time + quick, pose(PALMS_M))
+                hand.pose.move(time + quick + 0.05, time + quick + 0.55, pose(PALMS_M + APART_M))
+            self.clap_times.append(time + quick)
+            time += float(rng.uniform(0.95, 1.25))
+        for hand in hands:
+            hand.pose_weight.move(time, time + raise_s, 0.0)
+        plan.time = time + raise_s + 0.3
+        plan.label(start, "clap")
+
+    def stand(self) -> None:
+        """Hold an A-pose."""
+        plan, start, rise = self.plan, self.plan.time, 0.9
+        stop = start + rise + 0.2 + self.protocol.stand_s
+        for side in SIDES:
+            hand = plan.hands[side]
+            hand.pose.move(start, start, A_POSE)
+            hand.pose_weight.move(start, start + rise, 1.0)
+            hand.pose_weight.move(stop, stop + rise, 0.0)
+        self.stretches.append((start + rise + 0.2, stop, "stand"))
+        plan.time = stop + rise + 0.1
+        plan.label(start, "stand")
+
+    def move_about(self) -> None:
+        """Step about within the spot, lean on the table, and come back to the middle."""
+        plan, start = self.plan, self.plan.time
+        ahead = np.array([np.cos(self.spot.heading), np.sin(self.spot.heading)])
+        side = np.array([-ahead[1], ahead[0]]) * self.rng.choice([-1.0, 1.0])
+        far = 0.28 * self.spot.size
+        at_table = self.home.copy()
+        at_table[:2] += (self.spot.table_m - 0.32) * ahead
+        self.walk(at_table, self.spot.heading)
+        self._lean(ahead)
+        for off in (side * far, -ahead * far, -side * far):
+            if plan.time - start < self.protocol.move_s:
+                self.walk(self.home + np.append(off, 0.0))
+        self.walk(self.home, self.spot.heading)
+        self.stretches.append((start, plan.time, "move"))
+
+    def _lean(self, ahead: np.ndarray) -> None:
+        """Put both hands on the table, lean over it, and rise again."""
+        plan, start = self.plan, self.plan.time
+        across = np.array([-ahead[1], ahead[0]])
+        out, pause, back = 0.9, float(self.rng.uniform(1.2, 2.2)), 0.9
+        for hand_side in SIDES:
+            hand = plan.hands[hand_side]
+            place = self.home[:2] + (self.spot.table_m + 0.06) * ahead + LEFT_SIGN[hand_side] * 0.22 * across
+            height = self.home[2] + self.spot.table_z + 0.07
+            hand.goal.move(start, start, np.append(place, height))
+            hand.goal_weight.move(start, start + out, 1.0)
+            hand.goal_weight.move(start + out + pause, start + out + pause + back, 0.0)
+        plan.lean.move(start, start + out, (0.5, 0.0, 0.0))
+        plan.lean.move(start + out + pause, start + out + pause + back, 0.0)
+        plan.time = start + out + pause + back + 0.2
+        turn_to(plan, plan.heading + 1.2 * float(self.rng.choice([-1.0, 1.0])), self.rng)
+        plan.label(start, "lean")

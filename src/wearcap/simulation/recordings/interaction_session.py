@@ -1,30 +1,45 @@
-"""Simulated iReplica recordings: use of a flat's objects, recorded by a suit and a head camera (thesis §5.4)."""
+"""Simulated recordings of the use of a flat's objects: iReplica's (thesis §5.4) and ECHO's.
+
+iReplica's wearers open, close and move what a flat holds and wear a suit and a head camera; ECHO's wear a head device
+and carry the hand-held objects that lie about as well.
+"""
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
-from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
-from wearcap.recording.recording import ContactTrack, FloorTrack, Recording
-from wearcap.scene.environment import Environment
+from wearcap.recording.recording import Recording
+from wearcap.sensors.head import SlamNoise, head_stream
 from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.handling.house import House
-from wearcap.simulation.handling.household import Household
-from wearcap.simulation.people.wearer import perform
-from wearcap.simulation.places.interactive_flat import InteractiveFlat, build_interactive_flat
-from wearcap.simulation.places.world import World
+from wearcap.simulation.handling.household import USUAL, VARIED, Habits, Household
+from wearcap.simulation.handling.rearranging import APART_M, apart, kept_free, outlines
+from wearcap.simulation.people.person import Person
+from wearcap.simulation.people.wearer import SimulatedMotion, perform
+from wearcap.simulation.places.interactive_flat import InteractiveFlat, build_interactive_flat, obstacle
+from wearcap.simulation.places.movables import HANDHELDS, Movable, make_movable
+from wearcap.simulation.places.openables import at
+from wearcap.simulation.places.outline import rectangle
 from wearcap.simulation.recordings.localization_noise import LocalizationNoise, localize_statistically
-from wearcap.simulation.recordings.simulate import POOLS, activity_of, person_of
+from wearcap.simulation.recordings.simulate import POOLS, drawn_person, seeded, with_truth
 from wearcap.simulation.rendering.head_camera import HeadCameraConfig, head_camera, view_texture
 
 FLATS = {"train": 40, "val": 6, "test": 8}
 """Interactive flats of each split: each needs a scan, so they are used again."""
+TWICE = 0.4
+"""Probability of two objects of a kind."""
+TRIES = 60
+OPEN_SHARE, WIDE = 0.75, np.deg2rad(66.0)
+"""Share of the shut doors that are opened; least angle to which they are."""
+REACHABLE_SHARE = 0.96
+"""Share of the floor that must stay reachable when an object has been put there."""
 
 
 @dataclass(frozen=True)
 class InteractionConfig(HeadCameraConfig):
-    """Settings of a simulated recording. Suit and camera share a clock by default."""
+    """Settings of a simulated recording for iReplica. Suit and camera share a clock by default."""
 
     fps: float = 60.0
     minutes: float = 3.0
@@ -35,66 +50,132 @@ class InteractionConfig(HeadCameraConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.fps < 30 or not self.minutes > 0:
-            raise WearcapError(f"{self.minutes} min at {self.fps} Hz", expected="some time, at 30 Hz or more")
+        _check_length(self.minutes, self.fps)
 
 
 @dataclass(frozen=True)
-class SimulatedInteractions:
-    """A recording with the environment in which it took place, and the worlds it was made from."""
+class ObjectConfig:
+    """Settings of a simulated recording for ECHO."""
 
-    recording: Recording
-    environment: Environment
-    world: World
-    """The static world together with the movable objects at their initial poses."""
-    static: World
-    """The static part of the world alone."""
+    fps: float = 30.0
+    minutes: float = 2.0
+    head_noise: SlamNoise | None = field(default_factory=SlamNoise)
+
+    def __post_init__(self):
+        _check_length(self.minutes, self.fps)
 
 
-def flat_number(split: str, index: int) -> int:
-    """Number of the split's interactive flat in which its index-th recording takes place."""
-    return index % min(FLATS[split], POOLS[split][1])
+def _check_length(minutes: float, fps: float) -> None:
+    """Raises WearcapError for a recording without a length or below 30 Hz."""
+    if fps < 30 or not minutes > 0:
+        raise WearcapError(f"{minutes} min at {fps} Hz", expected="some time, at 30 Hz or more")
 
 
 def flat_of(split: str, number: int) -> InteractiveFlat:
     """A split's interactive flat by number, always the same."""
-    rng = np.random.default_rng([6, sum(map(ord, split)), number])
-    return build_interactive_flat(rng, f"sim-{split}-interactive_flat-{number:03d}")
+    return build_interactive_flat(seeded(6, split, number), f"sim-{split}-interactive_flat-{number:03d}")
 
 
-def simulate_interactions(config: InteractionConfig, name: str, split: str, seed: int) -> SimulatedInteractions:
-    """The recording of a seed, in the split's flat of the same number.
+@lru_cache(maxsize=2)
+def object_flat_of(split: str, number: int) -> InteractiveFlat:
+    """A split's interactive flat with hand-held objects by number, always the same.
+
+    Most of its doors are open, and one or two objects of each kind stand at reachable places, clear of doors, drawers
+    and walkers; where a kind finds no place, the next flat is taken.
+    """
+    rng = seeded(8, split, number)
+    while True:
+        flat = build_interactive_flat(rng, f"sim-{split}-object_flat-{number:03d}")
+        openables = tuple(
+            at(item, item.opening_sign * float(rng.uniform(WIDE, item.openness(item.opened))))
+            if item.category == "door" and item.blocks(0.0) and rng.random() < OPEN_SHARE
+            else item
+            for item in flat.openables
+        )
+        flat = InteractiveFlat(flat.static, flat.movables, openables)
+        names = [f"{category}_{copy}" for category in HANDHELDS for copy in range(1, 2 + int(rng.random() < TWICE))]
+        for name in names:
+            if (placed := _placed(flat, make_movable(name.rpartition("_")[0], name, rng), rng)) is not None:
+                flat = InteractiveFlat(flat.static, (*flat.movables, placed), openables)
+        if {movable.category for movable in flat.movables}.issuperset(HANDHELDS):
+            return flat
+
+
+def simulate_interactions(
+    config: InteractionConfig, name: str, split: str, seed: int
+) -> tuple[Recording, InteractiveFlat]:
+    """iReplica's recording of a seed and its flat, which is the split's flat of the same number.
 
     Sensed are `suit`, `camera` and its `localization`. True are `motion`, `contacts` of the feet, `floor`,
     `interactions` and, for everything that can be moved, `object_motion` on the motion's timestamps.
     """
-    rng = np.random.default_rng([7, sum(map(ord, split)), seed])
-    person = person_of(split, int(rng.integers(POOLS[split][0])))
-    flat = flat_of(split, flat_number(split, seed))
-    house, duration = House(flat), 60.0 * config.minutes
-    household = Household(house, person, rng)
-    household.live(duration)
-    simulated = perform(household.plan, flat.static, rng, duration, config.fps)
-    motion = simulated.motion
-    suit = suit_motion(motion, simulated.contact, config.suit, rng)
-    camera, path, _ = head_camera(motion, person.t_head_device, config, rng)
+    rng = seeded(7, split, seed)
+    person = drawn_person(split, rng)
+    flat = flat_of(split, seed % min(FLATS[split], POOLS[split][1]))
+    house, simulated = _lived(flat, person, config.minutes, config.fps, USUAL, rng)
+    suit = suit_motion(simulated.motion, simulated.contact, config.suit, rng)
+    camera, path, _ = head_camera(simulated.motion, person.t_head_device, config, rng)
     texture = view_texture(flat.world, path, max(1, round(config.camera_fps / 2)))
-    recording = Recording(
+    parts = {"suit": suit, "camera": camera}
+    parts["localization"] = localize_statistically(path, config.localization, rng, texture)
+    return _handled(house, simulated, person, name, config.minutes, parts), flat
+
+
+def simulate_objects(config: ObjectConfig, name: str, split: str, seed: int) -> tuple[Recording, InteractiveFlat]:
+    """ECHO's recording of a seed and its flat, which is the split's flat of the same number.
+
+    Sensed is `head`. True are `motion`, `contacts` of the feet, `floor`, `interactions` and, for everything that can
+    be moved, `object_motion` on the motion's timestamps.
+    """
+    rng = seeded(9, split, seed)
+    person = drawn_person(split, rng)
+    flat = object_flat_of(split, seed % POOLS[split][1])
+    house, simulated = _lived(flat, person, config.minutes, config.fps, VARIED, rng)
+    head = head_stream(simulated.motion, person.t_head_device, config.head_noise, rng)
+    return _handled(house, simulated, person, name, config.minutes, {"head": head}), flat
+
+
+def _lived(
+    flat: InteractiveFlat, person: Person, minutes: float, fps: float, habits: Habits, rng: np.random.Generator
+) -> tuple[House, SimulatedMotion]:
+    """The motion of a person who uses a flat's objects by some habits, and the house as it is left."""
+    household = Household(House(flat), person, rng, habits)
+    household.live(60.0 * minutes)
+    return household.house, perform(household.plan, flat.static, rng, 60.0 * minutes, fps)
+
+
+def _handled(
+    house: House, simulated: SimulatedMotion, person: Person, name: str, minutes: float, parts: dict
+) -> Recording:
+    """The recording of `_lived` with its sensed parts and the truth of body and objects."""
+    return with_truth(
+        simulated,
+        person,
         name,
-        suit=suit,
-        camera=camera,
-        localization=localize_statistically(path, config.localization, rng, texture),
-        motion=motion,
-        contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, simulated.contact),
-        object_motion=house.object_motion(motion),
-        interactions=house.interactions(duration),
-        floor=FloorTrack(motion.timestamps, simulated.floor_height),
-        skeleton=person.skeleton,
-        shape=person.shape,
-        subject=person.name,
-        location=flat.static.name,
-        activity=activity_of(simulated.labels),
-        source="wearcap simulation",
-        license="MIT (generated)",
+        house.flat.static.name,
+        object_motion=house.object_motion(simulated.motion),
+        interactions=house.interactions(60.0 * minutes),
+        **parts,
     )
-    return SimulatedInteractions(recording, flat.environment, flat.world, flat.static)
+
+
+def _placed(flat: InteractiveFlat, movable: Movable, rng: np.random.Generator) -> Movable | None:
+    """The object at a free place of the floor; None where none was found."""
+    house, navigation = House(flat), flat.static.navigation
+    standing = house.obstacles()
+    solid = [item.footprint for item in (*flat.static.objects, *standing) if item.z_range[0] < 1.0]
+    zones = kept_free(house)
+    rooms = [navigation.barred(standing, point) for point in flat.static.sample_floor(rng, 6)]
+    points = max(rooms, key=lambda grid: int(grid.walkable.sum())).node_points
+    outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
+    for _ in range(TRIES):
+        x, y, z = points[rng.integers(len(points))]
+        x, y, heading = (float(v) for v in (*rng.normal((x, y), 0.15), rng.uniform(-np.pi, np.pi)))
+        if not apart(outlines(outline, np.array([[x, y, heading]])), [*solid, *zones], APART_M):
+            continue
+        placed = movable.placed(x, y, heading, float(z))
+        for around in points[rng.integers(len(points), size=2)]:
+            left = navigation.barred((*standing, obstacle(placed, None)), around).walkable.sum()
+            if left > REACHABLE_SHARE * len(points):
+                return placed
+    return None

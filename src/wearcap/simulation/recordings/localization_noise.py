@@ -62,7 +62,15 @@ def localize_statistically(
     wrong, off = _outliers(count, noise, rng, fps)
     error = torch.where(wrong[:, None], off, error).float()
     lost = _outages(count, fps, noise, rng, texture)
-    confidence = _confidence(error / scale.float(), wrong, noise, rng)
+    # Confidence is like a share of inliers: high for small errors, low for most wrong frames, with much scatter.
+    good = 0.92 - 0.09 * (error / scale.float()).norm(dim=-1).clamp(max=6.0).double().numpy() / np.sqrt(6 / 3)
+    good += 0.10 * rng.standard_normal(count)
+    bad = rng.beta(2.0, 7.0, count)
+    fooled = rng.random(count) < noise.misjudged
+    value = np.where(
+        wrong.numpy() & ~fooled, bad, np.where(wrong.numpy(), 0.7 + 0.12 * rng.standard_normal(count), good)
+    )
+    confidence = torch.from_numpy(np.clip(value, 0.02, 1.0)).float()
     sure = confidence.clamp(min=0.02)[:, None]
     spread = scale.float() * (0.75 / sure) * torch.from_numpy(np.exp(0.3 * rng.standard_normal((count, 1))))
     R = rotation.exp(error[:, :3]) @ path.R_world_body
@@ -147,18 +155,3 @@ def _outages(
         lost[start:stop] = True
         left -= length * fps
     return lost
-
-
-def _confidence(
-    relative: Tensor, wrong: Tensor, noise: LocalizationNoise, rng: np.random.Generator
-) -> Float[Tensor, "time"]:
-    """Confidence like a share of inliers: high for small errors, low for most wrong frames, with much scatter."""
-    count = len(wrong)
-    good = 0.92 - 0.09 * relative.norm(dim=-1).clamp(max=6.0).double().numpy() / np.sqrt(6 / 3)
-    good += 0.10 * rng.standard_normal(count)
-    bad = rng.beta(2.0, 7.0, count)
-    fooled = rng.random(count) < noise.misjudged
-    value = np.where(
-        wrong.numpy() & ~fooled, bad, np.where(wrong.numpy(), 0.7 + 0.12 * rng.standard_normal(count), good)
-    )
-    return torch.from_numpy(np.clip(value, 0.02, 1.0)).float()

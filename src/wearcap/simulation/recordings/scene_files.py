@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
 from PIL import Image
 
 from wearcap.files import atomic_path, write_text
@@ -77,7 +76,11 @@ def write_scene(scenery: Scenery, folder: str | Path, settings: SceneSettings, s
     folder = Path(folder)
     wanted = json.dumps({"settings": asdict(settings), "seed": seed, "world": scenery.world.name}, sort_keys=True)
     plan = plan_photos(scenery, settings)
-    _discard_stale(folder, wanted)
+    note = folder / MADE
+    if not note.is_file() or note.read_text(encoding="utf-8") != wanted:
+        for path in (folder / CLOUD, folder / FILE_NAME, *(folder / "photos").glob("*.jpg")):
+            path.unlink(missing_ok=True)
+        write_text(note, wanted)
     if not (folder / CLOUD).is_file():
         scan = scan_world(scenery, settings.spacing_m, np.random.default_rng([12, seed]), settings.scanner)
         write_ply(Ply(scan.points, scan.colors), folder / CLOUD)
@@ -86,22 +89,8 @@ def write_scene(scenery: Scenery, folder: str | Path, settings: SceneSettings, s
         if not (folder / photo.file).is_file():
             rng = np.random.default_rng([14, seed, int(number)])
             light = Development(exposure=float(rng.uniform(0.92, 1.06)), noise=settings.noise, vignetting=0.25)
-            save_jpeg(render_view(scenery, photo.camera, photo.T_world_cam, light, rng), folder / photo.file)
+            picture = Image.fromarray(render_view(scenery, photo.camera, photo.T_world_cam, light, rng))
+            with atomic_path(folder / photo.file) as temporary:
+                picture.save(temporary, "JPEG", quality=92, subsampling=0)
     if not (folder / FILE_NAME).is_file():
         write_photos(plan, folder)
-
-
-def _discard_stale(folder: Path, wanted: str) -> None:
-    """Remove files of other settings, and write the new settings to `made.json`."""
-    note = folder / MADE
-    if note.is_file() and note.read_text(encoding="utf-8") == wanted:
-        return
-    for path in (folder / CLOUD, folder / FILE_NAME, *(folder / "photos").glob("*.jpg")):
-        path.unlink(missing_ok=True)
-    write_text(note, wanted)
-
-
-def save_jpeg(picture: UInt8[np.ndarray, "height width 3"], path: Path, quality: int = 92) -> None:
-    """Write a picture atomically."""
-    with atomic_path(path) as temporary:
-        Image.fromarray(picture).save(temporary, "JPEG", quality=quality, subsampling=0)

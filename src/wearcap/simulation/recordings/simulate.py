@@ -1,24 +1,30 @@
-"""One simulated recording: a world, a person, activities, and the sensor readings."""
+"""Simulated recordings: a world, one person or two face to face, activities, and the sensor readings.
 
-from collections.abc import Sequence
+Two wearers share a session, its world and its clock. The second is placed in front of the first after both were
+simulated, so walking may lead them through each other, walls and furniture: by default they stay where they are.
+"""
+
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
-from wearcap.recording.recording import ContactTrack, FloorTrack, PointCloud, Recording
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.recording.recording import ContactTrack, FloorTrack, Recording
 from wearcap.sensors.head import SlamNoise, head_stream
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
+from wearcap.sensors.keypoints import action_camera
 from wearcap.sensors.slam import semidense_points
 from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.people.person import Person, draw_person
-from wearcap.simulation.people.plan import Label
 from wearcap.simulation.people.wearer import SimulatedMotion, simulate_motion
 from wearcap.simulation.places.flat import build_flat
-from wearcap.simulation.places.hillside import build_hillside
-from wearcap.simulation.places.outdoor import build_outdoor
+from wearcap.simulation.places.outdoor import build_hillside, build_outdoor
 from wearcap.simulation.places.site import build_site
 from wearcap.simulation.places.world import World
 from wearcap.simulation.rendering.ego_view import write_ego_video
@@ -35,6 +41,9 @@ WORLDS = {
 """Kinds of surroundings: a number for their seeds, and their builder."""
 
 OUTDOOR_SHARE = 0.3
+STAYING = ("stand", "gesture", "look_around")
+"""Activities on the spot."""
+ACTION_CAMERA_FPS = 30.0
 
 
 @dataclass(frozen=True)
@@ -74,33 +83,80 @@ def simulate_recording(
     if config.camera and folder is None:
         raise WearcapError("no folder for the head camera's video", expected="one for the data set")
     rng = np.random.default_rng([seed, sum(map(ord, split))])
-    subjects, locations = POOLS[split]
-    person = person_of(split, int(rng.integers(subjects)))
-    number, kind = int(rng.integers(locations)), "outdoor" if rng.uniform() < OUTDOOR_SHARE else "flat"
-    world = world_of(split, number, config.world or kind)
+    person = drawn_person(split, rng)
+    world = _drawn_world(config, split, rng)
     activities = list(config.activities) if config.activities else None
     simulated = simulate_motion(world, person, rng, config.duration_s, config.fps, activities)
-    recording = sense(config, name, world, person, simulated, rng)
+    recording = _sensed(config, name, world, person, simulated, rng)
     if not config.camera or folder is None:
         return recording
-    file, film = folder / "videos" / f"{name}.mp4", np.random.default_rng([31, sum(map(ord, split)), seed])
-    camera = write_ego_video(file, world, simulated.motion, person.shape, person.t_head_device, film)
+    file = folder / "videos" / f"{name}.mp4"
+    camera = write_ego_video(file, world, simulated.motion, person.shape, person.t_head_device, seeded(31, split, seed))
     return replace(recording, camera=camera)
+
+
+def simulate_two_wearers(
+    config: SimulationConfig, name: str, split: str, seed: int, distance_m: float = 2.5
+) -> tuple[Recording, Recording]:
+    """Recordings NAME-a and NAME-b of the session NAME, of two people of the split; each wears an action camera.
+
+    They face each other in the first frame. Raises WearcapError when the cameras are to film, which is for one wearer
+    alone.
+    """
+    if config.camera:
+        raise WearcapError("cameras that film two wearers", expected="camera=false")
+    rng = seeded(seed, split, 2)
+    people = [person_of(split, int(number)) for number in rng.choice(POOLS[split][0], 2, replace=False)]
+    world = _drawn_world(config, split, rng)
+    activities = config.activities or STAYING
+    first, second = (
+        simulate_motion(world, person, rng, config.duration_s, config.fps, list(activities)) for person in people
+    )
+    a, b = first.motion, second.motion
+    ahead, heading = (rotation.yaw_of(motion.R_parent_joint[0, 0]) for motion in (a, b))
+    R = rotation.about_axis("z", ahead + torch.pi - heading)
+    place = a.t_world_root[0] + distance_m * torch.stack([ahead.cos(), ahead.sin(), torch.zeros(())])
+    rise = first.floor_height[0] - second.floor_height[0]
+    place = torch.stack([place[0], place[1], b.t_world_root[0, 2] + rise])
+    moved = b.moved(Rigid(R, place - R @ b.t_world_root[0]))
+    facing = replace(second, motion=moved, floor_height=second.floor_height + rise)
+    recordings = []
+    for letter, person, simulated in zip("ab", people, (first, facing)):
+        every = max(1, round(config.fps / ACTION_CAMERA_FPS))
+        recording = _sensed(config, f"{name}-{letter}", world, person, simulated, rng)
+        camera = action_camera(simulated.motion.timestamps[::every].contiguous())
+        recordings.append(replace(recording, session=name, camera=camera))
+    return recordings[0], recordings[1]
+
+
+def seeded(salt: int, split: str, number: int) -> np.random.Generator:
+    """A generator for the number-th of a split's people, places or recordings; `salt` tells these apart."""
+    return np.random.default_rng([salt, sum(map(ord, split)), number])
 
 
 def person_of(split: str, number: int) -> Person:
     """A split's person by number, always the same."""
-    return draw_person(f"sim-{split}-person-{number:03d}", np.random.default_rng([1, sum(map(ord, split)), number]))
+    return draw_person(f"sim-{split}-person-{number:03d}", seeded(1, split, number))
+
+
+def drawn_person(split: str, rng: np.random.Generator) -> Person:
+    """One of a split's people."""
+    return person_of(split, int(rng.integers(POOLS[split][0])))
 
 
 def world_of(split: str, number: int, kind: str = "flat") -> World:
     """A split's place of a kind (`WORLDS`) by number, always the same."""
     salt, build = WORLDS[kind]
-    rng = np.random.default_rng([salt, sum(map(ord, split)), number])
-    return build(rng, f"sim-{split}-{kind}-{number:03d}")
+    return build(seeded(salt, split, number), f"sim-{split}-{kind}-{number:03d}")
 
 
-def sense(
+def _drawn_world(config: SimulationConfig, split: str, rng: np.random.Generator) -> World:
+    """One of a split's places, of the configured kind."""
+    number, kind = int(rng.integers(POOLS[split][1])), "outdoor" if rng.uniform() < OUTDOOR_SHARE else "flat"
+    return world_of(split, number, config.world or kind)
+
+
+def _sensed(
     config: SimulationConfig,
     name: str,
     world: World,
@@ -108,34 +164,37 @@ def sense(
     simulated: SimulatedMotion,
     rng: np.random.Generator,
 ) -> Recording:
-    """Add sensor readings to a simulated motion."""
+    """The recording of a simulated motion by the sensors of a configuration."""
     motion = simulated.motion
     head = head_stream(motion, person.t_head_device, config.head_noise, rng)
     imu = {joint: synthesize_imu(motion, joint, noise=config.imu_noise, rng=rng) for joint in config.imu_joints}
-    points: PointCloud | None = semidense_points(world.mesh, world.face_texture, head, rng) if config.points else None
+    points = semidense_points(world.mesh, world.face_texture, head, rng) if config.points else None
     suit = suit_motion(motion, simulated.contact, config.suit, rng) if config.suit else None
+    return with_truth(simulated, person, name, world.name, head=head, imu=imu, suit=suit, points=points)
+
+
+def with_truth(
+    simulated: SimulatedMotion, person: Person, name: str, location: str, activity: str | None = None, **parts: Any
+) -> Recording:
+    """A recording with its sensed `parts` and the truth of a simulated motion.
+
+    Its activities, the longest first, are those of the motion's labels unless `activity` names them.
+    """
+    motion = simulated.motion
+    seconds: dict[str, float] = {}
+    for label in simulated.labels:
+        seconds[label.name] = seconds.get(label.name, 0.0) + float(label.stop_s - label.start_s)
     return Recording(
         name,
-        head=head,
-        imu=imu,
-        suit=suit,
-        points=points,
         motion=motion,
         contacts=ContactTrack(motion.timestamps, FOOT_PATCHES, simulated.contact),
         floor=FloorTrack(motion.timestamps, simulated.floor_height),
         skeleton=person.skeleton,
         shape=person.shape,
         subject=person.name,
-        location=world.name,
-        activity=activity_of(simulated.labels),
+        location=location,
+        activity=activity or ", ".join(sorted(seconds, key=lambda key: -seconds[key])),
         source="wearcap simulation",
         license="MIT (generated)",
+        **parts,
     )
-
-
-def activity_of(labels: Sequence[Label]) -> str:
-    """Activities of a recording, the longest first."""
-    seconds: dict[str, float] = {}
-    for label in labels:
-        seconds[label.name] = seconds.get(label.name, 0.0) + float(label.stop_s - label.start_s)
-    return ", ".join(sorted(seconds, key=lambda key: -seconds[key]))

@@ -3,8 +3,9 @@
 Small images for image encoders, one ray per pixel. The motion may also be a real one in simulated surroundings.
 """
 
+import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ import torch
 from jaxtyping import Float, Float32, Int32, UInt8
 from torch import Tensor
 
+from wearcap.body.anny_body import anny_body
+from wearcap.body.model import BodyModel
+from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import raster, rotation
 from wearcap.geometry.camera import Camera
@@ -21,11 +25,10 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream
 from wearcap.sensors.noise import smooth_noise
 from wearcap.sensors.slam import R_DEVICE_CAM
+from wearcap.simulation.places.builder import hue
 from wearcap.simulation.places.world import World
-from wearcap.simulation.rendering import texture_kernels, view_kernels
-from wearcap.simulation.rendering.ego_body import EgoBody, ego_body
 from wearcap.simulation.rendering.texture import AMBIENT_ABOVE, AMBIENT_BELOW, KEY
-from wearcap.simulation.rendering.views import NEAR_M, SKY, Scenery, View, visible
+from wearcap.simulation.rendering.views import NEAR_M, Lens, Scenery, View, colored, visible
 
 EGO_CAMERA = Camera("pinhole", 96, 72, 36.8, 36.8, 47.5, 35.5)
 """105° x 89°, as wide as Aria's colour camera."""
@@ -34,11 +37,26 @@ PITCH_DEG, MOUNT_DEG, MOUNT_M = (10.0, 15.0), 1.5, 0.004
 """Range of the camera's downward tilt, and deviations of its mount in angle and position."""
 _CHUNK = 128
 """Number of frames whose bodies are skinned at once."""
-_VIEW = View(np.eye(3), EGO_CAMERA.fx, EGO_CAMERA.cx, EGO_CAMERA.cy, EGO_CAMERA.width, EGO_CAMERA.height)
+_SKIN = np.array([[0.93, 0.76, 0.66], [0.80, 0.58, 0.44], [0.56, 0.36, 0.25], [0.30, 0.19, 0.14]])
+"""Skin tones from light to dark."""
+_WORN = {
+    "wrist": "skin",
+    "elbow": "forearm",
+    "shoulder": "sleeve",
+    "collar": "shirt",
+    "hip": "trousers",
+    "knee": "shin",
+    "ankle": "shoe",
+    "toe": "shoe",
+    "pelvis": "trousers",
+}
+"""Clothing of the body part that follows each joint; the shirt covers all others."""
+_MOTTLE = 0.06
+"""Deviation of the colour from vertex to vertex, as a share: folds and veins."""
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class _Shot:
     """Appearance of one recording: its light, and how the camera turns light into grey levels."""
 
     light: Float[np.ndarray, "6"]
@@ -50,7 +68,7 @@ class Shot:
     """Deviation in grey levels."""
 
     @classmethod
-    def drawn(cls, frames: int, rng: np.random.Generator) -> "Shot":
+    def drawn(cls, frames: int, rng: np.random.Generator) -> "_Shot":
         turn, rise = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(35, 75))
         to_light = [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)]
         key = KEY * rng.uniform(0.6, 2.0)
@@ -61,6 +79,54 @@ class Shot:
         drift = smooth_noise(rng, frames, 1, 4.0, EGO_FPS)[:, 0].clamp(-2, 2).numpy()
         exposure = np.exp(0.15 * np.clip(rng.standard_normal(), -2, 2) + 0.08 * drift)
         return cls(light, gain.astype(np.float32), exposure.astype(np.float32), rng.uniform(1.0, 3.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """A dressed body without its head and neck."""
+
+    model: BodyModel
+    faces: Int32[np.ndarray, "face 3"]
+    """Faces of the body model."""
+    color: Float32[np.ndarray, "vertex 3"]
+    """Vertex colours, RGB 0…1."""
+
+
+def _dressed(skeleton: Skeleton, shape: dict[str, float], rng: np.random.Generator) -> _Body:
+    """A body fitted to the skeleton's bones; the skin tone is derived from the skeleton, the clothes are drawn.
+
+    Raises WearcapError as `anny_body` does.
+    """
+    whole = anny_body(skeleton, shape)
+    dominant = whole.skin_joints.gather(1, whole.skin_weights.argmax(1, keepdim=True))[:, 0]
+    above = [skeleton.index(name) for name in ("neck", "head")]
+    kept = ~torch.isin(dominant, torch.tensor(above))
+    faces = whole.faces[kept[whole.faces].all(1)]
+    vertices = faces.unique()
+    number = torch.zeros(len(kept), dtype=torch.int64)
+    number[vertices] = torch.arange(len(vertices))
+    body = replace(
+        whole,
+        rest_vertices=whole.rest_vertices[vertices],
+        faces=number[faces],
+        regions={},
+        skin_joints=whole.skin_joints[vertices],
+        skin_weights=whole.skin_weights[vertices],
+    )
+    own = np.random.default_rng(zlib.crc32(skeleton.t_parent_joint.numpy().tobytes()))  # the same for the same bones
+    place = own.uniform(0, len(_SKIN) - 1)
+    tone = [np.interp(place, np.arange(len(_SKIN)), _SKIN[:, channel]) for channel in range(3)]
+    skin = (np.array(tone) * own.uniform(0.94, 1.06)).astype(np.float32)
+    shirt, trousers, shoe = (np.array(hue(rng, (0.0, 0.75))) * rng.uniform(0.25, 1.1) for _ in range(3))
+    worn = {"skin": skin, "shirt": shirt, "trousers": trousers, "shoe": shoe}
+    bare = rng.uniform(size=3)
+    worn["sleeve"] = skin if bare[0] < 0.1 else shirt
+    worn["forearm"] = skin if bare[1] < 0.5 or bare[0] < 0.1 else shirt
+    worn["shin"] = skin if bare[2] < 0.2 else trousers
+    parts = [name.removeprefix("left_").removeprefix("right_") for name in skeleton.joint_names]
+    table = np.stack([worn[_WORN.get(part, "shirt")] for part in parts])[dominant[vertices].numpy()]
+    color = np.clip(table * (1 + _MOTTLE * rng.standard_normal((len(table), 1))), 0.02, 0.98).astype(np.float32)
+    return _Body(body, body.faces.numpy().astype(np.int32), color)
 
 
 def write_ego_video(
@@ -84,7 +150,11 @@ def write_ego_video(
         raise WearcapError(
             f"a video of {len(times)} frames", where=motion.provenance.get("source"), expected="two or more"
         )
-    stream = CameraStream(times, EGO_CAMERA, *_mount(t_head_device, rng), video=f"{file.parent.name}/{file.name}")
+    tilt = torch.tensor([0.0, np.deg2rad(rng.uniform(*PITCH_DEG)), 0.0])
+    turn = tilt + np.deg2rad(MOUNT_DEG) * torch.from_numpy(rng.standard_normal(3))
+    moved = t_head_device + MOUNT_M * torch.from_numpy(rng.standard_normal(3)).float()
+    R_head_cam = rotation.exp(turn.float()) @ R_DEVICE_CAM
+    stream = CameraStream(times, EGO_CAMERA, R_head_cam, moved, video=f"{file.parent.name}/{file.name}")
     frames = ego_frames(world, motion, shape, stream, rng)
     write_frames(file, frames, motion.fps / every)
     return stream
@@ -94,137 +164,54 @@ def ego_frames(
     world: World, motion: Motion, shape: dict[str, float], stream: CameraStream, rng: np.random.Generator
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """The image at each timestamp of the stream, which must be timestamps of the motion."""
-    scenery, body = Scenery.of(world), ego_body(motion.skeleton, shape, rng)
+    scenery, body, lens = Scenery.of(world), _dressed(motion.skeleton, shape, rng), _lens()
     rows = torch.searchsorted(motion.timestamps, stream.timestamps.contiguous())
     T_head_cam = Rigid(stream.R_head_cam, stream.t_head_cam)
-    shot = Shot.drawn(len(rows), rng)
+    shot = _Shot.drawn(len(rows), rng)
     for first in range(0, len(rows), _CHUNK):
         T_world_joint = motion.T_world_joint[rows[first : first + _CHUNK]]
         vertices = body.model.vertices(T_world_joint).numpy()
         T_world_cam = T_world_joint[:, motion.skeleton.index("head")] @ T_head_cam[None]
         for number in range(len(vertices)):
-            light, _ = draw_view(scenery, T_world_cam[number], body, vertices[number], shot.light)
+            light = _drawn(scenery, lens, T_world_cam[number], body, vertices[number], shot.light)
             light *= shot.gain * shot.exposure[first + number]
             light += shot.noise * rng.standard_normal(light.shape, np.float32) + 0.5
             yield np.clip(light, 0, 255).astype(np.uint8)
 
 
-def draw_view(
-    scenery: Scenery,
-    T_world_cam: Rigid,
-    body: EgoBody,
-    vertices: Float32[np.ndarray, "vertex 3"],
-    light: Float[np.ndarray, "6"],
-) -> tuple[Float32[np.ndarray, "height width 3"], Int32[np.ndarray, "height width"]]:
-    """Light (grey levels, unbounded) in the image of `EGO_CAMERA`, and the body's face in each pixel, -1 elsewhere.
-
-    `vertices` are the body's in the world, `light` is laid out as `Shot.light`.
-    """
-    R, t = T_world_cam.R.double().numpy(), T_world_cam.t.double().numpy()
-    pose = np.concatenate([R, t[:, None]], 1)
-    nearness, index = visible(scenery, R, t, _VIEW)
-    own, in_cam = np.full_like(index, -1), (vertices - t) @ R
-    raster.draw_pinhole(in_cam, body.faces, _VIEW.focal, _VIEW.focal, _VIEW.cx, _VIEW.cy, NEAR_M, nearness, own)
-    index[own >= 0] = -1
-    picture = _surroundings(scenery, pose, nearness, index, light)
-    mine = own >= 0
-    picture[mine] = _lit_body(body, in_cam, pose, nearness, own, light)[mine]
-    return picture, own
-
-
-def _mount(t_head_device: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Rotation and position of the camera on the head."""
-    tilt = torch.tensor([0.0, np.deg2rad(rng.uniform(*PITCH_DEG)), 0.0])
-    turn = tilt + np.deg2rad(MOUNT_DEG) * torch.from_numpy(rng.standard_normal(3))
-    moved = MOUNT_M * torch.from_numpy(rng.standard_normal(3)).float()
-    return rotation.exp(turn.float()) @ R_DEVICE_CAM, t_head_device + moved
-
-
-def _unit_rays() -> tuple[Float32[np.ndarray, "pixel 3"], Float32[np.ndarray, "pixel"]]:
-    """Ray of every pixel in the camera's axes, and its length per metre of depth."""
+def _lens() -> Lens:
+    """The lens of `EGO_CAMERA`, one sample per pixel."""
     x, y = np.meshgrid(np.arange(EGO_CAMERA.width), np.arange(EGO_CAMERA.height))
     plane = np.stack([(x - EGO_CAMERA.cx) / EGO_CAMERA.fx, (y - EGO_CAMERA.cy) / EGO_CAMERA.fy], -1)
     rays = np.concatenate([plane, np.ones((*x.shape, 1))], -1).reshape(-1, 3).astype(np.float32)
     length = np.linalg.norm(rays, axis=-1)
-    return rays / length[:, None], length
+    view = View(np.eye(3), EGO_CAMERA.fx, EGO_CAMERA.cx, EGO_CAMERA.cy, EGO_CAMERA.width, EGO_CAMERA.height)
+    slots = np.arange(len(rays), dtype=np.int32)
+    return Lens(rays / length[:, None], slots, length, 1.0 / EGO_CAMERA.fx, (view,))
 
 
-_RAYS, _REACH = _unit_rays()
-_SLOTS = np.arange(len(_RAYS), dtype=np.int32)
-
-
-def _surroundings(
-    scenery: Scenery, pose: np.ndarray, nearness: np.ndarray, index: np.ndarray, light: np.ndarray
+def _drawn(
+    scenery: Scenery,
+    lens: Lens,
+    T_world_cam: Rigid,
+    body: _Body,
+    vertices: Float32[np.ndarray, "vertex 3"],
+    light: Float[np.ndarray, "6"],
 ) -> Float32[np.ndarray, "height width 3"]:
-    count = len(_RAYS)
-    out, points = np.zeros((count, 3), np.float32), np.empty((count, 3))
-    face, facing, footprint, distance = np.empty(count, np.int32), *np.empty((3, count), np.float32)
-    paint = scenery.paint
-    view_kernels.meet_faces(
-        _RAYS,
-        _SLOTS,
-        _REACH,
-        1.0 / EGO_CAMERA.fx,
-        pose,
-        index.ravel(),
-        nearness.ravel(),
-        paint.frames,
-        SKY,
-        points,
-        face,
-        facing,
-        footprint,
-        distance,
-        out,
-    )
-    texture_kernels.color_points(
-        points,
-        face,
-        facing,
-        footprint,
-        paint.frames,
-        paint.extents,
-        paint.colors,
-        paint.materials,
-        paint.seeds,
-        light,
-        out,
-    )
-    return out.reshape(EGO_CAMERA.height, EGO_CAMERA.width, 3)
-
-
-def _lit_body(
-    body: EgoBody, in_cam: np.ndarray, pose: np.ndarray, nearness: np.ndarray, own: np.ndarray, light: np.ndarray
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Image of the body alone, each face with its own normal, by the renderer's shading."""
-    rays = (_RAYS * _REACH[:, None]).reshape(EGO_CAMERA.height, EGO_CAMERA.width, 3)
+    """Light (grey levels, unbounded) in the image of `EGO_CAMERA`; `vertices` are the body's in the world."""
+    R, t = T_world_cam.R.double().numpy(), T_world_cam.t.double().numpy()
+    pose, (view,) = np.concatenate([R, t[:, None]], 1), lens.views
+    nearness, index = visible(scenery, R, t, view)
+    own, in_cam = np.full_like(index, -1), (vertices - t) @ R
+    raster.draw_pinhole(in_cam, body.faces, view.focal, view.focal, view.cx, view.cy, NEAR_M, nearness, own)
+    index[own >= 0] = -1
+    picture = colored(scenery, lens, pose, nearness.ravel(), index.ravel(), light)[0].reshape(*own.shape, 3)
+    # The renderer shades the body alone, each face with its own normal.
     none, no_map = np.zeros(len(body.faces), bool), np.zeros((0, 0), np.float32)
-    out = np.empty((EGO_CAMERA.height, EGO_CAMERA.width, 3), np.uint8)
-    raster.resolve(
-        nearness,
-        own,
-        rays,
-        1,
-        pose,
-        in_cam,
-        body.faces,
-        body.color,
-        none,
-        none,
-        255 * body.color,
-        body.faces,
-        body.color,
-        light,
-        np.zeros((6, 4)),
-        1.0,
-        no_map,
-        no_map,
-        no_map,
-        no_map,
-        1.0,
-        np.zeros((EGO_CAMERA.height, 3), np.float32),
-        out,
-        np.empty(own.shape, np.float32),
-        np.empty_like(own),
-    )
-    return out
+    shaded, rays = np.empty(picture.shape, np.uint8), (lens.rays * lens.reach[:, None]).reshape(picture.shape)
+    mesh = (in_cam, body.faces, body.color, none, none, 255 * body.color, body.faces, body.color)
+    lights = (light, np.zeros((6, 4)), 1.0, no_map, no_map, no_map, no_map, 1.0)
+    images = (np.zeros((view.height, 3), np.float32), shaded, np.empty(own.shape, np.float32), np.empty_like(own))
+    raster.resolve(nearness, own, rays, 1, pose, *mesh, *lights, *images)
+    picture[own >= 0] = shaded[own >= 0]
+    return picture

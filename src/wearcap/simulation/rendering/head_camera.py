@@ -1,21 +1,29 @@
-"""The camera on a simulated wearer's head: its mount, its clock, and the texture it sees."""
+"""The camera on a simulated wearer's head: its mount, its clock, the texture it sees, and its video with sound."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
 
+import av
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
 from wearcap.geometry import raster, rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.io.formats.video import video_encoder
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream
+from wearcap.sensors.noise import smooth_noise
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.places.world import World
+from wearcap.simulation.rendering.views import NEAR_M, Development, Scenery, render_view
 
 HEAD_CAMERA = Camera(
     "opencv", 1920, 1080, 871.80, 885.58, 961.54, 550.69, (-0.2546, 0.0804, 1.458e-4, -1.397e-5)
@@ -23,6 +31,13 @@ HEAD_CAMERA = Camera(
 """The HPS data set's head camera at half its size."""
 HEAD_CAMERA_TRUTH = "head_camera"
 """Entry of `Recording.object_motion` with the camera's true poses, on the camera's own clock."""
+GLANCE_PX, GLANCE = (27, 48), (22.0, 22.0, 23.5, 13.0)
+"""Height and width of the small image in which texture is measured; its focal lengths and middle (px)."""
+SOUND_HZ = 48_000
+BLUR_STEP_PX, MOST_STEPS = 3.0, 5
+"""Largest motion between the sub-frames that are averaged into a frame, and most sub-frames."""
+GLARE = 0.03
+"""Contrast during glare, when the image shows next to nothing."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +80,6 @@ def head_camera(
     return stream, Trajectory(times, at.R_world_body, at.t_world_body), (offset, drift)
 
 
-_GLANCE = Camera("pinhole", 48, 27, 22.0, 22.0, 23.5, 13.0)
-
-
 def view_texture(world: World, path: Trajectory, every: int = 15) -> Float[Tensor, "time"]:
     """Texture in a camera's frames: the mean texture grade (features per m²) in view.
 
@@ -78,18 +90,96 @@ def view_texture(world: World, path: Trajectory, every: int = 15) -> Float[Tenso
     seen = np.empty(len(frames))
     R, t = path.R_world_body.double().numpy(), path.t_world_body.double().numpy()
     for row, frame in enumerate(frames):
-        nearness = np.full((_GLANCE.height, _GLANCE.width), -np.inf, np.float32)
-        index = np.full((_GLANCE.height, _GLANCE.width), -1, np.int32)
-        raster.draw_pinhole(
-            (world.mesh.vertices - t[frame]) @ R[frame],
-            world.mesh.faces,
-            _GLANCE.fx,
-            _GLANCE.fy,
-            _GLANCE.cx,
-            _GLANCE.cy,
-            0.03,
-            nearness,
-            index,
-        )
+        nearness, index = np.full(GLANCE_PX, -np.inf, np.float32), np.full(GLANCE_PX, -1, np.int32)
+        vertices = (world.mesh.vertices - t[frame]) @ R[frame]
+        raster.draw_pinhole(vertices, world.mesh.faces, *GLANCE, NEAR_M, nearness, index)
         seen[row] = grade[index].mean()
     return torch.from_numpy(np.interp(np.arange(len(path.timestamps)), frames, seen)).float()
+
+
+@dataclass(frozen=True)
+class Filming:
+    """Settings of the head camera's video."""
+
+    shutter_s: float = 1 / 120
+    """Exposure time; 0: no motion blur."""
+    noise: float = 3.0
+    """Deviation in grey levels."""
+    exposure: float = 0.12
+    """Deviation of the automatic exposure, as a share, over some seconds."""
+    vignetting: float = 0.3
+    crf: int = 17
+    """H.264's constant quality: lower is better."""
+    glare_s: tuple[tuple[float, float], ...] = ()
+    """Intervals (start, stop) on the camera's clock in which the image shows next to nothing."""
+
+
+def film(
+    scenery: Scenery, camera: Camera, path: Trajectory, times: torch.Tensor, filming: Filming, rng: np.random.Generator
+):
+    """Yields the frame (uint8 height width 3) of every time (s, on the clock of `path`, the camera's true poses)."""
+    first, last = path.timestamps[0], path.timestamps[-1]
+    fps = 1.0 / times.diff().median().item() if len(times) > 1 else 30.0
+    exposure = 1 + filming.exposure * smooth_noise(rng, len(times), 1, 6.0, fps)[:, 0].clamp(-2, 2)
+    for number, time in enumerate(times.tolist()):
+        ends = resample(path, torch.tensor([time, time + filming.shutter_s]).double().clamp(first, last))
+        turned = rotation.geodesic(ends.R_world_body[0], ends.R_world_body[1]).item()
+        steps = min(MOST_STEPS, 1 + int(turned * camera.fx / BLUR_STEP_PX)) if filming.shutter_s else 1
+        moments = torch.linspace(time, time + (filming.shutter_s if steps > 1 else 0.0), steps).double()
+        poses = resample(path, moments.clamp(first, last))
+        glared = any(start <= time < stop for start, stop in filming.glare_s)
+        how = Development(exposure[number].item(), GLARE if glared else 1.0, filming.noise, filming.vignetting)
+        yield render_view(scenery, camera, Rigid(poses.R_world_body, poses.t_world_body), how, rng)
+
+
+def write_head_video(
+    file: str | Path,
+    scenery: Scenery,
+    camera: Camera,
+    path: Trajectory,
+    times: torch.Tensor,
+    filming: Filming,
+    rng: np.random.Generator,
+    claps_s: Sequence[float] = (),
+) -> None:
+    """Write an MP4 with one frame per time (evenly spaced), and the claps' sound (`claps_s` on the same clock).
+
+    Raises WearcapError for odd picture sizes and fewer than two times.
+    """
+    if camera.width % 2 or camera.height % 2 or len(times) < 2:
+        raise WearcapError(
+            f"a video of {len(times)} frames of {camera.width}x{camera.height}",
+            expected="even sizes, two frames or more",
+        )
+    fps = 1.0 / times.diff().median().item()
+    with atomic_path(file) as temporary, av.open(str(temporary), "w", format="mp4") as container:
+        codec, options = video_encoder(filming.crf)
+        stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001), options=options)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
+        sound = container.add_stream("aac", rate=SOUND_HZ, layout="mono")
+        for piece in _sound(times, claps_s, rng):
+            container.mux(sound.encode(piece))
+        container.mux(sound.encode(None))
+        for picture in film(scenery, camera, path, times, filming, rng):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode(None))
+
+
+def _sound(times: torch.Tensor, claps_s: Sequence[float], rng: np.random.Generator):
+    """Audio frames from the first to the last image: a quiet room, and claps of some 10 ms."""
+    first, last = times[0].item(), times[-1].item()
+    count = int((last - first + 0.1) * SOUND_HZ)
+    wave = 0.001 * rng.standard_normal(count, np.float32)
+    length = int(0.05 * SOUND_HZ)
+    fading = np.exp(-np.arange(length) / (0.006 * SOUND_HZ)).astype(np.float32)
+    for clap in claps_s:
+        start = round((clap - first) * SOUND_HZ)
+        if 0 <= start < count:
+            stop = min(start + length, count)
+            burst = 0.35 * fading * rng.standard_normal(length, np.float32)
+            wave[start:stop] += burst[: stop - start]
+    for start in range(0, count, 1024):
+        piece = av.AudioFrame.from_ndarray(wave[None, start : start + 1024].clip(-1, 1).copy(), "fltp", "mono")
+        piece.rate, piece.pts = SOUND_HZ, start
+        yield piece

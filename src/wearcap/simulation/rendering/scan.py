@@ -1,14 +1,15 @@
 """A simulated world's scan: what a laser scanner on a trolley measures from its stations, coloured."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 
 from wearcap.errors import WearcapError
+from wearcap.geometry.compiled import compiled
 from wearcap.scene.scan import Scan
 from wearcap.simulation.places.world import World
-from wearcap.simulation.rendering import scan_kernels
 from wearcap.simulation.rendering.views import CUBE, Scenery, View, visible
 
 CHUNK = 1_000_000
@@ -58,10 +59,26 @@ def scan_world(
         raise WearcapError(f"points {spacing_m} m apart", expected="a positive spacing")
     stations = place_stations(walked or scenery.world, scanner.station_m, scanner.clearance_m)
     stations[:, 2] += scanner.height_m
-    near = _near_stations(scenery.vertices, stations, scanner)
-    survey = (stations, *near, _surroundings(scenery, stations, scanner.view_px))
+    size = scanner.view_px
+    nearness = np.empty((len(stations), len(CUBE), size, size), np.float32)
+    for station, views in zip(stations, nearness):
+        for view, R in zip(views, CUBE):
+            view[:] = visible(scenery, R, station, View(R, size / 2, (size - 1) / 2, (size - 1) / 2, size, size))[0]
+    # For every cell of the plan the nearest stations in reach, in order, and the index of each cell's first.
+    origin = scenery.vertices[:, :2].min(0).astype(np.float64) - 0.1
+    shape = np.ceil((scenery.vertices[:, :2].max(0) + 0.1 - origin) / CELL_M).astype(np.int64)
+    grid = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 2)
+    middle = origin + (grid + 0.5) * CELL_M
+    distance = np.linalg.norm(middle[:, None] - stations[None, :, :2], axis=-1)
+    order = np.argsort(distance, axis=1)[:, :TRIED]
+    within = np.take_along_axis(distance, order, 1) < scanner.max_m + CELL_M
+    first = np.concatenate([[0], within.sum(1).cumsum()])
+    survey = (stations, order[within], first, CELL_M, origin, shape, nearness)
+    # Most faces of a world are inside or below others: a face is sampled if some of a few random points are seen.
+    probed = np.repeat(np.arange(len(scenery.faces)), PROBES)
+    _, kept = _measured(scenery, survey, scanner, probed, _on_faces(scenery, probed, rng), rng)
     points, colors = [], []
-    for face, place in _samples(scenery, spacing_m, _faces_seen(scenery, survey, scanner, rng), rng):
+    for face, place in _samples(scenery, spacing_m, kept.reshape(-1, PROBES).any(1), rng):
         measured, kept = _measured(scenery, survey, scanner, face, place, rng)
         points.append(measured[kept].astype(np.float32))
         footprint = np.full(int(kept.sum()), max(spacing_m, 0.01))
@@ -72,30 +89,10 @@ def scan_world(
 def _measured(scenery: Scenery, survey: tuple, scanner: Scanner, face, place, rng) -> tuple:
     """Measured positions of surface samples, and a mask of those that were measured."""
     measured, kept = np.empty_like(place), np.zeros(len(place), bool)
-    scan_kernels.measure(
-        place,
-        scenery.paint.frames[face, 9:12],
-        *survey,
-        rng.random((len(place), 3)),
-        scanner.full_m,
-        scanner.max_m,
-        scanner.noise_m,
-        scanner.mixed,
-        scanner.wrong,
-        rng.standard_normal(len(place)),
-        measured,
-        kept,
-    )
+    draws = rng.random((len(place), 3)), rng.standard_normal(len(place))
+    errors = scanner.full_m, scanner.max_m, scanner.noise_m, scanner.mixed, scanner.wrong
+    _measure(place, scenery.paint.frames[face, 9:12], survey, draws, errors, measured, kept)
     return measured, kept
-
-
-def _faces_seen(
-    scenery: Scenery, survey: tuple, scanner: Scanner, rng: np.random.Generator
-) -> Bool[np.ndarray, "face"]:
-    """Faces of which at least one of some random points is seen: most of a world's are inside or below others."""
-    face = np.repeat(np.arange(len(scenery.faces)), PROBES)
-    _, kept = _measured(scenery, survey, scanner, face, _on_faces(scenery, face, rng), rng)
-    return kept.reshape(-1, PROBES).any(1)
 
 
 def place_stations(world: World, spacing_m: float, clearance_m: float = 0.45) -> Float[np.ndarray, "station 3"]:
@@ -109,33 +106,6 @@ def place_stations(world: World, spacing_m: float, clearance_m: float = 0.45) ->
         chosen.append(int(left.argmax()))
         left &= np.linalg.norm(points - points[chosen[-1]], axis=1) >= spacing_m
     return points[chosen]
-
-
-def _surroundings(
-    scenery: Scenery, stations: Float[np.ndarray, "station 3"], size: int
-) -> Float32[np.ndarray, "station 6 row column"]:
-    """1/depth of each station's view through the sides of a cube along the world's axes."""
-    out = np.empty((len(stations), 6, size, size), np.float32)
-    half = (size - 1) / 2
-    for number, station in enumerate(stations):
-        for side, R in enumerate(CUBE):
-            out[number, side] = visible(scenery, R, station, View(R, size / 2, half, half, size, size))[0]
-    return out
-
-
-def _near_stations(
-    vertices: Float32[np.ndarray, "vertex 3"], stations: Float[np.ndarray, "station 3"], scanner: Scanner
-) -> tuple[Int[np.ndarray, "entry"], Int[np.ndarray, "slot"], float, np.ndarray, np.ndarray]:
-    """For every cell of the plan the nearest stations in reach, in order: entries, each cell's first, and the grid."""
-    origin = vertices[:, :2].min(0).astype(np.float64) - 0.1
-    shape = np.ceil((vertices[:, :2].max(0) + 0.1 - origin) / CELL_M).astype(np.int64)
-    grid = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 2)
-    middle = origin + (grid + 0.5) * CELL_M
-    distance = np.linalg.norm(middle[:, None] - stations[None, :, :2], axis=-1)
-    order = np.argsort(distance, axis=1)[:, :TRIED]
-    within = np.take_along_axis(distance, order, 1) < scanner.max_m + CELL_M
-    first = np.concatenate([[0], within.sum(1).cumsum()])
-    return order[within], first, CELL_M, origin, shape
 
 
 def _samples(scenery: Scenery, spacing_m: float, wanted: Bool[np.ndarray, "face"], rng: np.random.Generator):
@@ -158,3 +128,70 @@ def _on_faces(
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
     return a + u * (b - a) + v * (c - a)
+
+
+@compiled
+def _cube_pixel(x, y, z, size):
+    """Side of the cube around a station, row and column, and depth before that side, of an offset from it."""
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if az >= ax and az >= ay:
+        side, depth = (0 if z > 0 else 5), az
+        u, v = (x if z > 0 else -x), y
+    elif ax >= ay:
+        side, depth = (1 if x > 0 else 2), ax
+        u, v = (-z if x > 0 else z), y
+    else:
+        side, depth = (3 if y > 0 else 4), ay
+        u, v = x, (-z if y > 0 else z)
+    depth = max(depth, 1e-6)
+    column = int(min(size - 1.0, max(0.0, math.floor(0.5 * size * (1.0 + u / depth)))))
+    row = int(min(size - 1.0, max(0.0, math.floor(0.5 * size * (1.0 + v / depth)))))
+    return side, row, column, depth
+
+
+@compiled
+def _measure(points, normals, survey, draws, errors, out, kept):
+    """Measured position of every point that a station sees; `kept` is their mask.
+
+    The stations of a point's cell are tried from near to far; the last of the `survey` is 1/depth (station side row
+    column) of their views through the sides of a cube. Beyond `full_m` fewer points are met. Range noise, range errors
+    and points that float between an outline and what lies behind it lie along the ray. The `draws` are uniform
+    (point 3) and normal (point); `errors` are the scanner's.
+    """
+    stations, near_stations, near_first, cell, origin, shape, nearness = survey
+    luck, normal_draw = draws
+    full_m, max_m, noise_m, mixed, wrong = errors
+    size = nearness.shape[-1]
+    for k in range(len(points)):
+        kept[k] = False
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        i, j = int((x - origin[0]) / cell), int((y - origin[1]) / cell)
+        if i < 0 or j < 0 or i >= shape[0] or j >= shape[1]:
+            continue
+        slot = i * shape[1] + j
+        for n in range(near_first[slot], near_first[slot + 1]):
+            station = near_stations[n]
+            dx, dy, dz = x - stations[station, 0], y - stations[station, 1], z - stations[station, 2]
+            distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+            facing = -(dx * normals[k, 0] + dy * normals[k, 1] + dz * normals[k, 2]) / distance
+            if distance > max_m or distance < 0.3 or facing < 0.03:
+                continue
+            side, row, column, depth = _cube_pixel(dx, dy, dz, size)
+            drawn = nearness[station, side, row, column]
+            if drawn * depth > 1.02 + 0.08 * (1.0 - min(1.0, 4.0 * facing)):
+                continue
+            if luck[k, 0] * max(1.0, (distance / full_m) ** 2) > min(1.0, 2.5 * facing):
+                break
+            stretch = noise_m * normal_draw[k] / distance
+            if luck[k, 1] < wrong:
+                stretch = -0.5 * luck[k, 2]
+            elif luck[k, 1] < wrong + mixed:
+                beyond = max(
+                    nearness[station, side, row, min(size - 1, column + 1)],
+                    nearness[station, side, row, max(0, column - 1)],
+                )
+                if beyond * depth > 1.15:
+                    stretch = luck[k, 2] * (1.0 / (beyond * depth) - 1.0)
+            out[k, 0], out[k, 1], out[k, 2] = x + stretch * dx, y + stretch * dy, z + stretch * dz
+            kept[k] = True
+            break

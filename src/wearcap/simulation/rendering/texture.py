@@ -8,15 +8,16 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from wearcap.simulation.places.outline import points_in_convex
 from wearcap.simulation.places.world import World
 from wearcap.simulation.rendering import texture_kernels as kernels
 
-LIGHT = (0.35, 0.5, 1.0)
-"""Direction to the key light."""
+_TO_LIGHT = np.array((0.35, 0.5, 1.0))
 KEY, AMBIENT_BELOW, AMBIENT_ABOVE = 0.26, 0.66, 0.90
+LIGHT: Float[np.ndarray, "6"] = np.array([*_TO_LIGHT / np.linalg.norm(_TO_LIGHT), KEY, AMBIENT_BELOW, AMBIENT_ABOVE])
+"""Unit direction to the key light, its strength, the ambient light from below and from above."""
 
 _TEXTILE = ("sofa", "armchair", "bed")
 _WOODEN = ("table", "desk", "coffee_table", "shelf", "wardrobe", "cabinet", "chair", "bench", "door_frame", "railing")
@@ -47,7 +48,10 @@ class Paint:
         offset = corners - origin[:, None]
         a, b = np.einsum("fcx,fx->fc", offset, u), np.einsum("fcx,fx->fc", offset, v)
         extents = np.stack([a.min(1), a.max(1), b.min(1), b.max(1)], 1)
-        _share_with_twin(extents, world.face_object, normal)
+        # The second triangle of a quad gets exactly the extents of the first.
+        twin = (np.abs(np.diff(extents, axis=0)) < 1e-3).all(1) & (np.diff(world.face_object) == 0)
+        second = np.flatnonzero(twin & ((normal[1:] * normal[:-1]).sum(1) > 0.999)) + 1
+        extents[second] = extents[second - 1]
         height = np.einsum("fx,fx->f", offset[:, 0], normal)
         color = world.mesh.color[world.mesh.faces[:, 0]].astype(np.float64)
         materials = _materials(world, corners.mean(1), normal, color, extents)
@@ -61,7 +65,7 @@ class Paint:
 
     @property
     def tables(self) -> tuple[np.ndarray, ...]:
-        return self.frames, self.extents, self.colors, self.materials, self.seeds, light_table()
+        return self.frames, self.extents, self.colors, self.materials, self.seeds
 
     def colors_of(
         self,
@@ -73,13 +77,8 @@ class Paint:
         light = np.zeros((len(points), 3), np.float32)
         front = np.ones(len(points), np.float32)
         footprint = footprint.astype(np.float32)
-        kernels.color_points(points, face.astype(np.int32), front, footprint, *self.tables, light)
+        kernels.color_points(points, face.astype(np.int32), front, footprint, self.tables, LIGHT, light)
         return np.minimum(light, 255).astype(np.uint8)
-
-
-def light_table() -> Float[np.ndarray, "6"]:
-    direction = np.array(LIGHT) / np.linalg.norm(LIGHT)
-    return np.array([*direction, KEY, AMBIENT_BELOW, AMBIENT_ABOVE])
 
 
 def _headings(world: World) -> Float[np.ndarray, "face"]:
@@ -100,14 +99,6 @@ def _axes(world: World, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     u = np.where(level[:, None], along, u)
     u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-20)
     return origin, u, np.cross(normal, u)
-
-
-def _share_with_twin(extents: np.ndarray, face_object: np.ndarray, normal: np.ndarray) -> None:
-    """Give the second triangle of a quad, in place, exactly the extents of the first."""
-    twin = (np.abs(np.diff(extents, axis=0)) < 1e-3).all(1) & (np.diff(face_object) == 0)
-    twin &= (normal[1:] * normal[:-1]).sum(1) > 0.999
-    second = np.flatnonzero(twin) + 1
-    extents[second] = extents[second - 1]
 
 
 def _materials(
@@ -134,7 +125,10 @@ def _materials(
     out[shell & (texture == 40.0)] = kernels.CARPET
     kinds = np.array([entry.kind for entry in world.objects] + [""])[item]
     out[np.isin(kinds, ("wall", "pillar")) & ~shell] = kernels.PLASTER
-    out[(kinds == "wall") & upright & _in_open_air(world, middle + 0.3 * normal)] = kernels.BRICK
+    before = (middle + 0.3 * normal)[:, :2]
+    rooms = [] if world.outdoors else [room.polygon for room in world.rooms if not room.open_air]
+    indoors = np.any([np.zeros(len(before), bool), *(points_in_convex(before, room) for room in rooms)], axis=0)
+    out[(kinds == "wall") & upright & ~indoors] = kernels.BRICK
     out[np.isin(kinds, _STONY)] = kernels.BRICK
     out[(kinds == "facade") & (texture == 9.0)] = kernels.BRICK
     out[np.isin(kinds, _WOODEN) & (out != kernels.POSTER) & wood_ish] = kernels.WOOD
@@ -145,14 +139,6 @@ def _materials(
     printed = np.isin(out, (kernels.POSTER, kernels.BOOKS))
     out[green_ish & ~printed & (texture > 0.9) & ((texture >= 12.0) | shell)] = kernels.FOLIAGE
     return out.astype(np.uint8)
-
-
-def _in_open_air(world: World, points: Float[np.ndarray, "face 3"]) -> Bool[np.ndarray, "face"]:
-    """Whether points lie in no room with walls."""
-    if world.outdoors:
-        return np.ones(len(points), bool)
-    rooms = [room for room in world.rooms if not room.open_air]
-    return ~np.any([points_in_convex(points[:, :2], room.polygon) for room in rooms], axis=0)
 
 
 def _seeds(world: World, extents, materials, normal, color) -> Int[np.ndarray, "face"]:

@@ -4,6 +4,7 @@ Visibility is found through pinhole views (one, or the sides of a cube for fishe
 the picture; each pixel's own ray then meets the plane of its face, so that lenses bend texture exactly.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -12,15 +13,16 @@ import scipy.interpolate
 import scipy.sparse
 import scipy.sparse.csgraph
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int32, UInt8
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import raster
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.compiled import compiled
 from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.places.world import World
-from wearcap.simulation.rendering import texture_kernels, view_kernels
-from wearcap.simulation.rendering.texture import Paint
+from wearcap.simulation.rendering.texture import LIGHT, Paint
+from wearcap.simulation.rendering.texture_kernels import color_points
 
 NEAR_M = 0.03
 SKY = np.array([[0.80, 0.84, 0.88], [0.48, 0.63, 0.85]]) * 255.0
@@ -102,7 +104,17 @@ def render_view(
     light /= len(poses.t)
     if samples > 1:
         light = light.reshape(camera.height, samples, camera.width, samples, 3).mean((1, 3))
-    return _developed(light, development, rng)
+    if development.contrast != 1.0:
+        light = light.mean() + development.contrast * (light - light.mean())
+    if development.exposure != 1.0:
+        light = light * development.exposure
+    if development.vignetting:
+        y, x = np.linspace(-1, 1, light.shape[0])[:, None], np.linspace(-1, 1, light.shape[1])
+        light = light * (1 - development.vignetting * 0.5 * (x**2 + y**2))[..., None].astype(np.float32)
+    if development.noise:
+        assert rng is not None, "noise needs a generator"
+        light = light + development.noise * rng.standard_normal(light.shape, np.float32)
+    return np.clip(light + 0.5, 0, 255).astype(np.uint8)
 
 
 def view_depth(scenery: Scenery, camera: Camera, T_world_cam: Rigid) -> Float32[np.ndarray, "height width"]:
@@ -111,33 +123,12 @@ def view_depth(scenery: Scenery, camera: Camera, T_world_cam: Rigid) -> Float32[
 
 
 def _exposed(scenery: Scenery, camera: Camera, T_world_cam: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    lens = _lens(camera)
+    """Light in the image, and distance along the rays (m)."""
+    lens, shape = _lens(camera), (camera.height, camera.width)
     R, t = (part.detach().double().cpu().numpy() for part in (T_world_cam.R, T_world_cam.t))
     buffers = [visible(scenery, R @ view.R_cam_view, t, view) for view in lens.views]
-    nearness = np.concatenate([near.ravel() for near, _ in buffers])
-    index = np.concatenate([face.ravel() for _, face in buffers])
-    count = camera.height * camera.width
-    light, points = np.zeros((count, 3), np.float32), np.empty((count, 3))
-    face, facing, footprint, distance = np.empty(count, np.int32), *np.empty((3, count), np.float32)
-    view_kernels.meet_faces(
-        lens.rays.reshape(-1, 3),
-        lens.slots.ravel(),
-        lens.reach.ravel(),
-        2.0 / (camera.fx + camera.fy),
-        np.concatenate([R, t[:, None]], 1),
-        index,
-        nearness,
-        scenery.paint.frames,
-        SKY,
-        points,
-        face,
-        facing,
-        footprint,
-        distance,
-        light,
-    )
-    texture_kernels.color_points(points, face, facing, footprint, *scenery.paint.tables, light)
-    shape = camera.height, camera.width
+    nearness, index = (np.concatenate([buffer.ravel() for buffer in pair]) for pair in zip(*buffers))
+    light, distance = colored(scenery, lens, np.concatenate([R, t[:, None]], 1), nearness, index, LIGHT)
     return light.reshape(*shape, 3), distance.reshape(shape)
 
 
@@ -154,22 +145,49 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class _Lens:
-    rays: Float32[np.ndarray, "height width 3"]
-    slots: np.ndarray
+class Lens:
+    """Rays of an image's pixels, and the samples of its pinhole views that they meet first."""
+
+    rays: Float32[np.ndarray, "pixel 3"]
+    slots: Int32[np.ndarray, "pixel"]
     """Index of the sample in all views one after the other; -1 where the lens shows nothing."""
-    reach: Float32[np.ndarray, "height width"]
+    reach: Float32[np.ndarray, "pixel"]
     """Distance along the ray per metre of the view's depth."""
+    pixel_angle: float
+    """Angle between neighbouring pixels (rad)."""
     views: tuple[View, ...]
 
 
 def visible(scenery: Scenery, R: np.ndarray, t: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Nearness (1/m) and face of every sample of a view."""
+    """Nearness (1/m) and face of every sample of a view; -1 without a face."""
     nearness = np.full((view.height, view.width), -np.inf, np.float32)
     index = np.full((view.height, view.width), -1, np.int32)
     vertices = (scenery.vertices - t) @ R
     raster.draw_pinhole(vertices, scenery.faces, view.focal, view.focal, view.cx, view.cy, NEAR_M, nearness, index)
     return nearness, index
+
+
+def colored(
+    scenery: Scenery, lens: Lens, pose: np.ndarray, nearness: np.ndarray, index: np.ndarray, light: np.ndarray
+) -> tuple[Float32[np.ndarray, "pixel 3"], Float32[np.ndarray, "pixel"]]:
+    """Light in every pixel, and its distance along the ray (m; infinite without a surface).
+
+    `pose` is [R | t] of the camera in the world, `nearness` and `index` are the (flat) samples of the lens's views, and
+    `light` is laid out as `texture.LIGHT`.
+    """
+    count = len(lens.slots)
+    out, points = np.zeros((count, 3), np.float32), np.empty((count, 3))
+    face, facing, footprint, distance = np.empty(count, np.int32), *np.empty((3, count), np.float32)
+    _meet_faces(
+        (lens.rays, lens.slots, lens.reach, lens.pixel_angle),
+        pose,
+        (index, nearness),
+        scenery.paint.frames,
+        SKY,
+        (points, face, facing, footprint, distance, out),
+    )
+    color_points(points, face, facing, footprint, scenery.paint.tables, light, out)
+    return out, distance
 
 
 CUBE = (
@@ -184,7 +202,7 @@ CUBE = (
 
 
 @lru_cache(maxsize=8)
-def _lens(camera: Camera) -> _Lens:
+def _lens(camera: Camera) -> Lens:
     rays = _rays(camera)
     seen = np.isfinite(rays).all(-1)
     rays = np.nan_to_num(rays)
@@ -193,7 +211,14 @@ def _lens(camera: Camera) -> _Lens:
         views = [View(R, size / 2, (size - 1) / 2, (size - 1) / 2, size, size) for R in CUBE]
         side = np.stack([rays @ view.R_cam_view[:, 2] for view in views]).argmax(0)
     else:
-        views, side = [_single_view(camera, rays[seen])], np.zeros(seen.shape, int)
+        if not seen.any() or rays[seen][:, 2].min() < 0.05:
+            raise WearcapError("a lens that sees sidewards", expected="a fisheye model for it")
+        plane = rays[seen][:, :2] / rays[seen][:, 2:]
+        focal = max(camera.fx, camera.fy)
+        low, high = plane.min(0) * focal, plane.max(0) * focal
+        width, height = (int(n) + 2 for n in np.ceil(high - low))
+        views = [View(np.eye(3), focal, -low[0] + 0.5, -low[1] + 0.5, width, height)]  # it holds every ray
+        side = np.zeros(seen.shape, int)
     slots, reach = np.full(seen.shape, -1, np.int32), np.ones(seen.shape, np.float32)
     kept, first = [], 0
     for number, view in enumerate(views):
@@ -208,7 +233,8 @@ def _lens(camera: Camera) -> _Lens:
         reach[here] = 1.0 / local[:, 2]
         first += view.width * view.height
         kept.append(view)
-    return _Lens(rays.astype(np.float32), slots, reach, tuple(kept))
+    flat_rays = rays.astype(np.float32).reshape(-1, 3)
+    return Lens(flat_rays, slots.ravel(), reach.ravel(), 2.0 / (camera.fx + camera.fy), tuple(kept))
 
 
 _EVERY_PX = 8
@@ -230,28 +256,38 @@ def _rays(camera: Camera) -> Float[np.ndarray, "height width 3"]:
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-def _single_view(camera: Camera, rays: np.ndarray) -> View:
-    """A pinhole view that holds every ray of a lens without fisheye."""
-    if not len(rays) or rays[:, 2].min() < 0.05:
-        raise WearcapError("a lens that sees sidewards", expected="a fisheye model for it")
-    plane = rays[:, :2] / rays[:, 2:]
-    focal = max(camera.fx, camera.fy)
-    low, high = plane.min(0) * focal, plane.max(0) * focal
-    width, height = (int(n) + 2 for n in np.ceil(high - low))
-    return View(np.eye(3), focal, -low[0] + 0.5, -low[1] + 0.5, width, height)
+@compiled
+def _meet_faces(lens, pose, buffers, frames, sky, out):
+    """Point, face, side (1 front, -1 back), footprint (m), distance along the ray (m) and light of every pixel: `out`.
 
-
-def _developed(
-    light: Float32[np.ndarray, "height width 3"], how: Development, rng: np.random.Generator | None
-) -> UInt8[np.ndarray, "height width 3"]:
-    if how.contrast != 1.0:
-        light = light.mean() + how.contrast * (light - light.mean())
-    if how.exposure != 1.0:
-        light = light * how.exposure
-    if how.vignetting:
-        y, x = np.linspace(-1, 1, light.shape[0])[:, None], np.linspace(-1, 1, light.shape[1])
-        light = light * (1 - how.vignetting * 0.5 * (x**2 + y**2))[..., None].astype(np.float32)
-    if how.noise:
-        assert rng is not None, "noise needs a generator"
-        light = light + how.noise * rng.standard_normal(light.shape, np.float32)
-    return np.clip(light + 0.5, 0, 255).astype(np.uint8)
+    `lens` holds the fields of `Lens` but its views, `buffers` the index and the nearness of the samples. `frames` are
+    `Paint.frames`. A pixel without a face (-1) gets its colour in the light: black, or the sky's.
+    """
+    rays, slots, reach, pixel_angle = lens
+    index, nearness = buffers
+    points, face, facing, footprint, distance, light = out
+    for k in range(len(slots)):
+        slot = slots[k]
+        face[k], distance[k] = -1, math.inf
+        if slot < 0:
+            continue
+        u, v, w = rays[k, 0], rays[k, 1], rays[k, 2]
+        dx = pose[0, 0] * u + pose[0, 1] * v + pose[0, 2] * w
+        dy = pose[1, 0] * u + pose[1, 1] * v + pose[1, 2] * w
+        dz = pose[2, 0] * u + pose[2, 1] * v + pose[2, 2] * w
+        number = index[slot]
+        if number < 0:
+            rise = min(1.0, max(0.0, 0.5 + 0.8 * dz))
+            for channel in range(3):
+                light[k, channel] = sky[0, channel] + rise * (sky[1, channel] - sky[0, channel])
+            continue
+        f = frames[number]
+        slope = dx * f[9] + dy * f[10] + dz * f[11]
+        above = (pose[0, 3] - f[0]) * f[9] + (pose[1, 3] - f[1]) * f[10] + (pose[2, 3] - f[2]) * f[11]
+        # A pixel's ray misses its face by up to a sample at outlines: it stays near the drawn depth.
+        near = reach[k] / nearness[slot]
+        d = (f[12] - above) / slope if abs(slope) > 1e-9 else near
+        d = min(1.08 * near, max(0.92 * near, d))
+        points[k, 0], points[k, 1], points[k, 2] = (pose[0, 3] + d * dx, pose[1, 3] + d * dy, pose[2, 3] + d * dz)
+        face[k], distance[k], facing[k] = number, d, -1.0 if slope > 0 else 1.0
+        footprint[k] = d * pixel_angle / math.sqrt(max(0.12, abs(slope)))
