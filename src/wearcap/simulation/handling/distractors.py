@@ -11,8 +11,8 @@ import torch
 from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.handling.carrying import bend_for, bow, spread
 from wearcap.simulation.handling.grips import GripPlace, drawn_grip, still
+from wearcap.simulation.people.actions import ON_THIGHS, hold
 from wearcap.simulation.people.gaze import look_about
-from wearcap.simulation.people.hands import ON_THIGHS, hold
 from wearcap.simulation.people.plan import SIDES, Plan
 
 SHORT_M = (0.05, 0.20)

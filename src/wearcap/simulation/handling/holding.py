@@ -15,7 +15,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.handling.carrying import DEEP, Errand, arrive, bend_for, bow, early, late, spread
 from wearcap.simulation.handling.grips import Grip
 from wearcap.simulation.handling.handlings import Handling, handling_of
-from wearcap.simulation.people.hands import ON_THIGHS, hold
+from wearcap.simulation.people.actions import ON_THIGHS, hold
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan
 from wearcap.simulation.people.track import Track, ease
 from wearcap.simulation.places.movables import Movable

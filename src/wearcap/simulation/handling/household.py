@@ -14,8 +14,9 @@ from wearcap.simulation.handling.house import Distractor, House
 from wearcap.simulation.handling.opening import operate
 from wearcap.simulation.handling.rearranging import fetch, floor_place, rearrange, relocate
 from wearcap.simulation.people.actions import ACTIVITIES, follow, start_place
+from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import Plan
-from wearcap.simulation.people.wearer import TAIL_S, Wearer
+from wearcap.simulation.people.wearer import TAIL_S
 from wearcap.simulation.places.movables import Movable
 from wearcap.simulation.places.openables import Openable
 from wearcap.simulation.places.outline import distance_to_convex
@@ -103,13 +104,13 @@ def pretend_to_handle(
 class Household:
     """Plans one activity after the other; the house's state changes with it."""
 
-    def __init__(self, house: House, person: Wearer, rng: np.random.Generator, habits: Habits = USUAL):
+    def __init__(self, house: House, person: Person, rng: np.random.Generator, habits: Habits = USUAL):
         self.house, self.rng, self.habits = house, rng, habits
         static = house.flat.static
         worlds = [house.world(point) for point in static.sample_floor(rng, 6)]
         largest = max(worlds, key=lambda world: int(world.navigation.walkable.sum()))
         position, heading = start_place(largest, rng)
-        self.plan = Plan(person.skeleton, person.style, position, heading, static.floor_height)
+        self.plan = Plan(person, position, heading, static.floor_height)
         self.plan.time = 0.3
         self.openables = {item.name: item for item in house.flat.openables}
         self.movables = {item.name: item for item in house.flat.movables}

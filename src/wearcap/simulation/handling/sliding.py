@@ -310,5 +310,5 @@ def _look(
             if back and rng.random() < 0.4
             else rng.normal(0, 0.2)
         )
-        time = turn_head(plan, time, (side, float(rng.normal(0.35, 0.12)))) + float(rng.exponential(1.2)) + 0.3
-    turn_head(plan, max(time, end), (0.0, plan.style.head_pitch))
+        time = turn_head(plan, time, side, float(rng.normal(0.35, 0.12))) + float(rng.exponential(1.2)) + 0.3
+    turn_head(plan, max(time, end))

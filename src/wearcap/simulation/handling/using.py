@@ -52,10 +52,10 @@ def drink(plan: Plan, held: Held, rng: np.random.Generator) -> None:
         held.go(time, time + raise_, before, -0.35 * tilt, 0.5 * yaw)
         tip = time + raise_ - 0.25
         held.go(tip, tip + 0.8, tuple(at.tolist()), -tilt, yaw)
-        turn_head(plan, tip, (0.0, -0.22))
+        turn_head(plan, tip, 0.0, -0.22)
         sip = tip + 0.8 + float(rng.uniform(0.6, 2.2))
         held.go(sip, sip + 0.7, before, -0.3 * tilt, 0.5 * yaw)
-        turn_head(plan, sip, (0.0, plan.style.head_pitch))
+        turn_head(plan, sip)
         time = sip + 0.6
         if rng.random() < 0.6:
             held.return_to_carry(time, time + 0.9)
@@ -224,8 +224,8 @@ def overhead(plan: Plan, held: Held, rng: np.random.Generator) -> None:
         plan.lean.move(stop, stop + up, 0.0)
         time = stop + 1.6 * up + float(rng.uniform(0.1, 0.5))
     if rng.random() < 0.5:
-        turn_head(plan, start + 0.8, (0.0, -0.25))
-        turn_head(plan, time - 1.2, (0.0, plan.style.head_pitch))
+        turn_head(plan, start + 0.8, 0.0, -0.25)
+        turn_head(plan, time - 1.2)
     plan.time = time
 
 
