@@ -7,12 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.handling.distractors import bend_over, gesture_at, hover, linger, squat_by
-from wearcap.simulation.handling.grips import GripPlace
-from wearcap.simulation.handling.house import Distractor, House
+from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.opening import operate
-from wearcap.simulation.handling.rearranging import fetch, floor_place, rearrange, relocate
+from wearcap.simulation.handling.rearranging import rearrange, relocate
 from wearcap.simulation.people.actions import ACTIVITIES, follow, start_place
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import Plan
@@ -83,24 +80,6 @@ VARIED = Habits(
 """Every kind is held for a fair share of the time, hand-held objects for about half of it."""
 
 
-def pretend_to_handle(
-    plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, height_m: float, rng: np.random.Generator
-) -> None:
-    """One of the acts that resemble handling, in front of an object of a height."""
-    low = float(T_world_object.t[2]) + height_m < 0.95
-    chance = rng.random()
-    if low and chance < 0.18:
-        bend_over(plan, T_world_object, height_m, rng)
-    elif low and chance < 0.32:
-        squat_by(plan, T_world_object, height_m, rng)
-    elif chance < 0.45:
-        gesture_at(plan, T_world_object, height_m, rng)
-    elif chance < 0.55:
-        linger(plan, rng)
-    else:
-        hover(plan, places, T_world_object, rng)
-
-
 class Household:
     """Plans one activity after the other; the house's state changes with it."""
 
@@ -163,12 +142,11 @@ class Household:
         return f"{verb} {(self.openables | self.movables)[name].category}"
 
     def _act(self, name: str) -> bool:
-        distractor = pretend_to_handle if self.rng.random() < self.habits.distractor_share else None
+        pretend = self.rng.random() < self.habits.distractor_share
         if name in self.openables:
-            return self.turn(self.openables[name], distractor)
-        movable = self.movables[name]
-        act = {"box": relocate, **dict.fromkeys(HANDHELD, fetch)}.get(movable.category, rearrange)
-        return act(self.plan, self.house, self.rng, movable, distractor)
+            return self.turn(self.openables[name], pretend)
+        act = relocate if self.movables[name].category in ("box", *HANDHELD) else rearrange
+        return act(self.plan, self.house, self.rng, self.movables[name], pretend)
 
     def rearrange_room(self) -> str:
         """Move several objects near each other, one after another."""
@@ -180,7 +158,7 @@ class Household:
             self.use(name)
         return "rearrange" if self.plan.time > start else "stand"
 
-    def turn(self, item: Openable, distractor: Distractor | None = None) -> bool:
+    def turn(self, item: Openable, pretend: bool) -> bool:
         """Open a closed openable, close an open one; sometimes to a value in between."""
         at, full = self.house.values[item.name], item.openness(item.opened)
         if item.openness(at) > 0.3 * full:
@@ -190,7 +168,7 @@ class Household:
         value = item.closed + share * (item.opened - item.closed)
         if abs(value - at) < 0.12 * full:
             return False
-        return operate(self.plan, self.house, self.rng, item, value, self._side(item), distractor)
+        return operate(self.plan, self.house, self.rng, item, value, self._side(item), pretend)
 
     def go(self, goal: Float[np.ndarray, "3"], stop_m: float = 0.0) -> bool:
         """Walk to a floor point (m), or within `stop_m` of it, opening closed doors on the path; False on failure."""
@@ -238,7 +216,7 @@ class Household:
         """Floor point at an object, or in front of an openable's handle (m)."""
         floor = float(self.plan.position[2])
         if name in self.movables:
-            return np.append(floor_place(self.house, self.movables[name])[:2], floor)
+            return np.append(self.house.floor_place(self.movables[name])[:2], floor)
         item = self.openables[name]
         if item.category == "door":
             return self._beyond(item, self._side(item), 0.6)

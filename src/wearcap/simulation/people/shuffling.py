@@ -84,6 +84,12 @@ def step_to(plan: Plan, rng: np.random.Generator, place: Float[np.ndarray, "2"],
     shuffle(plan, rng, body, begin, begin + duration)
 
 
+def arrive(plan: Plan, rng: np.random.Generator, place: Float[np.ndarray, "3"]) -> None:
+    """Step to x, y (m) and a heading (rad) nearby, unless one is there."""
+    if np.hypot(*(place[:2] - plan.position[:2])) > 0.03 or abs(wrap(place[2] - plan.heading)) > 0.1:
+        step_to(plan, rng, place[:2], place[2])
+
+
 def _landings(
     plan: Plan, path: _BodyPath, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "step"], Float[np.ndarray, "step"]]:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from wearcap.simulation.handling.house import House
-from wearcap.simulation.handling.rearranging import APART_M, apart, kept_free, outlines
+from wearcap.simulation.handling.rearranging import APART_M, apart, outlines
 from wearcap.simulation.places.handhelds import MAKERS
 from wearcap.simulation.places.interactive_flat import InteractiveFlat, obstacle
 from wearcap.simulation.places.movables import Movable, make_movable
@@ -45,7 +45,7 @@ def _placed(flat: InteractiveFlat, movable: Movable, rng: np.random.Generator) -
     house, navigation = House(flat), flat.static.navigation
     standing = house.obstacles()
     solid = [item.footprint for item in (*flat.static.objects, *standing) if item.z_range[0] < 1.0]
-    zones = kept_free(house)
+    zones = house.kept_free()
     rooms = [navigation.barred(standing, point) for point in flat.static.sample_floor(rng, 6)]
     points = max(rooms, key=lambda grid: int(grid.walkable.sum())).node_points
     outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
