@@ -18,7 +18,7 @@ from torch import Tensor
 
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, Moves, vector
+from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, vector
 from wearcap.simulation.people.actions import DEEP, HEELS_RAD, ON_THIGHS, hold
 from wearcap.simulation.people.gaze import look_at
 from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, Plan
@@ -201,6 +201,19 @@ class Held:
     lift_s: float
     lifted_s: float
 
+    def pose(self, times: Float[np.ndarray, "time"], T_world_chest: Rigid, on_the_way: "_OnTheWay") -> Rigid:
+        """Pose over time: where it stands, in front of the chest, and where it will stand."""
+        choice, lift, lower = self.choice, on_the_way.lift, on_the_way.lower
+        assert isinstance(choice, Carry)
+        first, last = (torch.from_numpy(pose) for pose in (choice.start, choice.stop))
+        yaw = rotation.yaw_of(T_world_chest.R).double()
+        ahead = torch.stack([yaw.cos(), yaw.sin(), torch.zeros_like(yaw)], -1)
+        held = T_world_chest.t.double() + choice.chest[0] * ahead - torch.tensor([0.0, 0.0, choice.chest[1]])
+        heading = yaw - choice.facing
+        at_first, at_last = (rotation.wrap_angle(end[2] - heading) for end in (first, last))
+        turned = rotation.about_axis("z", heading + (1 - lift) * at_first + lower * at_last)
+        return Rigid(turned, on_the_way.point(held, first[[0, 1, 3]], last[[0, 1, 3]]))
+
 
 @dataclass
 class HeldObject(Held):
@@ -216,6 +229,8 @@ class HeldObject(Held):
     keys: Track = field(init=False)
     """The palms' middle from `anchor`, ahead, out and up along the body's heading (m), and the object's pitch
     (forwards), yaw (outwards) and roll (outer side up) against `Take.neutral` (rad)."""
+    strides: Track = field(init=False, default_factory=lambda: Track(np.zeros(1)))
+    """Swing of the hand, opposite to the foot of its side, -1…1."""
 
     def __post_init__(self):
         self.keys = Track(self.carry)
@@ -235,6 +250,82 @@ class HeldObject(Held):
     def return_to_carry(self, start_s: float, stop_s: float) -> None:
         """Return to the carrying pose between two times (s)."""
         self.keys.move(start_s, stop_s, self.carry)
+
+    def swing_with_strides(self, plan: Plan, until_s: float) -> None:
+        """Write `strides` for the plan's steps between the end of the lift and a time (s)."""
+        last = self.lifted_s
+        prints = [(p, side) for side in SIDES for p in plan.prints[side] if self.lifted_s < p.land_s < until_s]
+        for print_, side in sorted(prints, key=lambda pair: pair[0].land_s):
+            other = [p for p in plan.prints[OTHER[side]] if p.land_s < print_.land_s][-1]
+            step = float((print_.ground - other.ground)[:2] @ turn(print_.heading)[:, 0])
+            size = float(np.clip(step / 0.6, -1.0, 1.2))
+            if print_.land_s > last + 0.2:
+                swung = -self.choice.sign * LEFT_SIGN[side] * size
+                self.strides.move(max(last, print_.land_s - 0.7), print_.land_s, swung)
+                last = print_.land_s
+        self.strides.move(last, last + 0.7, 0.0)
+
+    @cached_property
+    def corners(self) -> Float[Tensor, "corner 3"]:
+        """Corners of its convex hull, in its own axes (m)."""
+        vertices = self.choice.movable.object.mesh.vertices.astype(np.float64)
+        return torch.from_numpy(vertices[scipy.spatial.ConvexHull(vertices).vertices])
+
+    def pose(self, times: Float[np.ndarray, "time"], T_world_chest: Rigid, on_the_way: "_OnTheWay") -> Rigid:
+        """Pose over time: where it stands, in the hands as keyed, and where it will stand."""
+        choice, about = self.choice, rotation.about_axis
+        lift, lower = on_the_way.lift, on_the_way.lower
+        keys = torch.from_numpy(self.keys.sample(times))
+        swing = torch.from_numpy(self.strides.sample(times)[:, 0])
+        hangs = 0.0 if choice.side is None else 1.0 if choice.beside else 0.4
+        keys[:, 0] += hangs * SWING_M * swing
+        keys[:, 3] -= hangs * SWING_RAD * swing
+        R_heading = about("z", rotation.yaw_of(T_world_chest.R).double())
+        mirror = torch.tensor([1.0, choice.sign, 1.0], dtype=torch.float64)
+        anchor = T_world_chest.t.double() + T_world_chest.R.double() @ torch.from_numpy(self.anchor)
+        point = anchor + (R_heading @ (keys[:, :3] * mirror)[..., None])[..., 0]
+        turned = about("z", choice.sign * keys[:, 4]) @ about("y", keys[:, 3]) @ about("x", choice.sign * keys[:, 5])
+        R = R_heading @ turned @ torch.from_numpy(choice.neutral())
+        middle = torch.from_numpy(choice.middle)
+        R_first, R_last = (about("z", torch.tensor(pose[2])) for pose in (choice.start, choice.stop))
+        first, last = (
+            torch.from_numpy(pose[[0, 1, 3]]) + R_pose @ middle
+            for pose, R_pose in ((choice.start, R_first), (choice.stop, R_last))
+        )
+        near, off = (on_the_way.near, on_the_way.off) if choice.long else (lift, lower)
+        R = _between(R_first.expand_as(R), R, near)
+        R = _between(R, R_last.expand_as(R), off)
+        t = on_the_way.point(point, first, last) - R @ middle
+        # it keeps off the floor, smoothly
+        soft = (LONG_LIFTED_M if choice.long else LIFTED_M) * lift * (1 - lower)
+        below = choice.start[3] - t[:, 2] - (R[:, 2] @ self.corners.T).amin(-1)
+        off_floor = (below + torch.sqrt(below**2 + soft**2 + 1e-18)) / 2
+        return Rigid(R, t + off_floor[:, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+
+
+class _OnTheWay:
+    """Progress of lifting and lowering at times (s), 0…1 each, given their intervals (s)."""
+
+    def __init__(self, times: np.ndarray, up: tuple[float, float], down: tuple[float, float]):
+        # around the knees an object comes near the body late, and leaves it early
+        late = up[0] + 0.35 * (up[1] - up[0]), up[1]
+        early = down[0], down[1] - 0.35 * (down[1] - down[0])
+        self.lift, self.lower, self.near, self.off = (
+            torch.from_numpy(ease((times - start) / (stop - start))) for start, stop in (up, down, late, early)
+        )
+
+    def point(self, held: Tensor, first: Tensor, last: Tensor) -> Float[Tensor, "time 3"]:
+        """A point (m) between where it is lifted, where it is held, and where it is put down."""
+        up = torch.stack([self.near, self.near, self.lift], -1)
+        down = torch.stack([self.off, self.off, self.lower], -1)
+        return held + (1 - up) * (first - held) + down * (last - held)
+
+
+def _between(
+    R: Float[Tensor, "time 3 3"], R_other: Float[Tensor, "time 3 3"], share: Float[Tensor, "time"]
+) -> Float[Tensor, "time 3 3"]:
+    """Interpolation between two rotations by a share."""
+    return R @ rotation.exp(share[:, None] * rotation.log(R.transpose(-1, -2) @ R_other))
 
 
 def carry_options(
@@ -321,7 +412,10 @@ def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
     bow(plan, release, release + rise, 0.0, 0.0)
     choice.move_free_hand(plan, bend, down, (release + 0.3 * rise, release + rise), rng)
     look_at(plan, np.append(choice.stop[:2], choice.stop[3]), (start, start + 0.5), (release, release + 0.6))
-    moves, box = _path(plan, held, down), isinstance(choice, Carry)
+    if isinstance(held, HeldObject):
+        held.swing_with_strides(plan, start)
+    moves = lambda times, chest: held.pose(times, chest, _OnTheWay(times, (held.lift_s, held.lifted_s), down))  # noqa: E731
+    box = isinstance(choice, Carry)
     hover = (0.15, 0.22) if box else (0.05, 0.09) if choice.side else (0.12, 0.18)
     grips = []
     for side, place in choice.places.items():
@@ -391,115 +485,3 @@ def _carried(plan: Plan, choice: Take, reach: float, rng: np.random.Generator) -
         pitch = rng.uniform(-0.1, 0.4) if choice.lies else rng.uniform(-0.1, 0.15)
         up[:4] = [0.50 * reach, rng.uniform(-0.03, 0.04), -rng.uniform(0.45, 0.58) * reach, pitch]
     return up
-
-
-def _path(plan: Plan, held: Held, down: tuple[float, float]) -> Moves:
-    """Pose of an object over time: where it stands, in the hands, and, lowered in an interval (s), where it will."""
-    up = held.lift_s, held.lifted_s
-    # around the knees the object comes near the body late, and leaves it early
-    late = up[0] + 0.35 * (up[1] - up[0]), up[1]
-    early = down[0], down[1] - 0.35 * (down[1] - down[0])
-    if isinstance(held, HeldObject):
-        in_hands = _InHand(plan, held, down[0])
-    else:
-        assert isinstance(held.choice, Carry)
-        in_hands = _BeforeChest(held.choice)
-
-    def moves(times: Float[np.ndarray, "time"], T_world_chest: Rigid) -> Rigid:
-        shares = (torch.from_numpy(ease((times - start) / (stop - start))) for start, stop in (up, down, late, early))
-        return in_hands.pose(times, T_world_chest, *shares)
-
-    return moves
-
-
-def _on_the_way(point: Tensor, first: Tensor, last: Tensor, lift: Tensor, lower: Tensor, near: Tensor, off: Tensor):
-    """A carried point (m) between where it is lifted and where it is put down."""
-    share = torch.stack([near, near, lift], -1), torch.stack([off, off, lower], -1)
-    return point + (1 - share[0]) * (first - point) + share[1] * (last - point)
-
-
-@dataclass(frozen=True)
-class _BeforeChest:
-    """A box in front of the chest."""
-
-    choice: Carry
-
-    def pose(
-        self, times: np.ndarray, T_world_chest: Rigid, lift: Tensor, lower: Tensor, near: Tensor, off: Tensor
-    ) -> Rigid:
-        choice = self.choice
-        first, last = (torch.from_numpy(pose) for pose in (choice.start, choice.stop))
-        yaw = rotation.yaw_of(T_world_chest.R).double()
-        ahead = torch.stack([yaw.cos(), yaw.sin(), torch.zeros_like(yaw)], -1)
-        held = T_world_chest.t.double() + choice.chest[0] * ahead - torch.tensor([0.0, 0.0, choice.chest[1]])
-        t = _on_the_way(held, first[[0, 1, 3]], last[[0, 1, 3]], lift, lower, near, off)
-        heading = yaw - choice.facing
-        at_first, at_last = (rotation.wrap_angle(end[2] - heading) for end in (first, last))
-        return Rigid(rotation.about_axis("z", heading + (1 - lift) * at_first + lower * at_last), t)
-
-
-class _InHand:
-    """An object in one hand or both, whose keys the wearer follows; it swings with the strides until a time (s)."""
-
-    def __init__(self, plan: Plan, held: HeldObject, until_s: float):
-        self.held, self.strides = held, Track(np.zeros(1))
-        vertices = held.choice.movable.object.mesh.vertices.astype(np.float64)
-        self.corners = torch.from_numpy(vertices[scipy.spatial.ConvexHull(vertices).vertices])
-        # opposite to the foot of its side, -1…1
-        last = held.lifted_s
-        prints = [(p, side) for side in SIDES for p in plan.prints[side] if held.lifted_s < p.land_s < until_s]
-        for print_, side in sorted(prints, key=lambda pair: pair[0].land_s):
-            other = [p for p in plan.prints[OTHER[side]] if p.land_s < print_.land_s][-1]
-            step = float((print_.ground - other.ground)[:2] @ turn(print_.heading)[:, 0])
-            size = float(np.clip(step / 0.6, -1.0, 1.2))
-            if print_.land_s > last + 0.2:
-                swung = -held.choice.sign * LEFT_SIGN[side] * size
-                self.strides.move(max(last, print_.land_s - 0.7), print_.land_s, swung)
-                last = print_.land_s
-        self.strides.move(last, last + 0.7, 0.0)
-
-    def pose(
-        self, times: np.ndarray, T_world_chest: Rigid, lift: Tensor, lower: Tensor, near: Tensor, off: Tensor
-    ) -> Rigid:
-        choice = self.held.choice
-        point, R = self._held_all_the_time(times, T_world_chest)
-        middle = torch.from_numpy(choice.middle)
-        R_first, R_last = (rotation.about_axis("z", torch.tensor(pose[2])) for pose in (choice.start, choice.stop))
-        first, last = (
-            torch.from_numpy(pose[[0, 1, 3]]) + R_pose @ middle
-            for pose, R_pose in ((choice.start, R_first), (choice.stop, R_last))
-        )
-        point = _on_the_way(point, first, last, lift, lower, near, off)
-        turned = (near, off) if choice.long else (lift, lower)
-        R = _between(R_first.expand_as(R), R, turned[0])
-        R = _between(R, R_last.expand_as(R), turned[1])
-        t = point - R @ middle
-        # it keeps off the floor, smoothly
-        soft = (LONG_LIFTED_M if choice.long else LIFTED_M) * lift * (1 - lower)
-        below = choice.start[3] - t[:, 2] - (R[:, 2] @ self.corners.T).amin(-1)
-        off_floor = (below + torch.sqrt(below**2 + soft**2 + 1e-18)) / 2
-        return Rigid(R, t + off_floor[:, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-
-    def _held_all_the_time(
-        self, times: np.ndarray, T_world_chest: Rigid
-    ) -> tuple[Float[Tensor, "time 3"], Float[Tensor, "time 3 3"]]:
-        """Middle of the palms (m) and rotation of the object if it were held all the time."""
-        choice, about = self.held.choice, rotation.about_axis
-        keys = torch.from_numpy(self.held.keys.sample(times))
-        swing = torch.from_numpy(self.strides.sample(times)[:, 0])
-        hangs = 0.0 if choice.side is None else 1.0 if choice.beside else 0.4
-        keys[:, 0] += hangs * SWING_M * swing
-        keys[:, 3] -= hangs * SWING_RAD * swing
-        R_heading = about("z", rotation.yaw_of(T_world_chest.R).double())
-        mirror = torch.tensor([1.0, choice.sign, 1.0], dtype=torch.float64)
-        anchor = T_world_chest.t.double() + T_world_chest.R.double() @ torch.from_numpy(self.held.anchor)
-        point = anchor + (R_heading @ (keys[:, :3] * mirror)[..., None])[..., 0]
-        turned = about("z", choice.sign * keys[:, 4]) @ about("y", keys[:, 3]) @ about("x", choice.sign * keys[:, 5])
-        return point, R_heading @ turned @ torch.from_numpy(choice.neutral())
-
-
-def _between(
-    R: Float[Tensor, "time 3 3"], R_other: Float[Tensor, "time 3 3"], share: Float[Tensor, "time"]
-) -> Float[Tensor, "time 3 3"]:
-    """Interpolation between two rotations by a share."""
-    return R @ rotation.exp(share[:, None] * rotation.log(R.transpose(-1, -2) @ R_other))
