@@ -18,17 +18,6 @@ from wearcap.simulation.places.movables import Movable
 from wearcap.simulation.places.openables import Openable
 from wearcap.simulation.places.outline import distance_to_convex
 
-WEIGHTS = {
-    "door": 1.5,
-    "window": 2.2,
-    "drawer": 2.2,
-    "cabinet_door": 1.8,
-    "sofa": 2.5,
-    "table": 1.2,
-    "chair": 1.2,
-    "box": 0.8,
-}
-"""Weight of each category in the choice of the next object."""
 HANDHELD = ("suitcase", "backpack", "bottle", "tool", "ball")
 """Categories that are used while they are carried."""
 EVEN_S = 4.0
@@ -36,8 +25,6 @@ EVEN_S = 4.0
 AGAIN, ROOM = 0.25, 0.10
 """Probability of using the last object again, and of moving several objects of one room."""
 TRIES = 5
-DISTRACTOR_SHARE = 0.14
-"""Probability of an act in front of an object without touching it."""
 ORDINARY = ("stand", "look_around", "turn", "walk", "hold", "gesture", "carry", "reach", "sit", "crouch")
 CLOSE_BEHIND = 0.35
 """Probability of closing a door after walking through."""
@@ -46,7 +33,6 @@ PARTLY = 0.25
 BEYOND_M = 0.95
 """Distance behind a door to which one walks through it."""
 REACHED_M = 0.4
-NEAR_M = 2.5
 IN_ROOM, SAME_ROOM_M = 4, 3.5
 """Most objects that are moved when a room is rearranged, and their largest distance from the first."""
 
@@ -63,13 +49,19 @@ class Habits:
     """Whether kinds that were held less so far are preferred."""
     again: float = AGAIN
     """Probability of using the last object again, unless it was in the hands for long."""
-    near_m: float = NEAR_M
+    near_m: float = 2.5
     """Distance per factor 1/e in the probability of an object's choice."""
-    distractor_share: float = DISTRACTOR_SHARE
+    distractor_share: float = 0.14
     """Probability of an act in front of an object without touching it."""
 
 
-USUAL = Habits(WEIGHTS, 0.42)
+USUAL = Habits(
+    {
+        "door": 1.5, "window": 2.2, "drawer": 2.2, "cabinet_door": 1.8, "sofa": 2.5, "table": 1.2, "chair": 1.2,
+        "box": 0.8,
+    },
+    0.42,
+)  # fmt: skip
 VARIED = Habits(
     {
         "door": 3.0, "window": 4.4, "drawer": 4.4, "cabinet_door": 4.6, "sofa": 4.5, "table": 2.6, "chair": 2.4,
@@ -93,6 +85,7 @@ class Household:
         self.plan.time = 0.3
         self.openables = {item.name: item for item in house.flat.openables}
         self.movables = {item.name: item for item in house.flat.movables}
+        self.items: dict[str, Movable | Openable] = self.openables | self.movables
         self.last: str | None = None
 
     def live(self, duration_s: float) -> None:
@@ -120,13 +113,14 @@ class Household:
     def interact(self) -> str:
         """Use an object, after passing the doors on the path; "stand" where nothing could be done."""
         chance = self.rng.random()
-        again = self.habits.again if self._kind(self.last) not in HANDHELD else AGAIN
+        held = self.last is not None and self.items[self.last].category in HANDHELD
+        again = AGAIN if held else self.habits.again
         if chance < again and self.last is not None and (done := self.use(self.last)) != "stand":
             return done
         if chance > 1.0 - ROOM:
             return self.rearrange_room()
         for _ in range(TRIES):
-            if (done := self.use(self._drawn(self.openables | self.movables))) != "stand":
+            if (done := self.use(self._drawn(self.items))) != "stand":
                 return done
         return "stand"
 
@@ -138,8 +132,7 @@ class Household:
         if not done:
             return "walk" if self.plan.time > start else "stand"
         self.last = name
-        verb = "move" if name in self.movables else "turn"
-        return f"{verb} {(self.openables | self.movables)[name].category}"
+        return f"{'move' if name in self.movables else 'turn'} {self.items[name].category}"
 
     def _act(self, name: str) -> bool:
         pretend = self.rng.random() < self.habits.distractor_share
@@ -191,11 +184,9 @@ class Household:
 
     def go_through(self, door: Openable) -> bool:
         """Open a door, walk through it, and sometimes close it behind."""
-        start = self.plan.time
-        width = door.openness(door.opened)
-        share = float(self.rng.uniform(np.deg2rad(66.0), width)) / width
+        start, side, width = self.plan.time, self._side(door), door.openness(door.opened)
+        share = self.rng.uniform(np.deg2rad(66.0), width) / width
         value = door.closed + share * (door.opened - door.closed)
-        side = self._side(door)
         if not operate(self.plan, self.house, self.rng, door, value, side):
             return False
         self.last = door.name
@@ -232,27 +223,18 @@ class Household:
         weights *= [self._weight(item.category) / kinds[item.category] for item in items.values()]
         return str(self.rng.choice(list(items), p=weights / weights.sum()))
 
-    def _kind(self, name: str | None) -> str:
-        return (self.openables | self.movables)[name].category if name is not None else ""
-
     def _weight(self, category: str) -> float:
         if not self.habits.even:
             return self.habits.weights[category]
-        items = self.openables | self.movables
-        spans = [h.stop_s - h.start_s for h in self.house.handlings if items[h.name].category == category]
+        spans = [h.stop_s - h.start_s for h in self.house.handlings if self.items[h.name].category == category]
         return self.habits.weights[category] / (EVEN_S + sum(spans))
 
     def _side(self, door: Openable) -> int:
         """Index of the handle on the side where one stands: 0 where the leaf opens to."""
-        if len(door.handles) == 1:
-            return 0
-        return 0 if self._across(door, self.plan.position) > 0 else 1
-
-    def _across(self, door: Openable, point: Float[np.ndarray, "3"]) -> float:
-        """Signed distance of a point from a door's plane, positive where the leaf opens to (m)."""
         pose = door.pose(door.closed)
-        local = pose.R.numpy().T @ (np.array([*point[:2], 0.0]) - np.array([*pose.t[:2].tolist(), 0.0]))
-        return float(local[1]) * door.opening_sign
+        offset = np.append(self.plan.position[:2] - pose.t[:2].numpy(), 0.0)
+        across = float((pose.R.numpy().T @ offset)[1]) * door.opening_sign
+        return 0 if len(door.handles) == 1 or across > 0 else 1
 
     def _beyond(self, door: Openable, side: int, far_m: float = BEYOND_M) -> Float[np.ndarray, "3"]:
         """Floor point in front of a door's middle on a side (m)."""
@@ -265,29 +247,18 @@ class Household:
     def _same_side(self, point: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"]) -> bool:
         """Whether no wall or closed door stands between two points near each other."""
         between = goal[:2] + np.linspace(0.0, 1.0, 9)[:, None] * (point[:2] - goal[:2])
-        walls = [
-            item.footprint for item in self.house.flat.static.objects if item.kind == "wall" and item.z_range[0] < 1.0
-        ]
-        walls += [
-            door.footprint(self.house.values[door.name])
-            for door in self.house.flat.openables
-            if door.category == "door"
-        ]
+        flat, values = self.house.flat, self.house.values
+        walls = [item.footprint for item in flat.static.objects if item.kind == "wall" and item.z_range[0] < 1.0]
+        walls += [door.footprint(values[door.name]) for door in flat.openables if door.category == "door"]
         return min(float(distance_to_convex(between, wall).min()) for wall in walls) > 0.01
 
     def _door_between(self, goal: Float[np.ndarray, "3"]) -> Openable | None:
         """The first door on the path to a point that is not open enough."""
         shut = [door for door in self.house.flat.openables if door.blocks(self.house.values[door.name])]
-        if not shut:
-            return None
         world = self.house.world(self.plan.position, without=tuple(door.name for door in shut))
-        path = world.navigation.shortest(self.plan.position, goal, 1.0)
+        path = world.navigation.shortest(self.plan.position, goal, 1.0) if shut else None
         if path is None:
             return None
-        first = {}
-        for door in shut:
-            gap = door.footprint(door.closed)
-            near = np.flatnonzero(distance_to_convex(path[:, :2], gap) < 0.12)
-            if len(near):
-                first[door.name] = int(near[0])
-        return self.openables[min(first, key=lambda name: first[name])] if first else None
+        near = [distance_to_convex(path[:, :2], door.footprint(door.closed)) < 0.12 for door in shut]
+        passed = [(int(there.argmax()), number) for number, there in enumerate(near) if there.any()]
+        return shut[min(passed)[1]] if passed else None
