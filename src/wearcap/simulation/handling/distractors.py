@@ -101,10 +101,9 @@ def bend_over(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.G
     down = rng.uniform(0.8, 1.3) / plan.style.briskness
     leave = start + down + rng.uniform(0.6, 3.0)
     lean = rng.uniform(0.35, 0.8)
-    plan.lean.move(start, start + down, (lean, rng.normal(0.0, 0.08), rng.normal(0.0, 0.12)))
-    plan.lean.move(leave, leave + 1.1 * down, 0.0)
-    plan.crouch.move(start, start + down, rng.uniform(0.0, 0.08))
-    plan.crouch.move(leave, leave + 1.1 * down, 0.0)
+    out, back = (start, start + down), (leave, leave + 1.1 * down)
+    plan.lean.visit((lean, rng.normal(0.0, 0.08), rng.normal(0.0, 0.12)), out, back)
+    plan.crouch.visit(rng.uniform(0.0, 0.08), out, back)
     if rng.random() < 0.5:
         hold(plan, SIDES, ON_THIGHS, start, leave + down, rng)
     _look(plan, T_world_object, (0.0, 0.0, 0.6 * height), start, leave)

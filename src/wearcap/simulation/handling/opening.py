@@ -274,27 +274,15 @@ def _rated(
     free = np.minimum(leaf, room)
     cost += 2.0 * np.maximum(BODY_M + EASY_M - free, 0.0) / EASY_M
     cost[leaf < BODY_M] = np.inf
-    cost[_arm_hits(task, shoulder, arm, far)] = np.inf
-    return cost, heading
-
-
-def _arm_hits(
-    task: _Task,
-    shoulder: Float[np.ndarray, "key point 2"],
-    arm: Float[np.ndarray, "key point 2"],
-    far: Float[np.ndarray, "key point"],
-) -> Bool[np.ndarray, "key point"]:
-    """Whether the straight arm, except its last 7 cm, passes through the moved object or another."""
+    # the straight arm, except its last 7 cm, may not pass through the moved object or another
     last = np.clip(1.0 - 0.07 / np.maximum(far, 0.1), 0.0, 1.0)[..., None]
-    hits = np.zeros(far.shape, bool)
     for share in np.linspace(0.25, 1.0, 7):
         along = shoulder + share * last * arm
         for key, outline in enumerate(task.footprint if not task.low else ()):
-            hits[key] |= _within(along[key], outline, 0.01 if share == 1.0 else ARM_M)
-        if share < 0.9:
-            for outline in task.high:
-                hits |= _within(along, outline, ARM_M)
-    return hits
+            cost[key, _within(along[key], outline, 0.01 if share == 1.0 else ARM_M)] = np.inf
+        for outline in task.high if share < 0.9 else ():
+            cost[_within(along, outline, ARM_M)] = np.inf
+    return cost, heading
 
 
 def _within(

@@ -140,8 +140,7 @@ def hold(
         # a hand that hangs may take its next posture unseen: only the weight moves it
         hangs = hand.pose_weight.last[0] < 0.01
         hand.pose.move(start_s, start_s if hangs else start_s + rise, varied)
-        hand.pose_weight.move(start_s, start_s + rise * rng.uniform(0.9, 1.3), 1.0)
-        hand.pose_weight.move(stop_s - rise, stop_s, 0.0)
+        hand.pose_weight.visit(1.0, (start_s, start_s + rise * rng.uniform(0.9, 1.3)), (stop_s - rise, stop_s))
 
 
 def squat(
@@ -149,14 +148,12 @@ def squat(
 ) -> None:
     """Bend knees (m) and trunk (rad, forwards), and straighten them; `down` and `up` are starts and durations (s)."""
     start, leave = down[0], up[0]
-    plan.crouch.move(start, start + down[1], depth)
-    plan.crouch.move(leave, leave + up[1], 0.0)
-    plan.lean.move(start, start + down[1], (lean, 0.0, rng.normal(0.0, 0.08)))
-    plan.lean.move(leave, leave + up[1], 0.0)
+    out, back = (start, start + down[1]), (leave, leave + up[1])
+    plan.crouch.visit(depth, out, back)
+    plan.lean.visit((lean, 0.0, rng.normal(0.0, 0.08)), out, back)
     if depth > DEEP * plan.hip_height:
         for side in SIDES:
-            plan.heel_lift[side].move(start + 0.3 * down[1], start + down[1], HEELS_RAD)
-            plan.heel_lift[side].move(leave, leave + 0.6 * up[1], 0.0)
+            plan.heel_lift[side].visit(HEELS_RAD, (start + 0.3 * down[1], out[1]), (leave, leave + 0.6 * up[1]))
 
 
 @activity("stand", weight=2.0)
@@ -295,12 +292,11 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
     out = float(np.clip(0.45 + 0.55 * np.hypot(far, low) + 0.8 * crouch, 0.5, 1.6)) / plan.style.briskness
     hold_s, back = rng.uniform(0.3, 1.4), out * rng.uniform(1.0, 1.3)
     leave = start + out + hold_s
+    there, home = (start, start + out), (leave, leave + back)
     inner = LEFT_SIGN[side] * np.clip(0.25 * lean, 0.0, 0.2)
-    plan.lean.move(start, start + out, (lean, 0.0, -inner))
-    plan.lean.move(leave, leave + back, 0.0)
-    plan.crouch.move(start, start + out, crouch)
-    plan.crouch.move(leave, leave + back, 0.0)
-    plan.hands[side].go_for(point, (start, start + out), (leave, leave + back))
+    plan.lean.visit((lean, 0.0, -inner), there, home)
+    plan.crouch.visit(crouch, there, home)
+    plan.hands[side].go_for(point, there, home)
     look_at(plan, touched, (start, start + 0.45), (leave, leave + 0.5), 1.0)
     plan.time = leave + back + rng.uniform(0.05, 0.6)
 

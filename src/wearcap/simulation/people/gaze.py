@@ -52,8 +52,7 @@ def look_at(
 ) -> None:
     """Turn the gaze to a point in the world (m) in one interval of time and off it in another (s)."""
     plan.gaze_point.move(turn[0], turn[0], point)
-    plan.gaze_weight.move(*turn, weight)
-    plan.gaze_weight.move(*leave, 0.0)
+    plan.gaze_weight.visit(weight, turn, leave)
 
 
 def head_angles(

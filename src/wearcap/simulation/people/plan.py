@@ -76,14 +76,12 @@ class HandScore:
     def go_for(self, point: Float[np.ndarray, "3"], out: tuple[float, float], back: tuple[float, float]) -> None:
         """Bring the wrist to a point in the world (m) in one interval of time and let it go in another (s)."""
         self.goal.move(out[0], out[0], point)
-        self.goal_weight.move(*out, 1.0)
-        self.goal_weight.move(*back, 0.0)
+        self.goal_weight.visit(1.0, out, back)
 
     def take(self, pose, out: tuple[float, float], back: tuple[float, float]) -> None:
         """Bring a hanging hand into a pose in one interval of time and let it hang again in another (s)."""
         self.pose.move(out[0], out[0], pose)
-        self.pose_weight.move(*out, 1.0)
-        self.pose_weight.move(*back, 0.0)
+        self.pose_weight.visit(1.0, out, back)
 
 
 @dataclass(frozen=True)

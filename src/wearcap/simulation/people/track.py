@@ -49,6 +49,11 @@ class Track:
         self._moves.append((start_s, max(stop_s, start_s + 1e-6), value - self.last))
         self.last = value.copy()
 
+    def visit(self, value, out: tuple[float, float], back: tuple[float, float]) -> None:
+        """Go to `value` in one interval of time and to zero in another (s)."""
+        self.move(*out, value)
+        self.move(*back, 0.0)
+
     def sample(self, times: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time feature"]:
         """Values at rising times (s). Loops over transitions, each touching only its own frames."""
         out = np.zeros((len(times) + 1, len(self.initial)))
