@@ -18,7 +18,7 @@ from torch import Tensor
 
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, vector
+from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, Vector, vector
 from wearcap.simulation.people.actions import DEEP, HEELS_RAD, ON_THIGHS, hold
 from wearcap.simulation.people.gaze import look_at
 from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, Plan
@@ -189,6 +189,28 @@ class Take(Errand):
         )
         return wanted @ here.T
 
+    def carrying_pose(self, plan: Plan, reach: float, rng: np.random.Generator) -> Float[np.ndarray, "6"]:
+        """Pose in walking, as `HeldObject.keys`: beside a leg, ahead at arm's length (m), or before the body."""
+        up = np.zeros(6)
+        if self.beside:
+            palm = abs(float((turn(-self.facing) @ self.middle[:2])[1]))
+            out = LEG_M + self.extent[1] + palm - shoulder_of(plan)[1]
+            hangs = np.sqrt(max((STRETCH * reach) ** 2 - out**2, 0.0))
+            lowest = shoulder_height(plan) - self.middle[2] - OFF_FLOOR_M
+            up[:3] = [rng.uniform(0.0, 0.06), out, -min(hangs, lowest)]
+        elif self.side is None:
+            near = self.extent[0] + rng.uniform(0.15, 0.20)
+            up[:3] = [near, 0.0, -rng.uniform(0.40, 0.58) * reach]
+        elif self.long:
+            up[:4] = [0.42 * reach, 0.06, -0.50 * reach, -rng.uniform(0.8, 1.0)]
+        elif rng.random() < 0.45:
+            pitch = rng.uniform(1.0, 1.25) if self.lies else rng.uniform(0.45, 0.7)
+            up[:4] = [0.08, rng.uniform(0.05, 0.09), -0.91 * reach, pitch]
+        else:
+            pitch = rng.uniform(-0.1, 0.4) if self.lies else rng.uniform(-0.1, 0.15)
+            up[:4] = [0.50 * reach, rng.uniform(-0.03, 0.04), -rng.uniform(0.45, 0.58) * reach, pitch]
+        return up
+
 
 @dataclass
 class Held:
@@ -236,13 +258,7 @@ class HeldObject(Held):
         self.keys = Track(self.carry)
 
     def go(
-        self,
-        start_s: float,
-        stop_s: float,
-        place: tuple[float, float, float],
-        pitch: float = 0.0,
-        yaw: float = 0.0,
-        roll: float = 0.0,
+        self, start_s: float, stop_s: float, place: Vector, pitch: float = 0.0, yaw: float = 0.0, roll: float = 0.0
     ) -> None:
         """Bring it to a place, as shares of the arm's reach, and angles (rad) between two times."""
         self.keys.move(start_s, stop_s, np.array([*(self.reach * np.array(place)), pitch, yaw, roll]))
@@ -395,7 +411,7 @@ def lift(plan: Plan, choice: Errand, rng: np.random.Generator) -> Held:
     shoulder = shoulder_of(plan)
     shoulder[1] *= 0.0 if choice.side is None else choice.sign
     reach = plan.arm_length + float(np.linalg.norm(plan.skeleton.sites["left_palm"].t_joint_site))
-    return HeldObject(choice, start, touch, *up, shoulder, reach, _carried(plan, choice, reach, rng))
+    return HeldObject(choice, start, touch, *up, shoulder, reach, choice.carrying_pose(plan, reach, rng))
 
 
 def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
@@ -462,26 +478,3 @@ def shoulder_height(plan: Plan) -> float:
     spine = plan.skeleton.indices("l5", "l3", "t12", "t8")
     above = float(plan.skeleton.t_parent_joint[spine, 2].sum()) + float(shoulder_of(plan)[2])
     return plan.hip_height + above - SOFT_M
-
-
-def _carried(plan: Plan, choice: Take, reach: float, rng: np.random.Generator) -> Float[np.ndarray, "6"]:
-    """Carrying pose in walking, as `HeldObject.keys`: beside a leg, ahead at arm's length, or before the body."""
-    up = np.zeros(6)
-    if choice.beside:
-        palm = abs(float((turn(-choice.facing) @ choice.middle[:2])[1]))
-        out = LEG_M + choice.extent[1] + palm - shoulder_of(plan)[1]
-        hangs = np.sqrt(max((STRETCH * reach) ** 2 - out**2, 0.0))
-        lowest = shoulder_height(plan) - choice.middle[2] - OFF_FLOOR_M
-        up[:3] = [rng.uniform(0.0, 0.06), out, -min(hangs, lowest)]
-    elif choice.side is None:
-        near = choice.extent[0] + rng.uniform(0.15, 0.20)
-        up[:3] = [near, 0.0, -rng.uniform(0.40, 0.58) * reach]
-    elif choice.long:
-        up[:4] = [0.42 * reach, 0.06, -0.50 * reach, -rng.uniform(0.8, 1.0)]
-    elif rng.random() < 0.45:
-        pitch = rng.uniform(1.0, 1.25) if choice.lies else rng.uniform(0.45, 0.7)
-        up[:4] = [0.08, rng.uniform(0.05, 0.09), -0.91 * reach, pitch]
-    else:
-        pitch = rng.uniform(-0.1, 0.4) if choice.lies else rng.uniform(-0.1, 0.15)
-        up[:4] = [0.50 * reach, rng.uniform(-0.03, 0.04), -rng.uniform(0.45, 0.58) * reach, pitch]
-    return up

@@ -162,7 +162,14 @@ def _perform(plan: Plan, house: House, turn: _Turn, rng: np.random.Generator) ->
     count = max(round(turn.seconds * 30), 8)
     here = np.array([*plan.position[:2], turn.places[0, 2] + wrap(plan.heading - turn.places[0, 2])])
     fade = np.linspace(1.0, 0.0, len(turn.places))[:, None] ** 2
-    path = _smooth_path(turn.places + fade * (here - turn.places[0]), count)
+    # the body's path at even times, smooth, its ends kept
+    keys = turn.places + fade * (here - turn.places[0])
+    at = np.linspace(0.0, len(keys) - 1.0, count)
+    fine = np.stack([np.interp(at, np.arange(len(keys)), column) for column in keys.T], 1)
+    sigma = 0.9 * count / len(keys)
+    reach = max(int(3 * sigma), 1)
+    padded = np.concatenate([np.repeat(fine[:1], reach, 0), fine, np.repeat(fine[-1:], reach, 0)])
+    path = scipy.ndimage.gaussian_filter1d(padded, sigma, axis=0)[reach : reach + count]
     times = np.linspace(begin, stop, count)
     place, yaw = item.handles[turn.handle], _hand_yaw(plan, turn, path)
 
@@ -319,13 +326,3 @@ def _cheapest(
     for best in reversed(came):
         path.append(int(best[path[-1]]))
     return number[path[::-1]], float(total.min())
-
-
-def _smooth_path(places: Float[np.ndarray, "key 3"], count: int) -> Float[np.ndarray, "time 3"]:
-    """The path at `count` even times, smooth, its ends kept."""
-    at = np.linspace(0.0, len(places) - 1.0, count)
-    fine = np.stack([np.interp(at, np.arange(len(places)), column) for column in places.T], 1)
-    sigma = 0.9 * count / len(places)
-    reach = max(int(3 * sigma), 1)
-    padded = np.concatenate([np.repeat(fine[:1], reach, 0), fine, np.repeat(fine[-1:], reach, 0)])
-    return scipy.ndimage.gaussian_filter1d(padded, sigma, axis=0)[reach : reach + count]

@@ -116,7 +116,14 @@ def _drawn_slide(plan: Plan, house: House, world: World, rng: np.random.Generato
     zones = [zone for zone in house.kept_free() if distance_to_convex(start[:2], zone) < 4.0]
     outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
     for _ in range(TRIES):
-        stop = _drawn_stop(movable, start, rng)
+        # mostly displaced along the object's own axes, now and then turned
+        along = rng.choice(4) * np.pi / 2 + start[2] if rng.random() < 0.7 else rng.uniform(-np.pi, np.pi)
+        angle = along + rng.normal(0.0, 0.15)
+        far, spin = rng.uniform(*FAR_M[movable.category]), 0.0
+        if rng.random() < TURN_SHARE:
+            spin = rng.choice([-1.0, 1.0]) * (np.pi / 2 if rng.random() < 0.3 else rng.uniform(0.25, 1.2))
+            far *= rng.uniform(0.2, 1.0)
+        stop = start + np.array([far * np.cos(angle), far * np.sin(angle), spin])
         placed = outlines(outline, stop[None])
         if not apart(placed, low, APART_M) or not apart(placed, zones, 0.0):
             continue
@@ -130,17 +137,6 @@ def _drawn_slide(plan: Plan, house: House, world: World, rng: np.random.Generato
             if free > BODY_M and reached and _keeps_floor_reachable(house, world, movable, choice.stop, end):
                 return choice
     return None
-
-
-def _drawn_stop(movable: Movable, start: Float[np.ndarray, "3"], rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """A new place, mostly displaced along the object's own axes, now and then turned."""
-    along = rng.choice(4) * np.pi / 2 + start[2] if rng.random() < 0.7 else rng.uniform(-np.pi, np.pi)
-    angle = along + rng.normal(0.0, 0.15)
-    far, spin = rng.uniform(*FAR_M[movable.category]), 0.0
-    if rng.random() < TURN_SHARE:
-        spin = rng.choice([-1.0, 1.0]) * (np.pi / 2 if rng.random() < 0.3 else rng.uniform(0.25, 1.2))
-        far *= rng.uniform(0.2, 1.0)
-    return start + np.array([far * np.cos(angle), far * np.sin(angle), spin])
 
 
 def _drawn_errand(plan: Plan, house: House, world: World, rng: np.random.Generator, movable: Movable) -> Errand | None:

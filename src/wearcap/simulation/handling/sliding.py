@@ -104,20 +104,14 @@ def slide_options(
             weight = 1.0 if both else {"chair": 1.5, "table": 0.5}.get(movable.category, 0.25)
             found.append((rng.exponential(1.0) / ((0.25 if aside else 1.0) * weight), rail, both, angle))
     for _, rail, both, angle in sorted(found, key=lambda option: option[0]):
-        yield _drawn(plan, movable, start, stop, rail, both, angle, rng)
+        yield _drawn(plan, movable, np.stack([start, stop]), rail, both, angle, rng)
 
 
 def _drawn(
-    plan: Plan,
-    movable: Movable,
-    start: np.ndarray,
-    stop: np.ndarray,
-    rail: Rail,
-    both: bool,
-    angle: float,
-    rng: np.random.Generator,
+    plan: Plan, movable: Movable, ends: np.ndarray, rail: Rail, both: bool, angle: float, rng: np.random.Generator
 ) -> Slide:
     """Draw the remaining choices: hands and their places, tempo, pause, distance."""
+    start, stop = ends
     change = stop - start
     length, turned = float(np.linalg.norm(change[:2])), abs(change[2])
     speed = rng.uniform(*SPEEDS[movable.category]) * plan.style.briskness**0.5

@@ -159,7 +159,7 @@ def _hold_up(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
 
 
 @use_of("suitcase", "backpack")
-def _swing(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
+def _swing_about(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Let the object that hangs from the hand swing forwards and back."""
     x, y, z = (held.carry[:3] / held.reach).tolist()
     time, size, sign = plan.time + 0.1, rng.uniform(0.12, 0.25), 1.0

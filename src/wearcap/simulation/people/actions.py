@@ -96,11 +96,7 @@ def path_length(path: Float[np.ndarray, "waypoint 3"]) -> float:
 
 
 def approach(
-    plan: Plan,
-    world: World,
-    rng: np.random.Generator,
-    goal: Float[np.ndarray, "3"] | None,
-    heading: float | None = None,
+    plan: Plan, world: World, rng: np.random.Generator, goal: np.ndarray | None, heading: float | None = None
 ) -> bool:
     """Walk to a floor point (m; a free one when None) and turn there to a heading (rad); False without a path."""
     goal = _free_point(world, rng, float(plan.position[2])) if goal is None else goal
@@ -111,13 +107,7 @@ def approach(
     return True
 
 
-def follow(
-    plan: Plan,
-    world: World,
-    rng: np.random.Generator,
-    path: Float[np.ndarray, "waypoint 3"],
-    heading: float | None = None,
-) -> None:
+def follow(plan: Plan, world: World, rng: np.random.Generator, path: np.ndarray, heading: float | None = None) -> None:
     """Walk along a path that `World.plan_path` found and turn to a heading (rad) at its end."""
     start = plan.time
     if path_length(path) > 0.25:
@@ -249,7 +239,7 @@ def _gesture(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 
 
 @activity("carry", weight=1.5)
-def _carry(plan: Plan, world: World, rng: np.random.Generator) -> bool:
+def _carry_along(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Walk to another place with an object in the hands."""
     start = plan.time
     if not approach(plan, world, rng, None):

@@ -44,15 +44,11 @@ def turn_head(plan: Plan, start_s: float, yaw: float = 0.0, pitch: float | None 
 
 
 def look_at(
-    plan: Plan,
-    point: Float[np.ndarray, "3"],
-    turn: tuple[float, float],
-    leave: tuple[float, float],
-    weight: float = 0.9,
+    plan: Plan, point: Float[np.ndarray, "3"], on: tuple[float, float], off: tuple[float, float], weight: float = 0.9
 ) -> None:
     """Turn the gaze to a point in the world (m) in one interval of time and off it in another (s)."""
-    plan.gaze_point.move(turn[0], turn[0], point)
-    plan.gaze_weight.visit(weight, turn, leave)
+    plan.gaze_point.move(on[0], on[0], point)
+    plan.gaze_weight.visit(weight, on, off)
 
 
 def head_angles(
