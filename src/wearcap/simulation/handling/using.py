@@ -245,7 +245,7 @@ def _sway(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
 
 
 def _watch(plan: Plan, held: HeldObject, at: tuple[float, float, float], start_s: float, stop_s: float) -> None:
-    """Look at the working hands: a place given as in `Held.go`."""
+    """Look at the working hands: a place given as in `HeldObject.go`."""
     shoulder = shoulder_of(plan)
     ahead, out, up = held.reach * np.array(at)
     aside = held.choice.sign * (out + (0.0 if held.choice.side is None else shoulder[1]))
