@@ -7,7 +7,7 @@ from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry import rotation
 from wearcap.recording.motion import Motion
-from wearcap.simulation.people.comfort import forearm_and_wrist
+from wearcap.simulation.people.arms import forearm_and_wrist
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import SIDES, Plan
 from wearcap.simulation.people.wearer import SimulatedMotion, perform
@@ -27,7 +27,7 @@ def level_world() -> World:
 
 
 def plan_at(person: Person, world: World, x: float, y: float, heading: float) -> Plan:
-    plan = Plan(person.skeleton, person.style, np.array([x, y, 0.0]), heading, world.floor_height)
+    plan = Plan(person, np.array([x, y, 0.0]), heading, world.floor_height)
     plan.time = 0.4
     return plan
 

@@ -5,10 +5,7 @@ import pytest
 import torch
 from handled import assert_natural, level_world, palm_errors, performed, plan_at
 
-from wearcap.geometry import rotation
-from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory
-from wearcap.simulation.handling.grips import Grip, GripPlace, drawn_grip, following, still
+from wearcap.simulation.handling.grips import Grip, GripPlace, drawn_grip, still
 from wearcap.simulation.people.person import draw_person
 from wearcap.simulation.places.movables import floor_pose
 
@@ -71,11 +68,3 @@ def test_one_thing_after_the_other(floor, person):
     simulated = performed(plan, floor, rng)
     assert palm_errors(plan, simulated.motion).max() < 0.002
     assert_natural(simulated)
-
-
-def test_following_a_trajectory_rests_at_its_ends():
-    times = torch.linspace(1.0, 2.0, 11, dtype=torch.float64)
-    track = Trajectory(times, rotation.about_axis("z", times), torch.stack([times, times, times], -1))
-    pose = following(track)(np.array([0.0, 1.5, 3.0]), Rigid.identity(3))
-    assert torch.allclose(pose.t[:, 0], torch.tensor([1.0, 1.5, 2.0], dtype=torch.float64))
-    assert torch.allclose(rotation.yaw_of(pose.R), torch.tensor([1.0, 1.5, 2.0], dtype=torch.float64))

@@ -8,8 +8,8 @@ import pytest
 import torch
 from handled import assert_natural, level_world, palm_errors, performed, plan_at
 
-from wearcap.simulation.handling.handlings import object_motion
-from wearcap.simulation.handling.holding import put_down, take_options, take_up
+from wearcap.simulation.handling.grips import object_motion
+from wearcap.simulation.handling.holding import lift, put_down, take_options
 from wearcap.simulation.handling.using import use
 from wearcap.simulation.people.person import draw_person
 from wearcap.simulation.people.walking import walk_along
@@ -58,7 +58,7 @@ def handled(floor, category, seed, hands=None):
     turned = float(choice.stand[2])
     choice = replace(choice, stop=np.array([1.4 * np.cos(turned), 1.4 * np.sin(turned), START[2], 0.0]))
     plan = plan_at(person, floor, *choice.stand)
-    held = take_up(plan, choice, rng)
+    held = lift(plan, choice, rng)
     use(plan, held, rng)
     walk_along(plan, np.stack([plan.position, [*choice.goal[:2], 0.0]]), rng, 1.0)
     handling = put_down(plan, held, rng)

@@ -6,9 +6,9 @@ import torch
 from handled import assert_natural, level_world, palm_errors, performed, plan_at
 
 from wearcap.geometry import rotation
-from wearcap.simulation.handling.carrying import carry_options, lift, put_down
 from wearcap.simulation.handling.distractors import bend_over, gesture_at, hover, squat_by
-from wearcap.simulation.handling.handlings import hand_rows, interactions_of, object_motion
+from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, object_motion, still
+from wearcap.simulation.handling.holding import carry_options, lift, put_down
 from wearcap.simulation.handling.sliding import slide, slide_options
 from wearcap.simulation.people.person import draw_person
 from wearcap.simulation.people.plan import SIDES
@@ -49,8 +49,9 @@ def test_a_thing_goes_where_it_should_with_the_hands_on_it(floor, category, targ
     assert (track.t_world_body[-1, :2] - torch.tensor(target[:2])).abs().max() < 1e-4
     assert rotation.yaw_of(track.R_world_body)[-1].item() == pytest.approx(target[2], abs=1e-4)
     moving = track.t_world_body.diff(dim=0).norm(dim=-1) > 1e-5
-    held = interactions_of([handling]).hand_contact(simulated.motion.timestamps)
-    assert held[1:][moving].any(1).all(), "it moves only while it is held"
+    times = simulated.motion.timestamps
+    held = torch.stack([(times >= start) & (times < stop) for start, stop, _ in handling.rows]).any(0)
+    assert held[1:][moving].all(), "it moves only while it is held"
     half_deep, half_wide = choice.movable.half_size
     for frame in range(0, len(track), 5):
         x, y, _ = track.t_world_body[frame].tolist()
@@ -72,13 +73,17 @@ def test_one_hand_only_translates(floor):
 
 
 def test_rows_are_split_where_the_hands_change():
-    rows = hand_rows([("left", 1.0, 4.0), ("right", 2.0, 6.0), ("left", 7.0, 8.0)])
-    assert rows == [
+    place, moves = GripPlace((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)), still(floor_pose(np.zeros(3)))
+    held = (("left", 1.0, 4.0), ("right", 2.0, 6.0), ("left", 7.0, 8.0))
+    grips = [(side, Grip(place, moves, start, stop)) for side, start, stop in held]
+    handling = Handling.of("box_1", "sliding", moves, grips)
+    assert handling.rows == (
         (1.0, 2.0, (True, False)),
         (2.0, 4.0, (True, True)),
         (4.0, 6.0, (False, True)),
         (7.0, 8.0, (True, False)),
-    ]
+    )
+    assert (handling.start_s, handling.stop_s) == (1.0, 8.0)
 
 
 def test_a_box_is_lifted_carried_and_put_down(floor):

@@ -8,7 +8,7 @@ import torch
 
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
-from wearcap.simulation.handling.handlings import Handling
+from wearcap.simulation.handling.grips import Handling
 from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.household import HANDHELD, VARIED, Household
 from wearcap.simulation.places.movables import HANDHELDS
@@ -88,7 +88,7 @@ def test_what_was_held_less_is_gone_for_more():
     household = Household(house, person_of("val", 1), np.random.default_rng(0), VARIED)
     before = household._weight("ball")
     moves = lambda times, chest: house.poses["ball_1"]  # noqa: E731
-    house.handlings.append(Handling("ball_1", "sliding", moves, 0.0, 20.0, ((0.0, 20.0, (True, True)),)))
+    house.handlings.append(Handling("ball_1", "sliding", moves, ((0.0, 20.0, (True, True)),)))
     assert household._weight("ball") < 0.3 * before
 
 

@@ -25,7 +25,7 @@ def opened_and_closed(category, handle, person, seeds=range(8)):
         for item in (item for item in flat.openables if item.category == category and item.closed == 0.0):
             out = -(item.pose(0.0).R.numpy() @ np.array(item.handles[handle].fingers))[:2]
             start = item.handle(handle, np.array(0.0))[:2] + 0.8 * out / np.linalg.norm(out)
-            plan = Plan(person.skeleton, person.style, np.array([*start, 0.0]), 0.0, flat.static.floor_height)
+            plan = Plan(person, np.array([*start, 0.0]), 0.0, flat.static.floor_height)
             plan.time = 0.3
             if not operate(plan, house, rng, item, 0.85 * item.opened, handle):
                 continue

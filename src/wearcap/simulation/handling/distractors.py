@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.handling.carrying import bend_for, bow, spread
-from wearcap.simulation.handling.grips import GripPlace, drawn_grip, still
-from wearcap.simulation.people.gaze import look_about
-from wearcap.simulation.people.hands import ON_THIGHS, hold
+from wearcap.simulation.handling.grips import GripPlace, Vector, drawn_grip, still, vector
+from wearcap.simulation.handling.holding import bend_for, bow, spread
+from wearcap.simulation.people.actions import ON_THIGHS, hold, squat
+from wearcap.simulation.people.gaze import look_about, look_at
 from wearcap.simulation.people.plan import SIDES, Plan
 
 SHORT_M = (0.05, 0.20)
@@ -21,35 +21,46 @@ LOW_M, HOVER_LOW_M = 0.60, 0.18
 """Height of places below which one bends down, and the hands' distance then, beside the object."""
 
 
-def hover(
-    plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, rng: np.random.Generator, gaze: bool = True
+def pretend_to_handle(
+    plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, height_m: float, rng: np.random.Generator
 ) -> None:
+    """One of the acts that resemble handling, in front of an object of a height."""
+    low = float(T_world_object.t[2]) + height_m < 0.95
+    chance = rng.random()
+    if low and chance < 0.18:
+        bend_over(plan, T_world_object, height_m, rng)
+    elif low and chance < 0.32:
+        squat_by(plan, T_world_object, height_m, rng)
+    elif chance < 0.45:
+        gesture_at(plan, T_world_object, height_m, rng)
+    elif chance < 0.55:  # linger
+        stop = plan.time + rng.uniform(1.0, 3.5)
+        look_about(plan, plan.time, stop, rng, spread=0.4)
+        plan.time = stop
+    else:
+        hover(plan, places, T_world_object, rng)
+
+
+def hover(plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, rng: np.random.Generator) -> None:
     """Reach for places on an object as if to take hold, stop short of them, stay a while, and draw back.
 
     `places` is by hand, in the object's axes; they must be within reach of the standing wearer.
     """
-    start = plan.time + 0.1
+    start, briskness = plan.time + 0.1, plan.style.briskness
     first = next(iter(places.values()))
     low = float((T_world_object.R.double() @ torch.tensor(first.point).double() + T_world_object.t)[2])
     crouch, lean = bend_for(plan, low - float(plan.position[2]), rng) if low < LOW_M else (0.0, 0.0)
-    out = float(np.clip(rng.normal(0.8, 0.18) + crouch, 0.45, 1.6)) / plan.style.briskness
+    out = float(np.clip(rng.normal(0.8, 0.18) + crouch, 0.45, 1.6)) / briskness
     touch = start + out
-    leave = touch + float(rng.uniform(0.2, 2.2))
-    gap = float(rng.uniform(*SHORT_M)) * (0.5 if crouch > 0 else 1.0)
+    leave = touch + rng.uniform(0.2, 2.2)
+    gap = rng.uniform(*SHORT_M) * (0.5 if crouch > 0 else 1.0)
     lean = lean or float(np.clip(rng.normal(0.2, 0.1), 0.0, 0.5))
     stop = leave
     for side, place in places.items():
         point = np.array(place.point) + gap * np.array(place.normal) - rng.uniform(0.0, 0.05) * np.array(place.fingers)
-        x, y, z = (float(v) for v in point + 0.02 * rng.standard_normal(3))
-        late = float(rng.uniform(0.0, 0.3))
-        grip = drawn_grip(
-            replace(place, point=(x, y, z)),
-            still(T_world_object),
-            touch + late,
-            leave + late,
-            rng,
-            plan.style.briskness,
-        )
+        short = replace(place, point=vector(point + 0.02 * rng.standard_normal(3)))
+        late = rng.uniform(0.0, 0.3)
+        grip = drawn_grip(short, still(T_world_object), touch + late, leave + late, rng, briskness)
         if crouch > 0 or grip.start_s < plan.time:
             grip = replace(grip, reach_s=grip.touch_s - start)
         if crouch > 0:
@@ -60,31 +71,23 @@ def hover(
         spread(plan, (start, start + 0.45 * out), (leave, stop))
     bow(plan, start, touch, crouch, lean)
     bow(plan, leave, stop, 0.0, 0.0)
-    if gaze:
-        _look(plan, T_world_object, first.point, start, leave)
+    _look(plan, T_world_object, first.point, start, leave)
     plan.time = stop
 
 
 def gesture_at(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
     """Gesture about an object of a height (m), looking at it now and then."""
-    start, stop = plan.time, plan.time + float(rng.uniform(2.5, 6.0))
+    start, stop = plan.time, plan.time + rng.uniform(2.5, 6.0)
     for side in SIDES if rng.random() < 0.5 else (str(rng.choice(SIDES)),):
-        hand, time, first = plan.hands[side], start + float(rng.uniform(0.1, 0.6)), True
+        hand, time, first = plan.hands[side], start + rng.uniform(0.1, 0.6), True
         while time < stop - 1.4:
-            ahead = float(rng.normal(0.62, 0.14))
-            pose = [
-                ahead,
-                rng.normal(-0.02, 0.16),
-                rng.normal(-0.42, 0.15),
-                0.4,
-                rng.normal(-0.2, 0.4),
-                rng.normal(0.15, 0.15),
-            ]
-            beat = 0.7 if first else float(rng.uniform(0.4, 0.9))
+            ahead, aside, up = rng.normal((0.62, -0.02, -0.42), (0.14, 0.16, 0.15))
+            pose = [ahead, aside, up, 0.4, rng.normal(-0.2, 0.4), rng.normal(0.15, 0.15)]
+            beat = 0.7 if first else rng.uniform(0.4, 0.9)
             hand.pose.move(time, time if first else time + beat, pose)
             if first:
                 hand.pose_weight.move(time, time + beat, 1.0)
-            first, time = False, time + beat + float(rng.exponential(0.5))
+            first, time = False, time + beat + rng.exponential(0.5)
         if not first:
             hand.pose_weight.move(stop - 0.9, stop, 0.0)
     if rng.random() < 0.7:
@@ -95,13 +98,12 @@ def gesture_at(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.
 def bend_over(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
     """Lean over an object to look at it, hands hanging, on the back or on the thighs."""
     start = plan.time + 0.1
-    down = float(rng.uniform(0.8, 1.3)) / plan.style.briskness
-    leave = start + down + float(rng.uniform(0.6, 3.0))
-    lean = float(rng.uniform(0.35, 0.8))
-    plan.lean.move(start, start + down, (lean, float(rng.normal(0.0, 0.08)), float(rng.normal(0.0, 0.12))))
-    plan.lean.move(leave, leave + 1.1 * down, 0.0)
-    plan.crouch.move(start, start + down, float(rng.uniform(0.0, 0.08)))
-    plan.crouch.move(leave, leave + 1.1 * down, 0.0)
+    down = rng.uniform(0.8, 1.3) / plan.style.briskness
+    leave = start + down + rng.uniform(0.6, 3.0)
+    lean = rng.uniform(0.35, 0.8)
+    out, back = (start, start + down), (leave, leave + 1.1 * down)
+    plan.lean.visit((lean, rng.normal(0.0, 0.08), rng.normal(0.0, 0.12)), out, back)
+    plan.crouch.visit(rng.uniform(0.0, 0.08), out, back)
     if rng.random() < 0.5:
         hold(plan, SIDES, ON_THIGHS, start, leave + down, rng)
     _look(plan, T_world_object, (0.0, 0.0, 0.6 * height), start, leave)
@@ -111,35 +113,18 @@ def bend_over(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.G
 def squat_by(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
     """Squat in front of a low object as if to lift it, hands on the thighs or before the knees, and get up again."""
     start = plan.time + 0.1
-    depth = float(rng.uniform(0.24, 0.42)) * plan.hip_height
-    down = (0.7 + 1.1 * depth) * float(rng.uniform(0.9, 1.3)) / plan.style.briskness
-    leave = start + down + float(rng.uniform(0.4, 2.5))
-    up = down * float(rng.uniform(1.0, 1.25))
-    plan.crouch.move(start, start + down, depth)
-    plan.crouch.move(leave, leave + up, 0.0)
-    plan.lean.move(
-        start, start + down, (float(rng.uniform(0.3, 0.55)) + 0.5 * depth, 0.0, float(rng.normal(0.0, 0.08)))
-    )
-    plan.lean.move(leave, leave + up, 0.0)
-    if depth > 0.3 * plan.hip_height:
-        for side in SIDES:
-            plan.heel_lift[side].move(start + 0.3 * down, start + down, 0.35)
-            plan.heel_lift[side].move(leave, leave + 0.6 * up, 0.0)
-    before = (0.42, float(rng.uniform(-0.05, 0.25)), float(rng.uniform(-0.75, -0.55)), 0.3, 0.2, 0.1)
+    depth = rng.uniform(0.24, 0.42) * plan.hip_height
+    down = (0.7 + 1.1 * depth) * rng.uniform(0.9, 1.3) / plan.style.briskness
+    leave = start + down + rng.uniform(0.4, 2.5)
+    up = down * rng.uniform(1.0, 1.25)
+    squat(plan, rng, depth, rng.uniform(0.3, 0.55) + 0.5 * depth, (start, down), (leave, up))
+    before = (0.42, rng.uniform(-0.05, 0.25), rng.uniform(-0.75, -0.55), 0.3, 0.2, 0.1)
     hold(plan, SIDES, ON_THIGHS if rng.random() < 0.5 else before, start, leave + 0.8 * up, rng)
     _look(plan, T_world_object, (0.0, 0.0, 0.6 * height), start, leave)
     plan.time = leave + up + 0.1
 
 
-def linger(plan: Plan, rng: np.random.Generator) -> None:
-    """Stand close to an object, looking about."""
-    stop = plan.time + float(rng.uniform(1.0, 3.5))
-    look_about(plan, plan.time, stop, rng, spread=0.4)
-    plan.time = stop
-
-
-def _look(plan: Plan, T_world_object: Rigid, local: tuple[float, float, float], start: float, stop: float) -> None:
+def _look(plan: Plan, T_world_object: Rigid, local: Vector, start: float, stop: float) -> None:
+    """Look at a point in an object's axes (m) between two times (s)."""
     point = T_world_object.R.double().numpy() @ np.array(local) + T_world_object.t.double().numpy()
-    plan.gaze_point.move(start, start, point)
-    plan.gaze_weight.move(start, start + 0.5, 0.85)
-    plan.gaze_weight.move(stop, stop + 0.6, 0.0)
+    look_at(plan, point, (start, start + 0.5), (stop, stop + 0.6), 0.85)

@@ -1,7 +1,8 @@
-"""Grips: a hand that holds an object from one time to another, however the object moves."""
+"""Grips: a hand that holds an object from one time to another, however the object moves, and what they make of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -10,7 +11,8 @@ from torch import Tensor
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import exp
-from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording.motion import Motion
 from wearcap.simulation.people.track import ease
 
 Vector = tuple[float, float, float]
@@ -107,7 +109,7 @@ def drawn_grip(
 ) -> Grip:
     """A grip with random durations of approach and return (0.4–1.2 s each) and hover distance."""
     there, back = (float(np.clip(rng.normal(0.75, 0.15) / briskness, 0.4, 1.2)) for _ in range(2))
-    return Grip(place, moves, touch_s, release_s, there, back, float(rng.uniform(0.04, 0.09)))
+    return Grip(place, moves, touch_s, release_s, there, back, rng.uniform(0.04, 0.09))
 
 
 def still(T_world_object: Rigid) -> Moves:
@@ -117,8 +119,51 @@ def still(T_world_object: Rigid) -> Moves:
     )
 
 
-def following(trajectory: Trajectory) -> Moves:
-    """Motion of an object along a given trajectory; it is static before its start and after its end."""
-    first, last = trajectory.timestamps[0].item(), trajectory.timestamps[-1].item()
-    track = Trajectory(trajectory.timestamps, trajectory.R_world_body.double(), trajectory.t_world_body.double())
-    return lambda times, chest: resample(track, torch.from_numpy(np.clip(times, first, last))).T_world_body
+@dataclass(frozen=True)
+class Handling:
+    """One object's handling from the first touch to the last release, and its motion meanwhile."""
+
+    name: str
+    contact_class: str
+    moves: Moves
+    rows: tuple[tuple[float, float, tuple[bool, bool]], ...]
+    """Intervals (s) with a fixed set of holding hands, one flag for each of `HANDS`."""
+
+    @classmethod
+    def of(cls, name: str, contact_class: str, moves: Moves, grips: Sequence[tuple[str, Grip]]) -> "Handling":
+        """A handling from its grips (side, grip): rows are split where the set of holding hands changes."""
+        rows = []
+        for start, stop in pairwise(sorted({time for _, grip in grips for time in (grip.touch_s, grip.release_s)})):
+            middle = (start + stop) / 2
+            hands = {side for side, grip in grips if grip.touch_s <= middle < grip.release_s}
+            if hands:
+                rows.append((start, stop, ("left" in hands, "right" in hands)))
+        return cls(name, contact_class, moves, tuple(rows))
+
+    @property
+    def start_s(self) -> float:
+        return self.rows[0][0]
+
+    @property
+    def stop_s(self) -> float:
+        return self.rows[-1][1]
+
+
+def object_motion(T_world_object: Rigid, handlings: Sequence[Handling], motion: Motion) -> Trajectory:
+    """Poses of an object on a motion's timestamps: as its handlings move it, static between them.
+
+    `handlings` are those of this one object; `T_world_object` is its initial pose; `motion` is the wearer's, whose
+    chest carried objects follow.
+    """
+    times, chest = motion.timestamps.numpy(), motion.joint("t8").to(torch.float64)
+    R = T_world_object.R.double().repeat(len(times), 1, 1)
+    t = T_world_object.t.double().repeat(len(times), 1)
+    for handling in sorted(handlings, key=lambda handling: handling.start_s):
+        first, last = np.searchsorted(times, (handling.start_s, handling.stop_s)).tolist()
+        if first >= len(times):
+            continue
+        last = max(last, first + 1)
+        pose = handling.moves(times[first:last], chest[first:last])
+        R[first:last], t[first:last] = pose.R, pose.t
+        R[last:], t[last:] = pose.R[-1], pose.t[-1]
+    return Trajectory(motion.timestamps, R.float(), t.float())

@@ -1,6 +1,5 @@
-"""The current state of an interactive flat: where every object stands, and the handlings so far."""
+"""The current state of an interactive flat: where every object stands, what it keeps free, and the handlings so far."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,18 +8,17 @@ from jaxtyping import Float
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.recording.motion import Motion
-from wearcap.simulation.handling.grips import GripPlace
-from wearcap.simulation.handling.handlings import Handling, interactions_of, object_motion
-from wearcap.simulation.people.plan import Plan
+from wearcap.simulation.handling.grips import Handling, object_motion
 from wearcap.simulation.places.interactive_flat import InteractiveFlat, obstacle
 from wearcap.simulation.places.movables import Movable
-from wearcap.simulation.places.openables import Openable
 from wearcap.simulation.places.world import World, WorldObject
 
-Distractor = Callable[[Plan, dict[str, GripPlace], Rigid, float, np.random.Generator], None]
-"""An act that resembles handling an object: given places for the hands, the object's pose and its height (m)."""
+NEAR_WALKABLE_M = 0.3
+"""Distance from the walkable floor within which seats and reach targets can be used."""
+BEFORE_M = 0.45
+"""Depth kept free in front of openables, beyond their sweep."""
 
 
 @dataclass
@@ -39,20 +37,21 @@ class House:
         self.values = {item.name: 0.0 for item in self.flat.openables}
         self.poses = {item.name: item.object.T_world_object.to(torch.float64) for item in self.flat.movables}
 
-    def pose(self, item: Movable | Openable) -> Rigid:
-        """Pose of an object at the end of the plan."""
-        return item.pose(self.values[item.name]) if isinstance(item, Openable) else self.poses[item.name]
-
     def obstacles(self, without: tuple[str, ...] = ()) -> tuple[WorldObject, ...]:
         """Everything that can be moved, at its current place."""
-        items = (*self.flat.movables, *self.flat.openables)
-        return tuple(obstacle(item, self.pose(item)) for item in items if item.name not in without)
+        poses = [(item, self.poses[item.name]) for item in self.flat.movables]
+        poses += [(item, item.pose(self.values[item.name])) for item in self.flat.openables]
+        return tuple(obstacle(item, pose) for item, pose in poses if item.name not in without)
 
     def world(self, around: Float[np.ndarray, "3"], without: tuple[str, ...] = ()) -> World:
         """The flat's current state, walkable where one gets to from a floor point (m); seats are the fixed ones."""
         static, extra = self.flat.static, self.obstacles(without)
         grid = static.navigation.barred(extra, around)
-        near = lambda point: _beside(grid.node_points, np.array(point))  # noqa: E731
+
+        def near(point) -> bool:
+            away = np.linalg.norm(grid.node_points[:, :2] - np.array(point)[:2], axis=1)
+            return bool((away < NEAR_WALKABLE_M).any())
+
         now = replace(
             static,
             objects=(*static.objects, *extra),
@@ -62,17 +61,39 @@ class House:
         now.__dict__["navigation"] = grid
         return now
 
+    def floor_place(self, movable: Movable) -> Float[np.ndarray, "3"]:
+        """Floor pose of an object: x, y (m) and heading (rad)."""
+        pose = self.poses[movable.name]
+        return np.array([*pose.t[:2].tolist(), float(np.arctan2(pose.R[1, 0], pose.R[0, 0]))])
+
+    def kept_free(self) -> list[Float[np.ndarray, "4 2"]]:
+        """Outlines of the floor before doors, windows and cabinets, and behind doors."""
+        zones = []
+        for item in self.flat.openables:
+            if item.hinged:  # a square over the leaf's quarter circle
+                width, sign = float(item.outline[:, 0].max()), item.opening_sign
+                behind = -0.9 if item.category == "door" else 0.0
+                low, high = sorted((sign * (width + 0.1), sign * behind))
+                pose, depth = item.pose(item.closed), width + BEFORE_M
+            else:
+                high = float(item.outline[:, 1].max())
+                low, pose, depth = -high, item.object.T_world_object, abs(item.opened - item.closed) + BEFORE_M
+            corners = np.array([[0.0, low], [depth, low], [depth, high], [0.0, high]])
+            zones.append(corners @ pose.R[:2, :2].double().numpy().T + pose.t[:2].double().numpy())
+        return zones
+
     def interactions(self, until_s: float) -> Interactions:
-        """Intervals in which hands hold objects, up to the end of a recording (s)."""
-        rows = interactions_of(self.handlings)
-        kept = torch.nonzero(rows.start_s < until_s)[:, 0]
-        pick = lambda names: tuple(names[k] for k in kept.tolist())  # noqa: E731
+        """Intervals in which hands hold objects, ordered by their start, up to the end of a recording (s)."""
+        rows = sorted(
+            ((row, handling) for handling in self.handlings for row in handling.rows if row[0] < until_s),
+            key=lambda pair: pair[0][:2],
+        )
         return Interactions(
-            rows.start_s[kept],
-            rows.stop_s[kept].clamp(max=until_s),
-            rows.hands[kept],
-            pick(rows.objects),
-            pick(rows.classes),
+            torch.tensor([row[0] for row, _ in rows], dtype=torch.float64),
+            torch.tensor([min(row[1], until_s) for row, _ in rows], dtype=torch.float64),
+            torch.tensor([row[2] for row, _ in rows], dtype=torch.bool).reshape(-1, len(HANDS)),
+            tuple(handling.name for _, handling in rows),
+            tuple(handling.contact_class for _, handling in rows),
         )
 
     def object_motion(self, motion: Motion) -> dict[str, Trajectory]:
@@ -83,7 +104,3 @@ class House:
             )
             for item in (*self.flat.movables, *self.flat.openables)
         }
-
-
-def _beside(points: Float[np.ndarray, "node 3"], point: Float[np.ndarray, "3"], within_m: float = 0.3) -> bool:
-    return bool(len(points)) and float(np.linalg.norm(points[:, :2] - point[:2], axis=1).min()) < within_m

@@ -7,30 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.handling.distractors import bend_over, gesture_at, hover, linger, squat_by
-from wearcap.simulation.handling.grips import GripPlace
-from wearcap.simulation.handling.house import Distractor, House
+from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.opening import operate
-from wearcap.simulation.handling.rearranging import fetch, floor_place, rearrange, relocate
+from wearcap.simulation.handling.rearranging import rearrange, relocate
 from wearcap.simulation.people.actions import ACTIVITIES, follow, start_place
+from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import Plan
-from wearcap.simulation.people.wearer import TAIL_S, Wearer
+from wearcap.simulation.people.wearer import TAIL_S
 from wearcap.simulation.places.movables import Movable
 from wearcap.simulation.places.openables import Openable
 from wearcap.simulation.places.outline import distance_to_convex
 
-WEIGHTS = {
-    "door": 1.5,
-    "window": 2.2,
-    "drawer": 2.2,
-    "cabinet_door": 1.8,
-    "sofa": 2.5,
-    "table": 1.2,
-    "chair": 1.2,
-    "box": 0.8,
-}
-"""Weight of each category in the choice of the next object."""
 HANDHELD = ("suitcase", "backpack", "bottle", "tool", "ball")
 """Categories that are used while they are carried."""
 EVEN_S = 4.0
@@ -38,8 +25,6 @@ EVEN_S = 4.0
 AGAIN, ROOM = 0.25, 0.10
 """Probability of using the last object again, and of moving several objects of one room."""
 TRIES = 5
-DISTRACTOR_SHARE = 0.14
-"""Probability of an act in front of an object without touching it."""
 ORDINARY = ("stand", "look_around", "turn", "walk", "hold", "gesture", "carry", "reach", "sit", "crouch")
 CLOSE_BEHIND = 0.35
 """Probability of closing a door after walking through."""
@@ -48,7 +33,6 @@ PARTLY = 0.25
 BEYOND_M = 0.95
 """Distance behind a door to which one walks through it."""
 REACHED_M = 0.4
-NEAR_M = 2.5
 IN_ROOM, SAME_ROOM_M = 4, 3.5
 """Most objects that are moved when a room is rearranged, and their largest distance from the first."""
 
@@ -65,13 +49,19 @@ class Habits:
     """Whether kinds that were held less so far are preferred."""
     again: float = AGAIN
     """Probability of using the last object again, unless it was in the hands for long."""
-    near_m: float = NEAR_M
+    near_m: float = 2.5
     """Distance per factor 1/e in the probability of an object's choice."""
-    distractor_share: float = DISTRACTOR_SHARE
+    distractor_share: float = 0.14
     """Probability of an act in front of an object without touching it."""
 
 
-USUAL = Habits(WEIGHTS, 0.42)
+USUAL = Habits(
+    {
+        "door": 1.5, "window": 2.2, "drawer": 2.2, "cabinet_door": 1.8, "sofa": 2.5, "table": 1.2, "chair": 1.2,
+        "box": 0.8,
+    },
+    0.42,
+)  # fmt: skip
 VARIED = Habits(
     {
         "door": 3.0, "window": 4.4, "drawer": 4.4, "cabinet_door": 4.6, "sofa": 4.5, "table": 2.6, "chair": 2.4,
@@ -82,37 +72,20 @@ VARIED = Habits(
 """Every kind is held for a fair share of the time, hand-held objects for about half of it."""
 
 
-def pretend_to_handle(
-    plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, height_m: float, rng: np.random.Generator
-) -> None:
-    """One of the acts that resemble handling, in front of an object of a height."""
-    low = float(T_world_object.t[2]) + height_m < 0.95
-    chance = rng.random()
-    if low and chance < 0.18:
-        bend_over(plan, T_world_object, height_m, rng)
-    elif low and chance < 0.32:
-        squat_by(plan, T_world_object, height_m, rng)
-    elif chance < 0.45:
-        gesture_at(plan, T_world_object, height_m, rng)
-    elif chance < 0.55:
-        linger(plan, rng)
-    else:
-        hover(plan, places, T_world_object, rng)
-
-
 class Household:
     """Plans one activity after the other; the house's state changes with it."""
 
-    def __init__(self, house: House, person: Wearer, rng: np.random.Generator, habits: Habits = USUAL):
+    def __init__(self, house: House, person: Person, rng: np.random.Generator, habits: Habits = USUAL):
         self.house, self.rng, self.habits = house, rng, habits
         static = house.flat.static
         worlds = [house.world(point) for point in static.sample_floor(rng, 6)]
         largest = max(worlds, key=lambda world: int(world.navigation.walkable.sum()))
         position, heading = start_place(largest, rng)
-        self.plan = Plan(person.skeleton, person.style, position, heading, static.floor_height)
+        self.plan = Plan(person, position, heading, static.floor_height)
         self.plan.time = 0.3
         self.openables = {item.name: item for item in house.flat.openables}
         self.movables = {item.name: item for item in house.flat.movables}
+        self.items: dict[str, Movable | Openable] = self.openables | self.movables
         self.last: str | None = None
 
     def live(self, duration_s: float) -> None:
@@ -140,13 +113,14 @@ class Household:
     def interact(self) -> str:
         """Use an object, after passing the doors on the path; "stand" where nothing could be done."""
         chance = self.rng.random()
-        again = self.habits.again if self._kind(self.last) not in HANDHELD else AGAIN
+        held = self.last is not None and self.items[self.last].category in HANDHELD
+        again = AGAIN if held else self.habits.again
         if chance < again and self.last is not None and (done := self.use(self.last)) != "stand":
             return done
         if chance > 1.0 - ROOM:
             return self.rearrange_room()
         for _ in range(TRIES):
-            if (done := self.use(self._drawn(self.openables | self.movables))) != "stand":
+            if (done := self.use(self._drawn(self.items))) != "stand":
                 return done
         return "stand"
 
@@ -158,16 +132,14 @@ class Household:
         if not done:
             return "walk" if self.plan.time > start else "stand"
         self.last = name
-        verb = "move" if name in self.movables else "turn"
-        return f"{verb} {(self.openables | self.movables)[name].category}"
+        return f"{'move' if name in self.movables else 'turn'} {self.items[name].category}"
 
     def _act(self, name: str) -> bool:
-        distractor = pretend_to_handle if self.rng.random() < self.habits.distractor_share else None
+        pretend = self.rng.random() < self.habits.distractor_share
         if name in self.openables:
-            return self.turn(self.openables[name], distractor)
-        movable = self.movables[name]
-        act = {"box": relocate, **dict.fromkeys(HANDHELD, fetch)}.get(movable.category, rearrange)
-        return act(self.plan, self.house, self.rng, movable, distractor)
+            return self.turn(self.openables[name], pretend)
+        act = relocate if self.movables[name].category in ("box", *HANDHELD) else rearrange
+        return act(self.plan, self.house, self.rng, self.movables[name], pretend)
 
     def rearrange_room(self) -> str:
         """Move several objects near each other, one after another."""
@@ -179,7 +151,7 @@ class Household:
             self.use(name)
         return "rearrange" if self.plan.time > start else "stand"
 
-    def turn(self, item: Openable, distractor: Distractor | None = None) -> bool:
+    def turn(self, item: Openable, pretend: bool) -> bool:
         """Open a closed openable, close an open one; sometimes to a value in between."""
         at, full = self.house.values[item.name], item.openness(item.opened)
         if item.openness(at) > 0.3 * full:
@@ -189,7 +161,7 @@ class Household:
         value = item.closed + share * (item.opened - item.closed)
         if abs(value - at) < 0.12 * full:
             return False
-        return operate(self.plan, self.house, self.rng, item, value, self._side(item), distractor)
+        return operate(self.plan, self.house, self.rng, item, value, self._side(item), pretend)
 
     def go(self, goal: Float[np.ndarray, "3"], stop_m: float = 0.0) -> bool:
         """Walk to a floor point (m), or within `stop_m` of it, opening closed doors on the path; False on failure."""
@@ -212,11 +184,9 @@ class Household:
 
     def go_through(self, door: Openable) -> bool:
         """Open a door, walk through it, and sometimes close it behind."""
-        start = self.plan.time
-        width = door.openness(door.opened)
-        share = float(self.rng.uniform(np.deg2rad(66.0), width)) / width
+        start, side, width = self.plan.time, self._side(door), door.openness(door.opened)
+        share = self.rng.uniform(np.deg2rad(66.0), width) / width
         value = door.closed + share * (door.opened - door.closed)
-        side = self._side(door)
         if not operate(self.plan, self.house, self.rng, door, value, side):
             return False
         self.last = door.name
@@ -237,7 +207,7 @@ class Household:
         """Floor point at an object, or in front of an openable's handle (m)."""
         floor = float(self.plan.position[2])
         if name in self.movables:
-            return np.append(floor_place(self.house, self.movables[name])[:2], floor)
+            return np.append(self.house.floor_place(self.movables[name])[:2], floor)
         item = self.openables[name]
         if item.category == "door":
             return self._beyond(item, self._side(item), 0.6)
@@ -253,27 +223,18 @@ class Household:
         weights *= [self._weight(item.category) / kinds[item.category] for item in items.values()]
         return str(self.rng.choice(list(items), p=weights / weights.sum()))
 
-    def _kind(self, name: str | None) -> str:
-        return (self.openables | self.movables)[name].category if name is not None else ""
-
     def _weight(self, category: str) -> float:
         if not self.habits.even:
             return self.habits.weights[category]
-        items = self.openables | self.movables
-        spans = [h.stop_s - h.start_s for h in self.house.handlings if items[h.name].category == category]
+        spans = [h.stop_s - h.start_s for h in self.house.handlings if self.items[h.name].category == category]
         return self.habits.weights[category] / (EVEN_S + sum(spans))
 
     def _side(self, door: Openable) -> int:
         """Index of the handle on the side where one stands: 0 where the leaf opens to."""
-        if len(door.handles) == 1:
-            return 0
-        return 0 if self._across(door, self.plan.position) > 0 else 1
-
-    def _across(self, door: Openable, point: Float[np.ndarray, "3"]) -> float:
-        """Signed distance of a point from a door's plane, positive where the leaf opens to (m)."""
         pose = door.pose(door.closed)
-        local = pose.R.numpy().T @ (np.array([*point[:2], 0.0]) - np.array([*pose.t[:2].tolist(), 0.0]))
-        return float(local[1]) * door.opening_sign
+        offset = np.append(self.plan.position[:2] - pose.t[:2].numpy(), 0.0)
+        across = float((pose.R.numpy().T @ offset)[1]) * door.opening_sign
+        return 0 if len(door.handles) == 1 or across > 0 else 1
 
     def _beyond(self, door: Openable, side: int, far_m: float = BEYOND_M) -> Float[np.ndarray, "3"]:
         """Floor point in front of a door's middle on a side (m)."""
@@ -286,29 +247,18 @@ class Household:
     def _same_side(self, point: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"]) -> bool:
         """Whether no wall or closed door stands between two points near each other."""
         between = goal[:2] + np.linspace(0.0, 1.0, 9)[:, None] * (point[:2] - goal[:2])
-        walls = [
-            item.footprint for item in self.house.flat.static.objects if item.kind == "wall" and item.z_range[0] < 1.0
-        ]
-        walls += [
-            door.footprint(self.house.values[door.name])
-            for door in self.house.flat.openables
-            if door.category == "door"
-        ]
+        flat, values = self.house.flat, self.house.values
+        walls = [item.footprint for item in flat.static.objects if item.kind == "wall" and item.z_range[0] < 1.0]
+        walls += [door.footprint(values[door.name]) for door in flat.openables if door.category == "door"]
         return min(float(distance_to_convex(between, wall).min()) for wall in walls) > 0.01
 
     def _door_between(self, goal: Float[np.ndarray, "3"]) -> Openable | None:
         """The first door on the path to a point that is not open enough."""
         shut = [door for door in self.house.flat.openables if door.blocks(self.house.values[door.name])]
-        if not shut:
-            return None
         world = self.house.world(self.plan.position, without=tuple(door.name for door in shut))
-        path = world.navigation.shortest(self.plan.position, goal, 1.0)
+        path = world.navigation.shortest(self.plan.position, goal, 1.0) if shut else None
         if path is None:
             return None
-        first = {}
-        for door in shut:
-            gap = door.footprint(door.closed)
-            near = np.flatnonzero(distance_to_convex(path[:, :2], gap) < 0.12)
-            if len(near):
-                first[door.name] = int(near[0])
-        return self.openables[min(first, key=lambda name: first[name])] if first else None
+        near = [distance_to_convex(path[:, :2], door.footprint(door.closed)) < 0.12 for door in shut]
+        passed = [(int(there.argmax()), number) for number, there in enumerate(near) if there.any()]
+        return shut[min(passed)[1]] if passed else None

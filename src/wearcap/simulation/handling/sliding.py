@@ -7,15 +7,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.handling.grips import Grip, GripPlace, Moves, drawn_grip
-from wearcap.simulation.handling.handlings import Handling, handling_of
+from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, Moves, drawn_grip
 from wearcap.simulation.people.gait import glide
-from wearcap.simulation.people.gaze import turn_head
-from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan, wrap
-from wearcap.simulation.people.shuffling import shuffle, step_to
+from wearcap.simulation.people.gaze import look_at, turn_head
+from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, Plan, wrap
+from wearcap.simulation.people.shuffling import arrive, shuffle
 from wearcap.simulation.people.track import ease
 from wearcap.simulation.places.movables import Movable, Rail, floor_pose
+from wearcap.simulation.places.outline import turn
 
 SPEEDS = {"sofa": (0.12, 0.26), "table": (0.13, 0.32), "chair": (0.18, 0.42)}
 """Range of an object's mean speed (m/s); the peak is about 1.5 times that."""
@@ -40,7 +39,6 @@ class Slide:
     """Pose of the object after, its heading unwrapped."""
     bow: float
     """Sideways deviation of its path from the straight line (m)."""
-    rail: Rail
     places: dict[str, GripPlace]
     """Palm places by hand."""
     hands: tuple[tuple[str, ...], ...]
@@ -63,15 +61,8 @@ class Slide:
     def body_at(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
         """Pose of the wearer (x, y, heading) at a share of the path."""
         x, y, heading = self.object_at(share).T
-        cos, sin = np.cos(heading), np.sin(heading)
-        return np.stack(
-            [
-                x + cos * self.local[0] - sin * self.local[1],
-                y + sin * self.local[0] + cos * self.local[1],
-                heading + self.local[2],
-            ],
-            1,
-        )
+        (cos, sin), (ahead, left, turned) = (np.cos(heading), np.sin(heading)), self.local
+        return np.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left, heading + turned], 1)
 
     @property
     def stand(self) -> Float[np.ndarray, "3"]:
@@ -85,10 +76,6 @@ class Slide:
         half = self.seconds / 2
         first, second = since / half, (since - half - self.pause_s) / half
         return 0.5 * (ease(first) + ease(second))
-
-    @property
-    def duration_s(self) -> float:
-        return self.seconds + self.pause_s
 
 
 def slide_options(
@@ -107,109 +94,69 @@ def slide_options(
     displacement = stop[:2] - start[:2]
     found = []
     for rail in movable.rails:
-        angle = (
-            wrap(float(np.arctan2(displacement[1], displacement[0])) - start[2] - rail.facing)
-            if np.hypot(*displacement) > 0.05
-            else 0.0
-        )
+        angle = 0.0
+        if np.hypot(*displacement) > 0.05:
+            angle = wrap(float(np.arctan2(displacement[1], displacement[0])) - start[2] - rail.facing)
+        aside = PUSH < abs(angle) < PULL
         for both in (True, False):
-            if (both and not rail.both_hands) or (turns and not both):
+            if (both and not rail.both_hands) or (turns and not both) or (aside and movable.category == "sofa"):
                 continue
-            aside = PUSH < abs(angle) < PULL
-            if aside and movable.category == "sofa":
-                continue
-            weight = (0.25 if aside else 1.0) * (
-                1.0 if both else {"chair": 1.5, "table": 0.5}.get(movable.category, 0.25)
-            )
-            found.append((rng.exponential(1.0) / weight, rail, both, angle))
+            weight = 1.0 if both else {"chair": 1.5, "table": 0.5}.get(movable.category, 0.25)
+            found.append((rng.exponential(1.0) / ((0.25 if aside else 1.0) * weight), rail, both, angle))
     for _, rail, both, angle in sorted(found, key=lambda option: option[0]):
-        yield _drawn(plan, movable, start, stop, rail, both, angle, rng)
+        yield _drawn(plan, movable, np.stack([start, stop]), rail, both, angle, rng)
 
 
 def _drawn(
-    plan: Plan,
-    movable: Movable,
-    start: np.ndarray,
-    stop: np.ndarray,
-    rail: Rail,
-    both: bool,
-    angle: float,
-    rng: np.random.Generator,
+    plan: Plan, movable: Movable, ends: np.ndarray, rail: Rail, both: bool, angle: float, rng: np.random.Generator
 ) -> Slide:
     """Draw the remaining choices: hands and their places, tempo, pause, distance."""
+    start, stop = ends
     change = stop - start
     length, turned = float(np.linalg.norm(change[:2])), abs(change[2])
-    low, high = SPEEDS[movable.category]
-    speed = float(rng.uniform(low, high)) * plan.style.briskness**0.5
+    speed = rng.uniform(*SPEEDS[movable.category]) * plan.style.briskness**0.5
     if PUSH < abs(angle) < PULL:
         speed *= 0.75
     seconds = max((length + TURN_LEVER_M * turned) / speed, 1.2)
-    pause = float(rng.uniform(0.5, 1.6)) if seconds > 3.0 and rng.random() < 0.25 else 0.0
-    hands = _hand_sets(both, bool(turned > 0), seconds, rng)
+    pause = rng.uniform(0.5, 1.6) if seconds > 3.0 and rng.random() < 0.25 else 0.0
+    hands = (SIDES,) if turned > 0 else _hand_sets(both, seconds, rng)  # only both may turn an object
     used = sorted({side for group in hands for side in group})
     wide = 2.0 * float(plan.skeleton.t_parent_joint[plan.skeleton.indices("left_collar", "left_shoulder"), 1].sum())
     apart = min(wide * rng.uniform(0.75, 1.5), rail.length) if len(used) > 1 else 0.0
     reach = max(rail.length - apart, 0.0) / 2
     middle = rail.length / 2 + float(np.clip(rng.normal(0.0, 0.4), -1, 1)) * min(reach, 0.5)
-    if turned > 0.5:  # The lever is longer near an end.
+    if turned > 0.5:  # the lever is longer near an end
         middle = rail.length / 2 + float(rng.choice([-1.0, 1.0])) * reach * rng.uniform(0.0, 0.8)
-    tilt = float(rng.uniform(0.0, 0.18))
-    places, offsets = {}, {}
+    tilt = rng.uniform(0.0, 0.18)
+    places = {}
     for side in used:
-        offsets[side] = -LEFT_SIGN[side] * apart / 2 + 0.03 * rng.standard_normal() * (rail.length > 0.1)
-        along = float(np.clip(middle + offsets[side], 0.0, rail.length))
-        places[side] = rail.at(along, tilt + float(rng.normal(0.0, 0.05)))
-    return Slide(
-        movable,
-        start,
-        stop,
-        float(np.clip(rng.normal(0.0, 0.05), -0.1, 0.1)) * length if turned == 0 else 0.0,
-        rail,
-        places,
-        hands,
-        _body(plan, rail, places, speed, angle, EFFORT[movable.category], rng),
-        seconds,
-        pause,
-        angle,
-    )
+        offset = -LEFT_SIGN[side] * apart / 2 + 0.03 * rng.standard_normal() * (rail.length > 0.1)
+        along = float(np.clip(middle + offset, 0.0, rail.length))
+        places[side] = rail.at(along, tilt + rng.normal(0.0, 0.05))
+    bow = float(np.clip(rng.normal(0.0, 0.05), -0.1, 0.1)) * length if turned == 0 else 0.0
+    # the middle of the feet: toes clear of the object, hands in front of their shoulders
+    ahead, left = turn(rail.facing).T
+    heavy = (0.15 if abs(angle) < PUSH else 0.05) * EFFORT[movable.category]
+    distance = plan.sole[1] + 0.05 + 0.55 * speed + heavy + rng.uniform(0.0, 0.07)
+    aside = -LEFT_SIGN[used[0]] * rng.uniform(0.10, 0.24) if len(used) == 1 else 0.0
+    faced = 0.06 * rng.standard_normal()
+    if PUSH < abs(angle) < PULL:
+        faced += 0.25 * np.sign(angle)
+    point = np.mean([place.point for place in places.values()], 0)
+    place = point[:2] - (rail.stand_off + distance) * ahead + aside * left
+    local = np.append(place, rail.facing + faced)
+    return Slide(movable, start, stop, bow, places, hands, local, seconds, pause, angle)
 
 
-def _hand_sets(both: bool, turns: bool, seconds: float, rng: np.random.Generator) -> tuple[tuple[str, ...], ...]:
-    """Sets of holding hands, one after the other; only both may turn an object."""
-    if turns:
-        return (SIDES,)
+def _hand_sets(both: bool, seconds: float, rng: np.random.Generator) -> tuple[tuple[str, ...], ...]:
+    """Sets of holding hands, one after the other."""
     first = SIDES[int(rng.random() < 0.6)]
-    other = SIDES[1 - SIDES.index(first)]
+    other = OTHER[first]
     if seconds < 3.5 or rng.random() > (0.3 if both else 0.25):
         return (SIDES,) if both else ((first,),)
     if not both:
         return ((first,), (other,))
-    return [((first,), SIDES), (SIDES, (first,)), ((first,), SIDES, (other,))][int(rng.integers(3))]
-
-
-def _body(
-    plan: Plan,
-    rail: Rail,
-    places: dict[str, GripPlace],
-    speed: float,
-    angle: float,
-    effort: float,
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "3"]:
-    """Middle of the feet in the object's axes: toes clear of the object, hands in front of their shoulders."""
-    point = np.mean([place.point for place in places.values()], 0)
-    ahead = np.array([np.cos(rail.facing), np.sin(rail.facing)])
-    left = np.array([-ahead[1], ahead[0]])
-    heavy = 0.15 * effort if abs(angle) < PUSH else 0.05 * effort
-    distance = plan.sole[1] + 0.05 + 0.55 * speed + heavy + float(rng.uniform(0.0, 0.07))
-    aside = 0.0
-    if len(places) == 1:
-        aside = -LEFT_SIGN[next(iter(places))] * float(rng.uniform(0.10, 0.24))
-    turned = 0.06 * rng.standard_normal()
-    if PUSH < abs(angle) < PULL:
-        turned += 0.25 * np.sign(angle)
-    place = point[:2] - (rail.stand_off + distance) * ahead + aside * left
-    return np.append(place, rail.facing + turned)
+    return (((first,), SIDES), (SIDES, (first,)), ((first,), SIDES, (other,)))[rng.integers(3)]
 
 
 def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 0.0) -> Handling:
@@ -217,31 +164,22 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
 
     Writes footsteps, lean, grips and gaze; `plan.time` becomes the end. The object is static at `choice.stop` then.
     """
-    if np.hypot(*(choice.stand[:2] - plan.position[:2])) > 0.03 or abs(wrap(choice.stand[2] - plan.heading)) > 0.1:
-        step_to(plan, rng, choice.stand[:2], choice.stand[2])
+    arrive(plan, rng, choice.stand)
     touch = plan.time + float(np.clip(rng.normal(0.8, 0.15) / plan.style.briskness, 0.5, 1.3))
-    begin = touch + float(rng.uniform(0.25, 0.8))
-    end = begin + choice.duration_s
-
-    def moves(times: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
-        return floor_pose(choice.object_at(choice.share(times - begin)), floor_z)
-
-    release = end + float(rng.uniform(0.1, 0.7))
+    begin = touch + rng.uniform(0.25, 0.8)
+    end = begin + (choice.seconds + choice.pause_s)
+    moves = lambda times, chest: floor_pose(choice.object_at(choice.share(times - begin)), floor_z)  # noqa: E731
+    release = end + rng.uniform(0.1, 0.7)
     grips = _grips(plan, choice, moves, (touch, begin, end, release), rng)
     for side, grip in grips:
         plan.grip(side, grip)
     _lean(plan, choice, plan.time, begin, end, release, rng)
     _look(plan, choice, touch, begin, end, floor_z, rng)
-    heading = plan.heading
-    base = float(choice.body_at(np.zeros(1))[0, 2])
-    unwrap = heading + wrap(base - heading) - base
-
-    def body(times: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time 3"]:
-        return choice.body_at(choice.share(times - begin)) + np.array([0.0, 0.0, unwrap])
-
-    shuffle(plan, rng, body, begin, end)
+    base = float(choice.stand[2])
+    unwrap = np.array([0.0, 0.0, plan.heading + wrap(base - plan.heading) - base])
+    shuffle(plan, rng, lambda times: choice.body_at(choice.share(times - begin)) + unwrap, begin, end)
     plan.time = max(plan.time, release + 0.5 * max(grip.return_s for _, grip in grips))
-    return handling_of(choice.movable.name, "sliding", moves, grips)
+    return Handling.of(choice.movable.name, "sliding", moves, grips)
 
 
 def _grips(
@@ -255,8 +193,8 @@ def _grips(
     for side in choice.places:
         member = [k for k, group in enumerate(choice.hands) if side in group]
         first, last = member[0], member[-1]
-        # The new hand takes hold a little before the other lets go.
-        start = touch + _stagger(rng) if first == 0 else cuts[first - 1] - float(rng.uniform(0.1, 0.4))
+        # the new hand takes hold a little before the other lets go.
+        start = touch + _stagger(rng) if first == 0 else cuts[first - 1] - rng.uniform(0.1, 0.4)
         stop = release + _stagger(rng) if last == count - 1 else cuts[last]
         grips.append((side, drawn_grip(choice.places[side], moves, start, stop, rng, plan.style.briskness)))
     return grips
@@ -264,7 +202,7 @@ def _grips(
 
 def _stagger(rng: np.random.Generator) -> float:
     """Delay between hands (s): they come and go together, or one after the other."""
-    return float(rng.uniform(0.05, 0.25)) if rng.random() < 0.5 else 0.0
+    return rng.uniform(0.05, 0.25) if rng.random() < 0.5 else 0.0
 
 
 def _lean(
@@ -283,7 +221,7 @@ def _lean(
         shift, crouch = -0.10 * effort * rng.uniform(0.5, 1.2), 0.07 * effort * rng.uniform(0.3, 1.2)
     twist = 0.0
     if len(choice.places) == 1:
-        twist = -LEFT_SIGN[next(iter(choice.places))] * float(rng.uniform(0.02, 0.18))
+        twist = -LEFT_SIGN[next(iter(choice.places))] * rng.uniform(0.02, 0.18)
     plan.lean.move(start, begin - 0.1, (ready, 0.0, 0.5 * twist))
     plan.lean.move(begin - 0.2, begin + 0.7, (lean, 0.0, twist))
     plan.crouch.move(begin - 0.2, begin + 0.7, crouch)
@@ -300,15 +238,10 @@ def _look(
     local = torch.tensor(next(iter(choice.places.values())).point, dtype=torch.float64)
     pose = floor_pose(choice.start, floor_z)
     point = (pose.R @ local + pose.t).numpy()
-    plan.gaze_point.move(touch - 0.6, touch - 0.6, point)
-    plan.gaze_weight.move(touch - 0.6, touch - 0.2, 0.85)
-    plan.gaze_weight.move(begin + 0.1, begin + 0.8, 0.0)
+    look_at(plan, point, (touch - 0.6, touch - 0.2), (begin + 0.1, begin + 0.8), 0.85)
     time, back = begin + 0.6, abs(choice.travel_angle) > PULL
     while time < end - 0.8:
-        side = (
-            float(rng.choice([-1.0, 1.0])) * rng.uniform(0.7, 1.1)
-            if back and rng.random() < 0.4
-            else rng.normal(0, 0.2)
-        )
-        time = turn_head(plan, time, (side, float(rng.normal(0.35, 0.12)))) + float(rng.exponential(1.2)) + 0.3
-    turn_head(plan, max(time, end), (0.0, plan.style.head_pitch))
+        over_shoulder = back and rng.random() < 0.4
+        yaw = rng.choice([-1.0, 1.0]) * rng.uniform(0.7, 1.1) if over_shoulder else rng.normal(0, 0.2)
+        time = turn_head(plan, time, yaw, rng.normal(0.35, 0.12)) + rng.exponential(1.2) + 0.3
+    turn_head(plan, max(time, end))

@@ -6,8 +6,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float
 
-from wearcap.body.skeleton import Skeleton
-from wearcap.simulation.people.plan import Footprint, step_rise
+from wearcap.simulation.people.plan import SIDES, Footprint, Plan, step_rise
 from wearcap.simulation.people.track import Track, ease, hermite
 
 ROLL_DOWN_S = 0.13
@@ -21,23 +20,6 @@ LATE_LIFT = 0.06
 """Height of the heel shortly before it lands, per angle by which the toes are up then (m/rad)."""
 STAIR_WAIT = 0.16
 """Share of a swing up a stair during which the foot only rises, and of one down during which it only sinks."""
-
-
-@dataclass(frozen=True)
-class FootShape:
-    """Points of a foot in the ankle's axes (tip: in the toe joint's), flat on the floor (m)."""
-
-    heel: Float[np.ndarray, "3"]
-    ball: Float[np.ndarray, "3"]
-    tip: Float[np.ndarray, "3"]
-
-    @classmethod
-    def of(cls, skeleton: Skeleton, side: str) -> "FootShape":
-        return cls(
-            np.array(skeleton.sites[f"{side}_heel"].t_joint_site),
-            skeleton.t_parent_joint[skeleton.index(f"{side}_toe")].double().numpy(),
-            np.array(skeleton.sites[f"{side}_toe_tip"].t_joint_site),
-        )
 
 
 @dataclass(frozen=True)
@@ -60,38 +42,58 @@ class FootMotion:
     running: Bool[np.ndarray, "time"]
 
 
-def foot_motion(
-    prints: list[Footprint], shape: FootShape, heel_lift: Track, times: Float[np.ndarray, "time"]
-) -> FootMotion:
+@dataclass(frozen=True)
+class Feet:
+    """Both feet of a plan at the times of a motion's frames (s); the rest of the body follows from them."""
+
+    plan: Plan
+    times: Float[np.ndarray, "time"]
+    fps: float
+    left: FootMotion
+    right: FootMotion
+
+    @classmethod
+    def of(cls, plan: Plan, times: Float[np.ndarray, "time"], fps: float) -> "Feet":
+        """The feet moved through the plan's prints."""
+        return cls(plan, times, fps, *(_foot_motion(plan, side, times) for side in SIDES))
+
+    def __getitem__(self, side: str) -> FootMotion:
+        return getattr(self, side)
+
+
+def _foot_motion(plan: Plan, side: str, times: Float[np.ndarray, "time"]) -> FootMotion:
     """Move a foot through its prints. Planted patches stand still in the world; swings clear the floor.
 
     In a stance the sole turns about the heel (toe up) or, with toes flat, about the ball (heel up); the swing
     continues both the turn and its rate, so that ankle and pitch are twice continuously differentiable.
     """
-    at = _Timeline(prints, times)
-    roll, bend = _roll(at, heel_lift.sample(times)[:, 0])
-    share = at.swing_share
+    skeleton, at = plan.skeleton, _Timeline(plan.prints[side], times)
+    # points of the foot in the ankle's axes (the tip in the toe joint's), flat on the floor (m)
+    heel, tip = (np.array(skeleton.sites[f"{side}_{site}"].t_joint_site) for site in ("heel", "toe_tip"))
+    ball = skeleton.t_parent_joint[skeleton.index(f"{side}_toe")].double().numpy()
+    roll, bend = at.roll(plan.heel_lift[side].sample(times)[:, 0])
+    share, lifted = at.swing_share, bump(at.swing_share)
     rise = at["step"]
     slope = at.mix("height", np.ones_like(share)) - at["height"] - rise
-    moved = advance(share, rise)
-    turned = ease(share)
-    pivot_x, pivot_z = _pivot(at, roll, turned, shape)
-    depth = _depth(shape, roll, bend, SOFT_M * bump(share))
+    moved, turned = advance(share, rise), ease(share)
+    # the stationary point is the ball while the heel is up, the heel while the toe is
+    on_heel = np.where(at.planted, (roll < 0).astype(np.float64), np.where(at.land_pitch_next > 0, 0.0, turned))
+    pivot_x, pivot_z = (ball[i] + on_heel * (heel[i] - ball[i]) for i in (0, 2))
     rolled = pivot_x - (np.cos(roll) * pivot_x + np.sin(roll) * pivot_z)
-    raised = at.clearance * bump(share) + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * _late(share) + depth
-    tilt = at.mix("tilt", turned)
-    heading = at.mix("heading", turned)
+    late = (share / 0.75) ** 9 * ((1.0 - share) / 0.25) ** 3  # a bump with its top at 0.75
+    depth = _depth((heel, ball, tip), roll, bend, SOFT_M * lifted)
+    raised = at.clearance * lifted + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * late + depth
+    tilt, heading = at.mix("tilt", turned), at.mix("heading", turned)
     ground = at.mix("ground", moved[:, None])
     ground[:, 2] = at["height"] + slope * moved + rise * climb(rise, share)
-    outward = at.bow * bump(share)
+    outward = at.bow * lifted
     cos, sin = np.cos(heading), np.sin(heading)
     ground[:, 0] -= outward * sin
     ground[:, 1] += outward * cos
     along = rolled * np.cos(tilt) + raised * np.sin(tilt)
     above = raised * np.cos(tilt) - rolled * np.sin(tilt)
     ankle = ground + np.stack([along * cos, along * sin, above], 1)
-    press = _pressure_along(at, shape)
-    pressure = ground + press[:, None] * np.stack([cos, sin, np.zeros_like(cos)], 1)
+    pressure = ground + at.pressure(heel, ball)[:, None] * np.stack([cos, sin, np.zeros_like(cos)], 1)
     contact = at.planted[:, None] & np.stack([roll < 0.01, roll > -0.01], 1)
     return FootMotion(ankle, ground, heading, roll + tilt, bend, at.planted, contact, pressure, at.running)
 
@@ -113,7 +115,6 @@ class _Timeline:
         self.since_land = times - self["land_s"]
         self.until_lift = self["lift_s"] - times
         self.planted = self.until_lift > 0
-        self.stance_s = self["lift_s"] - self["land_s"]
         self.swing_s = np.where(self.planted, 1.0, columns["land_s"][self.next] - self["lift_s"])
         self.swing_share = np.clip(-self.until_lift / self.swing_s, 0.0, 1.0)
         self.clearance, self.bow = columns["clearance"][self.next], columns["bow"][self.next]
@@ -125,8 +126,35 @@ class _Timeline:
         return self._columns[name][self.now]
 
     def mix(self, name: str, share: np.ndarray) -> np.ndarray:
+        """A value between that of a frame's print and that of the next, by a share."""
         here = self._columns[name][self.now]
         return here + share * (self._columns[name][self.next] - here)
+
+    def roll(self, heel_lift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pitch of the sole against the floor and bend of the toes (rad)."""
+        stance_s = self["lift_s"] - self["land_s"]
+        down, up = np.minimum(ROLL_DOWN_S, 0.35 * stance_s), np.minimum(ROLL_UP_S, 0.58 * stance_s)
+        rate = 1.7 * self["lift_pitch"] / up
+        zero = np.zeros_like(rate)
+        landing = hermite(self.since_land / down, (self["land_pitch"], zero), (zero, zero))
+        leaving = hermite(1.0 - self.until_lift / up, (zero, self["lift_pitch"]), (zero, rate * up))
+        stance = landing + leaving + heel_lift
+        start = (self["lift_pitch"] + heel_lift, rate * self.swing_s)
+        swing = hermite(self.swing_share, (start[0], self.land_pitch_next), (start[1], zero))
+        early, late = self.swing_share / 0.5, self.swing_share / 0.4 - 1.5
+        relax = hermite(early, (start[0], zero), (start[1] * 0.5, zero))
+        brace = hermite(late, (zero, np.maximum(self.land_pitch_next, 0.0)), (zero, zero))
+        roll = np.where(self.planted, stance, swing)
+        return roll, np.where(self.planted, np.maximum(stance, 0.0), relax + brace)
+
+    def pressure(self, heel: Float[np.ndarray, "3"], ball: Float[np.ndarray, "3"]) -> np.ndarray:
+        """Centre of pressure ahead of the ankle (m): from heel to toes in a step, under the arch when standing."""
+        middle = 0.30 * ball[0]
+        after, before = ease(self.since_land / 0.25), ease(1.0 - self.until_lift / 0.32)
+        strike = np.clip(self["land_pitch"] / -0.3, -1.0, 1.0)
+        back = np.where(strike > 0, strike * (0.4 * heel[0] - middle), -strike * (ball[0] - middle))
+        forth = np.clip(self["lift_pitch"] / 0.6, 0.0, 1.0) * (ball[0] + 0.01 - middle)
+        return middle + back * (1.0 - after) + forth * before
 
 
 def glide(share: Float[np.ndarray, "*batch"], ramps: tuple[float, float] = (0.36, 0.30)) -> Float[np.ndarray, "*batch"]:
@@ -153,54 +181,6 @@ def bump(share: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
     return 64.0 * (share * (1.0 - share)) ** 3
 
 
-def _late(share: np.ndarray) -> np.ndarray:
-    """A bump with its top at 0.75."""
-    return (share / 0.75) ** 9 * ((1.0 - share) / 0.25) ** 3
-
-
-def _roll(at: _Timeline, heel_lift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pitch of the sole against the floor and bend of the toes (rad)."""
-    down = np.minimum(ROLL_DOWN_S, 0.35 * at.stance_s)
-    up = np.minimum(ROLL_UP_S, 0.58 * at.stance_s)
-    rate = 1.7 * at["lift_pitch"] / up
-    zero = np.zeros_like(rate)
-    landing = hermite(at.since_land / down, (at["land_pitch"], zero), (zero, zero))
-    leaving = hermite(1.0 - at.until_lift / up, (zero, at["lift_pitch"]), (zero, rate * up))
-    stance = landing + leaving + heel_lift
-    start = (at["lift_pitch"] + heel_lift, rate * at.swing_s)
-    swing = hermite(at.swing_share, (start[0], at.land_pitch_next), (start[1], zero))
-    roll = np.where(at.planted, stance, swing)
-    early, late = at.swing_share / 0.5, at.swing_share / 0.4 - 1.5
-    relax = hermite(early, (start[0], zero), (start[1] * 0.5, zero))
-    brace = hermite(late, (zero, np.maximum(at.land_pitch_next, 0.0)), (zero, zero))
-    return roll, np.where(at.planted, np.maximum(stance, 0.0), relax + brace)
-
-
-def _pivot(at: _Timeline, roll: np.ndarray, turned: np.ndarray, shape: FootShape):
-    """The point of the foot that is stationary: ball while the heel is up, heel while the toe is."""
-    on_ball_next = at.land_pitch_next > 0
-    landing_share = np.where(on_ball_next, 0.0, turned)
-    share = np.where(at.planted, (roll < 0).astype(np.float64), landing_share)
-    return tuple(shape.ball[i] + share * (shape.heel[i] - shape.ball[i]) for i in (0, 2))
-
-
-def _depth(shape: FootShape, roll: np.ndarray, bend: np.ndarray, soft: np.ndarray) -> np.ndarray:
-    """Height of the ankle over the sole's lowest point (m): a maximum over heel, ball and tip, softened by `soft`."""
-    cos, sin = np.cos(roll), np.sin(roll)
-    toe_cos, toe_sin = np.cos(roll - bend), np.sin(roll - bend)
-    ball = sin * shape.ball[0] - cos * shape.ball[2]
-    points = np.stack(
-        [
-            sin * shape.heel[0] - cos * shape.heel[2],
-            ball - toe_cos * shape.tip[2],
-            ball + toe_sin * shape.tip[0] - toe_cos * shape.tip[2],
-        ]
-    )
-    width = np.maximum(soft, 1e-5)
-    top = points.max(0)
-    return top + width * np.log(np.exp((points - top) / width).sum(0)) * (soft > 1e-5)
-
-
 def climb(rise: Float[np.ndarray, "*#batch"], share: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
     """Height profile of the floor below a swing: up early and down late, so that the foot clears the stair's edge."""
     early, late = ease(share / 0.58), ease((share - 0.45) / 0.55)
@@ -208,21 +188,25 @@ def climb(rise: Float[np.ndarray, "*#batch"], share: Float[np.ndarray, "*batch"]
     return up * early + (1.0 - up) * late
 
 
-def _pressure_along(at: _Timeline, shape: FootShape) -> np.ndarray:
-    """Centre of pressure ahead of the ankle (m): from heel to toes in a step, under the arch when standing."""
-    middle = 0.30 * shape.ball[0]
-    after, before = ease(at.since_land / 0.25), ease(1.0 - at.until_lift / 0.32)
-    strike = np.clip(at["land_pitch"] / -0.3, -1.0, 1.0)
-    back = np.where(strike > 0, strike * (0.4 * shape.heel[0] - middle), -strike * (shape.ball[0] - middle))
-    forth = np.clip(at["lift_pitch"] / 0.6, 0.0, 1.0) * (shape.ball[0] + 0.01 - middle)
-    return middle + back * (1.0 - after) + forth * before
+def _depth(
+    foot: tuple[np.ndarray, np.ndarray, np.ndarray], roll: np.ndarray, bend: np.ndarray, soft: np.ndarray
+) -> np.ndarray:
+    """Height of the ankle over the sole's lowest point (m): a maximum over heel, ball and tip, softened by `soft`."""
+    heel, ball, tip = foot
+    cos, sin = np.cos(roll), np.sin(roll)
+    toe_cos, toe_sin = np.cos(roll - bend), np.sin(roll - bend)
+    below = sin * ball[0] - cos * ball[2]
+    points = np.stack(
+        [sin * heel[0] - cos * heel[2], below - toe_cos * tip[2], below + toe_sin * tip[0] - toe_cos * tip[2]]
+    )
+    width = np.maximum(soft, 1e-5)
+    top = points.max(0)
+    return top + width * np.log(np.exp((points - top) / width).sum(0)) * (soft > 1e-5)
 
 
-def load_on_left(
-    planted: Bool[np.ndarray, "time 2"], times: Float[np.ndarray, "time"], rng: np.random.Generator
-) -> Float[np.ndarray, "time"]:
+def load_on_left(feet: Feet, rng: np.random.Generator) -> Float[np.ndarray, "time"]:
     """Share of the weight on the left foot; while standing long it shifts from leg to leg now and then."""
-    alone = planted[:, 0].astype(int) - planted[:, 1].astype(int)
+    times, alone = feet.times, feet.left.planted.astype(int) - feet.right.planted.astype(int)
     edges = np.flatnonzero(np.diff(alone)) + 1
     starts, stops = np.concatenate([[0], edges]), np.concatenate([edges, [len(times)]])
     runs = [(alone[a], times[a], times[min(b, len(times) - 1)]) for a, b in zip(starts, stops)]
@@ -235,14 +219,11 @@ def load_on_left(
             load.move(start, stop, target)
             continue
         load.move(start, start + 0.45, 0.5)
-        _shift_weight(load, start + 0.6, stop - 0.8, rng)
+        first, last = start + 0.6, stop - 0.8
+        time = first + rng.exponential(3.0)
+        while time + 2.0 < last:
+            load.move(time, time + rng.uniform(0.8, 1.6), np.clip(0.5 + rng.normal(0.0, 0.17), 0.12, 0.88))
+            time += 1.7 + rng.exponential(6.0)
+        load.move(max(last - 0.8, first), max(last, first + 0.1), 0.5)
         load.move(stop - 0.5, stop, target)
     return load.sample(times)[:, 0]
-
-
-def _shift_weight(load: Track, start: float, stop: float, rng: np.random.Generator) -> None:
-    time = start + rng.exponential(3.0)
-    while time + 2.0 < stop:
-        load.move(time, time + rng.uniform(0.8, 1.6), np.clip(0.5 + rng.normal(0.0, 0.17), 0.12, 0.88))
-        time += 1.7 + rng.exponential(6.0)
-    load.move(max(stop - 0.8, start), max(stop, start + 0.1), 0.5)

@@ -1,6 +1,6 @@
-"""Simulated people, typical adults: bones, habits, and the device's place on the head."""
+"""Simulated people, typical adults: bones, habits of moving, and the device's place on the head."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -8,10 +8,67 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import Site, Skeleton, xsens23
-from wearcap.simulation.people.style import Style
 
-_LEG = ("hip", "knee", "ankle", "toe")
-_ARM = ("collar", "shoulder", "elbow", "wrist")
+
+@dataclass(frozen=True)
+class Gait:
+    """Habits of walking and standing (m, rad)."""
+
+    speed: float
+    """Preferred walking speed (m/s)."""
+    walk_ratio: float
+    """Step length per cadence (m per step/min); grows with the leg's length."""
+    step_width: float
+    stance_width: float
+    toe_out: float
+    variability: float
+    """Deviation of step length, time and width from step to step, as a share."""
+    knee_soft: float
+    """Knee flexion at which the standing leg counts as straight."""
+    heel_rise: float
+    """Scales how far feet roll at push-off and landing."""
+
+
+@dataclass(frozen=True)
+class Arms:
+    """Habits of the hanging arms (rad)."""
+
+    swing: float
+    """Shoulder angle per metre between the feet (rad/m)."""
+    symmetry: float
+    """More swing left than right, as a share."""
+    elbow: float
+    spread: float
+    turn: float
+    """Inward turn of the hanging arm: palms face back."""
+
+
+@dataclass(frozen=True)
+class Posture:
+    """Habits of trunk and head (rad)."""
+
+    slouch: float
+    """Forward lean of the chest."""
+    head_pitch: float
+    """Habitual downward tilt of the head while walking."""
+    pelvis_tilt: float
+    pelvis_yaw: float
+    """Turn per metre between the feet (rad/m)."""
+    pelvis_list: float
+    trunk_counter: float
+    """Trunk turn against the pelvis, as a share of the pelvis' turn."""
+    sway: float
+    """Standing sway (m)."""
+
+
+@dataclass(frozen=True)
+class Style:
+    """Habits that make one person's movement their own; `briskness` scales the tempo of all that is not walking."""
+
+    gait: Gait
+    arms: Arms
+    posture: Posture
+    briskness: float
 
 
 @dataclass(frozen=True)
@@ -26,6 +83,38 @@ class Person:
     t_head_device: Float[Tensor, "3"]
 
 
+LEG_M = 0.93
+"""Height of the hips to which `speed` and `walk_ratio` of `NORMAL` belong."""
+NORMAL = {
+    "speed": (1.25, 0.13), "walk_ratio": (0.0065, 0.0005), "step_width": (0.10, 0.02), "stance_width": (0.19, 0.035),
+    "toe_out": (0.12, 0.07), "symmetry": (0.0, 0.15), "slouch": (0.05, 0.05), "head_pitch": (0.12, 0.07),
+}  # fmt: skip
+"""Means and deviations of habits that are normally distributed among adults."""
+LOGNORMAL = {
+    "variability": 0.03, "knee_soft": 0.14, "heel_rise": 1.0, "swing": 0.46, "elbow": 0.30, "spread": 0.14,
+    "turn": 0.32, "pelvis_tilt": 0.07, "pelvis_yaw": 0.12, "pelvis_list": 0.06, "trunk_counter": 1.1, "sway": 0.005,
+    "briskness": 1.0,
+}  # fmt: skip
+"""Medians of all others; their logarithms deviate by `LOG_DEVIATION`."""
+LOG_DEVIATION = 0.22
+LIMITS = {
+    "heel_rise": (0.8, 1.2), "knee_soft": (0.08, 0.25), "step_width": (0.05, 0.16), "stance_width": (0.12, 0.30),
+    "variability": (0.015, 0.05), "speed": (0.9, 1.65), "briskness": (0.7, 1.4),
+}  # fmt: skip
+
+
+def draw_style(rng: np.random.Generator, leg_length: float) -> Style:
+    """Habits drawn at random; `leg_length` is the hips' height above the floor (m)."""
+    drawn = {name: rng.normal(*spread) for name, spread in NORMAL.items()}
+    drawn["speed"] *= (leg_length / LEG_M) ** 0.5
+    drawn["walk_ratio"] = drawn["walk_ratio"] * leg_length / LEG_M
+    drawn |= {name: median * float(np.exp(rng.normal(0.0, LOG_DEVIATION))) for name, median in LOGNORMAL.items()}
+    drawn["heel_rise"] = rng.normal(1.0, 0.1)
+    drawn |= {name: float(np.clip(drawn[name], *limits)) for name, limits in LIMITS.items()}
+    gait, arms, posture = ({f.name: drawn[f.name] for f in fields(part)} for part in (Gait, Arms, Posture))
+    return Style(Gait(**gait), Arms(**arms), Posture(**posture), drawn["briskness"])
+
+
 def draw_person(name: str, rng: np.random.Generator) -> Person:
     """A person of 1.50–1.95 m with legs, arms and shoulders of their own proportions."""
     height = float(np.clip(rng.normal(1.72, 0.10), 1.50, 1.95))
@@ -36,8 +125,8 @@ def draw_person(name: str, rng: np.random.Generator) -> Person:
     offsets = base.t_parent_joint * scale
     share = base.root_height / stature
     trunk = (1 - share * legs) / (1 - share)  # longer legs, shorter trunk: the height stays
-    for joint, name_ in enumerate(base.joint_names):
-        part = name_.removeprefix("left_").removeprefix("right_")
+    for joint, joint_name in enumerate(base.joint_names):
+        part = joint_name.removeprefix("left_").removeprefix("right_")
         if part in ("knee", "ankle"):
             offsets[joint] *= legs
         elif part in ("elbow", "wrist"):
@@ -45,7 +134,7 @@ def draw_person(name: str, rng: np.random.Generator) -> Person:
         elif part in ("hip", "collar", "shoulder"):
             offsets[joint, 1] *= width
             offsets[joint, 2] *= trunk
-        elif part not in _LEG and part not in _ARM:
+        elif part != "toe":
             offsets[joint, 2] *= trunk
     sites = {
         key: Site(site.joint, tuple(float(v) * scale for v in site.t_joint_site)) for key, site in base.sites.items()
@@ -53,10 +142,5 @@ def draw_person(name: str, rng: np.random.Generator) -> Person:
     skeleton = Skeleton(base.name, base.joint_names, base.parents, offsets, sites)
     mass_index = float(np.clip(rng.normal(24.0, 3.0), 18.0, 34.0))
     device = torch.tensor([rng.uniform(0.08, 0.10), rng.normal(0.0, 0.003), rng.uniform(0.08, 0.10)]).float()
-    return Person(
-        name,
-        skeleton,
-        Style.sample(rng, skeleton.root_height),
-        {"height": height, "weight": mass_index * height**2},
-        device,
-    )
+    shape = {"height": height, "weight": mass_index * height**2}
+    return Person(name, skeleton, draw_style(rng, skeleton.root_height), shape, device)

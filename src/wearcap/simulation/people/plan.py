@@ -1,21 +1,32 @@
 """The plan of a simulated motion: footprints and keyed channels, written by activities and read by the generator."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
 from wearcap.simulation.handling.grips import Grip
-from wearcap.simulation.people.style import Style
+from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.track import Track
+from wearcap.simulation.places.outline import turn
 
 SIDES = ("left", "right")
+OTHER = {"left": "right", "right": "left"}
 LEFT_SIGN = {"left": 1.0, "right": -1.0}
 STEEPEST = 0.2
 """A foot adapts to slopes below this, and stays level on steeper ones (a step's edge)."""
 STEP_M = 0.05
 """Rise from print to print, beyond that of their slopes, from which on it counts as a step."""
+
+A = TypeVar("A", float, np.ndarray)
+
+
+def wrap(angle: A) -> A:
+    """The same angle in [-π, π)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 @dataclass(frozen=True)
@@ -45,7 +56,7 @@ def step_rise(old: Footprint, new: Footprint) -> float:
     if old.tilt == new.tilt == 0.0:
         return rise
     offset = (new.ground - old.ground)[:2]
-    slopes = (-np.tan(p.tilt) * (offset @ np.array([np.cos(p.heading), np.sin(p.heading)])) / 2 for p in (old, new))
+    slopes = (-np.tan(p.tilt) * (offset @ turn(p.heading)[:, 0]) / 2 for p in (old, new))
     remaining = rise - sum(slopes)
     return remaining if abs(remaining) > STEP_M else 0.0
 
@@ -62,9 +73,21 @@ class HandScore:
     goal: Track = field(default_factory=lambda: Track(np.zeros(3)))
     """Wrist in the world (m)."""
 
+    def go_for(self, point: Float[np.ndarray, "3"], out: tuple[float, float], back: tuple[float, float]) -> None:
+        """Bring the wrist to a point in the world (m) in one interval of time and let it go in another (s)."""
+        self.goal.move(out[0], out[0], point)
+        self.goal_weight.visit(1.0, out, back)
+
+    def take(self, pose, out: tuple[float, float], back: tuple[float, float]) -> None:
+        """Bring a hanging hand into a pose in one interval of time and let it hang again in another (s)."""
+        self.pose.move(out[0], out[0], pose)
+        self.pose_weight.visit(1.0, out, back)
+
 
 @dataclass(frozen=True)
 class Label:
+    """The time of an activity, by its name."""
+
     start_s: float
     stop_s: float
     name: str
@@ -73,8 +96,8 @@ class Label:
 class Plan:
     """The motion planned so far. Activities append to it; `time` is when the next may start."""
 
-    def __init__(self, skeleton: Skeleton, style: Style, position: np.ndarray, heading: float, floor_height):
-        self.skeleton, self.style, self.floor_height = skeleton, style, floor_height
+    def __init__(self, person: Person, position: np.ndarray, heading: float, floor_height: Callable[..., np.ndarray]):
+        self.skeleton, self.style, self.floor_height = person.skeleton, person.style, floor_height
         self.time = 0.0
         self.labels: list[Label] = []
         self.hands = {side: HandScore() for side in SIDES}
@@ -98,18 +121,17 @@ class Plan:
         self.gaze_point = Track(np.array([*position[:2], 1.5]))
         """A point in the world that is looked at while its weight is 1 (m)."""
         self.prints: dict[str, list[Footprint]] = {
-            side: [self.footprint(side, position, heading, style.stance_width / 2)] for side in SIDES
+            side: [self.footprint(side, position, heading, self.style.gait.stance_width / 2)] for side in SIDES
         }
 
     def footprint(self, side: str, center: np.ndarray, heading: float, half_width: float, **how) -> Footprint:
         """A print beside a floor point, turned out by the wearer's habit, on the floor near the point's height."""
         sign = LEFT_SIGN[side]
         ground = np.array(center, np.float64)
-        ground[:2] += sign * half_width * np.array([-np.sin(heading), np.cos(heading)])
-        foot_heading = heading + sign * self.style.toe_out
-        ahead = np.array([np.cos(foot_heading), np.sin(foot_heading)])
+        ground[:2] += sign * half_width * turn(heading)[:, 1]
+        foot_heading = heading + sign * self.style.gait.toe_out
         heel, tip = self.sole
-        under = ground[:2] + np.array([0.0, heel, tip])[:, None] * ahead
+        under = ground[:2] + np.array([0.0, heel, tip])[:, None] * turn(foot_heading)[:, 0]
         heights = self.floor_height(under, np.full(3, ground[2]))
         tilt = 0.0
         if np.isfinite(heights[0]):
@@ -141,6 +163,10 @@ class Plan:
             raise ValueError(f"the {side} hand reaches at {grip.start_s} s for one object while it holds another")
         self.grips[side].append(grip)
 
+    def bones(self, *joints: str) -> Float[Tensor, "joint 3"]:
+        """Offsets of joints from their parents in the rest pose (m), in float64."""
+        return self.skeleton.t_parent_joint[self.skeleton.indices(*joints)].double()
+
     @property
     def position(self) -> Float[np.ndarray, "3"]:
         """Floor point between the feet as they stand at the end of the plan (m)."""
@@ -167,8 +193,3 @@ class Plan:
 
     def label(self, start_s: float, name: str) -> None:
         self.labels.append(Label(start_s, self.time, name))
-
-
-def wrap(angle: float) -> float:
-    """The same angle in [-π, π)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -1,17 +1,17 @@
 """The trunk over the feet: a pendulum's centre of mass, a pelvis that the legs can carry, a counter-turning chest."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.people.gait import FootMotion, load_on_left
-from wearcap.simulation.people.plan import SIDES, Plan
+from wearcap.simulation.people.gait import Feet, load_on_left
+from wearcap.simulation.people.plan import SIDES
 from wearcap.simulation.people.track import blur, falling_at_most, lower_envelope, pendulum, wander
 
 SPINE = ("l5", "l3", "t12", "t8")
@@ -27,19 +27,8 @@ HIPS_AHEAD_M = 0.042
 """Additional forward offset of the hips in walking, relative to standing."""
 STANCE_BEND = 0.9
 """More bend of a bearing knee in walking than in standing, as a share of the knee's softness."""
-
-
-@dataclass(frozen=True)
-class Trunk:
-    """Pelvis and chest over time; angles are yaw, forward pitch and roll to the right in the world (rad)."""
-
-    pelvis: Float[np.ndarray, "time 3"]
-    pelvis_angles: Float[np.ndarray, "time 3"]
-    chest_angles: Float[np.ndarray, "time 3"]
-    heading: Float[np.ndarray, "time"]
-    stride: Float[np.ndarray, "time"]
-    """Left foot ahead of the right one (m), smooth."""
-    speed: Float[np.ndarray, "time"]
+HELP = ("lean", "bend", "twist", "crouch", "ahead", "aside")
+"""Trunk motions that help hands to reach, columns of `help_`: as `Plan.lean` (rad), `crouch` and `shift` (m)."""
 
 
 def rotation_of(angles: Float[np.ndarray, "time 3"]) -> Float[Tensor, "time 3 3"]:
@@ -53,6 +42,7 @@ def rotation_of(angles: Float[np.ndarray, "time 3"]) -> Float[Tensor, "time 3 3"
 class Stance:
     """Quantities that follow from the feet before the trunk is placed over them, with all random draws."""
 
+    feet: Feet
     heading: Float[np.ndarray, "time"]
     load: Float[np.ndarray, "time"]
     """Share of the weight on the left foot."""
@@ -61,71 +51,86 @@ class Stance:
     speed: Float[np.ndarray, "time"]
     acceleration: Float[np.ndarray, "time 2"]
     stride: Float[np.ndarray, "time"]
+    """Left foot ahead of the right one (m), smooth."""
     drift: Float[np.ndarray, "time 6"]
 
+    @classmethod
+    def of(cls, feet: Feet, rng: np.random.Generator) -> "Stance":
+        """Motion of the wearer's mass over the feet."""
+        plan, fps, count = feet.plan, feet.fps, len(feet.times)
+        heading = blur((feet.left.heading + feet.right.heading) / 2, 0.13, fps)
+        forward = np.stack([np.cos(heading), np.sin(heading)], 1)
+        load = load_on_left(feet, rng)
+        pressure = load[:, None] * feet.left.pressure + (1 - load[:, None]) * feet.right.pressure
+        pressure = pressure[:, :2] + wander(rng, count, 2, 2.2, plan.style.posture.sway, fps)
+        rate = float(np.sqrt(GRAVITY / (1.06 * plan.hip_height)))
+        mass = pendulum(pressure, rate, fps)
+        velocity = np.gradient(mass, axis=0) * fps
+        speed = blur((velocity * forward).sum(1), 0.3, fps)
+        acceleration = blur(rate**2 * (mass - pressure), 0.1, fps)
+        stride = blur(((feet.left.ankle - feet.right.ankle)[:, :2] * forward).sum(1), 0.06, fps)
+        return cls(feet, heading, load, mass, speed, acceleration, stride, wander(rng, count, 6, 2.5, 0.010, fps))
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """Pelvis and chest over time; angles are yaw, forward pitch and roll to the right in the world (rad)."""
+
+    stance: Stance
+    pelvis: Float[np.ndarray, "time 3"]
+    pelvis_angles: Float[np.ndarray, "time 3"]
+    chest_angles: Float[np.ndarray, "time 3"]
+
+    @cached_property
+    def spine(self) -> tuple[Float[Tensor, "time joint 3 3"], Rigid]:
+        """World rotations of the joints of `SPINE` in order, the last one the chest's, and the chest's pose.
+
+        The turn between pelvis and chest is shared evenly among them.
+        """
+        skeleton = self.stance.feet.plan.skeleton
+        R_pelvis, R_chest = rotation_of(self.pelvis_angles), rotation_of(self.chest_angles)
+        between = rotation.log(R_pelvis.transpose(-1, -2) @ R_chest)
+        position, rotations = torch.from_numpy(self.pelvis), [R_pelvis]
+        for number, name in enumerate(SPINE, start=1):
+            position = position + rotations[-1] @ skeleton.t_parent_joint[skeleton.index(name)].double()
+            rotations.append(R_pelvis @ rotation.exp(number / len(SPINE) * between))
+        R_world = torch.stack(rotations[1:], 1)
+        return R_world, Rigid(R_world[:, -1], position)
+
     @property
-    def forward(self) -> Float[np.ndarray, "time 2"]:
-        return np.stack([np.cos(self.heading), np.sin(self.heading)], 1)
+    def chest(self) -> Rigid:
+        """Pose of the chest."""
+        return self.spine[1]
 
 
-HELP = ("lean", "bend", "twist", "crouch", "ahead", "aside")
-"""Trunk motions that help hands to reach, columns of `help_`: as `Plan.lean` (rad), `crouch` and `shift` (m)."""
-
-
-def stance_motion(
-    plan: Plan, feet: dict[str, FootMotion], times: Float[np.ndarray, "time"], fps: float, rng: np.random.Generator
-) -> Stance:
-    """Motion of the wearer's mass over the feet."""
-    left, right = (feet[side] for side in SIDES)
-    count = len(times)
-    heading = blur((left.heading + right.heading) / 2, 0.13, fps)
-    forward = np.stack([np.cos(heading), np.sin(heading)], 1)
-    load = load_on_left(np.stack([left.planted, right.planted], 1), times, rng)
-    pressure = load[:, None] * left.pressure + (1 - load[:, None]) * right.pressure
-    pressure = pressure[:, :2] + wander(rng, count, 2, 2.2, plan.style.sway, fps)
-    rate = float(np.sqrt(GRAVITY / (1.06 * plan.hip_height)))
-    mass = pendulum(pressure, rate, fps)
-    velocity = np.gradient(mass, axis=0) * fps
-    speed = blur((velocity * forward).sum(1), 0.3, fps)
-    acceleration = blur(rate**2 * (mass - pressure), 0.1, fps)
-    stride = blur(((left.ankle - right.ankle)[:, :2] * forward).sum(1), 0.06, fps)
-    return Stance(heading, load, mass, speed, acceleration, stride, wander(rng, count, 6, 2.5, 0.010, fps))
-
-
-def trunk_motion(
-    plan: Plan,
-    feet: dict[str, FootMotion],
-    stance: Stance,
-    times: Float[np.ndarray, "time"],
-    fps: float,
-    help_: Float[np.ndarray, "time 6"] | None = None,
-) -> Trunk:
+def trunk_motion(stance: Stance, help_: Float[np.ndarray, "time 6"] | None = None) -> Trunk:
     """Pelvis and chest that follow from the feet, the plan's channels, the wearer's habits and the hands' need."""
-    style, heading, forward, stride, drift = (plan.style, stance.heading, stance.forward, stance.stride, stance.drift)
+    plan, times, fps = stance.feet.plan, stance.feet.times, stance.feet.fps
+    style, heading, stride, drift = plan.style.posture, stance.heading, stance.stride, stance.drift
+    forward = np.stack([np.cos(heading), np.sin(heading)], 1)
     seated = plan.seat_weight.sample(times)
     moving = np.clip(np.abs(stance.speed) / 0.8, 0.0, 1.0)
     lean, crouch, shift = plan.lean.sample(times), plan.crouch.sample(times)[:, 0], plan.shift.sample(times)
     if help_ is not None:
         lean, crouch, shift = lean + help_[:, :3], crouch + help_[:, 3], shift + help_[:, 4:]
 
+    # the pelvis drops on the side that swings: it rolls to the right while the left leg stands
+    drops = style.pelvis_list * (0.35 + 0.65 * moving) * np.sin(np.pi * (blur(stance.load, 0.05, fps) - 0.5))
     pelvis_angles = np.stack(
         [
             heading - style.pelvis_yaw * stride * (1 - seated[:, 0]) + 0.3 * lean[:, 2],
             style.pelvis_tilt * (0.4 + 0.6 * moving) + 0.45 * lean[:, 0] + drift[:, 0],
-            _list(style.pelvis_list, blur(stance.load, 0.05, fps), moving) + 0.15 * lean[:, 1],
+            drops + 0.15 * lean[:, 1],
         ],
         1,
     )
     across = np.stack([-forward[:, 1], forward[:, 0]], 1)
     sideways = (stance.acceleration * across).sum(1)
+    speeding = blur((stance.acceleration * forward).sum(1), 0.12, fps)
     chest_angles = np.stack(
         [
             heading + style.trunk_counter * style.pelvis_yaw * blur(stride, 0.05, fps) + lean[:, 2] + drift[:, 1],
-            style.slouch
-            + 0.035 * stance.speed
-            + 0.03 * blur((stance.acceleration * forward).sum(1), 0.12, fps)
-            + lean[:, 0]
-            + drift[:, 2],
+            style.slouch + 0.035 * stance.speed + 0.03 * speeding + lean[:, 0] + drift[:, 2],
             -0.35 * pelvis_angles[:, 2] - 0.025 * sideways + lean[:, 1] + drift[:, 3],
         ],
         1,
@@ -135,58 +140,25 @@ def trunk_motion(
     place = place + shift[:, :1] * forward + shift[:, 1:] * across
     seat = plan.seat.sample(times)
     place += seated[:, :1] * (seat[:, :2] - place)
-    height = _height(plan, feet, place, moving, rotation_of(pelvis_angles), fps) - crouch
+    height = _height(stance.feet, place, moving, rotation_of(pelvis_angles)) - crouch
     height += seated[:, 1] * (seat[:, 2] - height)
-    pelvis = np.concatenate([place, height[:, None]], 1)
-    return Trunk(pelvis, pelvis_angles, chest_angles, heading, stride, stance.speed)
-
-
-@dataclass(frozen=True)
-class Spine:
-    """World rotations of the joints of `SPINE` in order, the last one the chest's, and where the chest is."""
-
-    R_world: Float[Tensor, "time joint 3 3"]
-    t_world_chest: Float[Tensor, "time 3"]
-
-    @property
-    def chest(self) -> Rigid:
-        return Rigid(self.R_world[:, -1], self.t_world_chest)
-
-
-def spine_motion(skeleton: Skeleton, trunk: Trunk) -> Spine:
-    """The turn between pelvis and chest, shared evenly among the spine's joints."""
-    R_pelvis, R_chest = rotation_of(trunk.pelvis_angles), rotation_of(trunk.chest_angles)
-    between = rotation.log(R_pelvis.transpose(-1, -2) @ R_chest)
-    position, rotations = torch.from_numpy(trunk.pelvis), [R_pelvis]
-    for number, name in enumerate(SPINE, start=1):
-        position = position + rotations[-1] @ skeleton.t_parent_joint[skeleton.index(name)].double()
-        rotations.append(R_pelvis @ rotation.exp(number / len(SPINE) * between))
-    return Spine(torch.stack(rotations[1:], 1), position)
-
-
-def _list(amount: float, load: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """The pelvis drops on the side that swings: roll to the right while the left leg stands."""
-    return amount * (0.35 + 0.65 * moving) * np.sin(np.pi * (load - 0.5))
+    return Trunk(stance, np.concatenate([place, height[:, None]], 1), pelvis_angles, chest_angles)
 
 
 def _height(
-    plan: Plan,
-    feet: dict[str, FootMotion],
+    feet: Feet,
     place: Float[np.ndarray, "time 2"],
     moving: Float[np.ndarray, "time"],
     R_world_pelvis: Float[Tensor, "time 3 3"],
-    fps: float,
 ) -> Float[np.ndarray, "time"]:
     """Height of the pelvis (m): as high as both legs let it, with soft knees, and smooth."""
-    skeleton = plan.skeleton
+    fps, left, right = feet.fps, feet.left, feet.right
     limits = []
     for side in SIDES:
-        hip, knee, ankle = (
-            skeleton.t_parent_joint[skeleton.index(f"{side}_{joint}")].double() for joint in ("hip", "knee", "ankle")
-        )
+        hip, knee, ankle = feet.plan.bones(f"{side}_hip", f"{side}_knee", f"{side}_ankle")
         bears = blur(feet[side].planted.astype(np.float64), 0.08, fps)
         soft = np.zeros_like(place[:, :1]).repeat(3, 1)
-        soft[:, 1] = plan.style.knee_soft * (0.5 + (0.5 + STANCE_BEND * moving) * bears)
+        soft[:, 1] = feet.plan.style.gait.knee_soft * (0.5 + (0.5 + STANCE_BEND * moving) * bears)
         lower = rotation.exp(torch.from_numpy(soft)) @ ankle[:, None]
         leg = (knee + lower[..., 0]).norm(dim=-1).numpy()
         offset = (R_world_pelvis @ hip).numpy()
@@ -195,12 +167,11 @@ def _height(
         limits.append(feet[side].ankle[:, 2] + up - offset[:, 2])
     limit = np.minimum(*limits)
     high, level = lower_envelope(limit, ENVELOPE_S, fps), lower_envelope(limit, STEP_ENVELOPE_S, fps)
-    apart = np.abs(feet["left"].ground[:, 2] - feet["right"].ground[:, 2])
-    stairs = blur(np.clip(apart / STAIR_APART_M, 0.0, 1.0), 0.25, fps)
+    stairs = blur(np.clip(np.abs(left.ground[:, 2] - right.ground[:, 2]) / STAIR_APART_M, 0.0, 1.0), 0.25, fps)
     share = LEVELLED * moving + (STAIRS_LEVELLED - LEVELLED * moving) * stairs
-    running = blur(np.maximum(feet["left"].running, feet["right"].running).astype(np.float64), 0.15, fps)
+    running = blur(np.maximum(left.running, right.running).astype(np.float64), 0.15, fps)
     share += running * (1.0 - share)
-    stands = blur((feet["left"].planted | feet["right"].planted).astype(np.float64), 0.045, fps)
+    stands = blur((left.planted | right.planted).astype(np.float64), 0.045, fps)
     bounce = BOUNCE_M * running * (BOUNCE_MIDDLE - stands)
     wanted = np.minimum(high + share * (level - high) + bounce, high)
     return blur(falling_at_most(wanted, GRAVITY, fps), 0.02, fps)

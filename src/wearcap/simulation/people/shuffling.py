@@ -6,13 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Footprint, Plan, wrap
+from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, Plan, wrap
 from wearcap.simulation.people.track import blur, ease
 
 Body = Callable[[Float[np.ndarray, "time"]], Float[np.ndarray, "time 3"]]
 """x, y (m) and unwrapped heading (rad) of the floor point between the feet at times (s)."""
 
 GRID_S = 0.02
+SPEED = 0.45
+"""Speed of steps to a place nearby (m/s)."""
 STILL = 0.035
 """Below this speed (m/s) no step is taken."""
 TURNED_M = 0.24
@@ -41,11 +43,9 @@ class _BodyPath:
         times = np.linspace(start_s, stop_s, max(int((stop_s - start_s) / GRID_S), 2) + 1)
         place = body(times)
         step = times[1] - times[0]
-        speed = blur(np.gradient(place, step, axis=0), 0.12, 1.0 / step)
+        x, y, turn = blur(np.gradient(place, step, axis=0), 0.12, 1.0 / step).T
         cos, sin = np.cos(place[:, 2]), np.sin(place[:, 2])
-        return cls(
-            times, place, cos * speed[:, 0] + sin * speed[:, 1], cos * speed[:, 1] - sin * speed[:, 0], speed[:, 2]
-        )
+        return cls(times, place, cos * x + sin * y, cos * y - sin * x, turn)
 
     def at(self, name: str, time: float) -> float:
         return float(np.interp(time, self.times, getattr(self, name)))
@@ -54,46 +54,40 @@ class _BodyPath:
         return np.array([np.interp(time, self.times, column) for column in self.place.T])
 
 
-def shuffle(
-    plan: Plan, rng: np.random.Generator, body: Body, start_s: float, stop_s: float, width: float | None = None
-) -> None:
+def shuffle(plan: Plan, rng: np.random.Generator, body: Body, start_s: float, stop_s: float) -> None:
     """Follow a body's path from one time to another with alternate steps, feet together at its end.
 
-    Each foot lands at the body's place in the middle of its stance. `width` is the lateral distance of the feet (m);
-    None is the wearer's own. `plan.time` becomes the last landing, at most about half a second after the path's end.
+    Each foot lands at the body's place in the middle of its stance. `plan.time` becomes the last landing, at most
+    about half a second after the path's end.
     """
     path = _BodyPath.of(body, start_s, stop_s)
     lands, beats = _landings(plan, path, rng)
-    if not len(lands):
-        plan.time = max(plan.time, stop_s)
-        return
-    side = _first(plan, path, rng)
-    width = plan.style.stance_width if width is None else width
+    side = _first_foot(plan, path, rng) if len(lands) else ""
     for k, (land, beat) in enumerate(zip(lands, beats)):
-        last = k >= len(lands) - 2
         swing = beat * float(np.clip(0.66 + 0.05 * rng.standard_normal(), 0.55, 0.78))
-        following = lands[min(k + 2, len(lands) - 1)]
+        last, following = k >= len(lands) - 2, lands[min(k + 2, len(lands) - 1)]
         middle = stop_s if last else 0.5 * (land + following - swing)
-        print_ = _print(plan, path, side, middle, beat, width if not last else plan.style.stance_width, rng)
-        _step(plan, path, side, land, swing, print_)
-        side = SIDES[1 - SIDES.index(side)]
+        _step(plan, path, side, (land, swing, beat), middle, rng)
+        side = OTHER[side]
     plan.time = max(plan.time, stop_s)
 
 
-def step_to(
-    plan: Plan, rng: np.random.Generator, place: Float[np.ndarray, "2"], heading: float, speed: float = 0.45
-) -> None:
+def step_to(plan: Plan, rng: np.random.Generator, place: Float[np.ndarray, "2"], heading: float) -> None:
     """Bring the feet beside each other to a place nearby (m) and a heading (rad), in small steps."""
     start = np.append(plan.position[:2], plan.heading)
-    change = np.append(np.asarray(place) - start[:2], wrap(heading - start[2]))
+    change = np.append(place - start[:2], wrap(heading - start[2]))
     effort = float(np.linalg.norm(change[:2]) + TURNED_M * abs(change[2]))
     if effort < 0.03:
         return
-    duration = max(1.5 * effort / speed, 0.7)
-    begin = plan.time + 0.15
-    shuffle(
-        plan, rng, lambda times: start + ease((times - begin) / duration)[:, None] * change, begin, begin + duration
-    )
+    duration, begin = max(1.5 * effort / SPEED, 0.7), plan.time + 0.15
+    body = lambda times: start + ease((times - begin) / duration)[:, None] * change  # noqa: E731
+    shuffle(plan, rng, body, begin, begin + duration)
+
+
+def arrive(plan: Plan, rng: np.random.Generator, place: Float[np.ndarray, "3"]) -> None:
+    """Step to x, y (m) and a heading (rad) nearby, unless one is there."""
+    if np.hypot(*(place[:2] - plan.position[:2])) > 0.03 or abs(wrap(place[2] - plan.heading)) > 0.1:
+        step_to(plan, rng, place[:2], place[2])
 
 
 def _landings(
@@ -105,8 +99,7 @@ def _landings(
     beat = np.clip(beat, 0.42, 1.1)
     rate = ease((effort - STILL) / STILL) / beat
     phase = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(path.times))])
-    total = np.trapezoid(effort, path.times)
-    if total < 0.04:
+    if np.trapezoid(effort, path.times) < 0.04:
         return np.zeros(0), np.zeros(0)
     count = max(round(phase[-1]), 1)
     rising = phase + 1e-6 * np.arange(len(phase))
@@ -115,14 +108,14 @@ def _landings(
     beats = np.interp(lands, path.times, beat)
     lands = np.append(lands, lands[-1] + 0.9 * beats[-1])
     beats = np.append(beats, min(beats[-1], 0.75))
-    noise = 1.2 * plan.style.variability * rng.standard_normal(len(lands)) * beats
+    noise = 1.2 * plan.style.gait.variability * rng.standard_normal(len(lands)) * beats
     lands = np.maximum.accumulate(lands + noise)
     first = max(plan.time, path.times[0] - 0.2) + 0.75 * beats[0]
     least = first + np.concatenate([[0.0], np.cumsum(0.82 * beats[1:])])
     return np.maximum(lands, least), beats
 
 
-def _first(plan: Plan, path: _BodyPath, rng: np.random.Generator) -> str:
+def _first_foot(plan: Plan, path: _BodyPath, rng: np.random.Generator) -> str:
     """The foot on the side to which it goes or turns, else the one behind, else either."""
     half = len(path.times) // 2
     aside = np.trapezoid(path.aside[:half], path.times[:half])
@@ -137,27 +130,22 @@ def _first(plan: Plan, path: _BodyPath, rng: np.random.Generator) -> str:
     return SIDES[int(rng.random() < 0.5)]
 
 
-def _print(
-    plan: Plan, path: _BodyPath, side: str, middle: float, beat: float, width: float, rng: np.random.Generator
-) -> Footprint:
-    """Footprint of a foot whose stance has its middle at a time."""
-    x, y, heading = path.place_at(middle)
-    across = abs(path.at("aside", middle)) * beat
-    half = max(width, across + CLOSE_M) / 2 * (1.0 + plan.style.variability * rng.standard_normal())
+def _step(
+    plan: Plan, path: _BodyPath, side: str, timing: tuple[float, float, float], middle: float, rng: np.random.Generator
+) -> None:
+    """One step whose stance has its middle at a time; `timing` is its landing, swing and the steps' interval (s)."""
+    land, swing, beat = timing
+    gait, (x, y, heading) = plan.style.gait, path.place_at(middle)
+    across, ahead = abs(path.at("aside", middle)) * beat, path.at("ahead", middle)
+    half = max(gait.stance_width, across + CLOSE_M) / 2 * (1.0 + gait.variability * rng.standard_normal())
     center = np.array([x, y, plan.position[2]])
     center[:2] += 0.008 * rng.standard_normal(2)
-    ahead = path.at("ahead", middle)
-    size = float(np.clip(2.0 * abs(ahead) * beat / 1.0, 0.0, 0.45))
+    size = float(np.clip(2.0 * abs(ahead) * beat, 0.0, 0.45))
     land_pitch = -0.35 * size if ahead > 0 else 0.5 * size
-    return plan.footprint(
-        side, center, heading, half, land_pitch=land_pitch, clearance=0.02 + 0.03 * size, bow=LEFT_SIGN[side] * 0.012
-    )
-
-
-def _step(plan: Plan, path: _BodyPath, side: str, land: float, swing: float, print_: Footprint) -> None:
-    old, other = plan.prints[side][-1], plan.prints[SIDES[1 - SIDES.index(side)]][-1]
+    how = {"land_pitch": land_pitch, "clearance": 0.02 + 0.03 * size, "bow": LEFT_SIGN[side] * 0.012}
+    print_ = plan.footprint(side, center, heading, half, **how)
+    old, other = plan.prints[side][-1], plan.prints[OTHER[side]][-1]
     lift = max(land - swing, old.land_s + 0.2, other.land_s + APART_S)
-    land = max(land, lift + 0.3)
     stride = float(np.linalg.norm((print_.ground - old.ground)[:2]))
     lift_pitch = 0.75 * min(stride, 0.6) if path.at("ahead", lift) > 0.02 else 0.12
-    plan.step(side, lift, land, lift_pitch, print_)
+    plan.step(side, lift, max(land, lift + 0.3), lift_pitch, print_)

@@ -37,21 +37,22 @@ class Track:
 
     initial: Float[np.ndarray, "feature"]
     _moves: list[tuple[float, float, np.ndarray]] = field(default_factory=list)
-    _last: np.ndarray = field(init=False)
+    last: Float[np.ndarray, "feature"] = field(init=False)
+    """Value of the channel after its last transition."""
 
     def __post_init__(self):
-        self._last = self.initial.astype(np.float64)
-
-    @property
-    def last(self) -> Float[np.ndarray, "feature"]:
-        """Value of the channel after its last transition."""
-        return self._last
+        self.last = self.initial.astype(np.float64)
 
     def move(self, start_s: float, stop_s: float, value) -> None:
         """Go to `value` between two times (s); equal times mean a jump."""
-        value = np.broadcast_to(np.asarray(value, np.float64), self._last.shape)
-        self._moves.append((start_s, max(stop_s, start_s + 1e-6), value - self._last))
-        self._last = value.copy()
+        value = np.broadcast_to(np.asarray(value, np.float64), self.last.shape)
+        self._moves.append((start_s, max(stop_s, start_s + 1e-6), value - self.last))
+        self.last = value.copy()
+
+    def visit(self, value, out: tuple[float, float], back: tuple[float, float]) -> None:
+        """Go to `value` in one interval of time and to zero in another (s)."""
+        self.move(*out, value)
+        self.move(*back, 0.0)
 
     def sample(self, times: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time feature"]:
         """Values at rising times (s). Loops over transitions, each touching only its own frames."""
@@ -115,13 +116,9 @@ def wander(
     coarse = scipy.ndimage.gaussian_filter1d(rng.standard_normal((knots, features)), 1.5, axis=0)
     coarse /= np.sqrt(1 / (2 * np.sqrt(np.pi) * 1.5))
     place = np.arange(length) / fps / spacing + 3.0
-    return std * _cubic(coarse, place)
-
-
-def _cubic(coarse: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Uniform cubic B-spline with the rows as control points: twice continuously differentiable."""
     low = np.floor(place).astype(int)
     u = (place - low)[:, None]
     low = np.clip(low, 1, len(coarse) - 3)
+    # a uniform cubic B-spline with the rows as control points is twice continuously differentiable
     weights = ((1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3)
-    return np.sum([w * coarse[low + k - 1] for k, w in enumerate(weights)], 0) / 6.0
+    return std * (np.sum([w * coarse[low + k - 1] for k, w in enumerate(weights)], 0) / 6.0)

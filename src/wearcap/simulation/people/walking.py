@@ -1,14 +1,20 @@
-"""Footsteps along a path: speed from curvature, step length from speed, treads of stairs met exactly."""
+"""Walking: smooth paths over the floor, and footsteps along them that meet the treads of stairs exactly."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from wearcap.simulation.people.gait import advance, bump, climb
-from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, STEP_M, Footprint, Plan, step_rise, wrap
+from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, STEP_M, Footprint, Plan, step_rise, wrap
 from wearcap.simulation.people.track import blur
+from wearcap.simulation.places.navigation import CLEARANCE_M, NavigationGrid
+from wearcap.simulation.places.outline import turn
 
+WAYPOINT_M = 0.1
+SMOOTHING_PASSES = 80
+STAIR_APPROACH_M = 0.5
+"""Distance from stairs within which paths are straight."""
 SPACING_M = 0.02
 RUN_SPEED = 2.1
 JOG_SPEED = 1.4
@@ -22,13 +28,54 @@ CURVE_SPEED = 0.95
 """Speed (m/s) in a curve of radius 1 m, for a wearer whose own speed is 1.3 m/s (two-thirds power law)."""
 HEEL_ROOM_M, TOE_ROOM_M, EDGE_M = 0.055, 0.015, 0.08
 """Margins on treads: heel behind the ankle, toes before the next riser, and, going down, the ankle past the edge."""
-
 PAST_KERB_M = 0.16
 """Distance of the ankle beyond a kerb's edge after stepping over it."""
 
 
+def plan_path(
+    grid: NavigationGrid,
+    flights: tuple,
+    start: Float[np.ndarray, "3"],
+    goal: Float[np.ndarray, "3"],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "waypoint 3"] | None:
+    """A smooth path from start to goal, waypoints about 0.1 m apart; heights only to a cell. None without a path.
+
+    It keeps off obstacles and is straight on stairs.
+    """
+    cells = grid.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
+    if cells is None:
+        return None
+    points = _evenly(np.concatenate([start[None], cells, goal[None]]))
+    if len(points) < 4:
+        return points
+    layer = grid.layer_of(points)
+    sides = [rng.uniform(-1, 1) * max(flight.width / 2 - 0.35, 0.0) for flight in flights]
+    for _ in range(SMOOTHING_PASSES):
+        moved = points.copy()
+        moved[1:-1, :2] += 0.5 * ((points[:-2, :2] + points[2:, :2]) / 2 - points[1:-1, :2])
+        for flight, side in zip(flights, sides):  # drawn to a line beside the flight's middle
+            run, off = flight.up_and_left(moved[:, :2])
+            on = (run > -STAIR_APPROACH_M) & (run < flight.length + STAIR_APPROACH_M) & (np.abs(off) < flight.width / 2)
+            on &= (moved[:, 2] > flight.base_z - 0.3) & (moved[:, 2] < flight.top_z + 0.3)
+            on[[0, -1]] = False
+            moved[on, :2] += ((side - off[on]) * 0.5)[:, None] * flight.left
+        clear = grid._clearance_in(layer, moved[:, :2])
+        tight = (clear < CLEARANCE_M) & (clear < grid._clearance_in(layer, points[:, :2]))
+        points = np.where(tight[:, None], points, moved)
+    return _evenly(points)
+
+
+def _evenly(points: np.ndarray) -> np.ndarray:
+    """The same polyline with waypoints spaced evenly in the plane, both ends kept."""
+    length = np.concatenate([[0.0], np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1).cumsum()])
+    count = max(int(np.ceil(length[-1] / WAYPOINT_M)), 1) + 1
+    place = np.linspace(0.0, length[-1], count)
+    return np.stack([np.interp(place, length, axis) for axis in points.T], 1)
+
+
 @dataclass(frozen=True)
-class Course:
+class _Course:
     """A path to be walked, by arc length."""
 
     points: Float[np.ndarray, "point 3"]
@@ -43,46 +90,82 @@ class Course:
     run_from: float
     """Speed (m/s) from which on the gait is running."""
 
+    @classmethod
+    def of(cls, plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float, flights: tuple) -> "_Course":
+        """Speed, time and step phase along a path. Steps fall on the treads of the flights that it takes."""
+        points, heading = _rounded(path)
+        length = np.arange(len(points)) * SPACING_M
+        curvature = blur(np.abs(np.gradient(heading, SPACING_M)), 0.15, 1 / SPACING_M)
+        pace = speed / 1.3 if speed < RUN_SPEED else 1.5
+        limit = np.minimum(speed, CURVE_SPEED * pace * np.maximum(curvature, 0.05) ** (-1 / 3))
+        anchors = [anchor for flight in flights for anchor in _tread_anchors(points, flight, plan.sole[1])]
+        anchors = sorted(anchors, key=lambda anchor: anchor[0])
+        stairs = np.zeros(len(points))
+        for at, up, tread in anchors:
+            near = np.abs(length - at) < 0.55 * tread
+            stairs[near] = up
+            beat = (0.58 if up > 0 else 0.54) / plan.style.briskness**0.5
+            limit[near] = np.minimum(limit[near], tread / beat)
+        limit = blur(_ramped(limit), 0.10, 1 / SPACING_M)
+        stride = np.minimum(np.sqrt(60 * plan.style.gait.walk_ratio * limit), limit * 60 / MIN_CADENCE)
+        run_from = JOG_SPEED if speed > RUN_SPEED else np.inf
+        stride = np.where(limit > run_from, limit * 60 / (158 + 6 * limit), stride)
+        phase = np.concatenate([[0.0], np.cumsum(SPACING_M / stride[:-1])])
+        time = np.concatenate([[0.0], np.cumsum(SPACING_M / limit[:-1])])
+        # the phase is stretched piecewise, so that it is a whole number at every anchor and at the end
+        knots, whole, previous = [0.0], [0], 0.0
+        for end in [at for at, *_ in anchors if 0.1 < at < length[-1] - 0.1] + [length[-1]]:
+            steps = np.interp(end, length, phase) - np.interp(previous, length, phase)
+            knots.append(float(np.interp(end, length, phase)))
+            whole.append(whole[-1] + max(round(steps), 1))
+            previous = end
+        return cls(points, heading, limit, time, np.interp(phase, knots, whole), stairs, run_from)
+
     def at_phase(self, name: str, phase: float) -> float:
         """Heading, speed, time or on_stairs at the phase; clamped at the ends."""
         return float(np.interp(phase, self.phase, getattr(self, name)))
 
-    def point_at(self, phase: float) -> Float[np.ndarray, "3"]:
-        """Floor point at the phase (m); clamped at the ends."""
-        return np.array([np.interp(phase, self.phase, column) for column in self.points.T])
+    def footprint(self, plan: Plan, side: str, k: int, last: bool, speed: float, rng: np.random.Generator) -> Footprint:
+        """Print of the k-th step, which varies about the path by the wearer's habit."""
+        gait = plan.style.gait
+        point = np.array([np.interp(k, self.phase, column) for column in self.points.T])
+        heading, stairs = self.at_phase("heading", k), abs(self.at_phase("on_stairs", k)) > 0.5
+        narrow = 0.6 if speed > self.run_from else 1.0
+        width = gait.step_width * narrow * (1 + 3 * gait.variability * rng.standard_normal())
+        if last:
+            width = gait.stance_width * (1 + 0.1 * rng.standard_normal())
+        length = gait.variability * rng.standard_normal() * 0.6 * (0.0 if stairs else 1.0)
+        point[:2] += length * turn(heading)[:, 0]
+        return plan.footprint(side, point, heading + 0.03 * rng.standard_normal(), width / 2)
 
 
 def walk_along(
     plan: Plan, path: Float[np.ndarray, "waypoint 3"], rng: np.random.Generator, speed: float, flights: tuple = ()
 ) -> None:
     """Turn towards a path's start, walk (or run, above 2.1 m/s) along it and stop at its end, feet together."""
-    course = plan_course(plan, path, speed, flights)
+    course = _Course.of(plan, path, speed, flights)
     ahead = float(np.interp(0.35, np.arange(len(course.heading)) * SPACING_M, course.heading))
     if abs(wrap(ahead - plan.heading)) > np.deg2rad(50):
         turn_to(plan, ahead - np.sign(wrap(ahead - plan.heading)) * np.deg2rad(15), rng)
     steps = round(course.phase[-1])
-    first = _first_foot(plan, course, rng)
-    sides = [first if k % 2 else _other(first) for k in range(1, steps + 2)]
+    side = _first_foot(plan, wrap(course.at_phase("heading", 1.0) - plan.heading), rng)
     lands = np.array([course.at_phase("time", k - 0.5) for k in range(1, steps + 1)])
     tempo = np.diff(lands, append=lands[-1] + 0.55) if steps > 1 else np.array([0.6])
-    lands = lands + plan.style.variability * rng.standard_normal(steps) * np.clip(tempo, 0, 0.6) * 0.6
+    lands = lands + plan.style.gait.variability * rng.standard_normal(steps) * np.clip(tempo, 0, 0.6) * 0.6
     lands = lands + plan.time + READY_S + 0.5 - lands[0]
     lands = np.append(lands, lands[-1] + max(tempo[-1], 0.55))
-    for k, (side, land) in enumerate(zip(sides, lands), start=1):
+    for k, land in enumerate(lands, start=1):
         last = k > steps
         how = course.at_phase("speed", min(k, steps) - 0.5)
-        print_ = _course_print(plan, course, side, min(k, steps), last, how, rng)
+        print_ = course.footprint(plan, side, min(k, steps), last, how, rng)
         beat = land - lands[k - 2] if k > 1 else 0.62
         running = how > course.run_from and not last
-        lift = land - beat * (1.0 - double_support(how, running)) if k > 1 else land - 0.5
-        _walk_step(plan, side, lift, land, print_, running)
-
-
-def double_support(speed: float, running: bool) -> float:
-    """Share of a step's time in which both feet stand; negative in running, where neither does."""
-    if running:
-        return float(np.clip(-0.22 - 0.08 * (speed - RUN_SPEED), -0.38, -0.12))
-    return float(np.clip(0.24 + 0.16 * (1.3 - speed), 0.14, 0.42))
+        if running:  # there is a time in which neither foot stands
+            both = float(np.clip(-0.22 - 0.08 * (how - RUN_SPEED), -0.38, -0.12))
+        else:
+            both = float(np.clip(0.24 + 0.16 * (1.3 - how), 0.14, 0.42))
+        _walk_step(plan, side, land - beat * (1.0 - both) if k > 1 else land - 0.5, land, print_, running)
+        side = OTHER[side]
 
 
 def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprint, running: bool) -> None:
@@ -90,33 +173,22 @@ def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprin
     old = plan.prints[side][-1]
     lift = max(lift, old.land_s + 0.16)
     stride = float(np.linalg.norm((print_.ground - old.ground)[:2]))
-    size = min(stride / 1.35, 1.15) * plan.style.heel_rise
+    size = min(stride / 1.35, 1.15) * plan.style.gait.heel_rise
     rise = step_rise(old, print_)
-    lift_pitch, land_pitch, clearance = 0.95 * size, -0.44 * size, 0.02
-    if running:
-        lift_pitch, land_pitch, clearance = 0.85, -0.10, 0.10
+    lift_pitch, land_pitch, clearance = (0.85, -0.10, 0.10) if running else (0.95 * size, -0.44 * size, 0.02)
     if rise > STEP_M:
         lift_pitch, land_pitch, clearance = 0.55, 0.06, 0.05
     elif rise < -STEP_M:
         lift_pitch, land_pitch, clearance = 0.60, 0.22, 0.03
     elif stride < 0.45:
         clearance = 0.03
-    clearance = max(clearance, _over_corner(plan, old, print_))
-    new = Footprint(
-        print_.ground,
-        print_.heading,
-        print_.tilt,
-        land_pitch=land_pitch,
-        clearance=clearance,
-        bow=LEFT_SIGN[side] * 0.012,
-        running=running,
-    )
-    plan.step(side, lift, land, lift_pitch, new)
+    clearance = max(clearance, _over_corner(plan, old, print_, rise))
+    swing = {"land_pitch": land_pitch, "clearance": clearance, "bow": LEFT_SIGN[side] * 0.012, "running": running}
+    plan.step(side, lift, land, lift_pitch, replace(print_, **swing))
 
 
-def _over_corner(plan: Plan, old: Footprint, new: Footprint) -> float:
+def _over_corner(plan: Plan, old: Footprint, new: Footprint, rise: float) -> float:
     """Height (m) to which a swing must lift the foot to clear a step or crest whose corner it cuts; 0 going down."""
-    rise = step_rise(old, new)
     if rise < -STEP_M:
         return 0.0
     share = np.linspace(0.15, 0.8, 14)
@@ -132,52 +204,7 @@ def _over_corner(plan: Plan, old: Footprint, new: Footprint) -> float:
     return float(min(need.max(), 0.35))
 
 
-def _course_print(
-    plan: Plan, course: Course, side: str, k: int, last: bool, speed: float, rng: np.random.Generator
-) -> Footprint:
-    style = plan.style
-    point, heading = course.point_at(k), course.at_phase("heading", k)
-    stairs = abs(course.at_phase("on_stairs", k)) > 0.5
-    width = (
-        style.step_width
-        * (0.6 if speed > course.run_from else 1.0)
-        * (1 + 3 * style.variability * rng.standard_normal())
-    )
-    if last:
-        width = style.stance_width * (1 + 0.1 * rng.standard_normal())
-    length = style.variability * rng.standard_normal() * 0.6 * (0.0 if stairs else 1.0)
-    point[:2] += length * np.array([np.cos(heading), np.sin(heading)])
-    heading += 0.03 * rng.standard_normal()
-    return plan.footprint(side, point, heading, width / 2)
-
-
-def plan_course(plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float, flights: tuple) -> Course:
-    """Speed, time and step phase along a path. Steps fall on the treads of the flights that it takes."""
-    points, heading = _smooth(path)
-    length = np.arange(len(points)) * SPACING_M
-    curvature = blur(np.abs(np.gradient(heading, SPACING_M)), 0.15, 1 / SPACING_M)
-    pace = speed / 1.3 if speed < RUN_SPEED else 1.5
-    limit = np.minimum(speed, CURVE_SPEED * pace * np.maximum(curvature, 0.05) ** (-1 / 3))
-    foot = plan.sole[1]
-    anchors = [anchor for flight in flights for anchor in _tread_anchors(points, flight, foot)]
-    anchors = sorted(anchors, key=lambda anchor: anchor[0])
-    stairs = np.zeros(len(points))
-    for at, direction, tread, _rise in anchors:
-        near = np.abs(length - at) < 0.55 * tread
-        stairs[near] = direction
-        beat = (0.58 if direction > 0 else 0.54) / plan.style.briskness**0.5
-        limit[near] = np.minimum(limit[near], tread / beat)
-    limit = blur(_ramped(limit), 0.10, 1 / SPACING_M)
-    stride = np.minimum(np.sqrt(60 * plan.style.walk_ratio * limit), limit * 60 / MIN_CADENCE)
-    run_from = JOG_SPEED if speed > RUN_SPEED else np.inf
-    stride = np.where(limit > run_from, limit * 60 / (158 + 6 * limit), stride)
-    raw = np.concatenate([[0.0], np.cumsum(SPACING_M / stride[:-1])])
-    time = np.concatenate([[0.0], np.cumsum(SPACING_M / limit[:-1])])
-    phase = _anchored(raw, length, [a[0] for a in anchors])
-    return Course(points, heading, limit, time, phase, stairs, run_from)
-
-
-def _smooth(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _rounded(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Evenly spaced points of a path with rounded corners, and its unwrapped heading."""
     run = np.concatenate([[0.0], np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).cumsum()])
     count = max(int(run[-1] / SPACING_M), 4)
@@ -202,8 +229,8 @@ def _ramped(limit: np.ndarray) -> np.ndarray:
     return np.sqrt(np.minimum.accumulate((squared + fall)[::-1])[::-1] - fall)
 
 
-def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float, int, float, float]]:
-    """(arc length, direction up or down, tread, rise) of the places on a path where a foot must stand on a flight.
+def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float, int, float]]:
+    """(arc length, 1 up or -1 down, tread) of the places on a path where a foot must stand on a flight.
 
     `foot` is how far the toes are ahead of the ankle (m).
     """
@@ -214,64 +241,45 @@ def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float,
     if inside.sum() < 3:
         return []
     first, last = np.flatnonzero(inside)[[0, -1]]
-    up = run[last] > run[first]
+    up = 1 if run[last] > run[first] else -1
     treads = np.arange(flight.steps + 1) * flight.tread
     if flight.steps == 1:
-        wanted = np.array([PAST_KERB_M if up else -PAST_KERB_M])
-    elif up:
+        wanted = np.array([up * PAST_KERB_M])
+    elif up > 0:
         wanted = np.concatenate([[-0.29], treads[:-1] + min(HEEL_ROOM_M, flight.tread - foot - TOE_ROOM_M)])
     else:
         wanted = np.concatenate([[treads[-2] + 0.20], treads[-2::-1] - EDGE_M])
-    crossing = run[first : last + 1] * (1 if up else -1)
-    crossing = np.maximum.accumulate(crossing) + 1e-9 * np.arange(len(crossing))
-    wanted = wanted * (1 if up else -1)
+    crossing = np.maximum.accumulate(run[first : last + 1] * up)
+    crossing = crossing + 1e-9 * np.arange(len(crossing))
+    wanted = wanted * up
     wanted = wanted[(wanted > crossing[0]) & (wanted < crossing[-1])]
     places = np.interp(wanted, crossing, np.arange(first, last + 1) * SPACING_M)
-    return [(float(place), 1 if up else -1, flight.tread, flight.rise) for place in places]
+    return [(float(place), up, flight.tread) for place in places]
 
 
-def _anchored(raw: np.ndarray, length: np.ndarray, anchors: list[float]) -> np.ndarray:
-    """The phase stretched piecewise, so that it is a whole number at every anchor and at the end."""
-    ends = [a for a in anchors if 0.1 < a < length[-1] - 0.1] + [length[-1]]
-    knots, whole, previous = [0.0], [0], 0.0
-    for end in ends:
-        steps = np.interp(end, length, raw) - np.interp(previous, length, raw)
-        knots.append(float(np.interp(end, length, raw)))
-        whole.append(whole[-1] + max(round(steps), 1))
-        previous = end
-    return np.interp(raw, knots, whole)
+def _first_foot(plan: Plan, turned: float, rng: np.random.Generator) -> str:
+    """The foot behind, else the inner one of a turn by an angle (rad), else either."""
+    apart = (plan.prints["left"][-1].ground - plan.prints["right"][-1].ground)[:2]
+    ahead = apart @ turn(plan.heading)[:, 0]
+    if abs(ahead) > 0.1:
+        return "right" if ahead > 0 else "left"
+    if abs(turned) > 0.2:
+        return "left" if turned > 0 else "right"
+    return SIDES[int(rng.random() < 0.5)]
 
 
 def turn_to(plan: Plan, heading: float, rng: np.random.Generator) -> None:
     """Turn on the spot to a heading (rad) in steps of at most about 55 degrees, the inner foot first."""
     start, center = plan.heading, plan.position
-    turn = wrap(heading - start)
-    side = "left" if turn > 0 else "right"
-    count = max(int(np.ceil(abs(turn) / np.deg2rad(55))), 1) + 1
+    turned = wrap(heading - start)
+    side = "left" if turned > 0 else "right"
+    count = max(int(np.ceil(abs(turned) / np.deg2rad(55))), 1) + 1
     beat = float(np.clip(0.56 * rng.normal(1.0, 0.07) / plan.style.briskness, 0.42, 0.8))
     land = plan.time + READY_S + 0.44 * beat / 0.56
     for k in range(1, count + 1):
-        facing = start + turn * min(k / (count - 1 + 0.3), 1.0) if k < count - 1 else start + turn
+        facing = start + turned * min(k / (count - 1 + 0.3), 1.0) if k < count - 1 else start + turned
         center[:2] += 0.012 * rng.standard_normal(2)
-        width = plan.style.stance_width * (1.0 + 0.08 * rng.standard_normal())
-        how = plan.footprint(
-            side, center, facing, width / 2, land_pitch=-0.05, clearance=0.025, bow=LEFT_SIGN[side] * 0.02
-        )
-        plan.step(side, land - 0.72 * beat, land, 0.22, how)
-        side, land = _other(side), land + beat * rng.normal(1.0, 0.04)
-
-
-def _other(side: str) -> str:
-    return SIDES[1 - SIDES.index(side)]
-
-
-def _first_foot(plan: Plan, course: Course, rng: np.random.Generator) -> str:
-    """The foot behind, else the inner one of a turn, else either."""
-    along = np.array([np.cos(plan.heading), np.sin(plan.heading)])
-    ahead = (plan.prints["left"][-1].ground - plan.prints["right"][-1].ground)[:2] @ along
-    if abs(ahead) > 0.1:
-        return "right" if ahead > 0 else "left"
-    turn = wrap(course.at_phase("heading", 1.0) - plan.heading)
-    if abs(turn) > 0.2:
-        return "left" if turn > 0 else "right"
-    return SIDES[int(rng.random() < 0.5)]
+        width = plan.style.gait.stance_width * (1.0 + 0.08 * rng.standard_normal())
+        how = {"land_pitch": -0.05, "clearance": 0.025, "bow": LEFT_SIGN[side] * 0.02}
+        plan.step(side, land - 0.72 * beat, land, 0.22, plan.footprint(side, center, facing, width / 2, **how))
+        side, land = OTHER[side], land + beat * rng.normal(1.0, 0.04)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from wearcap.geometry.mesh import Mesh
-from wearcap.simulation.people.paths import plan_path
+from wearcap.simulation.people.walking import plan_path
 from wearcap.simulation.places.navigation import NavigationGrid
 from wearcap.simulation.places.outline import points_in_convex
 

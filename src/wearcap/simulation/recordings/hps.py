@@ -16,9 +16,10 @@ from wearcap.recording.recording import ImuStream, Intervals, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.people.actions import ACTIVITIES, FREE_M, follow, on_stairs, path_length
+from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan
 from wearcap.simulation.people.walking import turn_to
-from wearcap.simulation.people.wearer import TAIL_S, SimulatedMotion, Wearer, perform
+from wearcap.simulation.people.wearer import TAIL_S, SimulatedMotion, perform
 from wearcap.simulation.places.world import CaptureSpot, World
 from wearcap.simulation.recordings.localization_noise import LocalizationNoise, localize_statistically
 from wearcap.simulation.recordings.simulate import POOLS, drawn_person, seeded, with_truth, world_of
@@ -162,7 +163,7 @@ def _shaken_by_claps(stream: ImuStream, motion: Motion, claps_s: tuple[float, ..
 
 
 def simulate_session(
-    world: World, person: Wearer, rng: np.random.Generator, fps: float = 60.0, protocol: Protocol = Protocol()
+    world: World, person: Person, rng: np.random.Generator, fps: float = 60.0, protocol: Protocol = Protocol()
 ) -> SimulatedSession:
     """A session at the world's first capture spot, deterministic for a given state of `rng`."""
     session = _Session(world, person, rng, protocol)
@@ -195,11 +196,11 @@ def simulate_session(
 class _Session:
     """The plan in the making, and the distance walked so far."""
 
-    def __init__(self, world: World, person: Wearer, rng: np.random.Generator, protocol: Protocol):
+    def __init__(self, world: World, person: Person, rng: np.random.Generator, protocol: Protocol):
         self.world, self.rng, self.protocol = world, rng, protocol
         self.spot: CaptureSpot = world.spots[0]
         self.home = np.array(self.spot.position)
-        self.plan = Plan(person.skeleton, person.style, self.home.copy(), self.spot.heading, world.floor_height)
+        self.plan = Plan(person, self.home.copy(), self.spot.heading, world.floor_height)
         self.plan.time = 0.8
         self.travelled = 0.0
         self.stretches: list[tuple[float, float, str]] = []

@@ -15,7 +15,7 @@ from wearcap.sensors.head import SlamNoise, head_stream
 from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.household import USUAL, VARIED, Habits, Household
-from wearcap.simulation.handling.rearranging import APART_M, apart, kept_free, outlines
+from wearcap.simulation.handling.rearranging import APART_M, apart, outlines
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.wearer import SimulatedMotion, perform
 from wearcap.simulation.places.interactive_flat import InteractiveFlat, build_interactive_flat, obstacle
@@ -164,7 +164,7 @@ def _placed(flat: InteractiveFlat, movable: Movable, rng: np.random.Generator) -
     house, navigation = House(flat), flat.static.navigation
     standing = house.obstacles()
     solid = [item.footprint for item in (*flat.static.objects, *standing) if item.z_range[0] < 1.0]
-    zones = kept_free(house)
+    zones = house.kept_free()
     rooms = [navigation.barred(standing, point) for point in flat.static.sample_floor(rng, 6)]
     points = max(rooms, key=lambda grid: int(grid.walkable.sum())).node_points
     outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
