@@ -11,7 +11,7 @@ from wearcap.body.smpl_body import smpl_body
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.formats.smpl_files import read_smpl
+from wearcap.io.formats.smpl import read_smpl
 
 AXES = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # model → world
 

@@ -10,10 +10,9 @@ from ocam_files import lens, xml_of
 
 from wearcap.body.skeletons import smpl24
 from wearcap.geometry import rotation
-from wearcap.io.datasets.hps import PELVIS_SMPL, nominal_mount
-from wearcap.io.datasets.hps_unity import JOINTS
+from wearcap.io.datasets.hps import JOINTS, PELVIS_SMPL, nominal_mount
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.io.formats.smpl_axes import A
+from wearcap.io.formats.smpl import A
 from wearcap.recording import Motion
 from wearcap_testing import swaying_motion
 

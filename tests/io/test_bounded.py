@@ -12,26 +12,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wearcap.io.datasets.totalcapture import read_totalcapture
 
 from wearcap.errors import WearcapError
+from wearcap.io.datasets.hcontact import read_smpl_json
 from wearcap.io.datasets.mocap_every_folder import _config
-from wearcap.io.datasets.totalcapture import read_totalcapture
 from wearcap.io.formats import bounded
 from wearcap.io.formats.asf_amc import read_asf
 from wearcap.io.formats.bvh import read_bvh
+from wearcap.io.formats.camera_json import read_photos
 from wearcap.io.formats.colmap import read_colmap
-from wearcap.io.formats.euroc import read_euroc
-from wearcap.io.formats.json_text import read_json
 from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.io.formats.npz import map_npy, read_npz
 from wearcap.io.formats.ocamcalib import OCamModel
 from wearcap.io.formats.pcd import read_pcd
-from wearcap.io.formats.photos import read_photos
 from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.poses import read_euroc, read_tum
 from wearcap.io.formats.restricted_pickle import read_pickle
-from wearcap.io.formats.smpl_json import read_smpl_json
-from wearcap.io.formats.text import read_text
-from wearcap.io.formats.tum import read_tum
+from wearcap.io.formats.text import read_json, read_text
 from wearcap.io.formats.video import read_frames, read_image, video_info
 from wearcap.io.formats.wavefront import read_obj
 

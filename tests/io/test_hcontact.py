@@ -11,8 +11,14 @@ from hypothesis import given
 
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.hcontact import activity_of, hcontact_names, location_of, read_hcontact, read_hcontact_split
-from wearcap.io.formats.smpl_json import read_smpl_json
+from wearcap.io.datasets.hcontact import (
+    activity_of,
+    hcontact_names,
+    location_of,
+    read_hcontact,
+    read_hcontact_split,
+    read_smpl_json,
+)
 from wearcap.prepare.hcontact import hcontact_tasks
 from wearcap.prepare.splits import read_splits
 from wearcap.recording.store import RecordingStore

@@ -15,7 +15,7 @@ from test_mvnx import mvnx, sample
 from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.hps_scene import is_hps_scene, read_hps_scene
+from wearcap.io.datasets.hps import is_hps_scene, read_hps_scene
 from wearcap.io.datasets.hps_sequence import hps_names, is_hps, read_hps_sequence, scan_name, subject_of
 
 # Scans -------------------------------------------------------------------------------------------------------------

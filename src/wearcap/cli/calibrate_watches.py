@@ -21,7 +21,7 @@ from wearcap.files import folder_lock
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.devices.watch_calibration_json import WornCalibration, write_watch_calibration
 from wearcap.io.devices.watch_log import read_watch_log
-from wearcap.io.formats.tum import read_tum
+from wearcap.io.formats.poses import read_tum
 from wearcap.recording import FloorTrack, ImuStream, Recording, RecordingStore
 from wearcap.recording.locate import load_recording
 from wearcap.recording.store import save_recording

@@ -25,8 +25,7 @@ def main(arguments: list[str]) -> None:
         raise WearcapError(f"port {options.port}", expected="1 to 65535")
 
     from wearcap.io.formats.environment import FILE_NAME
-    from wearcap.io.formats.scan import read_scan
-    from wearcap.io.formats.scene_folder import cloud_file
+    from wearcap.io.formats.scene_folder import cloud_file, read_scan
     from wearcap.viewer.object_editor import ObjectEditor
 
     cloud = cloud_file(options.scene)

@@ -21,14 +21,13 @@ from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.devices.aria_mps import find_mps_file, head_stream, is_mps_folder, read_closed_loop, read_mps
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.io.formats.bvh import read_bvh
-from wearcap.io.formats.euroc import read_euroc
-from wearcap.io.formats.json_text import read_json_object
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.tum import read_tum
+from wearcap.io.formats.poses import read_euroc, read_tum
+from wearcap.io.formats.text import read_json_object
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
 

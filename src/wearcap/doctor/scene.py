@@ -9,10 +9,10 @@ from jaxtyping import Float32
 
 from wearcap.doctor.report import Finding, refusal
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.hps_scene import CLOUD, is_hps_scene, read_hps_scene
-from wearcap.io.formats.image_file import open_image
-from wearcap.io.formats.photos import FILE_NAME, read_photos
-from wearcap.io.formats.scan import read_scan
+from wearcap.io.datasets.hps import CLOUD, is_hps_scene, read_hps_scene
+from wearcap.io.formats.camera_json import PHOTOS_FILE, read_photos
+from wearcap.io.formats.scene_folder import read_scan
+from wearcap.io.formats.video import open_image
 from wearcap.localization.visual_map import VisualMap
 from wearcap.recording import PointCloud, Recording
 from wearcap.recording.photo import Photo
@@ -40,11 +40,11 @@ NO_PHOTOS = Finding(
 
 def is_scene(folder: Path) -> bool:
     """Whether a folder holds a scan with photos: wearcap's (photos.json) or NavVis' (sensor_frame.xml)."""
-    return (folder / FILE_NAME).is_file() or (folder / CLOUD).is_file() or is_hps_scene(folder)
+    return (folder / PHOTOS_FILE).is_file() or (folder / CLOUD).is_file() or is_hps_scene(folder)
 
 
 def _is_navvis(folder: Path) -> bool:
-    return is_hps_scene(folder) and not (folder / FILE_NAME).is_file()
+    return is_hps_scene(folder) and not (folder / PHOTOS_FILE).is_file()
 
 
 def read_scene(folder: Path) -> tuple[Recording, list[Finding]]:
@@ -63,7 +63,7 @@ def read_scene(folder: Path) -> tuple[Recording, list[Finding]]:
         photos = read_hps_scene(folder)[1] if _is_navvis(folder) else read_photos(folder)
         findings += check_photos(photos, scan)
     except WearcapError as error:
-        listed = (folder / FILE_NAME).is_file() or _is_navvis(folder)
+        listed = (folder / PHOTOS_FILE).is_file() or _is_navvis(folder)
         findings.append(refusal(error, "photos") if listed else NO_PHOTOS)
     shown = torch.zeros(0, 3) if scan is None else torch.from_numpy(_thinned(scan.points))
     return Recording(folder.resolve().name, points=PointCloud(shown) if len(shown) else None), findings

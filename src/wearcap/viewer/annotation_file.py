@@ -9,7 +9,7 @@ from typing import Any
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.io.formats.contact_labels import LabelClock, Labels, annotation_of, parse_labels
-from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.text import read_json
 
 
 def label_path(output: str | Path, name: str) -> Path:

@@ -15,9 +15,9 @@ from wearcap.body.skeletons import smplh52, smplx22
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry import rotation
-from wearcap.io.formats.frame_grid import even_frames, nominal_fps
+from wearcap.io.formats.motion_npz import even_frames, nominal_fps
 from wearcap.io.formats.npz import read_npz, require
-from wearcap.io.formats.smpl_axes import A, rotations_from_smpl, shape_from_arrays
+from wearcap.io.formats.smpl import A, rotations_from_smpl, shape_from_arrays
 from wearcap.recording import Motion, Recording
 
 PELVIS_SMPLH = (-0.0022, -0.2408, 0.0286)

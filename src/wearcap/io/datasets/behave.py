@@ -22,11 +22,11 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.amass import PELVIS_SMPLH
 from wearcap.io.datasets.one_object import OneObject, smpl_motion
-from wearcap.io.formats.json_text import read_json
 from wearcap.io.formats.npz import read_npz, require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import check_rising
-from wearcap.io.formats.smpl_axes import shape_from_betas
+from wearcap.io.formats.smpl import shape_from_betas
+from wearcap.io.formats.text import read_json
 from wearcap.scene.object_mesh import centered, check_object_mesh
 
 FPS = 30

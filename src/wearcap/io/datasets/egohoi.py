@@ -21,16 +21,15 @@ from wearcap.files import atomic_path
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.hcontact import activity_of, location_of
+from wearcap.io.datasets.hcontact import activity_of, location_of, read_smpl_json
 from wearcap.io.datasets.hps import read_hps_subject
 from wearcap.io.datasets.hps_sequence import subject_of
 from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
-from wearcap.io.formats.json_text import read_json
 from wearcap.io.formats.npz import read_npz, require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
-from wearcap.io.formats.smpl_axes import shape_from_betas
-from wearcap.io.formats.smpl_json import read_smpl_json
+from wearcap.io.formats.smpl import shape_from_betas
+from wearcap.io.formats.text import read_json
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment

@@ -4,6 +4,22 @@
 is. Localisation is the pose of the OpenCV camera in that world. io/datasets/hps_sequence.py puts a sequence together.
 """
 
+# MERGED DOCS
+# """A scan of the HPS data set (unzipped): cloud, database photos of a fisheye rig, their calibration.
+#
+# `info/00000-info.json` gives the pose of each camera of the rig in the scan's world, along OpenCV's axes of the picture
+# as stored (the trolley's cameras are mounted on their side: right in the picture may be down in the room).
+# """
+# """The suit's pose in the HPS data set: text written by Unity (`*_pose.txt`, `*_trans.txt`).
+#
+# Unity's world is left-handed (x right, y up, z forward) and turns by Euler angles "ZXY": first about z, then x, then y,
+# all about fixed axes, in degrees. With x flipped it is SMPL's (x left, y up, z forward, right-handed): rotations about
+# x keep their sign, those about y and z change it, so R = Ry(-y) Rx(x) Rz(-z). SMPL's axes are then converted as in
+# io/datasets/amass.py; here the world's axes are, too, for Unity's world is y up.
+# """
+
+import re
+from array import array
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,12 +33,16 @@ from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
-from wearcap.io.formats.json_text import read_json_object
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import about_axis, matrix_from_quat_wxyz
 from wearcap.io.formats.npz import require
+from wearcap.io.formats.ocamcalib import read_sensor_frame
 from wearcap.io.formats.poses import NORM_TOLERANCE
 from wearcap.io.formats.restricted_pickle import read_pickle
-from wearcap.io.formats.smpl_axes import rotations_from_smpl
+from wearcap.io.formats.smpl import A, rotations_from_smpl
+from wearcap.io.formats.text import at_line, finite_floats, numbered_lines, read_json, read_json_object
 from wearcap.recording import Localization, Motion
+from wearcap.recording.photo import Photo
 
 FPS = 30.0
 """Frame rate (Hz) of the motion, the suit's exports and the localised video (resampled from 29.97)."""
@@ -203,3 +223,132 @@ def resampled_localization(localization: Localization, fps: float | int) -> Loca
 def nominal_mount() -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """(R_head_cam, t_head_cam) of an upright, forward-looking camera on the forehead (assumed: it is not measured)."""
     return torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), torch.tensor([0.12, 0.0, 0.12])
+
+
+CLOUD, CALIBRATION = "pointcloud.ply", "sensor_frame.xml"
+_PHOTO = re.compile(r"(\d+)-(cam\d+)\.jpe?g", re.IGNORECASE)
+
+
+def is_hps_scene(folder: str | Path) -> bool:
+    """Whether a folder has the layout of a NavVis scan: a calibration and poses of pictures."""
+    return (Path(folder) / CALIBRATION).is_file() and (Path(folder) / "info").is_dir()
+
+
+def read_hps_scene(folder: str | Path) -> tuple[Path, list[Photo]]:
+    """(path of the cloud, photos in order of frame and camera); the cloud itself is read by `io.formats.scan.read_scan`.
+
+    Pictures whose frame was found invalid by the scanner are left out. Raises WearcapError for a missing cloud,
+    calibration or picture folder, a picture without pose or calibration, and what those readers refuse.
+    """
+    folder = Path(folder)
+    if folder.suffix == ".zip":
+        raise WearcapError("a packed scan", where=folder, expected="its folder", fix="Unzip it first.")
+    for part in (CLOUD, CALIBRATION, "cam", "info"):
+        if not (folder / part).exists():
+            raise WearcapError(f"no {part}", where=folder, expected=f"a scan with {CLOUD}, {CALIBRATION}, cam/, info/")
+    cameras = {
+        name: model.camera(f"{folder / CALIBRATION}, camera {name!r}")
+        for name, model in read_sensor_frame(folder / CALIBRATION).items()
+    }
+    named = [(match, path) for path in sorted((folder / "cam").iterdir()) if (match := _PHOTO.fullmatch(path.name))]
+    if not named:
+        raise WearcapError("no pictures", where=folder / "cam", expected="files such as 00000-cam0.jpg")
+    photos, info, info_path = [], {}, None
+    for match, path in named:
+        frame, name = match.groups()
+        if info_path != folder / "info" / f"{frame}-info.json":
+            info_path = folder / "info" / f"{frame}-info.json"
+            info = read_json(info_path)
+        if not isinstance(info, dict) or name not in info:
+            raise WearcapError(f"no pose of {name}", where=info_path, expected=f"one for {path.name}")
+        if name not in cameras:
+            raise WearcapError(f"no intrinsics of {name}", where=folder / CALIBRATION, expected=f"one for {path.name}")
+        if str(info.get("valid", "true")).lower() == "false":
+            continue
+        quat_wxyz, position = read_hps_pose(info[name], f"{info_path}, {name}")
+        R = matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz))
+        photos.append(Photo(path, cameras[name], Rigid(R.float(), torch.from_numpy(position).float())))
+    return folder / CLOUD, photos
+
+
+_ARM = ("collar", "shoulder", "elbow", "wrist", "hand")
+_LEG = ("hip", "knee", "ankle", "foot")
+JOINTS = (
+    "pelvis",
+    *(f"{side}_{joint}" for side in ("left", "right") for joint in _LEG),
+    "spine1",
+    "spine2",
+    "spine3",
+    *(f"left_{joint}" for joint in _ARM),
+    "neck",
+    "head",
+    *(f"right_{joint}" for joint in _ARM),
+)
+"""Order of the file's Euler angles: Unity's hierarchy of SMPL, depth first."""
+_WITH_INNER_ROOT = 3 * (len(JOINTS) + 1)
+"""Files name the root twice: the avatar, which turns, and below it the model's own root, which does not."""
+
+
+def read_unity_motion(
+    pose_path: str | Path, trans_path: str | Path, t_template_pelvis: tuple[float, float, float] = PELVIS_SMPL
+) -> Motion:
+    """Read one sequence's `_pose.txt` and `_trans.txt` as a smpl24 motion at 30 Hz that begins at 0 s, z up.
+
+    A last line that was cut short is left out. Raises WearcapError naming the line for a wrong count or what is no
+    number, and for files whose lengths differ by more than one frame.
+    """
+    angles_deg = _table(pose_path, (_WITH_INNER_ROOT, 3 * len(JOINTS)))
+    if angles_deg.shape[1] == _WITH_INNER_ROOT:
+        angles_deg = np.delete(angles_deg, [3, 4, 5], 1)
+    trans = _table(trans_path, (3,))
+    if abs(len(angles_deg) - len(trans)) > 1:
+        raise WearcapError(
+            f"{len(trans)} positions for {len(angles_deg)} poses",
+            where=trans_path,
+            expected=f"as many lines as in {Path(pose_path).name}",
+        )
+    count = min(len(angles_deg), len(trans))
+    R_smpl = rotations_from_unity(torch.from_numpy(angles_deg[:count]).unflatten(1, (-1, 3)))
+    skeleton = smpl24()
+    order = [JOINTS.index(name) for name in skeleton.joint_names]
+    t_smpl = torch.from_numpy(trans[:count]) * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+    t_smpl = t_smpl + torch.tensor(t_template_pelvis, dtype=torch.float64)
+    return Motion(
+        torch.arange(count, dtype=torch.float64) / FPS,
+        skeleton,
+        (A @ R_smpl[:, order] @ A.T).float(),
+        (t_smpl @ A.T).float(),
+        provenance={"source": Path(pose_path).name, "format": "hps unity"},
+    )
+
+
+def rotations_from_unity(angles_deg: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotations in SMPL's axes from Unity's Euler angles (x, y, z in degrees)."""
+    x, y, z = torch.deg2rad(angles_deg).unbind(-1)
+    return about_axis("y", -y) @ about_axis("x", x) @ about_axis("z", -z)
+
+
+def _table(path: str | Path, widths: tuple[int, ...]) -> np.ndarray:
+    values, width = array("d"), 0
+    short: WearcapError | None = None
+    for number, line in numbered_lines(path):
+        tokens = line.split()
+        if not tokens:
+            continue
+        if short is not None:
+            raise short
+        width = width or len(tokens)
+        if width not in widths or len(tokens) != width:
+            short = WearcapError(
+                f"{len(tokens)} numbers", where=at_line(path, number), expected=" or ".join(map(str, widths))
+            )
+            if len(tokens) >= width:
+                raise short
+            continue  # the recorder stops in the middle of a line: only the last may be short
+        try:
+            values.extend(finite_floats(tokens))
+        except ValueError as error:
+            raise WearcapError(f"what is no finite number ({error})"[:200], where=at_line(path, number)) from error
+    if not values:
+        raise WearcapError("no lines of numbers", where=path)
+    return np.asarray(values).reshape(-1, width)

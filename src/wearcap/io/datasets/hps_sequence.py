@@ -17,6 +17,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.hps import (
+    CLOUD,
     FPS,
     IMAGE_SIZE,
     nominal_mount,
@@ -25,11 +26,10 @@ from wearcap.io.datasets.hps import (
     read_hps_motion,
     read_hps_starts,
     read_hps_subject,
+    read_unity_motion,
 )
-from wearcap.io.datasets.hps_scene import CLOUD
-from wearcap.io.datasets.hps_unity import read_unity_motion
 from wearcap.io.formats.mvnx import read_mvnx
-from wearcap.io.formats.smpl_axes import shape_from_betas
+from wearcap.io.formats.smpl import shape_from_betas
 from wearcap.io.formats.video import video_info
 from wearcap.recording import CameraStream, Localization, Motion, Recording
 

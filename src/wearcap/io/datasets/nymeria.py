@@ -22,9 +22,9 @@ from wearcap.io.datasets.amass import PELVIS_SMPLH
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, find_mps_file, head_stream, read_closed_loop, read_mps_points
 from wearcap.io.devices.aria_vrs import extract_video
 from wearcap.io.devices.head_alignment import align_head, clock_offset
-from wearcap.io.formats.json_text import read_json_object
 from wearcap.io.formats.npz import read_npz, require
-from wearcap.io.formats.smpl_axes import rotations_from_smpl
+from wearcap.io.formats.smpl import rotations_from_smpl
+from wearcap.io.formats.text import read_json_object
 from wearcap.recording import ContactTrack, HeadStream, Motion, Recording
 
 SUIT_HZ = 240.0

@@ -25,7 +25,7 @@ from wearcap.io.datasets.amass import PELVIS_SMPLX
 from wearcap.io.datasets.one_object import OneObject, smpl_motion
 from wearcap.io.formats.npz import require
 from wearcap.io.formats.restricted_pickle import read_pickle
-from wearcap.io.formats.smpl_axes import shape_from_arrays
+from wearcap.io.formats.smpl import shape_from_arrays
 from wearcap.io.formats.wavefront import read_obj
 from wearcap.scene.object_mesh import centered, check_object_mesh
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.formats.smpl_axes import rotations_from_smpl
+from wearcap.io.formats.smpl import rotations_from_smpl
 from wearcap.recording.motion import Motion
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
-from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.text import read_json
 from wearcap.sensors.arm_swings import SwingClock
 from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment
 from wearcap.sensors.clock import Clock

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.text import read_json
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.scene.objects import CONTACT_CLASSES
 

@@ -14,8 +14,8 @@ from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
-from wearcap.io.formats.json_text import read_json
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
+from wearcap.io.formats.text import read_json
 from wearcap.scene.environment import Environment, hinge_gap_m
 from wearcap.scene.objects import FREEDOMS, Freedom, SceneObject
 

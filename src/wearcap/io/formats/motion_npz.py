@@ -5,16 +5,20 @@ everything that is no array), and for tools that know AMASS' keys `trans`, `pose
 parent, in this skeleton's joints and axes), `mocap_framerate` and `joint_names`.
 """
 
+# MERGED DOCS
+# """Frames of a motion on an even time grid, for formats with a fixed frame rate."""
+
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Int64
+from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.formats.frame_grid import nominal_fps
 from wearcap.io.formats.npz import read_npz, require
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.recording.motion import Motion
@@ -135,3 +139,35 @@ def _check_interactions(interactions: Interactions, path: str | Path) -> None:
     for names in (interactions.objects, interactions.classes):
         if not isinstance(names, tuple) or len(names) != count or not all(isinstance(name, str) for name in names):
             raise ValueError(f"names that do not match {count} interactions")
+
+
+STILL_FPS = 30.0
+"""Rate (Hz) written for a motion of a single frame, which has none."""
+
+
+def even_frames(motion: Motion) -> tuple[Int64[Tensor, "time"], float]:
+    """Index of the nearest frame at each step of the motion's nominal rate, and that rate (Hz).
+
+    An even motion keeps every frame once; over a gap the nearest frame is repeated, so that nothing shifts in time.
+    Raises WearcapError for a motion without frames or with a gap of more than a minute.
+    """
+    if len(motion) == 0:
+        raise WearcapError("the motion has no frames", expected="at least one frame to write")
+    if len(motion) == 1:
+        return torch.zeros(1, dtype=torch.int64), STILL_FPS
+    steps, fps = motion.timestamps.diff(), nominal_fps(motion.fps)
+    if not (steps > 0).all() or steps.max() > 60:
+        raise WearcapError(
+            "timestamps fall, repeat or leave a gap of over a minute",
+            expected="rising timestamps in s",
+            fix="Cut the motion at the gap.",
+        )
+    start, duration = motion.timestamps[0], motion.timestamps[-1] - motion.timestamps[0]
+    grid = start + torch.arange(round(duration.item() * fps) + 1, dtype=torch.float64) / fps
+    midpoints = (motion.timestamps[1:] + motion.timestamps[:-1]) / 2
+    return torch.searchsorted(midpoints, grid), fps
+
+
+def nominal_fps(fps: float) -> float:
+    """Nearest integer rate if the rate was only rounded (120.0005 Hz from a step of .0083333 s), else the rate itself."""
+    return float(round(fps)) if round(fps) and abs(fps - round(fps)) < 1e-4 * fps else fps

@@ -1,13 +1,20 @@
-"""Checks that every reader of a trajectory shares."""
+"""Trajectories: the checks that every reader of poses shares, TUM's text and EuRoC's CSV.
 
+TUM: lines of `timestamp tx ty tz qx qy qz qw`, `#` begins a comment. EuRoC: CSV of `#timestamp [ns], p x y z [m],
+q w x y z`, more columns (velocity, biases) may follow.
+"""
+
+from array import array
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.geometry.rotation import matrix_from_quat_wxyz
+from wearcap.files import write_text
+from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.formats.csv_table import load_rows, open_text
 
 NORM_TOLERANCE = 0.02
 """Largest deviation of a quaternion's norm from 1: text files round, but a mixed-up column is far off."""
@@ -61,3 +68,50 @@ def check_rising(timestamps: np.ndarray, where: str | Path) -> None:
             expected="timestamps that rise",
             fix="Sort the rows by time and drop repeated ones.",
         )
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """Trajectory in the file's own world and body axes (s, m).
+
+    Raises WearcapError for lines without 8 numbers, NaN, unsorted times, quaternions far from unit norm.
+    """
+    values = array("d")
+    with open_text(path) as file:
+        for number, line in enumerate(file, 1):
+            row = line.split("#")[0].replace(",", " ").split()
+            if row and len(row) != 8:
+                what = f"line {number} has {len(row)} fields"
+                raise WearcapError(what, where=path, expected="timestamp tx ty tz qx qy qz qw")
+            try:
+                values.extend(map(float, row))
+            except ValueError as error:
+                what = f"line {number}: {error}"[:200]
+                raise WearcapError(what, where=path, expected="lines of 8 numbers") from error
+    if not values:
+        raise WearcapError("no poses in the file", where=path, expected="lines of 8 numbers")
+    table = np.asarray(values).reshape(-1, 8)
+    return checked_trajectory(table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]], path)
+
+
+def write_tum(trajectory: Trajectory, path: str | Path) -> None:
+    """Write a trajectory atomically, timestamps to the microsecond."""
+    wxyz = quat_wxyz_from_matrix(trajectory.R_world_body.double()).numpy()
+    table = np.concatenate(
+        [trajectory.timestamps.numpy()[:, None], trajectory.t_world_body.double().numpy(), wxyz[:, [1, 2, 3, 0]]], 1
+    )
+    lines = [f"{row[0]:.6f} " + " ".join(f"{value:.7f}" for value in row[1:]) for row in table]
+    write_text(path, "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines]) + "\n")
+
+
+def read_euroc(path: str | Path) -> Trajectory:
+    """Trajectory in the file's own world and body axes (s, m); the scalar of the quaternion stands first.
+
+    Raises WearcapError for fewer than 8 columns, NaN, unsorted times, quaternions far from unit norm.
+    """
+    with open_text(path) as file:
+        lines = (line for line in file if line.strip() and not line.startswith("#"))
+        expected = "timestamp [ns], x, y, z, qw, qx, qy, qz in every line"
+        table = load_rows(lines, "not an EuRoC trajectory", path, expected, ndmin=2, usecols=range(8))
+    if not len(table):
+        raise WearcapError("no poses in the file", where=path, expected="lines of at least 8 numbers")
+    return checked_trajectory(table[:, 0] * 1e-9, table[:, 1:4], table[:, 4:8], path)

@@ -7,9 +7,9 @@ import numpy as np
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
+from wearcap.io.formats.ply import GREY
 from wearcap.io.formats.text import at_line, numbered_lines
 
-_COLOR = np.array([0.7, 0.7, 0.7], np.float32)
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -46,7 +46,7 @@ def read_obj(path: str | Path) -> Mesh:
             expected="faces of its own vertices",
             fix="The file was cut short: copy it again.",
         )
-    return Mesh(points, corners, _COLOR)
+    return Mesh(points, corners, GREY)
 
 
 def _vertex(words: list[str]) -> list[float]:

@@ -17,7 +17,7 @@ from wearcap.files import atomic_path, write_text
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.formats.photos import FILE_NAME, write_photos
+from wearcap.io.formats.camera_json import PHOTOS_FILE, write_photos
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.scene_folder import CLOUD
 from wearcap.recording.photo import Photo
@@ -87,7 +87,7 @@ def write_scene(scenery: Scenery, folder: str | Path, settings: SceneSettings, s
             rng = np.random.default_rng([14, seed, int(number)])
             light = Development(exposure=float(rng.uniform(0.92, 1.06)), noise=settings.noise, vignetting=0.25)
             save_jpeg(render_view(scenery, photo.camera, photo.T_world_cam, light, rng), folder / photo.file)
-    if not (folder / FILE_NAME).is_file():
+    if not (folder / PHOTOS_FILE).is_file():
         write_photos(plan, folder)
 
 
@@ -96,7 +96,7 @@ def _discard_stale(folder: Path, wanted: str) -> None:
     note = folder / MADE
     if note.is_file() and note.read_text(encoding="utf-8") == wanted:
         return
-    for path in (folder / CLOUD, folder / FILE_NAME, *(folder / "photos").glob("*.jpg")):
+    for path in (folder / CLOUD, folder / PHOTOS_FILE, *(folder / "photos").glob("*.jpg")):
         path.unlink(missing_ok=True)
     write_text(note, wanted)
 
